@@ -1,0 +1,133 @@
+"""COCO average precision of a detector on whole photographs, without foveation.
+
+python -m benchmarks.detector_ap --detector yolov3-tiny --root DIR --annotations FILE
+"""
+
+import argparse
+import contextlib
+import io
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from semfov.detection import Candidates, Detector, Selection
+from semfov.detection.load import load_detector
+from semfov.detection.selection import suppress
+
+# COCO's evaluation counts at most 100 boxes of an image, at any confidence.
+SELECTIONS = {
+    "per-class NMS": Selection(threshold=0.001, iou=0.5, limit=100, per_class=True),
+    "class-agnostic NMS": Selection(threshold=0.001, iou=0.5, limit=100),
+}
+
+
+def read_image(path: Path) -> Tensor:
+    """A photograph as `(1, 3, H, W)`, RGB in [0, 1], in the orientation in which COCO annotates: as stored."""
+    import numpy as np
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1)[None] / 255
+
+
+def rows_above(candidates: Candidates, threshold: float, *, multilabel: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Row, score (objectness times class) and label from 0 of what one image's candidates score above `threshold`.
+
+    Each box counts with its best class; with `multilabel`, with every class.
+    """
+    scores = candidates.classes[0]
+    if candidates.objectness is not None:
+        scores = scores * candidates.objectness[0][:, None]
+    if not multilabel:
+        best = scores.argmax(-1, keepdim=True)
+        scores = torch.zeros_like(scores).scatter(-1, best, scores.gather(-1, best))
+    rows, labels = (scores >= threshold).nonzero(as_tuple=True)
+    return rows, scores[rows, labels], labels
+
+
+@torch.no_grad()
+def detect(
+    detector: Detector, image: Tensor, selections: Iterable[Selection], *, multilabel: bool = False
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Boxes, scores and labels of one photograph for each of `selections`."""
+    canvas, placement = detector.fit(image)
+    candidates = detector.propose(canvas)
+    boxes = placement.boxes_to_image(candidates.boxes[0])
+    for selection in selections:
+        rows, scores, labels = rows_above(candidates, selection.threshold, multilabel=multilabel)
+        keep = suppress(boxes[rows], scores, labels, selection)
+        yield boxes[rows][keep], scores[keep], labels[keep]
+
+
+def average_precision(
+    detector: Detector,
+    root: Path,
+    annotations: Path,
+    selections: Sequence[Selection],
+    *,
+    multilabel: bool = False,
+) -> list[tuple[float, float]]:
+    """AP and AP50 of COCOeval for each of `selections`, over all images of the annotation file."""
+    from pycocotools.coco import COCO
+
+    with contextlib.redirect_stdout(io.StringIO()):
+        truth = COCO(str(annotations))
+    category = {entry["name"]: entry["id"] for entry in truth.dataset["categories"]}
+    ids = torch.tensor([category[name] for name in detector.classes])
+    results: list[list[dict[str, Any]]] = [[] for _ in selections]
+    for image_id in tqdm(sorted(truth.imgs), desc=detector.name, unit="image"):
+        image = read_image(root / truth.imgs[image_id]["file_name"])
+        found = detect(detector, image, selections, multilabel=multilabel)
+        for result, (boxes, scores, labels) in zip(results, found, strict=True):
+            sizes = torch.cat([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], -1)
+            for box, score, label in zip(sizes.tolist(), scores.tolist(), ids[labels].tolist(), strict=True):
+                result.append({"image_id": image_id, "category_id": label, "bbox": box, "score": score})
+    return [evaluate(truth, result) for result in results]
+
+
+def evaluate(truth: Any, result: list[dict[str, Any]]) -> tuple[float, float]:
+    """AP and AP50 of one list of results."""
+    from pycocotools.cocoeval import COCOeval
+
+    with contextlib.redirect_stdout(io.StringIO()):
+        evaluation = COCOeval(truth, truth.loadRes(result), "bbox")
+        evaluation.evaluate()
+        evaluation.accumulate()
+        evaluation.summarize()
+    return float(evaluation.stats[0]), float(evaluation.stats[1])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="COCO average precision of a detector, without foveation")
+    parser.add_argument("--detector", default="yolov3-tiny", help="name or file, as load_detector takes it")
+    parser.add_argument("--weights", help="weights file, for a cfg or instead of the published weights")
+    parser.add_argument("--root", type=Path, required=True, help="folder of the photographs")
+    parser.add_argument("--annotations", type=Path, required=True, help="COCO annotation file")
+    parser.add_argument("--stride", type=int, nargs="*", default=[0, 32], help="canvas padding; 0: the whole canvas")
+    parser.add_argument("--multilabel", action="store_true", help="let a box count for every class")
+    parser.add_argument("--direct", action="store_true", help="plain convolutions instead of Winograd's")
+    arguments = parser.parse_args()
+    print("| detector | padding | NMS | AP | AP50 |\n|---|---|---|---|---|")
+    for stride in arguments.stride:
+        options: dict[str, Any] = {"weights": arguments.weights} if arguments.weights else {}
+        if not arguments.detector.endswith(".onnx") and ":" not in arguments.detector:
+            options |= {"stride": stride or None, "winograd": not arguments.direct}
+        detector = load_detector(arguments.detector, **options)
+        scores = average_precision(
+            detector,
+            arguments.root,
+            arguments.annotations,
+            list(SELECTIONS.values()),
+            multilabel=arguments.multilabel,
+        )
+        padding = "whole canvas" if detector.stride is None else f"to a multiple of {detector.stride}"
+        for name, (ap, ap50) in zip(SELECTIONS, scores, strict=True):
+            print(f"| {detector.name} | {padding} | {name} | {ap:.3f} | {ap50:.3f} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Applications that measure semfov: visual search, exploration, calibration."""

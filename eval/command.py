@@ -1,0 +1,59 @@
+"""Command lines from dataclasses: help, YAML files, dotted overrides, exit codes."""
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+from jsonargparse import ArgumentParser, set_parsing_settings
+
+from semfov.errors import SemfovError
+
+Config = TypeVar("Config")
+
+
+def make_parser(config: type[Any], description: str | None) -> ArgumentParser:
+    """A parser with an option for every field of `config`, nested fields dotted, and `--config FILE.yaml`."""
+    set_parsing_settings(docstring_parse_attribute_docstrings=False)
+    parser = ArgumentParser(
+        prog=None, description=description, default_env=False, formatter_class=_formatter(), exit_on_error=True
+    )
+    parser.add_argument("--config", action="config", help="YAML file with settings; options after it override it.")
+    parser.add_class_arguments(config, as_group=True)
+    return parser
+
+
+def _formatter() -> Any:
+    import argparse
+
+    from jsonargparse import DefaultHelpFormatter
+
+    class Formatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
+        """Keeps the line breaks of the description."""
+
+    return Formatter
+
+
+def run_command(
+    main: Callable[[Config], None],
+    config: type[Config],
+    description: str | None,
+    arguments: Sequence[str] | None = None,
+) -> int:
+    """Parse `arguments` into a `config` and call `main` with it.
+
+    Returns:
+        0, or 1 after a `SemfovError` (printed in one line), or 130 after Ctrl-C; usage errors exit with 2.
+    """
+    parser = make_parser(config, description)
+    parsed = parser.parse_args(arguments)
+    parsed.pop("config", None)
+    settings = parser.instantiate_classes(parsed)
+    try:
+        main(config(**settings.as_dict()))
+    except SemfovError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on where this one stopped", file=sys.stderr)
+        return 130
+    return 0

@@ -1,0 +1,149 @@
+"""Settings of the evaluation, as dataclasses that the command line and YAML files fill in."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from semfov.belief import Footprint
+from semfov.detection.scores import BackgroundPolicy
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which scenes to search.
+
+    Args:
+        root: folder of the photographs; None uses the embedded scenes, which need no data set.
+        annotations: COCO-format instances file for the photographs.
+        limit: use only the first so many scenes (None: all of the photographs, 8 embedded scenes).
+        min_instances: leave out photographs with fewer objects (published: 8).
+        max_target_area: a class that covers a larger share of the image is not searched for (published: 0.2).
+        scene_seed: seed that the embedded scenes are composed by.
+    """
+
+    root: Path | None = None
+    annotations: Path | None = None
+    limit: int | None = None
+    min_instances: int = 8
+    max_target_area: float = 0.2
+    scene_seed: int = 0
+
+
+@dataclass(frozen=True)
+class DetectorConfig:
+    """Which detector looks through the fovea.
+
+    Args:
+        name: `yolov3-tiny`, `yolov3`, `yolov3-spp`, a Darknet cfg file or an ONNX model.
+        weights: file with the weights (None: those registered for the name).
+        background: where the background score comes from (`semfov.detection.scores`).
+        threshold: boxes with a lower confidence are dropped.
+        iou: class-agnostic non-maximum suppression drops boxes that overlap a better one by more.
+        limit: most boxes kept in a view.
+        stride: pad the view only to a multiple of this (None: to the detector's square input, as published).
+    """
+
+    name: str = "yolov3-tiny"
+    weights: Path | None = None
+    background: BackgroundPolicy = "residual"
+    threshold: float = 0.02
+    iou: float = 0.5
+    limit: int = 100
+    stride: int | None = 32
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """The foveal sensor.
+
+    Args:
+        sigma: width of the fovea in pixels of an image whose longer side is `reference` (published: 100 and 50).
+        growth: how much wider the window of each coarser band is (2: published sensor, 1: a sharp disc).
+        levels: number of bands of the Laplacian pyramid.
+        convention: `kornia` or `opencv` pyramid.
+        reference: longer side in pixels that sigma is meant for.
+    """
+
+    sigma: float = 100.0
+    growth: float = 2.0
+    levels: int = 5
+    convention: Literal["kornia", "opencv"] = "kornia"
+    reference: float = 640.0
+
+
+@dataclass(frozen=True)
+class BeliefConfig:
+    """The grid of beliefs.
+
+    Args:
+        columns: cells in a row.
+        rows: cells in a column.
+        prior: Dirichlet parameter of every class before the first look.
+        fusion: `kaplan` (published), `product` or `sum`.
+        footprint: which cells a detection updates: `overlap` (published), `centre` or `box_centre`.
+        model: fitted observation model, by name or file (None: the one shipped for the detector).
+    """
+
+    columns: int = 10
+    rows: int = 10
+    prior: float = 0.5
+    fusion: Literal["kaplan", "product", "sum"] = "kaplan"
+    footprint: Footprint = "overlap"
+    model: str | None = None
+
+
+@dataclass(frozen=True)
+class ProtocolConfig:
+    """The experiment.
+
+    Args:
+        starts: searches for each image and target, each from another cell that holds no target.
+        shifts: gaze shifts of a search.
+        ties: equal cells are chosen at `random`, or the `first` by number.
+        seed: seed of starts and tie-breaking; the same seed gives the same result to the last bit.
+        batch: episodes that are run as one tensor (no influence on the result).
+    """
+
+    starts: int = 10
+    shifts: int = 30
+    ties: Literal["random", "first"] = "random"
+    seed: int = 0
+    batch: int = 1024
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """Visual search: find a target class by moving a fovea, and count the gaze shifts that it takes.
+
+    Args:
+        data: which scenes to search.
+        detector: which detector looks through the fovea.
+        sensor: the foveal sensor.
+        belief: the grid of beliefs.
+        protocol: the experiment.
+        policies: policies to compare: `random`, or `non-predictive` / `predictive` followed by `-raw` (scores are
+            likelihoods) or `-calibrated` (scores go through the observation model).
+        out: folder for tables, figures, per-episode records and the manifest.
+        cache: folder for what the detector saw from every cell, shared between runs (None: the user's cache).
+        store: keep what the detector saw on disk; false recomputes it (the result is the same).
+        workers: processes (None: one for each CPU core).
+        scanpaths: draw this many episodes.
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
+    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    policies: tuple[str, ...] = (
+        "random",
+        "non-predictive-raw",
+        "predictive-raw",
+        "non-predictive-calibrated",
+        "predictive-calibrated",
+    )
+    out: Path = Path("runs/search")
+    cache: Path | None = None
+    store: bool = True
+    workers: int | None = None
+    scanpaths: int = 3

@@ -1,0 +1,153 @@
+"""The search protocol: which episodes there are, and running them as tensors."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from eval.config import ProtocolConfig
+from eval.setup import Scenes
+from semfov import Grid
+from semfov.agent import step
+from semfov.belief import Evidence
+from semfov.gaze import Policy
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One search: a target class in a scene, from a start.
+
+    Attributes:
+        scene: index of the scene in its data set.
+        target: class index, 1..K.
+        repetition: which of the starts, from 0.
+        start: cell of the first fixation.
+        goal: cells that an object of the target class overlaps.
+        commonest: whether the target is the scene's class with most instances (the first of them by index).
+    """
+
+    scene: int
+    target: int
+    repetition: int
+    start: int
+    goal: tuple[int, ...]
+    commonest: bool
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of an episode: the fixated cells in order, and the gaze shift that found the target, or -1."""
+
+    cells: tuple[int, ...]
+    found_at: int
+
+
+def generator_for(*what: object) -> torch.Generator:
+    """A generator seeded by what it is for, so that no episode's numbers depend on another's."""
+    digest = hashlib.sha256(repr(what).encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:8], "big") >> 1)
+
+
+def episodes_of(scenes: Scenes, index: int, columns: int, rows: int, protocol: ProtocolConfig) -> list[Episode]:
+    """All episodes of one scene: every legal target, `starts` cells that no object of it overlaps.
+
+    Starts differ from each other as long as there are enough cells.
+    """
+    boxes, labels, size = scenes.annotation(index)
+    covered = Grid(columns, rows, size).footprint(boxes)
+    counts = torch.bincount(labels, minlength=1)
+    targets = scenes.targets(index)
+    commonest = max(targets, key=lambda t: (int(counts[t]), -t)) if targets else None
+    episodes = []
+    for target in targets:
+        goal = covered[labels == target].any(0)
+        free = (~goal).nonzero()[:, 0]
+        if not len(free) or not goal.any():
+            continue
+        generator = generator_for("start", protocol.seed, scenes.ids[index], target)
+        rounds = -(-protocol.starts // len(free))
+        order = torch.cat([torch.randperm(len(free), generator=generator) for _ in range(rounds)])
+        cells = tuple(goal.nonzero()[:, 0].tolist())
+        episodes += [
+            Episode(index, target, repetition, start, cells, target == commonest)
+            for repetition, start in enumerate(free[order[: protocol.starts]].tolist())
+        ]
+    return episodes
+
+
+def tie_noise(scenes: Scenes, episode: Episode, cells: int, protocol: ProtocolConfig) -> Tensor:
+    """Random numbers that break an episode's ties, `(shifts+1, X·Y)`; the same for every policy."""
+    shape = protocol.shifts + 1, cells
+    if protocol.ties == "first":
+        return torch.linspace(1, 0, cells).expand(shape)
+    what = "ties", protocol.seed, scenes.ids[episode.scene], episode.target, episode.repetition
+    return torch.rand(shape, generator=generator_for(*what))
+
+
+def run_episodes(
+    episodes: Sequence[Episode],
+    evidence: Evidence,
+    noise: Tensor,
+    policy: Policy,
+    *,
+    prior: float,
+    fusion: str,
+    shifts: int,
+    batch: int,
+) -> list[Outcome]:
+    """Run episodes of one scene, `batch` at a time, each until its target is found or its gaze shifts are spent.
+
+    Args:
+        episodes: of one and the same scene.
+        evidence: what a look from every cell of it says, a batch of X·Y.
+        noise: `(episodes, shifts+1, X·Y)`, from `tie_noise`.
+        policy: makes the acquisition function for the targets.
+        prior: Dirichlet parameter before the first look.
+        fusion: rule of fusion.
+        shifts: most gaze shifts.
+        batch: episodes in a tensor.
+    """
+    outcomes: list[Outcome] = []
+    for first in range(0, len(episodes), batch):
+        part = slice(first, first + batch)
+        outcomes += _run_batch(episodes[part], evidence, noise[part], policy, prior, fusion, shifts)
+    return outcomes
+
+
+def _run_batch(
+    episodes: Sequence[Episode],
+    evidence: Evidence,
+    noise: Tensor,
+    policy: Policy,
+    prior: float,
+    fusion: str,
+    shifts: int,
+) -> list[Outcome]:
+    count, cells, components = len(episodes), evidence.footprint.shape[-1], evidence.likelihood.shape[-1]
+    goals = torch.zeros(count, cells, dtype=torch.bool)
+    for row, episode in enumerate(episodes):
+        goals[row, list(episode.goal)] = True
+    targets = torch.tensor([episode.target for episode in episodes])
+    visits = torch.full((count, shifts + 1), -1)
+    found_at = torch.full((count,), -1)
+
+    active = torch.arange(count)
+    cell = torch.tensor([episode.start for episode in episodes])
+    beta = evidence.likelihood.new_full((count, cells, components), prior)
+    visited = torch.zeros(count, cells, dtype=torch.bool)
+    for shift in range(shifts + 1):
+        visits[active, shift] = cell
+        found = goals[active, cell]
+        found_at[active[found]] = shift
+        go_on = ~found
+        if shift == shifts or not go_on.any():
+            break
+        active, cell, beta, visited = active[go_on], cell[go_on], beta[go_on], visited[go_on]
+        after = step(
+            beta, visited, cell, evidence[cell], policy(targets[active]), noise[active, shift], fusion=fusion
+        )
+        left = after.cell >= 0
+        active, cell, beta, visited = active[left], after.cell[left], after.beta[left], after.visited[left]
+    return [Outcome(tuple(row[row >= 0].tolist()), int(at)) for row, at in zip(visits, found_at, strict=True)]

@@ -1,0 +1,48 @@
+"""Visual search: `python -m eval.search` finds objects in photographs by moving a fovea.
+
+Without arguments it searches the embedded scenes, which need no data set. With a COCO-format data set:
+
+    python -m eval.search --data.root val2017 --data.annotations instances_val2017.json --out runs/val
+    python -m eval.search --config configs/paper_search.yaml --data.root ... --data.annotations ...
+
+A run that was stopped goes on where it was when the same command is given again.
+"""
+
+import sys
+from collections.abc import Sequence
+
+from eval.command import run_command
+from eval.config import SearchConfig
+from eval.parallel import available_cores, mine, rank, run_tasks, wait_for_all
+from eval.report import report
+from eval.tasks import Parts, SearchRun, prepare_process, search_scene
+
+
+def search(config: SearchConfig) -> None:
+    """Run a visual search experiment and write its tables, figures and records."""
+    run = SearchRun(config)
+    parts = Parts(config.out / "parts", run.key)
+    todo = [index for index in mine(range(len(run.scenes))) if parts.load(index) is None]
+    done = run_tasks(
+        search_scene,
+        todo,
+        workers=config.workers or available_cores(),
+        setup=prepare_process,
+        settings=(config,),
+        title="searching",
+        unit="scene",
+    )
+    for _ in done:
+        pass
+    wait_for_all()
+    if rank() == 0:
+        report(run, parts)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    return run_command(search, SearchConfig, __doc__, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

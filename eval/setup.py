@@ -1,0 +1,88 @@
+"""From settings to objects: scenes, eye, observation model, policies."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+import semfov
+from eval.config import DataConfig, DetectorConfig, SearchConfig, SensorConfig
+from semfov.data.scene import Scene
+from semfov.errors import InputError, check, lookup
+from semfov.eye import Eye
+from semfov.gaze import SEARCH_POLICIES
+
+
+class Scenes(Protocol):
+    """What the evaluation needs of a data set (`CocoScenes`, `EmbeddedScenes`)."""
+
+    ids: list[int] | list[str]
+    classes: tuple[str, ...]
+    fingerprint: str
+
+    def __len__(self) -> int: ...
+    def __getitem__(self, index: int) -> Scene: ...
+    def annotation(self, index: int) -> tuple[Tensor, Tensor, tuple[int, int]]: ...
+    def targets(self, index: int) -> list[int]: ...
+    def digest(self, index: int) -> str: ...
+
+
+def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
+    """The scenes to search: photographs where a root is given, else embedded ones."""
+    if (data.root is None) != (data.annotations is None):
+        raise InputError("data: expected both data.root and data.annotations, or neither for the embedded scenes")
+    if data.root is None:
+        from semfov.data.scenes import EmbeddedScenes
+
+        return EmbeddedScenes(count=data.limit or 8, seed=data.scene_seed, classes=classes)
+    from semfov.data.coco import CocoScenes
+
+    return CocoScenes(
+        data.root,
+        data.annotations,
+        classes,
+        min_instances=data.min_instances,
+        max_target_area=data.max_target_area,
+        limit=data.limit,
+    )
+
+
+def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
+    """The foveal sensor and the detector behind it."""
+    model = semfov.load_detector(
+        detector.name,
+        weights=detector.weights,
+        background=detector.background,
+        selection=semfov.Selection(threshold=detector.threshold, iou=detector.iou, limit=detector.limit),
+        stride=detector.stride,
+    )
+    foveation = semfov.Foveation(
+        sensor.sigma, levels=sensor.levels, growth=sensor.growth, convention=sensor.convention
+    )
+    return Eye(foveation, model, reference=sensor.reference).eval().requires_grad_(False)
+
+
+def make_observation(config: SearchConfig, eye: Eye) -> semfov.FovealObservationModel:
+    """The observation model, checked to belong to this detector, background policy and class list."""
+    model = semfov.FovealObservationModel.from_pretrained(config.belief.model or eye.detector.name)
+    model.check_compatible(eye.settings(), eye.detector.classes)
+    return model.eval().requires_grad_(False)
+
+
+def split_policy(name: str) -> tuple[str, bool]:
+    """`predictive-calibrated` -> (`predictive`, True); `random` -> (`random`, False)."""
+    known = ["random"] + [f"{p}-{m}" for p in SEARCH_POLICIES[1:] for m in ("raw", "calibrated")]
+    lookup(name, known, "policy")
+    base, _, mode = name.rpartition("-")
+    return (base, mode == "calibrated") if base else (name, False)
+
+
+def needs_model(policies: tuple[str, ...]) -> bool:
+    """Whether a policy of the run predicts or calibrates."""
+    check(len(policies) > 0, "policies", "at least one policy", "none")
+    return any(base == "predictive" or calibrated for base, calibrated in map(split_policy, policies))
+
+
+def single_thread() -> None:
+    """One thread a process: detections then do not depend on how many processes share the work."""
+    torch.set_num_threads(1)

@@ -1,0 +1,117 @@
+"""What the detector sees from every cell of every scene, computed once and kept on disk.
+
+Scenes are static and the gaze sits on cell centres, so detections are a function of (scene, cell). The store
+remembers them under a key of everything that they depend on; it changes how long a run takes and nothing else.
+"""
+
+import hashlib
+import json
+import platform
+from pathlib import Path
+
+import kornia
+import torch
+import torchvision
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+import semfov
+from semfov import Detections, Grid
+from semfov.eye import Eye
+from semfov.files import replacing
+
+
+def see_all(eye: Eye, image: Tensor, grid: Grid) -> Detections:
+    """Detections in `image` `(3, H, W)` from the centre of every cell, a batch of X·Y.
+
+    Views go through the detector one at a time: the bits then do not depend on which views share a batch.
+    """
+    view = eye.open(image[None])
+    with torch.inference_mode():
+        looks = [eye.look(view, centre[None]) for centre in grid.centres.to(image)]
+        return Detections.stack(looks)
+
+
+class DetectionStore:
+    """A folder of detections, one file for each scene.
+
+    Files are written atomically and carry a checksum; one that is damaged, cut short or of another version counts
+    as missing and is computed again.
+
+    Args:
+        folder: where the store lies; several runs and processes may share it.
+        settings: `Eye.settings()`.
+        columns: cells in a row.
+        rows: cells in a column.
+    """
+
+    def __init__(self, folder: Path, settings: dict[str, object], columns: int, rows: int) -> None:
+        versions = {
+            "semfov": semfov.__version__,
+            "torch": torch.__version__,
+            "torchvision": torchvision.__version__,
+            "kornia": kornia.__version__,
+            "machine": platform.machine(),
+        }
+        what = {"settings": settings, "grid": [columns, rows], "versions": versions}
+        self.key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+        self.folder = folder / self.key[:16]
+
+    def path(self, digest: str) -> Path:
+        """File for the scene whose image has this sha256."""
+        return self.folder / f"{digest[:32]}.safetensors"
+
+    def __contains__(self, digest: str) -> bool:
+        return self.load(digest) is not None
+
+    def load(self, digest: str) -> Detections | None:
+        """Detections from every cell of a scene, or None if the store does not have them whole."""
+        path = self.path(digest)
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        except (OSError, SafetensorError):
+            return None
+        names = {"boxes", "scores", "count"}
+        if set(tensors) != names or metadata.get("sha256") != checksum(tensors) or metadata.get("key") != self.key:
+            return None
+        return unpack(tensors)
+
+    def save(self, digest: str, detections: Detections) -> None:
+        """Keep the detections of a scene."""
+        tensors = pack(detections)
+        content = save(tensors, {"sha256": checksum(tensors), "key": self.key})
+        with replacing(self.path(digest)) as temporary:
+            temporary.write_bytes(content)
+
+
+def pack(detections: Detections) -> dict[str, Tensor]:
+    """Detections without their padding, which is most of a padded batch."""
+    mask = detections.mask
+    return {
+        "boxes": detections.boxes[mask].contiguous(),
+        "scores": detections.scores[mask].contiguous(),
+        "count": mask.sum(-1),
+    }
+
+
+def unpack(tensors: dict[str, Tensor]) -> Detections:
+    """The padded batch that `pack` made the tensors from."""
+    count = tensors["count"]
+    mask = torch.arange(int(count.max()) if len(count) else 0) < count[:, None]
+    boxes = tensors["boxes"].new_zeros(*mask.shape, 4)
+    scores = tensors["scores"].new_zeros(*mask.shape, tensors["scores"].shape[-1])
+    boxes[mask], scores[mask] = tensors["boxes"], tensors["scores"]
+    return Detections(boxes, scores, mask)
+
+
+def checksum(tensors: dict[str, Tensor]) -> str:
+    """sha256 over names, shapes and bytes."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"{name}{tuple(tensor.shape)}{tensor.dtype}".encode())
+        digest.update(tensor.numpy().tobytes())
+    return digest.hexdigest()

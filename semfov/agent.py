@@ -1,0 +1,201 @@
+"""The chain: look, weigh what was seen, update the belief, choose where to look next."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from semfov.belief.evidence import Evidence, Observation, weigh
+from semfov.belief.grid import Footprint, Grid
+from semfov.belief.update import fuse
+from semfov.detection.detections import Detections
+from semfov.detection.detector import Detector
+from semfov.errors import check, check_shape, lookup
+from semfov.eye import Eye
+from semfov.gaze.policies import Policy
+from semfov.gaze.selection import select_fixation
+from semfov.scanpath import Scanpath
+from semfov.sensor.foveation import Foveation
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one look leaves behind.
+
+    Attributes:
+        beta: `(B, X·Y, K+1)`, the belief after the look.
+        visited: `(B, X·Y)`, cells that inhibition of return keeps the gaze from.
+        values: `(B, X·Y)`, acquisition values.
+        cell: `(B,)`, the next cell to fixate, -1 where none is left.
+    """
+
+    beta: Tensor
+    visited: Tensor
+    values: Tensor
+    cell: Tensor
+
+
+def step(
+    beta: Tensor,
+    visited: Tensor,
+    cell: Tensor,
+    evidence: Evidence,
+    acquisition: Callable[[Tensor], Tensor],
+    noise: Tensor,
+    *,
+    fusion: str = "kaplan",
+) -> Step:
+    """One cycle of active perception for a batch of episodes; agent and evaluation both call it.
+
+    Args:
+        beta: `(B, X·Y, K+1)`, the belief before the look.
+        visited: `(B, X·Y)` boolean, cells fixated before.
+        cell: `(B,)`, the cell that is fixated now.
+        evidence: what the look from there says.
+        acquisition: maps the new belief to values `(B, X·Y)`.
+        noise: `(B, X·Y)`, random numbers that break ties.
+        fusion: `kaplan`, `product` or `sum`.
+    """
+    beta = fuse(beta, evidence.likelihood, evidence.footprint, fusion)
+    visited = visited.scatter(-1, cell[:, None], True)
+    values = acquisition(beta)
+    return Step(beta, visited, values, select_fixation(values, visited, noise))
+
+
+class ActivePerception(nn.Module):
+    """An agent with a foveal sensor that searches an image for a class.
+
+    Args:
+        sensor: the foveal sensor; its σ is in pixels of an image whose longer side is `reference`.
+        detector: turns foveated views into detections.
+        observation: calibrates scores by class and distance to the fovea; None takes them raw.
+        grid: `(columns, rows)` of the belief.
+        policy: makes the acquisition function for a target (`semfov.gaze.search_policy`).
+        prior: Dirichlet parameter of every class before the first look.
+        fusion: `kaplan`, `product` or `sum`.
+        footprint: which cells a detection updates (`Grid.footprint`).
+        reference: longer side in pixels of the image that the sensor's σ is meant for.
+
+    Example::
+
+        agent = ActivePerception(
+            Foveation(100.0), load_detector("yolov3-tiny"), None, (10, 10), search_policy("non-predictive")
+        )
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+    """
+
+    def __init__(
+        self,
+        sensor: Foveation,
+        detector: Detector,
+        observation: Observation | None,
+        grid: tuple[int, int],
+        policy: Policy,
+        *,
+        prior: float = 0.5,
+        fusion: str = "kaplan",
+        footprint: Footprint = "overlap",
+        reference: float = 640.0,
+    ) -> None:
+        super().__init__()
+        check(prior > 0, "prior", "a positive number", prior)
+        self.eye = Eye(sensor, detector, reference=reference)
+        self.observation = observation
+        self.columns, self.rows = grid
+        self.policy = policy
+        self.prior = prior
+        self.fusion = fusion
+        self.footprint: Footprint = footprint
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the belief's components, background first."""
+        return ("background", *self.eye.detector.classes)
+
+    def search(
+        self,
+        image: Tensor,
+        target: str | int,
+        *,
+        start: int | None = None,
+        shifts: int = 30,
+        seed: int = 0,
+        boxes: Tensor | None = None,
+        confirm: float = 0.5,
+    ) -> Scanpath:
+        """Search an image for a target class.
+
+        The search ends when the target is found, after `shifts` gaze shifts, or when no cell is left. With `boxes`
+        the target is found when the gaze is on a cell that one of them overlaps (the protocol of the paper);
+        without, when a detection over the fixation has the target as its best class with a score of `confirm`.
+
+        Args:
+            image: `(3, H, W)` or `(1, 3, H, W)`, RGB in [0, 1].
+            target: name or index (1..K) of the class.
+            start: first cell; None draws one.
+            shifts: most gaze shifts to make.
+            seed: of the generator that draws the start and breaks ties.
+            boxes: `(M, 4)`, where the target really is.
+            confirm: score at which a detection over the fixation counts as finding the target.
+
+        Raises:
+            InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
+        """
+        image = image[None] if image.ndim == 3 else image
+        check_shape(image, "image", 1, 3, None, None)
+        index = self._target(target)
+        grid = Grid(self.columns, self.rows, (image.shape[-1], image.shape[-2]))
+        generator = torch.Generator().manual_seed(seed)
+        if start is None:
+            start = int(torch.randint(len(grid), (1,), generator=generator))
+        check(0 <= start < len(grid), "start", f"a cell from 0 to {len(grid) - 1}", start)
+        goal = None if boxes is None else grid.footprint(boxes.to(image)).any(-2)
+
+        view = self.eye.open(image)
+        acquisition = self.policy(index)
+        beta = image.new_full((1, len(grid), len(self.classes)), self.prior)
+        visited = torch.zeros(1, len(grid), dtype=torch.bool, device=image.device)
+        cell, cells, seen, beliefs, values, found = start, [], [], [], [], False
+        while True:
+            fixation = grid.centres[cell].to(image)[None]
+            detections = self.eye.look(view, fixation)
+            evidence = weigh(detections, fixation, grid, self.observation, self.footprint)
+            noise = torch.rand(1, len(grid), generator=generator).to(image)
+            here = torch.tensor([cell], device=image.device)
+            after = step(beta, visited, here, evidence, acquisition, noise, fusion=self.fusion)
+            beta, visited = after.beta, after.visited
+            cells.append(cell)
+            seen.append(detections)
+            beliefs.append(beta[0])
+            values.append(after.values[0])
+            found = bool(goal[cell]) if goal is not None else covers(detections, fixation, index, confirm)
+            cell = int(after.cell)
+            if found or len(cells) > shifts or cell < 0:
+                break
+        visits = torch.tensor(cells, device=image.device)
+        return Scanpath(
+            grid=grid,
+            classes=self.classes,
+            target=index,
+            cells=visits,
+            fixations=grid.centres.to(image)[visits],
+            detections=tuple(seen),
+            beliefs=torch.stack(beliefs),
+            values=torch.stack(values),
+            found=found,
+        )
+
+    def _target(self, target: str | int) -> int:
+        if isinstance(target, str):
+            return self.classes.index(lookup(target, self.classes[1:], "target class"))
+        check(1 <= target < len(self.classes), "target", f"a class from 1 to {len(self.classes) - 1}", target)
+        return target
+
+
+def covers(detections: Detections, fixation: Tensor, target: int, confirm: float) -> bool:
+    """Whether a detection over the fixation `(1, 2)` has `target` as its best class, with a score of `confirm`."""
+    point = fixation[:, None] + 0.5
+    over = ((detections.boxes[..., :2] <= point) & (detections.boxes[..., 2:] > point)).all(-1)
+    sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= confirm)
+    return bool((over & sure & detections.mask).any())

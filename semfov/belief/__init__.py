@@ -1,0 +1,9 @@
+"""Beliefs about the scene: a grid of Dirichlet distributions and the rules that update it."""
+
+from semfov.belief import fusion
+from semfov.belief.evidence import Evidence, Observation, weigh
+from semfov.belief.grid import Footprint, Grid
+from semfov.belief.semantic_map import SemanticMap
+from semfov.belief.update import fuse
+
+__all__ = ["Evidence", "Footprint", "Grid", "Observation", "SemanticMap", "fuse", "fusion", "weigh"]

@@ -1,0 +1,101 @@
+"""Rules that update a Dirichlet belief about a class with the likelihood of one observation."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from semfov.errors import check
+
+Rule = Callable[[Tensor, Tensor], Tensor]
+
+
+def kaplan(beta: Tensor, likelihood: Tensor) -> Tensor:
+    r"""Kaplan's rule: match the mean of the exact posterior, keep the least likely class where it is.
+
+    .. math:: \beta'_k = \beta_k \frac{1 + \lambda_k / D}{1 + \min_j \lambda_j / D}, \quad
+              D = \sum_j \beta_j \lambda_j
+
+    (Kaplan, Chakraborty and Ulukus, 2018; the whole numerator stands over the whole denominator.) It is computed as
+    `β + β (λ − min λ) / (D + min λ)`, which is the same and adds only terms that are not negative.
+
+    Args:
+        beta: `(..., K+1)`, Dirichlet parameters, positive.
+        likelihood: `(..., K+1)`, λ_k up to a common factor, not negative, not all zero; broadcasts with `beta`.
+
+    Returns:
+        New parameters, `(..., K+1)`, nowhere smaller than `beta`.
+
+    Raises:
+        InputError: a likelihood is zero for every class, negative or not finite.
+
+    >>> kaplan(torch.ones(3), torch.tensor([1.0, 0.0, 0.0]))
+    tensor([2., 1., 1.])
+    """
+    return kaplan_scaled(beta, scale_likelihood(likelihood))
+
+
+def product(beta: Tensor, likelihood: Tensor) -> Tensor:
+    r"""Product rule: Bayes for a class that is fixed, with one unit of evidence more.
+
+    .. math:: \beta'_k = (1 + \sum_j \beta_j) \, \beta_k \lambda_k / \sum_j \beta_j \lambda_j
+
+    The mean is the categorical posterior `p_k λ_k / Σ p λ`. Arguments and errors as for `kaplan`.
+
+    >>> product(torch.ones(2), torch.tensor([3.0, 1.0]))
+    tensor([2.2500, 0.7500])
+    """
+    return product_scaled(beta, scale_likelihood(likelihood))
+
+
+def sum(beta: Tensor, likelihood: Tensor) -> Tensor:
+    r"""Sum rule: count the normalised likelihood as one soft observation.
+
+    .. math:: \beta'_k = \beta_k + \lambda_k / \sum_j \lambda_j
+
+    Arguments and errors as for `kaplan`.
+
+    >>> sum(torch.ones(2), torch.tensor([3.0, 1.0]))
+    tensor([1.7500, 1.2500])
+    """
+    return sum_scaled(beta, scale_likelihood(likelihood))
+
+
+def kaplan_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
+    """`kaplan` for likelihoods that `scale_likelihood` has checked and scaled."""
+    least = scaled.amin(-1, keepdim=True)
+    expected = (beta * scaled).sum(-1, keepdim=True)
+    return torch.addcdiv(beta, beta * (scaled - least), expected + least)
+
+
+def product_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
+    """`product` for likelihoods that `scale_likelihood` has checked and scaled."""
+    joint = beta * scaled
+    # A floor keeps parameters positive where many likelihoods of 0 in a row would leave none.
+    joint = joint.clamp(min=torch.finfo(joint.dtype).tiny)
+    return (1 + beta.sum(-1, keepdim=True)) * joint / joint.sum(-1, keepdim=True)
+
+
+def sum_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
+    """`sum` for likelihoods that `scale_likelihood` has checked and scaled."""
+    return beta + scaled / scaled.sum(-1, keepdim=True)
+
+
+RULES: dict[str, Rule] = {"kaplan": kaplan_scaled, "product": product_scaled, "sum": sum_scaled}
+
+
+def scale_likelihood(likelihood: Tensor) -> Tensor:
+    """Check likelihoods and scale each row to a largest value of 1 (every rule is blind to a common factor)."""
+    largest = likelihood.amax(-1, keepdim=True)
+    if not torch.compiler.is_compiling():
+        # NaN and infinity survive the maximum and the minimum, so two reductions answer everything.
+        least = likelihood.detach().amin()
+        usable = bool((least >= 0) & ((largest > 0) & (largest < torch.inf)).all()) if likelihood.numel() else True
+        check(usable, "likelihood", "finite values, none negative, not all zero", _describe(likelihood))
+    return likelihood / largest
+
+
+def _describe(likelihood: Tensor) -> str:
+    if not torch.isfinite(likelihood).all():
+        return "NaN or infinity"
+    return "a negative value" if (likelihood < 0).any() else "a row of zeros"

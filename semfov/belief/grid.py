@@ -1,0 +1,140 @@
+"""The grid of cells over an image: centres, which cells a box covers, distances to the fixation."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from semfov.errors import check, check_shape, lookup
+
+Footprint = Literal["overlap", "centre", "box_centre"]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """`columns` × `rows` equal cells over an image, numbered row by row: `cell = row * columns + column`.
+
+    Points have pixel centres at integers; box edges count from the image's left and top edge (COCO), so a point
+    `p` lies at `p + 0.5` on the scale of the boxes.
+
+    Args:
+        columns: number of cells in a row, X.
+        rows: number of cells in a column, Y.
+        size: `(width, height)` in pixels of one image, or a tensor `(B, 2)`, one row for each image of a batch.
+
+    >>> grid = Grid(4, 2, (640, 480))
+    >>> grid.centres[5]
+    tensor([239.5000, 359.5000])
+    """
+
+    columns: int
+    rows: int
+    size: tuple[float, float] | Tensor
+
+    def __post_init__(self) -> None:
+        check(self.columns >= 1 and self.rows >= 1, "columns, rows", "at least 1", (self.columns, self.rows))
+        size = torch.as_tensor(self.size)
+        check_shape(size, "size", 2)
+        check(bool((size > 0).all()), "size", "a positive width and height", self.size)
+
+    def __len__(self) -> int:
+        """Number of cells, X·Y."""
+        return self.columns * self.rows
+
+    @property
+    def extent(self) -> Tensor:
+        """`(width, height)` as a floating-point tensor, `(2,)` or `(B, 2)`."""
+        size = torch.as_tensor(self.size)
+        return size if size.is_floating_point() else size.to(torch.get_default_dtype())
+
+    @property
+    def centres(self) -> Tensor:
+        """Centre of every cell as a point, `(X·Y, 2)` or `(B, X·Y, 2)`."""
+        cell = torch.arange(len(self), device=self.extent.device)
+        steps = torch.stack([cell % self.columns, cell // self.columns], -1) + 0.5
+        return steps * self._cell_size()[..., None, :] - 0.5
+
+    @property
+    def edges(self) -> Tensor:
+        """Box `(x1, y1, x2, y2)` of every cell, `(X·Y, 4)` or `(B, X·Y, 4)`."""
+        middle, half = self.centres + 0.5, self._cell_size()[..., None, :] / 2
+        return torch.cat([middle - half, middle + half], -1)
+
+    def _cell_size(self) -> Tensor:
+        return self.extent / self.extent.new_tensor([self.columns, self.rows])
+
+    def cell_of(self, points: Tensor) -> Tensor:
+        """Cell in which each point `(..., 2)` lies, `(...)`; a point outside counts to the nearest cell.
+
+        With a batch of sizes `(B, 2)` the points are `(B, ..., 2)`.
+        """
+        check_shape(points, "points", 2)
+        step = ((points + 0.5) / self._align(self._cell_size(), points)).floor().long()
+        column = step[..., 0].clamp(0, self.columns - 1)
+        row = step[..., 1].clamp(0, self.rows - 1)
+        return row * self.columns + column
+
+    def footprint(self, boxes: Tensor, rule: Footprint = "overlap") -> Tensor:
+        """Which cells each box covers, `(..., L, X·Y)` boolean, for boxes `(..., L, 4)`.
+
+        - `overlap`: cells that share a positive area with the box (the published rule).
+        - `centre`: cells whose centre lies in the box, or the cell of the box's centre where there is none.
+        - `box_centre`: only the cell in which the centre of the box lies.
+
+        With a batch of sizes `(B, 2)` the boxes are `(B, L, 4)`. Boxes without area cover nothing.
+
+        >>> Grid(2, 1, (10, 10)).footprint(torch.tensor([[1.0, 1.0, 5.0, 5.0], [4.0, 0.0, 6.0, 2.0]]))
+        tensor([[ True, False],
+                [ True,  True]])
+        """
+        check_shape(boxes, "boxes", None, 4)
+        lookup(rule, get_args(Footprint), "footprint rule")
+        full = (boxes[..., 2] > boxes[..., 0]) & (boxes[..., 3] > boxes[..., 1])
+        low, high = boxes[..., None, :2], boxes[..., None, 2:]
+        if rule == "overlap":
+            across = _overlaps(self._borders(0).to(boxes), low[..., 0], high[..., 0])
+            down = _overlaps(self._borders(1).to(boxes), low[..., 1], high[..., 1])
+            return (down[..., :, None] & across[..., None, :] & full[..., None, None]).flatten(-2)
+        own = self.cell_of((boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5)
+        central = own[..., None] == torch.arange(len(self), device=boxes.device)
+        if rule == "centre":
+            middle = (self.centres + 0.5)[..., None, :, :].to(boxes)
+            inside = ((middle >= low) & (middle < high)).all(-1)
+            central = inside | (central & ~inside.any(-1, keepdim=True))
+        return central & full[..., None]
+
+    def box_distance(self, boxes: Tensor, fixation: Tensor) -> Tensor:
+        """Distance from the centre of each box `(..., L, 4)` to the fixation `(..., 2)`, `(..., L)`.
+
+        In units of the image's longer side, so that one observation model serves every resolution.
+        """
+        check_shape(boxes, "boxes", None, 4)
+        check_shape(fixation, "fixation", 2)
+        centre = (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
+        offset = torch.linalg.vector_norm(centre - fixation[..., None, :], dim=-1)
+        return offset / self.extent.amax(-1)[..., None].to(offset)
+
+    @property
+    def cell_distance(self) -> Tensor:
+        """Distance between the centres of every two cells, `(X·Y, X·Y)` or `(B, X·Y, X·Y)`, in longer sides."""
+        centres = self.centres
+        offset = centres[..., :, None, :] - centres[..., None, :, :]
+        return torch.linalg.vector_norm(offset, dim=-1) / self.extent.amax(-1)[..., None, None]
+
+    def _borders(self, axis: int) -> Tensor:
+        """Borders between the cells along x (0) or y (1), `(n+1,)`, or `(B, 1, n+1)` for a batch of sizes."""
+        count = (self.columns, self.rows)[axis]
+        extent = self.extent[..., axis, None] if self.extent.ndim == 1 else self.extent[:, None, axis, None]
+        return torch.arange(count + 1, device=extent.device) * (extent / count)
+
+    def _align(self, values: Tensor, points: Tensor) -> Tensor:
+        """Per-image values `(B, 2)` as a shape that broadcasts over points `(B, ..., 2)`."""
+        extra = points.ndim - values.ndim
+        aligned = values if values.ndim == 1 else values.reshape(values.shape[0], *[1] * extra, 2)
+        return aligned.to(points)
+
+
+def _overlaps(borders: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Which intervals between successive `borders` share a positive length with `low`..`high`."""
+    return (borders[..., :-1] < high) & (borders[..., 1:] > low)

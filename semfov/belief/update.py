@@ -1,0 +1,49 @@
+"""Fusing a batch of detections into a batch of maps."""
+
+import torch
+from torch import Tensor
+
+from semfov.belief.fusion import RULES, scale_likelihood
+from semfov.errors import check, check_shape, lookup
+
+
+def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kaplan") -> Tensor:
+    """Update every cell with the detections that cover it, one after another.
+
+    Cells are independent, so the r-th detection of every cell of every map is fused in the same step: there are as
+    many steps as detections pile up on one cell, not as there are detections, and only covered cells are touched.
+
+    Args:
+        beta: `(B, X·Y, K+1)`, Dirichlet parameters.
+        likelihood: `(B, L, K+1)`, likelihoods of the classes given each detection, in order of fusion.
+        footprint: `(B, L, X·Y)` boolean, the cells that each detection updates (false for padding).
+        rule: `kaplan`, `product` or `sum` (`semfov.fusion`).
+
+    Returns:
+        New parameters `(B, X·Y, K+1)`.
+
+    >>> fuse(torch.ones(1, 2, 2), torch.tensor([[[0.0, 1.0]]]), torch.tensor([[[True, False]]]))
+    tensor([[[1., 2.],
+             [1., 1.]]])
+    """
+    check_shape(beta, "beta", None, None, None)
+    batch, cells, components = beta.shape
+    check_shape(likelihood, "likelihood", batch, None, components)
+    check_shape(footprint, "footprint", batch, likelihood.shape[1], cells)
+    update = RULES[lookup(rule, RULES, "fusion rule")]
+    check(footprint.dtype == torch.bool, "footprint", "a boolean tensor", footprint.dtype)
+    image, detection, cell = footprint.nonzero(as_tuple=True)
+    if len(image) == 0:
+        return beta.clone()
+    rank = footprint.cumsum(1, dtype=torch.int32)[image, detection, cell]
+    order = rank.argsort(stable=True)
+    rows = (image * cells + cell)[order]
+    sources = (image * likelihood.shape[1] + detection)[order]
+    steps = torch.bincount(rank)[1:].tolist()
+    flat = beta.reshape(-1, components).clone()
+    # Padding may hold zeros, which no rule accepts; nothing reads it.
+    used = footprint.any(-1, keepdim=True)
+    evidence = scale_likelihood(torch.where(used, likelihood, 1.0)).reshape(-1, components)
+    for row, source in zip(rows.split(steps), sources.split(steps), strict=True):
+        flat.index_copy_(0, row, update(flat.index_select(0, row), evidence.index_select(0, source)))
+    return flat.view(batch, cells, components)

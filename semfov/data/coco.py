@@ -1,0 +1,222 @@
+"""Data sets in COCO's format as scenes for visual search.
+
+Run as a program, it fetches the official files: `python -m semfov.data.coco val2017 --root DIR`.
+"""
+
+import hashlib
+import json
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from semfov.data.annotations import read_annotations
+from semfov.data.classes import canonical_name, class_indices
+from semfov.data.images import read_image
+from semfov.data.scene import Annotation, Coverage, Scene, legal_targets
+from semfov.errors import DataError, check
+
+_log = logging.getLogger(__name__)
+
+
+class CocoScenes:
+    """Photographs with COCO annotations, as many as the published selection keeps.
+
+    An image is kept that has at least `min_instances` boxes (of any category) and at least one class whose boxes
+    cover at most `max_target_area` of it: such classes are its legal targets. Categories are matched to `classes` by
+    name, in COCO's or in Darknet's spelling.
+
+    Boxes are cut to their image. Dropped are boxes without area inside the image, boxes of crowds with
+    `crowd="drop"`, and boxes of categories that `classes` does not have. `repairs` counts each over the whole file,
+    and one warning of the logger `semfov.data.coco` tells them; anything else that is wrong with the file raises.
+
+    Args:
+        root: folder of the images.
+        annotations: COCO instances file.
+        classes: names of the detector's classes 1..K.
+        min_instances: boxes that an image needs, at least.
+        max_target_area: share of the image that a target may cover; None allows any, and keeps images without boxes.
+        limit: keep only so many images, those with the lowest ids.
+        coverage: how the share is measured (`semfov.data.scene.box_coverage`): the sum of the boxes' areas, or the
+            area of their union, which is smaller where they overlap and so admits a few more targets.
+        crowd: whether boxes that frame a crowd count as ordinary boxes (a gaze on a crowd of people is on people) or
+            are dropped.
+
+    Attributes:
+        classes: as given.
+        ids: ids of the kept images, ascending.
+        repairs: what was cut or dropped, and how often.
+        fingerprint: sha256 of the annotation file, the settings, and the names and sizes of the image files.
+
+    Raises:
+        DataError: a file is missing or damaged, or no image is left.
+    """
+
+    def __init__(
+        self,
+        root: str | PathLike[str],
+        annotations: str | PathLike[str],
+        classes: Sequence[str],
+        *,
+        min_instances: int = 8,
+        max_target_area: float | None = 0.2,
+        limit: int | None = None,
+        coverage: Coverage = "sum",
+        crowd: Literal["keep", "drop"] = "keep",
+    ) -> None:
+        check(min_instances >= 0, "min_instances", "at least 0", min_instances)
+        check(max_target_area is None or max_target_area > 0, "max_target_area", "above 0 or None", max_target_area)
+        check(limit is None or limit >= 1, "limit", "at least 1 or None", limit)
+        check(coverage in ("sum", "union"), "coverage", "'sum' or 'union'", repr(coverage))
+        check(crowd in ("keep", "drop"), "crowd", "'keep' or 'drop'", repr(crowd))
+        self.classes = tuple(classes)
+        coco, digest = read_annotations(annotations)
+        packed = _Packed(coco, _match(coco, self.classes, annotations), drop_crowds=crowd == "drop")
+        self.repairs = packed.repairs
+        if self.repairs:
+            _log.warning("%s: %s", annotations, ", ".join(f"{what}: {n}" for what, n in self.repairs.items()))
+
+        self._packed = packed
+        self._rows: list[int] = []
+        self._targets: list[list[int]] = []
+        for row, instances in enumerate(packed.instances):
+            if instances < min_instances or len(self._rows) == limit:
+                continue
+            targets = legal_targets(packed.annotation(row), max_target_area, coverage)
+            if targets or max_target_area is None:
+                self._rows.append(row)
+                self._targets.append(targets)
+        if not self._rows:
+            raise DataError(
+                f"annotations {annotations}: none of {len(packed.ids)} images has at least {min_instances} boxes and "
+                f"a class that covers at most {max_target_area} of it; relax min_instances or max_target_area"
+            )
+        self.ids: list[Any] = [packed.ids[row] for row in self._rows]
+        self._files = [Path(root, packed.names[row]) for row in self._rows]
+        settings = [digest, self.classes, self.ids, max_target_area, coverage, crowd]
+        self.fingerprint = _sha256(settings, [packed.names[row] for row in self._rows], _file_sizes(self._files))
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index: int) -> Scene:
+        """Decode an image. Its frame is the upright one, or the stored one where only that has the recorded size."""
+        annotation, path = self.annotation(index), self._files[index]
+        width, height = annotation.size
+        image = read_image(path)
+        if image.shape[-2:] != (height, width):
+            shown = tuple(image.shape[-2:])
+            image = read_image(path, oriented=False)
+            if image.shape[-2:] != (height, width):
+                raise DataError(
+                    f"image {path}: expected {width} × {height} pixels as annotated, got {shown[1]} × {shown[0]}; "
+                    f"use the image that the annotations were made on"
+                )
+        name = self._packed.names[self._rows[index]]
+        return Scene(self.ids[index], name, image, annotation.boxes, annotation.labels)
+
+    def annotation(self, index: int) -> Annotation:
+        """The objects of a scene, without decoding its image."""
+        return self._packed.annotation(self._rows[index])
+
+    def targets(self, index: int) -> list[int]:
+        """Classes of a scene that may be searched for, ascending."""
+        return list(self._targets[index])
+
+    def digest(self, index: int) -> str:
+        """sha256 of an image file and of the size that its annotations tell."""
+        path = self._files[index]
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise DataError(f"image {path}: cannot be read ({error.strerror}); check data.root") from None
+        return _sha256(hashlib.sha256(content).hexdigest(), self._packed.sizes[self._rows[index]])
+
+
+class _Packed:
+    """The objects of all images of a file, end to end in a few tensors, so that they travel to workers cheaply."""
+
+    def __init__(self, coco: Any, labels: dict[int | str, int], *, drop_crowds: bool) -> None:
+        self.ids: list[Any] = sorted(coco.imgs)
+        self.names: list[str] = [coco.imgs[i]["file_name"] for i in self.ids]
+        self.sizes = [(int(coco.imgs[i]["width"]), int(coco.imgs[i]["height"])) for i in self.ids]
+        self.repairs: Counter[str] = Counter()
+
+        entries = [(row, entry) for row, i in enumerate(self.ids) for entry in coco.imgToAnns.get(i, ())]
+        rows = torch.tensor([row for row, _ in entries], dtype=torch.int64)
+        label = torch.tensor([labels[entry["category_id"]] for _, entry in entries], dtype=torch.int64)
+        crowd = torch.tensor([bool(entry.get("iscrowd", 0)) for _, entry in entries], dtype=torch.bool)
+        given = torch.tensor([[float(v) for v in entry["bbox"]] for _, entry in entries], dtype=torch.float64)
+        limits = torch.tensor([self.sizes[row] * 2 for row, _ in entries], dtype=torch.float64).reshape(-1, 4)
+
+        corner, extent = given.reshape(-1, 4).split(2, -1)
+        edges = torch.cat([corner, corner + extent], -1)
+        cut = edges.clamp(min=0).minimum(limits)
+        boxes = cut.float()
+        solid = (boxes[:, 2:] > boxes[:, :2]).all(-1)
+        dropped = solid & crowd & drop_crowds
+        kept = solid & ~dropped
+        known = kept & (label > 0)
+        # official files have two decimals: less than one of them is rounding
+        outside = kept & ((edges - cut).abs() > 0.01).any(-1)
+        for what, which in (("without area in the image, dropped", ~solid), ("of crowds, dropped", dropped)):
+            self._count(f"boxes {what}", which)
+        self._count("boxes cut to the image", outside)
+        for at in (kept & ~known).nonzero()[:, 0].tolist():
+            name = coco.cats[entries[at][1]["category_id"]]["name"]
+            self.repairs[f"boxes of {name!r}, which the detector does not know, dropped"] += 1
+
+        self.instances: list[int] = rows[kept].bincount(minlength=len(self.ids)).tolist()
+        self._boxes, self._labels, self._crowd = boxes[known], label[known], crowd[known]
+        self._ends: list[int] = rows[known].bincount(minlength=len(self.ids)).cumsum(0).tolist()
+
+    def _count(self, what: str, which: torch.Tensor) -> None:
+        if which.any():
+            self.repairs[what] = int(which.sum())
+
+    def annotation(self, row: int) -> Annotation:
+        own = slice(self._ends[row - 1] if row else 0, self._ends[row])
+        boxes, labels, crowd = self._boxes[own], self._labels[own], self._crowd[own]
+        return Annotation(boxes.clone(), labels.clone(), crowd.clone(), self.sizes[row])
+
+
+def _match(coco: Any, classes: tuple[str, ...], path: str | PathLike[str]) -> dict[int | str, int]:
+    """Category id -> index of the class, 0 for categories that the detector does not have."""
+    indices = class_indices(classes)
+    labels = {i: indices.get(canonical_name(category["name"]), 0) for i, category in coco.cats.items()}
+    if not any(labels.values()):
+        names = ", ".join(ascii(category["name"]) for category in list(coco.cats.values())[:5]) or "none"
+        raise DataError(
+            f"annotations {path}: expected some of the detector's {len(classes)} classes "
+            f"({', '.join(classes[:5])}, ...) among the categories, got {names}"
+        )
+    return labels
+
+
+def _file_sizes(files: list[Path]) -> list[int]:
+    sizes, missing = [], []
+    for path in files:
+        try:
+            sizes.append(path.stat().st_size)
+        except (OSError, ValueError):
+            missing.append(path)
+    if missing:
+        raise DataError(
+            f"image {missing[0]}: no such file ({len(missing)} of {len(files)} are missing); "
+            f"check data.root, or fetch COCO with python -m semfov.data.coco"
+        )
+    return sizes
+
+
+def _sha256(*parts: object) -> str:
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+if __name__ == "__main__":
+    from semfov.data.download import main
+
+    raise SystemExit(main())

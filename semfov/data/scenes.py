@@ -1,0 +1,246 @@
+"""Embedded scenes: search arrays composed of photographs that installed packages carry.
+
+They need no data set and no network: objects of known classes and distractors lie, without touching, on a textured
+background, so every box is known by construction.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from semfov.data.classes import class_indices
+from semfov.data.images import read_image
+from semfov.data.scene import Annotation, Scene, legal_targets
+from semfov.errors import DataError, check
+
+_VERSION = 1  # raise it whenever the same seed would give another picture
+
+_SIZE = (640, 480)
+_SLOTS = (4, 3)
+_MARGIN = 4
+_SIDES = (136, 152)
+_FOLDERS = {"skimage": "data", "matplotlib": "mpl-data/sample_data"}
+_DISTRIBUTIONS = {"skimage": "scikit-image", "matplotlib": "matplotlib"}
+
+_Box = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A cut-out of a photograph that a package carries.
+
+    Attributes:
+        title: what it shows.
+        package: the package that carries the file.
+        file: its name there.
+        crop: the part that is shown, `(x1, y1, x2, y2)` in pixels of the photograph.
+        label: class of the object on it, `""` for a distractor.
+        box: the object on the photograph, in the same pixels; what lies outside the crop is not shown.
+    """
+
+    title: str
+    package: str
+    file: str
+    crop: _Box
+    label: str = ""
+    box: _Box = (0, 0, 0, 0)
+
+
+OBJECTS = (
+    Photograph("astronaut", "skimage", "astronaut.png", (0, 0, 372, 420), "person", (20, 14, 366, 420)),
+    Photograph("officer", "matplotlib", "grace_hopper.jpg", (0, 0, 512, 600), "person", (14, 22, 512, 600)),
+    Photograph("cameraman", "skimage", "camera.png", (0, 30, 390, 512), "person", (20, 60, 320, 512)),
+    Photograph("cat", "skimage", "chelsea.png", (0, 0, 390, 300), "cat", (4, 0, 384, 300)),
+    Photograph("cup", "skimage", "coffee.png", (60, 0, 500, 400), "cup", (172, 17, 408, 312)),
+    Photograph("motorcycle", "skimage", "motorcycle_left.png", (60, 50, 711, 480), "motorcycle", (94, 76, 686, 452)),
+)
+DISTRACTORS = (
+    Photograph("rocket", "skimage", "rocket.jpg", (180, 60, 460, 420)),
+    Photograph("deep field", "skimage", "hubble_deep_field.jpg", (100, 100, 700, 700)),
+    Photograph("colour wheel", "skimage", "color.png", (0, 0, 371, 370)),
+    Photograph("retina", "skimage", "retina.jpg", (0, 0, 1411, 1411)),
+    Photograph("tissue", "skimage", "ihc.png", (0, 0, 512, 512)),
+    Photograph("coins", "skimage", "coins.png", (0, 0, 384, 303)),
+    Photograph("moon", "skimage", "moon.png", (0, 0, 512, 512)),
+    Photograph("brick wall", "skimage", "brick.png", (0, 0, 512, 512)),
+    Photograph("gravel", "skimage", "gravel.png", (0, 0, 400, 400)),
+)
+TEXTURES = ("brick.png", "grass.png", "gravel.png")
+
+
+@dataclass(frozen=True)
+class Item:
+    """A photograph's place in a scene: the patch is `(x1, y1, x2, y2)` in scene pixels, mirrored or not."""
+
+    photograph: Photograph
+    patch: _Box
+    mirrored: bool
+
+    def box(self) -> tuple[float, float, float, float]:
+        """The object's box in scene pixels."""
+        left, top, right, bottom = self.photograph.crop
+        x1, y1, x2, y2 = self.photograph.box
+        if self.mirrored:
+            x1, x2 = left + right - x2, left + right - x1
+        px, py = self.patch[:2]
+        sx = (self.patch[2] - px) / (right - left)
+        sy = (self.patch[3] - py) / (bottom - top)
+        return (px + (x1 - left) * sx, py + (y1 - top) * sy, px + (x2 - left) * sx, py + (y2 - top) * sy)
+
+
+class EmbeddedScenes:
+    """Search arrays of 640 × 480 pixels: five objects and five distractors on a textured background each.
+
+    Scene `i` of a seed depends on the seed and on `i` only. Objects are people, a cat, a cup and a motorcycle; those
+    of classes that the detector does not have are there without a box.
+
+    Args:
+        classes: names of the detector's classes 1..K, in COCO's or Darknet's spelling.
+        count: number of scenes.
+        seed: of the compositions.
+
+    Raises:
+        DataError: a package that carries the photographs is missing.
+
+    >>> scenes = EmbeddedScenes(("person", "cat"), count=2)
+    >>> scenes[0].image.shape
+    torch.Size([3, 480, 640])
+    """
+
+    def __init__(self, classes: Sequence[str], *, count: int = 8, seed: int = 0) -> None:
+        check(count >= 1, "count", "at least 1", count)
+        check(seed >= 0, "seed", "at least 0", seed)
+        self.classes = tuple(classes)
+        self.ids = list(range(count))
+        self._seed = seed
+        self._labels = class_indices(self.classes)
+        known = {photograph.label for photograph in OBJECTS}
+        check(not known.isdisjoint(self._labels), "classes", f"one of {', '.join(sorted(known))}", self.classes)
+        files = sorted({(p.package, p.file) for p in OBJECTS + DISTRACTORS} | {("skimage", t) for t in TEXTURES})
+        digests = [hashlib.sha256(_path(*file).read_bytes()).hexdigest() for file in files]
+        settings = json.dumps([_VERSION, self.classes, count, seed, digests])
+        self.fingerprint = hashlib.sha256(settings.encode()).hexdigest()
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, index: int) -> Scene:
+        """Compose a scene."""
+        annotation = self.annotation(index)
+        image = torch.from_numpy(self._pixels(index)).permute(2, 0, 1).contiguous()
+        name = f"search array {self.ids[index]}, seed {self._seed}"
+        return Scene(self.ids[index], name, image.float() / 255, annotation.boxes, annotation.labels)
+
+    def items(self, index: int) -> list[Item]:
+        """Everything that lies in a scene, objects first."""
+        return _layout(self._generator(index))
+
+    def annotation(self, index: int) -> Annotation:
+        """The objects of a scene, without composing its image."""
+        objects = [item for item in self.items(index) if item.photograph.label in self._labels]
+        boxes = torch.tensor([item.box() for item in objects], dtype=torch.float32).reshape(-1, 4)
+        labels = torch.tensor([self._labels[item.photograph.label] for item in objects], dtype=torch.int64)
+        return Annotation(boxes, labels, torch.zeros(len(objects), dtype=torch.bool), _SIZE)
+
+    def targets(self, index: int) -> list[int]:
+        """Classes of a scene that may be searched for, ascending."""
+        return legal_targets(self.annotation(index))
+
+    def digest(self, index: int) -> str:
+        """sha256 of a scene's pixels."""
+        return hashlib.sha256(self._pixels(index).tobytes()).hexdigest()
+
+    def _generator(self, index: int) -> np.random.Generator:
+        return np.random.Generator(np.random.PCG64([self._seed, self.ids[index]]))
+
+    def _pixels(self, index: int) -> NDArray[np.uint8]:
+        generator = self._generator(index)
+        items = _layout(generator)
+        canvas = _background(generator)
+        for item in items:
+            x1, y1, x2, y2 = item.patch
+            patch = _cut_out(item.photograph, (x2 - x1, y2 - y1))
+            canvas[y1:y2, x1:x2] = patch[:, ::-1] if item.mirrored else patch
+        return canvas
+
+
+def _layout(generator: np.random.Generator) -> list[Item]:
+    """Five objects and five distractors, each at a random place of its own slot."""
+    photographs = [OBJECTS[i] for i in generator.permutation(len(OBJECTS))[:5]]
+    photographs += [DISTRACTORS[i] for i in generator.permutation(len(DISTRACTORS))[:5]]
+    columns, rows = _SLOTS
+    pitch = _SIZE[0] // columns, _SIZE[1] // rows
+    slots = generator.permutation(columns * rows)
+    items = []
+    for photograph, slot in zip(photographs, slots[: len(photographs)].tolist(), strict=True):
+        left, top, right, bottom = photograph.crop
+        side = int(generator.integers(*_SIDES, endpoint=True))
+        longer = max(right - left, bottom - top)
+        width, height = side * (right - left) // longer, side * (bottom - top) // longer
+        x = slot % columns * pitch[0] + int(generator.integers(_MARGIN, pitch[0] - width - _MARGIN, endpoint=True))
+        y = slot // columns * pitch[1] + int(generator.integers(_MARGIN, pitch[1] - height - _MARGIN, endpoint=True))
+        items.append(Item(photograph, (x, y, x + width, y + height), bool(generator.integers(2))))
+    return items
+
+
+def _background(generator: np.random.Generator) -> NDArray[np.uint8]:
+    """Clouds (octaves of random grids, amplitude halving with the scale) over a faint texture, in a random tint.
+
+    Integers all the way, so that every machine composes the same bits.
+    """
+    from PIL import Image
+
+    clouds = np.zeros(_SIZE[::-1], dtype=np.int64)
+    for octave in range(6):
+        grid = generator.integers(256, size=(3 << octave, 4 << octave), dtype=np.uint8)
+        smooth = Image.fromarray(grid).resize(_SIZE, Image.Resampling.BICUBIC)
+        clouds += np.asarray(smooth, dtype=np.int64) - 128 << (5 - octave)
+    texture = _texture(TEXTURES[generator.integers(len(TEXTURES))])
+    tint = generator.integers(110, 180) + generator.integers(-20, 21, size=3)
+    levels = tint + (clouds // 150 + texture // 5)[..., None]
+    return levels.clip(0, 255).astype(np.uint8)
+
+
+@cache
+def _texture(file: str) -> NDArray[np.int64]:
+    """A texture as large as a scene, tiled by mirroring, about its middle grey."""
+    grey = _photograph("skimage", file)[..., 0].astype(np.int64)
+    mirrored = np.concatenate([grey, grey[:, ::-1]], axis=1)
+    return (mirrored - grey.sum() // grey.size)[: _SIZE[1], : _SIZE[0]]
+
+
+def _cut_out(photograph: Photograph, size: tuple[int, int]) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    pixels = Image.fromarray(_photograph(photograph.package, photograph.file))
+    return np.asarray(pixels.resize(size, Image.Resampling.LANCZOS, box=photograph.crop))
+
+
+@cache
+def _photograph(package: str, file: str) -> NDArray[np.uint8]:
+    """A photograph `(H, W, 3)` of an installed package."""
+    image: Tensor = read_image(_path(package, file))
+    return (image * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
+
+
+def _path(package: str, file: str) -> Path:
+    spec: Any = find_spec(package)
+    if spec is None or spec.origin is None:
+        raise DataError(f"embedded scenes: expected the package {package}; pip install {_DISTRIBUTIONS[package]}")
+    path = Path(spec.origin).parent / _FOLDERS[package] / file
+    if not path.is_file():
+        raise DataError(
+            f"embedded scenes: expected the photograph {path}; "
+            f"pip install --force-reinstall --no-deps {_DISTRIBUTIONS[package]}"
+        )
+    return path

@@ -1,0 +1,18 @@
+"""Detectors and what they return: boxes with full class-score vectors."""
+
+from semfov.detection.detections import Detections
+from semfov.detection.detector import Detector
+from semfov.detection.placement import Placement, letterbox
+from semfov.detection.scores import BackgroundPolicy, Candidates, score_vectors
+from semfov.detection.selection import Selection
+
+__all__ = [
+    "BackgroundPolicy",
+    "Candidates",
+    "Detections",
+    "Detector",
+    "Placement",
+    "Selection",
+    "letterbox",
+    "score_vectors",
+]

@@ -1,0 +1,90 @@
+"""The interface that every detector keeps."""
+
+from abc import ABC, abstractmethod
+from dataclasses import asdict
+
+from torch import Tensor, nn
+
+from semfov.detection.detections import Detections
+from semfov.detection.placement import Placement, letterbox
+from semfov.detection.scores import BackgroundPolicy, Candidates
+from semfov.detection.selection import Selection, select
+from semfov.errors import check_shape
+
+
+class Detector(nn.Module, ABC):
+    """Turns images into `Detections` with the full score vector of every box that is kept.
+
+    An adapter implements `propose`, which sees canvases (images already fitted to its input) and returns every
+    candidate of its head. `forward` does the whole: fit, detect, map the boxes back. An agent that foveates at the
+    detector's resolution calls `fit`, foveates the canvas and calls `detect` itself.
+
+    Attributes:
+        name: what the model is called in tables and in fitted observation models.
+        classes: names of the K classes, without background, in the order of the scores from index 1.
+        input_size: `(width, height)` of the canvas.
+        background: the background policy of the scores (`semfov.detection.scores`).
+        selection: which candidates are kept.
+        fill: padding value of the canvas.
+        stride: the canvas is padded to a multiple of it only; None pads to `input_size`.
+        stretch: whether images are stretched to the canvas instead of letterboxed.
+        digest: sha256 of the weights, `""` where there is none (random weights).
+    """
+
+    def __init__(
+        self,
+        name: str,
+        classes: tuple[str, ...],
+        input_size: tuple[int, int],
+        *,
+        background: BackgroundPolicy = "residual",
+        selection: Selection | None = None,
+        fill: float = 0.5,
+        stride: int | None = None,
+        stretch: bool = False,
+        digest: str = "",
+    ) -> None:
+        super().__init__()
+        self.name = name
+        self.classes = classes
+        self.input_size = input_size
+        self.background: BackgroundPolicy = background
+        self.selection = Selection() if selection is None else selection
+        self.fill = fill
+        self.stride = stride
+        self.stretch = stretch
+        self.digest = digest
+
+    @abstractmethod
+    def propose(self, canvas: Tensor) -> Candidates:
+        """Every box of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1], as `fit` makes it."""
+
+    def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
+        """Fit images `(B, 3, H, W)`, RGB in [0, 1], into the input: the canvas and where the image lies on it."""
+        check_shape(images, "images", None, 3, None, None)
+        return letterbox(images, self.input_size, fill=self.fill, stride=self.stride, stretch=self.stretch)
+
+    def detect(self, canvas: Tensor, placement: Placement | None = None) -> Detections:
+        """Detections on a canvas from `fit`, boxes in pixels of the image that `placement` tells.
+
+        Without a placement, boxes stay in canvas pixels.
+        """
+        return select(self.propose(canvas), placement, self.selection, self.background)
+
+    def forward(self, images: Tensor) -> Detections:
+        """Detections in images `(B, 3, H, W)`, RGB in [0, 1], boxes in pixels of those images."""
+        canvas, placement = self.fit(images)
+        return self.detect(canvas, placement)
+
+    def settings(self) -> dict[str, object]:
+        """What the detections depend on, for the keys of caches and the metadata of fitted models."""
+        return {
+            "name": self.name,
+            "digest": self.digest,
+            "input_size": list(self.input_size),
+            "background": self.background,
+            "selection": asdict(self.selection),
+            "fill": self.fill,
+            "stride": self.stride,
+            "stretch": self.stretch,
+        }

@@ -1,0 +1,113 @@
+"""`load_detector`: every detector by its name or its file."""
+
+from collections.abc import Callable, Sequence
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from semfov.detection.architectures import ARCHITECTURES
+from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.darknet import Darknet
+from semfov.detection.darknet_config import Section, read_cfg
+from semfov.detection.darknet_weights import read_weights
+from semfov.detection.detector import Detector
+from semfov.detection.scores import BackgroundPolicy
+from semfov.detection.selection import Selection
+from semfov.detection.weights import fetch
+from semfov.detection.yolo import YoloV3
+from semfov.errors import InputError, check, lookup
+
+WINOGRAD_TILE = 2
+
+
+def load_detector(name_or_path: str | PathLike[str], **options: Any) -> Detector:
+    """A detector by its name or its file, ready for inference.
+
+    - `"yolov3-tiny"`, `"yolov3"`, `"yolov3-spp"`: Darknet networks; options of `load_yolo`. Weights are downloaded
+      to the cache once, or read from the file `weights=`.
+    - a path that ends in `.cfg`, with `weights=`: any Darknet network with YOLOv3 heads; options of `load_yolo`.
+    - a path that ends in `.onnx`: a model of your own; options of `semfov.detection.onnx.load_onnx`.
+    - `"torchvision:<model>"`: options of `semfov.detection.torchvision.load_torchvision`.
+
+    Raises:
+        InputError: the name or an option is not known.
+        DataError: weights are damaged, or cannot be had.
+    """
+    name = fspath(name_or_path)
+    if name.endswith(".onnx"):
+        from semfov.detection.onnx import load_onnx
+
+        return load_onnx(name, **options)
+    if name.startswith("torchvision:"):
+        from semfov.detection.torchvision import load_torchvision
+
+        return load_torchvision(name, **options)
+    if name.endswith(".weights"):
+        raise InputError(f"name_or_path: expected a cfg and its weights, load_detector('x.cfg', weights={name!r})")
+    return load_yolo(name, **options)
+
+
+def load_yolo(
+    name_or_cfg: str,
+    *,
+    weights: str | PathLike[str] | None = None,
+    classes: Sequence[str] | str | PathLike[str] | None = None,
+    input_size: int | tuple[int, int] | None = None,
+    stride: int | None = 32,
+    background: BackgroundPolicy = "residual",
+    threshold: float = 0.02,
+    iou: float = 0.5,
+    limit: int = 100,
+    per_class: bool = False,
+    winograd: bool = True,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> YoloV3:
+    """YOLOv3, YOLOv3-tiny, YOLOv3-spp or a network from a cfg of your own, with trained weights.
+
+    Args:
+        name_or_cfg: name, or path of a cfg.
+        weights: path of a Darknet weights file; None takes the published weights of `name_or_cfg`.
+        classes: class names, or a text file with one on each line; None means the 80 of COCO.
+        input_size: canvas in pixels, one side or `(width, height)`; None takes the cfg's.
+        stride: pad the canvas only to a multiple of it; None pads to `input_size`.
+        background: background policy of the scores (`semfov.score_vectors`).
+        threshold: see `Selection`, as for `iou`, `limit` and `per_class`.
+        winograd: compute 3 x 3 convolutions by Winograd's algorithm, which is faster on a CPU. False leaves plain
+            `torch` convolutions, for training, for other devices and for export.
+        device: where the network lives.
+        dtype: of the network's parameters.
+    """
+    sections, name = _sections(name_or_cfg)
+    network = Darknet(sections)
+    digest = read_weights(network, fetch(name) if weights is None else weights)
+    if winograd:
+        network.use_winograd(WINOGRAD_TILE)
+    network.eval().requires_grad_(False).to(device=device, dtype=dtype, memory_format=torch.channels_last)
+    return YoloV3(
+        network,
+        _names(classes, network.heads[0].classes),
+        name=name,
+        input_size=(input_size, input_size) if isinstance(input_size, int) else input_size,
+        stride=stride,
+        background=background,
+        selection=Selection(threshold, iou, limit, per_class),
+        digest=digest,
+    )
+
+
+def _sections(name_or_cfg: str) -> tuple[list[Section], str]:
+    """Sections of a network, and what to call it."""
+    if name_or_cfg.endswith(".cfg"):
+        return read_cfg(name_or_cfg), Path(name_or_cfg).stem
+    return ARCHITECTURES[lookup(name_or_cfg, ARCHITECTURES, "detector")](), name_or_cfg
+
+
+def _names(classes: Sequence[str] | str | PathLike[str] | None, count: int) -> tuple[str, ...]:
+    """Class names from a list, from a file, or COCO's."""
+    if isinstance(classes, str | PathLike):
+        classes = Path(classes).read_text(encoding="utf-8").split("\n")
+        classes = [line.strip() for line in classes if line.strip()]
+    return COCO_CLASSES if classes is None else tuple(classes)

@@ -1,0 +1,94 @@
+"""Letterboxing: fitting an image into a detector's input, and the way back."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.errors import check, check_shape
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where an image lies in a detector's input (its canvas).
+
+    Points are pixel centres at integers, so the corner of the image is at -0.5:
+
+        canvas + 0.5 = (image + 0.5) · scale + offset
+
+    Box edges are positions between pixels (0 is the left edge of the image): canvas = image · scale + offset.
+
+    Attributes:
+        size: `(width, height)` of the image in pixels.
+        scale: canvas pixels per image pixel, `(x, y)`; equal in both axes unless the image is stretched.
+        offset: left and top padding on the canvas, in canvas pixels.
+    """
+
+    size: tuple[int, int]
+    scale: tuple[float, float]
+    offset: tuple[int, int]
+
+    def points_to_canvas(self, points: Tensor) -> Tensor:
+        """Image points `(..., 2)` -> canvas points."""
+        check_shape(points, "points", 2)
+        scale, offset = points.new_tensor(self.scale), points.new_tensor(self.offset)
+        return (points + 0.5) * scale + offset - 0.5
+
+    def boxes_to_image(self, boxes: Tensor) -> Tensor:
+        """Canvas boxes `(..., 4)` -> image boxes, cut to the image."""
+        check_shape(boxes, "boxes", 4)
+        scale, offset = boxes.new_tensor(self.scale * 2), boxes.new_tensor(self.offset * 2)
+        image = (boxes - offset) / scale
+        limit = boxes.new_tensor(self.size * 2, dtype=boxes.dtype)
+        return torch.minimum(image.clamp(min=0.0), limit)
+
+
+def letterbox(
+    image: Tensor,
+    size: tuple[int, int],
+    *,
+    fill: float = 0.5,
+    stride: int | None = None,
+    stretch: bool = False,
+) -> tuple[Tensor, Placement]:
+    """Resize `image` to fit into `size` with its proportions kept, and pad the rest with `fill`.
+
+    Args:
+        image: `(B, C, H, W)`.
+        size: `(width, height)` of the canvas.
+        fill: value of the padding.
+        stride: if given, pad only to the next multiple of `stride` instead of the whole canvas
+            (fewer pixels to compute, and the same content).
+        stretch: give up the proportions and fill the canvas (then nothing is padded).
+
+    Returns:
+        The canvas `(B, C, height, width)` and the `Placement` that maps points and boxes.
+
+    >>> canvas, placement = letterbox(torch.rand(1, 3, 480, 640), (416, 416))
+    >>> canvas.shape, placement.offset
+    (torch.Size([1, 3, 416, 416]), (0, 52))
+    """
+    check_shape(image, "image", None, None, None, None)
+    height, width = image.shape[-2:]
+    check(height > 0 and width > 0, "image", "at least one pixel", tuple(image.shape))
+    if stretch:
+        inner = size
+    else:
+        ratio = min(size[0] / width, size[1] / height)
+        inner = (max(1, round(width * ratio)), max(1, round(height * ratio)))
+    canvas_size = size if stride is None else tuple(-(-n // stride) * stride for n in inner)
+    resized = resize(image, inner)
+    left, top = (canvas_size[0] - inner[0]) // 2, (canvas_size[1] - inner[1]) // 2
+    right, bottom = canvas_size[0] - inner[0] - left, canvas_size[1] - inner[1] - top
+    canvas = F.pad(resized, (left, right, top, bottom), value=fill)
+    return canvas, Placement((width, height), (inner[0] / width, inner[1] / height), (left, top))
+
+
+def resize(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Bilinear resize of `(B, C, H, W)` to `(width, height)`, antialiased where it shrinks."""
+    width, height = size
+    if tuple(image.shape[-2:]) == (height, width):
+        return image.clone()
+    shrinks = height < image.shape[-2] or width < image.shape[-1]
+    return F.interpolate(image, (height, width), mode="bilinear", align_corners=False, antialias=shrinks)

@@ -1,0 +1,68 @@
+"""Which candidate boxes are kept: threshold, non-maximum suppression, at most so many."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.detection.detections import Detections
+from semfov.detection.placement import Placement
+from semfov.detection.scores import BackgroundPolicy, Candidates, score_vectors
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Settings of the selection.
+
+    Attributes:
+        threshold: boxes with a lower confidence (objectness times best class score) are dropped.
+        iou: of two boxes that overlap more than this, the less confident is suppressed.
+        limit: at most so many boxes of an image are kept.
+        per_class: suppress only boxes of the same best class; False is class-agnostic.
+    """
+
+    threshold: float = 0.02
+    iou: float = 0.5
+    limit: int = 100
+    per_class: bool = False
+
+
+def select(
+    candidates: Candidates, placement: Placement | None, selection: Selection, policy: BackgroundPolicy
+) -> Detections:
+    """Keep the best boxes of each image, mapped to the image and with their full score vectors.
+
+    Gradients flow to boxes and scores of what is kept; the choice itself is not differentiable.
+    """
+    return Detections.stack(
+        [_select_one(candidates, image, placement, selection, policy) for image in range(candidates.boxes.shape[0])]
+    )
+
+
+def _select_one(
+    candidates: Candidates,
+    image: int,
+    placement: Placement | None,
+    selection: Selection,
+    policy: BackgroundPolicy,
+) -> Detections:
+    confident = candidates.confidence[image] >= selection.threshold
+    rows = candidates.take(image, confident.nonzero()[:, 0])
+    boxes = rows.boxes if placement is None else placement.boxes_to_image(rows.boxes)
+    keep = suppress(boxes, rows.confidence, rows.classes.argmax(-1), selection)
+    scores = score_vectors(rows, policy)[keep]
+    return Detections(boxes[keep][None], scores[None], torch.ones_like(keep, dtype=torch.bool)[None])
+
+
+@torch.no_grad()
+def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:
+    """Indices of the boxes that survive non-maximum suppression, most confident first."""
+    from torchvision.ops import batched_nms, nms
+
+    full = ((boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])).nonzero()[:, 0]
+    boxes, confidence, labels = boxes[full], confidence[full], labels[full]
+    if selection.per_class:
+        keep = batched_nms(boxes, confidence, labels, selection.iou)
+    else:
+        keep = nms(boxes, confidence, selection.iou)
+    return full[keep[: selection.limit]]

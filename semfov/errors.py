@@ -1,0 +1,59 @@
+"""Errors that a user can act on, and the checks that raise them."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+import torch
+from torch import Tensor
+
+
+class SemfovError(Exception):
+    """Base of every error that semfov raises on purpose; its message names the thing and the remedy."""
+
+
+class InputError(SemfovError, ValueError):
+    """An argument, a setting or a tensor is not what the call needs."""
+
+
+class DataError(SemfovError):
+    """A file (image, annotations, weights, cache) is missing, damaged or of the wrong shape."""
+
+
+def check(condition: bool, argument: str, expected: str, got: object) -> None:
+    """Raise `InputError` unless `condition` holds: the argument, what was expected and what came.
+
+    >>> check(True, "sigma", "a positive number", 3.0)
+    """
+    if not condition:
+        raise InputError(f"{argument}: expected {expected}, got {got}")
+
+
+def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
+    """Raise `InputError` unless the last dimensions of `tensor` are `shape` (`None` stands for any size).
+
+    >>> check_shape(torch.zeros(2, 3, 4), "boxes", None, 4)
+    """
+    sizes = tuple(tensor.shape[-len(shape) :])
+    fits = tensor.ndim >= len(shape) and all(s is None or s == n for s, n in zip(shape, sizes, strict=True))
+    wanted = ", ".join("any" if s is None else str(s) for s in shape)
+    check(fits, argument, f"a tensor of shape (..., {wanted})", tuple(tensor.shape))
+
+
+def check_finite(tensor: Tensor, argument: str) -> None:
+    """Raise `InputError` where `tensor` holds a NaN or an infinity."""
+    bad = int((~torch.isfinite(tensor)).sum())
+    check(bad == 0, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not")
+
+
+def lookup(name: str, known: Iterable[str], what: str) -> str:
+    """Return `name` if it is `known`, else raise `InputError` with the nearest known names.
+
+    >>> lookup("cup", ["cup", "cat"], "class")
+    'cup'
+    """
+    names = list(known)
+    if name in names:
+        return name
+    near = get_close_matches(name, names, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known: {', '.join(names)}"
+    raise InputError(f"unknown {what} {name!r}; {hint}")

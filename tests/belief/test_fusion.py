@@ -1,0 +1,111 @@
+"""Fusion rules against the exact posterior, a scalar twin and the properties that define them."""
+
+import itertools
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.belief import fusion
+from semfov.errors import InputError
+
+positive = st.floats(0.05, 20.0)
+likelihoods = st.lists(st.floats(0.0, 1.0), min_size=2, max_size=6).filter(lambda values: max(values) > 1e-3)
+
+
+def exact_posterior_mean(beta: list[float], likelihood: list[float]) -> list[float]:
+    """Mean of the exact posterior, a mixture of Dirichlets Dir(β + e_k) weighted by β_k λ_k."""
+    total, weights = sum(beta), [b * l for b, l in zip(beta, likelihood, strict=True)]
+    return [(b + w / sum(weights)) / (total + 1) for b, w in zip(beta, weights, strict=True)]
+
+
+def scalar_kaplan(beta: list[float], likelihood: list[float]) -> list[float]:
+    """The published formula, letter by letter."""
+    expected = sum(b * l for b, l in zip(beta, likelihood, strict=True))
+    return [
+        b * (1 + l / expected) / (1 + min(likelihood) / expected) for b, l in zip(beta, likelihood, strict=True)
+    ]
+
+
+@given(likelihoods, st.data())
+def test_kaplan_matches_the_formula_and_the_exact_mean(likelihood, data):
+    beta = data.draw(st.lists(positive, min_size=len(likelihood), max_size=len(likelihood)))
+    b, l = torch.tensor(beta, dtype=torch.float64), torch.tensor(likelihood, dtype=torch.float64)
+    after = fusion.kaplan(b, l)
+    torch.testing.assert_close(after, torch.tensor(scalar_kaplan(beta, likelihood), dtype=torch.float64))
+    mean = torch.tensor(exact_posterior_mean(beta, likelihood), dtype=torch.float64)
+    torch.testing.assert_close(after / after.sum(), mean)
+    assert (after >= b).all()
+    assert after[l.argmin()] == b[l.argmin()]
+
+
+def test_kaplan_mean_is_that_of_the_integrated_posterior():
+    """Monte Carlo over the prior: the posterior mean of p is E[p (p·λ)] / E[p·λ]."""
+    beta, likelihood = torch.tensor([0.7, 2.0, 1.3]).double(), torch.tensor([0.9, 0.2, 0.05]).double()
+    torch.manual_seed(0)
+    draws = torch.distributions.Dirichlet(beta).sample((200_000,))
+    weights = draws @ likelihood
+    posterior = (weights[:, None] * draws).mean(0) / weights.mean()
+    after = fusion.kaplan(beta, likelihood)
+    torch.testing.assert_close(after / after.sum(), posterior, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_kaplan_special_cases(dtype):
+    beta = torch.tensor([0.5, 1.5, 3.0], dtype=dtype)
+    torch.testing.assert_close(fusion.kaplan(beta, torch.full((3,), 0.37, dtype=dtype)), beta)
+    one_hot = torch.tensor([0.0, 1.0, 0.0], dtype=dtype)
+    torch.testing.assert_close(fusion.kaplan(beta, one_hot), beta + one_hot)
+    assert fusion.kaplan(beta, one_hot).dtype == dtype
+
+
+@pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
+def test_rules_ignore_scale_and_order_of_classes(rule):
+    torch.manual_seed(1)
+    beta, likelihood = torch.rand(7, 4).double() + 0.1, torch.rand(7, 4).double()
+    after = rule(beta, likelihood)
+    torch.testing.assert_close(rule(beta, likelihood * 1e-30), after)
+    for order in itertools.permutations(range(4)):
+        torch.testing.assert_close(rule(beta[:, order], likelihood[:, order]), after[:, order])
+
+
+def test_product_and_sum_by_hand():
+    beta, likelihood = torch.tensor([1.0, 3.0]), torch.tensor([0.5, 0.25])
+    torch.testing.assert_close(fusion.product(beta, likelihood), 5 * torch.tensor([0.5, 0.75]) / 1.25)
+    torch.testing.assert_close(fusion.sum(beta, likelihood), beta + torch.tensor([2 / 3, 1 / 3]))
+
+
+@pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
+@pytest.mark.parametrize(
+    ("bad", "word"),
+    [([0.0, 0.0], "zeros"), ([float("nan"), 1.0], "NaN"), ([-0.1, 1.0], "negative"), ([1.0, float("inf")], "inf")],
+)
+def test_unusable_likelihoods_are_refused(rule, bad, word):
+    with pytest.raises(InputError, match=word):
+        rule(torch.ones(2), torch.tensor(bad))
+
+
+@pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
+def test_gradients(rule):
+    torch.manual_seed(2)
+    beta = (torch.rand(3, 4, dtype=torch.float64) + 0.2).requires_grad_()
+    likelihood = (torch.rand(3, 4, dtype=torch.float64) + 0.1).requires_grad_()
+    assert torch.autograd.gradcheck(rule, (beta, likelihood))
+
+
+@pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
+def test_compiles_whole(rule):
+    beta, likelihood = torch.rand(5, 4) + 0.1, torch.rand(5, 4)
+    compiled = torch.compile(rule, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(beta, likelihood), rule(beta, likelihood))
+
+
+def test_extreme_likelihoods_stay_finite():
+    likelihood = torch.tensor([1e-38, 1.0, 3e38])
+    for rule in fusion.RULES.values():
+        beta = torch.full((3,), 0.5)
+        for _ in range(300):
+            beta = rule(beta, fusion.scale_likelihood(likelihood))
+        assert torch.isfinite(beta).all()
+        assert (beta > 0).all()

@@ -1,0 +1,111 @@
+"""The grid against loops over cells and pixels."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.belief import Grid
+from semfov.errors import InputError
+
+
+def overlap_by_loop(grid: Grid, size: tuple[int, int], box: list[float]) -> list[bool]:
+    width, height = size
+    covered = []
+    for row in range(grid.rows):
+        for column in range(grid.columns):
+            left, right = column * width / grid.columns, (column + 1) * width / grid.columns
+            top, bottom = row * height / grid.rows, (row + 1) * height / grid.rows
+            across = min(right, box[2]) - max(left, box[0])
+            down = min(bottom, box[3]) - max(top, box[1])
+            covered.append(across > 0 and down > 0)
+    return covered
+
+
+@given(
+    st.integers(1, 7),
+    st.integers(1, 7),
+    st.tuples(st.sampled_from([64, 100, 640]), st.sampled_from([48, 77, 427])),
+    st.lists(st.floats(-20, 700, width=32), min_size=4, max_size=4),
+)
+def test_overlap_equals_the_loop(columns, rows, size, corners):
+    (x1, x2), (y1, y2) = sorted(corners[::2]), sorted(corners[1::2])
+    box = [x1, y1, x2, y2]
+    grid = Grid(columns, rows, size)
+    got = grid.footprint(torch.tensor([box], dtype=torch.float64))[0].tolist()
+    expected = overlap_by_loop(grid, size, box) if x2 > x1 and y2 > y1 else [False] * len(grid)
+    assert got == expected
+
+
+def test_pixels_agree_with_cells():
+    """Every pixel centre lies in the cell that `cell_of` says, counted by slicing an image."""
+    grid = Grid(4, 3, (12, 9))
+    image = torch.arange(12).reshape(3, 4).repeat_interleave(3, 0).repeat_interleave(3, 1)
+    ys, xs = torch.meshgrid(torch.arange(9), torch.arange(12), indexing="ij")
+    cells = grid.cell_of(torch.stack([xs, ys], -1).float())
+    assert torch.equal(cells, image)
+
+
+def test_centres_and_edges():
+    grid = Grid(2, 2, (8, 4))
+    assert grid.centres.tolist() == [[1.5, 0.5], [5.5, 0.5], [1.5, 2.5], [5.5, 2.5]]
+    assert grid.edges[3].tolist() == [4, 2, 8, 4]
+    assert torch.equal(grid.cell_of(grid.centres), torch.arange(4))
+
+
+@pytest.mark.parametrize("rule", ["overlap", "centre", "box_centre"])
+def test_footprint_rules(rule):
+    grid = Grid(10, 10, (100, 100))
+    box = torch.tensor([[12.0, 12.0, 38.0, 28.0], [41.0, 41.0, 43.0, 43.0], [5.0, 5.0, 5.0, 9.0]])
+    expected = {
+        "overlap": [{11, 12, 13, 21, 22, 23}, {44}, set()],
+        "centre": [{11, 12, 13, 21, 22, 23}, {44}, set()],
+        "box_centre": [{22}, {44}, set()],
+    }[rule]
+    got = [set(row.nonzero()[:, 0].tolist()) for row in grid.footprint(box, rule)]
+    assert got == expected
+
+
+def test_centre_rule_leaves_out_barely_touched_cells():
+    grid = Grid(10, 10, (100, 100))
+    box = torch.tensor([[8.0, 18.0, 27.0, 32.0]])
+    assert set(grid.footprint(box, "overlap")[0].nonzero()[:, 0].tolist()) == {10, 11, 12, 20, 21, 22, 30, 31, 32}
+    assert set(grid.footprint(box, "centre")[0].nonzero()[:, 0].tolist()) == {21, 22}
+
+
+def test_batch_of_sizes_equals_single_grids():
+    sizes = [(640, 480), (300, 500)]
+    torch.manual_seed(0)
+    corner = torch.rand(2, 5, 2) * 300
+    boxes = torch.cat([corner, corner + torch.rand(2, 5, 2) * 200], -1)
+    fixation = torch.rand(2, 2) * 300
+    batch = Grid(5, 4, torch.tensor(sizes))
+    for rule in ("overlap", "centre", "box_centre"):
+        singles = [Grid(5, 4, size).footprint(b, rule) for size, b in zip(sizes, boxes, strict=True)]
+        assert torch.equal(batch.footprint(boxes, rule), torch.stack(singles))
+    for name in ("centres", "edges", "cell_distance"):
+        torch.testing.assert_close(getattr(batch, name)[1], getattr(Grid(5, 4, sizes[1]), name))
+    single = Grid(5, 4, sizes[1]).box_distance(boxes[1], fixation[1])
+    torch.testing.assert_close(batch.box_distance(boxes, fixation)[1], single)
+
+
+def test_distances_are_in_longer_sides():
+    grid = Grid(2, 1, (200, 100))
+    assert grid.cell_distance.tolist() == [[0, 0.5], [0.5, 0]]
+    box = torch.tensor([[90.5, 40.5, 110.5, 60.5]])
+    assert grid.box_distance(box, torch.tensor([100.0, 80.0])).tolist() == [pytest.approx(0.15)]
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: Grid(0, 3, (10, 10)),
+        lambda: Grid(3, 3, (10, 0)),
+        lambda: Grid(3, 3, (10, 10)).footprint(torch.zeros(4)),
+        lambda: Grid(3, 3, (10, 10)).footprint(torch.zeros(1, 4), "all"),
+        lambda: Grid(3, 3, (10, 10)).cell_of(torch.zeros(3)),
+    ],
+)
+def test_bad_input(call):
+    with pytest.raises(InputError):
+        call()
