@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from eval.config import ProtocolConfig
-from eval.setup import Scenes
 from semfov import Grid
 from semfov.agent import step
 from semfov.belief import Evidence
+from semfov.data.scene import Scenes
 from semfov.gaze import Policy
 
 
@@ -55,8 +55,8 @@ def episodes_of(scenes: Scenes, index: int, columns: int, rows: int, protocol: P
 
     Starts differ from each other as long as there are enough cells.
     """
-    boxes, labels, size = scenes.annotation(index)
-    covered = Grid(columns, rows, size).footprint(boxes)
+    annotation = scenes.annotation(index)
+    labels, covered = annotation.labels, Grid(columns, rows, annotation.size).footprint(annotation.boxes)
     counts = torch.bincount(labels, minlength=1)
     targets = scenes.targets(index)
     commonest = max(targets, key=lambda t: (int(counts[t]), -t)) if targets else None

@@ -1,30 +1,15 @@
 """From settings to objects: scenes, eye, observation model, policies."""
 
-from typing import Protocol
+from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 import semfov
 from eval.config import DataConfig, DetectorConfig, SearchConfig, SensorConfig
-from semfov.data.scene import Scene
+from semfov.data.scene import Scenes
 from semfov.errors import InputError, check, lookup
 from semfov.eye import Eye
 from semfov.gaze import SEARCH_POLICIES
-
-
-class Scenes(Protocol):
-    """What the evaluation needs of a data set (`CocoScenes`, `EmbeddedScenes`)."""
-
-    ids: list[int] | list[str]
-    classes: tuple[str, ...]
-    fingerprint: str
-
-    def __len__(self) -> int: ...
-    def __getitem__(self, index: int) -> Scene: ...
-    def annotation(self, index: int) -> tuple[Tensor, Tensor, tuple[int, int]]: ...
-    def targets(self, index: int) -> list[int]: ...
-    def digest(self, index: int) -> str: ...
 
 
 def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
@@ -53,7 +38,9 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
         detector.name,
         weights=detector.weights,
         background=detector.background,
-        selection=semfov.Selection(threshold=detector.threshold, iou=detector.iou, limit=detector.limit),
+        threshold=detector.threshold,
+        iou=detector.iou,
+        limit=detector.limit,
         stride=detector.stride,
     )
     foveation = semfov.Foveation(

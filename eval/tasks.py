@@ -1,5 +1,7 @@
 """The unit of work of a search run: one scene, from photograph to outcomes of all policies."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 import time
@@ -10,9 +12,10 @@ import torch
 
 from eval.config import SearchConfig
 from eval.protocol import Outcome, episodes_of, run_episodes, tie_noise
-from eval.setup import Scenes, make_eye, make_observation, make_scenes, needs_model, single_thread, split_policy
+from eval.setup import make_eye, make_observation, make_scenes, needs_model, single_thread, split_policy
 from eval.store import DetectionStore, see_all
 from semfov import Detections, Grid, weigh
+from semfov.data.scene import Scenes
 from semfov.errors import DataError
 from semfov.files import write_text
 from semfov.gaze import Policy, search_policy
@@ -51,7 +54,7 @@ class SearchRun:
 
     def grid(self, index: int) -> Grid:
         """The grid over a scene."""
-        return Grid(self.config.belief.columns, self.config.belief.rows, self.scenes.annotation(index)[2])
+        return Grid(self.config.belief.columns, self.config.belief.rows, self.scenes.annotation(index).size)
 
     def detections(self, index: int) -> Detections:
         """What is seen from every cell of a scene, from the store or computed (and kept)."""
@@ -110,9 +113,11 @@ class SearchRun:
 
 def cache_folder(config: SearchConfig) -> Path:
     """Folder of the detection store."""
+    if config.cache is not None:
+        return config.cache / "looks"
     from semfov.detection.weights import cache_dir
 
-    return (config.cache or cache_dir()) / "looks"
+    return cache_dir() / "looks"
 
 
 class Parts:

@@ -128,7 +128,8 @@ class ActivePerception(nn.Module):
 
         The search ends when the target is found, after `shifts` gaze shifts, or when no cell is left. With `boxes`
         the target is found when the gaze is on a cell that one of them overlaps (the protocol of the paper);
-        without, when a detection over the fixation has the target as its best class with a score of `confirm`.
+        without, when a detection that overlaps the fixated cell has the target as its best class with a score of
+        `confirm`.
 
         Args:
             image: `(3, H, W)` or `(1, 3, H, W)`, RGB in [0, 1].
@@ -137,7 +138,7 @@ class ActivePerception(nn.Module):
             shifts: most gaze shifts to make.
             seed: of the generator that draws the start and breaks ties.
             boxes: `(M, 4)`, where the target really is.
-            confirm: score at which a detection over the fixation counts as finding the target.
+            confirm: score at which a detection at the fixation counts as finding the target.
 
         Raises:
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
@@ -169,7 +170,7 @@ class ActivePerception(nn.Module):
             seen.append(detections)
             beliefs.append(beta[0])
             values.append(after.values[0])
-            found = bool(goal[cell]) if goal is not None else covers(detections, fixation, index, confirm)
+            found = bool(goal[cell]) if goal is not None else confirms(detections, grid, cell, index, confirm)
             cell = int(after.cell)
             if found or len(cells) > shifts or cell < 0:
                 break
@@ -193,9 +194,7 @@ class ActivePerception(nn.Module):
         return target
 
 
-def covers(detections: Detections, fixation: Tensor, target: int, confirm: float) -> bool:
-    """Whether a detection over the fixation `(1, 2)` has `target` as its best class, with a score of `confirm`."""
-    point = fixation[:, None] + 0.5
-    over = ((detections.boxes[..., :2] <= point) & (detections.boxes[..., 2:] > point)).all(-1)
-    sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= confirm)
-    return bool((over & sure & detections.mask).any())
+def confirms(detections: Detections, grid: Grid, cell: int, target: int, score: float) -> bool:
+    """Whether a detection that overlaps `cell` has `target` as its best class, with at least this score."""
+    sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score)
+    return bool((grid.footprint(detections.boxes)[..., cell] & sure & detections.mask).any())

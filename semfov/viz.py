@@ -105,7 +105,7 @@ def plot_episode(
     from matplotlib.figure import Figure
 
     with rc_context(STYLE):
-        figure = Figure(figsize=(width, 2 * 2.5 * aspect + 1.1), layout="constrained")
+        figure = Figure(figsize=(width, 2 * 2.5 * aspect + 0.6), layout="constrained")
         left, right = figure.subfigures(1, 2, width_ratios=[5.2, width - 5.2])
         _draw_scanpath(left.subplots(), scanpath, image, boxes)
         panels = right.subplots(2, len(shown), squeeze=False)
@@ -194,8 +194,8 @@ def _draw_view(axes: Axes, scanpath: Scanpath, fixation: int, view: Tensor) -> N
     _draw_image(axes, scanpath, view)
     _draw_detections(axes, scanpath, scanpath.detections[fixation])
     x, y = (scanpath.fixations[fixation] + 0.5).tolist()
-    axes.plot(x, y, "+", color="white", markersize=11, markeredgewidth=2.6)
-    axes.plot(x, y, "+", color=COLOURS[0], markersize=10, markeredgewidth=1.4)
+    axes.plot(x, y, "+", color="white", markersize=11, markeredgewidth=2.8, zorder=5)
+    axes.plot(x, y, "+", color=COLOURS[0], markersize=10, markeredgewidth=1.4, zorder=5)
     axes.set_title(f"fixation {fixation}")
 
 
@@ -206,12 +206,15 @@ def _draw_belief(axes: Axes, scanpath: Scanpath, fixation: int, target: int | No
     width, height = grid.extent.tolist()
     if image is not None:
         _draw_image(axes, scanpath, image, dim=0.3)
-    posterior = mean(scanpath.beliefs[fixation].detach().cpu())[:, index].reshape(grid.rows, grid.columns)
+    posteriors = mean(scanpath.beliefs.detach().cpu())[..., index]
+    posterior = posteriors[fixation].reshape(grid.rows, grid.columns)
+    # One scale for the whole episode, so that its pictures can be compared.
     axes.imshow(
         posterior.numpy(),
         extent=(0, width, height, 0),
         cmap="viridis",
         vmin=0,
+        vmax=float(posteriors.max()),
         alpha=0.8 if image is not None else 1,
     )
     x, y = (scanpath.fixations[fixation].cpu() + 0.5).tolist()

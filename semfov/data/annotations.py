@@ -12,6 +12,8 @@ from typing import Any
 
 from semfov.errors import DataError
 
+_LARGEST = 2**24  # pixels of a side, up to which float32 boxes have whole pixels
+
 
 def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
     """Read and check a COCO instances file.
@@ -82,7 +84,7 @@ def _check(data: dict[str, Any]) -> None:
         raise _Fault("images: expected ids of one kind, got integers and strings")
     for where, image in _entries(data, "images"):
         for key in ("width", "height"):
-            if not (_is_number(image.get(key)) and image[key] >= 1 and image[key] == int(image[key])):
+            if not (_is_number(image.get(key)) and 1 <= image[key] <= _LARGEST and image[key] == int(image[key])):
                 raise _Fault(f"{where}: expected {key} to be a whole number of pixels, got {_show(image, key)}")
     _ids(data, "annotations", {})
     for where, annotation in _entries(data, "annotations"):

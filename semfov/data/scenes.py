@@ -28,7 +28,7 @@ _VERSION = 1  # raise it whenever the same seed would give another picture
 _SIZE = (640, 480)
 _SLOTS = (4, 3)
 _MARGIN = 4
-_SIDES = (136, 152)
+_SIDES = (140, 152)
 _FOLDERS = {"skimage": "data", "matplotlib": "mpl-data/sample_data"}
 _DISTRIBUTIONS = {"skimage": "scikit-image", "matplotlib": "matplotlib"}
 
@@ -45,7 +45,7 @@ class Photograph:
         file: its name there.
         crop: the part that is shown, `(x1, y1, x2, y2)` in pixels of the photograph.
         label: class of the object on it, `""` for a distractor.
-        box: the object on the photograph, in the same pixels; what lies outside the crop is not shown.
+        box: the object on the photograph, in the same pixels, inside the crop.
     """
 
     title: str
@@ -60,9 +60,11 @@ OBJECTS = (
     Photograph("astronaut", "skimage", "astronaut.png", (0, 0, 372, 420), "person", (20, 14, 366, 420)),
     Photograph("officer", "matplotlib", "grace_hopper.jpg", (0, 0, 512, 600), "person", (14, 22, 512, 600)),
     Photograph("cameraman", "skimage", "camera.png", (0, 30, 390, 512), "person", (20, 60, 320, 512)),
-    Photograph("cat", "skimage", "chelsea.png", (0, 0, 390, 300), "cat", (4, 0, 384, 300)),
-    Photograph("cup", "skimage", "coffee.png", (60, 0, 500, 400), "cup", (172, 17, 408, 312)),
-    Photograph("motorcycle", "skimage", "motorcycle_left.png", (60, 50, 711, 480), "motorcycle", (94, 76, 686, 452)),
+    Photograph("cat", "skimage", "chelsea.png", (60, 0, 390, 300), "cat", (60, 0, 384, 300)),
+    Photograph("cup", "skimage", "coffee.png", (140, 0, 440, 330), "cup", (172, 17, 408, 312)),
+    Photograph(
+        "motorcycle", "skimage", "motorcycle_left.png", (80, 60, 700, 470), "motorcycle", (94, 76, 686, 452)
+    ),
 )
 DISTRACTORS = (
     Photograph("rocket", "skimage", "rocket.jpg", (180, 60, 460, 420)),
@@ -101,8 +103,8 @@ class Item:
 class EmbeddedScenes:
     """Search arrays of 640 × 480 pixels: five objects and five distractors on a textured background each.
 
-    Scene `i` of a seed depends on the seed and on `i` only. Objects are people, a cat, a cup and a motorcycle; those
-    of classes that the detector does not have are there without a box.
+    Scene `i` of a seed depends on the seed and on `i` only. Objects are people, a cat, a cup and a motorcycle;
+    those of classes that the detector does not have are there without a box.
 
     Args:
         classes: names of the detector's classes 1..K, in COCO's or Darknet's spelling.
@@ -188,7 +190,9 @@ def _layout(generator: np.random.Generator) -> list[Item]:
         longer = max(right - left, bottom - top)
         width, height = side * (right - left) // longer, side * (bottom - top) // longer
         x = slot % columns * pitch[0] + int(generator.integers(_MARGIN, pitch[0] - width - _MARGIN, endpoint=True))
-        y = slot // columns * pitch[1] + int(generator.integers(_MARGIN, pitch[1] - height - _MARGIN, endpoint=True))
+        y = slot // columns * pitch[1] + int(
+            generator.integers(_MARGIN, pitch[1] - height - _MARGIN, endpoint=True)
+        )
         items.append(Item(photograph, (x, y, x + width, y + height), bool(generator.integers(2))))
     return items
 
@@ -204,10 +208,10 @@ def _background(generator: np.random.Generator) -> NDArray[np.uint8]:
     for octave in range(6):
         grid = generator.integers(256, size=(3 << octave, 4 << octave), dtype=np.uint8)
         smooth = Image.fromarray(grid).resize(_SIZE, Image.Resampling.BICUBIC)
-        clouds += np.asarray(smooth, dtype=np.int64) - 128 << (5 - octave)
+        clouds += (np.asarray(smooth, dtype=np.int64) - 128) << (5 - octave)
     texture = _texture(TEXTURES[generator.integers(len(TEXTURES))])
     tint = generator.integers(110, 180) + generator.integers(-20, 21, size=3)
-    levels = tint + (clouds // 150 + texture // 5)[..., None]
+    levels = tint + (clouds // 150 + texture // 8)[..., None]
     return levels.clip(0, 255).astype(np.uint8)
 
 

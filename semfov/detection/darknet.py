@@ -1,25 +1,15 @@
 """Darknet networks as torch modules, built from the sections of a cfg."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from fractions import Fraction
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
+from semfov.detection.darknet_builder import Builder
 from semfov.detection.darknet_config import Section
-from semfov.detection.darknet_layers import ACTIVATIONS, Convolution, Head, MaxPool, Route, Shortcut, Upsample
+from semfov.detection.darknet_layers import Convolution, Head
 from semfov.detection.winograd import WinogradConvolution
 from semfov.errors import DataError, check, check_shape
-
-# Keys that would change what a layer computes, with the only value that is implemented.
-_NEUTRAL = {
-    "convolutional": {"binary": "0", "xnor": "0", "dilation": "1", "antialiasing": "0"},
-    "maxpool": {"maxpool_depth": "0", "antialiasing": "0"},
-    "shortcut": {"weights_type": "none"},
-    "upsample": {"scale": "1"},
-    "yolo": {"new_coords": "0"},
-}
 
 
 class Darknet(nn.Module):
@@ -47,14 +37,19 @@ class Darknet(nn.Module):
             raise DataError("cfg: expected [net] as its first section")
         self.input_size = (sections[0].integer("width", 416), sections[0].integer("height", 416))
         self.channels = sections[0].integer("channels", 3)
-        builder = _Builder(self.channels)
+        builder = Builder(self.channels)
         self.layers = nn.ModuleList([builder.add(section) for section in sections[1:]])
         self.heads = [layer for layer in self.layers if isinstance(layer, Head)]
         if not self.heads:
             raise DataError(f"{sections[0].where}: expected at least one [yolo] section, got none")
         self.stride = max(-(-shape.step.numerator // shape.step.denominator) for shape in builder.shapes)
         self._sources = builder.sources
-        self._last_reader = {source: index for index, read in enumerate(self._sources) for source in read}
+        # The layer after which an output is needed no more; the maps of the heads are what the network returns.
+        self._last_reader = {index: index for index in range(-1, len(self.layers))}
+        self._last_reader |= {source: index for index, read in enumerate(self._sources) for source in read}
+        self._last_reader |= {i: len(self.layers) for i, layer in enumerate(self.layers) if isinstance(layer, Head)}
+        # The first layers have maps so large that a CPU is faster with one image of a batch after the other.
+        self._stem = next((index for index, shape in enumerate(builder.shapes) if shape.step >= 8), 0)
 
     def forward(self, image: Tensor) -> list[Tensor]:
         """Raw maps of the heads."""
@@ -62,141 +57,30 @@ class Darknet(nn.Module):
         height, width = image.shape[-2:]
         fits = height % self.stride == 0 and width % self.stride == 0 and height * width > 0
         check(fits, "image", f"sides that are multiples of {self.stride}", f"{width} x {height}")
-        outputs = {-1: image.contiguous(memory_format=torch.channels_last)}
-        maps = []
-        for index, (layer, sources) in enumerate(zip(self.layers, self._sources, strict=True)):
-            outputs[index] = layer(*(outputs[source] for source in sources))
-            if isinstance(layer, Head):
-                maps.append(outputs[index])
-            for source in set(sources):
-                if self._last_reader[source] == index:
-                    del outputs[source]
-        return maps
+        image = image.contiguous(memory_format=torch.channels_last)
+        stem = self._stem if image.device.type == "cpu" and image.shape[0] > 1 else 0
+        outputs = {-1: image}
+        if stem:
+            parts = [self._run({-1: part}, 0, stem) for part in image.split(1)]
+            outputs = {index: torch.cat([part[index] for part in parts]) for index in parts[0]}
+        outputs = self._run(outputs, stem, len(self.layers))
+        return [outputs[index] for index, layer in enumerate(self.layers) if isinstance(layer, Head)]
 
-    def use_winograd(self, tile: int = 2, *, channels: int = 64) -> None:
-        """Compute 3 x 3 convolutions of at least `channels` inputs by Winograd's algorithm; for inference only."""
+    def _run(self, outputs: dict[int, Tensor], start: int, stop: int) -> dict[int, Tensor]:
+        """Outputs of layers `start` to `stop` that are read later, from the outputs that these layers read."""
+        outputs = dict(outputs)
+        for index in range(start, stop):
+            outputs[index] = self.layers[index](*(outputs[source] for source in self._sources[index]))
+            outputs = {source: output for source, output in outputs.items() if self._last_reader[source] > index}
+        return outputs
+
+    def use_winograd(self, *, channels: int = 64) -> None:
+        """Compute 3 x 3 convolutions of at least `channels` inputs by Winograd's algorithm, for inference on a CPU.
+
+        Output tiles are 4 pixels wide, or 2 where the transformed kernels would not fit into a CPU's cache.
+        """
         for index, layer in enumerate(self.layers):
             if isinstance(layer, Convolution) and WinogradConvolution.replaces(layer):
                 if layer.in_channels >= channels:
+                    tile = 4 if layer.in_channels * layer.out_channels <= 2**17 else 2
                     self.layers[index] = WinogradConvolution(layer, tile)
-
-
-@dataclass(frozen=True)
-class _Shape:
-    """Channels of an output, and input pixels per output pixel."""
-
-    channels: int
-    step: Fraction
-
-
-class _Builder:
-    """Turns sections into layers, and keeps track of shapes and of what each layer reads."""
-
-    def __init__(self, channels: int) -> None:
-        self.shapes: list[_Shape] = []
-        self.sources: list[tuple[int, ...]] = []
-        self._image = _Shape(channels, Fraction(1))
-        self._makers: dict[str, Callable[[Section], nn.Module]] = {
-            "convolutional": self._convolution,
-            "maxpool": self._maxpool,
-            "upsample": self._upsample,
-            "route": self._route,
-            "shortcut": self._shortcut,
-            "yolo": self._yolo,
-            "dropout": self._dropout,
-        }
-
-    def add(self, section: Section) -> nn.Module:
-        if section.kind not in self._makers:
-            known = ", ".join(self._makers)
-            raise DataError(f"{section.where}: layer [{section.kind}] is not supported; supported: {known}")
-        for key, value in _NEUTRAL.get(section.kind, {}).items():
-            if section.text(key, value) != value:
-                raise DataError(f"{section.where}: [{section.kind}] {key}={section.text(key)} is not supported")
-        return self._makers[section.kind](section)
-
-    @property
-    def _here(self) -> _Shape:
-        return self.shapes[-1] if self.shapes else self._image
-
-    def _note(self, channels: int, step: Fraction, *sources: int) -> None:
-        self.sources.append((len(self.shapes) - 1, *sources))
-        self.shapes.append(_Shape(channels, step))
-
-    def _convolution(self, section: Section) -> nn.Module:
-        here, filters, groups = self._here, section.integer("filters", 1), section.integer("groups", 1)
-        if here.channels % groups or filters % groups:
-            raise DataError(f"{section.where}: groups={groups} divides not both {here.channels} and {filters} channels")
-        size, stride = section.integer("size", 1), section.integer("stride", 1)
-        same = section.integer("pad", 0, minimum=0)
-        self._note(filters, here.step * stride)
-        return Convolution(
-            here.channels,
-            filters,
-            size,
-            stride=stride,
-            padding=size // 2 if same else section.integer("padding", 0, minimum=0),
-            groups=groups,
-            activation=_activation(section, "logistic"),
-            normalised=bool(section.integer("batch_normalize", 0, minimum=0)),
-        )
-
-    def _maxpool(self, section: Section) -> nn.Module:
-        stride = section.integer("stride", 1)
-        size = section.integer("size", stride)
-        self._note(self._here.channels, self._here.step * stride)
-        return MaxPool(size, stride, section.integer("padding", size - 1, minimum=0))
-
-    def _upsample(self, section: Section) -> nn.Module:
-        stride = section.integer("stride", 2)
-        self._note(self._here.channels, self._here.step / stride)
-        return Upsample(stride)
-
-    def _route(self, section: Section) -> nn.Module:
-        sources = tuple(self._layer(section, "layers", layer) for layer in section.integers("layers"))
-        groups, group = section.integer("groups", 1), section.integer("group_id", 0, minimum=0)
-        shapes = [self.shapes[source] for source in sources]
-        if len({shape.step for shape in shapes}) != 1:
-            raise DataError(f"{section.where}: [route] expected layers of one size, got {section.text('layers')}")
-        if group >= groups or any(shape.channels % groups for shape in shapes):
-            raise DataError(f"{section.where}: [route] has no part {group} of {groups} equal groups of channels")
-        self.sources.append(sources)
-        self.shapes.append(_Shape(sum(shape.channels for shape in shapes) // groups, shapes[0].step))
-        return Route(groups, group)
-
-    def _shortcut(self, section: Section) -> nn.Module:
-        sources = [self._layer(section, "from", layer) for layer in section.integers("from")]
-        if len(sources) != 1 or self.shapes[sources[0]] != self._here:
-            raise DataError(f"{section.where}: [shortcut] expected one layer of the same shape, got {sources}")
-        self._note(self._here.channels, self._here.step, *sources)
-        return Shortcut(_activation(section, "linear"))
-
-    def _yolo(self, section: Section) -> nn.Module:
-        numbers = section.numbers("anchors")
-        pairs = list(zip(numbers[::2], numbers[1::2], strict=False))
-        mask = section.integers("mask", ",".join(map(str, range(len(pairs)))))
-        if len(numbers) % 2 or not mask or any(not 0 <= index < len(pairs) for index in mask):
-            raise DataError(f"{section.where}: [yolo] mask {mask} does not choose from {len(numbers)} / 2 anchors")
-        scale = section.numbers("scale_x_y", "1")
-        head = Head(tuple(pairs[index] for index in mask), section.integer("classes", 20), scale[0])
-        if head.channels != self._here.channels:
-            raise DataError(f"{section.where}: [yolo] expected {head.channels} channels, got {self._here.channels}")
-        self._note(self._here.channels, self._here.step)
-        return head
-
-    def _dropout(self, section: Section) -> nn.Module:
-        self._note(self._here.channels, self._here.step)
-        return nn.Identity()
-
-    def _layer(self, section: Section, key: str, number: int) -> int:
-        index = number if number >= 0 else len(self.shapes) + number
-        if not 0 <= index < len(self.shapes):
-            raise DataError(f"{section.where}: [{section.kind}] {key}={number} points to no earlier layer")
-        return index
-
-
-def _activation(section: Section, default: str) -> str:
-    name = section.text("activation", default)
-    if name not in ACTIVATIONS:
-        raise DataError(f"{section.where}: activation {name!r} is not supported; known: {', '.join(ACTIVATIONS)}")
-    return name

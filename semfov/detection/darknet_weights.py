@@ -42,7 +42,9 @@ def read_weights(network: Darknet, path: str | PathLike[str]) -> str:
         raise DataError(f"weights {str(path)!r}: expected {needed} bytes for this cfg, got {len(data)}: {fault}")
     numbers = torch.frombuffer(data, dtype=torch.float32, offset=start)
     if not bool(torch.isfinite(numbers).all()):
-        raise DataError(f"weights {str(path)!r}: expected finite numbers, so the file is damaged or no weights file")
+        raise DataError(
+            f"weights {str(path)!r}: expected finite numbers, so the file is damaged or no weights file"
+        )
     for layer in layers:
         numbers = _fill(layer, numbers, str(path))
     return hashlib.sha256(data).hexdigest()

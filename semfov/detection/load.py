@@ -19,8 +19,6 @@ from semfov.detection.weights import fetch
 from semfov.detection.yolo import YoloV3
 from semfov.errors import InputError, check, lookup
 
-WINOGRAD_TILE = 2
-
 
 def load_detector(name_or_path: str | PathLike[str], **options: Any) -> Detector:
     """A detector by its name or its file, ready for inference.
@@ -84,7 +82,7 @@ def load_yolo(
     network = Darknet(sections)
     digest = read_weights(network, fetch(name) if weights is None else weights)
     if winograd:
-        network.use_winograd(WINOGRAD_TILE)
+        network.use_winograd()
     network.eval().requires_grad_(False).to(device=device, dtype=dtype, memory_format=torch.channels_last)
     return YoloV3(
         network,

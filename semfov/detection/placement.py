@@ -86,9 +86,13 @@ def letterbox(
 
 
 def resize(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Bilinear resize of `(B, C, H, W)` to `(width, height)`, antialiased where it shrinks."""
+    """Bilinear resize of `(B, C, H, W)` to `(width, height)`, antialiased where it shrinks to less than half.
+
+    Up to there plain bilinear sees every pixel, and it is what detectors are trained on: antialiasing COCO's
+    photographs to 416 pixels costs YOLOv3-tiny a point of AP50.
+    """
     width, height = size
     if tuple(image.shape[-2:]) == (height, width):
         return image.clone()
-    shrinks = height < image.shape[-2] or width < image.shape[-1]
-    return F.interpolate(image, (height, width), mode="bilinear", align_corners=False, antialias=shrinks)
+    skips = 2 * height < image.shape[-2] or 2 * width < image.shape[-1]
+    return F.interpolate(image, (height, width), mode="bilinear", align_corners=False, antialias=skips)

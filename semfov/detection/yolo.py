@@ -36,7 +36,9 @@ def decode_yolo(
     tensor([[[12., 14., 20., 18.]]])
     """
     batch, channels, rows, columns = raw.shape
-    check(channels % len(anchors) == 0, "raw", f"a multiple of {len(anchors)} anchors as channels", tuple(raw.shape))
+    check(
+        channels % len(anchors) == 0, "raw", f"a multiple of {len(anchors)} anchors as channels", tuple(raw.shape)
+    )
     cells = raw.permute(0, 2, 3, 1).reshape(batch, rows, columns, len(anchors), -1)
     column = torch.arange(columns, device=raw.device, dtype=raw.dtype)
     row = torch.arange(rows, device=raw.device, dtype=raw.dtype)
@@ -80,7 +82,9 @@ class YoloV3(Detector):
         size = network.input_size if input_size is None else input_size
         multiple = f"a multiple of {network.stride}"
         check(all(n > 0 and n % network.stride == 0 for n in size), "input_size", f"{multiple} in both axes", size)
-        check(stride is None or (stride > 0 and stride % network.stride == 0), "stride", f"None or {multiple}", stride)
+        check(
+            stride is None or (stride > 0 and stride % network.stride == 0), "stride", f"None or {multiple}", stride
+        )
         for head in network.heads:
             check(head.classes == len(classes), "classes", f"{head.classes} names", len(classes))
         super().__init__(

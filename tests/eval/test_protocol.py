@@ -10,6 +10,7 @@ from eval.config import ProtocolConfig
 from eval.metrics import cumulative_performance, random_search
 from eval.protocol import Outcome, episodes_of, run_episodes, tie_noise
 from semfov import Evidence, fusion, search_policy
+from semfov.data.scene import Annotation
 
 CLASSES = ("cat", "cup", "person")
 
@@ -28,7 +29,8 @@ class Annotated:
         return list(range(100, 100 + len(self.boxes)))
 
     def annotation(self, index):
-        return self.boxes[index], self.labels[index], self.size
+        crowd = torch.zeros(len(self.labels[index]), dtype=torch.bool)
+        return Annotation(self.boxes[index], self.labels[index], crowd, self.size)
 
     def targets(self, index):
         return sorted(set(self.labels[index].tolist()))

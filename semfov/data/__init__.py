@@ -1,0 +1,33 @@
+"""Images, annotated scenes and where they come from."""
+
+from typing import TYPE_CHECKING, Any
+
+from semfov.data.classes import canonical_name, class_index
+from semfov.data.images import read_image
+from semfov.data.scene import Annotation, Scene, Scenes, box_coverage, legal_targets
+from semfov.data.scenes import EmbeddedScenes
+
+if TYPE_CHECKING:
+    from semfov.data.coco import CocoScenes
+
+__all__ = [
+    "Annotation",
+    "CocoScenes",
+    "EmbeddedScenes",
+    "Scene",
+    "Scenes",
+    "box_coverage",
+    "canonical_name",
+    "class_index",
+    "legal_targets",
+    "read_image",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # semfov.data.coco is also a program, which Python warns about when its package has imported it already
+    if name == "CocoScenes":
+        from semfov.data.coco import CocoScenes
+
+        return CocoScenes
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,293 @@
+"""Fetching the official COCO files: resumable, verified and unpacked file by file."""
+
+import argparse
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import stat
+import sys
+import time
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from http.client import HTTPException, HTTPResponse
+from pathlib import Path, PurePosixPath
+from urllib.error import HTTPError, URLError
+from urllib.request import Request, urlopen
+
+from semfov.errors import DataError, SemfovError, check, lookup
+
+ADDRESS = "http://images.cocodataset.org"
+_CHUNK = 1 << 20
+_TIMEOUT = 30.0
+_ATTEMPTS = 3
+
+
+@dataclass(frozen=True)
+class Archive:
+    """A zip file on the server.
+
+    Attributes:
+        path: where it lies below the server's address.
+        size: in bytes.
+        sha256: of the whole file.
+    """
+
+    path: str
+    size: int
+    sha256: str
+
+    @property
+    def name(self) -> str:
+        """File name."""
+        return PurePosixPath(self.path).name
+
+
+# COCO publishes no digests of its own; these are what many independent users of the files recorded.
+_ANNOTATIONS = Archive(
+    "annotations/annotations_trainval2017.zip",
+    252_907_541,
+    "113a836d90195ee1f884e704da6304dfaaecff1f023f49b6ca93c4aaae470268",
+)
+SPLITS = {
+    "val2017": Archive(
+        "zips/val2017.zip", 815_585_330, "4f7e2ccb2866ec5041993c9cf2a952bbed69647b115d0f74da7ce8f4bef82f05"
+    ),
+    "train2017": Archive(
+        "zips/train2017.zip", 19_336_861_798, "69a8bb58ea5f8f99d24875f21416de2e9ded3178e903f1f7603e283b9e06d929"
+    ),
+}
+
+
+def download_coco(split: str, root: str | os.PathLike[str], *, address: str = ADDRESS, keep: bool = False) -> None:
+    """Fetch a split's images into `root/<split>` and its boxes into `root/annotations/instances_<split>.json`.
+
+    What is there already is not fetched again; an interrupted transfer goes on where it stopped. Archives that lie
+    in `root` already are verified, used and left there.
+
+    Args:
+        split: `"val2017"` or `"train2017"`.
+        root: folder of the data set.
+        address: of the server, or of a mirror that has the same files under the same paths.
+        keep: keep the archives that were fetched.
+
+    Raises:
+        InputError: the split is unknown.
+        DataError: no network, no space, or a file that is not the official one.
+    """
+    images = SPLITS[lookup(split, SPLITS, "split")]
+    check(address.startswith(("http://", "https://")), "address", "http://... or https://...", repr(address))
+    fetch_split(split, Path(root), images, _ANNOTATIONS, address=address, keep=keep)
+
+
+def fetch_split(
+    split: str, root: Path, images: Archive, annotations: Archive, *, address: str, keep: bool, pause: float = 1.0
+) -> None:
+    """`download_coco` for any pair of archives."""
+    instances = f"annotations/instances_{split}.json"
+    try:
+        if _is_complete(root, split, instances):
+            return
+        for archive, members in ((annotations, instances), (images, f"{split}/")):
+            brought = root / archive.name
+            if brought.exists():
+                _verify(brought, archive, f"delete it, and run again to fetch {address}/{archive.path}")
+                unpack(brought, root, members)
+                continue
+            file = fetch(archive, root / ".download", address=address, pause=pause)
+            unpack(file, root, members)
+            if keep:
+                file.replace(brought)
+            else:
+                file.unlink()
+        with contextlib.suppress(OSError):  # another split's transfer may wait in it
+            (root / ".download").rmdir()
+    except OSError as error:
+        raise DataError(
+            f"{root}: cannot be written ({error.strerror or error}); check the folder and its disk"
+        ) from error
+
+
+def fetch(archive: Archive, folder: Path, *, address: str = ADDRESS, pause: float = 1.0) -> Path:
+    """Fetch an archive into `folder` and verify it; a transfer that breaks off goes on, `pause` seconds later.
+
+    Unfinished bytes wait in `<name>.part`, also from an earlier run; the file itself is there only when verified.
+    """
+    file, part = folder / archive.name, folder / f"{archive.name}.part"
+    if file.exists():
+        return file
+    folder.mkdir(parents=True, exist_ok=True)
+    _check_space(folder, archive, part)
+    failures = 0
+    while (before := _size(part)) < archive.size:
+        try:
+            _transfer(f"{address.rstrip('/')}/{archive.path}", archive, part)
+        except (URLError, HTTPException, ConnectionError, TimeoutError) as error:
+            failures = failures + 1 if _size(part) == before else 1
+            if failures == _ATTEMPTS:
+                reason = getattr(error, "reason", error)
+                raise DataError(
+                    f"{address}/{archive.path}: transfer failed at {_size(part):,} of {archive.size:,} bytes "
+                    f"({reason}); run again to resume, or copy {archive.name} into the data set's folder"
+                ) from None
+            time.sleep(pause * failures)
+    try:
+        _verify(part, archive, "it was deleted; run again")
+    except DataError:
+        part.unlink()
+        raise
+    part.replace(file)
+    return file
+
+
+def unpack(file: Path, root: Path, members: str) -> None:
+    """Unpack what lies under `members` in a zip file; every file appears whole or not at all.
+
+    Files that are there with the right content are left alone, so an interrupted run goes on.
+    """
+    from tqdm import tqdm
+
+    try:
+        with zipfile.ZipFile(file) as archive:
+            wanted = [m for m in archive.infolist() if m.filename.startswith(members) and not m.is_dir()]
+            if not wanted:
+                raise DataError(f"{file}: expected {members} in it, got none; delete the file and run again")
+            for member in tqdm(wanted, desc=f"unpacking {file.name}", unit="file", disable=None):
+                target = _inside(root, member, file)
+                if _is_unpacked(target, member):
+                    continue
+                target.parent.mkdir(parents=True, exist_ok=True)
+                part = target.with_name(f"{target.name}.part")
+                with archive.open(member) as source, part.open("wb") as sink:
+                    shutil.copyfileobj(source, sink, _CHUNK)
+                part.replace(target)
+    except zipfile.BadZipFile as error:
+        raise DataError(f"{file}: damaged zip file ({error}); delete it and run again") from None
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`python -m semfov.data.coco`."""
+    parser = argparse.ArgumentParser(
+        prog="python -m semfov.data.coco",
+        description="Fetch the official COCO 2017 photographs and their boxes. An interrupted run is resumed by "
+        "the same command; files that are there already are not fetched again.",
+        epilog="Without a network, bring the zip files from elsewhere, put them into DIR and run the same command.",
+    )
+    parser.add_argument(
+        "split", choices=sorted(SPLITS), help="val2017: 5,000 images, 1.1 GB; train2017: 118,287, 20 GB"
+    )
+    parser.add_argument("--root", required=True, metavar="DIR", help="folder of the data set; made if need be")
+    parser.add_argument("--address", default=ADDRESS, metavar="URL", help="server or mirror (default: %(default)s)")
+    parser.add_argument("--keep", action="store_true", help="keep the zip files that were fetched")
+    options = parser.parse_args(arguments)
+    try:
+        download_coco(options.split, options.root, address=options.address, keep=options.keep)
+    except SemfovError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted; run the same command to resume", file=sys.stderr)
+        return 130
+    root = Path(options.root)
+    print(f"data.root: {root / options.split}")
+    print(f"data.annotations: {root / 'annotations' / f'instances_{options.split}.json'}")
+    return 0
+
+
+def _transfer(url: str, archive: Archive, part: Path) -> None:
+    """Append what is missing to `part`; returns also when the server stops early."""
+    from tqdm import tqdm
+
+    start = _size(part)
+    try:
+        response: HTTPResponse = urlopen(Request(url, headers={"Range": f"bytes={start}-"}), timeout=_TIMEOUT)
+    except HTTPError as error:
+        error.close()
+        if error.code >= 500:
+            raise
+        raise DataError(f"{url}: the server answers {error.code} {error.reason}; check the address") from None
+    with response:
+        if response.status != 206:  # the server knows no ranges and sends the whole
+            start = 0
+        length = response.headers.get("Content-Length")
+        if length is not None and start + int(length) != archive.size:
+            raise DataError(
+                f"{url}: expected {archive.size:,} bytes, the server has {start + int(length):,}; check the address"
+            )
+        bar = tqdm(
+            total=archive.size,
+            initial=start,
+            desc=archive.name,
+            unit="B",
+            unit_scale=True,
+            unit_divisor=1024,
+            disable=None,
+        )
+        with bar, part.open("r+b" if start else "wb") as sink:
+            sink.seek(start)
+            while chunk := _read(response):
+                sink.write(chunk)
+                bar.update(len(chunk))
+                if sink.tell() > archive.size:
+                    sink.truncate(0)
+                    raise DataError(
+                        f"{url}: expected {archive.size:,} bytes, the server sends more; check the address"
+                    )
+    if _size(part) < archive.size:
+        raise ConnectionError("the connection closed early")
+
+
+def _read(response: HTTPResponse) -> bytes:
+    try:
+        return response.read(_CHUNK)
+    except OSError as error:  # of the network; errors of the disk stay what they are
+        raise ConnectionError(error) from error
+
+
+def _verify(file: Path, archive: Archive, remedy: str) -> None:
+    with file.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    if digest != archive.sha256:
+        raise DataError(f"{file}: expected sha256 {archive.sha256}, got {digest}; {remedy}")
+
+
+def _is_unpacked(target: Path, member: zipfile.ZipInfo) -> bool:
+    right_size = target.is_file() and target.stat().st_size == member.file_size
+    return right_size and zlib.crc32(target.read_bytes()) == member.CRC
+
+
+def _inside(root: Path, member: zipfile.ZipInfo, file: Path) -> Path:
+    """Where a member goes, refusing names that lead out of `root` and links."""
+    path = PurePosixPath(member.filename)
+    if ".." in path.parts or path.is_absolute() or "\\" in member.filename or ":" in member.filename:
+        raise DataError(f"{file}: holds a file with the unsafe name {member.filename!r}; delete it")
+    if stat.S_ISLNK(member.external_attr >> 16):
+        raise DataError(f"{file}: holds the link {member.filename!r}; delete it")
+    return root.joinpath(*path.parts)
+
+
+def _check_space(folder: Path, archive: Archive, part: Path) -> None:
+    needed = 2 * archive.size - _size(part)  # the archive, and its files beside it
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise DataError(
+            f"{folder}: expected {needed / 1e9:.1f} GB of free space for {archive.name} and its files, "
+            f"got {free / 1e9:.1f} GB; free some or choose another --root"
+        )
+
+
+def _size(file: Path) -> int:
+    return file.stat().st_size if file.exists() else 0
+
+
+def _is_complete(root: Path, split: str, instances: str) -> bool:
+    try:
+        images = json.loads((root / instances).read_bytes())["images"]
+        return {image["file_name"] for image in images} <= set(os.listdir(root / split))
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except (ValueError, KeyError, TypeError):  # not the official file, which will replace it
+        return False

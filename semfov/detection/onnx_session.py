@@ -1,0 +1,142 @@
+"""An ONNX model in onnxruntime, called with torch tensors."""
+
+from collections.abc import Callable, Sequence
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from semfov.errors import DataError, InputError, check
+
+FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
+
+# Further inputs that exported detectors have, made from the canvas: sizes and scales to map boxes with.
+EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
+    "orig_target_sizes": lambda canvas: _repeat(canvas, [canvas.shape[-1], canvas.shape[-2]]),
+    "im_shape": lambda canvas: _repeat(canvas, [canvas.shape[-2], canvas.shape[-1]]).to(canvas.dtype),
+    "scale_factor": lambda canvas: canvas.new_ones(canvas.shape[0], 2),
+}
+
+
+class OnnxSession:
+    """One inference session on one file.
+
+    Spinning is off: threads of a pool that spin slow the next torch operation by an order of magnitude.
+
+    Args:
+        path: the model.
+        threads: threads of an operation; None follows `torch.get_num_threads()`.
+        device: `"cpu"`, or `"cuda"` where onnxruntime has the CUDA provider.
+        spinning: let idle threads spin; for measurements only.
+
+    Attributes:
+        image: name of the input that takes the image.
+        shape: its shape, None where it is dynamic.
+        outputs: name and shape of every output, None where a size is dynamic.
+        metadata: the model's own key-value pairs.
+        producer: what the file says made it.
+
+    Raises:
+        DataError: no such file, or no model that onnxruntime can run.
+        InputError: the model has inputs that nothing is known of, or the device is not there.
+    """
+
+    def __init__(
+        self,
+        path: str | PathLike[str],
+        *,
+        threads: int | None = None,
+        device: torch.device | str = "cpu",
+        spinning: bool = False,
+    ) -> None:
+        import onnxruntime as ort
+
+        self.path, self.spinning = Path(path), spinning
+        self.threads = torch.get_num_threads() if threads is None else threads
+        check(self.threads > 0, "threads", "at least one", self.threads)
+        self.device = torch.device(device)
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = self.threads
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 3  # some exporters leave a warning for every initialiser
+        options.add_session_config_entry("session.intra_op.allow_spinning", str(int(spinning)))
+        if not self.path.is_file():
+            raise DataError(f"no ONNX model {str(path)!r}")
+        try:
+            self._session = ort.InferenceSession(fspath(path), options, providers=_providers(self.device))
+        except InputError:
+            raise
+        except Exception as error:  # onnxruntime's own exceptions share no base class
+            raise DataError(f"cannot load the ONNX model {str(path)!r}: {error}") from error
+        meta = self._session.get_modelmeta()
+        self.metadata: dict[str, str] = dict(meta.custom_metadata_map)
+        self.producer: str = meta.producer_name
+        self.outputs = tuple((o.name, _sizes(o.shape)) for o in self._session.get_outputs())
+        self.image, self.shape, self._dtype, self._extra = self._inputs()
+
+    def _inputs(self) -> tuple[str, tuple[int | None, ...], torch.dtype, list[str]]:
+        """Name, shape and dtype of the image input, and the names of the others."""
+        inputs = self._session.get_inputs()
+        images = [i for i in inputs if len(i.shape) == 4 and i.type in FLOATS]
+        found = ", ".join(f"{i.name} {i.shape} {i.type}" for i in inputs)
+        if len(images) != 1 or _sizes(images[0].shape)[1] not in (3, None):
+            raise InputError(f"{self.path.name}: expected one floating-point input (B, 3, H, W), got {found}")
+        extra = [i.name for i in inputs if i is not images[0]]
+        if not set(extra) <= set(EXTRA_INPUTS):
+            raise InputError(f"{self.path.name}: expected inputs image, {', '.join(EXTRA_INPUTS)}, got {found}")
+        return images[0].name, _sizes(images[0].shape), FLOATS[images[0].type], extra
+
+    def __call__(self, image: Tensor) -> dict[str, Tensor]:
+        """Outputs by name, on the device and in the dtype of `image` `(B, 3, H, W)`; no gradients.
+
+        A model with a fixed batch size is run as often as needed.
+        """
+        batch, fixed = image.shape[0], self.shape[0]
+        check(batch > 0, "image", "at least one image", batch)
+        size = batch if fixed is None else fixed
+        source = image.detach().to(device="cpu", dtype=self._dtype)
+        short = -batch % size
+        if short:
+            source = torch.cat([source, source[-1:].expand(short, -1, -1, -1)])
+        runs = [self._run(part.contiguous()) for part in source.split(size)]
+        return {
+            name: torch.cat([run[name] for run in runs])[:batch].to(image)
+            if runs[0][name].is_floating_point()
+            else torch.cat([run[name] for run in runs])[:batch].to(image.device)
+            for name, _ in self.outputs
+        }
+
+    def _run(self, image: Tensor) -> dict[str, Tensor]:
+        feed = {self.image: image.numpy()} | {name: EXTRA_INPUTS[name](image).numpy() for name in self._extra}
+        names = [name for name, _ in self.outputs]
+        return dict(zip(names, map(torch.from_numpy, self._session.run(names, feed)), strict=True))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _reopen, (self.path, self.threads, self.device, self.spinning)
+
+
+def _reopen(path: Path, threads: int, device: torch.device, spinning: bool) -> OnnxSession:
+    return OnnxSession(path, threads=threads, device=device, spinning=spinning)
+
+
+def _providers(device: torch.device) -> list[Any]:
+    """Execution providers for a device, the CPU's behind it for operations that it has not."""
+    import onnxruntime as ort
+
+    if device.type == "cpu":
+        return ["CPUExecutionProvider"]
+    provider = f"{device.type.upper()}ExecutionProvider"
+    if provider not in ort.get_available_providers():
+        have = ", ".join(ort.get_available_providers())
+        raise InputError(f"device: expected one that onnxruntime can use, got {device} (its providers: {have})")
+    return [(provider, {"device_id": device.index or 0}), "CPUExecutionProvider"]
+
+
+def _sizes(shape: Sequence[int | str | None]) -> tuple[int | None, ...]:
+    return tuple(size if isinstance(size, int) and size > 0 else None for size in shape)
+
+
+def _repeat(canvas: Tensor, row: list[int]) -> Tensor:
+    return torch.tensor([row]).expand(canvas.shape[0], -1).contiguous()

@@ -1,0 +1,68 @@
+"""What a network wants its input to look like, as data that can stand beside the model."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Literal, Self, get_args
+
+from torch import Tensor
+
+from semfov.errors import check, check_shape, lookup
+
+ChannelOrder = Literal["rgb", "bgr"]
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """From a canvas, RGB in [0, 1], to the input of a network: `(canvas · scale - mean) / std`.
+
+    Attributes:
+        channels: order of the network's channels.
+        scale: value of white before mean and std; 255 for networks that take bytes.
+        mean: subtracted from each channel, in the network's channel order and after `scale`.
+        std: divides each channel.
+        stretch: the image fills the canvas; False keeps its proportions and pads (letterbox).
+        fill: padding value of the canvas, in [0, 1].
+
+    >>> import torch
+    >>> Preprocessing(channels="bgr", scale=255.0)(torch.ones(1, 3, 1, 1)).flatten()
+    tensor([255., 255., 255.])
+    """
+
+    channels: ChannelOrder = "rgb"
+    scale: float = 1.0
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    stretch: bool = False
+    fill: float = 114 / 255
+
+    def __post_init__(self) -> None:
+        lookup(self.channels, get_args(ChannelOrder), "channel order")
+        for name in ("mean", "std"):
+            values = tuple(float(value) for value in getattr(self, name))
+            check(len(values) == 3, f"preprocessing.{name}", "three numbers", values)
+            object.__setattr__(self, name, values)
+        check(all(value > 0 for value in self.std), "preprocessing.std", "positive numbers", self.std)
+        check(self.scale > 0, "preprocessing.scale", "a positive number", self.scale)
+        check(0 <= self.fill <= 1, "preprocessing.fill", "a number in [0, 1]", self.fill)
+
+    def __call__(self, canvas: Tensor) -> Tensor:
+        """Canvas `(B, 3, H, W)` -> input of the network, a new tensor of the same shape."""
+        check_shape(canvas, "canvas", None, 3, None, None)
+        image = canvas.flip(1) if self.channels == "bgr" else canvas
+        factor = canvas.new_tensor([self.scale / std for std in self.std]).view(3, 1, 1)
+        shift = canvas.new_tensor([mean / std for mean, std in zip(self.mean, self.std, strict=True)]).view(3, 1, 1)
+        return image * factor - shift
+
+    def merged(self, settings: Mapping[str, Any]) -> Self:
+        """The same with some settings replaced; unknown names are refused."""
+        for name in settings:
+            lookup(name, [field.name for field in fields(self)], "preprocessing setting")
+        return replace(self, **settings)
+
+    def settings(self) -> dict[str, Any]:
+        """All settings, as JSON takes them."""
+        return {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self).items()}
+
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)

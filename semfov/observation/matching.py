@@ -1,0 +1,52 @@
+"""Which object a detection shows: greedy matching of detected to annotated boxes."""
+
+import torch
+from torch import Tensor
+
+from semfov.errors import check_shape
+
+
+def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
+    """Intersection over union of every two boxes, `(M, 4)` and `(N, 4)` -> `(M, N)`; 0 for boxes without area.
+
+    >>> box_iou(torch.tensor([[0.0, 0, 2, 2]]), torch.tensor([[1.0, 0, 3, 2], [5, 5, 6, 6]]))
+    tensor([[0.3333, 0.0000]])
+    """
+    check_shape(boxes, "boxes", None, 4)
+    check_shape(others, "others", None, 4)
+    low = torch.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = torch.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    shared = (high - low).clamp(min=0).prod(-1)
+    area, other_area = ((b[:, 2:] - b[:, :2]).clamp(min=0).prod(-1) for b in (boxes, others))
+    union = area[:, None] + other_area[None] - shared
+    return torch.where(union > 0, shared / union, 0.0)
+
+
+def match(boxes: Tensor, truth: Tensor, labels: Tensor, *, iou: float = 0.5) -> Tensor:
+    """True class of each detection, 0 (background) where it shows no object.
+
+    Detections choose in their order (most confident first) the object that they overlap most among those not taken,
+    if the overlap is at least `iou`; no object is matched twice. The detected class plays no part.
+
+    Args:
+        boxes: `(L, 4)`, detections, most confident first.
+        truth: `(M, 4)`, annotated boxes.
+        labels: `(M,)`, their classes, 1..K.
+        iou: least intersection over union.
+
+    Returns:
+        `(L,)`, class indices.
+
+    >>> match(torch.tensor([[0.0, 0, 9, 9], [0, 0, 8, 8]]), torch.tensor([[0.0, 0, 9, 9]]), torch.tensor([7]))
+    tensor([7, 0])
+    """
+    overlap = box_iou(boxes, truth)
+    matched = labels.new_zeros(len(boxes))
+    if overlap.numel() == 0:
+        return matched
+    for detection in range(len(boxes)):
+        best, index = overlap[detection].max(0)
+        if best >= iou:
+            matched[detection] = labels[index]
+            overlap[:, index] = -1.0
+    return matched

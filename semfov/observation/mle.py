@@ -1,0 +1,313 @@
+"""Maximum-likelihood Dirichlets from mean log sufficient statistics, many at once."""
+
+import math
+from collections.abc import Callable
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from semfov.errors import SemfovError, check, check_finite, check_shape, lookup
+
+Method = Literal["newton", "fixed_point", "gradient"]
+
+# Below this, the inverse of ψ is read off ψ(x) ≈ -1/x - γ, above it off ψ(x) ≈ ln(x - 1/2) (Minka 2000).
+_KNEE = -2.22
+_EULER = 0.5772156649015329
+# Rounding of float64 can leave this much of Σ exp(mean_log) above 1 in statistics that came in float32.
+_FEASIBLE = 1e-5
+# No step changes the logarithm of a parameter by more.
+_LONGEST = 2.0
+# Newton's steps that change every parameter by less than a tenth are taken as they are.
+_SAFE = 0.1
+_ROUNDS = 60
+
+
+def mle(mean_log: Tensor, *, method: Method = "newton", max_precision: float = 1e8) -> Tensor:
+    r"""Maximum-likelihood parameters of Dirichlets, from the mean of the logarithms of their samples.
+
+    .. math:: \max_\alpha \; \ln\Gamma(A) - \sum_k \ln\Gamma(\alpha_k) + \sum_k (\alpha_k - 1) g_k, \quad
+              A = \sum_k \alpha_k, \quad g_k = \frac{1}{n} \sum_i \ln s_{ik}
+
+    The objective is concave, and has a maximum where `Σ exp(g) < 1`. All methods find the same one:
+
+    - `newton`: the Hessian is diagonal plus rank one, so that a step costs O(K) (Minka 2000, "Estimating a Dirichlet
+      distribution", equations 15 to 18); taken on `ln α`, which keeps α positive, and halved until it climbs.
+    - `fixed_point`: `ψ(α_k) = ψ(A) + g_k` (Minka 2000, equation 9). On its own each round leaves a fixed share of the
+      error, nearly all where A is large; as that share is known, A is moved all the way at once.
+    - `gradient`: L-BFGS on `ln α`, in coordinates in which the Fisher information is the identity.
+
+    Identical samples have `Σ exp(g) = 1` and a likelihood without bound. The precision A is kept to at most
+    `max_precision`; the result is then the maximum among Dirichlets of that precision.
+
+    Computed in float64. Differentiable in `mean_log` (once, by the implicit function theorem).
+
+    Args:
+        mean_log: `(..., K)`, K ≥ 2; mean log scores. For scores with zeros see `semfov.dirichlet.floor`, for little
+            or no data `semfov.dirichlet.shrink`.
+        method: how the maximum is found.
+        max_precision: upper bound of A.
+
+    Returns:
+        α, `(..., K)`.
+
+    Raises:
+        InputError: `mean_log` is not finite, or no sample of the simplex can have it.
+
+    >>> mle(torch.tensor([-1.0, -1.0]))
+    tensor([1.5674, 1.5674])
+    """
+    check_shape(mean_log, "mean_log", None)
+    components = mean_log.shape[-1]
+    check(components >= 2, "mean_log", "at least 2 components", components)
+    check_finite(mean_log, "mean_log")
+    check(max_precision > 0, "max_precision", "a positive number", max_precision)
+    solve = _METHODS[lookup(method, get_args(Method), "method")]
+    rows = mean_log.detach().to(torch.float64).reshape(-1, components)
+    total = rows.exp().sum(-1)
+    largest = float(total.max()) if len(rows) else 0.0
+    check(largest <= 1 + _FEASIBLE, "mean_log", "means of logarithms of scores that sum to 1", f"Σ exp = {largest}")
+
+    capped = _reaches(rows, total, max_precision)
+    alpha = torch.empty_like(rows)
+    alpha[capped] = _at_precision(rows[capped], max_precision)
+    alpha[~capped] = solve(rows[~capped])
+    if mean_log.requires_grad and torch.is_grad_enabled():
+        moved = mean_log.to(torch.float64).reshape(-1, components)
+        alpha = alpha + _response(alpha, moved - rows, capped)
+    return alpha.reshape(mean_log.shape).to(mean_log.dtype)
+
+
+def shrink(mean_log: Tensor, count: Tensor, parent: Tensor, strength: float) -> Tensor:
+    r"""Mean logs of cells with little data, drawn towards those of a parent by pseudo-counts.
+
+    .. math:: g = \frac{n \bar g + w \, g_0}{n + w}
+
+    The MLE of the result is the MAP estimate under the conjugate prior of `w` samples with mean log `g_0`. Where the
+    parent is feasible, `Σ exp(g_0) < 1`, so is the result, whatever the data.
+
+    Args:
+        mean_log: `(..., K)`, mean logs of the cells; not read where `count` is 0.
+        count: `(...)`, samples n of each cell.
+        parent: `(..., K)`, mean logs of the parent.
+        strength: pseudo-counts w, positive.
+
+    >>> shrink(torch.tensor([-2.0, -1.0]), torch.tensor(1), torch.tensor([-1.0, -1.0]), 1.0)
+    tensor([-1.5000, -1.0000])
+    """
+    check(strength > 0, "strength", "a positive number of pseudo-counts", strength)
+    count = count.to(mean_log.dtype)[..., None]
+    share = count / (count + strength)
+    return parent + share * torch.where(share > 0, mean_log - parent, 0.0)
+
+
+def vacuous(components: int) -> Tensor:
+    """Mean logs of Dir(1, ..., 1), the uniform density on the simplex, `(K,)` in float64: `ψ(1) - ψ(K)`.
+
+    >>> mle(vacuous(3))
+    tensor([1.0000, 1.0000, 1.0000], dtype=torch.float64)
+    """
+    digamma = torch.tensor([1.0, components], dtype=torch.float64).digamma()
+    return (digamma[0] - digamma[1]).expand(components).clone()
+
+
+def inverse_digamma(y: Tensor) -> Tensor:
+    """The positive x with ψ(x) = y, by Newton's method (Minka 2000, appendix C).
+
+    >>> inverse_digamma(torch.digamma(torch.tensor([0.01, 1.0, 100.0], dtype=torch.float64)))
+    tensor([1.0000e-02, 1.0000e+00, 1.0000e+02], dtype=torch.float64)
+    """
+    x = _guess(y)
+    for _ in range(5):
+        x = x - (x.digamma() - y) / _trigamma(x)
+    return x
+
+
+def _guess(y: Tensor) -> Tensor:
+    return torch.where(y >= _KNEE, y.exp() + 0.5, -1 / (y.clamp(max=_KNEE) + _EULER))
+
+
+def _trigamma(x: Tensor) -> Tensor:
+    return torch.polygamma(1, x)
+
+
+def _reaches(rows: Tensor, total: Tensor, precision: float) -> Tensor:
+    """Which rows have their maximum at `precision` or above.
+
+    The right side of A = Σ ψ⁻¹(ψ(A) + g) is above the left below the solution, and nowhere above A Σ exp(g) + K/2.
+    """
+    reaches = 1 - total <= rows.shape[-1] / (2 * precision)
+    level = total.new_tensor(precision).digamma()
+    reaches[reaches.clone()] = inverse_digamma(level + rows[reaches]).sum(-1) >= precision
+    return reaches
+
+
+def _at_precision(rows: Tensor, precision: float) -> Tensor:
+    """Maximum under Σ α = precision: ψ(α_k) = y + g_k, where y makes the sum right."""
+    level = math.log(precision) - rows.logsumexp(-1, keepdim=True)
+    for _ in range(_ROUNDS):
+        alpha = inverse_digamma(level + rows)
+        total = alpha.sum(-1, keepdim=True)
+        step = (precision / total).log() * total / _trigamma(alpha).reciprocal().sum(-1, keepdim=True)
+        level = level + step
+        if bool((step.abs() <= 1e-12 * level.abs().clamp(min=1)).all()):
+            break
+    return alpha * (precision / total)
+
+
+def _first_guess(rows: Tensor) -> Tensor:
+    """Parameters within some ten per cent: A = Σ ψ⁻¹(ψ(A) + g) solved with a rough inverse of ψ."""
+    slack = (-torch.expm1(rows.logsumexp(-1, keepdim=True))).clamp(min=torch.finfo(rows.dtype).eps)
+    log_precision = ((rows.shape[-1] - 1) / 2 / slack).log()
+    for _ in range(3):
+        precision = log_precision.exp()
+        level = precision.digamma() + rows
+        alpha = _guess(level)
+        rates = torch.where(level >= _KNEE, alpha - 0.5, alpha.square())
+        total = alpha.sum(-1, keepdim=True)
+        slope = precision * _trigamma(precision) * rates.sum(-1, keepdim=True) / total - 1
+        step = (total.log() - log_precision) / slope.clamp(max=-1e-9)
+        log_precision = log_precision - step.clamp(-_LONGEST, _LONGEST)
+    return _guess(log_precision.exp().digamma() + rows)
+
+
+def _residual(alpha: Tensor, rows: Tensor) -> Tensor:
+    """Gradient of the mean log likelihood in α: ψ(A) - ψ(α_k) + g_k."""
+    return alpha.sum(-1, keepdim=True).digamma() - alpha.digamma() + rows
+
+
+def _response(alpha: Tensor, change: Tensor, capped: Tensor | None = None) -> Tensor:
+    """Solve `(diag ψ'(α) - ψ'(A)) x = change`: how far the maximum moves when the mean logs change.
+
+    Where a row is `capped`, under Σ x = 0.
+    """
+    rates = _trigamma(alpha).reciprocal()
+    total, precision = rates.sum(-1, keepdim=True), alpha.sum(-1, keepdim=True)
+    outer = 1 / (1 / _trigamma(precision) - total)
+    if capped is not None:
+        outer = torch.where(capped[:, None], -1 / total, outer)
+    direct = rates * change
+    return direct + rates * outer * direct.sum(-1, keepdim=True)
+
+
+def _tolerance(precision: Tensor) -> Tensor:
+    """Relative change of the parameters that counts as none; rounding of ψ leaves about 1e-15 A of it."""
+    return 1e-8 + 1e-14 * precision
+
+
+def _objective(alpha: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean log likelihood of each row but for Σ g, and a bound on its rounding error."""
+    outer, inner, linear = alpha.sum(-1).lgamma(), alpha.lgamma(), alpha * rows
+    value = outer + (linear - inner).sum(-1)
+    size = outer.abs() + (inner.abs() + linear.abs()).sum(-1)
+    return value, 16 * torch.finfo(alpha.dtype).eps * size
+
+
+def _newton(rows: Tensor) -> Tensor:
+    result = _first_guess(rows)
+    active = torch.arange(len(rows), device=rows.device)
+    alpha = result.clone()
+    for _ in range(_ROUNDS):
+        step = _response(alpha, _residual(alpha, rows)) / alpha
+        length = step.abs().amax(-1)
+        going = length > _tolerance(alpha.sum(-1))
+        far = length > _SAFE
+        step[far] = _climbing(alpha[far], step[far], rows[far])
+        alpha = alpha * step.exp()
+        result[active] = alpha
+        active, alpha, rows = active[going], alpha[going], rows[going]
+        if len(active) == 0:
+            return result
+    raise _not_converged("newton", len(active))
+
+
+def _climbing(alpha: Tensor, step: Tensor, rows: Tensor) -> Tensor:
+    """Shorten each step on ln α to at most `_LONGEST`, then halve it until the likelihood does not fall."""
+    step = step * (_LONGEST / step.abs().amax(-1, keepdim=True)).clamp(max=1.0)
+    value, rounding = _objective(alpha, rows)
+    for _ in range(_ROUNDS if len(rows) else 0):
+        falls = _objective(alpha * step.exp(), rows)[0] < value - rounding
+        if not bool(falls.any()):
+            break
+        step = torch.where(falls[:, None], step / 2, step)
+    return step
+
+
+def _fixed_point(rows: Tensor) -> Tensor:
+    result = torch.empty_like(rows)
+    active = torch.arange(len(rows), device=rows.device)
+    precision = _first_guess(rows).sum(-1)
+    for _ in range(_ROUNDS):
+        alpha = inverse_digamma(precision.digamma()[:, None] + rows)
+        result[active] = alpha
+        total = alpha.sum(-1)
+        # What is left of an error after the round: d ln(Σ α) / d ln(A).
+        left = precision * _trigamma(precision) * _trigamma(alpha).reciprocal().sum(-1) / total
+        step = (total / precision).log() / (1 - left).clamp(min=torch.finfo(rows.dtype).eps)
+        going = step.abs() > _tolerance(total)
+        precision = (precision * step.clamp(-_LONGEST, _LONGEST).exp())[going]
+        active, rows = active[going], rows[going]
+        if len(active) == 0:
+            return result
+    raise _not_converged("fixed_point", len(active))
+
+
+def _gradient(rows: Tensor) -> Tensor:
+    alpha, distance = _first_guess(rows), torch.inf
+    for _ in range(_ROUNDS if len(rows) else 0):
+        # Close to the maximum the likelihood changes by less than its rounding, so a line search would stall.
+        alpha = _descend(alpha, rows, "strong_wolfe" if distance > 1e-3 else None)
+        step = (_response(alpha, _residual(alpha, rows)) / alpha).abs().amax(-1)
+        if bool((step <= _tolerance(alpha.sum(-1))).all()):
+            return alpha
+        distance = float(step.max())
+    if len(rows):
+        raise _not_converged("gradient", len(rows))
+    return alpha
+
+
+def _descend(start: Tensor, rows: Tensor, line_search: str | None) -> Tensor:
+    """One run of L-BFGS from `start`.
+
+    The Fisher information of ln α is `diag(α² ψ'(α)) - ψ'(A) α αᵀ`: scaling by `across` takes the diagonal to 1, and
+    `along` is the one direction in which the rank-one part leaves another value than 1.
+    """
+    rates = _trigamma(start).reciprocal()
+    total = rates.sum(-1, keepdim=True)
+    rest = (1 - _trigamma(start.sum(-1, keepdim=True)) * total).clamp(min=torch.finfo(rows.dtype).eps)
+    across, along = rates.sqrt() / start, rates / start * (total * rest).rsqrt()
+    offset = torch.zeros_like(rows, requires_grad=True)
+    shift = torch.zeros_like(total, requires_grad=True)
+    outer, inner = start.sum(-1).lgamma(), start.lgamma()
+    optimiser = torch.optim.LBFGS(
+        [offset, shift], max_iter=25, tolerance_grad=1e-13, tolerance_change=0, line_search_fn=line_search
+    )
+
+    def current() -> Tensor:
+        return start * (offset * across + shift * along).exp()
+
+    @torch.enable_grad()
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        alpha = current()
+        # Term by term against the start, which keeps digits that the difference of two sums would lose.
+        gain = (
+            (alpha.sum(-1).lgamma() - outer) - (alpha.lgamma() - inner).sum(-1) + ((alpha - start) * rows).sum(-1)
+        )
+        lost = -gain.sum()
+        lost.backward()
+        return lost
+
+    optimiser.step(loss)
+    return current().detach()
+
+
+def _not_converged(method: str, rows: int) -> SemfovError:
+    return SemfovError(f"mle: method {method!r} has not converged after {_ROUNDS} rounds in {rows} Dirichlets")
+
+
+_METHODS: dict[str, Callable[[Tensor], Tensor]] = {
+    "newton": _newton,
+    "fixed_point": _fixed_point,
+    "gradient": _gradient,
+}

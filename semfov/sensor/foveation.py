@@ -1,0 +1,178 @@
+"""The foveal sensor: an image that is sharp around a fixation and ever coarser away from it."""
+
+import torch
+from torch import Tensor, nn
+
+from semfov.errors import check, check_finite, check_shape
+from semfov.sensor.pyramid import Bands, Convention, laplacian_pyramid, pyrup
+
+
+def foveate(
+    image: Tensor | Bands,
+    gaze: Tensor,
+    *,
+    sigma: float | Tensor,
+    levels: int = 5,
+    growth: float | Tensor = 2.0,
+    convention: Convention = "kornia",
+) -> Tensor:
+    r"""Foveate images around fixations.
+
+    Each band of a Laplacian pyramid is weighted with a Gaussian window around the fixation, and the pyramid put
+    together again (Almeida, Figueiredo, Bernardino and Santos-Victor, 2018):
+
+    .. math:: R_K = G_K, \quad R_k = w_k L_k + \mathrm{expand}(R_{k+1}), \quad
+              w_k(x, y) = \exp\left(-\frac{(x-x_0)^2 + (y-y_0)^2}{2 \sigma_k^2}\right), \quad
+              \sigma_k = \sigma \cdot g^k
+
+    which is `expand^K(G_K) + Σ_k expand^k(w_k L_k)`. A window is evaluated at the places in the image where the
+    pixels of its band lie: pixel i of band k at `(i + ½) · W / W_k − ½` with Kornia's pyramid, at `2^k i` with
+    OpenCV's.
+
+    Args:
+        image: `(B, C, H, W)`, or a pyramid of it from `Foveation.pyramid`, which any number of fixations can share
+            (`levels` and `convention` are then the pyramid's).
+        gaze: fixation `(x, y)` in image pixels, inside or outside: `(2,)` for all images, `(B, 2)` one for each, or
+            `(B, G, 2)` G for each.
+        sigma: width σ of the fovea in image pixels: a number, `()`, `(B,)`, or `(B, 2)` for widths along x and y.
+            Infinity gives the image back.
+        levels: number of bands, K.
+        growth: factor g by which the window of each coarser band is wider; 2 is the published sensor, 1 a sharp
+            disc.
+        convention: `kornia` or `opencv` (`semfov.sensor.pyramid`).
+
+    Returns:
+        `(B, C, H, W)`, or `(B, G, C, H, W)` for G fixations.
+
+    Raises:
+        InputError: a shape does not fit, the gaze is not finite, or σ or growth is not positive.
+
+    >>> image = torch.rand(1, 3, 48, 64)
+    >>> foveate(image, torch.tensor([32.0, 24.0]), sigma=10.0).shape
+    torch.Size([1, 3, 48, 64])
+    >>> foveate(image, torch.rand(1, 7, 2), sigma=10.0).shape
+    torch.Size([1, 7, 3, 48, 64])
+    """
+    bands = image if isinstance(image, Bands) else laplacian_pyramid(image, levels, convention)
+    batch = bands.base.shape[0]
+    check_shape(gaze, "gaze", 2)
+    many = gaze.ndim == 3
+    check(
+        gaze.ndim <= 3 and gaze.shape[0] == (2 if gaze.ndim == 1 else batch),
+        "gaze",
+        _shapes(batch),
+        tuple(gaze.shape),
+    )
+    _check_values(gaze, sigma, growth)
+    fixation = gaze.to(bands.base) if many else gaze.to(bands.base).expand(batch, 2)[:, None]
+    width = _widths(sigma, bands.base)
+    return _collapse(bands, fixation, width, growth) if many else _collapse(bands, fixation, width, growth)[:, 0]
+
+
+class Foveation(nn.Module):
+    """A foveal sensor, see `foveate`.
+
+    Args:
+        sigma: width of the fovea in image pixels.
+        levels: number of bands of the pyramid.
+        growth: factor by which the window of each coarser band is wider.
+        convention: `kornia` or `opencv` pyramid.
+        learnable: make σ a parameter (its logarithm is what is learnt, so that it stays positive).
+
+    >>> sensor = Foveation(20.0)
+    >>> bands = sensor.pyramid(torch.rand(2, 3, 64, 64))
+    >>> views = [sensor(bands, torch.tensor([x, 32.0])) for x in (16.0, 48.0)]
+    """
+
+    def __init__(
+        self,
+        sigma: float,
+        levels: int = 5,
+        growth: float = 2.0,
+        convention: Convention = "kornia",
+        *,
+        learnable: bool = False,
+    ) -> None:
+        super().__init__()
+        check(sigma > 0, "sigma", "a positive number", sigma)
+        check(growth > 0, "growth", "a positive number", growth)
+        check(levels >= 0, "levels", "0 or more", levels)
+        self.levels = levels
+        self.growth = growth
+        self.convention: Convention = convention
+        log_sigma = torch.tensor(float(sigma)).log()
+        self.log_sigma = nn.Parameter(log_sigma, requires_grad=learnable)
+
+    @property
+    def sigma(self) -> Tensor:
+        """Width of the fovea in image pixels."""
+        return self.log_sigma.exp()
+
+    def pyramid(self, image: Tensor) -> Bands:
+        """The part of the work that does not depend on the gaze, for an image `(B, C, H, W)`."""
+        return laplacian_pyramid(image, self.levels, self.convention)
+
+    def forward(self, image: Tensor | Bands, gaze: Tensor) -> Tensor:
+        """Foveate an image or a pyramid around `gaze`; shapes as for `foveate`."""
+        return foveate(
+            image, gaze, sigma=self.sigma, levels=self.levels, growth=self.growth, convention=self.convention
+        )
+
+    def extra_repr(self) -> str:
+        """Settings, for `print`."""
+        settings = f"levels={self.levels}, growth={self.growth:g}, convention={self.convention!r}"
+        return f"sigma={float(self.sigma.detach()):g}, {settings}"
+
+
+def _collapse(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> Tensor:
+    """Put the pyramid together around `(B, G, 2)` fixations: `(B, G, C, H, W)`."""
+    batch, many = fixation.shape[:2]
+    result = bands.base
+    repeated = False
+    for k in reversed(range(len(bands.details))):
+        band = bands.details[k]
+        height, width = band.shape[-2:]
+        expanded = pyrup(result, (height, width), bands.convention)
+        if not repeated:
+            # All fixations share the coarsest level.
+            expanded = expanded[:, None].expand(batch, many, *expanded.shape[1:]).flatten(0, 1)
+            repeated = True
+        across = _window(bands, k, -1, fixation[..., 0], sigma[:, 0] * growth**k)
+        down = _window(bands, k, -2, fixation[..., 1], sigma[:, 1] * growth**k)
+        window = (down[..., :, None] * across[..., None, :])[:, :, None]
+        blended = torch.addcmul(expanded.unflatten(0, (batch, many)), window, band[:, None])
+        result = blended.flatten(0, 1)
+    if not repeated:
+        return result[:, None].expand(batch, many, *result.shape[1:]).clone()
+    return result.unflatten(0, (batch, many))
+
+
+def _window(bands: Bands, k: int, axis: int, centre: Tensor, sigma: Tensor) -> Tensor:
+    """Gaussian window of band k along one axis, `(B, G, n)`, for centres `(B, G)` and widths `(B,)`."""
+    count, length = bands.details[k].shape[axis], bands.size[axis + 2]
+    place = torch.arange(count, device=centre.device, dtype=centre.dtype)
+    place = place * 2**k if bands.convention == "opencv" else (place + 0.5) * (length / count) - 0.5
+    offset = (place - centre[..., None]) / sigma[:, None, None]
+    return torch.exp(-0.5 * offset.square())
+
+
+def _widths(sigma: float | Tensor, like: Tensor) -> Tensor:
+    """σ along x and y for every image, `(B, 2)`."""
+    width = torch.as_tensor(sigma).to(like)
+    batch = like.shape[0]
+    fits = width.ndim == 0 or (width.shape[0] in (1, batch) and width.shape[1:] in ((), (2,)))
+    check(fits, "sigma", f"a number or shape (), ({batch},) or ({batch}, 2)", tuple(width.shape))
+    return (width[:, None] if width.ndim == 1 else width).expand(batch, 2)
+
+
+def _check_values(gaze: Tensor, sigma: float | Tensor, growth: float | Tensor) -> None:
+    if torch.compiler.is_compiling():
+        return
+    check_finite(gaze, "gaze")
+    for name, value in (("sigma", sigma), ("growth", growth)):
+        positive = bool((torch.as_tensor(value) > 0).all())
+        check(positive, name, "a positive number", value if isinstance(value, float | int) else value.tolist())
+
+
+def _shapes(batch: int) -> str:
+    return f"a tensor of shape (2,), ({batch}, 2) or ({batch}, G, 2)"

@@ -1,0 +1,283 @@
+import copy
+import json
+import logging
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from semfov.data import CocoScenes, read_image
+from semfov.errors import DataError, InputError
+
+CLASSES = ("cat", "person", "tvmonitor")  # not in the file's order, and in Darknet's spelling
+BOXES = [
+    (20, "cat", (0, 0, 10, 10)),
+    (10, "person", (1, 2, 3, 4)),
+    (10, "tv", (5, 6, 20, 20)),
+    (10, "cat", (30.5, 20.25, 4, 4)),
+]
+ALL = {"min_instances": 0, "max_target_area": None}
+
+
+def test_boxes_labels_and_ids(photographs, make_coco):
+    scenes = CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
+    assert scenes.ids == [10, 20, 30]
+    assert len(scenes) == 3
+    first = scenes[0]
+    assert (first.id, first.name, first.size) == (10, "10.png", (40, 30))
+    assert first.boxes.tolist() == [[1, 2, 4, 6], [5, 6, 25, 26], [30.5, 20.25, 34.5, 24.25]]
+    assert first.labels.tolist() == [2, 3, 1]
+    assert first.boxes.dtype == torch.float32
+    assert first.labels.dtype == torch.int64
+    assert torch.equal(first.image, read_image(photographs / "10.png"))
+    assert scenes[2].boxes.shape == (0, 4)
+    assert not scenes.repairs
+
+
+def test_annotation_without_pixels(photographs, make_coco):
+    scenes = CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
+    for index in range(3):
+        annotation, scene = scenes.annotation(index), scenes[index]
+        assert torch.equal(annotation.boxes, scene.boxes)
+        assert torch.equal(annotation.labels, scene.labels)
+        assert annotation.size == scene.size
+    scenes.annotation(0).boxes.zero_()
+    assert scenes.annotation(0).boxes.any()
+
+
+def test_iteration_and_index_errors(photographs, make_coco):
+    scenes = CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
+    assert [scene.id for scene in scenes] == [10, 20, 30]
+    assert scenes[-1].id == 30
+    with pytest.raises(IndexError):
+        scenes.annotation(3)
+
+
+def test_selection(photographs, make_coco):
+    # 10: 8 boxes, all small; 20: 7 boxes; 30: 8 boxes, but its only class covers too much
+    boxes = [(10, "person", (i, 0, 2, 2)) for i in range(7)] + [(10, "tv", (0, 0, 40, 20))]
+    boxes += [(20, "person", (i, 0, 2, 2)) for i in range(7)]
+    boxes += [(30, "cat", (i, 0, 10, 10)) for i in range(8)]
+    file = make_coco(boxes)
+    scenes = CocoScenes(photographs, file, CLASSES)
+    assert scenes.ids == [10]
+    assert scenes.targets(0) == [2]
+    assert CocoScenes(photographs, file, CLASSES, min_instances=7).ids == [10, 20]
+    assert CocoScenes(photographs, file, CLASSES, max_target_area=None).ids == [10, 30]
+    assert CocoScenes(photographs, file, CLASSES, max_target_area=0.2, coverage="union").ids == [10, 30]
+    assert CocoScenes(photographs, file, CLASSES, min_instances=1, max_target_area=None, limit=2).ids == [10, 20]
+    with pytest.raises(DataError, match="none of 3 images has at least 9 boxes"):
+        CocoScenes(photographs, file, CLASSES, min_instances=9)
+
+
+def test_selection_does_not_depend_on_the_detector(photographs, make_coco):
+    boxes = [(10, "person", (i, 0, 2, 2)) for i in range(4)] + [(10, "cat", (i, 9, 2, 2)) for i in range(4)]
+    scenes = CocoScenes(photographs, make_coco(boxes), ("cat",))
+    assert scenes.ids == [10]
+    assert scenes.annotation(0).labels.tolist() == [1] * 4
+    assert scenes.repairs == {"boxes of 'person', which the detector does not know, dropped": 4}
+
+
+def test_repairs_are_counted_and_told_once(photographs, make_coco, caplog):
+    boxes = [
+        (10, "cat", (-5, -5, 10, 10)),
+        (10, "cat", (35, 25, 10, 10)),
+        (10, "cat", (30, 20, 10.004, 10)),  # rounding of the official files
+        (10, "cat", (3, 3, 0, 5)),
+        (10, "cat", (50, 3, 5, 5)),
+        (10, "person", (0, 0, 9, 9), {"iscrowd": 1}),
+    ]
+    with caplog.at_level(logging.WARNING):
+        scenes = CocoScenes(photographs, make_coco(boxes), CLASSES, min_instances=1, crowd="drop")
+    assert scenes.repairs == {
+        "boxes without area in the image, dropped": 2,
+        "boxes cut to the image": 2,
+        "boxes of crowds, dropped": 1,
+    }
+    assert len(caplog.records) == 1
+    assert "boxes cut to the image: 2" in caplog.text
+    assert scenes.annotation(0).boxes.tolist() == [[0, 0, 5, 5], [35, 25, 40, 30], [30, 20, 40, 30]]
+    assert CocoScenes(photographs, make_coco(boxes), CLASSES, min_instances=1).annotation(0).crowd.tolist() == [
+        False,
+        False,
+        False,
+        True,
+    ]
+
+
+def test_boxes_that_vanish_in_float32_are_dropped(photographs, make_coco):
+    scenes = CocoScenes(photographs, make_coco([(10, "cat", (30, 20, 1e-9, 5))]), CLASSES, **ALL)
+    assert scenes.annotation(0).boxes.shape == (0, 4)
+    assert scenes.repairs == {"boxes without area in the image, dropped": 1}
+
+
+def test_no_common_classes(photographs, make_coco):
+    with pytest.raises(DataError, match=r"expected some of the detector's 2 classes .* got 'person', 'cat', 'tv'"):
+        CocoScenes(photographs, make_coco(BOXES), ("zebra", "cup"))
+    with pytest.raises(DataError, match="got none"):
+        CocoScenes(photographs, make_coco(categories=()), CLASSES)
+
+
+def test_missing_images(photographs, make_coco, coco_dict):
+    data = coco_dict(BOXES)
+    data["images"][0]["file_name"] = "gone.png"
+    with pytest.raises(DataError, match=r"gone\.png: no such file \(1 of 3 are missing\); check data\.root"):
+        CocoScenes(photographs, make_coco(data=data), CLASSES, **ALL)
+    only = CocoScenes(photographs, make_coco(data=data), CLASSES, min_instances=1, max_target_area=None)
+    assert only.ids == [10, 20]  # an image that is not used may be missing
+
+
+@pytest.mark.parametrize("frame", ["upright", "stored"])
+def test_frame_of_a_turned_photograph(tmp_path, make_coco, coco_dict, frame):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    pixels = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "10.png", exif=exif)
+    data = coco_dict([(10, "cat", (0, 0, 3, 4))])
+    data["images"] = [
+        {"id": 10, "file_name": "10.png"}
+        | ({"width": 30, "height": 40} if frame == "upright" else {"width": 40, "height": 30})
+    ]
+    image = CocoScenes(tmp_path, make_coco(data=data), CLASSES, **ALL)[0].image
+    expected = np.rot90(pixels, -1) if frame == "upright" else pixels
+    assert np.array_equal((image * 255).round().byte().permute(1, 2, 0).numpy(), expected)
+
+
+def test_size_that_does_not_fit(photographs, make_coco, coco_dict):
+    data = coco_dict(BOXES)
+    data["images"][1]["width"] = 41
+    scenes = CocoScenes(photographs, make_coco(data=data), CLASSES, **ALL)
+    with pytest.raises(DataError, match=r"10\.png: expected 41 × 30 pixels as annotated, got 40 × 30"):
+        scenes[0]
+
+
+def test_fingerprint_tells_what_matters(photographs, make_coco, coco_dict):
+    scenes = CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
+    prints = {scenes.fingerprint}
+    assert CocoScenes(str(photographs), make_coco(BOXES), list(CLASSES), **ALL).fingerprint in prints
+    prints.add(CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL, crowd="drop").fingerprint)
+    prints.add(CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL, limit=2).fingerprint)
+    prints.add(CocoScenes(photographs, make_coco(BOXES[1:]), CLASSES, **ALL).fingerprint)
+    prints.add(CocoScenes(photographs, make_coco(BOXES), CLASSES[::-1], **ALL).fingerprint)
+    assert len(prints) == 5
+    assert all(len(value) == 64 for value in prints)
+    assert len({scenes.digest(i) for i in range(3)}) == 3
+
+
+def test_scenes_travel_to_workers(photographs, make_coco):
+    scenes = CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
+    twin = pickle.loads(pickle.dumps(scenes))
+    assert twin.fingerprint == scenes.fingerprint
+    assert torch.equal(twin[0].boxes, scenes[0].boxes)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"min_instances": -1}, {"max_target_area": 0}, {"limit": 0}, {"coverage": "mean"}, {"crowd": "maybe"}],
+)
+def test_bad_settings(photographs, make_coco, options):
+    with pytest.raises(InputError, match=next(iter(options))):
+        CocoScenes(photographs, make_coco(BOXES), CLASSES, **options)
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.just(10**400),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(["id", "name", "x"]), inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+places = st.one_of(
+    st.tuples(st.sampled_from(["images", "annotations", "categories"])),
+    st.tuples(st.sampled_from(["images", "annotations", "categories"]), st.integers(0, 2)),
+    st.tuples(st.just("images"), st.integers(0, 2), st.sampled_from(["id", "file_name", "width", "height"])),
+    st.tuples(st.just("categories"), st.integers(0, 2), st.sampled_from(["id", "name"])),
+    st.tuples(
+        st.just("annotations"),
+        st.integers(0, 3),
+        st.sampled_from(["id", "image_id", "category_id", "bbox", "iscrowd"]),
+    ),
+    st.tuples(st.just("annotations"), st.integers(0, 3), st.just("bbox"), st.integers(0, 3)),
+)
+numbers = st.floats(-60, 60) | st.integers(-60, 60) | st.sampled_from([1e308, -1e308, 0])
+
+
+@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(changes=st.lists(st.tuples(places, json_values | numbers), min_size=1, max_size=3), cut=st.booleans())
+def test_any_file_gives_scenes_or_a_data_error(photographs, tmp_path, coco_dict, changes, cut):
+    data = copy.deepcopy(coco_dict(BOXES))
+    for where, value in changes:
+        entry = data
+        try:
+            for key in where[:-1]:
+                entry = entry[key]
+            if cut:
+                del entry[where[-1]]
+            else:
+                entry[where[-1]] = value
+        except (KeyError, IndexError, TypeError):
+            continue  # an earlier change took the place away
+    path = tmp_path / "fuzz.json"
+    path.write_text(json.dumps(data))
+    try:
+        scenes = CocoScenes(photographs, path, CLASSES, **ALL)
+    except DataError as error:
+        message = str(error)
+    else:
+        message = ""
+        for index in range(len(scenes)):
+            annotation = scenes.annotation(index)
+            x1, y1, x2, y2 = annotation.boxes.unbind(-1)
+            assert ((x1 >= 0) & (x1 < x2) & (x2 <= annotation.size[0])).all()
+            assert ((y1 >= 0) & (y1 < y2) & (y2 <= annotation.size[1])).all()
+            assert ((annotation.labels >= 1) & (annotation.labels <= len(CLASSES))).all()
+            assert scenes.targets(index) == sorted(set(annotation.labels.tolist()))
+    assert "\n" not in message
+
+
+@pytest.mark.shared
+def test_development_photographs(shared):
+    from pycocotools.coco import COCO
+
+    file = shared / "coco/annotations/instances_eval300.json"
+    reference = COCO(file)
+    names = {c["id"]: c["name"] for c in reference.dataset["categories"]}
+    classes = tuple(sorted(names.values()))
+    scenes = CocoScenes(shared / "coco/eval300", file, classes)
+    assert scenes.ids == sorted(reference.getImgIds())
+    pairs = 0
+    for index, identity in enumerate(scenes.ids):
+        entries = [a for a in reference.loadAnns(reference.getAnnIds(identity)) if min(a["bbox"][2:]) > 0]
+        annotation = scenes.annotation(index)
+        assert [classes[k - 1] for k in annotation.labels.tolist()] == [names[a["category_id"]] for a in entries]
+        x, y, w, h = np.array([a["bbox"] for a in entries], dtype=np.float64).T
+        assert np.array_equal(annotation.boxes.numpy(), np.stack([x, y, x + w, y + h], -1).astype(np.float32))
+        pairs += len(scenes.targets(index))
+    assert (len(scenes), pairs) == (300, 1079)
+    union = CocoScenes(shared / "coco/eval300", file, classes, coverage="union", limit=60)
+    for index in range(len(union)):
+        annotation = union.annotation(index)
+        legal = []
+        for label in annotation.labels.unique().tolist():
+            grid = np.zeros(annotation.size[::-1], dtype=bool)
+            for x1, y1, x2, y2 in annotation.boxes[annotation.labels == label].round().int().tolist():
+                grid[y1:y2, x1:x2] = True
+            if abs(grid.mean() - 0.2) > 0.005:  # some boxes are not of whole pixels
+                legal.append((label, bool(grid.mean() <= 0.2)))
+        assert all((label in union.targets(index)) == expected for label, expected in legal)
+
+
+def test_program_warns_of_nothing():
+    run = subprocess.run(
+        [sys.executable, "-W", "error::RuntimeWarning", "-m", "semfov.data.coco", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "val2017" in run.stdout

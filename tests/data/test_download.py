@@ -1,0 +1,311 @@
+import hashlib
+import io
+import json
+import re
+import shutil
+import socket
+import stat
+import threading
+import zipfile
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import numpy as np
+import pytest
+
+from semfov.data import download
+from semfov.data.download import SPLITS, Archive, download_coco, fetch, fetch_split, main, unpack
+from semfov.errors import DataError, InputError
+
+NAMES = [f"{n:012d}.jpg" for n in (139, 285, 632)]
+
+
+def zipped(members):
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
+INSTANCES = json.dumps({"images": [{"file_name": name} for name in NAMES]})
+PICTURES = {f"val2017/{name}": np.random.default_rng(i).bytes(40_000) for i, name in enumerate(NAMES)}
+FILES = {
+    "/zips/val2017.zip": zipped({"val2017/": b""} | PICTURES),
+    "/annotations/annotations_trainval2017.zip": zipped(
+        {"annotations/instances_val2017.json": INSTANCES, "annotations/captions_val2017.json": "{}"}
+    ),
+}
+ARCHIVES = {p: Archive(p.lstrip("/"), len(data), hashlib.sha256(data).hexdigest()) for p, data in FILES.items()}
+IMAGES, ANNOTATIONS = ARCHIVES.values()
+
+
+class Server(ThreadingHTTPServer):
+    """Serves FILES; `stop_after` closes each answer early, `ranges` is whether it knows ranges."""
+
+    daemon_threads = True
+
+    def __init__(self):
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.files = dict(FILES)
+        self.stop_after = None
+        self.status = None
+        self.ranges = True
+        self.requests = []
+
+    @property
+    def address(self):
+        return f"http://127.0.0.1:{self.server_port}"
+
+
+class Handler(BaseHTTPRequestHandler):
+    def do_GET(self):
+        start = int(re.fullmatch(r"bytes=(\d+)-", self.headers["Range"])[1])
+        self.server.requests.append((self.path, start))
+        data = self.server.files.get(self.path)
+        if self.server.status or data is None:
+            self.send_error(self.server.status or 404)
+            return
+        if self.server.ranges:
+            data = data[start:]
+            self.send_response(206)
+        else:
+            self.send_response(200)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data[: self.server.stop_after])
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def server():
+    server = Server()
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    yield server
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+@pytest.fixture
+def dead_address():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    return f"http://127.0.0.1:{port}"
+
+
+def get(root, address, *, keep=False):
+    fetch_split("val2017", root, IMAGES, ANNOTATIONS, address=address, keep=keep, pause=0)
+
+
+def tree(root):
+    return sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_file())
+
+
+WHOLE = sorted(["annotations/instances_val2017.json", *PICTURES])
+
+
+def test_fetches_verifies_and_unpacks(server, tmp_path):
+    get(tmp_path / "new" / "coco", server.address)
+    root = tmp_path / "new" / "coco"
+    assert tree(root) == WHOLE
+    assert (root / "annotations/instances_val2017.json").read_text() == INSTANCES
+    assert all((root / name).read_bytes() == content for name, content in PICTURES.items())
+    before = len(server.requests)
+    get(root, server.address)
+    assert len(server.requests) == before  # all there
+
+
+def test_broken_transfers_go_on_where_they_stopped(server, tmp_path):
+    server.stop_after = 50_000
+    get(tmp_path, server.address, keep=True)
+    starts = [start for path, start in server.requests if path == "/zips/val2017.zip"]
+    assert starts == [0, 50_000, 100_000]
+    assert (tmp_path / "val2017.zip").read_bytes() == FILES["/zips/val2017.zip"]
+    assert tree(tmp_path) == sorted([*WHOLE, "val2017.zip", "annotations_trainval2017.zip"])
+
+
+def test_a_later_run_resumes(server, tmp_path):
+    server.stop_after = 0
+    (tmp_path / "val2017.zip.part").write_bytes(FILES["/zips/val2017.zip"][:70_000])
+    with pytest.raises(
+        DataError, match=r"failed at 70,000 of [\d,]+ bytes \(the connection closed early\); run again"
+    ):
+        fetch(IMAGES, tmp_path, address=server.address, pause=0)
+    assert (tmp_path / "val2017.zip.part").stat().st_size == 70_000
+    server.stop_after = None
+    assert fetch(IMAGES, tmp_path, address=server.address).read_bytes() == FILES["/zips/val2017.zip"]
+    assert server.requests[-1][1] == 70_000
+
+
+def test_server_without_ranges(server, tmp_path):
+    server.ranges = False
+    (tmp_path / "val2017.zip.part").write_bytes(b"x" * 70_000)
+    assert fetch(IMAGES, tmp_path, address=server.address).read_bytes() == FILES["/zips/val2017.zip"]
+
+
+def test_changed_content_is_refused_and_deleted(server, tmp_path):
+    data = bytearray(FILES["/zips/val2017.zip"])
+    data[1000] ^= 1
+    server.files["/zips/val2017.zip"] = bytes(data)
+    with pytest.raises(DataError, match=f"expected sha256 {IMAGES.sha256}, got .*; it was deleted; run again"):
+        fetch(IMAGES, tmp_path, address=server.address)
+    assert tree(tmp_path) == []
+
+
+def test_other_size_is_refused(server, tmp_path):
+    server.files["/zips/val2017.zip"] += b"more"
+    with pytest.raises(DataError, match=r"expected [\d,]+ bytes, the server has"):
+        fetch(IMAGES, tmp_path, address=server.address)
+
+
+def test_server_errors(server, tmp_path):
+    with pytest.raises(DataError, match=r"/elsewhere/zips/val2017\.zip: the server answers 404"):
+        fetch(IMAGES, tmp_path, address=f"{server.address}/elsewhere")
+    server.status = 503
+    with pytest.raises(DataError, match="transfer failed at 0"):
+        fetch(IMAGES, tmp_path, address=server.address, pause=0)
+    assert len(server.requests) == 4  # a missing file is final, a busy server is asked again
+
+
+def test_no_network(tmp_path, dead_address):
+    with pytest.raises(DataError, match=r"transfer failed at 0 .* or copy annotations_trainval2017\.zip into"):
+        get(tmp_path, dead_address)
+
+
+def test_a_fetched_archive_waits_for_a_run_that_unpacks_it(server, tmp_path, monkeypatch):
+    monkeypatch.setattr(download, "unpack", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        get(tmp_path, server.address)
+    assert tree(tmp_path) == [".download/annotations_trainval2017.zip"]
+    monkeypatch.undo()
+    get(tmp_path, server.address)
+    assert [path for path, _ in server.requests] == [
+        "/annotations/annotations_trainval2017.zip",
+        "/zips/val2017.zip",
+    ]
+    assert tree(tmp_path) == WHOLE
+
+
+def test_another_splits_transfer_is_left_alone(server, tmp_path):
+    (tmp_path / ".download").mkdir()
+    (tmp_path / ".download/train2017.zip.part").touch()
+    get(tmp_path, server.address)
+    assert tree(tmp_path) == sorted([".download/train2017.zip.part", *WHOLE])
+
+
+def test_archives_brought_by_hand_are_used_and_left(tmp_path, dead_address):
+    for path, data in FILES.items():
+        (tmp_path / ARCHIVES[path].name).write_bytes(data)
+    get(tmp_path, dead_address)
+    assert tree(tmp_path) == sorted([*WHOLE, "val2017.zip", "annotations_trainval2017.zip"])
+
+
+def test_wrong_archive_brought_by_hand(tmp_path, dead_address):
+    (tmp_path / "annotations_trainval2017.zip").write_bytes(FILES["/annotations/annotations_trainval2017.zip"])
+    (tmp_path / "val2017.zip").write_bytes(b"something else")
+    with pytest.raises(DataError, match=r"val2017\.zip: expected sha256 .* delete it, and run again"):
+        get(tmp_path, dead_address)
+    assert (tmp_path / "val2017.zip").read_bytes() == b"something else"
+
+
+def test_unpacking_goes_on_and_mends(tmp_path):
+    (tmp_path / "val2017.zip").write_bytes(FILES["/zips/val2017.zip"])
+    first, second, _ = PICTURES
+    (tmp_path / "val2017").mkdir()
+    (tmp_path / first).write_bytes(PICTURES[first])
+    (tmp_path / second).write_bytes(PICTURES[second][:-1] + b"?")
+    before = (tmp_path / first).stat().st_mtime_ns
+    unpack(tmp_path / "val2017.zip", tmp_path, "val2017/")
+    assert all((tmp_path / name).read_bytes() == content for name, content in PICTURES.items())
+    assert (tmp_path / first).stat().st_mtime_ns == before
+
+
+def test_a_missing_picture_is_fetched_again(server, tmp_path):
+    get(tmp_path, server.address)
+    (tmp_path / "val2017" / NAMES[1]).unlink()
+    get(tmp_path, server.address)
+    assert tree(tmp_path) == WHOLE
+
+
+@pytest.mark.parametrize("name", ["val2017/../../evil", "val2017/..\\evil", "val2017/C:evil"])
+def test_names_that_lead_out_are_refused(tmp_path, name):
+    root = tmp_path / "root"
+    (tmp_path / "a.zip").write_bytes(zipped({name: b"evil"}))
+    with pytest.raises(DataError, match="unsafe name"):
+        unpack(tmp_path / "a.zip", root, "val2017/")
+    assert tree(tmp_path) == ["a.zip"]
+
+
+def test_links_are_refused(tmp_path):
+    link = zipfile.ZipInfo("val2017/link")
+    link.external_attr = (stat.S_IFLNK | 0o777) << 16
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr(link, "/etc/passwd")
+    with pytest.raises(DataError, match="holds the link"):
+        unpack(tmp_path / "a.zip", tmp_path, "val2017/")
+
+
+def test_damaged_and_empty_zip_files(tmp_path):
+    (tmp_path / "a.zip").write_bytes(b"no zip")
+    with pytest.raises(DataError, match="damaged zip file"):
+        unpack(tmp_path / "a.zip", tmp_path, "val2017/")
+    (tmp_path / "b.zip").write_bytes(zipped({"train2017/a.jpg": b""}))
+    with pytest.raises(DataError, match="expected val2017/ in it, got none"):
+        unpack(tmp_path / "b.zip", tmp_path, "val2017/")
+
+
+def test_full_disk(server, tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(download.shutil, "disk_usage", lambda _: usage._replace(free=1000))
+    with pytest.raises(DataError, match="free space"):
+        get(tmp_path, server.address)
+
+
+def test_disk_that_fills_up(server, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(download.shutil, "copyfileobj", full)
+    with pytest.raises(DataError, match=r"cannot be written \(No space left on device\)"):
+        get(tmp_path, server.address)
+    monkeypatch.undo()
+    get(tmp_path, server.address)
+    assert tree(tmp_path) == WHOLE
+
+
+def test_root_that_is_a_file(tmp_path, dead_address):
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="cannot be written"):
+        get(tmp_path / "file" / "coco", dead_address)
+
+
+def test_program(server, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(SPLITS, "val2017", IMAGES)
+    monkeypatch.setattr(download, "_ANNOTATIONS", ANNOTATIONS)
+    assert main(["val2017", "--root", str(tmp_path), "--address", server.address]) == 0
+    assert f"data.root: {tmp_path / 'val2017'}" in capsys.readouterr().out
+    assert tree(tmp_path) == WHOLE
+    assert main(["val2017", "--root", str(tmp_path / "b"), "--address", f"{server.address}/no"]) == 1
+    assert re.fullmatch(r"error: .*404.*\n", capsys.readouterr().err)
+
+
+def test_program_interrupted(tmp_path, monkeypatch, capsys):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(download, "fetch_split", interrupt)
+    assert main(["val2017", "--root", str(tmp_path)]) == 130
+    assert "same command to resume" in capsys.readouterr().err
+
+
+def test_bad_arguments(tmp_path):
+    with pytest.raises(InputError, match="unknown split 'val2071'; did you mean 'val2017'"):
+        download_coco("val2071", tmp_path)
+    with pytest.raises(InputError, match="address"):
+        download_coco("val2017", tmp_path, address="file:///tmp")
+    with pytest.raises(SystemExit):
+        main(["val2017"])

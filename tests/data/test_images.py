@@ -1,0 +1,238 @@
+import io
+import struct
+import zlib
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from semfov.data import read_image
+from semfov.data.images import MAX_PIXELS
+from semfov.errors import DataError
+
+# Four colours, one per quadrant, so that any turn or mirroring shows.
+COLOURS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], dtype=np.uint8)
+PICTURE = COLOURS.repeat(8, axis=0).repeat(12, axis=1)  # 16 high, 24 wide
+
+
+def bits(image):
+    return (image * 255).round().byte().permute(1, 2, 0).numpy()
+
+
+def test_rgb_png_is_exact(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    image = read_image(tmp_path / "a.png")
+    assert image.shape == (3, 7, 5)
+    assert image.dtype == torch.float32
+    assert image.is_contiguous()
+    assert np.array_equal(image.permute(1, 2, 0).numpy(), pixels.astype(np.float32) / 255)
+
+
+# What each EXIF orientation means, by where the standard shows row 0 and column 0 of the stored pixels.
+SHOWN = {
+    1: lambda a: a,
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.swapaxes(0, 1),
+    6: lambda a: np.rot90(a, -1),
+    7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
+    8: np.rot90,
+}
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg", "webp", "tif"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation(tmp_path, orientation, kind):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / f"a.{kind}"
+    lossless = {"lossless": True} if kind == "webp" else {"quality": 100, "subsampling": 0} if kind == "jpg" else {}
+    Image.fromarray(PICTURE).save(path, exif=exif, **lossless)
+    shown = bits(read_image(path)).astype(int)
+    expected = SHOWN[orientation](PICTURE).astype(int)
+    assert shown.shape == expected.shape
+    assert abs(shown - expected).max() <= 12
+    if kind != "tif":  # Pillow turns TIFF files itself
+        assert abs(bits(read_image(path, oriented=False)).astype(int) - PICTURE).max() <= 12
+
+
+@pytest.mark.parametrize("orientation", [0, 9, 65535])
+def test_unknown_orientation_is_upright(tmp_path, orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(PICTURE).save(tmp_path / "a.png", exif=exif)
+    assert np.array_equal(bits(read_image(tmp_path / "a.png")), PICTURE)
+
+
+def test_damaged_exif_is_passed_over(tmp_path):
+    Image.fromarray(PICTURE).save(tmp_path / "a.png", exif=b"Exif\0\0MM\0*\xff\xff\xff\xff\0\1\2")
+    assert np.array_equal(bits(read_image(tmp_path / "a.png")), PICTURE)
+
+
+def test_grey_has_three_equal_channels(tmp_path):
+    Image.fromarray(np.arange(256, dtype=np.uint8).reshape(16, 16)).save(tmp_path / "a.png")
+    image = bits(read_image(tmp_path / "a.png"))
+    assert np.array_equal(image, np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, -1))
+
+
+def test_bilevel(tmp_path):
+    Image.fromarray(np.array([[0, 255], [255, 0]], np.uint8)).convert("1").save(tmp_path / "a.png")
+    assert read_image(tmp_path / "a.png")[1].tolist() == [[0, 1], [1, 0]]
+
+
+def test_cmyk_jpeg(tmp_path):
+    Image.new("CMYK", (8, 8), (0, 255, 255, 0)).save(tmp_path / "red.jpg", quality=100)
+    assert abs(bits(read_image(tmp_path / "red.jpg")).astype(int) - (255, 0, 0)).max() <= 3
+    Image.new("CMYK", (8, 8), (0, 0, 0, 255)).save(tmp_path / "black.tif")
+    assert read_image(tmp_path / "black.tif").max() == 0
+
+
+def test_palette(tmp_path):
+    Image.fromarray(PICTURE).quantize(4).save(tmp_path / "a.png")
+    assert np.array_equal(bits(read_image(tmp_path / "a.png")), PICTURE)
+
+
+def test_transparency_lies_on_white(tmp_path):
+    alpha = np.array([[0, 255, 128]], np.uint8)
+    colour = np.zeros((1, 3, 3), np.uint8)
+    colour[..., 0] = 200
+    rgba = Image.fromarray(np.concatenate([colour, alpha[..., None]], -1))
+    expected = 255 - (255 - colour[0].astype(float)) * alpha[0, :, None] / 255
+    rgba.save(tmp_path / "rgba.png")
+    assert abs(bits(read_image(tmp_path / "rgba.png"))[0] - expected).max() <= 1
+    rgba.convert("LA").save(tmp_path / "la.png")
+    grey = np.asarray(rgba.convert("L"))[0].astype(float)
+    expected_grey = 255 - (255 - grey) * alpha[0] / 255
+    assert abs(bits(read_image(tmp_path / "la.png"))[0, :, 0] - expected_grey).max() <= 1
+
+
+@pytest.mark.parametrize("kind", ["png", "gif"])
+def test_transparent_palette_entry_is_white(tmp_path, kind):
+    image = Image.fromarray(np.array([[0, 1, 2]], np.uint8)).convert("P")
+    image.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
+    image.save(tmp_path / f"a.{kind}", transparency=1)
+    assert bits(read_image(tmp_path / f"a.{kind}")).tolist() == [[[255, 0, 0], [255, 255, 255], [0, 0, 255]]]
+
+
+def test_transparent_colour_of_rgb_png(tmp_path):
+    Image.fromarray(PICTURE).save(tmp_path / "a.png", transparency=(255, 0, 0))
+    image = bits(read_image(tmp_path / "a.png"))
+    assert (image[:8, :12] == 255).all()
+    assert np.array_equal(image[8:], PICTURE[8:])
+
+
+@pytest.mark.parametrize("kind", ["png", "tif"])
+def test_sixteen_bit_grey_keeps_its_depth(tmp_path, kind):
+    grey = np.array([[0, 1, 255, 256, 40000, 65535]], np.uint16)
+    Image.fromarray(grey).save(tmp_path / f"a.{kind}")
+    image = read_image(tmp_path / f"a.{kind}")
+    assert np.allclose(image[0].numpy(), grey / 65535, atol=1e-7)
+    assert torch.equal(image[0], image[2])
+
+
+def test_sixteen_bit_colour_png(tmp_path):
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    row = b"\0" + np.array([[65535, 0, 32896], [0, 65535, 257]], ">u2").tobytes()
+    header = struct.pack(">IIBBBBB", 2, 1, 16, 2, 0, 0, 0)
+    data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(row)) + chunk(b"IEND", b"")
+    (tmp_path / "a.png").write_bytes(data)
+    assert bits(read_image(tmp_path / "a.png")).tolist() == [[[255, 0, 128], [0, 255, 1]]]
+
+
+def test_float_tiff(tmp_path):
+    Image.fromarray(np.array([[0.0, 0.25, 1.0]], np.float32)).save(tmp_path / "a.tif")
+    assert read_image(tmp_path / "a.tif")[0].tolist() == [[0.0, 0.25, 1.0]]
+    Image.fromarray(np.array([[0.0, np.nan]], np.float32)).save(tmp_path / "b.tif")
+    with pytest.raises(DataError, match=r"b\.tif: expected values from 0 to 1"):
+        read_image(tmp_path / "b.tif")
+    Image.fromarray(np.array([[0, 70000]], np.int32)).save(tmp_path / "c.tif")
+    with pytest.raises(DataError, match=r"c\.tif: expected values from 0 to 65535"):
+        read_image(tmp_path / "c.tif")
+
+
+@pytest.mark.parametrize("kind", ["gif", "webp", "png"])
+def test_first_frame_of_an_animation(tmp_path, kind):
+    frames = [Image.new("RGB", (6, 4), colour) for colour in ("red", "blue", "lime")]
+    lossless = {"lossless": True} if kind == "webp" else {}
+    frames[0].save(tmp_path / f"a.{kind}", save_all=True, append_images=frames[1:], duration=50, **lossless)
+    assert (bits(read_image(tmp_path / f"a.{kind}")) == (255, 0, 0)).all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 700), (20000, 3)])
+def test_odd_sizes(tmp_path, size):
+    Image.new("RGB", size, "red").save(tmp_path / "a.png")
+    assert read_image(tmp_path / "a.png").shape == (3, size[1], size[0])
+
+
+def test_missing_and_wrong_files(tmp_path):
+    with pytest.raises(DataError, match=r"no\.jpg: no such file; check data\.root"):
+        read_image(tmp_path / "no.jpg")
+    with pytest.raises(DataError, match="expected a file, got a folder"):
+        read_image(tmp_path)
+    (tmp_path / "text.jpg").write_text("not an image")
+    with pytest.raises(DataError, match=r"text\.jpg: not an image"):
+        read_image(tmp_path / "text.jpg")
+    (tmp_path / "empty.jpg").touch()
+    with pytest.raises(DataError, match=r"empty\.jpg: not an image"):
+        read_image(tmp_path / "empty.jpg")
+
+
+@pytest.mark.parametrize("kind", ["jpg", "png", "gif", "webp", "tif"])
+def test_truncated(tmp_path, kind):
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / f"a.{kind}")
+    whole = (tmp_path / f"a.{kind}").read_bytes()
+    (tmp_path / f"a.{kind}").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(DataError, match=rf"a\.{kind}: (truncated, damaged|not an image)"):
+        read_image(tmp_path / f"a.{kind}")
+
+
+@pytest.mark.parametrize("side", [9600, 60000])
+def test_decompression_bomb(tmp_path, side):
+    header = struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
+    chunk = b"IHDR" + header
+    data = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    idat = b"IDAT" + zlib.compress(b"\0" * 100)
+    data += struct.pack(">I", len(idat) - 4) + idat + struct.pack(">I", zlib.crc32(idat))
+    (tmp_path / "bomb.png").write_bytes(data)
+    with pytest.raises(DataError, match=rf"bomb\.png: .*{MAX_PIXELS:,} pixels"):
+        read_image(tmp_path / "bomb.png")
+
+
+def samples():
+    for kind in ("JPEG", "PNG", "GIF", "WEBP", "TIFF", "BMP"):
+        stream = io.BytesIO()
+        Image.fromarray(PICTURE).save(stream, kind)
+        yield stream.getvalue()
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    sample=st.sampled_from(list(samples())),
+    changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), max_size=6),
+    keep=st.floats(0, 1),
+)
+def test_damaged_files_give_an_image_or_a_data_error(tmp_path_factory, sample, changes, keep):
+    data = bytearray(sample[: max(1, round(keep * len(sample)))])
+    for where, value in changes:
+        data[int(where * len(data))] = value
+    path = tmp_path_factory.getbasetemp() / "damaged"
+    path.write_bytes(data)
+    try:
+        image = read_image(path)
+    except DataError as error:
+        message = str(error)
+    else:
+        assert image.shape[0] == 3
+        assert image.min() >= 0
+        assert image.max() <= 1
+        return
+    assert str(path) in message
+    assert "\n" not in message

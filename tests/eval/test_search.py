@@ -1,0 +1,193 @@
+"""`python -m eval.search` as a user runs it: small, on the embedded scenes, with the real detector."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from eval.config import BeliefConfig, DataConfig, ProtocolConfig, SearchConfig
+from eval.search import main, search
+from eval.store import DetectionStore, see_all
+from eval.tasks import SearchRun
+
+pytestmark = pytest.mark.weights
+
+RECORDS = ("episodes.jsonl", "summary.csv")
+
+
+@pytest.fixture(scope="session")
+def small(tmp_path_factory):
+    """A run of two scenes on 4 × 3 cells."""
+    folder = tmp_path_factory.mktemp("search")
+    return SearchConfig(
+        data=DataConfig(limit=2),
+        belief=BeliefConfig(columns=4, rows=3),
+        protocol=ProtocolConfig(starts=3, shifts=6),
+        policies=("random", "non-predictive-raw"),
+        cache=folder / "cache",
+        out=folder / "out",
+        workers=1,
+        scanpaths=1,
+    )
+
+
+@pytest.fixture(scope="session")
+def finished(small):
+    """The small run, done once."""
+    threads = torch.get_num_threads()
+    search(small)
+    torch.set_num_threads(threads)
+    return small
+
+
+def records_of(config: SearchConfig) -> list[bytes]:
+    return [(config.out / name).read_bytes() for name in RECORDS]
+
+
+def test_run_leaves_everything(finished):
+    records = [json.loads(line) for line in (finished.out / "episodes.jsonl").read_text().splitlines()]
+    assert {record["policy"] for record in records} == set(finished.policies)
+    for record in records:
+        assert record["start"] == record["cells"][0]
+        assert record["start"] not in record["goal"]
+        assert len(set(record["cells"])) == len(record["cells"]) <= finished.protocol.shifts + 1
+        hits = [shift for shift, cell in enumerate(record["cells"]) if cell in record["goal"]]
+        assert record["found_at"] == (hits[0] if hits else -1)
+    with (finished.out / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 2 * 7
+    everything = [
+        r for r in rows if r["average"] == "all targets" and r["policy"] == "random" and r["shifts"] == "6"
+    ]
+    by_scene = {}
+    for record in records:
+        if record["policy"] == "random":
+            by_scene.setdefault(record["scene"], []).append(record["found_at"] >= 0)
+    expected = sum(sum(found) / len(found) for found in by_scene.values()) / len(by_scene)
+    assert float(everything[0]["performance"]) == pytest.approx(expected, abs=1e-6)
+    manifest = json.loads((finished.out / "manifest.json").read_text())
+    assert manifest["eye"]["detector"]["digest"]
+    assert yaml.safe_load((finished.out / "config.yaml").read_text())["protocol"]["starts"] == 3
+    pictures = sorted(path.name for path in finished.out.glob("*.png"))
+    assert pictures[0] == "cumulative_performance.png"
+    assert len(pictures) == 2
+    assert "CP@5" in (finished.out / "summary.md").read_text()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"store": False}, {"workers": 2}, {"protocol": ProtocolConfig(starts=3, shifts=6, batch=2)}],
+    ids=["without the store", "two workers", "small batches"],
+)
+def test_same_bits(finished, change, tmp_path):
+    again = replace(finished, out=tmp_path / "out", cache=tmp_path / "cache", **change)
+    search(again)
+    assert records_of(again) == records_of(finished)
+
+
+def test_store_equals_looking_and_refuses_damage(finished):
+    run = SearchRun(finished)
+    digest = run.scenes.digest(0)
+    stored = run.store.load(digest)
+    seen = see_all(run.eye, run.scenes[0].image, run.grid(0))
+    for name in ("boxes", "scores", "mask"):
+        assert torch.equal(getattr(stored, name), getattr(seen, name))
+    path = run.store.path(digest)
+    whole = path.read_bytes()
+    for damage in (whole[: len(whole) // 2], b"", whole[:-40] + bytes([whole[-40] ^ 1]) + whole[-39:]):
+        path.write_bytes(damage)
+        assert run.store.load(digest) is None
+    path.write_bytes(whole)
+    other = DetectionStore(path.parent.parent, {"another": "eye"}, 4, 3)
+    other.folder = run.store.folder
+    assert other.load(digest) is None
+
+
+def test_damaged_parts_are_computed_again(finished, tmp_path):
+    again = replace(finished, out=tmp_path)
+    search(again)
+    part = next((tmp_path / "parts").glob("*/000001.json"))
+    part.write_text(part.read_text().replace('"repetition": 1', '"repetition": 2', 1))
+    search(again)
+    assert records_of(again) == records_of(finished)
+
+
+def command(config: SearchConfig, out: Path, cache: Path, *more: str) -> list[str]:
+    return [
+        sys.executable, "-m", "eval.search", "--data.limit", "2", "--belief.columns", "4", "--belief.rows", "3",
+        "--protocol.starts", "3", "--protocol.shifts", "6", "--policies", json.dumps(list(config.policies)),
+        "--out", str(out), "--cache", str(cache), "--workers", "1", "--scanpaths", "0", *more,
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_killed_run_resumes_with_the_same_result(finished, tmp_path):
+    call = command(finished, tmp_path / "out", tmp_path / "cache")
+    root = Path(__file__).parents[2]
+    process = subprocess.Popen(call, cwd=root, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("out/parts/*/*.json")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "out/summary.csv").exists()
+    subprocess.run(call, cwd=root, check=True, capture_output=True)
+    again = replace(finished, out=tmp_path / "out")
+    assert records_of(again) == records_of(finished)
+
+
+@pytest.mark.slow
+def test_torchrun_ranks_share_the_work(finished, tmp_path):
+    call = command(finished, tmp_path / "out", tmp_path / "cache")
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run(
+        [*launch, *call[1:]], cwd=Path(__file__).parents[2], check=True, capture_output=True, env=environment
+    )
+    assert records_of(replace(finished, out=tmp_path / "out")) == records_of(finished)
+
+
+def test_errors_are_one_line(capsys, tmp_path):
+    assert main(["--policies", '["predicitve-raw"]', "--out", str(tmp_path)]) == 1
+    assert "did you mean 'predictive-raw'" in capsys.readouterr().err
+    assert main(["--detector.name", "yolov3-tinny", "--out", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert "yolov3-tiny" in error
+    assert error.count("\n") == 1
+
+
+def test_unwritable_output_is_named(capsys, tmp_path, small):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    arguments = command(small, blocked / "out", small.cache)[3:]
+    assert main(arguments) == 1
+    assert str(blocked) in capsys.readouterr().err
+
+
+def test_unknown_keys_are_refused(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--sensor.sigmma", "3"])
+    assert stopped.value.code == 2
+    assert "sigmma" in capsys.readouterr().err
+
+
+def test_help_and_print_config(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--help"])
+    assert stopped.value.code == 0
+    text = capsys.readouterr().out
+    for word in ("--sensor.sigma", "width of the fovea", "--config"):
+        assert word in text
+    with pytest.raises(SystemExit):
+        main(["--sensor.sigma", "50", "--print_config"])
+    printed = yaml.safe_load(capsys.readouterr().out)
+    assert printed["sensor"]["sigma"] == 50

@@ -1,0 +1,183 @@
+"""Densities, moments, entropy and divergence against scipy, torch.distributions, mpmath and closed forms."""
+
+import mpmath
+import numpy as np
+import pytest
+import scipy.stats
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.errors import InputError
+from semfov.observation import dirichlet
+
+DTYPES = [torch.float32, torch.float64]
+
+
+def random_case(dtype, shape=(4, 3), components=6, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    alpha = torch.rand(*shape, components, generator=generator, dtype=torch.float64) * 5 + 0.05
+    scores = torch.rand(*shape, components, generator=generator, dtype=torch.float64) + 1e-3
+    return alpha.to(dtype), (scores / scores.sum(-1, keepdim=True)).log().to(dtype)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_log_prob_is_that_of_scipy_and_torch(dtype):
+    alpha, log_scores = random_case(dtype)
+    got = dirichlet.log_prob(alpha, log_scores)
+    assert got.dtype == dtype
+    assert got.shape == (4, 3)
+    double = log_scores.double().exp()
+    double = double / double.sum(-1, keepdim=True)
+    expected = torch.distributions.Dirichlet(alpha.double()).log_prob(double)
+    tolerance = 1e-4 if dtype == torch.float32 else 1e-12
+    torch.testing.assert_close(got.double(), expected, rtol=tolerance, atol=tolerance)
+    for i, j in np.ndindex(4, 3):
+        reference = scipy.stats.dirichlet.logpdf(double[i, j].numpy(), alpha[i, j].double().numpy())
+        assert float(got[i, j]) == pytest.approx(reference, rel=tolerance, abs=tolerance)
+
+
+def test_two_components_are_a_beta():
+    alpha = torch.tensor([[0.3, 4.0], [7.0, 2.5]], dtype=torch.float64)
+    x = torch.tensor([0.2, 0.9], dtype=torch.float64)
+    log_scores = torch.stack([x, 1 - x], -1).log()
+    beta = scipy.stats.beta(alpha[:, 0].numpy(), alpha[:, 1].numpy())
+    np.testing.assert_allclose(dirichlet.log_prob(alpha, log_scores), beta.logpdf(x.numpy()), rtol=1e-12)
+    np.testing.assert_allclose(dirichlet.entropy(alpha), beta.entropy(), rtol=1e-10)
+    np.testing.assert_allclose(dirichlet.mean(alpha)[:, 0], beta.mean(), rtol=1e-14)
+    np.testing.assert_allclose(dirichlet.covariance(alpha)[:, 0, 0], beta.var(), rtol=1e-12)
+
+
+def mpmath_forms(alpha, other, log_scores):
+    """Log density, entropy and divergence in 60 digits."""
+    with mpmath.workdps(60):
+        a, b, x = ([mpmath.mpf(v) for v in row] for row in (alpha, other, log_scores))
+
+        def normaliser(p):
+            return mpmath.fsum(mpmath.loggamma(v) for v in p) - mpmath.loggamma(mpmath.fsum(p))
+
+        total = mpmath.fsum(a)
+        surprise = [mpmath.digamma(v) - mpmath.digamma(total) for v in a]
+        log_prob = mpmath.fsum((v - 1) * y for v, y in zip(a, x, strict=True)) - normaliser(a)
+        entropy = normaliser(a) - mpmath.fsum((v - 1) * y for v, y in zip(a, surprise, strict=True))
+        divergence = normaliser(b) - normaliser(a)
+        divergence += mpmath.fsum((v - w) * y for v, w, y in zip(a, b, surprise, strict=True))
+        return float(log_prob), float(entropy), float(divergence)
+
+
+@pytest.mark.parametrize(
+    ("alpha", "other"),
+    [
+        ([1e-8, 2e-8, 0.5], [1.0, 1.0, 1.0]),
+        ([1e-3, 1e-5, 1e-4], [2e-3, 1e-5, 3e-4]),
+        ([1e6, 3e5, 0.01], [1e3, 1e3, 1e3]),
+        ([150.0, 1e-6, 40.0], [150.0, 1e-7, 41.0]),
+    ],
+)
+def test_tails_agree_with_sixty_digits(alpha, other):
+    log_scores = [-1e-9, -300.0, -21.0]
+    a, b, x = (torch.tensor(v, dtype=torch.float64) for v in (alpha, other, log_scores))
+    reference = mpmath_forms(a.tolist(), b.tolist(), x.tolist())
+    got = [dirichlet.log_prob(a, x), dirichlet.entropy(a), dirichlet.kl_divergence(a, b)]
+    # Terms of the size of A ln A cancel, so errors are measured by it.
+    scale = max(1.0, float(a.sum() * a.sum().log().abs()), float(b.sum() * b.sum().log().abs()))
+    for value, expected in zip(got, reference, strict=True):
+        assert float(value) == pytest.approx(expected, rel=1e-12, abs=1e-14 * scale)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_entropy_and_divergence_are_those_of_torch(dtype):
+    alpha, _ = random_case(dtype)
+    other, _ = random_case(dtype, seed=1)
+    p, q = (torch.distributions.Dirichlet(a.double()) for a in (alpha, other))
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-12
+    torch.testing.assert_close(dirichlet.entropy(alpha).double(), p.entropy(), rtol=tolerance, atol=10 * tolerance)
+    torch.testing.assert_close(
+        dirichlet.kl_divergence(alpha, other).double(),
+        torch.distributions.kl_divergence(p, q),
+        rtol=tolerance,
+        atol=10 * tolerance,
+    )
+
+
+parameters = st.lists(st.floats(1e-3, 1e3), min_size=4, max_size=4).map(lambda v: torch.tensor(v, dtype=torch.float64))
+
+
+@given(parameters, parameters)
+def test_divergence_is_not_negative_and_zero_to_itself(alpha, other):
+    scale = float((alpha.sum() + other.sum()) * 10)
+    assert float(dirichlet.kl_divergence(alpha, other)) >= -1e-14 * scale
+    assert float(dirichlet.kl_divergence(alpha, alpha)) == 0
+
+
+def test_moments_are_those_of_scipy():
+    alpha = torch.tensor([0.4, 2.0, 7.5, 1.1], dtype=torch.float64)
+    reference = scipy.stats.dirichlet(alpha.numpy())
+    np.testing.assert_allclose(dirichlet.mean(alpha), reference.mean(), rtol=1e-14)
+    np.testing.assert_allclose(dirichlet.covariance(alpha), reference.cov(), rtol=1e-12)
+
+
+def test_categorical_covariance_is_that_of_one_draw():
+    alpha = torch.tensor([[0.4, 2.0, 7.5], [1.0, 1.0, 2.0]], dtype=torch.float64)
+    p = alpha / alpha.sum(-1, keepdim=True)
+    draws = torch.eye(3, dtype=torch.float64)
+    expected = torch.zeros(2, 3, 3, dtype=torch.float64)
+    for row in range(2):
+        for k in range(3):
+            offset = draws[k] - p[row]
+            expected[row] += p[row, k] * torch.outer(offset, offset)
+    torch.testing.assert_close(dirichlet.categorical_covariance(alpha), expected, rtol=1e-13, atol=1e-15)
+
+
+def test_everything_has_gradients():
+    alpha, log_scores = random_case(torch.float64, shape=(2,), components=3)
+    other = alpha.flip(0).clone()
+    for tensor in (alpha, other, log_scores):
+        tensor.requires_grad_()
+    check = torch.autograd.gradcheck
+    assert check(dirichlet.log_prob, (alpha, log_scores))
+    assert check(dirichlet.kl_divergence, (alpha, other))
+    for function in (dirichlet.mean, dirichlet.entropy, dirichlet.covariance, dirichlet.categorical_covariance):
+        assert check(function, (alpha,))
+    assert check(lambda s: dirichlet.floor(s, 1e-3), (torch.tensor([0.2, 0.5, 0.3]).double().requires_grad_(),))
+
+
+def test_functions_compile_in_one_piece():
+    alpha, log_scores = random_case(torch.float64)
+    for function, arguments in [
+        (dirichlet.log_prob, (alpha, log_scores)),
+        (dirichlet.entropy, (alpha,)),
+        (dirichlet.kl_divergence, (alpha, alpha + 1)),
+    ]:
+        compiled = torch.compile(function, fullgraph=True, backend="eager")
+        torch.testing.assert_close(compiled(*arguments), function(*arguments))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_floor_makes_logarithms_finite_and_keeps_the_simplex(dtype):
+    scores = torch.tensor([[0.0, 0.0, 1.0], [1e-9, 0.5, 0.5]], dtype=dtype)
+    kept = scores.clone()
+    floored = dirichlet.floor(scores, 1e-6)
+    assert torch.equal(scores, kept)
+    assert floored.dtype == dtype
+    torch.testing.assert_close(floored.sum(-1), torch.ones(2, dtype=dtype))
+    torch.testing.assert_close(floored[0, :2], torch.full((2,), 1e-6 / (1 + 2e-6), dtype=dtype))
+    assert bool(floored.log().isfinite().all())
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: dirichlet.mean(torch.tensor([1.0, 0.0])),
+        lambda: dirichlet.entropy(torch.tensor([1.0, -1.0])),
+        lambda: dirichlet.log_prob(torch.tensor([1.0, torch.nan]), torch.zeros(2)),
+        lambda: dirichlet.log_prob(torch.ones(3), torch.zeros(2)),
+        lambda: dirichlet.kl_divergence(torch.ones(3), torch.ones(2)),
+        lambda: dirichlet.floor(torch.tensor([0.5, torch.nan]), 1e-6),
+        lambda: dirichlet.floor(torch.tensor([1.5, -0.5]), 1e-6),
+        lambda: dirichlet.floor(torch.tensor([0.5, 0.5]), 0.0),
+    ],
+)
+def test_bad_arguments_are_named(call):
+    with pytest.raises(InputError, match="expected"):
+        call()

@@ -1,0 +1,44 @@
+"""Matching against torchvision's IoU and a loop."""
+
+import torch
+from torchvision.ops import box_iou as torchvision_iou
+
+from semfov.observation.matching import box_iou, match
+
+
+def some_boxes(count, seed):
+    generator = torch.Generator().manual_seed(seed)
+    corner = torch.rand(count, 2, generator=generator) * 30
+    return torch.cat([corner, corner + 2 + torch.rand(count, 2, generator=generator) * 25], -1)
+
+
+def test_iou_equals_torchvision():
+    a, b = some_boxes(20, 0), some_boxes(30, 1)
+    torch.testing.assert_close(box_iou(a, b), torchvision_iou(a, b))
+
+
+def test_boxes_without_area_overlap_nothing():
+    flat = torch.tensor([[3.0, 3, 3, 9]])
+    assert box_iou(flat, flat).tolist() == [[0.0]]
+
+
+def test_match_equals_a_loop():
+    for seed in range(30):
+        boxes, truth = some_boxes(12, seed), some_boxes(6, seed + 100)
+        labels = torch.arange(1, 7)
+        expected, taken = [], set()
+        for box in boxes:
+            overlaps = torchvision_iou(box[None], truth)[0].tolist()
+            free = [(value, -index) for index, value in enumerate(overlaps) if index not in taken and value >= 0.3]
+            if free:
+                index = -max(free)[1]
+                taken.add(index)
+                expected.append(int(labels[index]))
+            else:
+                expected.append(0)
+        assert match(boxes, truth, labels, iou=0.3).tolist() == expected
+
+
+def test_nothing_to_match():
+    assert match(torch.zeros(0, 4), some_boxes(3, 0), torch.tensor([1, 2, 3])).tolist() == []
+    assert match(some_boxes(2, 0), torch.zeros(0, 4), torch.zeros(0, dtype=torch.long)).tolist() == [0, 0]

@@ -1,0 +1,144 @@
+"""The agent as a whole, with a detector that sees coloured squares."""
+
+import pytest
+import torch
+
+from semfov import ActivePerception, Foveation, Grid, SemanticMap, search_policy
+from semfov.agent import confirms, step
+from semfov.belief import weigh
+from semfov.detection import Candidates, Detections, Detector
+from semfov.errors import InputError
+from semfov.eye import Eye
+
+SIZE = (160, 120)
+
+
+class Squares(Detector):
+    """Detects the bounding box of what is red (class 1) and what is green (class 2); its score is how saturated."""
+
+    def __init__(self) -> None:
+        super().__init__("squares", ("red", "green"), SIZE)
+
+    def propose(self, canvas):
+        boxes, classes = [], []
+        for channel in (0, 1):
+            colour = canvas[0, channel] - canvas[0, 1 - channel]
+            ys, xs = (colour > 0.1).nonzero(as_tuple=True)
+            if len(xs):
+                boxes.append(torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas))
+                classes.append(torch.nn.functional.one_hot(torch.tensor(channel), 2) * colour.max().clamp(0, 1))
+        if not boxes:
+            return Candidates(canvas.new_zeros(1, 0, 4), canvas.new_zeros(1, 0, 2))
+        return Candidates(torch.stack(boxes)[None], torch.stack(classes)[None])
+
+
+@pytest.fixture
+def image():
+    """A red square at the top left and a smaller green one at the bottom right, on grey."""
+    picture = torch.full((3, 120, 160), 0.4)
+    picture[:, 8:28, 8:28] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
+    picture[:, 100:110, 130:140] = torch.tensor([0.1, 0.9, 0.1])[:, None, None]
+    return picture
+
+
+@pytest.fixture
+def agent():
+    return ActivePerception(
+        Foveation(40.0), Squares(), None, (8, 6), search_policy("non-predictive"), reference=160.0
+    )
+
+
+def test_search_goes_to_the_target(agent, image):
+    scanpath = agent.search(image, "green", start=0)
+    assert scanpath.found
+    assert scanpath.classes[scanpath.target] == "green"
+    grid = Grid(8, 6, SIZE)
+    goal = grid.footprint(torch.tensor([[130.0, 100, 140, 110]]))[0]
+    assert goal[scanpath.cells[-1]]
+    assert scanpath.shifts <= 3
+    assert scanpath.beliefs.shape == (len(scanpath), 48, 3)
+    assert torch.equal(scanpath.fixations, grid.centres[scanpath.cells])
+    assert len(set(scanpath.cells.tolist())) == len(scanpath)
+
+
+def test_boxes_decide_what_is_found(agent, image):
+    nowhere = torch.tensor([[60.0, 60, 61, 61]])
+    scanpath = agent.search(image, "green", start=0, boxes=nowhere, shifts=5)
+    hit = Grid(8, 6, SIZE).footprint(nowhere)[0].nonzero()[0, 0]
+    assert scanpath.found == (int(hit) in scanpath.cells.tolist())
+    assert scanpath.shifts <= 5
+    assert agent.search(image, "red", start=0, boxes=torch.tensor([[0.0, 0, 30, 30]])).shifts == 0
+
+
+def test_beliefs_are_those_of_a_semantic_map(agent, image):
+    scanpath = agent.search(image, "green", start=20, shifts=4, boxes=torch.tensor([[0.0, 119, 1, 120]]))
+    own = SemanticMap(Grid(8, 6, SIZE), ["red", "green"])
+    eye = Eye(Foveation(40.0), Squares(), reference=160.0)
+    for fixation, belief, seen in zip(scanpath.fixations, scanpath.beliefs, scanpath.detections, strict=True):
+        detections = eye(image[None], fixation[None])
+        torch.testing.assert_close(detections.boxes, seen.boxes)
+        own.update(detections, fixation[None])
+        torch.testing.assert_close(own.beta[0], belief)
+
+
+def test_same_seed_same_scanpath(agent, image):
+    empty = torch.full_like(image, 0.4)
+    first, second, other = (agent.search(empty, "red", seed=seed, shifts=9).cells for seed in (3, 3, 4))
+    assert torch.equal(first, second)
+    assert not torch.equal(first, other)
+
+
+def test_search_ends_when_every_cell_was_visited(image):
+    agent = ActivePerception(Foveation(40.0), Squares(), None, (3, 2), search_policy("random"), reference=160.0)
+    scanpath = agent.search(torch.full_like(image, 0.4), "red", shifts=50)
+    assert not scanpath.found
+    assert sorted(scanpath.cells.tolist()) == list(range(6))
+
+
+def test_class_names_are_suggested(agent, image):
+    with pytest.raises(InputError, match="did you mean 'green'"):
+        agent.search(image, "gren")
+    with pytest.raises(InputError, match="target"):
+        agent.search(image, 3)
+    with pytest.raises(InputError, match="start"):
+        agent.search(image, 1, start=48)
+
+
+def test_step_marks_visits_and_fuses(image):
+    grid = Grid(8, 6, SIZE)
+    detections = Squares()(image[None])
+    evidence = weigh(detections, grid.centres[:1], grid)
+    beta, visited = torch.full((1, 48, 3), 0.5), torch.zeros(1, 48, dtype=torch.bool)
+    visited[0, 9] = True
+    cell = torch.tensor([0])
+    after = step(beta, visited, cell, evidence, search_policy("non-predictive")(1), torch.rand(1, 48))
+    assert after.visited[0].nonzero()[:, 0].tolist() == [0, 9]
+    red = Grid(8, 6, SIZE).footprint(torch.tensor([[8.0, 8, 28, 28]]))[0]
+    assert red[after.cell[0]]
+    assert after.cell[0] not in (0, 9)
+    assert torch.equal(beta, torch.full((1, 48, 3), 0.5))
+
+
+def test_confirmation_needs_place_class_and_score():
+    grid = Grid(8, 6, SIZE)
+    boxes = torch.tensor([[[10.0, 10, 19, 19]]])
+    sure = Detections(boxes, torch.tensor([[[0.1, 0.8, 0.1]]]), torch.tensor([[True]]))
+    unsure = Detections(boxes, torch.tensor([[[0.1, 0.4, 0.5]]]), torch.tensor([[True]]))
+    assert confirms(sure, grid, 0, 1, 0.5)
+    assert not confirms(sure, grid, 1, 1, 0.5)
+    assert not confirms(sure, grid, 0, 1, 0.9)
+    assert not confirms(unsure, grid, 0, 1, 0.3)
+    padded = Detections(boxes, torch.tensor([[[0.1, 0.8, 0.1]]]), torch.tensor([[False]]))
+    assert not confirms(padded, grid, 0, 1, 0.5)
+
+
+def test_view_is_foveated_at_the_resolution_of_the_detector(image):
+    """A photograph of twice the size, its fovea scaled with it, gives the same view."""
+    eye = Eye(Foveation(30.0), Squares(), reference=160.0)
+    large = image.repeat_interleave(2, -1).repeat_interleave(2, -2)
+    small_view = eye.foveated(eye.open(image[None]), torch.tensor([[39.5, 19.5]]))
+    large_view = eye.foveated(eye.open(large[None]), torch.tensor([[79.5, 39.5]]))
+    torch.testing.assert_close(small_view, large_view, atol=0.05, rtol=0)
+    sharp = (small_view[0, :, 8:28, 8:28] - image[:, 8:28, 8:28]).abs().mean()
+    blurred = (small_view[0, :, 100:110, 130:140] - image[:, 100:110, 130:140]).abs().mean()
+    assert blurred > 3 * sharp

@@ -1,0 +1,1 @@
+"""Applications that fit semfov's models to data."""

@@ -1,0 +1,198 @@
+"""Labelled detections: what the detector scored, how far from the fovea, and what was really there."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from eval.config import DataConfig, DetectorConfig, SensorConfig
+from eval.parallel import available_cores, mine, run_tasks, wait_for_all
+from eval.protocol import generator_for
+from eval.setup import make_eye, make_scenes, single_thread
+from eval.store import checksum
+from semfov import Grid
+from semfov.data.scene import Scenes
+from semfov.errors import DataError
+from semfov.eye import Eye
+from semfov.files import replacing
+from semfov.observation.matching import match
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Detections with their true classes.
+
+    Attributes:
+        scores: `(M, K+1)`, score vectors.
+        distance: `(M,)`, from the box's centre to the fixation, in longer sides of the image.
+        labels: `(M,)`, true classes, 0 where a detection shows no object.
+        scene: `(M,)`, index of the scene.
+    """
+
+    scores: Tensor
+    distance: Tensor
+    labels: Tensor
+    scene: Tensor
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __getitem__(self, index: Tensor) -> Samples:
+        return Samples(self.scores[index], self.distance[index], self.labels[index], self.scene[index])
+
+    @classmethod
+    def join(cls, parts: list[Samples]) -> Samples:
+        """All samples of several sets, in order."""
+        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in _NAMES))
+
+
+_NAMES = ("scores", "distance", "labels", "scene")
+
+
+@dataclass(frozen=True)
+class SampleSettings:
+    """What labelled detections depend on.
+
+    Attributes:
+        data: the photographs.
+        detector: which detector looks through the fovea.
+        sensor: the foveal sensor.
+        fixations: random fixations in each photograph, uniform over its pixels.
+        iou: overlap from which a detection shows an object.
+        seed: of the fixations.
+    """
+
+    data: DataConfig
+    detector: DetectorConfig
+    sensor: SensorConfig
+    fixations: int
+    iou: float
+    seed: int
+
+
+class Sampler:
+    """Looks at photographs from random fixations; one shard is a run of successive photographs.
+
+    Attributes:
+        key: sha256 of everything that the samples depend on.
+    """
+
+    shard_size = 32
+
+    def __init__(self, settings: SampleSettings) -> None:
+        self.settings = settings
+        self.eye: Eye = make_eye(settings.detector, settings.sensor)
+        self.scenes: Scenes = make_scenes(settings.data, self.eye.detector.classes)
+        what = [self.eye.settings(), self.scenes.fingerprint, settings.fixations, settings.iou, settings.seed]
+        what += [self.shard_size, torch.__version__]
+        self.key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def shards(self) -> range:
+        """Numbers of the shards."""
+        return range(-(-len(self.scenes) // self.shard_size))
+
+    def path(self, folder: Path, shard: int) -> Path:
+        """File of a shard."""
+        return folder / self.key[:16] / f"{shard:06d}.safetensors"
+
+    def load(self, folder: Path, shard: int) -> Samples | None:
+        """Samples of a shard, or None if they are not there whole."""
+        try:
+            with safe_open(self.path(folder, shard), framework="pt") as file:
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+                metadata = file.metadata() or {}
+        except (OSError, SafetensorError):
+            return None
+        whole = set(tensors) == set(_NAMES) and metadata == {"key": self.key, "sha256": checksum(tensors)}
+        return Samples(**tensors) if whole else None
+
+    def save(self, folder: Path, shard: int, samples: Samples) -> None:
+        """Keep the samples of a shard."""
+        tensors = {name: getattr(samples, name).contiguous() for name in _NAMES}
+        with replacing(self.path(folder, shard)) as temporary:
+            temporary.write_bytes(save(tensors, {"key": self.key, "sha256": checksum(tensors)}))
+
+    def sample(self, shard: int) -> Samples:
+        """Look at the photographs of a shard."""
+        first = shard * self.shard_size
+        scenes = range(first, min(first + self.shard_size, len(self.scenes)))
+        return Samples.join([self._look(index) for index in scenes])
+
+    def _look(self, index: int) -> Samples:
+        settings, scene = self.settings, self.scenes[index]
+        grid = Grid(1, 1, scene.size)
+        generator = generator_for("fixations", settings.seed, scene.id)
+        points = torch.rand(settings.fixations, 2, generator=generator) * grid.extent - 0.5
+        parts = []
+        with torch.inference_mode():
+            view = self.eye.open(scene.image[None])
+            for point in points:
+                seen = self.eye.look(view, point[None])
+                parts.append(
+                    Samples(
+                        seen.scores[0],
+                        grid.box_distance(seen.boxes[0], point),
+                        match(seen.boxes[0], scene.boxes, scene.labels, iou=settings.iou),
+                        torch.full((int(seen.count),), index),
+                    )
+                )
+        return Samples.join(parts)
+
+
+_process: dict[str, tuple[Sampler, Path]] = {}
+
+
+def _prepare(settings: SampleSettings, folder: Path) -> None:
+    single_thread()
+    _process["sampler"] = Sampler(settings), folder
+
+
+def _run_shard(shard: int) -> int:
+    sampler, folder = _process["sampler"]
+    sampler.save(folder, shard, sampler.sample(shard))
+    return shard
+
+
+def collect(settings: SampleSettings, folder: Path, workers: int | None, title: str) -> tuple[Sampler, Samples]:
+    """Labelled detections of all photographs, in order; finished shards are read back, the others computed.
+
+    The result is the same to the last bit for any number of workers and ranks.
+    """
+    sampler = Sampler(settings)
+    todo = [shard for shard in mine(sampler.shards) if sampler.load(folder, shard) is None]
+    done = run_tasks(
+        _run_shard,
+        todo,
+        workers=workers or available_cores(),
+        setup=_prepare,
+        settings=(settings, folder),
+        title=title,
+        unit="shard",
+    )
+    for _ in done:
+        pass
+    wait_for_all()
+    parts = []
+    for shard in sampler.shards:
+        part = sampler.load(folder, shard)
+        if part is None:
+            path = sampler.path(folder, shard)
+            raise DataError(f"{path} is missing or damaged; run the same command again")
+        parts.append(part)
+    return sampler, Samples.join(parts)
+
+
+def describe(settings: SampleSettings) -> dict[str, object]:
+    """The settings as plain data, for metadata."""
+    plain = json.loads(json.dumps(asdict(settings), default=str))
+    plain["data"].pop("root", None)
+    plain["data"].pop("annotations", None)
+    return plain
