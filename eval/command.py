@@ -47,7 +47,7 @@ def run_command(
     parser = make_parser(config, description)
     parsed = parser.parse_args(arguments)
     parsed.pop("config", None)
-    settings = parser.instantiate_classes(parsed)
+    settings = parser.instantiate(parsed)
     try:
         main(config(**settings.as_dict()))
     except SemfovError as error:

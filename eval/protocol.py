@@ -145,9 +145,7 @@ def _run_batch(
         if shift == shifts or not go_on.any():
             break
         active, cell, beta, visited = active[go_on], cell[go_on], beta[go_on], visited[go_on]
-        after = step(
-            beta, visited, cell, evidence[cell], policy(targets[active]), noise[active, shift], fusion=fusion
-        )
+        after = step(beta, visited, cell, evidence[cell], policy(targets[active]), noise[active, shift], fusion=fusion)
         left = after.cell >= 0
         active, cell, beta, visited = active[left], after.cell[left], after.beta[left], after.visited[left]
     return [Outcome(tuple(row[row >= 0].tolist()), int(at)) for row, at in zip(visits, found_at, strict=True)]

@@ -63,9 +63,7 @@ def report(run: SearchRun, parts: Parts) -> None:
     write_text(out / "summary.md", summary)
     write_text(out / "config.yaml", resolved_config(run))
     write_text(out / "manifest.json", json.dumps(manifest(run, seconds, decision), indent=2) + "\n")
-    written = [
-        out / name for name in ("summary.md", "summary.csv", "episodes.jsonl", "config.yaml", "manifest.json")
-    ]
+    written = [out / name for name in ("summary.md", "summary.csv", "episodes.jsonl", "config.yaml", "manifest.json")]
     written += [draw_curves(run, curves["all targets"], expected), *draw_scanpaths(run, records)]
     print(summary)
     print("written:")
@@ -120,8 +118,7 @@ def expected_random(records: list[dict[str, Any]], shifts: int, cells: int) -> N
     for record in records:
         targets[record["scene"]][record["target"]] = len(record["goal"])
     curves = [
-        np.mean([random_search(count, shifts, cells) for count in goals.values()], axis=0)
-        for goals in targets.values()
+        np.mean([random_search(count, shifts, cells) for count in goals.values()], axis=0) for goals in targets.values()
     ]
     return np.asarray(np.mean(curves, axis=0), dtype=np.float64)
 
@@ -167,9 +164,7 @@ def summary_csv(curves: dict[str, dict[str, Curve]]) -> str:
     for average, policies in curves.items():
         for policy, curve in policies.items():
             for shift in range(len(curve.mean)):
-                figures = (
-                    f"{values[shift]:.6f}" for values in (curve.mean, curve.over_images, curve.over_repetitions)
-                )
+                figures = (f"{values[shift]:.6f}" for values in (curve.mean, curve.over_images, curve.over_repetitions))
                 table.writerow([average, policy, shift, *figures, curve.images, curve.episodes])
     return text.getvalue()
 

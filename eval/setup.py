@@ -43,9 +43,7 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
         limit=detector.limit,
         stride=detector.stride,
     )
-    foveation = semfov.Foveation(
-        sensor.sigma, levels=sensor.levels, growth=sensor.growth, convention=sensor.convention
-    )
+    foveation = semfov.Foveation(sensor.sigma, levels=sensor.levels, growth=sensor.growth, convention=sensor.convention)
     return Eye(foveation, model, reference=sensor.reference).eval().requires_grad_(False)
 
 

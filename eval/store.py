@@ -7,6 +7,7 @@ remembers them under a key of everything that they depend on; it changes how lon
 import hashlib
 import json
 import platform
+from functools import cache
 from pathlib import Path
 
 import kornia
@@ -53,6 +54,7 @@ class DetectionStore:
             "torchvision": torchvision.__version__,
             "kornia": kornia.__version__,
             "machine": platform.machine(),
+            "code": code_digest(),
         }
         what = {"settings": settings, "grid": [columns, rows], "versions": versions}
         self.key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
@@ -85,6 +87,14 @@ class DetectionStore:
         content = save(tensors, {"sha256": checksum(tensors), "key": self.key})
         with replacing(self.path(digest)) as temporary:
             temporary.write_bytes(content)
+
+
+@cache
+def code_digest() -> str:
+    """sha256 over the sources that turn an image into detections: a store never outlives a change of them."""
+    package = Path(semfov.__file__).parent
+    files = sorted([*package.glob("sensor/*.py"), *package.glob("detection/*.py"), package / "eye.py"])
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 def pack(detections: Detections) -> dict[str, Tensor]:

@@ -115,9 +115,9 @@ def cache_folder(config: SearchConfig) -> Path:
     """Folder of the detection store."""
     if config.cache is not None:
         return config.cache / "looks"
-    from semfov.detection.weights import cache_dir
+    from semfov.detection.weights import cache_folder as user_cache
 
-    return cache_dir() / "looks"
+    return user_cache() / "looks"
 
 
 class Parts:

@@ -16,7 +16,7 @@ from eval.config import DataConfig, DetectorConfig, SensorConfig
 from eval.parallel import available_cores, mine, run_tasks, wait_for_all
 from eval.protocol import generator_for
 from eval.setup import make_eye, make_scenes, single_thread
-from eval.store import checksum
+from eval.store import checksum, code_digest
 from semfov import Grid
 from semfov.data.scene import Scenes
 from semfov.errors import DataError
@@ -91,7 +91,7 @@ class Sampler:
         self.eye: Eye = make_eye(settings.detector, settings.sensor)
         self.scenes: Scenes = make_scenes(settings.data, self.eye.detector.classes)
         what = [self.eye.settings(), self.scenes.fingerprint, settings.fixations, settings.iou, settings.seed]
-        what += [self.shard_size, torch.__version__]
+        what += [self.shard_size, torch.__version__, code_digest()]
         self.key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
     @property

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from semfov.detection.darknet_builder import Builder
 from semfov.detection.darknet_config import Section
-from semfov.detection.darknet_layers import Convolution, Head
+from semfov.detection.darknet_layers import Head
 from semfov.detection.winograd import WinogradConvolution
 from semfov.errors import DataError, check, check_shape
 
@@ -21,6 +21,8 @@ class Darknet(nn.Module):
         input_size: `(width, height)` that the cfg asks for.
         stride: both sides of an input must be multiples of it.
         heads: the yolo layers, in order.
+        sections: what it was built from.
+        winograd: whether `use_winograd` was called.
 
     Shape:
         - input: `(B, C, H, W)`
@@ -33,6 +35,8 @@ class Darknet(nn.Module):
 
     def __init__(self, sections: Sequence[Section]) -> None:
         super().__init__()
+        self.sections = tuple(sections)
+        self.winograd = False
         if not sections or sections[0].kind not in ("net", "network"):
             raise DataError("cfg: expected [net] as its first section")
         self.input_size = (sections[0].integer("width", 416), sections[0].integer("height", 416))
@@ -79,8 +83,8 @@ class Darknet(nn.Module):
 
         Output tiles are 4 pixels wide, or 2 where the transformed kernels would not fit into a CPU's cache.
         """
+        self.winograd = True
         for index, layer in enumerate(self.layers):
-            if isinstance(layer, Convolution) and WinogradConvolution.replaces(layer):
-                if layer.in_channels >= channels:
-                    tile = 4 if layer.in_channels * layer.out_channels <= 2**17 else 2
-                    self.layers[index] = WinogradConvolution(layer, tile)
+            if WinogradConvolution.replaces(layer) and layer.in_channels >= channels:
+                tile = 4 if layer.in_channels * layer.out_channels < 2**17 else 2
+                self.layers[index] = WinogradConvolution(layer, tile)

@@ -65,9 +65,7 @@ class Builder:
     def _convolution(self, section: Section) -> nn.Module:
         here, filters, groups = self._here, section.integer("filters", 1), section.integer("groups", 1)
         if here.channels % groups or filters % groups:
-            raise DataError(
-                f"{section.where}: groups={groups} divides not both {here.channels} and {filters} channels"
-            )
+            raise DataError(f"{section.where}: groups={groups} divides not both {here.channels} and {filters} channels")
         size, stride = section.integer("size", 1), section.integer("stride", 1)
         same = section.integer("pad", 0, minimum=0)
         self._note(filters, here.step * stride)

@@ -38,13 +38,12 @@ def read_weights(network: Darknet, path: str | PathLike[str]) -> str:
     start = _header(data)
     needed = start + 4 * sum(_count(layer) for layer in layers)
     if len(data) != needed:
-        fault = "truncated" if len(data) < needed else "too long, or of another network"
-        raise DataError(f"weights {str(path)!r}: expected {needed} bytes for this cfg, got {len(data)}: {fault}")
+        fault = "truncated" if len(data) < needed else "too long"
+        found = f"expected {needed} bytes for this network, got {len(data)}"
+        raise DataError(f"weights {str(path)!r}: {found}; {fault}, or of another network")
     numbers = torch.frombuffer(data, dtype=torch.float32, offset=start)
     if not bool(torch.isfinite(numbers).all()):
-        raise DataError(
-            f"weights {str(path)!r}: expected finite numbers, so the file is damaged or no weights file"
-        )
+        raise DataError(f"weights {str(path)!r}: expected finite numbers, so the file is damaged or no weights file")
     for layer in layers:
         numbers = _fill(layer, numbers, str(path))
     return hashlib.sha256(data).hexdigest()

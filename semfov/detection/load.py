@@ -1,6 +1,6 @@
 """`load_detector`: every detector by its name or its file."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -10,31 +10,33 @@ import torch
 from semfov.detection.architectures import ARCHITECTURES
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.detection.darknet import Darknet
-from semfov.detection.darknet_config import Section, read_cfg
+from semfov.detection.darknet_config import read_cfg
 from semfov.detection.darknet_weights import read_weights
 from semfov.detection.detector import Detector
 from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.selection import Selection
-from semfov.detection.weights import fetch
+from semfov.detection.weights import WEIGHTS, fetch
 from semfov.detection.yolo import YoloV3
-from semfov.errors import InputError, check, lookup
+from semfov.errors import DataError, InputError, lookup
 
 
 def load_detector(name_or_path: str | PathLike[str], **options: Any) -> Detector:
     """A detector by its name or its file, ready for inference.
 
-    - `"yolov3-tiny"`, `"yolov3"`, `"yolov3-spp"`: Darknet networks; options of `load_yolo`. Weights are downloaded
-      to the cache once, or read from the file `weights=`.
+    - `"yolov3-tiny"`, `"yolov3"`, `"yolov3-spp"`: options of `load_yolo`.
     - a path that ends in `.cfg`, with `weights=`: any Darknet network with YOLOv3 heads; options of `load_yolo`.
     - a path that ends in `.onnx`: a model of your own; options of `semfov.detection.onnx.load_onnx`.
+    - `"yolox-nano"`, `"yolox-tiny"`, `"yolox-s"`: published models; options of the same.
     - `"torchvision:<model>"`: options of `semfov.detection.torchvision.load_torchvision`.
+
+    The weights of a name are downloaded once (`semfov.detection.weights`); `weights=` reads a file instead.
 
     Raises:
         InputError: the name or an option is not known.
         DataError: weights are damaged, or cannot be had.
     """
     name = fspath(name_or_path)
-    if name.endswith(".onnx"):
+    if name.endswith(".onnx") or (name in WEIGHTS and WEIGHTS[name].file.endswith(".onnx")):
         from semfov.detection.onnx import load_onnx
 
         return load_onnx(name, **options)
@@ -44,6 +46,8 @@ def load_detector(name_or_path: str | PathLike[str], **options: Any) -> Detector
         return load_torchvision(name, **options)
     if name.endswith(".weights"):
         raise InputError(f"name_or_path: expected a cfg and its weights, load_detector('x.cfg', weights={name!r})")
+    if not name.endswith(".cfg"):
+        lookup(name, WEIGHTS, "detector")
     return load_yolo(name, **options)
 
 
@@ -59,7 +63,7 @@ def load_yolo(
     iou: float = 0.5,
     limit: int = 100,
     per_class: bool = False,
-    winograd: bool = True,
+    winograd: bool | None = None,
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> YoloV3:
@@ -73,20 +77,26 @@ def load_yolo(
         stride: pad the canvas only to a multiple of it; None pads to `input_size`.
         background: background policy of the scores (`semfov.score_vectors`).
         threshold: see `Selection`, as for `iou`, `limit` and `per_class`.
-        winograd: compute 3 x 3 convolutions by Winograd's algorithm, which is faster on a CPU. False leaves plain
-            `torch` convolutions, for training, for other devices and for export.
+        winograd: compute 3 x 3 convolutions by Winograd's algorithm, with parameters that cannot be trained; None
+            does so on a CPU, where it is faster.
         device: where the network lives.
         dtype: of the network's parameters.
     """
-    sections, name = _sections(name_or_cfg)
-    network = Darknet(sections)
+    if name_or_cfg.endswith(".cfg"):
+        if weights is None:
+            raise InputError(f"weights: expected the path of the weights for {name_or_cfg!r}, got None")
+        name, sections = Path(name_or_cfg).stem, read_cfg(name_or_cfg)
+    else:
+        name = lookup(name_or_cfg, ARCHITECTURES, "detector")
+        sections = ARCHITECTURES[name]()
+    network = Darknet(sections).to(dtype).requires_grad_(False)
     digest = read_weights(network, fetch(name) if weights is None else weights)
-    if winograd:
+    if torch.device(device).type == "cpu" if winograd is None else winograd:
         network.use_winograd()
-    network.eval().requires_grad_(False).to(device=device, dtype=dtype, memory_format=torch.channels_last)
-    return YoloV3(
+    network.to(memory_format=torch.channels_last)
+    detector = YoloV3(
         network,
-        _names(classes, network.heads[0].classes),
+        _names(classes),
         name=name,
         input_size=(input_size, input_size) if isinstance(input_size, int) else input_size,
         stride=stride,
@@ -94,18 +104,15 @@ def load_yolo(
         selection=Selection(threshold, iou, limit, per_class),
         digest=digest,
     )
+    return detector.to(device).eval()
 
 
-def _sections(name_or_cfg: str) -> tuple[list[Section], str]:
-    """Sections of a network, and what to call it."""
-    if name_or_cfg.endswith(".cfg"):
-        return read_cfg(name_or_cfg), Path(name_or_cfg).stem
-    return ARCHITECTURES[lookup(name_or_cfg, ARCHITECTURES, "detector")](), name_or_cfg
-
-
-def _names(classes: Sequence[str] | str | PathLike[str] | None, count: int) -> tuple[str, ...]:
-    """Class names from a list, from a file, or COCO's."""
-    if isinstance(classes, str | PathLike):
-        classes = Path(classes).read_text(encoding="utf-8").split("\n")
-        classes = [line.strip() for line in classes if line.strip()]
-    return COCO_CLASSES if classes is None else tuple(classes)
+def _names(classes: Sequence[str] | str | PathLike[str] | None) -> tuple[str, ...]:
+    """Class names from a list, from the lines of a file, or COCO's."""
+    if not isinstance(classes, str | PathLike):
+        return COCO_CLASSES if classes is None else tuple(classes)
+    try:
+        lines = Path(classes).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"cannot read the class names in {str(classes)!r}: {error}") from error
+    return tuple(line.strip() for line in lines if line.strip())

@@ -14,6 +14,12 @@ from semfov.errors import InputError
 Outputs = Mapping[str, Tensor]
 Canvas = tuple[int, int]
 
+_LETTERBOX = Preprocessing()
+_IMAGENET = Preprocessing(mean=IMAGENET_MEAN, std=IMAGENET_STD, stretch=True)
+_NANODET = Preprocessing(
+    channels="bgr", scale=255.0, mean=(103.53, 116.28, 123.675), std=(57.375, 57.12, 58.395), stretch=True
+)
+
 STRIDES = (8, 16, 32, 64)
 DETR_LOGITS = ("logits", "pred_logits")
 
@@ -29,7 +35,7 @@ class Head:
     """
 
     decode: Callable[[Outputs, Canvas], Candidates]
-    preprocessing: Preprocessing = Preprocessing()
+    preprocessing: Preprocessing = _LETTERBOX
     background: BackgroundPolicy = "residual"
 
 
@@ -183,16 +189,11 @@ def _rtdetr(outputs: Outputs, canvas: Canvas) -> Candidates:
     return heads.decode_rtdetr_rows(_first(outputs), canvas)
 
 
-_IMAGENET = Preprocessing(mean=IMAGENET_MEAN, std=IMAGENET_STD, stretch=True)
-_NANODET = Preprocessing(
-    channels="bgr", scale=255.0, mean=(103.53, 116.28, 123.675), std=(57.375, 57.12, 58.395), stretch=True
-)
-
 HEADS: dict[str, Head] = {
     "candidates": Head(_candidates),
     "yolox": Head(
         lambda outputs, canvas: heads.decode_yolox(_first(outputs), canvas),
-        Preprocessing(channels="bgr", scale=255.0),
+        Preprocessing(channels="bgr", scale=255.0, corner=True),
     ),
     "yolov5": Head(lambda outputs, canvas: heads.decode_yolov5(_first(outputs))),
     "yolov8": Head(lambda outputs, canvas: heads.decode_yolov8(_first(outputs))),

@@ -51,6 +51,7 @@ def letterbox(
     fill: float = 0.5,
     stride: int | None = None,
     stretch: bool = False,
+    corner: bool = False,
 ) -> tuple[Tensor, Placement]:
     """Resize `image` to fit into `size` with its proportions kept, and pad the rest with `fill`.
 
@@ -61,6 +62,7 @@ def letterbox(
         stride: if given, pad only to the next multiple of `stride` instead of the whole canvas
             (fewer pixels to compute, and the same content).
         stretch: give up the proportions and fill the canvas (then nothing is padded).
+        corner: pad only on the right and below instead of equally on all sides.
 
     Returns:
         The canvas `(B, C, height, width)` and the `Placement` that maps points and boxes.
@@ -79,7 +81,7 @@ def letterbox(
         inner = (max(1, round(width * ratio)), max(1, round(height * ratio)))
     canvas_size = size if stride is None else tuple(-(-n // stride) * stride for n in inner)
     resized = resize(image, inner)
-    left, top = (canvas_size[0] - inner[0]) // 2, (canvas_size[1] - inner[1]) // 2
+    left, top = (0, 0) if corner else ((canvas_size[0] - inner[0]) // 2, (canvas_size[1] - inner[1]) // 2)
     right, bottom = canvas_size[0] - inner[0] - left, canvas_size[1] - inner[1] - top
     canvas = F.pad(resized, (left, right, top, bottom), value=fill)
     return canvas, Placement((width, height), (inner[0] / width, inner[1] / height), (left, top))

@@ -21,6 +21,7 @@ class Preprocessing:
         mean: subtracted from each channel, in the network's channel order and after `scale`.
         std: divides each channel.
         stretch: the image fills the canvas; False keeps its proportions and pads (letterbox).
+        corner: the letterboxed image lies in the upper left corner of the canvas, not in its middle.
         fill: padding value of the canvas, in [0, 1].
 
     >>> import torch
@@ -33,6 +34,7 @@ class Preprocessing:
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
     stretch: bool = False
+    corner: bool = False
     fill: float = 114 / 255
 
     def __post_init__(self) -> None:

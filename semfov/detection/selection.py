@@ -51,7 +51,9 @@ def _select_one(
     boxes = rows.boxes if placement is None else placement.boxes_to_image(rows.boxes)
     keep = suppress(boxes, rows.confidence, rows.classes.argmax(-1), selection)
     scores = score_vectors(rows, policy)[keep]
-    return Detections(boxes[keep][None], scores[None], torch.ones_like(keep, dtype=torch.bool)[None])
+    # Suppression ranks by objectness times class; the shares of a vector can rank otherwise.
+    order = scores[:, 1:].detach().amax(-1).argsort(descending=True, stable=True)
+    return Detections(boxes[keep[order]][None], scores[order][None], torch.ones_like(keep, dtype=torch.bool)[None])
 
 
 @torch.no_grad()

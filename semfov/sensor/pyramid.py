@@ -1,6 +1,7 @@
 """Gaussian and Laplacian pyramids in Kornia's and in OpenCV's convention, for images of any size."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, get_args
 
 import torch
@@ -13,10 +14,12 @@ Convention = Literal["kornia", "opencv"]
 
 # Kornia blurs with [1 4 6 4 1] / 16 and resizes bilinearly. Between even sizes both are one filter:
 # halving averages two blurred pixels, doubling blurs pixels at 1/4 and 3/4 between two.
+_BLUR = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 _HALVE = (1 / 32, 5 / 32, 10 / 32, 10 / 32, 5 / 32, 1 / 32)
 _DOUBLE_EVEN = (1 / 64, 21 / 64, 35 / 64, 7 / 64)
 _DOUBLE_ODD = _DOUBLE_EVEN[::-1]
-_OPENCV_HALVE = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
+
+_SMALL = 128
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,13 @@ class Bands:
         height, width = (self.details[0] if self.details else self.base).shape[-2:]
         return height, width
 
+    def places(self, k: int, axis: int) -> Tensor:
+        """Where in the image the pixels of band k lie, along y (axis -2) or x (-1): `(n,)`, in image pixels."""
+        band = self.details[k]
+        count, length = band.shape[axis], self.size[axis]
+        place = torch.arange(count, dtype=band.dtype, device=band.device)
+        return place * 2**k if self.convention == "opencv" else (place + 0.5) * (length / count) - 0.5
+
 
 def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     """Blur and halve an image.
@@ -58,13 +68,12 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     """
     check_shape(image, "image", None, None, None, None)
     lookup(convention, get_args(Convention), "pyramid convention")
+    height, width = image.shape[-2:]
+    if max(height, width) <= _SMALL and not torch.compiler.is_compiling():
+        down, across = (_matrix(n, None, convention, image.dtype, image.device) for n in (height, width))
+        return down @ image @ across.mT
     for axis in (-2, -1):
-        if convention == "opencv":
-            image = _filter(_extend(image, axis, 2, "reflect"), axis, _OPENCV_HALVE, step=2)
-        elif image.shape[axis] % 2 == 0 and image.shape[axis] >= 4:
-            image = _filter(_extend(image, axis, 2, "reflect"), axis, _HALVE, step=2)
-        else:
-            image = _resize(_blur(image, axis), axis, max(image.shape[axis] // 2, 1))
+        image = _reduce(image, axis, convention)
     return image
 
 
@@ -84,18 +93,14 @@ def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia
     """
     check_shape(image, "image", None, None, None, None)
     lookup(convention, get_args(Convention), "pyramid convention")
-    for axis, length in ((-1, size[1]), (-2, size[0])):
-        count = image.shape[axis]
-        if convention == "opencv":
-            check(
-                0 <= 2 * count - length <= 1, "size", f"{2 * count} or {2 * count - 1} for {count} pixels", length
-            )
-            image = _double_opencv(image, axis).narrow(axis, 0, length)
-        elif length == 2 * count and count >= 4:
-            image = _double(image, axis)
-        else:
-            image = _blur(_resize(image, axis, length), axis)
-    return image
+    if convention == "opencv":
+        for count, length in zip(image.shape[-2:], size, strict=True):
+            check(0 <= 2 * count - length <= 1, "size", f"{2 * count} or {2 * count - 1} for {count} pixels", length)
+    if max(size) <= _SMALL and not torch.compiler.is_compiling():
+        lengths = zip(image.shape[-2:], size, strict=True)
+        down, across = (_matrix(n, length, convention, image.dtype, image.device) for n, length in lengths)
+        return down @ image @ across.mT
+    return _expand(_expand(image, -1, size[1], convention), -2, size[0], convention)
 
 
 def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> Bands:
@@ -122,42 +127,64 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
     return Bands(tuple(details), image, convention)
 
 
-def _filter(image: Tensor, axis: int, taps: tuple[float, ...], step: int = 1) -> Tensor:
-    """Correlate with `taps` along `axis`, at every `step`-th place where all of them fit."""
-    places = image.shape[axis] - len(taps) + 1
-    # Sums of shifted slices run several times faster on a CPU than convolutions of one channel.
-    result = _part(image, axis, 0, places, step) * taps[0]
-    for i, tap in enumerate(taps[1:], start=1):
-        result = _add(result, _part(image, axis, i, places + i, step), tap)
+@lru_cache(maxsize=256)
+def _matrix(count: int, length: int | None, convention: Convention, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix that reduces a line of `count` pixels, or expands it to `length`.
+
+    Levels of a few thousand pixels cost less as two matrix products than as many short sums.
+    """
+    with torch.no_grad():
+        lines = torch.eye(count, dtype=torch.float64)[None, None]
+        lines = _reduce(lines, -2, convention) if length is None else _expand(lines, -2, length, convention)
+        return lines[0, 0].to(dtype=dtype, device=device)
+
+
+def _reduce(image: Tensor, axis: int, convention: Convention) -> Tensor:
+    """`pyrdown` along one axis."""
+    count = image.shape[axis]
+    if convention == "opencv":
+        return _halve(image, axis, _BLUR)
+    if count % 2 == 0 and count >= 4:
+        return _halve(image, axis, _HALVE)
+    return _resize(_blur(image, axis), axis, max(count // 2, 1))
+
+
+def _expand(image: Tensor, axis: int, length: int, convention: Convention) -> Tensor:
+    """`pyrup` along one axis."""
+    count = image.shape[axis]
+    if convention == "opencv":
+        return _double_opencv(image, axis).narrow(axis, 0, length)
+    if length == 2 * count and count >= 4:
+        return _double(image, axis)
+    return _blur(_resize(image, axis, length), axis)
+
+
+def _filter(pieces: list[Tensor], taps: tuple[float, ...]) -> Tensor:
+    """Weighted sum of shifted views; on a CPU several times faster than a convolution of one channel."""
+    result = pieces[0] * taps[0]
+    for piece, tap in zip(pieces[1:], taps[1:], strict=True):
+        # The sum is ours to write to, unless a gradient is to flow back through it.
+        result = torch.add(result, piece, alpha=tap) if torch.is_grad_enabled() else result.add_(piece, alpha=tap)
     return result
 
 
-def _part(image: Tensor, axis: int, start: int, stop: int, step: int = 1) -> Tensor:
-    piece = slice(start, stop, step)
-    return image[..., piece, :] if axis == -2 else image[..., piece]
+def _part(image: Tensor, axis: int, start: int, stop: int) -> Tensor:
+    return image[..., start:stop, :] if axis == -2 else image[..., start:stop]
 
 
-def _add(total: Tensor, image: Tensor, factor: float) -> Tensor:
-    """`total + factor * image`, in the memory of `total` (a temporary of ours) where no gradient needs it."""
-    if torch.is_grad_enabled():
-        return torch.add(total, image, alpha=factor)
-    return total.add_(image, alpha=factor)
-
-
-def _extend(image: Tensor, axis: int, width: int, mode: str) -> Tensor:
-    """Continue an image beyond its borders along one axis; a single pixel is repeated."""
-    pad = (width, width, 0, 0) if axis == -1 else (0, 0, width, width)
-    if mode == "reflect" and image.shape[axis] <= width:
-        # Reflection of a short line bounces to and fro, as `BORDER_REFLECT_101` of OpenCV does.
-        count = image.shape[axis]
-        period = max(2 * count - 2, 1)
-        place = torch.arange(-width, count + width, device=image.device) % period
-        return image.index_select(axis, torch.minimum(place, period - place) if count > 1 else place)
-    return F.pad(image, pad, mode=mode)
+def _reflect(image: Tensor, axis: int) -> Tensor:
+    """Continue an image by two pixels beyond its borders along one axis, mirrored at the outermost pixels."""
+    count = image.shape[axis]
+    if count > 2:
+        return F.pad(image, (2, 2, 0, 0) if axis == -1 else (0, 0, 2, 2), mode="reflect")
+    # A line of one or two pixels is mirrored to and fro, as `BORDER_REFLECT_101` of OpenCV does.
+    place = torch.arange(-2, count + 2, device=image.device) % max(2 * count - 2, 1)
+    return image.index_select(axis, place)
 
 
 def _blur(image: Tensor, axis: int) -> Tensor:
-    return _filter(_extend(image, axis, 2, "reflect"), axis, _OPENCV_HALVE)
+    extended, count = _reflect(image, axis), image.shape[axis]
+    return _filter([_part(extended, axis, i, i + count) for i in range(5)], _BLUR)
 
 
 def _resize(image: Tensor, axis: int, length: int) -> Tensor:
@@ -166,7 +193,27 @@ def _resize(image: Tensor, axis: int, length: int) -> Tensor:
     return F.interpolate(image, size, mode="bilinear", align_corners=False)
 
 
+def _halve(image: Tensor, axis: int, taps: tuple[float, ...]) -> Tensor:
+    """Correlate with 5 or 6 taps at every second place, from two pixels before the border on."""
+    extended = _reflect(image, axis)
+    count = (extended.shape[axis] - len(taps)) // 2 + 1
+    even, odd = _phases(extended, axis)
+    pieces = [_part(odd if i % 2 else even, axis, i // 2, i // 2 + count) for i in range(len(taps))]
+    return _filter(pieces, taps)
+
+
+def _phases(image: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    """Pixels with even and with odd numbers along one axis, laid out for sums of shifted views."""
+    if axis == -2:
+        return image[..., 0::2, :], image[..., 1::2, :]
+    return image[..., 0::2].contiguous(), image[..., 1::2].contiguous()
+
+
 def _interleave(even: Tensor, odd: Tensor, axis: int) -> Tensor:
+    """Even and odd pixels in turn."""
+    if axis == -1 and even.dtype in (torch.float32, torch.float64):
+        # Pairs of neighbours are laid out as complex numbers are, and those are written in one pass.
+        return torch.view_as_real(torch.complex(even, odd)).flatten(-2)
     return torch.stack([even, odd], axis).flatten(axis - 1, axis)
 
 
@@ -175,18 +222,20 @@ def _double(image: Tensor, axis: int) -> Tensor:
     count = image.shape[axis]
     first, second = _part(image, axis, 0, 1), _part(image, axis, 1, 2)
     last, previous = _part(image, axis, count - 1, count), _part(image, axis, count - 2, count - 1)
-    # Beyond the borders, what makes the inner filters give the result of clamped resizing and reflected blur.
-    even = torch.cat([7 * second - 6 * first, first, image, (6 * last + previous) / 7], axis)
-    odd = torch.cat([(6 * first + second) / 7, image, last, 7 * previous - 6 * last], axis)
-    return _interleave(_filter(even, axis, _DOUBLE_EVEN), _filter(odd, axis, _DOUBLE_ODD), axis)
+    # Continued like this, the inner filters give what clamped resizing and reflected blur give at the borders,
+    # but for one pixel of each phase, which is put right afterwards.
+    extended = torch.cat([7 * second - 6 * first, first, image, last, 7 * previous - 6 * last], axis)
+    pieces = [_part(extended, axis, i, i + count) for i in range(5)]
+    even, odd = _filter(pieces[:4], _DOUBLE_EVEN), _filter(pieces[1:], _DOUBLE_ODD)
+    _part(even, axis, count - 1, count).add_(previous - last, alpha=1 / 64)
+    _part(odd, axis, 0, 1).add_(second - first, alpha=1 / 64)
+    return _interleave(even, odd, axis)
 
 
 def _double_opencv(image: Tensor, axis: int) -> Tensor:
     """OpenCV's enlargement: pixels with zeros between them, blurred and doubled."""
     count = image.shape[axis]
-    first = _part(image, axis, min(1, count - 1), min(1, count - 1) + 1)
-    last = _part(image, axis, count - 1, count)
-    extended = torch.cat([first, image, last], axis)
-    even = _filter(extended, axis, (1 / 8, 6 / 8, 1 / 8))
-    odd = _filter(_part(extended, axis, 1, count + 2), axis, (1 / 2, 1 / 2))
-    return _interleave(even, odd, axis)
+    second = _part(image, axis, min(1, count - 1), min(1, count - 1) + 1)
+    extended = torch.cat([second, image, _part(image, axis, count - 1, count)], axis)
+    pieces = [_part(extended, axis, i, i + count) for i in range(3)]
+    return _interleave(_filter(pieces, (1 / 8, 6 / 8, 1 / 8)), _filter(pieces[1:], (1 / 2, 1 / 2)), axis)

@@ -1,0 +1,246 @@
+"""ONNX detection models of any common family, with the full score vector of every box."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from semfov.detection.class_names import keep_classes, named
+from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.detector import Detector
+from semfov.detection.onnx_recognition import HEADS, Signature, recognise
+from semfov.detection.onnx_session import OnnxSession
+from semfov.detection.onnx_settings import read_settings
+from semfov.detection.placement import Placement, letterbox
+from semfov.detection.preprocessing import Preprocessing
+from semfov.detection.scores import BackgroundPolicy, Candidates
+from semfov.detection.selection import Selection
+from semfov.detection.weights import WEIGHTS, fetch
+from semfov.errors import DataError, InputError, check, check_shape, lookup
+from semfov.files import sha256
+
+ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
+"""Published models that `load_onnx` knows by name."""
+
+
+class OnnxDetector(Detector):
+    """A model in onnxruntime as a `Detector`. Gradients do not flow through it.
+
+    Args:
+        session: the model.
+        head: name of its head, a key of `semfov.detection.onnx_recognition.HEADS`.
+        classes: name of each score, in order; `"N/A"` for scores that stand for no class.
+        name: what tables and fitted models call it.
+        input_size: `(width, height)` of the canvas; None takes the model's.
+        stride: pad the canvas to a multiple of it only, for models that take any size; None pads to `input_size`.
+        preprocessing: what the network expects; None means what its family is trained with.
+        logits: the scores come without their sigmoid.
+        background: background policy of the scores; None means the one that suits the head.
+        selection: which candidates are kept.
+        digest: sha256 of the model's file.
+    """
+
+    def __init__(
+        self,
+        session: OnnxSession,
+        head: str,
+        classes: Sequence[str],
+        *,
+        name: str = "onnx",
+        input_size: tuple[int, int] | None = None,
+        stride: int | None = None,
+        preprocessing: Preprocessing | None = None,
+        logits: bool = False,
+        background: BackgroundPolicy | None = None,
+        selection: Selection | None = None,
+        digest: str = "",
+    ) -> None:
+        family = HEADS[lookup(head, HEADS, "head")]
+        names, places = named(classes)
+        preprocessing = family.preprocessing if preprocessing is None else preprocessing
+        super().__init__(
+            name,
+            names,
+            canvas_size(session, input_size),
+            background=family.background if background is None else background,
+            selection=selection,
+            fill=preprocessing.fill,
+            stride=stride,
+            stretch=preprocessing.stretch,
+            digest=digest,
+        )
+        fixed = None not in session.shape[2:]
+        check(stride is None or not fixed, "stride", "None for a model with a fixed input size", stride)
+        self.session, self.head, self.preprocessing, self.logits = session, head, preprocessing, logits
+        self._places, self._scores = places, len(classes)
+
+    def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
+        """Fit images `(B, 3, H, W)`, RGB in [0, 1], into the input as the network's preprocessing says."""
+        check_shape(images, "images", None, 3, None, None)
+        wanted = self.preprocessing
+        return letterbox(
+            images,
+            self.input_size,
+            fill=wanted.fill,
+            stride=self.stride,
+            stretch=wanted.stretch,
+            corner=wanted.corner,
+        )
+
+    def propose(self, canvas: Tensor) -> Candidates:
+        """Every box of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
+        check_shape(canvas, "canvas", None, 3, *self.session.shape[2:])
+        if not canvas.is_floating_point():
+            raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
+        outputs = self.session(self.preprocessing(canvas.detach()))
+        candidates = HEADS[self.head].decode(outputs, (canvas.shape[-1], canvas.shape[-2]))
+        return keep_classes(self._checked(candidates), self._places, self._scores)
+
+    def _checked(self, candidates: Candidates) -> Candidates:
+        """Candidates as they should be: a wrong head or a missing sigmoid shows in the numbers."""
+        objectness = candidates.objectness
+        if self.logits:
+            objectness = None if objectness is None else objectness.sigmoid()
+            candidates = replace(candidates, classes=candidates.classes.sigmoid(), objectness=objectness)
+        if not bool(torch.isfinite(candidates.boxes).all()):
+            raise DataError(f"{self.name}: head {self.head!r} gives boxes that are not finite; is it another head?")
+        for scores in (candidates.classes, candidates.objectness):
+            if scores is not None and not bool(((scores >= 0) & (scores <= 1)).all()):
+                low, high = float(scores.min()), float(scores.max())
+                raise DataError(
+                    f"{self.name}: expected scores in [0, 1], got [{low:.3g}, {high:.3g}]; "
+                    f"say logits=True if they lack their sigmoid, or is {self.head!r} the wrong head?"
+                )
+        return candidates
+
+    def settings(self) -> dict[str, object]:
+        """What the detections depend on."""
+        own = {"head": self.head, "logits": self.logits, "preprocessing": self.preprocessing.settings()}
+        return super().settings() | own
+
+
+def load_onnx(
+    name_or_path: str | PathLike[str],
+    *,
+    weights: str | PathLike[str] | None = None,
+    head: str | None = None,
+    classes: Sequence[str] | None = None,
+    input_size: int | tuple[int, int] | None = None,
+    stride: int | None = None,
+    preprocessing: Preprocessing | Mapping[str, Any] | None = None,
+    logits: bool | None = None,
+    background: BackgroundPolicy | None = None,
+    threshold: float = 0.02,
+    iou: float = 0.5,
+    limit: int = 100,
+    per_class: bool = False,
+    threads: int | None = None,
+    device: torch.device | str = "cpu",
+) -> OnnxDetector:
+    """A detector from an ONNX file, or a published one by its name (`ONNX_MODELS`).
+
+    Every setting that is None is read from `model.json` beside `model.onnx`, else from the model's metadata, else it
+    follows from the model's family.
+
+    Args:
+        name_or_path: path of the model, or a name.
+        weights: for a name: the file, where it is not to be downloaded.
+        head: one of `candidates` (boxes, scores and objectness under these names, as `semfov.detection.export`
+            writes them), `detr`, `nanodet`, `nanodet-plus`, `picodet`, `rtdetr`, `yolov5`, `yolov8`, `yolox`; None
+            recognises it.
+        classes: name of each score in order, `"N/A"` for none; without a list, 80 or 91 scores are COCO's.
+        input_size: canvas in pixels, one side or `(width, height)`, for models that take any size.
+        stride: see `OnnxDetector`, as for `logits` and `background`.
+        preprocessing: settings of `Preprocessing` that differ from what the family is trained with.
+        threshold: see `Selection`, as for `iou`, `limit` and `per_class`.
+        threads: threads of onnxruntime; None follows `torch.get_num_threads()`.
+        device: where onnxruntime computes.
+
+    Raises:
+        InputError: the head is not recognised, or an option does not fit the model (the message lists the choices).
+        DataError: the model or its settings file is missing or damaged.
+    """
+    name = fspath(name_or_path)
+    path = _locate(name, weights)
+    session = OnnxSession(path, threads=threads, device=device)
+    stored = read_settings(path, session.metadata)
+    options = {
+        "head": head,
+        "classes": classes,
+        "input_size": (input_size, input_size) if isinstance(input_size, int) else input_size,
+        "stride": stride,
+        "logits": logits,
+        "background": background,
+        "name": name if name in ONNX_MODELS else None,
+    }
+    chosen = stored | {key: value for key, value in options.items() if value is not None}
+    size = canvas_size(session, chosen.get("input_size"))
+    outputs = probe(session, size)
+    names = chosen.get("classes")
+    family = chosen.get("head")
+    if family is None:
+        shapes = tuple((output, tuple(tensor.shape)) for output, tensor in outputs.items())
+        count = None if names is None else len(names)
+        family = recognise(Signature(session.image, shapes, size, session.producer, count))
+    known = HEADS[lookup(family, HEADS, "head")]
+    if not isinstance(preprocessing, Preprocessing):
+        wanted = known.preprocessing.merged(stored["preprocessing"])
+        preprocessing = wanted.merged({} if preprocessing is None else preprocessing)
+    return OnnxDetector(
+        session,
+        family,
+        coco_names(known.decode(outputs, size).classes.shape[-1]) if names is None else names,
+        name=chosen.get("name", path.stem),
+        input_size=size,
+        stride=chosen.get("stride"),
+        preprocessing=preprocessing,
+        logits=chosen.get("logits", False),
+        background=chosen.get("background"),
+        selection=Selection(threshold, iou, limit, per_class),
+        digest=sha256(path),
+    )
+
+
+def canvas_size(session: OnnxSession, wanted: Sequence[int] | None) -> tuple[int, int]:
+    """`(width, height)` of a model's canvas: its own where it is fixed, else the one that is wanted."""
+    height, width = session.shape[2:]
+    if wanted is None:
+        if height is None or width is None:
+            raise InputError(f"input_size: expected (width, height), as {session.path.name} takes any size, got None")
+        return width, height
+    sizes = tuple(wanted)
+    check(len(sizes) == 2 and min(sizes) > 0, "input_size", "(width, height) in pixels", sizes)
+    fits = width in (None, sizes[0]) and height in (None, sizes[1])
+    check(fits, "input_size", f"the model's own, {width} x {height}", sizes)
+    return sizes[0], sizes[1]
+
+
+def probe(session: OnnxSession, size: tuple[int, int]) -> dict[str, Tensor]:
+    """Outputs in the shapes that they have for one canvas: zeros where the model states them, else from a run."""
+    if all(None not in shape[1:] for _, shape in session.outputs):
+        return {name: torch.zeros(1, *(n or 0 for n in shape[1:])) for name, shape in session.outputs}
+    return session(torch.zeros(1, 3, size[1], size[0]))
+
+
+def coco_names(count: int) -> Sequence[str]:
+    """Names of 80 scores, COCO's classes, or of 91, COCO's category ids with their gaps."""
+    if count == 80:
+        return COCO_CLASSES
+    if count == 91:
+        from torchvision.models.detection import FasterRCNN_ResNet50_FPN_Weights
+
+        return FasterRCNN_ResNet50_FPN_Weights.COCO_V1.meta["categories"]
+    raise InputError(f"classes: expected the names of the model's {count} classes, got None")
+
+
+def _locate(name: str, weights: str | PathLike[str] | None) -> Path:
+    """The file of a model that is named, or is a path."""
+    if name in ONNX_MODELS:
+        return Path(fetch(name) if weights is None else weights)
+    if weights is not None or not name.endswith(".onnx"):
+        lookup(name, ONNX_MODELS, "ONNX model")
+    return Path(name)

@@ -1,0 +1,76 @@
+"""Settings that travel with an ONNX model: inside it, or in a JSON file beside it."""
+
+import ast
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from semfov.errors import DataError
+
+METADATA_KEY = "semfov"
+"""Key of the model's metadata under which an export by semfov keeps its settings, as JSON."""
+
+KEYS = (
+    "name",
+    "head",
+    "classes",
+    "input_size",
+    "stride",
+    "background",
+    "logits",
+    "preprocessing",
+    "licence",
+    "source",
+)
+"""What a settings file may hold; `licence` and `source` are for people."""
+
+
+def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Settings of the model at `path`: `model.json` beside `model.onnx` over the model's own metadata.
+
+    Metadata of exports by semfov and by Ultralytics (class names, input size) is understood.
+
+    Raises:
+        DataError: the file is no JSON object or has a key that is not one of `KEYS`.
+    """
+    beside = path.with_suffix(".json")
+    inside = _parse(metadata[METADATA_KEY], f"metadata of {path.name}") if METADATA_KEY in metadata else {}
+    outside = _parse(_read(beside), str(beside)) if beside.is_file() else {}
+    preprocessing = {**inside.get("preprocessing", {}), **outside.get("preprocessing", {})}
+    return {**_ultralytics(metadata), **inside, **outside, "preprocessing": preprocessing}
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"cannot read {path}: {error}") from error
+
+
+def _parse(text: str, where: str) -> dict[str, Any]:
+    try:
+        settings = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise DataError(f"{where}: expected JSON, got an error in line {error.lineno}: {error.msg}") from error
+    if not isinstance(settings, dict) or not isinstance(settings.get("preprocessing", {}), dict):
+        raise DataError(f"{where}: expected an object, with an object as its preprocessing")
+    unknown = sorted(set(settings) - set(KEYS))
+    if unknown:
+        raise DataError(f"{where}: unknown {', '.join(unknown)}; known: {', '.join(KEYS)}")
+    return settings
+
+
+def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Class names `{0: 'person', ...}` and input size `[height, width]` as Ultralytics writes them."""
+    found: dict[str, Any] = {}
+    try:
+        if "names" in metadata:
+            names = ast.literal_eval(metadata["names"])
+            found["classes"] = [str(names[i]) for i in range(len(names))]
+        if "imgsz" in metadata:
+            height, width = ast.literal_eval(metadata["imgsz"])
+            found["input_size"] = [int(width), int(height)]
+    except (ValueError, SyntaxError, TypeError, KeyError, IndexError):
+        return {}  # somebody else's keys of the same name
+    return found

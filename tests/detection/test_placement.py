@@ -1,0 +1,96 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.detection import letterbox
+from semfov.detection.placement import resize
+from semfov.errors import InputError
+
+sides = st.integers(1, 90)
+
+
+@given(sides, sides, st.sampled_from([None, 32]), st.booleans(), st.sampled_from([torch.float32, torch.float64]))
+def test_boxes_and_points_return(width, height, stride, stretch, dtype):
+    canvas, placement = letterbox(
+        torch.zeros(1, 3, height, width, dtype=dtype), (64, 48), stride=stride, stretch=stretch
+    )
+    assert canvas.dtype == dtype
+    assert placement.size == (width, height)
+    image = torch.tensor([[0.0, 0.0, width, height], [0.3 * width, 0.1 * height, 0.9 * width, 0.8 * height]]).to(dtype)
+    scale, offset = torch.tensor(placement.scale * 2).to(dtype), torch.tensor(placement.offset * 2).to(dtype)
+    torch.testing.assert_close(placement.boxes_to_image(image * scale + offset), image, atol=1e-3, rtol=1e-5)
+    # A point is a pixel centre: half a pixel from the edges of its pixel, on both sides of the way.
+    points = torch.rand(5, 2, dtype=dtype) * torch.tensor([width, height])
+    there = placement.points_to_canvas(points)
+    box = torch.cat([there + 0.5, there + 0.5], -1)
+    back = placement.boxes_to_image(box)[:, :2] - 0.5
+    inside = ((points + 0.5 >= 0) & (points + 0.5 <= torch.tensor([width, height]))).all(-1)
+    torch.testing.assert_close(back[inside], points[inside], atol=1e-3, rtol=1e-5)
+
+
+@given(sides, sides, st.sampled_from([None, 32]))
+def test_the_image_lies_where_the_placement_says(width, height, stride):
+    canvas, placement = letterbox(torch.ones(1, 1, height, width), (64, 64), fill=0.25, stride=stride)
+    bright = canvas[0, 0] > 0.99
+    rows, columns = bright.nonzero(as_tuple=True)
+    left, top = placement.offset
+    inner = (placement.scale[0] * width, placement.scale[1] * height)
+    assert (int(columns.min()), int(rows.min())) == (left, top)
+    assert (int(columns.max()) + 1 - left, int(rows.max()) + 1 - top) == pytest.approx(inner)
+    assert bool((canvas[0, 0][~bright] == 0.25).all())
+    if stride is None:
+        assert canvas.shape[-2:] == (64, 64)
+    else:
+        assert all(side % stride == 0 for side in canvas.shape[-2:])
+
+
+def test_boxes_are_cut_to_the_image():
+    _, placement = letterbox(torch.zeros(1, 3, 50, 100), (100, 100))
+    boxes = placement.boxes_to_image(torch.tensor([[-5.0, 0.0, 300.0, 40.0]]))
+    torch.testing.assert_close(boxes, torch.tensor([[0.0, 0.0, 100.0, 15.0]]))
+
+
+def test_corner_and_stretch():
+    image = torch.rand(1, 3, 20, 40)
+    canvas, placement = letterbox(image, (80, 80), corner=True)
+    assert placement.offset == (0, 0)
+    torch.testing.assert_close(canvas[..., :40, :], resize(image, (80, 40)))
+    canvas, placement = letterbox(image, (80, 80), stretch=True)
+    assert placement.scale == (2.0, 4.0)
+    torch.testing.assert_close(canvas, resize(image, (80, 80)))
+
+
+@pytest.mark.parametrize("size", [(37, 29), (60, 45), (100, 81)])
+def test_resize_is_opencv_bilinear_down_to_half(size):
+    image = np.random.default_rng(0).random((58, 74, 3), dtype=np.float32)
+    expected = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+    actual = resize(torch.from_numpy(image).permute(2, 0, 1)[None], size)[0].permute(1, 2, 0)
+    np.testing.assert_allclose(actual.numpy(), expected, atol=1e-5)
+
+
+def test_resize_averages_where_it_would_skip_pixels():
+    stripes = torch.zeros(1, 1, 8, 64)
+    stripes[..., ::4] = 1
+    small = resize(stripes, (8, 1))
+    torch.testing.assert_close(small[..., 1:-1], torch.full((1, 1, 1, 6), 0.25), atol=0.03, rtol=0)
+
+
+def test_same_size_is_a_copy():
+    image = torch.rand(1, 3, 8, 8)
+    canvas = resize(image, (8, 8))
+    canvas.zero_()
+    assert image.any()
+
+
+def test_gradient_flows():
+    image = torch.rand(1, 1, 5, 7, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: letterbox(x, (9, 9))[0], (image,))
+
+
+@pytest.mark.parametrize("shape", [(3, 8, 8), (1, 3, 0, 8)])
+def test_refuses_no_image(shape):
+    with pytest.raises(InputError, match="image"):
+        letterbox(torch.zeros(shape), (32, 32))

@@ -1,0 +1,107 @@
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.detection import Candidates, Selection, letterbox
+from semfov.detection.selection import select, suppress
+
+
+def overlap(a, b) -> float:
+    width = min(a[2], b[2]) - max(a[0], b[0])
+    height = min(a[3], b[3]) - max(a[1], b[1])
+    common = max(width, 0) * max(height, 0)
+    return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
+
+
+def brute_force(boxes, confidence, labels, selection) -> list[int]:
+    kept: list[int] = []
+    for i in sorted(range(len(boxes)), key=lambda i: -confidence[i]):
+        if boxes[i][2] <= boxes[i][0] or boxes[i][3] <= boxes[i][1]:
+            continue
+        rivals = [j for j in kept if not selection.per_class or labels[i] == labels[j]]
+        if all(overlap(boxes[i], boxes[j]) <= selection.iou for j in rivals):
+            kept.append(i)
+    return kept[: selection.limit]
+
+
+@given(st.integers(0, 2**32), st.integers(0, 40), st.booleans(), st.sampled_from([0.3, 0.5, 0.7]), st.integers(1, 15))
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_suppression_is_the_brute_force(dtype, seed, count, per_class, iou, limit):
+    generator = torch.Generator().manual_seed(seed)
+    corner = torch.rand(count, 2, generator=generator, dtype=dtype) * 10
+    boxes = torch.cat([corner, corner + torch.rand(count, 2, generator=generator, dtype=dtype) * 12 - 1], -1)
+    confidence = torch.rand(count, generator=generator, dtype=dtype)
+    labels = torch.randint(3, (count,), generator=generator)
+    selection = Selection(iou=iou, limit=limit, per_class=per_class)
+    keep = suppress(boxes, confidence, labels, selection)
+    assert keep.tolist() == brute_force(boxes.tolist(), confidence.tolist(), labels.tolist(), selection)
+
+
+def make(count: int, batch: int = 2, classes: int = 3, dtype=torch.float64, seed: int = 0) -> Candidates:
+    generator = torch.Generator().manual_seed(seed)
+    corner = torch.rand(batch, count, 2, generator=generator, dtype=dtype) * 60
+    size = torch.rand(batch, count, 2, generator=generator, dtype=dtype) * 20 + 1
+    return Candidates(
+        torch.cat([corner, corner + size], -1),
+        torch.rand(batch, count, classes, generator=generator, dtype=dtype),
+        torch.rand(batch, count, generator=generator, dtype=dtype),
+    )
+
+
+def test_threshold_order_and_vectors():
+    candidates = make(60)
+    selection = Selection(threshold=0.3, limit=7)
+    found = select(candidates, None, selection, "residual")
+    for image in range(2):
+        confident = (candidates.confidence[image] >= 0.3).nonzero()[:, 0]
+        rows = candidates.take(image, confident)
+        kept = brute_force(rows.boxes.tolist(), rows.confidence.tolist(), [0] * len(confident), selection)
+        assert found.count[image] == len(kept)
+        own = found[image : image + 1]
+        assert {tuple(box) for box in own.boxes[own.mask].tolist()} == {tuple(rows.boxes[i].tolist()) for i in kept}
+    assert bool((found.confidence[:, :-1] >= found.confidence[:, 1:]).all())
+    torch.testing.assert_close(found.scores.sum(-1), found.mask.double())
+
+
+def test_an_image_does_not_depend_on_its_batch():
+    candidates = make(40, batch=3)
+    whole = select(candidates, None, Selection(), "residual")
+    for image in range(3):
+        part = Candidates(*(x[image : image + 1] for x in (candidates.boxes, candidates.classes, candidates.objectness)))
+        alone = select(part, None, Selection(), "residual")
+        length = int(alone.count)
+        assert int(whole.count[image]) == length
+        assert torch.equal(whole.boxes[image, :length], alone.boxes[0])
+        assert torch.equal(whole.scores[image, :length], alone.scores[0])
+
+
+def test_boxes_outside_the_image_are_dropped():
+    _, placement = letterbox(torch.zeros(1, 3, 32, 64), (64, 64))
+    boxes = torch.tensor([[[10.0, 0.0, 20.0, 15.0], [10.0, 20.0, 20.0, 30.0]]])  # the first lies in the padding
+    found = select(Candidates(boxes, torch.ones(1, 2, 1)), placement, Selection(), "residual")
+    torch.testing.assert_close(found.boxes, torch.tensor([[[10.0, 4.0, 20.0, 14.0]]]))
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_nothing_is_found(count):
+    found = select(make(count), None, Selection(threshold=2.0), "residual")
+    assert found.boxes.shape == (2, 0, 4)
+    assert found.scores.shape == (2, 0, 4)
+    assert found.count.tolist() == [0, 0]
+
+
+def test_one_image_finds_nothing():
+    candidates = make(5)
+    candidates.objectness[0] = 0
+    assert select(candidates, None, Selection(), "residual").count.tolist()[0] == 0
+
+
+def test_gradients_reach_boxes_classes_and_objectness():
+    candidates = make(20, batch=1)
+    leaves = [x.requires_grad_() for x in (candidates.boxes, candidates.classes, candidates.objectness)]
+    found = select(candidates, None, Selection(), "residual")
+    (found.boxes.sum() + found.scores.square().sum()).backward()
+    for leaf in leaves:
+        rows = leaf.grad.reshape(20, -1).abs().sum(-1) > 0
+        assert int(rows.sum()) == int(found.count)
