@@ -17,6 +17,7 @@ from tqdm import tqdm
 from semfov.detection import Candidates, Detector, Selection
 from semfov.detection.load import load_detector
 from semfov.detection.selection import suppress
+from semfov.errors import lookup
 
 # COCO's evaluation counts at most 100 boxes of an image, at any confidence.
 SELECTIONS = {
@@ -77,6 +78,8 @@ def average_precision(
     with contextlib.redirect_stdout(io.StringIO()):
         truth = COCO(str(annotations))
     category = {entry["name"]: entry["id"] for entry in truth.dataset["categories"]}
+    for name in detector.classes:
+        lookup(name, category, "category of the annotations")
     ids = torch.tensor([category[name] for name in detector.classes])
     results: list[list[dict[str, Any]]] = [[] for _ in selections]
     for image_id in tqdm(sorted(truth.imgs), desc=detector.name, unit="image"):
@@ -107,26 +110,26 @@ def main() -> None:
     parser.add_argument("--weights", help="weights file, for a cfg or instead of the published weights")
     parser.add_argument("--root", type=Path, required=True, help="folder of the photographs")
     parser.add_argument("--annotations", type=Path, required=True, help="COCO annotation file")
-    parser.add_argument("--stride", type=int, nargs="*", default=[0, 32], help="canvas padding; 0: the whole canvas")
+    parser.add_argument("--stride", type=int, help="pad the canvas to a multiple of it; 0: the whole canvas")
     parser.add_argument("--multilabel", action="store_true", help="let a box count for every class")
-    parser.add_argument("--direct", action="store_true", help="plain convolutions instead of Winograd's")
+    parser.add_argument("--direct", action="store_true", help="plain convolutions instead of Winograd's (Darknet)")
     arguments = parser.parse_args()
-    print("| detector | padding | NMS | AP | AP50 |\n|---|---|---|---|---|")
-    for stride in arguments.stride:
-        options: dict[str, Any] = {"weights": arguments.weights} if arguments.weights else {}
-        if not arguments.detector.endswith(".onnx") and ":" not in arguments.detector:
-            options |= {"stride": stride or None, "winograd": not arguments.direct}
-        detector = load_detector(arguments.detector, **options)
-        scores = average_precision(
-            detector,
-            arguments.root,
-            arguments.annotations,
-            list(SELECTIONS.values()),
-            multilabel=arguments.multilabel,
-        )
-        padding = "whole canvas" if detector.stride is None else f"to a multiple of {detector.stride}"
-        for name, (ap, ap50) in zip(SELECTIONS, scores, strict=True):
-            print(f"| {detector.name} | {padding} | {name} | {ap:.3f} | {ap50:.3f} |")
+    options: dict[str, Any] = {}
+    if arguments.weights:
+        options["weights"] = arguments.weights
+    if arguments.stride is not None:
+        options["stride"] = arguments.stride or None
+    if arguments.direct:
+        options["winograd"] = False
+    detector = load_detector(arguments.detector, **options)
+    selections = list(SELECTIONS.values())
+    scores = average_precision(
+        detector, arguments.root, arguments.annotations, selections, multilabel=arguments.multilabel
+    )
+    padding = "the whole canvas" if detector.stride is None else f"a multiple of {detector.stride}"
+    print("| detector | padded to | NMS | AP | AP50 |\n|---|---|---|---|---|")
+    for name, (ap, ap50) in zip(SELECTIONS, scores, strict=True):
+        print(f"| {detector.name} | {padding} | {name} | {ap:.3f} | {ap50:.3f} |")
 
 
 if __name__ == "__main__":

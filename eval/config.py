@@ -17,7 +17,8 @@ class DataConfig:
         annotations: COCO-format instances file for the photographs.
         limit: use only the first so many scenes (None: all of the photographs, 8 embedded scenes).
         min_instances: leave out photographs with fewer objects (published: 8).
-        max_target_area: a class that covers a larger share of the image is not searched for (published: 0.2).
+        max_target_area: a class that covers a larger share of the image is not searched for (published: 0.2), unless
+            this is null.
         scene_seed: seed that the embedded scenes are composed by.
     """
 
@@ -25,7 +26,7 @@ class DataConfig:
     annotations: Path | None = None
     limit: int | None = None
     min_instances: int = 8
-    max_target_area: float = 0.2
+    max_target_area: float | None = 0.2
     scene_seed: int = 0
 
 

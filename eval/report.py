@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 import semfov
 from eval.metrics import cumulative_performance, random_search, standard_error
+from eval.setup import plain
+from eval.store import checksum
 from eval.tasks import Parts, SearchRun
 from semfov.belief import fuse, weigh
 from semfov.errors import DataError
@@ -192,7 +194,7 @@ def summary_markdown(
         ]
         if average == "all targets":
             rows.append(["random, by formula", *(f"{100 * expected[n]:.1f}" for n in shifts), ""])
-        lines += [*_table([head, *rows]), ""]
+        lines += [*table([head, *rows]), ""]
     return "\n".join(lines)
 
 
@@ -200,7 +202,8 @@ def _percent(value: float, error: float) -> str:
     return f"{100 * value:.1f} ± {100 * error:.1f}" if np.isfinite(error) else f"{100 * value:.1f}"
 
 
-def _table(rows: list[list[str]]) -> list[str]:
+def table(rows: list[list[str]]) -> list[str]:
+    """A Markdown table, its columns aligned; the first row is the head."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
@@ -210,7 +213,7 @@ def _table(rows: list[list[str]]) -> list[str]:
 
 def resolved_config(run: SearchRun) -> str:
     """Every setting of the run as YAML, ready for `--config`."""
-    return yaml.safe_dump(json.loads(json.dumps(asdict(run.config), default=str)), sort_keys=False)
+    return yaml.safe_dump(plain(asdict(run.config)), sort_keys=False)
 
 
 def manifest(run: SearchRun, seconds: dict[str, float], decision: dict[str, float]) -> dict[str, object]:
@@ -229,7 +232,7 @@ def manifest(run: SearchRun, seconds: dict[str, float], decision: dict[str, floa
         "store_key": run.store.key,
         "scenes_sha256": run.scenes.fingerprint,
         "eye": run.eye.settings(),
-        "model_sha256": None if run.model is None else run.model.digest,
+        "model_sha256": None if run.model is None else checksum(run.model.state_dict()),
         "seed": run.config.protocol.seed,
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
         "milliseconds_per_decision": {name: round(value, 4) for name, value in decision.items()},

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import logging
+import multiprocessing
+from typing import Any
+
 import torch
 
 import semfov
@@ -50,8 +55,9 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
 def make_observation(config: SearchConfig, eye: Eye) -> semfov.FovealObservationModel:
     """The observation model, checked to belong to this detector, background policy and class list."""
     model = semfov.FovealObservationModel.from_pretrained(config.belief.model or eye.detector.name)
-    model.check_compatible(eye.settings(), eye.detector.classes)
-    return model.eval().requires_grad_(False)
+    settings = eye.settings()
+    model.check_compatible(settings["detector"], eye.detector.classes, sensor=settings["sensor"])
+    return model.requires_grad_(False)
 
 
 def split_policy(name: str) -> tuple[str, bool]:
@@ -68,6 +74,13 @@ def needs_model(policies: tuple[str, ...]) -> bool:
     return any(base == "predictive" or calibrated for base, calibrated in map(split_policy, policies))
 
 
-def single_thread() -> None:
-    """One thread a process: detections then do not depend on how many processes share the work."""
+def plain(settings: dict[str, Any]) -> Any:
+    """Settings as JSON and YAML have them: paths as text, tuples as lists."""
+    return json.loads(json.dumps(settings, default=str))
+
+
+def prepare_worker() -> None:
+    """One thread a process, so that detections do not depend on how many share the work; and no repeated notices."""
     torch.set_num_threads(1)
+    if multiprocessing.parent_process() is not None:
+        logging.getLogger("semfov").setLevel(logging.ERROR)

@@ -7,6 +7,7 @@ remembers them under a key of everything that they depend on; it changes how lon
 import hashlib
 import json
 import platform
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
@@ -47,7 +48,7 @@ class DetectionStore:
         rows: cells in a column.
     """
 
-    def __init__(self, folder: Path, settings: dict[str, object], columns: int, rows: int) -> None:
+    def __init__(self, folder: Path, settings: Mapping[str, object], columns: int, rows: int) -> None:
         versions = {
             "semfov": semfov.__version__,
             "torch": torch.__version__,

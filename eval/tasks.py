@@ -12,8 +12,8 @@ import torch
 
 from eval.config import SearchConfig
 from eval.protocol import Outcome, episodes_of, run_episodes, tie_noise
-from eval.setup import make_eye, make_observation, make_scenes, needs_model, single_thread, split_policy
-from eval.store import DetectionStore, see_all
+from eval.setup import make_eye, make_observation, make_scenes, needs_model, prepare_worker, split_policy
+from eval.store import DetectionStore, checksum, see_all
 from semfov import Detections, Grid, weigh
 from semfov.data.scene import Scenes
 from semfov.errors import DataError
@@ -41,7 +41,7 @@ class SearchRun:
 
     def _key(self) -> str:
         config = self.config
-        model = None if self.model is None else self.model.digest
+        model = None if self.model is None else checksum(self.model.state_dict())
         belief = {**asdict(config.belief), "model": model}
         protocol = {name: value for name, value in asdict(config.protocol).items() if name != "batch"}
         what = [self.store.key, self.scenes.fingerprint, belief, protocol, list(config.policies)]
@@ -155,7 +155,7 @@ _process: dict[str, SearchRun] = {}
 
 def prepare_process(config: SearchConfig) -> None:
     """Build the run once in this process."""
-    single_thread()
+    prepare_worker()
     _process["run"] = SearchRun(config)
 
 

@@ -68,7 +68,7 @@ class Eye(nn.Module):
         """`look` at an image `(1, 3, H, W)` from fixations `(F, 2)`."""
         return self.look(self.open(image), fixations)
 
-    def settings(self) -> dict[str, object]:
+    def settings(self) -> dict[str, dict[str, object]]:
         """What the detections depend on, for the keys of caches and the metadata of fitted models."""
         sensor = self.sensor
         return {

@@ -60,6 +60,35 @@ def plot_cumulative_performance(
     return figure
 
 
+def plot_reliability(predictions: Mapping[str, tuple[Tensor, Tensor]], *, bins: int = 15) -> Figure:
+    """How often the most probable class is right, against its probability; a calibrated model lies on the diagonal.
+
+    Args:
+        predictions: for each model its probabilities `(M, K+1)` and the true classes `(M,)`.
+        bins: equally wide bins of probability; those without predictions are left out.
+    """
+    figure, (axes, below) = _figure(2, 1, width=4.4, height=5.4, ratios=[3, 1])
+    axes.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="perfectly calibrated")
+    for order, (name, (probabilities, labels)) in enumerate(predictions.items()):
+        confidence, predicted = probabilities.detach().cpu().max(-1)
+        right = (predicted == labels.cpu()).numpy()
+        index = np.clip(np.ceil(confidence.numpy() * bins).astype(int) - 1, 0, bins - 1)
+        count = np.bincount(index, minlength=bins)
+        filled = count > 0
+        mean_confidence = np.bincount(index, confidence.numpy(), bins)[filled] / count[filled]
+        accuracy = np.bincount(index, right, bins)[filled] / count[filled]
+        axes.plot(
+            mean_confidence, accuracy, LINES[order % 4], marker="o", markersize=4, color=COLOURS[order], label=name
+        )
+        edges = np.linspace(0, 1, bins + 1)
+        below.stairs(count / count.sum(), edges, color=COLOURS[order], linestyle=LINES[order % 4], linewidth=1.4)
+    axes.set(xlim=(0, 1), ylim=(0, 1), ylabel="share that is right")
+    axes.legend(loc="upper left")
+    axes.grid(alpha=0.3, linewidth=0.5)
+    below.set(xlim=(0, 1), xlabel="probability of the most probable class", ylabel="share")
+    return figure
+
+
 def plot_scanpath(scanpath: Scanpath, image: Tensor, *, boxes: Tensor | None = None) -> Figure:
     """Numbered fixations on the photograph, the grid, and what was detected at the last fixation.
 
@@ -115,13 +144,15 @@ def plot_episode(
     return figure
 
 
-def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+def _figure(
+    rows: int, columns: int, width: float, height: float, ratios: Sequence[float] | None = None
+) -> tuple[Figure, list[Axes]]:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
-        return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+        return figure, list(figure.subplots(rows, columns, squeeze=False, height_ratios=ratios).flat)
 
 
 def _draw_image(axes: Axes, scanpath: Scanpath, image: Tensor, dim: float = 0.0) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 from eval.config import DataConfig, DetectorConfig, SensorConfig
 from eval.parallel import available_cores, mine, run_tasks, wait_for_all
 from eval.protocol import generator_for
-from eval.setup import make_eye, make_scenes, single_thread
+from eval.setup import make_eye, make_scenes, prepare_worker
 from eval.store import checksum, code_digest
 from semfov import Grid
 from semfov.data.scene import Scenes
@@ -151,7 +151,7 @@ _process: dict[str, tuple[Sampler, Path]] = {}
 
 
 def _prepare(settings: SampleSettings, folder: Path) -> None:
-    single_thread()
+    prepare_worker()
     _process["sampler"] = Sampler(settings), folder
 
 
@@ -188,11 +188,3 @@ def collect(settings: SampleSettings, folder: Path, workers: int | None, title: 
             raise DataError(f"{path} is missing or damaged; run the same command again")
         parts.append(part)
     return sampler, Samples.join(parts)
-
-
-def describe(settings: SampleSettings) -> dict[str, object]:
-    """The settings as plain data, for metadata."""
-    plain = json.loads(json.dumps(asdict(settings), default=str))
-    plain["data"].pop("root", None)
-    plain["data"].pop("annotations", None)
-    return plain

@@ -181,19 +181,21 @@ def load_onnx(
     size = canvas_size(session, chosen.get("input_size"))
     outputs = probe(session, size)
     names = chosen.get("classes")
-    family = chosen.get("head")
-    if family is None:
+    if "head" not in chosen:
         shapes = tuple((output, tuple(tensor.shape)) for output, tensor in outputs.items())
         count = None if names is None else len(names)
-        family = recognise(Signature(session.image, shapes, size, session.producer, count))
-    known = HEADS[lookup(family, HEADS, "head")]
+        chosen["head"] = recognise(Signature(session.image, shapes, size, session.producer, count))
+    known = HEADS[lookup(chosen["head"], HEADS, "head")]
     if not isinstance(preprocessing, Preprocessing):
         wanted = known.preprocessing.merged(stored["preprocessing"])
         preprocessing = wanted.merged({} if preprocessing is None else preprocessing)
+    scores = known.decode(outputs, size).classes.shape[-1]
+    names = coco_names(scores) if names is None else names
+    check(len(names) == scores, "classes", f"{scores} names, one for each score", len(names))
     return OnnxDetector(
         session,
-        family,
-        coco_names(known.decode(outputs, size).classes.shape[-1]) if names is None else names,
+        chosen["head"],
+        names,
         name=chosen.get("name", path.stem),
         input_size=size,
         stride=chosen.get("stride"),
@@ -221,8 +223,9 @@ def canvas_size(session: OnnxSession, wanted: Sequence[int] | None) -> tuple[int
 
 def probe(session: OnnxSession, size: tuple[int, int]) -> dict[str, Tensor]:
     """Outputs in the shapes that they have for one canvas: zeros where the model states them, else from a run."""
-    if all(None not in shape[1:] for _, shape in session.outputs):
-        return {name: torch.zeros(1, *(n or 0 for n in shape[1:])) for name, shape in session.outputs}
+    stated = {name: [n for n in shape[1:] if n is not None] for name, shape in session.outputs}
+    if all(len(stated[name]) == len(shape) - 1 for name, shape in session.outputs):
+        return {name: torch.zeros(1, *sizes) for name, sizes in stated.items()}
     return session(torch.zeros(1, 3, size[1], size[0]))
 
 

@@ -39,7 +39,7 @@ class OnnxSession:
         producer: what the file says made it.
 
     Raises:
-        DataError: no such file, or no model that onnxruntime can run.
+        DataError: no such file, or no model that onnxruntime can run, or it fails on an image.
         InputError: the model has inputs that nothing is known of, or the device is not there.
     """
 
@@ -111,7 +111,11 @@ class OnnxSession:
     def _run(self, image: Tensor) -> dict[str, Tensor]:
         feed = {self.image: image.numpy()} | {name: EXTRA_INPUTS[name](image).numpy() for name in self._extra}
         names = [name for name, _ in self.outputs]
-        return dict(zip(names, map(torch.from_numpy, self._session.run(names, feed)), strict=True))
+        try:
+            arrays = self._session.run(names, feed)
+        except Exception as error:  # as above
+            raise DataError(f"{self.path.name} fails on images of shape {tuple(image.shape)}: {error}") from error
+        return dict(zip(names, map(torch.from_numpy, arrays), strict=True))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _reopen, (self.path, self.threads, self.device, self.spinning)

@@ -94,7 +94,8 @@ def _clip(boxes: Tensor, size: tuple[int, int]) -> Tensor:
 
 def head_of(model: nn.Module) -> tuple[Callable[[Any, Any, int], Raw], bool] | None:
     """The function above that suits a model, and whether its scores are a softmax; None if none does."""
-    from torchvision.models.detection import FCOS, SSD, FasterRCNN, RetinaNet
+    from torchvision.models.detection import FCOS, FasterRCNN, RetinaNet
+    from torchvision.models.detection.ssd import SSD
 
     for kind, function, softmax in (
         (FasterRCNN, roi_outputs, True),

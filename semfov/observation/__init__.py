@@ -1,0 +1,9 @@
+"""How scores depend on class and distance to the fovea: Dirichlets, their statistics, and the foveal model."""
+
+from semfov.observation import dirichlet
+from semfov.observation.calibration import fit_discriminative
+from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.matching import match
+from semfov.observation.statistics import DirichletStatistics
+
+__all__ = ["DirichletStatistics", "FovealObservationModel", "dirichlet", "fit_discriminative", "match"]

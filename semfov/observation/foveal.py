@@ -1,0 +1,327 @@
+"""The foveal observation model: how a detector scores objects of each class at each distance from the fovea."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from semfov.errors import DataError, check, check_finite, check_shape, lookup
+from semfov.observation import compatibility
+from semfov.observation.dirichlet import floor, log_normaliser
+from semfov.observation.fitting import estimate_prior, fit_table
+from semfov.observation.mle import Method
+from semfov.observation.statistics import DirichletStatistics
+from semfov.observation.storage import read, write
+
+SHIPPED = Path(__file__).parent / "models"
+_KIND = "foveal-observation-model"
+
+
+class FovealObservationModel(nn.Module):
+    r"""Dirichlet likelihoods of score vectors, one for each class k and level of distance d to the fovea.
+
+    .. math:: p(S \mid C = k, d) = \mathrm{Dir}(S \mid \alpha_{k,d})
+
+    (Luzio, Bernardino and Moreno, 2024). The posterior that `calibrate` gives is
+
+    .. math:: P(C = k \mid S, d) \propto \exp\big(\tau \ln \mathrm{Dir}(S \mid \alpha_{k,d}) + b_{k,d}\big) \, \pi_{k,d}
+
+    With `τ = 1`, `b = 0` and a uniform π, as `fit` leaves them, this is the published model. It is overconfident: the
+    density multiplies K+1 dimensions as if each were evidence of its own, though most scores are near zero together.
+    A class prior and τ < 1 help; `semfov.observation.fit_discriminative` trains α and b for the posterior itself,
+    and is what the recommended models use.
+
+    The logit of a class is linear in the log scores, with weights `τ (α - 1)`. So `α_k = 1 + e_k` with all else
+    uniform (`identity`) gives back the scores as they are.
+
+    Args:
+        alpha: `(K+1, N, K+1)`, positive: class (background first), level, component of the score vector.
+        edges: N - 1 ascending borders of the levels, in units of the image's longer side. A distance that equals a
+            border belongs to the inner level.
+        classes: names of the K classes, without background.
+        epsilon: scores are raised to at least this, and scaled to sum to 1.
+        log_prior: `(K+1, N)`, ln π up to a constant for each level; None is uniform.
+        bias: `(K+1, N)`, b; None is zero.
+        tempering: τ, positive.
+        expected: `(K+1, N, K+1)`, what `expected_scores` returns where that is not the mean of Dir(α), as in models
+            trained for the posterior; None takes the mean.
+        metadata: JSON values that are kept with the model: `detector` and `sensor` (settings it was fitted for),
+            `counts`, and whatever else is worth knowing.
+
+    Attributes:
+        log_alpha: the learnable parameter, `ln α`.
+
+    >>> model = FovealObservationModel.identity(["cup", "cat"], edges=[0.1, 0.2])
+    >>> model.calibrate(torch.tensor([0.2, 0.7, 0.1]), torch.tensor(0.15)).detach()
+    tensor([0.2000, 0.7000, 0.1000])
+    """
+
+    edges: Tensor
+    log_prior: Tensor
+    bias: Tensor
+    tempering: Tensor
+    expected: Tensor | None
+
+    def __init__(
+        self,
+        alpha: Tensor,
+        edges: Sequence[float] | Tensor,
+        classes: Sequence[str],
+        *,
+        epsilon: float = 1e-6,
+        log_prior: Tensor | None = None,
+        bias: Tensor | None = None,
+        tempering: float = 1.0,
+        expected: Tensor | None = None,
+        metadata: Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        components = len(classes) + 1
+        borders = torch.as_tensor(edges, dtype=alpha.dtype, device=alpha.device).reshape(-1).clone()
+        check_finite(borders, "edges")
+        ascending = bool((borders.diff() > 0).all()) and bool((borders > 0).all())
+        check(ascending, "edges", "positive, ascending numbers", borders.tolist())
+        shape = (components, len(borders) + 1, components)
+        check(tuple(alpha.shape) == shape, "alpha", f"shape (K+1, N, K+1) = {shape}", tuple(alpha.shape))
+        check_finite(alpha, "alpha")
+        check(bool((alpha > 0).all()), "alpha", "positive numbers", float(alpha.min()))
+        check(0 < epsilon < 1, "epsilon", "a number between 0 and 1", epsilon)
+        check(tempering > 0, "tempering", "a positive number", tempering)
+        self.classes = tuple(classes)
+        self.epsilon = epsilon
+        self.metadata = dict(metadata or {})
+        self.log_alpha = nn.Parameter(alpha.detach().log())
+        self.register_buffer("edges", borders)
+        for name, table, size in [
+            ("log_prior", log_prior, shape[:2]),
+            ("bias", bias, shape[:2]),
+            ("expected", expected, shape),
+        ]:
+            if table is not None:
+                check(tuple(table.shape) == size, name, f"shape {size}", tuple(table.shape))
+                check_finite(table, name)
+                table = table.detach().to(alpha).clone()
+            elif name != "expected":
+                table = alpha.new_zeros(size)
+            self.register_buffer(name, table)
+        self.register_buffer("tempering", alpha.new_tensor(tempering))
+        self._cache: tuple[Tensor, int, int, Tensor, Tensor] | None = None
+
+    @classmethod
+    def identity(cls, classes: Sequence[str], edges: Sequence[float] | Tensor, **settings: Any) -> Self:
+        """The model that calibrates nothing: `α_k = 1 + e_k`, so that `calibrate` returns the scores."""
+        levels = len(edges) + 1
+        alpha = 1 + torch.eye(len(classes) + 1)[:, None].repeat(1, levels, 1)
+        return cls(alpha, edges, classes, **settings)
+
+    @property
+    def alpha(self) -> Tensor:
+        """Dirichlet parameters, `(K+1, N, K+1)`, positive by construction; differentiable in `log_alpha`."""
+        return self.log_alpha.exp()
+
+    def level(self, distance: Tensor) -> Tensor:
+        """Level of each distance, `(...)` from 0 (the fovea) to N - 1."""
+        return torch.bucketize(distance.to(self.edges.dtype), self.edges)
+
+    def log_likelihood(self, scores: Tensor, distance: Tensor) -> Tensor:
+        """`ln Dir(S | α_{k,d})` for every class k, `(..., K+1)`.
+
+        Args:
+            scores: `(..., K+1)`, points of the simplex; floored at `epsilon`.
+            distance: `(...)`, from the fixation to the centre of the box, in units of the image's longer side.
+
+        Raises:
+            InputError: shapes do not fit, or a score is negative or not finite.
+        """
+        components = len(self.classes) + 1
+        check_shape(scores, "scores", components)
+        check(
+            scores.shape[:-1] == distance.shape, "distance", f"shape {tuple(scores.shape[:-1])}", tuple(distance.shape)
+        )
+        weight, constant = self._linear()
+        log_scores = floor(scores, self.epsilon).log().to(weight.dtype)
+        # One product for all levels, and a pick, costs less than fetching a matrix for each detection.
+        every = F.linear(log_scores, weight, constant).unflatten(-1, (-1, components))
+        index = self.level(distance)[..., None, None].expand(*distance.shape, 1, components)
+        return every.gather(-2, index).squeeze(-2).to(scores.dtype)
+
+    def calibrate(self, scores: Tensor, distance: Tensor, *, prior: bool = True) -> Tensor:
+        """Calibrated scores: the posterior of the classes, `(..., K+1)`, summing to 1.
+
+        Args:
+            scores: `(..., K+1)`, points of the simplex.
+            distance: `(...)`, in units of the image's longer side.
+            prior: False leaves out π, which gives the likelihoods of the classes up to a factor. Models without a
+                class prior give the same either way.
+        """
+        logits = self.log_likelihood(scores, distance) * self.tempering
+        offset = self.bias + self.log_prior if prior else self.bias
+        return (logits + offset.t()[self.level(distance)]).softmax(-1).to(scores.dtype)
+
+    def expected_scores(self) -> Tensor:
+        """Scores to expect of an object, `E[S | C = k, d]`, `(K+1, N, K+1)`."""
+        return self.log_alpha.softmax(-1) if self.expected is None else self.expected
+
+    def forward(self, scores: Tensor, distance: Tensor) -> Tensor:
+        """As `calibrate`."""
+        return self.calibrate(scores, distance)
+
+    @torch.no_grad()
+    def fit(
+        self,
+        statistics: DirichletStatistics,
+        *,
+        method: Method = "newton",
+        shrinkage: float = 10.0,
+        minimum: int = 100,
+        prior: bool = False,
+        tempering: float = 1.0,
+        **metadata: Any,
+    ) -> Self:
+        """Set α to the maximum a posteriori under the statistics of a training set, and return the model itself.
+
+        See `semfov.observation.fitting.fit_table` for the estimate. A level with fewer than `minimum` objects takes
+        the parameters of its inner neighbour; a warning and `metadata["fallback"]` say so.
+
+        Args:
+            statistics: sums of the scores by class and level, of shape `(K+1, N)`.
+            method: `newton`, `fixed_point` or `gradient` (`semfov.dirichlet.mle`).
+            shrinkage: pseudo-counts that draw a cell to its class, and a class to the uniform density.
+            minimum: objects, background not counted, that a level needs.
+            prior: take the frequencies of the classes as prior; False leaves it uniform, as published.
+            tempering: factor τ of the log likelihood.
+            metadata: JSON values to keep with the model.
+        """
+        components, levels = self.log_alpha.shape[:2]
+        wanted, got = ((components, levels), self.epsilon), (statistics.shape, statistics.epsilon)
+        check(got == wanted, "statistics", f"shape and epsilon {wanted}", got)
+        check(tempering > 0, "tempering", "a positive number", tempering)
+        alpha, fallback = fit_table(statistics, method=method, shrinkage=shrinkage, minimum=minimum)
+        if fallback:
+            told = ", ".join(f"{level} takes those of {source}" for level, source in fallback.items())
+            warnings.warn(f"levels with fewer than {minimum} objects: {told}", stacklevel=2)
+        self.log_alpha.copy_(alpha.log())
+        self.log_prior.copy_(estimate_prior(statistics.count, shrinkage) if prior else torch.tensor(0.0))
+        self.bias.zero_()
+        self.tempering.fill_(tempering)
+        self.expected = None
+        self.metadata |= {
+            "counts": statistics.count.tolist(),
+            "fallback": {str(level): source for level, source in fallback.items()},
+            "method": method,
+            "shrinkage": shrinkage,
+            "minimum": minimum,
+            **metadata,
+        }
+        return self
+
+    def check_compatible(
+        self,
+        settings: Mapping[str, Any] | None = None,
+        classes: Sequence[str] | None = None,
+        background: str | None = None,
+    ) -> None:
+        """Raise `InputError` where the model is to be used beside something that it was not fitted for.
+
+        Weights, classes and background policy must be those of the fit, as far as `metadata` tells them; other
+        settings that differ are warned of.
+
+        Args:
+            settings: `Detector.settings()`, or an eye's: `{"detector": ..., "sensor": ...}`.
+            classes: names of the K classes.
+            background: background policy of the scores.
+        """
+        settings = settings or {}
+        eye = settings if "detector" in settings else {"detector": settings}
+        fitted = self.metadata.get("detector", {})
+        compatibility.check_classes(self.classes, classes)
+        compatibility.check_background(fitted, background)
+        compatibility.check_detector(fitted, eye["detector"])
+        compatibility.check_sensor(self.metadata.get("sensor", {}), eye.get("sensor", {}))
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the model to a safetensors file with its metadata as JSON in the header, whole or not at all."""
+        from semfov import __version__
+
+        record = {
+            "kind": _KIND,
+            "version": __version__,
+            "classes": self.classes,
+            "epsilon": self.epsilon,
+            "metadata": self.metadata,
+        }
+        write(path, self.state_dict(), record)
+
+    @classmethod
+    def from_pretrained(cls, name_or_path: str | PathLike[str], *, detector: Any = None) -> Self:
+        """A model that is shipped with the package, by name, or one that `save` wrote, by path; in `eval` mode.
+
+        Args:
+            name_or_path: name, or path of a `.safetensors` file.
+            detector: a `semfov.Detector` that the model will be used with; checked by `check_compatible`.
+
+        Raises:
+            InputError: no model of that name is shipped, or it was not fitted for `detector`.
+            DataError: the file is missing, damaged or not a model.
+        """
+        path = _find(name_or_path)
+        tensors, record = read(path, _KIND)
+        try:
+            alpha = tensors.pop("log_alpha")
+            model = cls(
+                alpha.exp(),
+                tensors["edges"],
+                record["classes"],
+                epsilon=record["epsilon"],
+                expected=tensors.get("expected"),
+                metadata=record["metadata"],
+            )
+            model.load_state_dict({"log_alpha": alpha, **tensors})
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise DataError(f"{path}: not a complete observation model ({error})") from None
+        if detector is not None:
+            model.check_compatible(detector.settings(), detector.classes)
+        return model.eval()
+
+    def train(self, mode: bool = True) -> Self:
+        """As for every module; also forgets what `eval` mode keeps between calls."""
+        self._cache = None
+        return super().train(mode)
+
+    def extra_repr(self) -> str:
+        """Sizes, for `repr`."""
+        return f"classes={len(self.classes)}, levels={len(self.edges) + 1}, epsilon={self.epsilon}"
+
+    def _linear(self) -> tuple[Tensor, Tensor]:
+        """Weights `(N (K+1), K+1)` and constants of the log likelihoods, level by level.
+
+        Without gradients and in `eval` mode they are kept until `log_alpha` changes.
+        """
+        parameter = self.log_alpha
+        learning = self.training or (torch.is_grad_enabled() and parameter.requires_grad)
+        if learning or torch.compiler.is_compiling() or parameter.is_inference():
+            return self._make_linear()
+        key = (parameter, parameter._version, parameter.data_ptr())
+        if self._cache is None or self._cache[0] is not parameter or self._cache[1:3] != key[1:]:
+            with torch.inference_mode(False), torch.no_grad():
+                self._cache = (*key, *self._make_linear())
+        return self._cache[3:]
+
+    def _make_linear(self) -> tuple[Tensor, Tensor]:
+        alpha = self.alpha.transpose(0, 1)
+        # ln Γ of large parameters needs the digits: likelihoods differ by less than it is large.
+        constant = -log_normaliser(alpha.to(torch.float64)).to(alpha.dtype)
+        return (alpha - 1).flatten(0, 1), constant.flatten()
+
+
+def _find(name_or_path: str | PathLike[str]) -> Path:
+    path = Path(name_or_path)
+    if path.suffix == ".safetensors" or len(path.parts) > 1:
+        return path
+    shipped = sorted(file.stem for file in SHIPPED.glob("*.safetensors"))
+    return SHIPPED / f"{lookup(str(name_or_path), shipped, 'observation model')}.safetensors"

@@ -1,6 +1,7 @@
 """A small Darknet network with every kind of layer, and weights files for it."""
 
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -105,38 +106,36 @@ classes=2
 """
 
 # Filters, inputs per group, kernel side, batch norm: of each convolution of SMALL_CFG, in order.
-SMALL_CONVOLUTIONS = [(8, 3, 3, 1), (12, 8, 3, 1), (12, 4, 3, 1), (14, 18, 1, 0), (6, 18, 1, 1), (7, 14, 3, 0)]
-
-
-def darknet_bytes(
-    convolutions: list[tuple[int, int, int, int]], seed: int = 0, version: tuple[int, int] = (0, 2)
-) -> bytes:
-    """A weights file with random parameters, written as Darknet does."""
-    generator = np.random.default_rng(seed)
-    header = struct.pack("<3iQ" if version >= (0, 2) else "<3iI", *version, 0, 12345)
-    parts = []
-    for filters, inputs, side, normalised in convolutions:
-        parts.append(generator.normal(0, 0.5, filters))
-        if normalised:
-            parts.append(generator.uniform(0.5, 2, filters))
-            parts.append(generator.normal(0, 0.5, filters))
-            parts.append(generator.uniform(0.1, 3, filters))
-        parts.append(generator.normal(0, 1 / np.sqrt(inputs * side * side), filters * inputs * side * side))
-    return header + b"".join(part.astype("<f4").tobytes() for part in parts)
+SMALL_CONVOLUTIONS = [(8, 3, 3, 1), (12, 8, 3, 1), (12, 4, 3, 1), (14, 18, 1, 0), (6, 36, 1, 1), (7, 14, 3, 0)]
 
 
 @pytest.fixture
 def small_cfg(tmp_path: Path) -> Path:
+    """Cfg of a network of 17 layers, 6 of them convolutions."""
     path = tmp_path / "small.cfg"
     path.write_text(SMALL_CFG)
     return path
 
 
 @pytest.fixture
-def small_weights(tmp_path: Path) -> Path:
-    path = tmp_path / "small.weights"
-    path.write_bytes(darknet_bytes(SMALL_CONVOLUTIONS))
-    return path
+def write_weights(tmp_path: Path) -> Callable[..., Path]:
+    """Writes random weights for `small_cfg` as Darknet does."""
+
+    def write(version: tuple[int, int] = (0, 2), seed: int = 0) -> Path:
+        generator = np.random.default_rng(seed)
+        parts = []
+        for filters, inputs, side, normalised in SMALL_CONVOLUTIONS:
+            parts.append(generator.normal(0, 0.5, filters))
+            if normalised:
+                parts += [generator.uniform(0.5, 2, filters), generator.normal(0, 0.5, filters)]
+                parts.append(generator.uniform(0.1, 3, filters))
+            parts.append(generator.normal(0, 1 / np.sqrt(inputs * side * side), filters * inputs * side * side))
+        header = struct.pack("<3iQ" if version >= (0, 2) else "<3iI", *version, 0, 12345)
+        path = tmp_path / "small.weights"
+        path.write_bytes(header + np.concatenate(parts).astype("<f4").tobytes())
+        return path
+
+    return write
 
 
 @pytest.fixture(scope="session")
@@ -149,3 +148,52 @@ def tiny_weights() -> Path:
         return fetch("yolov3-tiny")
     except DataError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture
+def make_onnx(tmp_path: Path):
+    """Writes ONNX models whose outputs are given arrays `(1, ...)` times sigmoid(mean of the input image)."""
+    return lambda outputs, **options: write_onnx(tmp_path / options.pop("file", "model.onnx"), outputs, **options)
+
+
+def write_onnx(
+    path: Path,
+    outputs: dict[str, np.ndarray],
+    *,
+    size: tuple[int, int] = (64, 64),
+    image: str = "images",
+    batch: int | str = 1,
+    dynamic: bool = False,
+    extra: dict[str, tuple[int, list[int]]] | None = None,
+    metadata: dict[str, str] | None = None,
+    producer: str = "pytorch",
+    dtype: type = np.float32,
+) -> Path:
+    from onnx import helper, numpy_helper, save
+
+    kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
+    sides = ["height", "width"] if dynamic else [size[1], size[0]]
+    inputs = [helper.make_tensor_value_info(image, kind, [batch, 3, *sides])]
+    inputs += [helper.make_tensor_value_info(name, *about) for name, about in (extra or {}).items()]
+    nodes = [
+        helper.make_node("ReduceMean", [image], ["mean"], axes=[1, 2, 3], keepdims=0),
+        helper.make_node("Sigmoid", ["mean"], ["gain"]),
+    ]
+    infos, constants = [], []
+    for name, values in outputs.items():
+        ones = np.array([-1] + [1] * (values.ndim - 1), dtype=np.int64)
+        constants.append(numpy_helper.from_array(ones, f"{name}_shape"))
+        constants.append(numpy_helper.from_array(values.astype(dtype), f"{name}_values"))
+        nodes.append(helper.make_node("Reshape", ["gain", f"{name}_shape"], [f"{name}_gain"]))
+        nodes.append(helper.make_node("Mul", [f"{name}_values", f"{name}_gain"], [name]))
+        rest = [None] * (values.ndim - 1) if dynamic else list(values.shape[1:])
+        infos.append(helper.make_tensor_value_info(name, kind, [batch, *rest]))
+    model = helper.make_model(
+        helper.make_graph(nodes, "model", inputs, infos, constants),
+        producer_name=producer,
+        opset_imports=[helper.make_opsetid("", 17)],
+        ir_version=8,
+    )
+    helper.set_model_props(model, metadata or {})
+    save(model, str(path))
+    return path

@@ -2,20 +2,57 @@ import configparser
 import re
 
 import pytest
-from conftest import SMALL_CFG
 
 from semfov.detection.darknet_config import Section, parse_cfg, read_cfg
 from semfov.errors import DataError
 
 
-def test_agrees_with_configparser():
-    # The standard parser wants unique names of sections.
-    count = iter(range(100))
-    text = re.sub(r"\[(\w+)\]", lambda match: f"[{next(count)} {match[1]}]", SMALL_CFG)
+def test_agrees_with_configparser(small_cfg):
+    # The standard library's parser wants unique names of sections.
+    number = iter(range(100))
     parser = configparser.ConfigParser()
-    parser.read_string(text)
-    sections = parse_cfg(SMALL_CFG)
-    assert len(sections) == len(parser.sections())
+    parser.read_string(re.sub(r"\[(\w+)\]", lambda match: f"[{next(number)} {match[1]}]", small_cfg.read_text()))
+    sections = read_cfg(small_cfg)
+    assert len(sections) == len(parser.sections()) == 18
     for section, name in zip(sections, parser.sections(), strict=True):
         assert section.kind == name.split()[1]
         assert section.options == {key: "".join(value.split()) for key, value in parser[name].items()}
+
+
+def test_comments_blanks_and_repeated_keys():
+    (section,) = parse_cfg("# net\n ; net\n\n [ net ] \n width = 32 \n width=64\nempty=\n")
+    assert section.kind == "net"
+    assert section.options == {"width": "32", "empty": ""}
+    assert section.where == "cfg:4"
+
+
+def test_values():
+    section = Section("yolo", {"mask": "1,2,", "anchors": "1.5,2,3,4", "size": "3", "word": "x"}, "a.cfg:7")
+    assert section.integers("mask") == (1, 2)
+    assert section.numbers("anchors") == (1.5, 2.0, 3.0, 4.0)
+    assert section.integer("size") == 3
+    assert section.integer("stride", 2) == 2
+    with pytest.raises(DataError, match=r"a.cfg:7: \[yolo\] lacks 'classes'"):
+        section.integer("classes")
+    for key in ("mask", "word"):
+        with pytest.raises(DataError, match=rf"a.cfg:7: \[yolo\] {key}: expected"):
+            section.integer(key)
+    with pytest.raises(DataError, match="from 4 up, got '3'"):
+        section.integer("size", minimum=4)
+    with pytest.raises(DataError, match="expected numbers, got 'x'"):
+        section.numbers("word")
+
+
+@pytest.mark.parametrize("text", ["width=3", "[net]\nwidth 3", "[net"])
+def test_refuses_what_is_no_cfg(text):
+    with pytest.raises(DataError, match=r"cfg:\d: expected \[section\] or key=value"):
+        parse_cfg(text)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(DataError, match=r"cannot read the cfg .*missing.cfg"):
+        read_cfg(tmp_path / "missing.cfg")
+    binary = tmp_path / "binary.cfg"
+    binary.write_bytes(b"\xff\xfe\x00\x9f")
+    with pytest.raises(DataError, match="not a text file"):
+        read_cfg(binary)

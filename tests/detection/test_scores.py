@@ -29,10 +29,14 @@ def test_policies_by_hand(policy, classes, objectness, background, expected):
     torch.testing.assert_close(scores, torch.tensor([[expected]], dtype=torch.float64), **EXACT)
 
 
-@given(st.lists(st.floats(0, 1), min_size=1, max_size=6), st.floats(0, 1), st.sampled_from(["residual", "uniform", "none"]))
+@given(
+    st.lists(st.floats(0, 1), min_size=1, max_size=6), st.floats(0, 1), st.sampled_from(["residual", "uniform", "none"])
+)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_points_of_the_simplex(dtype, classes, objectness, policy):
-    c = Candidates(torch.zeros(1, 4, dtype=dtype), torch.tensor([classes], dtype=dtype), torch.tensor([objectness]).to(dtype))
+    c = Candidates(
+        torch.zeros(1, 4, dtype=dtype), torch.tensor([classes], dtype=dtype), torch.tensor([objectness]).to(dtype)
+    )
     scores = score_vectors(c, policy)
     assert scores.dtype == dtype
     assert bool((scores >= 0).all())

@@ -68,7 +68,9 @@ def test_an_image_does_not_depend_on_its_batch():
     candidates = make(40, batch=3)
     whole = select(candidates, None, Selection(), "residual")
     for image in range(3):
-        part = Candidates(*(x[image : image + 1] for x in (candidates.boxes, candidates.classes, candidates.objectness)))
+        part = Candidates(
+            *(x[image : image + 1] for x in (candidates.boxes, candidates.classes, candidates.objectness))
+        )
         alone = select(part, None, Selection(), "residual")
         length = int(alone.count)
         assert int(whole.count[image]) == length

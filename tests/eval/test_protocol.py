@@ -130,9 +130,7 @@ def test_an_episode_does_not_depend_on_other_scenes(scenes):
 
 
 def test_seeds_differ(scenes):
-    starts = [
-        [e.start for e in episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=10, seed=seed))] for seed in (0, 1)
-    ]
+    starts = [[e.start for e in episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=10, seed=seed))] for seed in (0, 1)]
     assert starts[0] != starts[1]
 
 

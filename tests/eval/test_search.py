@@ -65,9 +65,7 @@ def test_run_leaves_everything(finished):
     with (finished.out / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 2 * 7
-    everything = [
-        r for r in rows if r["average"] == "all targets" and r["policy"] == "random" and r["shifts"] == "6"
-    ]
+    everything = [r for r in rows if r["average"] == "all targets" and r["policy"] == "random" and r["shifts"] == "6"]
     by_scene = {}
     for record in records:
         if record["policy"] == "random":

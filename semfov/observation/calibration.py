@@ -1,0 +1,125 @@
+"""Training an observation model for the posterior of the class, rather than for the density of the scores."""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.errors import check, check_shape
+from semfov.observation.dirichlet import floor, log_normaliser
+from semfov.observation.fitting import estimate_prior
+from semfov.observation.foveal import FovealObservationModel
+
+
+def fit_discriminative(
+    model: FovealObservationModel,
+    scores: Tensor,
+    distance: Tensor,
+    labels: Tensor,
+    *,
+    decay: float = 2000.0,
+    level_decay: float = 10000.0,
+    bias_decay: float = 10.0,
+    iterations: int = 200,
+) -> FovealObservationModel:
+    r"""A model whose posterior is calibrated: α and b minimise the cross-entropy of the true classes.
+
+    The logits of the posterior are linear in the log scores, `Σ_j (α_kdj - 1) ln s_j + c_kd`, so this is multinomial
+    logistic regression, and is known as Dirichlet calibration (Kull et al. 2019, "Beyond temperature scaling"), here
+    one for each level of distance. Positive α are no restriction: a shift common to all classes changes nothing.
+
+    With 82 weights a class and level, and few examples of most, priors matter. They are normal, centred on returning
+    the scores as they are (`α_k = 1 + e_k`, where classes without examples stay), and tie the levels together:
+
+    .. math:: \ln \alpha_{kdj} = \ln(1 + \delta_{kj}) + u_{kj} + v_{kdj}, \quad
+              u \sim N(0, 1/\texttt{decay}), \; v \sim N(0, 1/\texttt{level\_decay}), \;
+              c \sim N(0, 1/\texttt{bias\_decay})
+
+    with `c` again the sum of a common part and one for each level. The diagonal of u, which acts as the temperature
+    of the scores, has the weaker prior of c. The objective, the posterior of these under the samples, is maximised by
+    L-BFGS on all samples from a fixed start, so that the result depends on nothing random.
+
+    Trained so, Dir(α) no longer describes the scores: the expected scores are kept from `model`. Its class
+    frequencies become the prior π, so that `calibrate(..., prior=False)` gives likelihoods.
+
+    Args:
+        model: gives edges, classes, epsilon, metadata, and the expected scores; fitted by `fit`.
+        scores: `(M, K+1)`, score vectors of detections. Computed in their dtype.
+        distance: `(M,)`, in units of the image's longer side.
+        labels: `(M,)`, index of the true class, 0 for background.
+        decay: precision of the prior of u, off the diagonal.
+        level_decay: precision of the prior of v.
+        bias_decay: precision of the prior of c.
+        iterations: steps of L-BFGS, at most.
+
+    Returns:
+        A new model; `model` stays as it is.
+
+    Raises:
+        InputError: shapes do not fit, a label is out of range, or there are no samples.
+    """
+    components, levels = len(model.classes) + 1, len(model.edges) + 1
+    check_shape(scores, "scores", None, components)
+    samples = len(scores)
+    check(samples > 0, "scores", "at least one sample", samples)
+    check_shape(distance, "distance", samples)
+    check_shape(labels, "labels", samples)
+    inside = bool(((labels >= 0) & (labels < components)).all())
+    check(inside, "labels", f"class indices from 0 to {components - 1}", "one outside")
+    for name, value in [("decay", decay), ("level_decay", level_decay), ("bias_decay", bias_decay)]:
+        check(value > 0, name, "a positive number", value)
+
+    # Measured from the floor, scores that are next to nothing are next to zero, and L-BFGS converges faster.
+    lowest = math.log(model.epsilon)
+    evidence = floor(scores.detach(), model.epsilon).log() - lowest
+    level = model.level(distance)
+    groups = [(evidence[level == n], labels[level == n]) for n in range(levels)]
+
+    unit = torch.eye(components).to(scores)
+    start = unit.log1p()[:, None]
+    across = scores.new_zeros(components, 1, components, requires_grad=True)
+    within = scores.new_zeros(components, levels, components, requires_grad=True)
+    common = scores.new_zeros(components, 1, requires_grad=True)
+    own = scores.new_zeros(components, levels, requires_grad=True)
+    precision = torch.where(unit[:, None] > 0, bias_decay, decay)
+    optimiser = torch.optim.LBFGS(
+        [across, within, common, own],
+        max_iter=iterations,
+        history_size=10,
+        tolerance_grad=1e-7,
+        tolerance_change=1e-9,
+        line_search_fn="strong_wolfe",
+    )
+
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        weight, constant = (start + across + within).exp() - 1, common + own
+        total = (precision * across.square()).sum() + level_decay * within.square().sum()
+        total = (total + bias_decay * (common.square().sum() + own.square().sum())) / 2
+        for n, (rows, truth) in enumerate(groups):
+            total = total + F.cross_entropy(F.linear(rows, weight[:, n], constant[:, n]), truth, reduction="sum")
+        mean = total / samples
+        mean.backward()
+        return mean
+
+    with torch.enable_grad():
+        optimiser.step(loss)
+
+    alpha = (start + across + within).detach().exp()
+    count = torch.zeros(components, levels, dtype=torch.int64, device=labels.device)
+    count.index_put_((labels, level), torch.ones_like(labels), accumulate=True)
+    log_prior = estimate_prior(count).to(alpha)
+    # What the posterior's constant is made of beside b: the normaliser of Dir(α), the shift by the floor, and π.
+    offset = log_normaliser(alpha.double()).to(alpha) - (alpha - 1).sum(-1) * lowest - log_prior
+    trained = {"decay": decay, "level_decay": level_decay, "bias_decay": bias_decay, "iterations": iterations}
+    return FovealObservationModel(
+        alpha,
+        model.edges.to(alpha),
+        model.classes,
+        epsilon=model.epsilon,
+        log_prior=log_prior,
+        bias=(common + own).detach() + offset,
+        expected=model.expected_scores().detach(),
+        metadata={**model.metadata, "method": "discriminative", "discriminative": trained, "counts": count.tolist()},
+    )

@@ -1,0 +1,64 @@
+"""From statistics by class and level to the Dirichlets of an observation model."""
+
+import torch
+from torch import Tensor
+
+from semfov.errors import check
+from semfov.observation.mle import Method, mle, shrink, vacuous
+from semfov.observation.statistics import DirichletStatistics
+
+# Scores of single precision cannot tell a precision beyond this from certainty.
+MAX_PRECISION = 1e6
+
+
+def fit_table(
+    statistics: DirichletStatistics, *, method: Method = "newton", shrinkage: float = 10.0, minimum: int = 100
+) -> tuple[Tensor, dict[int, int]]:
+    r"""Maximum a posteriori α for every class and level, `(K+1, N, K+1)` in float64.
+
+    The mean logs of a cell are shrunk to those of its class over all levels, and these to those of Dir(1, ..., 1)
+    (`semfov.dirichlet.shrink`):
+
+    .. math:: g_{k,d} = \frac{n_{k,d} \bar g_{k,d} + w g_k}{n_{k,d} + w}, \qquad
+              g_k = \frac{n_k \bar g_k + w (\psi(1) - \psi(K+1))}{n_k + w}
+
+    so that a class without samples gets the uniform density, and a cell without samples that of its class. A level
+    with fewer than `minimum` objects in all takes the parameters of its inner neighbour.
+
+    Args:
+        statistics: of shape `(K+1, N)`, background first.
+        method: of `semfov.dirichlet.mle`.
+        shrinkage: pseudo-counts w.
+        minimum: objects, background not counted, that a level needs.
+
+    Returns:
+        α, and the levels that fell back: level -> the level that its parameters are of. Level 0 has no inner
+        neighbour: it is recorded as falling back on itself, and is what shrinking makes of it.
+    """
+    check(len(statistics.shape) == 2, "statistics", "a table (K+1, N)", statistics.shape)
+    classes = statistics.sum(1)
+    uniform = vacuous(statistics.components).to(statistics.count.device)
+    parent = shrink(classes.mean_log, classes.count, uniform, shrinkage)
+    mean_log = shrink(statistics.mean_log, statistics.count, parent[:, None], shrinkage)
+    alpha = mle(mean_log, method=method, max_precision=MAX_PRECISION)
+    fallback: dict[int, int] = {}
+    for level, objects in enumerate(statistics.count[1:].sum(0).tolist()):
+        if objects < minimum:
+            fallback[level] = fallback.get(level - 1, max(level - 1, 0))
+            alpha[:, level] = alpha[:, fallback[level]]
+    return alpha, fallback
+
+
+def estimate_prior(count: Tensor, shrinkage: float = 10.0) -> Tensor:
+    r"""Log frequencies of the classes at each level, `(K+1, N)` in float64.
+
+    .. math:: \pi_{k,d} = \frac{n_{k,d} + w \pi_k}{n_d + w}, \qquad \pi_k = \frac{n_k + 1}{n + K + 1}
+
+    >>> estimate_prior(torch.tensor([[8], [0]]), 10.0).exp().flatten()
+    tensor([0.9444, 0.0556], dtype=torch.float64)
+    """
+    check(shrinkage > 0, "shrinkage", "a positive number of pseudo-counts", shrinkage)
+    count = count.to(torch.float64)
+    pooled = count.sum(1, keepdim=True) + 1
+    pooled = pooled / pooled.sum()
+    return ((count + shrinkage * pooled) / (count.sum(0) + shrinkage)).log()

@@ -1,0 +1,213 @@
+"""The torch module against a plain walk through cfg and weights: batch norm unfolded, numbers read one by one."""
+
+import configparser
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional as F
+
+from semfov.detection.architectures import yolov3, yolov3_tiny
+from semfov.detection.darknet import Darknet
+from semfov.detection.darknet_config import Section, parse_cfg, read_cfg
+from semfov.detection.darknet_weights import read_weights
+from semfov.detection.winograd import WinogradConvolution
+from semfov.errors import DataError, InputError
+
+
+class Walk:
+    """One layer after the other, as the cfg tells, in float64."""
+
+    def __init__(self, cfg: str, weights: Path, header: int = 20) -> None:
+        number = iter(range(1000))
+        self.parser = configparser.ConfigParser()
+        self.parser.read_string(re.sub(r"\[(\w+)\]", lambda match: f"[{next(number)} {match[1]}]", cfg))
+        self.numbers = torch.from_numpy(np.fromfile(weights, "<f4", offset=header).astype(np.float64))
+
+    def take(self, *shape: int) -> torch.Tensor:
+        count = int(np.prod(shape))
+        taken, self.numbers = self.numbers[:count], self.numbers[count:]
+        return taken.view(shape)
+
+    def convolve(self, x: torch.Tensor, options) -> torch.Tensor:
+        filters, size, groups = int(options["filters"]), int(options["size"]), int(options.get("groups", 1))
+        shift = self.take(filters)
+        normalised = options.get("batch_normalize") == "1"
+        if normalised:
+            scale, mean, variance = self.take(filters), self.take(filters), self.take(filters)
+        kernel = self.take(filters, x.shape[1] // groups, size, size)
+        padding = size // 2 if options.get("pad") == "1" else 0
+        x = F.conv2d(x, kernel, stride=int(options.get("stride", 1)), padding=padding, groups=groups)
+        x = F.batch_norm(x, mean, variance, scale, shift, eps=1e-5) if normalised else x + shift[:, None, None]
+        return {
+            "leaky": lambda x: torch.where(x > 0, x, x / 10),
+            "linear": lambda x: x,
+            "relu": lambda x: x.clamp(min=0),
+            "mish": lambda x: x * torch.tanh(torch.log1p(torch.exp(x))),
+        }[options["activation"]](x)
+
+    def __call__(self, x: torch.Tensor) -> list[torch.Tensor]:
+        outputs: list[torch.Tensor] = []
+        maps = []
+        for name in self.parser.sections()[1:]:
+            options, kind = self.parser[name], name.split()[1]
+            if kind == "convolutional":
+                x = self.convolve(x, options)
+            elif kind == "maxpool":
+                size, stride = int(options["size"]), int(options["stride"])
+                before = (size - 1) // 2
+                padded = F.pad(x, (before, size - 1 - before) * 2, value=-1e30)
+                # The size must not depend on the padding where the stride is 2.
+                x = F.max_pool2d(padded, size, stride)[..., : -(-x.shape[2] // stride), : -(-x.shape[3] // stride)]
+            elif kind == "upsample":
+                x = x.repeat_interleave(2, 2).repeat_interleave(2, 3)
+            elif kind == "shortcut":
+                x = x + outputs[int(options["from"])]
+            elif kind == "route":
+                x = torch.cat([outputs[int(layer)] for layer in options["layers"].split(",")], 1)
+                groups = int(options.get("groups", 1))
+                x = x.reshape(len(x), groups, -1, *x.shape[2:])[:, int(options.get("group_id", 0))]
+            else:
+                maps.append(x)
+            outputs.append(x)
+        assert len(self.numbers) == 0
+        return maps
+
+
+@pytest.mark.parametrize("version", [(0, 1), (0, 2)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_small_network(small_cfg, write_weights, version, dtype):
+    weights = write_weights(version)
+    network = Darknet(read_cfg(small_cfg)).to(dtype)
+    read_weights(network, weights)
+    image = torch.rand(3, 3, 32, 64, dtype=torch.float64)
+    expected = Walk(small_cfg.read_text(), weights, 20 if version == (0, 2) else 16)(image)
+    actual = network(image.to(dtype))
+    assert [tuple(m.shape) for m in actual] == [(3, 14, 4, 8), (3, 7, 16, 32)]
+    tolerance = {"atol": 1e-4, "rtol": 1e-4} if dtype == torch.float32 else {"atol": 1e-10, "rtol": 1e-10}
+    for a, e in zip(actual, expected, strict=True):
+        assert a.dtype == dtype
+        torch.testing.assert_close(a, e.to(dtype), **tolerance)
+
+
+@pytest.mark.weights
+@pytest.mark.parametrize("winograd", [False, True])
+def test_published_yolov3_tiny(tiny_weights, winograd):
+    sections = yolov3_tiny()
+    lines = [f"[{s.kind}]\n" + "".join(f"{key}={value}\n" for key, value in s.options.items()) for s in sections]
+    network = Darknet(sections).eval().requires_grad_(False)
+    read_weights(network, tiny_weights)
+    if winograd:
+        network.use_winograd()
+        assert sum(isinstance(layer, WinogradConvolution) for layer in network.layers) == 6
+    image = torch.rand(1, 3, 96, 64, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected = Walk("".join(lines), tiny_weights)(image)
+    for a, e in zip(network(image.float()), expected, strict=True):
+        torch.testing.assert_close(a.double(), e, atol=2e-3 if winograd else 2e-4, rtol=0)
+
+
+def test_gradient_reaches_the_image(small_cfg, write_weights):
+    network = Darknet(read_cfg(small_cfg)).double()
+    read_weights(network, write_weights())
+    image = torch.rand(1, 3, 8, 8, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: tuple(network(x)), (image,), fast_mode=True)
+    assert torch.autograd.grad(sum(m.sum() for m in network(image)), network.layers[0].weight)[0].any()
+
+
+def test_batch_gives_the_same_bits(small_cfg, write_weights):
+    network = Darknet(read_cfg(small_cfg)).requires_grad_(False)
+    read_weights(network, write_weights())
+    network.use_winograd(channels=1)
+    images = torch.rand(4, 3, 64, 96)
+    whole = network(images)
+    for i in range(4):
+        for together, alone in zip(whole, network(images[i : i + 1]), strict=True):
+            assert torch.equal(together[i : i + 1], alone)
+
+
+def test_keeps_the_image(small_cfg):
+    image = torch.rand(1, 3, 32, 64)
+    before = image.clone()
+    Darknet(read_cfg(small_cfg))(image)
+    assert torch.equal(image, before)
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_compiles_whole(small_cfg, batch):
+    network = Darknet(read_cfg(small_cfg)).eval()
+    image = torch.rand(batch, 3, 32, 64)
+    compiled = torch.compile(network, fullgraph=True, backend="eager")
+    for actual, expected in zip(compiled(image), network(image), strict=True):
+        torch.testing.assert_close(actual, expected)
+
+
+def test_reads_only_what_is_needed_later():
+    # Without dropping outputs, the 107 layers of YOLOv3 hold many times the largest one.
+    network = Darknet(yolov3(classes=1)).requires_grad_(False)
+    alive = []
+    original = network._run
+
+    def run(outputs, start, stop):
+        for index in range(start, stop):
+            outputs = original(outputs, index, index + 1)
+            alive.append(len(outputs))
+        return outputs
+
+    network._run = run
+    network(torch.zeros(1, 3, 32, 32))
+    assert max(alive) <= 6
+
+
+@pytest.mark.parametrize("size", [(3, 32, 31), (3, 0, 32), (1, 32, 32)])
+def test_refuses_images_that_do_not_fit(small_cfg, size):
+    with pytest.raises(InputError, match="image: expected"):
+        Darknet(read_cfg(small_cfg))(torch.zeros(1, *size))
+
+
+YOLO = "[yolo]\nmask=0\nanchors=1,2\nclasses=1\n"
+NET = "[net]\nwidth=32\nheight=32\nchannels=3\n"
+MAPS = "[convolutional]\nfilters=6\nactivation=linear\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected [net]"),
+        (MAPS + YOLO, "expected [net]"),
+        (NET + MAPS, "at least one [yolo]"),
+        (NET + "[lstm]\n", "cfg:5: layer [lstm] is not supported"),
+        (NET + "[convolutional]\nactivation=hardtan\n", "activation 'hardtan' is not supported"),
+        (NET + "[convolutional]\nactivation=linear\ndilation=2\n", "dilation=2 is not supported"),
+        (NET + "[convolutional]\nfilters=4\ngroups=2\nactivation=linear\n", "groups=2 divides not both 3 and 4"),
+        (NET + MAPS + "[route]\nlayers=-2\n", "layers=-2 points to no earlier layer"),
+        (NET + MAPS + "[route]\nlayers=1\n", "layers=1 points to no earlier layer"),
+        (NET + MAPS + "[route]\nlayers=0\ngroups=2\ngroup_id=2\n", "no part 2 of 2"),
+        (NET + MAPS + "[maxpool]\nstride=2\n[route]\nlayers=0,1\n", "expected layers of one size"),
+        (NET + MAPS + "[maxpool]\nstride=2\n[shortcut]\nfrom=0\n", "one layer of the same shape"),
+        (NET + MAPS + "[shortcut]\nfrom=0,0\n", "one layer of the same shape"),
+        (NET + MAPS + "[yolo]\nmask=0,1\nanchors=1,2,3,4\nclasses=1\n", "expected 12 channels, got 6"),
+        (NET + MAPS + "[yolo]\nmask=1\nanchors=1,2\nclasses=1\n", "mask (1,) does not choose"),
+        (NET + MAPS + "[yolo]\nmask=0\nanchors=1,2,3\nclasses=1\n", "mask (0,) does not choose"),
+    ],
+)
+def test_refuses_cfgs_with_one_line(text, message):
+    with pytest.raises(DataError) as caught:
+        Darknet(parse_cfg(text))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_dropout_does_nothing():
+    sections = parse_cfg(NET + "[dropout]\nprobability=.5\n" + MAPS + YOLO)
+    network, plain = Darknet(sections), Darknet([s for s in sections if s.kind != "dropout"])
+    network.layers[1].load_state_dict(plain.layers[0].state_dict())
+    image = torch.rand(1, 3, 4, 4)
+    assert torch.equal(network(image)[0], plain(image)[0])
+
+
+def test_mask_defaults_to_all_anchors():
+    section = Section("yolo", {"anchors": "1,2, 3,4", "classes": "1"})
+    network = Darknet([*parse_cfg(NET + MAPS.replace("6", "12")), section])
+    assert network.heads[0].anchors == ((1.0, 2.0), (3.0, 4.0))

@@ -1,0 +1,141 @@
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.load import load_detector
+from semfov.detection.placement import resize
+from semfov.errors import DataError, InputError
+
+
+def test_cfg_and_weights(small_cfg, write_weights):
+    detector = load_detector(small_cfg, weights=write_weights(), classes=["cat", "dog"], stride=8, threshold=0.1)
+    assert detector.name == "small"
+    assert detector.classes == ("cat", "dog")
+    assert detector.input_size == (64, 32)
+    assert detector.stride == 8
+    assert detector.selection.threshold == 0.1
+    assert len(detector.digest) == 64
+    assert not detector.training
+    assert not any(parameter.requires_grad for parameter in detector.parameters())
+    assert int(detector(torch.rand(2, 3, 40, 60)).count.sum()) > 0
+
+
+def test_options(small_cfg, write_weights, tmp_path):
+    names = tmp_path / "pets.names"
+    names.write_text("cat\n\ndog\n")
+    weights = write_weights()
+    options = {"weights": weights, "classes": names, "stride": None}
+    detector = load_detector(
+        str(small_cfg), **options, input_size=96, background="none", iou=0.4, limit=3, per_class=True
+    )
+    assert detector.classes == ("cat", "dog")
+    assert detector.input_size == (96, 96)
+    assert detector.background == "none"
+    assert detector.settings()["selection"] == {"threshold": 0.02, "iou": 0.4, "limit": 3, "per_class": True}
+    image = torch.rand(1, 3, 64, 96)
+    exact = load_detector(small_cfg, **options, winograd=False, dtype=torch.float64).propose(image)
+    assert exact.boxes.dtype == torch.float64
+    for winograd in (None, False):
+        proposed = load_detector(small_cfg, **options, winograd=winograd).propose(image)
+        torch.testing.assert_close(proposed.boxes.double(), exact.boxes, atol=1e-3, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["yolov3-tinny", "nothing"])
+def test_unknown_names(name):
+    with pytest.raises(InputError, match=f"unknown detector '{name}'; .*yolov3-tiny"):
+        load_detector(name)
+
+
+def test_files_that_do_not_fit(small_cfg, write_weights, tmp_path):
+    with pytest.raises(InputError, match=r"expected a cfg and its weights"):
+        load_detector("x.weights")
+    with pytest.raises(InputError, match="weights: expected the path"):
+        load_detector(small_cfg)
+    with pytest.raises(DataError, match=r"cannot read the cfg"):
+        load_detector(tmp_path / "missing.cfg", weights="x")
+    with pytest.raises(DataError, match=r"expected 248007048 bytes .* got"):
+        load_detector("yolov3", weights=write_weights())
+    with pytest.raises(InputError, match="classes: expected 2 names, got 80"):
+        load_detector(small_cfg, weights=write_weights(), stride=None)
+    with pytest.raises(DataError, match="cannot read the class names"):
+        load_detector(small_cfg, weights=write_weights(), classes=tmp_path / "missing.names")
+
+
+def test_other_rooms_are_called_when_needed(monkeypatch):
+    calls = []
+    for module, function in [("onnx", "load_onnx"), ("torchvision", "load_torchvision")]:
+        stand_in = SimpleNamespace(**{function: lambda name, _f=function, **options: calls.append((_f, name, options))})
+        monkeypatch.setitem(sys.modules, f"semfov.detection.{module}", stand_in)
+    load_detector("folder/model.onnx", threshold=0.1)
+    load_detector("yolox-nano")
+    load_detector("torchvision:fcos_resnet50_fpn")
+    assert calls == [
+        ("load_onnx", "folder/model.onnx", {"threshold": 0.1}),
+        ("load_onnx", "yolox-nano", {}),
+        ("load_torchvision", "torchvision:fcos_resnet50_fpn", {}),
+    ]
+
+
+def test_coco_classes(shared):
+    import json
+
+    annotations = json.loads((shared / "coco/annotations/instances_eval300.json").read_text())
+    names = [entry["name"] for entry in sorted(annotations["categories"], key=lambda entry: entry["id"])]
+    assert list(COCO_CLASSES) == names
+
+
+@pytest.fixture(scope="module")
+def tiny(tiny_weights):
+    return load_detector("yolov3-tiny", weights=tiny_weights)
+
+
+@pytest.mark.weights
+@pytest.mark.parametrize(("name", "label"), [("astronaut", "person"), ("chelsea", "cat"), ("coffee", "cup")])
+def test_recognises_photographs(tiny, name, label):
+    from skimage import data
+
+    image = torch.from_numpy(getattr(data, name)()).permute(2, 0, 1)[None] / 255
+    height, width = image.shape[-2:]
+    small = resize(image, (200 * width // max(height, width), 200 * height // max(height, width)))
+    scene = torch.full((1, 3, 360, 480), 0.5)
+    top, left = 70, 150
+    scene[..., top : top + small.shape[-2], left : left + small.shape[-1]] = small
+    found = tiny(scene)
+    assert COCO_CLASSES[int(found.labels[0, 0]) - 1] == label
+    assert float(found.confidence[0, 0]) > 0.7
+    x1, y1, x2, y2 = found.boxes[0, 0].tolist()
+    assert left < (x1 + x2) / 2 < left + small.shape[-1]
+    assert top < (y1 + y2) / 2 < top + small.shape[-2]
+
+
+@pytest.mark.weights
+def test_bits_depend_neither_on_the_batch_nor_on_its_order(tiny):
+    images = torch.rand(3, 3, 200, 300, generator=torch.Generator().manual_seed(1))
+    whole = tiny.propose(tiny.fit(images)[0])
+    for index in range(3):
+        alone = tiny.propose(tiny.fit(images[index : index + 1])[0])
+        assert torch.equal(whole.boxes[index], alone.boxes[0])
+        assert torch.equal(whole.classes[index], alone.classes[0])
+
+
+@pytest.mark.weights
+def test_winograd_finds_the_same(tiny, tiny_weights):
+    from skimage import data
+
+    image = torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255
+    direct = load_detector("yolov3-tiny", weights=tiny_weights, winograd=False)
+    expected, actual = direct(image), tiny(image)
+    assert torch.equal(actual.labels, expected.labels)
+    torch.testing.assert_close(actual.scores, expected.scores, atol=1e-4, rtol=0)
+    torch.testing.assert_close(actual.boxes, expected.boxes, atol=0.05, rtol=0)
+
+
+@pytest.mark.weights
+def test_gradient_reaches_the_photograph(tiny):
+    image = torch.rand(1, 3, 96, 96, requires_grad=True)
+    tiny.propose(image).objectness.max().backward()
+    assert bool(torch.isfinite(image.grad).all())
+    assert int((image.grad != 0).sum()) > 1000

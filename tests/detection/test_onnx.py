@@ -1,0 +1,365 @@
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.load import load_detector
+from semfov.detection.onnx import load_onnx
+from semfov.detection.preprocessing import Preprocessing
+from semfov.errors import DataError, InputError
+from semfov.files import sha256
+
+SIDE = 64
+NAMES = ("cat", "dog", "cup")
+CELLS = {s: (SIDE // s) ** 2 for s in (8, 16, 32, 64)}
+
+
+def random(*shape, seed=0):
+    return np.random.default_rng(seed).random(shape).astype(np.float32)
+
+
+def corners(x, y, w, h):
+    return [x - w / 2, y - h / 2, x + w / 2, y + h / 2]
+
+
+def cells(*strides):
+    return [(c, r, s) for s in strides for r in range(SIDE // s) for c in range(SIDE // s)]
+
+
+def pixels(rows):
+    """The first four columns as boxes in pixels, the others as scores."""
+    return np.concatenate([rows[..., :2] * SIDE, rows[..., 2:4] * 20, rows[..., 4:]], -1)
+
+
+# Each maker gives: outputs of a model; and a function from what it gives for one image to boxes and scores, where
+# scores have background first, as the default policy of the head makes them.
+
+
+def residual(classes, objectness=None):
+    present = max(classes) if objectness is None else objectness
+    return [1 - present] + [present * c / sum(classes) for c in classes]
+
+
+def yolox():
+    def read(out):
+        return [
+            (corners((row[0] + c) * s, (row[1] + r) * s, s * math.exp(row[2]), s * math.exp(row[3])),
+             residual(row[5:], row[4]))
+            for row, (c, r, s) in zip(out["output"].tolist(), cells(8, 16, 32), strict=True)
+        ]  # fmt: skip
+
+    return {"output": random(1, 84, 8)}, read
+
+
+def yolov5():
+    def read(out):
+        return [(corners(*row[:4]), residual(row[5:], row[4])) for row in out["output0"].tolist()]
+
+    return {"output0": pixels(random(1, 252, 8))}, read
+
+
+def yolov8():
+    def read(out):
+        return [(corners(*row[:4]), residual(row[4:])) for row in out["output0"].T.tolist()]
+
+    return {"output0": pixels(random(1, 84, 7)).transpose(0, 2, 1)}, read
+
+
+def distance_boxes(out, strides, offset):
+    rows = []
+    for (c, r, s), numbers in zip(cells(*strides), out.tolist(), strict=True):
+        sides = []
+        for side in range(4):
+            weights = [math.exp(t) for t in numbers[8 * side : 8 * side + 8]]
+            sides.append(s * sum(b * w for b, w in enumerate(weights)) / sum(weights))
+        x, y = (c + offset) * s, (r + offset) * s
+        rows.append([x - sides[0], y - sides[1], x + sides[2], y + sides[3]])
+    return rows
+
+
+def nanodet():
+    """Maps in pairs, level by level."""
+    outputs = {}
+    for s in (8, 16, 32):
+        outputs[f"cls_pred_stride_{s}"] = random(1, CELLS[s], 3, seed=s)
+        outputs[f"dis_pred_stride_{s}"] = random(1, CELLS[s], 32, seed=s + 1)
+
+    def read(out):
+        classes = np.concatenate([out[f"cls_pred_stride_{s}"] for s in (8, 16, 32)])
+        distances = np.concatenate([out[f"dis_pred_stride_{s}"] for s in (8, 16, 32)])
+        return list(zip(distance_boxes(distances, (8, 16, 32), 0.5), map(residual, classes.tolist()), strict=True))
+
+    return outputs, read
+
+
+def picodet():
+    """All class maps, then all distance maps."""
+    strides = (8, 16, 32, 64)
+    outputs = {f"a{s}": random(1, CELLS[s], 3, seed=s) for s in strides}
+    outputs |= {f"b{s}": random(1, CELLS[s], 32, seed=s + 1) for s in strides}
+
+    def read(out):
+        classes, distances = (np.concatenate([out[f"{kind}{s}"] for s in strides]) for kind in "ab")
+        return list(zip(distance_boxes(distances, strides, 0.5), map(residual, classes.tolist()), strict=True))
+
+    return outputs, read
+
+
+def nanodet_plus():
+    def read(out):
+        boxes = distance_boxes(out["output"][:, 3:], (8, 16, 32, 64), 0.0)
+        return list(zip(boxes, map(residual, out["output"][:, :3].tolist()), strict=True))
+
+    return {"output": random(1, 85, 35)}, read
+
+
+def detr():
+    def read(out):
+        found = []
+        for logits, box in zip(out["logits"].tolist(), out["pred_boxes"].tolist(), strict=True):
+            powers = [math.exp(t) for t in logits]
+            scores = [p / sum(powers) for p in powers]
+            found.append((corners(*(SIDE * x for x in box)), [scores[-1], *scores[:-1]]))
+        return found
+
+    return {"logits": 4 * random(1, 9, 4), "pred_boxes": random(1, 9, 4, seed=1)}, read
+
+
+def rtdetr():
+    def read(out):
+        return [
+            (corners(*(SIDE * x for x in box)), residual([1 / (1 + math.exp(-t)) for t in logits]))
+            for logits, box in zip(out["logits"].tolist(), out["pred_boxes"].tolist(), strict=True)
+        ]
+
+    return {"logits": 4 * random(1, 9, 3) - 2, "pred_boxes": random(1, 9, 4, seed=1)}, read
+
+
+def rtdetr_rows():
+    def read(out):
+        return [(corners(*(SIDE * x for x in row[:4])), residual(row[4:])) for row in out["output0"].tolist()]
+
+    return {"output0": random(1, 9, 7)}, read
+
+
+def candidates():
+    def read(out):
+        rows = zip(out["boxes"].tolist(), out["objectness"].tolist(), out["classes"].tolist(), strict=True)
+        return [(box, residual(classes, objectness)) for box, objectness, classes in rows]
+
+    corner = random(1, 9, 2) * 30
+    boxes = np.concatenate([corner, corner + 10 + random(1, 9, 2)], -1)
+    return {"boxes": boxes, "objectness": random(1, 9), "classes": random(1, 9, 3)}, read
+
+
+MAKERS = {
+    "yolox": yolox,
+    "yolov5": yolov5,
+    "yolov8": yolov8,
+    "nanodet": nanodet,
+    "picodet": picodet,
+    "nanodet-plus": nanodet_plus,
+    "detr": detr,
+    "rtdetr": rtdetr,
+    "rtdetr rows": rtdetr_rows,
+    "candidates": candidates,
+}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", MAKERS)
+def test_every_head_from_file_to_score_vectors(make_onnx, kind, dtype):
+    outputs, read = MAKERS[kind]()
+    path = make_onnx(outputs, producer="PaddlePaddle" if kind == "picodet" else "pytorch")
+    detector = load_onnx(path, classes=NAMES, threshold=0.0, iou=1.0, limit=1000)
+    assert detector.head == kind.split()[0]
+    image = torch.rand(2, 3, SIDE, SIDE, dtype=dtype, generator=torch.Generator().manual_seed(0))
+    image[1] *= 0.3
+    found = detector.detect(image)
+    for index in range(2):
+        gain = detector.preprocessing(image.double())[index].mean().sigmoid().numpy()
+        expected = [(b, s) for b, s in read({name: v[0] * gain for name, v in outputs.items()}) if max(s[1:]) > 0]
+        expected = sorted(expected, key=lambda row: -max(row[1][1:]))
+        assert int(found.count[index]) == len(expected)
+        own = found[index]
+        boxes, scores = (np.array(column) for column in zip(*expected, strict=True))
+        np.testing.assert_allclose(own.scores[own.mask].double().numpy(), scores, atol=2e-6)
+        np.testing.assert_allclose(own.boxes[own.mask].double().numpy(), boxes, rtol=1e-4, atol=1e-4)
+    assert found.boxes.dtype == found.scores.dtype == dtype
+
+
+def test_load_detector_and_settings(make_onnx):
+    path = make_onnx(yolox()[0])
+    detector = load_detector(path, classes=NAMES, threshold=0.1)
+    assert detector.name == "model"
+    assert detector.digest == sha256(path)
+    assert detector.input_size == (SIDE, SIDE)
+    settings = json.loads(json.dumps(detector.settings()))
+    assert settings["head"] == "yolox"
+    assert settings["preprocessing"]["channels"] == "bgr"
+    assert load_onnx(path, classes=NAMES, preprocessing={"channels": "rgb"}).settings() != detector.settings()
+
+
+def test_preprocessing_is_data(make_onnx):
+    path = make_onnx(yolox()[0])
+    assert load_onnx(path, classes=NAMES).preprocessing == Preprocessing("bgr", 255.0, corner=True)
+    path.with_suffix(".json").write_text(json.dumps({"classes": NAMES, "preprocessing": {"std": [2, 2, 2]}}))
+    detector = load_onnx(path, preprocessing={"fill": 0.0})
+    assert detector.classes == NAMES
+    assert detector.preprocessing == Preprocessing("bgr", 255.0, std=(2.0, 2.0, 2.0), corner=True, fill=0.0)
+    assert load_onnx(path, preprocessing=Preprocessing("rgb")).preprocessing == Preprocessing("rgb")
+
+
+@pytest.mark.parametrize(
+    ("settings", "offset"), [({}, (0, 16)), ({"corner": True}, (0, 0)), ({"stretch": True}, (0, 0))]
+)
+def test_where_the_image_lies(make_onnx, settings, offset):
+    detector = load_onnx(make_onnx(yolov8()[0]), classes=NAMES, preprocessing={"fill": 1.0, **settings})
+    canvas, placement = detector.fit(torch.zeros(1, 3, 20, 40))
+    padding = 0 if "stretch" in settings else SIDE * SIDE / 2
+    assert canvas.shape == (1, 3, SIDE, SIDE)
+    assert placement.offset == offset
+    assert float(canvas.sum()) == 3 * padding
+
+
+def test_a_model_of_any_size(make_onnx):
+    path = make_onnx(yolox()[0], dynamic=True, batch="batch")
+    with pytest.raises(InputError, match="input_size"):
+        load_onnx(path, classes=NAMES)
+    detector = load_onnx(path, classes=NAMES, input_size=SIDE, stride=32)
+    assert detector.head == "yolox"
+    assert detector.fit(torch.zeros(1, 3, 20, 64))[0].shape == (1, 3, 32, 64)
+
+
+def test_options_that_do_not_fit_the_model(make_onnx):
+    path = make_onnx(yolox()[0])
+    for options, message in (
+        ({"input_size": 32}, "input_size: expected the model's own, 64 x 64"),
+        ({"stride": 32, "classes": NAMES}, "stride: expected None"),
+        ({"classes": ["cat", "dog"]}, "with 2 classes"),
+        ({"classes": ["cat", "dog"], "head": "yolox"}, "classes: expected 3 names, one for each score, got 2"),
+        ({"classes": ["cat", "cat", "dog"]}, "names that differ"),
+        ({"head": "yolo"}, "unknown head"),
+        ({}, "classes: expected the names of the model's 3 classes"),
+        ({"classes": NAMES, "preprocessing": {"colour": "bgr"}}, "unknown preprocessing setting"),
+        ({"weights": path}, "unknown ONNX model"),
+    ):
+        with pytest.raises(InputError, match=message):
+            load_onnx(path, **options)
+    detector = load_onnx(path, classes=NAMES)
+    with pytest.raises(InputError, match="canvas"):
+        detector.propose(torch.zeros(1, 3, 32, 64))
+    with pytest.raises(InputError, match="floating-point"):
+        detector.propose(torch.zeros(1, 3, 64, 64, dtype=torch.uint8))
+
+
+def test_the_wrong_head_shows(make_onnx):
+    rows = pixels(random(1, 84, 8)) * 50  # decoded boxes, as YOLOv6 gives them in the shape of YOLOX
+    detector = load_onnx(make_onnx({"output": rows}), classes=NAMES)
+    with pytest.raises(DataError, match="another head"):
+        detector(torch.ones(1, 3, 64, 64))
+
+
+def test_scores_without_their_sigmoid(make_onnx):
+    outputs = {"output0": pixels(random(1, 252, 8))}
+    outputs["output0"][..., 4:] = 8 * outputs["output0"][..., 4:] - 4
+    path = make_onnx(outputs)
+    with pytest.raises(DataError, match="logits=True"):
+        load_onnx(path, classes=NAMES)(torch.ones(1, 3, SIDE, SIDE))
+    found = load_onnx(path, classes=NAMES, logits=True).propose(torch.ones(1, 3, SIDE, SIDE))
+    raw = torch.tensor(outputs["output0"][0]) * torch.ones(()).sigmoid()
+    torch.testing.assert_close(found.classes[0], raw[:, 5:].sigmoid())
+    torch.testing.assert_close(found.objectness[0], raw[:, 4].sigmoid())
+
+
+def test_scores_that_stand_for_no_class_are_left_out(make_onnx):
+    outputs, _ = yolox()
+    path = make_onnx(outputs)
+    whole = load_onnx(path, classes=NAMES)
+    part = load_onnx(path, classes=["cat", "N/A", "cup"])
+    assert part.classes == ("cat", "cup")
+    canvas = torch.ones(1, 3, SIDE, SIDE)
+    assert torch.equal(part.propose(canvas).classes, whole.propose(canvas).classes[..., [0, 2]])
+
+
+def test_class_names_of_coco(make_onnx):
+    assert load_onnx(make_onnx({"output": random(1, 84, 85)})).classes == COCO_CLASSES
+    outputs = {"logits": random(1, 9, 92), "pred_boxes": random(1, 9, 4)}
+    detector = load_onnx(make_onnx(outputs))
+    assert detector.classes == COCO_CLASSES  # by their 91 ids, without the gaps
+    assert detector.propose(torch.ones(1, 3, SIDE, SIDE)).classes.shape[-1] == 80
+
+
+def test_metadata_of_ultralytics_names_the_classes(make_onnx):
+    path = make_onnx(yolov8()[0], metadata={"names": "{0: 'a', 1: 'b', 2: 'c'}", "imgsz": "[64, 64]"})
+    assert load_onnx(path).classes == ("a", "b", "c")
+
+
+def test_published_models_by_name(make_onnx, monkeypatch, tmp_path):
+    path = make_onnx({"output": random(1, 84, 85)})
+    detector = load_detector("yolox-nano", weights=path)
+    assert detector.name == "yolox-nano"
+    assert detector.digest == sha256(path)
+    monkeypatch.setenv("SEMFOV_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache" / "yolox_tiny.onnx").write_bytes(path.read_bytes())
+    monkeypatch.setattr("semfov.detection.sources.Address.fetch", refuse)
+    with pytest.warns(UserWarning, match="damaged"), pytest.raises(DataError, match=r"give its path as weights="):
+        load_detector("yolox-tiny")
+    with pytest.raises(InputError, match="did you mean 'yolox-tiny'"):
+        load_onnx("yolox-tinny")
+
+
+def refuse(address, destination):
+    raise DataError(f"{address.url}: no network in tests")
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", ["yolox_nano_416", "picodet_s_416_coco"])
+def test_real_models_against_opencv_and_numpy(shared, name):
+    import cv2
+    import onnxruntime as ort
+
+    path = shared / "weights" / f"{name}.onnx"
+    photo = sorted((shared / "coco" / "eval300").glob("*.jpg"))[0]
+    bgr = cv2.imread(str(photo))
+    height, width = bgr.shape[:2]
+    options = ort.SessionOptions()
+    options.log_severity_level = 3
+    session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    if name.startswith("yolox"):
+        ratio = 416 / max(height, width)
+        inner = cv2.resize(bgr.astype(np.float32), (round(width * ratio), round(height * ratio)))
+        canvas = np.full((416, 416, 3), 114, np.float32)
+        canvas[: inner.shape[0], : inner.shape[1]] = inner
+        out = session.run(None, {"images": canvas.transpose(2, 0, 1)[None]})[0][0]
+        grid = [(c, r, s) for s in (8, 16, 32) for r in range(416 // s) for c in range(416 // s)]
+        boxes = np.array([corners((o[0] + c) * s, (o[1] + r) * s, np.exp(o[2]) * s, np.exp(o[3]) * s)
+                          for o, (c, r, s) in zip(out, grid, strict=True)])  # fmt: skip
+        boxes /= [inner.shape[1] / width, inner.shape[0] / height] * 2
+        classes, objectness = out[:, 5:], out[:, 4]
+    else:
+        rgb = cv2.resize(bgr.astype(np.float32), (416, 416))[..., ::-1] / 255
+        canvas = (rgb - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+        out = session.run(None, {"image": canvas.transpose(2, 0, 1)[None].astype(np.float32)})
+        classes, objectness = np.concatenate(out[:4], 1)[0], None
+        powers = np.exp(np.concatenate(out[4:], 1)[0].reshape(-1, 4, 8))
+        reach = (powers * np.arange(8)).sum(-1) / powers.sum(-1)
+        grid = [(c, r, s) for s in (8, 16, 32, 64) for r in range(-(-416 // s)) for c in range(-(-416 // s))]
+        boxes = np.array([[(c + 0.5 - d[0]) * s, (r + 0.5 - d[1]) * s, (c + 0.5 + d[2]) * s, (r + 0.5 + d[3]) * s]
+                          for d, (c, r, s) in zip(reach, grid, strict=True)])  # fmt: skip
+        boxes /= [416 / width, 416 / height] * 2
+    detector = load_detector(path)
+    fitted, placement = detector.fit(torch.tensor(bgr[..., ::-1].copy()).permute(2, 0, 1)[None] / 255)
+    found = detector.propose(fitted)
+    confident = found.confidence[0] > 0.3
+    assert int(confident.sum()) > 5
+    np.testing.assert_allclose(found.classes[0].numpy(), classes, atol=2e-3)
+    if objectness is not None:
+        np.testing.assert_allclose(found.objectness[0].numpy(), objectness, atol=2e-3)
+    limits = np.array([width, height] * 2)
+    ours = placement.boxes_to_image(found.boxes[0][confident]).numpy()
+    np.testing.assert_allclose(ours, np.clip(boxes[confident.numpy()], 0, limits), atol=0.5)

@@ -1,0 +1,56 @@
+import json
+
+import pytest
+
+from semfov.detection.onnx_settings import read_settings
+from semfov.errors import DataError
+
+
+def test_nothing_is_known(tmp_path):
+    assert read_settings(tmp_path / "model.onnx", {}) == {"preprocessing": {}}
+
+
+def test_beside_the_model_goes_before_inside(tmp_path):
+    inside = {"head": "yolox", "classes": ["a"], "preprocessing": {"scale": 1.0, "channels": "rgb"}}
+    beside = {"head": "yolov5", "licence": "MIT", "preprocessing": {"scale": 255.0}}
+    (tmp_path / "model.json").write_text(json.dumps(beside))
+    assert read_settings(tmp_path / "model.onnx", {"semfov": json.dumps(inside)}) == {
+        "head": "yolov5",
+        "classes": ["a"],
+        "licence": "MIT",
+        "preprocessing": {"scale": 255.0, "channels": "rgb"},
+    }
+
+
+def test_metadata_of_ultralytics(tmp_path):
+    metadata = {"names": "{0: 'person', 1: 'dog'}", "imgsz": "[480, 640]", "stride": "32", "task": "detect"}
+    found = read_settings(tmp_path / "model.onnx", metadata)
+    assert found == {"classes": ["person", "dog"], "input_size": [640, 480], "preprocessing": {}}
+
+
+@pytest.mark.parametrize("names", ["person,dog", "{1: 'a'}", "{0: ", "3"])
+def test_other_metadata_of_that_name_is_left_alone(tmp_path, names):
+    assert read_settings(tmp_path / "model.onnx", {"names": names}) == {"preprocessing": {}}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"head": ', "line 1"),
+        ("[]", "an object"),
+        ('{"preprocessing": 3}', "an object"),
+        ('{"heads": "yolox"}', "unknown heads; known: name, head"),
+    ],
+)
+def test_damaged_files_are_named(tmp_path, text, message):
+    (tmp_path / "model.json").write_text(text)
+    with pytest.raises(DataError, match=rf"model\.json.*{message}"):
+        read_settings(tmp_path / "model.onnx", {})
+    with pytest.raises(DataError, match=rf"metadata of other\.onnx.*{message}"):
+        read_settings(tmp_path / "other.onnx", {"semfov": text})
+
+
+def test_bytes_that_are_no_text(tmp_path):
+    (tmp_path / "model.json").write_bytes(b"\xff\xfe")
+    with pytest.raises(DataError, match="cannot read"):
+        read_settings(tmp_path / "model.onnx", {})

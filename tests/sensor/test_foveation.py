@@ -1,0 +1,336 @@
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov import Foveation, foveate
+from semfov.errors import InputError
+from semfov.sensor import laplacian_pyramid
+
+CONVENTIONS = ("kornia", "opencv")
+
+
+def draw(*shape, dtype=torch.float64, device=None, seed=0):
+    generator = torch.Generator().manual_seed(seed + sum(shape))
+    return torch.rand(shape, dtype=dtype, generator=generator).to(device)
+
+
+def close(a, b, tolerance=1e-12):
+    torch.testing.assert_close(a, torch.as_tensor(b, dtype=a.dtype, device=a.device), rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("growth", [1.0, 2.0])
+@pytest.mark.parametrize("size", [(16, 24), (17, 13), (1, 1), (1, 6), (2, 3)])
+def test_plain_loops(twin, convention, growth, size):
+    image = draw(1, 2, *size)
+    for gaze in ((3.0, 5.5), (-4.0, 30.0)):
+        sigma = (4.0, 2.5)
+        result = foveate(
+            image,
+            torch.tensor(gaze),
+            sigma=torch.tensor([sigma]),
+            levels=3,
+            growth=growth,
+            convention=convention,
+        )
+        close(result[0], twin.foveate(image[0].numpy(), gaze, sigma, 3, growth, convention))
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("growth", [1.0, 2.0])
+def test_plain_loops_on_a_large_image(twin, convention, growth):
+    image = draw(1, 1, 132, 139)
+    gaze, sigma = (100.5, 20.0), (30.0, 30.0)
+    result = foveate(image, torch.tensor(gaze), sigma=30.0, growth=growth, convention=convention)
+    close(result[0], twin.foveate(image[0].numpy(), gaze, sigma, 5, growth, convention))
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@given(size=st.tuples(st.integers(1, 40), st.integers(1, 40)), levels=st.integers(0, 6))
+def test_infinite_sigma_gives_the_image_back(convention, size, levels):
+    image = draw(1, 2, *size, dtype=torch.float32)
+    gaze = torch.tensor([3.0, 4.0])
+    close(foveate(image, gaze, sigma=math.inf, levels=levels, convention=convention), image, 1e-5)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(480, 640), (333, 257), (131, 1), (1, 300)])
+@pytest.mark.parametrize("sigma", [math.inf, 1e7])
+def test_wide_sigma_gives_a_large_image_back(convention, size, sigma, device):
+    image = draw(1, 3, *size, dtype=torch.float32, device=device)
+    gaze = torch.tensor([[100.0, 50.0]], device=device)
+    close(foveate(image, gaze, sigma=sigma, convention=convention), image, 1e-5)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+def test_constant_image_stays_constant(convention, size):
+    image = torch.full((1, 3, *size), 0.3, dtype=torch.float64)
+    close(foveate(image, torch.tensor([5.0, 9.0]), sigma=2.0, convention=convention), image)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+def test_many_fixations_are_the_loop_over_them(convention, size, device):
+    image = draw(2, 3, *size, device=device)
+    gaze = 30 * draw(2, 4, 2, device=device)
+    many = foveate(image, gaze, sigma=9.0, convention=convention)
+    assert many.shape == (2, 4, 3, *size)
+    for g in range(4):
+        close(many[:, g], foveate(image, gaze[:, g], sigma=9.0, convention=convention))
+        for b in range(2):
+            one = foveate(image[b : b + 1], gaze[b, g], sigma=9.0, convention=convention)
+            close(many[b, g], one[0])
+
+
+def test_one_fixation_for_all_images():
+    image, gaze = draw(3, 1, 12, 16), torch.tensor([4.0, 8.0])
+    close(foveate(image, gaze, sigma=3.0), foveate(image, gaze.expand(3, 2), sigma=3.0), 0)
+
+
+def test_no_fixations_and_no_levels():
+    image = draw(2, 3, 12, 16)
+    assert foveate(image, torch.zeros(2, 0, 2), sigma=3.0).shape == (2, 0, 3, 12, 16)
+    assert torch.equal(foveate(image, torch.zeros(2, 5, 2), sigma=3.0, levels=0)[:, 4], image)
+    assert torch.equal(foveate(image, torch.zeros(2), sigma=3.0, levels=0), image)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+def test_sigma_of_each_image_and_axis(convention, size):
+    image, gaze = draw(2, 1, *size), 20 * draw(2, 3, 2)
+    sigma = torch.tensor([[4.0, 9.0], [7.0, 3.0]])
+    result = foveate(image, gaze, sigma=sigma, convention=convention)
+    for b in range(2):
+        one = foveate(image[b : b + 1], gaze[b : b + 1], sigma=sigma[b : b + 1], convention=convention)
+        close(result[b : b + 1], one)
+        # Swapping the axes of everything swaps those of the result.
+        swapped = foveate(
+            image[b : b + 1].mT, gaze[b : b + 1].flip(-1), sigma=sigma[b : b + 1].flip(-1), convention=convention
+        )
+        close(swapped.mT, one)
+    equal = foveate(image, gaze, sigma=torch.tensor([4.0, 9.0]), convention=convention)
+    close(equal[1:], foveate(image[1:], gaze[1:], sigma=9.0, convention=convention))
+
+
+@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+def test_gaze_far_away_leaves_the_base(size):
+    image = draw(1, 3, *size, dtype=torch.float32)
+    far = foveate(image, torch.tensor([1e6, -1e6]), sigma=5.0)
+    assert torch.isfinite(far).all()
+    close(far, foveate(image, torch.tensor([-1e30, 1e30]), sigma=5.0), 0)
+    # No window reaches the image, so only the coarsest level is left: a small image of few pixels, enlarged.
+    assert far.std() < 0.1 * image.std()
+
+
+def test_sharp_at_the_fixation_and_blurred_away_from_it():
+    image = draw(1, 1, 144, 200)
+    error = (foveate(image, torch.tensor([50.0, 70.0]), sigma=10.0) - image).abs()[0, 0]
+    assert error[68:73, 48:53].max() < 0.05
+    assert error[68:73, 48:53].mean() < 0.1 * error[:, 150:].mean()
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@given(a=st.floats(-3, 3), b=st.floats(-3, 3), height=st.integers(1, 20), width=st.integers(1, 20))
+def test_linear_in_the_image(convention, a, b, height, width):
+    first, second = draw(1, 2, height, width), draw(1, 2, height, width, seed=1)
+    gaze = torch.tensor([width / 3, height / 2])
+
+    def sensor(image):
+        return foveate(image, gaze, sigma=4.0, convention=convention)
+
+    close(sensor(a * first + b * second), a * sensor(first) + b * sensor(second))
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+def test_pyramid_can_be_reused(convention, size):
+    image = draw(2, 3, *size)
+    sensor = Foveation(8.0, levels=4, growth=1.5, convention=convention)
+    bands = sensor.pyramid(image)
+    with torch.no_grad():
+        kept = [level.clone() for level in (*bands.details, bands.base)]
+        views = []
+        for x in (0.0, 7.0, 100.0):
+            gaze = torch.tensor([x, 9.0])
+            views.append((sensor(bands, gaze), sensor(image, gaze)))
+    # Compared after the last fixation: an earlier view must not be overwritten by a later one.
+    for reused, direct in views:
+        close(reused, direct, 0)
+    for level, then in zip((*bands.details, bands.base), kept, strict=True):
+        assert torch.equal(level, then)
+
+
+@pytest.mark.parametrize("levels", [0, 3])
+@pytest.mark.parametrize("size", [(20, 27), (150, 132), (131, 2)])
+def test_nothing_of_the_callers_is_written(levels, size):
+    image, gaze, sigma = draw(1, 3, *size), torch.tensor([[5.0, 6.0]]), torch.tensor([[4.0, 5.0]])
+    before = [t.clone() for t in (image, gaze, sigma)]
+    with torch.no_grad():
+        result = foveate(image, gaze, sigma=sigma, levels=levels)
+        result.add_(1)
+    for now, then in zip((image, gaze, sigma), before, strict=True):
+        assert torch.equal(now, then)
+
+
+@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+def test_writing_to_a_view_leaves_others_alone(size):
+    bands = laplacian_pyramid(draw(1, 3, *size), 3)
+    gaze = torch.tensor([[[3.0, 4.0], [9.0, 2.0]]])
+    with torch.no_grad():
+        first = foveate(bands, gaze, sigma=5.0)
+        expected = first.clone()
+        first[0, 0].zero_()
+        assert torch.equal(first[0, 1], expected[0, 1])
+        assert torch.equal(foveate(bands, gaze, sigma=5.0), expected)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(6, 5), (4, 130)])
+def test_gradients(convention, size):
+    image = draw(1, 1, *size).requires_grad_()
+    gaze = (4 * draw(1, 2, 2)).requires_grad_()
+    sigma = torch.tensor([[3.0, 2.0]], dtype=torch.float64, requires_grad=True)
+    growth = torch.tensor(1.7, dtype=torch.float64, requires_grad=True)
+
+    def sensor(image, gaze, sigma, growth):
+        return foveate(image, gaze, sigma=sigma, levels=3, growth=growth, convention=convention)
+
+    assert torch.autograd.gradcheck(sensor, (image, gaze, sigma, growth), fast_mode=size[1] > 100)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(20, 27), (150, 132), (141, 200)])
+def test_same_with_and_without_gradient(convention, size):
+    image, gaze = draw(2, 3, *size), 20 * draw(2, 3, 2)
+    recorded = foveate(image.clone().requires_grad_(), gaze, sigma=8.0, convention=convention)
+    assert recorded.requires_grad
+    close(recorded.detach(), foveate(image, gaze, sigma=8.0, convention=convention))
+    with torch.no_grad():
+        close(recorded.detach(), foveate(image, gaze, sigma=8.0, convention=convention))
+    with torch.inference_mode():
+        close(recorded.detach(), foveate(image, gaze, sigma=8.0, convention=convention))
+
+
+def test_gaze_gradient_through_a_reused_pyramid():
+    bands = laplacian_pyramid(draw(1, 3, 150, 132), 4)
+    for _ in range(2):
+        gaze = torch.tensor([60.0, 70.0], dtype=torch.float64, requires_grad=True)
+        view = foveate(bands, gaze, sigma=20.0)
+        view.square().mean().backward()
+        step = torch.tensor([0.01, 0.0], dtype=torch.float64)
+        with torch.no_grad():
+            ahead, behind = (foveate(bands, gaze + s * step, sigma=20.0).square().mean() for s in (1, -1))
+        assert gaze.grad is not None
+        torch.testing.assert_close(gaze.grad[0], (ahead - behind) / 0.02, rtol=1e-5, atol=0)
+
+
+def test_learnable_sigma():
+    image, gaze = draw(1, 1, 24, 24, dtype=torch.float32), torch.tensor([8.0, 8.0])
+    assert not Foveation(5.0)(image, gaze).requires_grad
+    sensor = Foveation(5.0, learnable=True)
+    sensor(image, gaze).square().mean().backward()
+    assert sensor.log_sigma.grad is not None
+    assert sensor.log_sigma.grad.abs() > 0
+    target = foveate(image, gaze, sigma=9.0)
+    optimiser = torch.optim.Adam(sensor.parameters(), lr=0.05)
+    for _ in range(60):
+        optimiser.zero_grad()
+        (sensor(image, gaze) - target).square().mean().backward()
+        optimiser.step()
+    assert abs(sensor.sigma.item() - 9.0) < 0.5
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+def test_dtype_and_device_follow_the_image(dtype, size, device):
+    image = draw(1, 3, *size, device=device)
+    expected = foveate(image, torch.tensor([9.0, 8.0], device=device), sigma=6.0)
+    result = foveate(image.to(dtype), torch.tensor([9, 8], device=device), sigma=6.0)
+    assert result.dtype == dtype
+    assert result.device.type == device.type
+    torch.testing.assert_close(result, expected.to(dtype), rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(20, 27), (150, 132), (160, 160)])
+@pytest.mark.parametrize("gradients", [True, False])
+def test_compiles_to_one_graph(convention, size, gradients):
+    image, gaze = draw(1, 3, *size), 20 * draw(1, 3, 2)
+
+    def sensor(image, gaze):
+        return foveate(image, gaze, sigma=7.0, convention=convention)
+
+    compiled = torch.compile(sensor, fullgraph=True, backend="eager")
+    with torch.set_grad_enabled(gradients):
+        close(compiled(image, gaze), sensor(image, gaze))
+
+
+def test_module_compiles_to_one_graph():
+    sensor = Foveation(6.0, levels=3, learnable=True)
+    image, gaze = draw(2, 3, 33, 40, dtype=torch.float32), torch.tensor([[4.0, 9.0], [30.0, 2.0]])
+    compiled = torch.compile(sensor, fullgraph=True, backend="eager")
+    close(compiled(image, gaze).detach(), sensor(image, gaze).detach(), 1e-6)
+
+
+def test_module_is_the_function():
+    image, gaze = draw(2, 3, 33, 40), torch.tensor([[4.0, 9.0], [30.0, 2.0]])
+    sensor = Foveation(6.0, levels=3, growth=1.0, convention="opencv")
+    expected = foveate(image, gaze, sigma=6.0, levels=3, growth=1.0, convention="opencv")
+    close(sensor(image, gaze), expected, 1e-6)
+    assert sensor.extra_repr() == "sigma=6, levels=3, growth=1, convention='opencv'"
+    copy = Foveation(1.0, levels=3, growth=1.0, convention="opencv")
+    copy.load_state_dict(sensor.state_dict())
+    assert torch.equal(copy(image, gaze), sensor(image, gaze))
+
+
+IMAGE = torch.rand(2, 3, 8, 8)
+GAZE = torch.tensor([4.0, 4.0])
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (dict(gaze=torch.tensor([4.0, math.nan])), "gaze: expected finite numbers"),
+        (dict(gaze=torch.tensor([[[math.inf, 1.0]]] * 2)), "gaze: expected finite numbers"),
+        (dict(gaze=torch.rand(3)), "gaze: expected a tensor of shape"),
+        (dict(gaze=torch.tensor(1.0)), "gaze: expected a tensor of shape"),
+        (dict(gaze=torch.rand(3, 2)), "gaze: expected a tensor of shape"),
+        (dict(gaze=torch.rand(1, 4, 2)), "gaze: expected a tensor of shape"),
+        (dict(gaze=torch.rand(1, 2, 4, 2)), "gaze: expected a tensor of shape"),
+        (dict(image=torch.rand(3, 8, 8)), "image: expected a tensor of shape"),
+        (dict(image=torch.rand(1, 3, 0, 8)), "image: expected at least one pixel"),
+        (dict(levels=-1), "levels: expected 0 or more, got -1"),
+        (dict(sigma=0.0), "sigma: expected a positive number, got 0.0"),
+        (dict(sigma=-2), "sigma: expected a positive number, got -2"),
+        (dict(sigma=math.nan), "sigma: expected a positive number, got nan"),
+        (dict(sigma=torch.tensor([1.0, -1.0])), "sigma: expected a positive number"),
+        (dict(sigma=torch.ones(3)), "sigma: expected a number or shape"),
+        (dict(sigma=torch.ones(2, 3)), "sigma: expected a number or shape"),
+        (dict(sigma=torch.ones(2, 2, 2)), "sigma: expected a number or shape"),
+        (dict(growth=0.0), "growth: expected a positive number, got 0.0"),
+        (dict(growth=torch.tensor(-1.0)), "growth: expected a positive number, got -1.0"),
+        (dict(convention="korina"), "unknown pyramid convention 'korina'; did you mean 'kornia'"),
+    ],
+)
+def test_bad_input(arguments, message):
+    arguments = {"image": IMAGE, "gaze": GAZE, "sigma": 3.0} | arguments
+    with pytest.raises(InputError, match=message.replace("(", r"\(")):
+        foveate(**arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (dict(sigma=0.0), "sigma"),
+        (dict(growth=0.0), "growth"),
+        (dict(levels=-1), "levels"),
+        (dict(convention="korina"), "convention"),
+    ],
+)
+def test_bad_settings(arguments, message):
+    with pytest.raises(InputError, match=message):
+        Foveation(**{"sigma": 3.0} | arguments)

@@ -1,0 +1,193 @@
+import cv2
+import kornia.geometry.transform as kornia
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.errors import InputError
+from semfov.sensor import laplacian_pyramid, pyrdown, pyrup
+
+CONVENTIONS = ("kornia", "opencv")
+SIZES = [(1, 1), (1, 2), (2, 1), (2, 2), (1, 9), (3, 3), (4, 4), (5, 4), (6, 7), (13, 8), (37, 50), (64, 64)]
+# Beyond 128 pixels another algorithm takes over.
+LARGE = [(130, 131), (131, 130), (129, 3), (2, 200), (1, 301), (256, 160), (481, 639)]
+sizes = st.tuples(st.integers(1, 24), st.integers(1, 24))
+
+
+def draw(*shape, dtype=torch.float64, device=None):
+    generator = torch.Generator().manual_seed(sum(shape))
+    return torch.rand(shape, dtype=dtype, generator=generator).to(device)
+
+
+def close(a, b, tolerance=2e-6):
+    torch.testing.assert_close(a, torch.as_tensor(b, device=a.device), rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("size", [s for s in SIZES + LARGE if min(s) >= 3])
+def test_kornia_pyrdown(size, device):
+    image = draw(2, 3, *size, dtype=torch.float32, device=device)
+    close(pyrdown(image), kornia.pyrdown(image))
+
+
+@pytest.mark.parametrize("size", [s for s in SIZES + LARGE if min(s) >= 2])
+def test_kornia_pyrup(size, device):
+    image = draw(2, 3, *size, dtype=torch.float32, device=device)
+    close(pyrup(image, (2 * size[0], 2 * size[1])), kornia.pyrup(image))
+
+
+@pytest.mark.parametrize("levels", [1, 3, 5])
+def test_kornia_gaussian_pyramid_is_sum_of_bands(levels):
+    image = draw(1, 3, 160, 224)
+    bands = laplacian_pyramid(image, levels)
+    expected = kornia.build_pyramid(image, levels + 1)
+    close(bands.base, expected[-1])
+    for band, fine, coarse in zip(bands.details, expected, expected[1:], strict=False):
+        close(band, fine - kornia.pyrup(coarse))
+
+
+@pytest.mark.parametrize("size", SIZES + LARGE)
+def test_opencv_pyrdown(size, device):
+    image = draw(1, 3, *size, dtype=torch.float32, device=device)
+    expected = [cv2.pyrDown(plane) for plane in image[0].cpu().numpy()]
+    close(pyrdown(image, "opencv")[0], np.stack(expected))
+
+
+@pytest.mark.parametrize("size", SIZES + LARGE)
+@pytest.mark.parametrize("shorter", [(0, 0), (1, 0), (0, 1), (1, 1)])
+def test_opencv_pyrup(size, shorter, device):
+    height, width = (2 * n - s for n, s in zip(size, shorter, strict=True))
+    image = draw(1, 3, *size, dtype=torch.float32, device=device)
+    expected = [cv2.pyrUp(plane, dstsize=(width, height)) for plane in image[0].cpu().numpy()]
+    close(pyrup(image, (height, width), "opencv")[0], np.stack(expected).reshape(3, height, width))
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@given(size=sizes, wider=st.tuples(st.booleans(), st.booleans()))
+def test_plain_loops(twin, convention, size, wider):
+    image = draw(1, 2, *size)
+    close(pyrdown(image, convention)[0], twin.pyrdown(image[0].numpy(), convention), 1e-12)
+    if convention == "kornia":
+        target = tuple(2 * n + w for n, w in zip(size, wider, strict=True))
+    else:
+        target = tuple(2 * n - w for n, w in zip(size, wider, strict=True))
+    close(pyrup(image, target, convention)[0], twin.pyrup(image[0].numpy(), target, convention), 1e-12)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(7, 11), (140, 133), (132, 160)])
+def test_sum_of_expanded_bands_is_the_image(convention, size):
+    image = draw(1, 3, *size)
+    bands = laplacian_pyramid(image, 5, convention)
+    assert bands.size == size
+    result = bands.base
+    for band in reversed(bands.details):
+        result = band + pyrup(result, tuple(band.shape[-2:]), convention)
+    close(result, image, 1e-14)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(9, 12), (134, 200)])
+def test_constant_image_has_no_bands(convention, size):
+    bands = laplacian_pyramid(torch.full((1, 1, *size), 0.7, dtype=torch.float64), 4, convention)
+    close(bands.base, torch.full_like(bands.base, 0.7), 1e-14)
+    for band in bands.details:
+        close(band, torch.zeros_like(band), 1e-14)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_dtype_and_device_follow_the_image(convention, dtype, device):
+    bands = laplacian_pyramid(draw(2, 3, 150, 40, dtype=dtype, device=device), 3, convention)
+    for level in (*bands.details, bands.base):
+        assert level.dtype == dtype
+        assert level.device.type == device.type
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("levels", [0, 1, 4])
+def test_sizes_of_the_bands(convention, levels):
+    bands = laplacian_pyramid(draw(1, 1, 150, 45), levels, convention)
+    rounded = (lambda n: n // 2) if convention == "kornia" else (lambda n: -(-n // 2))
+    size = (150, 45)
+    for band in bands.details:
+        assert tuple(band.shape[-2:]) == size
+        size = tuple(rounded(n) for n in size)
+    assert tuple(bands.base.shape[-2:]) == size
+    assert len(bands.details) == levels
+
+
+def test_places_of_pixels_are_where_their_weight_lies():
+    # A ramp is reproduced away from the borders by every level, so it tells where the pixels lie.
+    ramp = torch.arange(256, dtype=torch.float64).expand(1, 1, 160, 256)
+    for convention in CONVENTIONS:
+        bands = laplacian_pyramid(ramp, 4, convention)
+        level = ramp
+        for k in range(4):
+            inner = slice(4, -4)
+            close(bands.places(k, -1)[inner], level[0, 0, 0][inner], 1e-9)
+            level = pyrdown(level, convention)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(6, 5), (3, 130), (132, 4)])
+def test_gradients(convention, size):
+    image = draw(1, 1, *size).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: pyrdown(x, convention), image)
+    target = (2 * size[0], 2 * size[1] - 1)
+    assert torch.autograd.gradcheck(lambda x: pyrup(x, target, convention), image)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(131, 140), (140, 132)])
+def test_with_and_without_gradient_agree(convention, size):
+    image = draw(1, 2, *size)
+    recorded = laplacian_pyramid(image.clone().requires_grad_(), 3, convention)
+    with torch.no_grad():
+        plain = laplacian_pyramid(image, 3, convention)
+    for a, b in zip((*recorded.details, recorded.base), (*plain.details, plain.base), strict=True):
+        close(a.detach(), b, 1e-14)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_strided_images(convention):
+    image = draw(2, 3, 140, 150)
+    expected = laplacian_pyramid(image, 3, convention)
+    for same in (image.contiguous(memory_format=torch.channels_last), image.mT.contiguous().mT):
+        bands = laplacian_pyramid(same, 3, convention)
+        for a, b in zip((*bands.details, bands.base), (*expected.details, expected.base), strict=True):
+            close(a, b, 1e-14)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("size", [(20, 30), (160, 144), (141, 150)])
+def test_image_stays_as_it_was(convention, size):
+    image = draw(1, 3, *size)
+    before = image.clone()
+    with torch.no_grad():
+        bands = laplacian_pyramid(image, 4, convention)
+        kept = [level.clone() for level in (*bands.details, bands.base)]
+        laplacian_pyramid(image + 1, 4, convention)
+    assert torch.equal(image, before)
+    for level, then in zip((*bands.details, bands.base), kept, strict=True):
+        assert torch.equal(level, then)
+
+
+def test_bad_input():
+    with pytest.raises(InputError, match="image"):
+        pyrdown(torch.rand(4, 4))
+    with pytest.raises(InputError, match="image"):
+        pyrup(torch.rand(3, 4, 4), (8, 8))
+    with pytest.raises(InputError, match="convention 'openvc'; did you mean 'opencv'"):
+        pyrdown(torch.rand(1, 1, 4, 4), "openvc")
+    with pytest.raises(InputError, match="convention"):
+        pyrup(torch.rand(1, 1, 4, 4), (8, 8), "openvc")
+    with pytest.raises(InputError, match="size: expected 8 or 7 for 4 pixels, got 9"):
+        pyrup(torch.rand(1, 1, 4, 4), (8, 9), "opencv")
+    with pytest.raises(InputError, match="levels"):
+        laplacian_pyramid(torch.rand(1, 1, 4, 4), -1)
+    with pytest.raises(InputError, match="at least one pixel"):
+        laplacian_pyramid(torch.rand(1, 1, 0, 4), 1)
+    with pytest.raises(InputError, match="image"):
+        laplacian_pyramid(torch.rand(4, 4), 1)
