@@ -2,9 +2,9 @@
 
     python -m eval.calibration --data.root DIR --data.annotations instances.json --out runs/calibration
 
-Every photograph is fixated at random points and detections are matched to the annotated boxes. The table tells, for
-every level of distance to the fovea, how well raw and calibrated scores predict the true class, background included.
-Judge on photographs that the model was not fitted on.
+Without photographs it uses the embedded scenes. Every photograph is fixated at random points and detections are
+matched to the annotated boxes. The table tells, for every level of distance to the fovea, how well raw and calibrated
+scores predict the true class, background included. Judge on photographs that the model was not fitted on.
 """
 
 import sys
@@ -21,11 +21,10 @@ from eval.command import run_command
 from eval.config import DataConfig, DetectorConfig, SensorConfig
 from eval.parallel import rank
 from eval.report import save_figure, table
+from eval.samples import Sampler, Samples, SampleSettings, collect
 from eval.setup import plain
-from semfov.errors import check
 from semfov.files import write_text
 from semfov.viz import plot_reliability
-from train.samples import Sampler, Samples, SampleSettings, collect
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,6 @@ class CalibrationConfig:
 
 def judge(config: CalibrationConfig) -> None:
     """Collect labelled detections and write how well raw and calibrated scores predict their classes."""
-    check(config.data.root is not None, "data.root", "a folder of photographs with boxes", None)
     settings = SampleSettings(config.data, config.detector, config.sensor, config.fixations, config.iou, config.seed)
     sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
     if rank() > 0:
@@ -80,9 +78,8 @@ def judge(config: CalibrationConfig) -> None:
 
 def load_model(config: CalibrationConfig, sampler: Sampler) -> semfov.FovealObservationModel:
     """The observation model, checked against the detector and the sensor."""
-    detector, settings = sampler.eye.detector, sampler.eye.settings()
-    model = semfov.FovealObservationModel.from_pretrained(config.model or detector.name)
-    model.check_compatible(settings["detector"], detector.classes, sensor=settings["sensor"])
+    model = semfov.FovealObservationModel.from_pretrained(config.model or sampler.eye.detector.name)
+    model.check_compatible(sampler.eye.settings(), sampler.eye.detector.classes)
     return model
 
 

@@ -55,8 +55,7 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
 def make_observation(config: SearchConfig, eye: Eye) -> semfov.FovealObservationModel:
     """The observation model, checked to belong to this detector, background policy and class list."""
     model = semfov.FovealObservationModel.from_pretrained(config.belief.model or eye.detector.name)
-    settings = eye.settings()
-    model.check_compatible(settings["detector"], eye.detector.classes, sensor=settings["sensor"])
+    model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)
 
 

@@ -25,6 +25,7 @@ class FitConfig:
         holdout: every n-th photograph is kept out of the fit and used to judge it.
         iou: overlap from which a detection shows an object.
         seed: of the fixations.
+        shard: photographs in a unit of work; a run that is stopped loses no more than one for each worker.
         out: folder for the model, the report and the figures.
         cache: folder for the labelled detections (None: `out`).
         workers: processes (None: one for each CPU core).
@@ -41,6 +42,7 @@ class FitConfig:
     holdout: int = 10
     iou: float = 0.5
     seed: int = 0
+    shard: int = 32
     out: Path = Path("runs/fit_fom")
     cache: Path | None = None
     workers: int | None = None

@@ -2,6 +2,8 @@
 
     python -m train.fit_fom --data.root DIR --data.annotations instances.json --out runs/fit_fom
 
+Without photographs it uses the embedded scenes, which is only good for trying it out.
+
 Every photograph is fixated at random points; detections are matched to the annotated boxes, and p(scores | class,
 distance to the fovea) is fitted to them. The folder `out` gets the model (`<name>.safetensors`), a report that judges
 it on photographs that it was not fitted on, and a reliability diagram. A run that was stopped goes on where it was;
@@ -11,22 +13,23 @@ more machines share the work under `torchrun`. Use the model with `--belief.mode
 import sys
 import warnings
 from collections.abc import Sequence
+from dataclasses import fields
 
 import semfov
 from eval.command import run_command
 from eval.parallel import rank
+from eval.samples import Sampler, Samples, SampleSettings, collect
 from semfov.errors import DataError, check
 from semfov.observation import fit_discriminative
 from train.config import FitConfig
 from train.report import write_report
-from train.samples import Sampler, Samples, SampleSettings, collect
 
 
 def fit_fom(config: FitConfig) -> None:
     """Collect labelled detections, fit the model, judge it on held-out photographs, and write everything."""
-    check(config.data.root is not None, "data.root", "a folder of photographs with boxes", None)
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
-    settings = SampleSettings(config.data, config.detector, config.sensor, config.fixations, config.iou, config.seed)
+    names = [field.name for field in fields(SampleSettings)]
+    settings = SampleSettings(**{name: getattr(config, name) for name in names})
     folder = (config.cache or config.out) / "samples"
     sampler, samples = collect(settings, folder, config.workers, "looking")
     if rank() > 0:

@@ -13,11 +13,11 @@ import yaml
 import semfov
 from eval.calibration_metrics import Calibration, calibration
 from eval.report import commit, save_figure, table
+from eval.samples import Samples
 from eval.setup import plain
 from semfov.files import write_text
 from semfov.viz import plot_reliability
 from train.config import FitConfig
-from train.samples import Samples
 
 Models = dict[str, semfov.FovealObservationModel]
 

@@ -1,8 +1,9 @@
 """torchvision's detection models, with the full score vector of every box."""
 
+import inspect
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike, fspath
 from pathlib import Path
 from pickle import UnpicklingError
@@ -192,6 +193,8 @@ def load_torchvision(
         network = models.get_model(name, weights=enum, **model)
     except (TypeError, ValueError) as error:
         raise InputError(f"options of {name}: {error}") from error
+    for option in model:
+        lookup(option, _options(models.get_model_builder(name), type(network)), f"option of {name}")
     if enum is None and weights is not None:
         _load_state(network, _file(weights))
     network.requires_grad_(False).to(device)
@@ -214,6 +217,12 @@ def _member(enum: Any, weights: Any) -> Any:
     if isinstance(weights, str) and not Path(text).suffix:
         return enum[lookup(text, [*enum.__members__], f"{enum.__name__} member")]
     return None
+
+
+def _options(builder: Callable[..., nn.Module], kind: type[nn.Module]) -> list[str]:
+    """Options that a builder or its model's constructors know; all of them would swallow any other in silence."""
+    callables: list[Any] = [builder, *(each for each in kind.__mro__ if issubclass(each, nn.Module))]
+    return sorted({name for call in callables for name in inspect.signature(call).parameters})
 
 
 def _file(weights: str | PathLike[str]) -> Path:

@@ -91,7 +91,7 @@ def foveate(image, gaze, sigma, levels, growth, convention):
     return result
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def twin():
     """`pyrdown`, `pyrup` and `foveate` of float64 arrays."""
     return SimpleNamespace(pyrdown=pyrdown, pyrup=pyrup, foveate=foveate)

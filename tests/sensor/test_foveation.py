@@ -292,28 +292,28 @@ GAZE = torch.tensor([4.0, 4.0])
 
 
 @pytest.mark.parametrize(
-    "arguments, message",
+    ("arguments", "message"),
     [
-        (dict(gaze=torch.tensor([4.0, math.nan])), "gaze: expected finite numbers"),
-        (dict(gaze=torch.tensor([[[math.inf, 1.0]]] * 2)), "gaze: expected finite numbers"),
-        (dict(gaze=torch.rand(3)), "gaze: expected a tensor of shape"),
-        (dict(gaze=torch.tensor(1.0)), "gaze: expected a tensor of shape"),
-        (dict(gaze=torch.rand(3, 2)), "gaze: expected a tensor of shape"),
-        (dict(gaze=torch.rand(1, 4, 2)), "gaze: expected a tensor of shape"),
-        (dict(gaze=torch.rand(1, 2, 4, 2)), "gaze: expected a tensor of shape"),
-        (dict(image=torch.rand(3, 8, 8)), "image: expected a tensor of shape"),
-        (dict(image=torch.rand(1, 3, 0, 8)), "image: expected at least one pixel"),
-        (dict(levels=-1), "levels: expected 0 or more, got -1"),
-        (dict(sigma=0.0), "sigma: expected a positive number, got 0.0"),
-        (dict(sigma=-2), "sigma: expected a positive number, got -2"),
-        (dict(sigma=math.nan), "sigma: expected a positive number, got nan"),
-        (dict(sigma=torch.tensor([1.0, -1.0])), "sigma: expected a positive number"),
-        (dict(sigma=torch.ones(3)), "sigma: expected a number or shape"),
-        (dict(sigma=torch.ones(2, 3)), "sigma: expected a number or shape"),
-        (dict(sigma=torch.ones(2, 2, 2)), "sigma: expected a number or shape"),
-        (dict(growth=0.0), "growth: expected a positive number, got 0.0"),
-        (dict(growth=torch.tensor(-1.0)), "growth: expected a positive number, got -1.0"),
-        (dict(convention="korina"), "unknown pyramid convention 'korina'; did you mean 'kornia'"),
+        ({"gaze": torch.tensor([4.0, math.nan])}, "gaze: expected finite numbers"),
+        ({"gaze": torch.tensor([[[math.inf, 1.0]]] * 2)}, "gaze: expected finite numbers"),
+        ({"gaze": torch.rand(3)}, "gaze: expected a tensor of shape"),
+        ({"gaze": torch.tensor(1.0)}, "gaze: expected a tensor of shape"),
+        ({"gaze": torch.rand(3, 2)}, "gaze: expected a tensor of shape"),
+        ({"gaze": torch.rand(1, 4, 2)}, "gaze: expected a tensor of shape"),
+        ({"gaze": torch.rand(1, 2, 4, 2)}, "gaze: expected a tensor of shape"),
+        ({"image": torch.rand(3, 8, 8)}, "image: expected a tensor of shape"),
+        ({"image": torch.rand(1, 3, 0, 8)}, "image: expected at least one pixel"),
+        ({"levels": -1}, "levels: expected 0 or more, got -1"),
+        ({"sigma": 0.0}, "sigma: expected a positive number, got 0.0"),
+        ({"sigma": -2}, "sigma: expected a positive number, got -2"),
+        ({"sigma": math.nan}, "sigma: expected a positive number, got nan"),
+        ({"sigma": torch.tensor([1.0, -1.0])}, "sigma: expected a positive number"),
+        ({"sigma": torch.ones(3)}, "sigma: expected a number or shape"),
+        ({"sigma": torch.ones(2, 3)}, "sigma: expected a number or shape"),
+        ({"sigma": torch.ones(2, 2, 2)}, "sigma: expected a number or shape"),
+        ({"growth": 0.0}, "growth: expected a positive number, got 0.0"),
+        ({"growth": torch.tensor(-1.0)}, "growth: expected a positive number, got -1.0"),
+        ({"convention": "korina"}, "unknown pyramid convention 'korina'; did you mean 'kornia'"),
     ],
 )
 def test_bad_input(arguments, message):
@@ -323,12 +323,12 @@ def test_bad_input(arguments, message):
 
 
 @pytest.mark.parametrize(
-    "arguments, message",
+    ("arguments", "message"),
     [
-        (dict(sigma=0.0), "sigma"),
-        (dict(growth=0.0), "growth"),
-        (dict(levels=-1), "levels"),
-        (dict(convention="korina"), "convention"),
+        ({"sigma": 0.0}, "sigma"),
+        ({"growth": 0.0}, "growth"),
+        ({"levels": -1}, "levels"),
+        ({"convention": "korina"}, "convention"),
     ],
 )
 def test_bad_settings(arguments, message):

@@ -67,6 +67,7 @@ class SampleSettings:
         fixations: random fixations in each photograph, uniform over its pixels.
         iou: overlap from which a detection shows an object.
         seed: of the fixations.
+        shard: photographs in a shard, the unit of work.
     """
 
     data: DataConfig
@@ -75,6 +76,7 @@ class SampleSettings:
     fixations: int
     iou: float
     seed: int
+    shard: int = 32
 
 
 class Sampler:
@@ -84,20 +86,18 @@ class Sampler:
         key: sha256 of everything that the samples depend on.
     """
 
-    shard_size = 32
-
     def __init__(self, settings: SampleSettings) -> None:
         self.settings = settings
         self.eye: Eye = make_eye(settings.detector, settings.sensor)
         self.scenes: Scenes = make_scenes(settings.data, self.eye.detector.classes)
         what = [self.eye.settings(), self.scenes.fingerprint, settings.fixations, settings.iou, settings.seed]
-        what += [self.shard_size, torch.__version__, code_digest()]
+        what += [settings.shard, torch.__version__, code_digest()]
         self.key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
     @property
     def shards(self) -> range:
         """Numbers of the shards."""
-        return range(-(-len(self.scenes) // self.shard_size))
+        return range(-(-len(self.scenes) // self.settings.shard))
 
     def path(self, folder: Path, shard: int) -> Path:
         """File of a shard."""
@@ -122,8 +122,8 @@ class Sampler:
 
     def sample(self, shard: int) -> Samples:
         """Look at the photographs of a shard."""
-        first = shard * self.shard_size
-        scenes = range(first, min(first + self.shard_size, len(self.scenes)))
+        first = shard * self.settings.shard
+        scenes = range(first, min(first + self.settings.shard, len(self.scenes)))
         return Samples.join([self._look(index) for index in scenes])
 
     def _look(self, index: int) -> Samples:
