@@ -63,9 +63,11 @@ def plot_cumulative_performance(
 def plot_reliability(predictions: Mapping[str, tuple[Tensor, Tensor]], *, bins: int = 15) -> Figure:
     """How often the most probable class is right, against its probability; a calibrated model lies on the diagonal.
 
+    Bins with fewer than 20 predictions are left out: their shares are mostly chance.
+
     Args:
         predictions: for each model its probabilities `(M, K+1)` and the true classes `(M,)`.
-        bins: equally wide bins of probability; those without predictions are left out.
+        bins: equally wide bins of probability.
     """
     figure, (axes, below) = _figure(2, 1, width=4.4, height=5.4, ratios=[3, 1])
     axes.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="perfectly calibrated")
@@ -74,7 +76,7 @@ def plot_reliability(predictions: Mapping[str, tuple[Tensor, Tensor]], *, bins: 
         right = (predicted == labels.cpu()).numpy()
         index = np.clip(np.ceil(confidence.numpy() * bins).astype(int) - 1, 0, bins - 1)
         count = np.bincount(index, minlength=bins)
-        filled = count > 0
+        filled = count >= 20
         mean_confidence = np.bincount(index, confidence.numpy(), bins)[filled] / count[filled]
         accuracy = np.bincount(index, right, bins)[filled] / count[filled]
         axes.plot(

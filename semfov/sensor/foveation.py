@@ -1,9 +1,11 @@
 """The foveal sensor: an image that is sharp around a fixation and ever coarser away from it."""
 
+from typing import get_args
+
 import torch
 from torch import Tensor, nn
 
-from semfov.errors import check, check_finite, check_shape
+from semfov.errors import check, check_finite, check_shape, lookup
 from semfov.sensor.pyramid import Bands, Convention, laplacian_pyramid, pyrup
 
 
@@ -97,6 +99,7 @@ class Foveation(nn.Module):
         check(sigma > 0, "sigma", "a positive number", sigma)
         check(growth > 0, "growth", "a positive number", growth)
         check(levels >= 0, "levels", "0 or more", levels)
+        lookup(convention, get_args(Convention), "pyramid convention")
         self.levels = levels
         self.growth = growth
         self.convention: Convention = convention

@@ -256,22 +256,24 @@ def test_dtype_and_device_follow_the_image(dtype, size, device):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(20, 27), (150, 132), (160, 160)])
-@pytest.mark.parametrize("gradients", [True, False])
-def test_compiles_to_one_graph(convention, size, gradients):
-    image, gaze = draw(1, 3, *size), 20 * draw(1, 3, 2)
+@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+def test_compiles_to_one_graph(convention, size):
+    image, gaze = draw(1, 2, *size), 20 * draw(1, 3, 2)
+    torch.compiler.reset()
 
     def sensor(image, gaze):
-        return foveate(image, gaze, sigma=7.0, convention=convention)
+        return foveate(image, gaze, sigma=7.0, levels=2, convention=convention)
 
     compiled = torch.compile(sensor, fullgraph=True, backend="eager")
-    with torch.set_grad_enabled(gradients):
+    close(compiled(image, gaze), sensor(image, gaze))
+    with torch.no_grad():
         close(compiled(image, gaze), sensor(image, gaze))
 
 
 def test_module_compiles_to_one_graph():
-    sensor = Foveation(6.0, levels=3, learnable=True)
+    sensor = Foveation(6.0, levels=2, learnable=True)
     image, gaze = draw(2, 3, 33, 40, dtype=torch.float32), torch.tensor([[4.0, 9.0], [30.0, 2.0]])
+    torch.compiler.reset()
     compiled = torch.compile(sensor, fullgraph=True, backend="eager")
     close(compiled(image, gaze).detach(), sensor(image, gaze).detach(), 1e-6)
 

@@ -1,0 +1,7 @@
+"""Bottom-up saliency: where an image draws the gaze, whatever is looked for. Baselines to compare with."""
+
+from semfov.gaze.saliency.cells import cell_saliency
+from semfov.gaze.saliency.itti import IttiKoch, itti_koch_saliency
+from semfov.gaze.saliency.vocus2 import VOCUS2, vocus2_saliency
+
+__all__ = ["VOCUS2", "IttiKoch", "cell_saliency", "itti_koch_saliency", "vocus2_saliency"]

@@ -1,0 +1,53 @@
+"""A saliency map over the pixels as values of the cells of a grid."""
+
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from semfov.errors import check, check_shape, lookup
+
+Reduction = Literal["mean", "max"]
+
+
+def cell_saliency(saliency: Tensor, columns: int, rows: int, reduction: Reduction = "mean") -> Tensor:
+    """Saliency of each of `columns` × `rows` equal cells over the image, numbered row by row.
+
+    Args:
+        saliency: `(B, H, W)`, of any size.
+        columns: number of cells in a row, X.
+        rows: number of cells in a column, Y.
+        reduction: `mean` over the cell's area (a pixel on the border counts with the share inside), or `max` over
+            the pixels that share a positive area with it.
+
+    Returns:
+        `(B, Y·X)`.
+
+    >>> cell_saliency(torch.tensor([[[0.0, 2.0, 4.0]]]), 2, 1)
+    tensor([[0.6667, 3.3333]])
+    """
+    check_shape(saliency, "saliency", None, None, None)
+    check(saliency.ndim == 3, "saliency", "a tensor of shape (B, any, any)", tuple(saliency.shape))
+    check(min(saliency.shape[-2:]) > 0, "saliency", "at least one pixel", tuple(saliency.shape))
+    check(saliency.is_floating_point(), "saliency", "floating-point values", saliency.dtype)
+    check(columns >= 1 and rows >= 1, "columns, rows", "at least 1", (columns, rows))
+    lookup(reduction, get_args(Reduction), "reduction")
+    height, width = saliency.shape[-2:]
+    if reduction == "mean":
+        return (_shares(height, rows, saliency) @ saliency @ _shares(width, columns, saliency).mT).flatten(1)
+    down = torch.stack([saliency[:, start:stop].amax(1) for start, stop in _covered(height, rows)], 1)
+    return torch.stack([down[..., start:stop].amax(-1) for start, stop in _covered(width, columns)], -1).flatten(1)
+
+
+def _shares(pixels: int, cells: int, like: Tensor) -> Tensor:
+    """Share of each cell's length that each pixel covers, `(cells, pixels)`; rows sum to 1."""
+    # On a scale where both pixels and cells have whole-number borders.
+    pixel = torch.arange(pixels, device=like.device) * cells
+    cell = torch.arange(cells, device=like.device)[:, None] * pixels
+    overlap = torch.minimum(pixel + cells, cell + pixels) - torch.maximum(pixel, cell)
+    return overlap.clamp(min=0).to(like.dtype) / pixels
+
+
+def _covered(pixels: int, cells: int) -> list[tuple[int, int]]:
+    """First and end pixel of those that overlap each cell."""
+    return [(cell * pixels // cells, -(-(cell + 1) * pixels // cells)) for cell in range(cells)]

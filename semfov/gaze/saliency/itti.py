@@ -1,0 +1,196 @@
+"""The saliency model of Itti, Koch and Niebur: centre-surround differences of colour, intensity and orientation."""
+
+from collections.abc import Sequence
+from math import pi
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from semfov.errors import check, check_shape
+from semfov.gaze.saliency.fusion import rescale
+from semfov.gaze.saliency.opponent import anchor, double_opponency
+from semfov.sensor.pyramid import pyrdown
+
+CENTRES = (2, 3, 4)
+DELTAS = (3, 4)
+ORIENTATIONS = (0.0, 45.0, 90.0, 135.0)
+
+# The paper names no Gabor filter; these are the SaliencyToolbox's (Walther and Koch, 2006).
+_TAPS, _PERIOD, _SIGMA = 9, 7.0, 7 / 3
+
+# Lower maxima of a map do not count (Walther and Koch, 2006).
+_PEAK = 0.1
+
+# Maps with a smaller range, in units of the rounding error at 1, hold nothing else, and stretching would promote it.
+_FLAT = 32
+
+
+def gaussian_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
+    """Levels 0 to `levels` of a dyadic Gaussian pyramid (`cv2.pyrDown`), for channels `(B, C, H, W)`.
+
+    >>> [tuple(level.shape[-2:]) for level in gaussian_pyramid(torch.rand(1, 3, 9, 12), 3)]
+    [(9, 12), (5, 6), (3, 3), (2, 2)]
+    """
+    check(levels >= 0, "levels", "0 or more", levels)
+    pyramid = [channels]
+    for _ in range(levels):
+        pyramid.append(pyrdown(pyramid[-1], "opencv"))
+    return pyramid
+
+
+def gabor_kernels(orientations: Sequence[float] = ORIENTATIONS) -> Tensor:
+    r"""Even and odd Gabor filters that do not answer to a uniform image, `(2n, 9, 9)` in float64.
+
+    .. math:: g_\phi(x, y) = \cos(2\pi u / 7 + \phi) \exp(-(x^2 + y^2) / 2\sigma^2), \quad
+        u = x \cos\theta + y \sin\theta, \quad \phi \in \{0, \pi/2\}, \quad \sigma = 7/3
+
+    less their mean, with absolute values that sum to 1. At 0° the wave runs along x: vertical bars answer.
+
+    Args:
+        orientations: angles θ in degrees, y pointing down.
+
+    >>> gabor_kernels([0.0]).shape
+    torch.Size([2, 9, 9])
+    """
+    place = torch.arange(_TAPS, dtype=torch.float64) - _TAPS // 2
+    y, x = place[:, None], place[None, :]
+    envelope = torch.exp(-(x**2 + y**2) / (2 * _SIGMA**2))
+    angles = torch.tensor(list(orientations), dtype=torch.float64) * (pi / 180)
+    wave = 2 * pi / _PERIOD * (x * angles.cos()[:, None, None] + y * angles.sin()[:, None, None])
+    kernels = torch.stack([wave.cos(), -wave.sin()], 1).flatten(0, 1) * envelope
+    kernels = kernels - kernels.mean((-2, -1), keepdim=True)
+    return kernels / kernels.abs().sum((-2, -1), keepdim=True)
+
+
+def orientation_energy(intensity: Tensor, orientations: Sequence[float] = ORIENTATIONS) -> Tensor:
+    """Answer of Gabor filters `(B, n, h, w)` to an intensity `(B, 1, h, w)`: |even| + |odd|, borders continued.
+
+    >>> orientation_energy(torch.eye(9)[None, None])[0, :, 4, 4].argmax()
+    tensor(3)
+    """
+    check_shape(intensity, "intensity", None, 1, None, None)
+    kernels = gabor_kernels(orientations).to(intensity)
+    reach = _TAPS // 2
+    answers = F.conv2d(F.pad(intensity, (reach,) * 4, mode="replicate"), kernels[:, None])
+    return answers.abs().unflatten(1, (-1, 2)).sum(2)
+
+
+def across_scales(centre: Tensor, surround: Tensor) -> Tensor:
+    """Difference of two scales, `|centre - surround|`, the coarser enlarged bilinearly to the finer."""
+    size = (centre.shape[-2], centre.shape[-1])
+    return (centre - F.interpolate(surround, size, mode="bilinear", align_corners=False)).abs()
+
+
+def promote(maps: Tensor) -> Tensor:
+    r"""Itti's map normalisation: promote maps with one strong peak, suppress those with many.
+
+    .. math:: N(M) = M \, (1 - \bar m)^2
+
+    for a map stretched to [0, 1] and the mean of its local maxima other than the largest. A local maximum exceeds
+    0.1 and is no less than its eight neighbours; of equal neighbours the first counts. A map whose range is within
+    rounding errors of values up to 1 gives 0.
+
+    Args:
+        maps: `(..., h, w)`, each normalised alone.
+
+    >>> promote(torch.tensor([[4.0, 0.0, 0.0, 2.0]]))
+    tensor([[0.2500, 0.0000, 0.0000, 0.1250]])
+    """
+    maps = rescale(maps, _FLAT * torch.finfo(maps.dtype).eps)
+    peaks = local_maxima(maps) & (maps > _PEAK)
+    count = peaks.sum((-2, -1), keepdim=True)
+    # The largest is exactly 1 and always among them.
+    others = ((maps * peaks).sum((-2, -1), keepdim=True) - 1) / (count - 1).clamp(min=1)
+    return maps * (1 - torch.where(count > 1, others, 0.0)) ** 2
+
+
+def local_maxima(maps: Tensor) -> Tensor:
+    """Pixels of maps `(..., h, w)` above their earlier and no less than their later neighbours, row by row.
+
+    >>> local_maxima(torch.tensor([[1.0, 3.0, 3.0], [0.0, 2.0, 1.0]])).int()
+    tensor([[0, 1, 0],
+            [0, 0, 0]], dtype=torch.int32)
+    """
+    height, width = maps.shape[-2:]
+    padded = F.pad(maps, (1, 1, 1, 1), value=-torch.inf)
+    shifted = [padded[..., y : y + height, x : x + width] for y in range(3) for x in range(3)]
+    earlier = torch.stack(shifted[:4]).amax(0)
+    later = torch.stack(shifted[5:]).amax(0)
+    return (maps > earlier) & (maps >= later)
+
+
+def conspicuity(image: Tensor) -> Tensor:
+    r"""Conspicuity of intensity, colour and orientation, `(B, 3, h, w)` at scale 4 (Itti, Koch and Niebur, 1998).
+
+    .. math:: \bar I = \bigoplus_{c,s} N(I_{c,s}), \quad
+        \bar C = \bigoplus_{c,s} N(RG_{c,s}) + N(BY_{c,s}), \quad
+        \bar O = \sum_\theta N\Bigl(\bigoplus_{c,s} N(O_{c,s,\theta})\Bigr)
+
+    over centres c = 2, 3, 4 and surrounds s = c + 3, c + 4 of the Gaussian pyramid.
+
+    The opponency's contrast is that of R - G at the centre to R - G in the surround. The paper's equation 2 has G - R
+    in the surround, which taken literally answers most to a uniform colour; its text means the contrast.
+
+    Args:
+        image: `(B, 3, H, W)`, RGB in [0, 1].
+    """
+    levels = max(CENTRES) + max(DELTAS)
+    pyramid = gaussian_pyramid(anchor(double_opponency(image)), levels)
+    features = [torch.cat([level, orientation_energy(level[:, :1])], 1) for level in pyramid[min(CENTRES) :]]
+    total = torch.zeros((), dtype=image.dtype, device=image.device)
+    for centre in CENTRES:
+        here = features[centre - min(CENTRES)]
+        around = [features[centre - min(CENTRES) + delta] for delta in DELTAS]
+        maps = promote(torch.stack([across_scales(here, surround) for surround in around], 1)).sum(1)
+        # Across-scale addition happens at the coarsest centre.
+        total = total + gaussian_pyramid(maps, max(CENTRES) - centre)[-1]
+    intensity, colour, orientation = total.split([1, 2, len(ORIENTATIONS)], 1)
+    parts = [intensity, colour.sum(1, keepdim=True), promote(orientation).sum(1, keepdim=True)]
+    return torch.cat(parts, 1)
+
+
+def itti_koch_saliency(image: Tensor, *, normalise: bool = True) -> Tensor:
+    r"""Saliency by Itti, Koch and Niebur ("A model of saliency-based visual attention", PAMI 1998).
+
+    .. math:: S = \tfrac{1}{3} (N(\bar I) + N(\bar C) + N(\bar O))
+
+    at scale 4, enlarged bilinearly to the image; see `conspicuity` and `promote`.
+
+    Args:
+        image: `(B, 3, H, W)`, RGB in [0, 1].
+        normalise: stretch every map to [0, 1].
+
+    Returns:
+        `(B, H, W)`.
+
+    >>> image = torch.zeros(1, 3, 192, 256)
+    >>> image[:, 0, 80:96, 48:64] = 1.0
+    >>> row, column = divmod(int(itti_koch_saliency(image).argmax()), 256)
+    >>> 72 <= row < 104 and 40 <= column < 72
+    True
+    """
+    saliency = promote(conspicuity(image)).mean(1, keepdim=True)
+    size = (image.shape[-2], image.shape[-1])
+    saliency = F.interpolate(saliency, size, mode="bilinear", align_corners=False)[:, 0]
+    return rescale(saliency) if normalise else saliency
+
+
+class IttiKoch(nn.Module):
+    """Saliency by Itti, Koch and Niebur, see `itti_koch_saliency`.
+
+    >>> IttiKoch()(torch.rand(2, 3, 32, 48)).shape
+    torch.Size([2, 32, 48])
+    """
+
+    def __init__(self, *, normalise: bool = True) -> None:
+        super().__init__()
+        self.normalise = normalise
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Saliency `(B, H, W)` of an image `(B, 3, H, W)`."""
+        return itti_koch_saliency(image, normalise=self.normalise)
+
+    def extra_repr(self) -> str:
+        """Settings, for `print`."""
+        return f"normalise={self.normalise}"

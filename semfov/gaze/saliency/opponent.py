@@ -1,0 +1,70 @@
+"""Opponent colours, as either model has them."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.errors import check, check_shape
+
+
+def check_image(image: Tensor) -> None:
+    """Raise `InputError` unless `image` is a floating-point `(B, 3, H, W)` with at least one pixel."""
+    check_shape(image, "image", 3, None, None)
+    check(image.ndim == 4, "image", "a tensor of shape (B, 3, any, any)", tuple(image.shape))
+    check(image.is_floating_point(), "image", "floating-point values in [0, 1]", image.dtype)
+    check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
+
+
+def opponent_colours(image: Tensor) -> Tensor:
+    r"""Intensity, red-green and blue-yellow of VOCUS2 (Frintrop, Werner and Martin García, CVPR 2015, section 3.1).
+
+    .. math:: I = (R + G + B) / 3, \quad RG = R - G, \quad BY = B - (R + G) / 2
+
+    Args:
+        image: `(B, 3, H, W)`, RGB in [0, 1].
+
+    Returns:
+        `(B, 3, H, W)`: I, RG, BY.
+
+    >>> opponent_colours(torch.tensor([1.0, 0.0, 0.5]).reshape(1, 3, 1, 1)).flatten().tolist()
+    [0.5, 1.0, 0.0]
+    """
+    check_image(image)
+    red, green, blue = image.unbind(1)
+    return torch.stack([(red + green + blue) / 3, red - green, blue - (red + green) / 2], 1)
+
+
+def double_opponency(image: Tensor) -> Tensor:
+    r"""Intensity and the two opponencies of Itti, Koch and Niebur (1998), whose hue does not depend on intensity.
+
+    With r, g, b divided by I where I exceeds a tenth of the image's largest, and zero elsewhere,
+
+    .. math:: R = [r - (g + b)/2]_+, \; G = [g - (r + b)/2]_+, \; B = [b - (r + g)/2]_+,
+        \; Y = [(r + g)/2 - |r - g|/2 - b]_+
+
+    Args:
+        image: `(B, 3, H, W)`, RGB in [0, 1].
+
+    Returns:
+        `(B, 3, H, W)`: I, R - G, B - Y.
+
+    >>> double_opponency(torch.tensor([0.5, 0.0, 0.0]).reshape(1, 3, 1, 1)).flatten().tolist()
+    [0.1666666716337204, 3.0, 0.0]
+    """
+    check_image(image)
+    intensity = image.mean(1)
+    visible = intensity > intensity.amax((-2, -1), keepdim=True) / 10
+    gain = visible / torch.where(visible, intensity, 1.0)
+    red, green, blue = (image * gain[:, None]).unbind(1)
+    mean = (red + green) / 2
+    reds, greens = F.relu(red - (green + blue) / 2), F.relu(green - (red + blue) / 2)
+    blues, yellows = F.relu(blue - mean), F.relu(mean - (red - green).abs() / 2 - blue)
+    return torch.stack([intensity, reds - greens, blues - yellows], 1)
+
+
+def anchor(channels: Tensor) -> Tensor:
+    """Take the first pixel off every channel `(B, C, H, W)`.
+
+    Contrasts do not depend on it, and without it those of a uniform image are exactly zero, not rounding errors.
+    """
+    return channels - channels[..., :1, :1]

@@ -1,0 +1,182 @@
+"""VOCUS2: saliency as the contrast of two Gaussian pyramids, centre and surround."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from semfov.errors import check, check_shape, lookup
+from semfov.gaze.saliency.fusion import Fusion, fuse, rescale
+from semfov.gaze.saliency.lines import gaussian_blur
+from semfov.gaze.saliency.opponent import anchor, opponent_colours
+
+
+class Twin(NamedTuple):
+    """One scale of the twin pyramids.
+
+    Attributes:
+        centre: `(B, C, h, w)`.
+        surround: the same, blurred further.
+    """
+
+    centre: Tensor
+    surround: Tensor
+
+
+def twin_pyramids(
+    channels: Tensor, centre_sigma: float = 2.0, surround_sigma: float = 6.0, layers: int = 5, scales: int = 2
+) -> list[list[Twin]]:
+    r"""Centre and surround pyramids (Frintrop, Werner and Martin García, CVPR 2015, section 3.2).
+
+    A layer halves the one before; within a layer S scales, each blurred on from the one before (Lowe, 2004):
+
+    .. math:: \sigma_c(s) = 2^{s/S} \sigma_c, \quad
+        \mathrm{surround} = G(2^{s/S} \sqrt{\sigma_s^2 - \sigma_c^2}) * \mathrm{centre}
+
+    Scale S of a layer has twice the blur of scale 0: every second pixel of it starts the next layer.
+
+    Args:
+        channels: `(B, C, H, W)`.
+        centre_sigma: :math:`\sigma_c` in pixels of a layer.
+        surround_sigma: :math:`\sigma_s`, larger than `centre_sigma`.
+        layers: number of layers; fewer where the shorter side of the image cannot be halved so often.
+        scales: scales of a layer, S.
+
+    Returns:
+        For each layer a list of its scales.
+
+    >>> [len(layer) for layer in twin_pyramids(torch.rand(1, 3, 9, 20))]
+    [2, 2, 2, 2]
+    """
+    check_shape(channels, "channels", None, None, None, None)
+    check(min(channels.shape[-2:]) > 0, "channels", "at least one pixel", tuple(channels.shape))
+    _check_settings(centre_sigma, surround_sigma, layers, scales)
+    wider = (surround_sigma**2 - centre_sigma**2) ** 0.5
+    # From one scale to the next the variance grows by this factor.
+    growth = 2 ** (2 / scales)
+    centre = gaussian_blur(channels, centre_sigma)
+    pyramids: list[list[Twin]] = []
+    for layer in range(min(layers, min(channels.shape[-2:]).bit_length())):
+        if layer > 0:
+            centre = gaussian_blur(
+                centre, 2 ** ((scales - 1) / scales) * centre_sigma * (growth - 1) ** 0.5, halve=True
+            )
+        twins = [Twin(centre, gaussian_blur(centre, wider))]
+        for scale in range(1, scales):
+            step = 2 ** ((scale - 1) / scales) * centre_sigma * (growth - 1) ** 0.5
+            centre = gaussian_blur(centre, step)
+            twins.append(Twin(centre, gaussian_blur(centre, 2 ** (scale / scales) * wider)))
+        pyramids.append(twins)
+    return pyramids
+
+
+def on_off_contrasts(centre: Tensor, surround: Tensor) -> tuple[Tensor, Tensor]:
+    """Bright on dark and dark on bright: `max(centre - surround, 0)` and `max(surround - centre, 0)`.
+
+    >>> on_off_contrasts(torch.tensor([1.0, 2.0]), torch.tensor([3.0, 0.0]))
+    (tensor([0., 2.]), tensor([2., 0.]))
+    """
+    return F.relu(centre - surround), F.relu(surround - centre)
+
+
+def vocus2_saliency(
+    image: Tensor,
+    *,
+    centre_sigma: float = 2.0,
+    surround_sigma: float = 6.0,
+    layers: int = 5,
+    scales: int = 2,
+    fusion: Fusion = "mean",
+    normalise: bool = True,
+) -> Tensor:
+    """Saliency by VOCUS2 (Frintrop, Werner and Martin García, "Traditional saliency reloaded", CVPR 2015).
+
+    On-off and off-on contrasts of intensity, red-green and blue-yellow over all layers and scales, fused.
+
+    Args:
+        image: `(B, 3, H, W)`, RGB in [0, 1].
+        centre_sigma: blur of the centre; 2 for cluttered scenes, 3 for salient single objects.
+        surround_sigma: blur of the surround; 6 for cluttered scenes, 13 for salient single objects.
+        layers: layers of the pyramids, each half the one before.
+        scales: scales of a layer.
+        fusion: `mean` or `max`, within and across features.
+        normalise: stretch every map to [0, 1].
+
+    Returns:
+        `(B, H, W)`.
+
+    >>> image = torch.zeros(1, 3, 40, 60)
+    >>> image[:, 0, 10:14, 30:34] = 1.0
+    >>> row, column = divmod(int(vocus2_saliency(image).argmax()), 60)
+    >>> 10 <= row < 14 and 30 <= column < 34
+    True
+    """
+    lookup(fusion, ("mean", "max"), "fusion")
+    pyramids = twin_pyramids(
+        anchor(opponent_colours(image)), centre_sigma, surround_sigma, layers=layers, scales=scales
+    )
+    maps = [torch.cat([_contrasts(twin, fusion) for twin in twins], 1) for twins in pyramids]
+    saliency = fuse(maps, (image.shape[-2], image.shape[-1]), fusion)
+    return rescale(saliency) if normalise else saliency
+
+
+class VOCUS2(nn.Module):
+    """Saliency by VOCUS2, see `vocus2_saliency`.
+
+    >>> VOCUS2(centre_sigma=3.0, surround_sigma=13.0)(torch.rand(2, 3, 32, 48)).shape
+    torch.Size([2, 32, 48])
+    """
+
+    def __init__(
+        self,
+        centre_sigma: float = 2.0,
+        surround_sigma: float = 6.0,
+        *,
+        layers: int = 5,
+        scales: int = 2,
+        fusion: Fusion = "mean",
+        normalise: bool = True,
+    ) -> None:
+        super().__init__()
+        _check_settings(centre_sigma, surround_sigma, layers, scales)
+        lookup(fusion, ("mean", "max"), "fusion")
+        self.centre_sigma = centre_sigma
+        self.surround_sigma = surround_sigma
+        self.layers = layers
+        self.scales = scales
+        self.fusion: Fusion = fusion
+        self.normalise = normalise
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Saliency `(B, H, W)` of an image `(B, 3, H, W)`."""
+        return vocus2_saliency(
+            image,
+            centre_sigma=self.centre_sigma,
+            surround_sigma=self.surround_sigma,
+            layers=self.layers,
+            scales=self.scales,
+            fusion=self.fusion,
+            normalise=self.normalise,
+        )
+
+    def extra_repr(self) -> str:
+        """Settings, for `print`."""
+        sigmas = f"centre_sigma={self.centre_sigma:g}, surround_sigma={self.surround_sigma:g}"
+        return f"{sigmas}, layers={self.layers}, scales={self.scales}, fusion={self.fusion!r}"
+
+
+def _contrasts(twin: Twin, fusion: Fusion) -> Tensor:
+    """Contrasts to be fused `(B, N, h, w)`."""
+    if fusion == "mean":
+        # One of both contrasts is zero, so their mean is half the difference; the channels' mean is taken on the way.
+        differences = (twin.centre - twin.surround).abs().unbind(1)
+        return sum(differences[1:], differences[0])[:, None] / (2 * len(differences))
+    return torch.cat(on_off_contrasts(*twin), 1)
+
+
+def _check_settings(centre_sigma: float, surround_sigma: float, layers: int, scales: int) -> None:
+    check(centre_sigma > 0, "centre_sigma", "a positive number of pixels", centre_sigma)
+    check(surround_sigma > centre_sigma, "surround_sigma", f"more than centre_sigma = {centre_sigma}", surround_sigma)
+    check(layers >= 1, "layers", "1 or more", layers)
+    check(scales >= 1, "scales", "1 or more", scales)
