@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from semfov.belief.semantic_map import mean
 from semfov.detection.detections import Detections
-from semfov.errors import check
+from semfov.errors import InputError, check
 from semfov.scanpath import Scanpath
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # Okabe and Ito's palette: told apart with every common form of colour blindness.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 LINES = ("-", "--", "-.", ":")
-STYLE = {
+STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 9,
@@ -137,7 +137,8 @@ def plot_episode(
 
     with rc_context(STYLE):
         figure = Figure(figsize=(width, 2 * 2.5 * aspect + 0.6), layout="constrained")
-        left, right = figure.subfigures(1, 2, width_ratios=[5.2, width - 5.2])
+        sides: Any = figure.subfigures(1, 2, width_ratios=[5.2, width - 5.2])
+        left, right = sides
         _draw_scanpath(left.subplots(), scanpath, image, boxes)
         panels = right.subplots(2, len(shown), squeeze=False)
         for (above, below), fixation in zip(panels.T, shown, strict=True):
@@ -167,7 +168,7 @@ def _draw_image(axes: Axes, scanpath: Scanpath, image: Tensor, dim: float = 0.0)
 
 def _draw_grid(axes: Axes, scanpath: Scanpath) -> None:
     width, height = scanpath.grid.extent.tolist()
-    style = {"color": "white", "linewidth": 0.4, "alpha": 0.45}
+    style: dict[str, Any] = {"color": "white", "linewidth": 0.4, "alpha": 0.45}
     for column in range(1, scanpath.grid.columns):
         axes.axvline(column * width / scanpath.grid.columns, **style)
     for row in range(1, scanpath.grid.rows):
@@ -234,7 +235,8 @@ def _draw_view(axes: Axes, scanpath: Scanpath, fixation: int, view: Tensor) -> N
 
 def _draw_belief(axes: Axes, scanpath: Scanpath, fixation: int, target: int | None, image: Tensor | None) -> None:
     index = scanpath.target if target is None else target
-    check(index is not None, "target", "a class index, since the scanpath has no target", None)
+    if index is None:
+        raise InputError("target: expected a class index, since the scanpath has none, got None")
     grid = scanpath.grid
     width, height = grid.extent.tolist()
     if image is not None:

@@ -73,6 +73,7 @@ def letterbox(
     """
     check_shape(image, "image", None, None, None, None)
     height, width = image.shape[-2:]
+    check(image.is_floating_point(), "image", "floating-point pixels in [0, 1]", image.dtype)
     check(height > 0 and width > 0, "image", "at least one pixel", tuple(image.shape))
     if stretch:
         inner = size

@@ -1,11 +1,12 @@
 """A small Darknet network with every kind of layer, and weights files for it."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 SMALL_CFG = """
 [net]
@@ -136,6 +137,20 @@ def write_weights(tmp_path: Path) -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture
+def threads() -> Iterator[Callable[[], Iterator[int]]]:
+    """Runs a loop with one thread and with two, and restores the number at the end."""
+    before = torch.get_num_threads()
+
+    def numbers() -> Iterator[int]:
+        for number in (1, 2):
+            torch.set_num_threads(number)
+            yield number
+
+    yield numbers
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -122,6 +122,16 @@ def test_bits_depend_neither_on_the_batch_nor_on_its_order(tiny):
 
 
 @pytest.mark.weights
+@pytest.mark.parametrize("winograd", [True, False])
+def test_bits_do_not_depend_on_threads(tiny_weights, threads, winograd):
+    detector = load_detector("yolov3-tiny", weights=tiny_weights, winograd=winograd)
+    image = torch.rand(1, 3, 240, 320, generator=torch.Generator().manual_seed(1))
+    one, two = (detector.propose(detector.fit(image)[0]) for _ in threads())
+    assert torch.equal(one.boxes, two.boxes)
+    assert torch.equal(one.classes, two.classes)
+
+
+@pytest.mark.weights
 def test_winograd_finds_the_same(tiny, tiny_weights):
     from skimage import data
 

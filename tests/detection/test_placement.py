@@ -90,6 +90,18 @@ def test_gradient_flows():
     assert torch.autograd.gradcheck(lambda x: letterbox(x, (9, 9))[0], (image,))
 
 
+@pytest.mark.parametrize("size", [(416, 312), (700, 500), (300, 200)])
+def test_resize_gives_the_same_bits_on_any_number_of_threads(size, threads):
+    image = torch.rand(1, 3, 480, 640)
+    first, *others = [resize(image, size) for _ in threads()]
+    assert all(torch.equal(first, other) for other in others)
+
+
+def test_refuses_bytes():
+    with pytest.raises(InputError, match="floating-point pixels"):
+        letterbox(torch.zeros(1, 3, 8, 8, dtype=torch.uint8), (32, 32))
+
+
 @pytest.mark.parametrize("shape", [(3, 8, 8), (1, 3, 0, 8)])
 def test_refuses_no_image(shape):
     with pytest.raises(InputError, match="image"):
