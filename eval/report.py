@@ -18,9 +18,9 @@ import yaml
 from numpy.typing import NDArray
 
 import semfov
+from eval.cached import checksum
 from eval.metrics import cumulative_performance, random_search, standard_error
 from eval.setup import plain
-from eval.store import checksum
 from eval.tasks import Parts, SearchRun
 from semfov.belief import fuse, weigh
 from semfov.errors import DataError

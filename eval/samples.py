@@ -8,20 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
+from eval.cached import read_tensors, write_tensors
 from eval.config import DataConfig, DetectorConfig, SensorConfig
 from eval.parallel import available_cores, mine, run_tasks, wait_for_all
 from eval.protocol import generator_for
 from eval.setup import make_eye, make_scenes, prepare_worker
-from eval.store import checksum, code_digest
+from eval.store import code_digest
 from semfov import Grid
 from semfov.data.scene import Scenes
 from semfov.errors import DataError
 from semfov.eye import Eye
-from semfov.files import replacing
 from semfov.observation.matching import match
 
 
@@ -105,20 +103,12 @@ class Sampler:
 
     def load(self, folder: Path, shard: int) -> Samples | None:
         """Samples of a shard, or None if they are not there whole."""
-        try:
-            with safe_open(self.path(folder, shard), framework="pt") as file:
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-                metadata = file.metadata() or {}
-        except (OSError, SafetensorError):
-            return None
-        whole = set(tensors) == set(_NAMES) and metadata == {"key": self.key, "sha256": checksum(tensors)}
-        return Samples(**tensors) if whole else None
+        tensors = read_tensors(self.path(folder, shard), self.key)
+        return None if tensors is None else Samples(**tensors)
 
     def save(self, folder: Path, shard: int, samples: Samples) -> None:
         """Keep the samples of a shard."""
-        tensors = {name: getattr(samples, name).contiguous() for name in _NAMES}
-        with replacing(self.path(folder, shard)) as temporary:
-            temporary.write_bytes(save(tensors, {"key": self.key, "sha256": checksum(tensors)}))
+        write_tensors(self.path(folder, shard), self.key, {name: getattr(samples, name) for name in _NAMES})
 
     def sample(self, shard: int) -> Samples:
         """Look at the photographs of a shard."""

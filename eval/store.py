@@ -14,14 +14,12 @@ from pathlib import Path
 import kornia
 import torch
 import torchvision
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 import semfov
+from eval.cached import read_tensors, write_tensors
 from semfov import Detections, Grid
 from semfov.eye import Eye
-from semfov.files import replacing
 
 
 def see_all(eye: Eye, image: Tensor, grid: Grid) -> Detections:
@@ -54,7 +52,7 @@ class DetectionStore:
             "torch": torch.__version__,
             "torchvision": torchvision.__version__,
             "kornia": kornia.__version__,
-            "machine": platform.machine(),
+            "machine": [platform.machine(), torch.backends.cpu.get_cpu_capability()],
             "code": code_digest(),
         }
         what = {"settings": settings, "grid": [columns, rows], "versions": versions}
@@ -65,29 +63,14 @@ class DetectionStore:
         """File for the scene whose image has this sha256."""
         return self.folder / f"{digest[:32]}.safetensors"
 
-    def __contains__(self, digest: str) -> bool:
-        return self.load(digest) is not None
-
     def load(self, digest: str) -> Detections | None:
         """Detections from every cell of a scene, or None if the store does not have them whole."""
-        path = self.path(digest)
-        try:
-            with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        except (OSError, SafetensorError):
-            return None
-        names = {"boxes", "scores", "count"}
-        if set(tensors) != names or metadata.get("sha256") != checksum(tensors) or metadata.get("key") != self.key:
-            return None
-        return unpack(tensors)
+        tensors = read_tensors(self.path(digest), self.key)
+        return None if tensors is None else unpack(tensors)
 
     def save(self, digest: str, detections: Detections) -> None:
         """Keep the detections of a scene."""
-        tensors = pack(detections)
-        content = save(tensors, {"sha256": checksum(tensors), "key": self.key})
-        with replacing(self.path(digest)) as temporary:
-            temporary.write_bytes(content)
+        write_tensors(self.path(digest), self.key, pack(detections))
 
 
 @cache
@@ -102,8 +85,8 @@ def pack(detections: Detections) -> dict[str, Tensor]:
     """Detections without their padding, which is most of a padded batch."""
     mask = detections.mask
     return {
-        "boxes": detections.boxes[mask].contiguous(),
-        "scores": detections.scores[mask].contiguous(),
+        "boxes": detections.boxes[mask],
+        "scores": detections.scores[mask],
         "count": mask.sum(-1),
     }
 
@@ -116,13 +99,3 @@ def unpack(tensors: dict[str, Tensor]) -> Detections:
     scores = tensors["scores"].new_zeros(*mask.shape, tensors["scores"].shape[-1])
     boxes[mask], scores[mask] = tensors["boxes"], tensors["scores"]
     return Detections(boxes, scores, mask)
-
-
-def checksum(tensors: dict[str, Tensor]) -> str:
-    """sha256 over names, shapes and bytes."""
-    digest = hashlib.sha256()
-    for name in sorted(tensors):
-        tensor = tensors[name]
-        digest.update(f"{name}{tuple(tensor.shape)}{tensor.dtype}".encode())
-        digest.update(tensor.numpy().tobytes())
-    return digest.hexdigest()

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import torch
 
+from eval.cached import checksum
 from eval.config import SearchConfig
 from eval.protocol import Outcome, episodes_of, run_episodes, tie_noise
 from eval.setup import make_eye, make_observation, make_scenes, needs_model, prepare_worker, split_policy
-from eval.store import DetectionStore, checksum, see_all
+from eval.store import DetectionStore, see_all
 from semfov import Detections, Grid, weigh
 from semfov.data.scene import Scenes
 from semfov.errors import DataError

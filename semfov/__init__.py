@@ -8,6 +8,7 @@ from semfov.data import EmbeddedScenes, read_image
 from semfov.detection import Detections, Detector, Selection
 from semfov.detection.load import load_detector
 from semfov.errors import DataError, InputError, SemfovError
+from semfov.eye import Eye
 from semfov.gaze import acquisition, search_policy
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
 from semfov.scanpath import Scanpath
@@ -27,6 +28,7 @@ __all__ = [
     "DirichletStatistics",
     "EmbeddedScenes",
     "Evidence",
+    "Eye",
     "FovealObservationModel",
     "Foveation",
     "Grid",

@@ -20,6 +20,7 @@ SURFACE = {
     "DirichletStatistics",
     "EmbeddedScenes",
     "Evidence",
+    "Eye",
     "FovealObservationModel",
     "Foveation",
     "Grid",

@@ -1,5 +1,7 @@
 """What a fit leaves besides the model: figures on held-out photographs, counts, and a reliability diagram."""
 
+import csv
+import io
 import json
 import platform
 import sys
@@ -40,8 +42,9 @@ def write_report(
     write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
     write_text(config.out / "manifest.json", json.dumps(manifest(model, figures), indent=2) + "\n")
     last = list(models)[-1]
+    write_text(config.out / "counts.csv", counts_csv(model))
     figure = plot_reliability({name: (predictions[name], judged.labels) for name in ("raw scores", last)})
-    names = ["report.md", "config.yaml", "manifest.json"]
+    names = ["report.md", "counts.csv", "config.yaml", "manifest.json"]
     return [*(config.out / name for name in names), save_figure(figure, config.out / "reliability.png")]
 
 
@@ -82,6 +85,16 @@ def report_markdown(
             "",
         ]
     )
+
+
+def counts_csv(model: semfov.FovealObservationModel) -> str:
+    """Detections of each true class at each level that the fit saw."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["class", *(f"level {n}" for n in range(len(model.edges) + 1))])
+    for name, counts in zip(("background", *model.classes), model.metadata["counts"], strict=True):
+        rows.writerow([name, *counts])
+    return text.getvalue()
 
 
 def manifest(model: semfov.FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:

@@ -8,7 +8,6 @@ from torch.nn import functional as F
 
 from semfov.errors import check, check_shape
 from semfov.observation.dirichlet import floor, log_normaliser
-from semfov.observation.fitting import estimate_prior
 from semfov.observation.foveal import FovealObservationModel
 
 
@@ -23,7 +22,7 @@ def fit_discriminative(
     bias_decay: float = 10.0,
     iterations: int = 200,
 ) -> FovealObservationModel:
-    r"""A model whose posterior is calibrated: α and b minimise the cross-entropy of the true classes.
+    r"""A model whose posterior is calibrated: α and π minimise the cross-entropy of the true classes.
 
     The logits of the posterior are linear in the log scores, `Σ_j (α_kdj - 1) ln s_j + c_kd`, so this is multinomial
     logistic regression, and is known as Dirichlet calibration (Kull et al. 2019, "Beyond temperature scaling"), here
@@ -40,8 +39,7 @@ def fit_discriminative(
     of the scores, has the weaker prior of c. The objective, the posterior of these under the samples, is maximised by
     L-BFGS on all samples from a fixed start, so that the result depends on nothing random.
 
-    Trained so, Dir(α) no longer describes the scores: the expected scores are kept from `model`. Its class
-    frequencies become the prior π, so that `calibrate(..., prior=False)` gives likelihoods.
+    Trained so, Dir(α) no longer describes the scores: the expected scores are kept from `model`.
 
     Args:
         model: gives edges, classes, epsilon, metadata, and the expected scores; fitted by `fit`.
@@ -87,8 +85,8 @@ def fit_discriminative(
         [across, within, common, own],
         max_iter=iterations,
         history_size=10,
-        tolerance_grad=1e-7,
-        tolerance_change=1e-9,
+        tolerance_grad=1e-6,
+        tolerance_change=1e-7,
         line_search_fn="strong_wolfe",
     )
 
@@ -107,19 +105,15 @@ def fit_discriminative(
         optimiser.step(loss)
 
     alpha = (start + across + within).detach().exp()
-    count = torch.zeros(components, levels, dtype=torch.int64, device=labels.device)
-    count.index_put_((labels, level), torch.ones_like(labels), accumulate=True)
-    log_prior = estimate_prior(count).to(alpha)
-    # What the posterior's constant is made of beside b: the normaliser of Dir(α), the shift by the floor, and π.
-    offset = log_normaliser(alpha.double()).to(alpha) - (alpha - 1).sum(-1) * lowest - log_prior
+    # c is ln π, less the normaliser of Dir(α), plus the shift by the floor.
+    shift = log_normaliser(alpha.double()).to(alpha) - (alpha - 1).sum(-1) * lowest
     trained = {"decay": decay, "level_decay": level_decay, "bias_decay": bias_decay, "iterations": iterations}
     return FovealObservationModel(
         alpha,
         model.edges.to(alpha),
         model.classes,
         epsilon=model.epsilon,
-        log_prior=log_prior,
-        bias=(common + own).detach() + offset,
+        log_prior=(common + own).detach() + shift,
         expected=model.expected_scores().detach(),
-        metadata={**model.metadata, "method": "discriminative", "discriminative": trained, "counts": count.tolist()},
+        metadata={**model.metadata, "method": "discriminative", "discriminative": trained},
     )

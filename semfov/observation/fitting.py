@@ -9,6 +9,8 @@ from semfov.observation.statistics import DirichletStatistics
 
 # Scores of single precision cannot tell a precision beyond this from certainty.
 MAX_PRECISION = 1e6
+# Samples of the uniform density that a class is mixed with, whatever it has of its own.
+UNIFORM = 1.0
 
 
 def fit_table(
@@ -16,11 +18,11 @@ def fit_table(
 ) -> tuple[Tensor, dict[int, int]]:
     r"""Maximum a posteriori α for every class and level, `(K+1, N, K+1)` in float64.
 
-    The mean logs of a cell are shrunk to those of its class over all levels, and these to those of Dir(1, ..., 1)
-    (`semfov.dirichlet.shrink`):
+    The mean logs of a cell are shrunk to those of its class over all levels, and these by one sample to those of
+    Dir(1, ..., 1) (`semfov.dirichlet.shrink`):
 
     .. math:: g_{k,d} = \frac{n_{k,d} \bar g_{k,d} + w g_k}{n_{k,d} + w}, \qquad
-              g_k = \frac{n_k \bar g_k + w (\psi(1) - \psi(K+1))}{n_k + w}
+              g_k = \frac{n_k \bar g_k + \psi(1) - \psi(K+1)}{n_k + 1}
 
     so that a class without samples gets the uniform density, and a cell without samples that of its class. A level
     with fewer than `minimum` objects in all takes the parameters of its inner neighbour.
@@ -38,7 +40,7 @@ def fit_table(
     check(len(statistics.shape) == 2, "statistics", "a table (K+1, N)", statistics.shape)
     classes = statistics.sum(1)
     uniform = vacuous(statistics.components).to(statistics.count.device)
-    parent = shrink(classes.mean_log, classes.count, uniform, shrinkage)
+    parent = shrink(classes.mean_log, classes.count, uniform, UNIFORM)
     mean_log = shrink(statistics.mean_log, statistics.count, parent[:, None], shrinkage)
     alpha = mle(mean_log, method=method, max_precision=MAX_PRECISION)
     fallback: dict[int, int] = {}
@@ -47,6 +49,17 @@ def fit_table(
             fallback[level] = fallback.get(level - 1, max(level - 1, 0))
             alpha[:, level] = alpha[:, fallback[level]]
     return alpha, fallback
+
+
+def expected_table(statistics: DirichletStatistics, fallback: dict[int, int], shrinkage: float = 10.0) -> Tensor:
+    """Mean scores of every class and level, `(K+1, N, K+1)` in float64, shrunk and falling back as in `fit_table`."""
+    classes = statistics.sum(1)
+    uniform = torch.full_like(classes.mean[0], 1 / statistics.components)
+    parent = shrink(classes.mean, classes.count, uniform, UNIFORM)
+    table = shrink(statistics.mean, statistics.count, parent[:, None], shrinkage)
+    for level, source in fallback.items():
+        table[:, level] = table[:, source]
+    return table / table.sum(-1, keepdim=True)
 
 
 def estimate_prior(count: Tensor, shrinkage: float = 10.0) -> Tensor:

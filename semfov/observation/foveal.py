@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from semfov.errors import DataError, check, check_finite, check_shape, lookup
 from semfov.observation import compatibility
 from semfov.observation.dirichlet import floor, log_normaliser
-from semfov.observation.fitting import estimate_prior, fit_table
+from semfov.observation.fitting import estimate_prior, expected_table, fit_table
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
 from semfov.observation.storage import read, write
@@ -29,12 +29,12 @@ class FovealObservationModel(nn.Module):
 
     (Luzio, Bernardino and Moreno, 2024). The posterior that `calibrate` gives is
 
-    .. math:: P(C = k \mid S, d) \propto \exp\big(\tau \ln \mathrm{Dir}(S \mid \alpha_{k,d}) + b_{k,d}\big) \, \pi_{k,d}
+    .. math:: P(C = k \mid S, d) \propto \mathrm{Dir}(S \mid \alpha_{k,d})^\tau \, \pi_{k,d}
 
-    With `τ = 1`, `b = 0` and a uniform π, as `fit` leaves them, this is the published model. It is overconfident: the
-    density multiplies K+1 dimensions as if each were evidence of its own, though most scores are near zero together.
-    A class prior and τ < 1 help; `semfov.observation.fit_discriminative` trains α and b for the posterior itself,
-    and is what the recommended models use.
+    With `τ = 1` and a uniform π, as `fit` leaves them, this is the published model. It is overconfident: the density
+    multiplies K+1 dimensions as if each were evidence of its own, though most scores are near zero together. A class
+    prior and τ < 1 help; `semfov.observation.fit_discriminative` trains α and π for the posterior itself, and is what
+    the recommended models use.
 
     The logit of a class is linear in the log scores, with weights `τ (α - 1)`. So `α_k = 1 + e_k` with all else
     uniform (`identity`) gives back the scores as they are.
@@ -46,7 +46,6 @@ class FovealObservationModel(nn.Module):
         classes: names of the K classes, without background.
         epsilon: scores are raised to at least this, and scaled to sum to 1.
         log_prior: `(K+1, N)`, ln π up to a constant for each level; None is uniform.
-        bias: `(K+1, N)`, b; None is zero.
         tempering: τ, positive.
         expected: `(K+1, N, K+1)`, what `expected_scores` returns where that is not the mean of Dir(α), as in models
             trained for the posterior; None takes the mean.
@@ -63,7 +62,6 @@ class FovealObservationModel(nn.Module):
 
     edges: Tensor
     log_prior: Tensor
-    bias: Tensor
     tempering: Tensor
     expected: Tensor | None
 
@@ -75,7 +73,6 @@ class FovealObservationModel(nn.Module):
         *,
         epsilon: float = 1e-6,
         log_prior: Tensor | None = None,
-        bias: Tensor | None = None,
         tempering: float = 1.0,
         expected: Tensor | None = None,
         metadata: Mapping[str, Any] | None = None,
@@ -99,7 +96,6 @@ class FovealObservationModel(nn.Module):
         self.register_buffer("edges", borders)
         for name, table, size in [
             ("log_prior", log_prior, shape[:2]),
-            ("bias", bias, shape[:2]),
             ("expected", expected, shape),
         ]:
             if table is not None:
@@ -150,18 +146,10 @@ class FovealObservationModel(nn.Module):
         index = self.level(distance)[..., None, None].expand(*distance.shape, 1, components)
         return every.gather(-2, index).squeeze(-2).to(scores.dtype)
 
-    def calibrate(self, scores: Tensor, distance: Tensor, *, prior: bool = True) -> Tensor:
-        """Calibrated scores: the posterior of the classes, `(..., K+1)`, summing to 1.
-
-        Args:
-            scores: `(..., K+1)`, points of the simplex.
-            distance: `(...)`, in units of the image's longer side.
-            prior: False leaves out π, which gives the likelihoods of the classes up to a factor. Models without a
-                class prior give the same either way.
-        """
+    def calibrate(self, scores: Tensor, distance: Tensor) -> Tensor:
+        """Calibrated scores, the posterior of the classes, `(..., K+1)`; arguments and errors as `log_likelihood`."""
         logits = self.log_likelihood(scores, distance) * self.tempering
-        offset = self.bias + self.log_prior if prior else self.bias
-        return (logits + offset.t()[self.level(distance)]).softmax(-1).to(scores.dtype)
+        return (logits + self.log_prior.t()[self.level(distance)]).softmax(-1).to(scores.dtype)
 
     def expected_scores(self) -> Tensor:
         """Scores to expect of an object, `E[S | C = k, d]`, `(K+1, N, K+1)`."""
@@ -181,6 +169,7 @@ class FovealObservationModel(nn.Module):
         minimum: int = 100,
         prior: bool = False,
         tempering: float = 1.0,
+        expected: Literal["dirichlet", "empirical"] = "dirichlet",
         **metadata: Any,
     ) -> Self:
         """Set α to the maximum a posteriori under the statistics of a training set, and return the model itself.
@@ -191,31 +180,36 @@ class FovealObservationModel(nn.Module):
         Args:
             statistics: sums of the scores by class and level, of shape `(K+1, N)`.
             method: `newton`, `fixed_point` or `gradient` (`semfov.dirichlet.mle`).
-            shrinkage: pseudo-counts that draw a cell to its class, and a class to the uniform density.
+            shrinkage: pseudo-counts that draw a cell to its class.
             minimum: objects, background not counted, that a level needs.
             prior: take the frequencies of the classes as prior; False leaves it uniform, as published.
-            tempering: factor τ of the log likelihood.
+            tempering: exponent τ of the likelihood.
+            expected: what `expected_scores` returns: the means of the fitted Dirichlets, as published, or those of
+                the data. They differ, for a Dirichlet that is fitted to mean logs need not have the mean of the data.
             metadata: JSON values to keep with the model.
         """
         components, levels = self.log_alpha.shape[:2]
         wanted, got = ((components, levels), self.epsilon), (statistics.shape, statistics.epsilon)
         check(got == wanted, "statistics", f"shape and epsilon {wanted}", got)
         check(tempering > 0, "tempering", "a positive number", tempering)
+        lookup(expected, ["dirichlet", "empirical"], "kind of expected scores")
         alpha, fallback = fit_table(statistics, method=method, shrinkage=shrinkage, minimum=minimum)
         if fallback:
-            told = ", ".join(f"{level} takes those of {source}" for level, source in fallback.items())
-            warnings.warn(f"levels with fewer than {minimum} objects: {told}", stacklevel=2)
+            told = ", ".join(f"level {n} as level {source}" for n, source in fallback.items() if n > 0)
+            told += "; level 0 has no inner neighbour and rests on the classes' other levels" * (0 in fallback)
+            warnings.warn(f"levels with fewer than {minimum} objects fall back: {told}", stacklevel=2)
         self.log_alpha.copy_(alpha.log())
         self.log_prior.copy_(estimate_prior(statistics.count, shrinkage) if prior else torch.tensor(0.0))
-        self.bias.zero_()
         self.tempering.fill_(tempering)
-        self.expected = None
+        own = expected == "empirical"
+        self.expected = expected_table(statistics, fallback, shrinkage).to(self.log_alpha) if own else None
         self.metadata |= {
             "counts": statistics.count.tolist(),
             "fallback": {str(level): source for level, source in fallback.items()},
             "method": method,
             "shrinkage": shrinkage,
             "minimum": minimum,
+            "expected": expected,
             **metadata,
         }
         return self

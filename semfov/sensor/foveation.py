@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov.errors import check, check_finite, check_shape, lookup
-from semfov.sensor.pyramid import Bands, Convention, laplacian_pyramid, pyrup
+from semfov.sensor.pyramid import Bands, Convention, constant, laplacian_pyramid, places, pyrup
 
 
 def foveate(
@@ -130,26 +130,50 @@ class Foveation(nn.Module):
 def _collapse(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> Tensor:
     """Put the pyramid together around `(B, G, 2)` fixations: `(B, G, C, H, W)`."""
     batch, many = fixation.shape[:2]
+    if not bands.details:
+        return bands.base[:, None].repeat(1, many, 1, 1, 1)
+    windows = _windows(bands, fixation, sigma, growth)
     result = bands.base
     for k in reversed(range(len(bands.details))):
         band = bands.details[k]
+        across, down = windows[k]
+        window = (down[..., :, None] * across[..., None, :])[:, :, None]
         expanded = pyrup(result, (band.shape[-2], band.shape[-1]), bands.convention)
-        # All fixations share the coarsest level.
-        shared = expanded.shape[0] == batch
-        expanded = expanded[:, None] if shared else expanded.unflatten(0, (batch, many))
-        across = _window(bands, k, -1, fixation[..., 0], sigma[:, 0] * growth**k)
-        down = _window(bands, k, -2, fixation[..., 1], sigma[:, 1] * growth**k)
-        window = down[:, :, None, :, None] * across[:, :, None, None, :]
-        result = torch.addcmul(expanded, window, band[:, None]).flatten(0, 1)
-    if not bands.details:
-        return result[:, None].repeat(1, many, 1, 1, 1)
+        if k == len(bands.details) - 1:
+            # All fixations share the coarsest level.
+            result = torch.addcmul(expanded[:, None], window, band[:, None]).flatten(0, 1)
+        else:
+            expanded.unflatten(0, (batch, many)).addcmul_(window, band[:, None])
+            result = expanded
     return result.unflatten(0, (batch, many))
 
 
-def _window(bands: Bands, k: int, axis: int, centre: Tensor, sigma: Tensor) -> Tensor:
-    """Gaussian window of band k along one axis, `(B, G, n)`, for centres `(B, G)` and widths `(B,)`."""
-    offset = bands.places(k, axis) - centre[..., None]
-    return torch.exp(offset.square() * (-0.5 / sigma.square())[:, None, None])
+def _windows(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Gaussian windows `(B, G, w_k)` across and `(B, G, h_k)` down every band, all from one exponential."""
+    sizes = tuple((band.shape[-2], band.shape[-1]) for band in bands.details)
+    place, power, axis, level = _layout(sizes, bands.convention, sigma.dtype, sigma.device)
+    widths = (sigma[..., None] * growth**power).flatten(1)
+    offset = (place - fixation.index_select(-1, axis)) / widths.index_select(-1, level)[:, None]
+    pieces = offset.square().mul(-0.5).exp().split([n for size in sizes for n in reversed(size)], -1)
+    return list(zip(pieces[0::2], pieces[1::2], strict=True))
+
+
+@constant
+def _layout(
+    sizes: tuple[tuple[int, int], ...], convention: Convention, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """For pixels along x and y of every band: places; powers of the growth; the pixels' axes, and their widths."""
+    lines = [(axis, k) for k in range(len(sizes)) for axis in (0, 1)]
+    place = [places(sizes[k][1 - axis], sizes[0][1 - axis], k, convention) for axis, k in lines]
+    counts = torch.tensor([sizes[k][1 - axis] for axis, k in lines])
+    axes, levels = (torch.tensor(n).repeat_interleave(counts) for n in zip(*lines, strict=True))
+    power = torch.arange(len(sizes))
+    return (
+        torch.cat(place).to(device, dtype),
+        power.to(device, dtype),
+        axes.to(device),
+        (axes * len(sizes) + levels).to(device),
+    )
 
 
 def _widths(sigma: float | Tensor, like: Tensor) -> Tensor:

@@ -1,8 +1,9 @@
 """Gaussian and Laplacian pyramids in Kornia's and in OpenCV's convention, for images of any size."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Literal, get_args
+from functools import lru_cache, wraps
+from typing import Any, Literal, ParamSpec, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -12,14 +13,36 @@ from semfov.errors import check, check_shape, lookup
 
 Convention = Literal["kornia", "opencv"]
 
-# Kornia blurs with [1 4 6 4 1] / 16 and resizes bilinearly. Between even sizes both are one filter:
-# halving averages two blurred pixels, doubling blurs pixels at 1/4 and 3/4 between two.
 _BLUR = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
-_HALVE = (1 / 32, 5 / 32, 10 / 32, 10 / 32, 5 / 32, 1 / 32)
-_DOUBLE_EVEN = (1 / 64, 21 / 64, 35 / 64, 7 / 64)
-_DOUBLE_ODD = _DOUBLE_EVEN[::-1]
+# Kornia blurs and resizes bilinearly, which between even sizes is one filter too: halving averages two blurred
+# pixels, doubling blurs pixels at 1/4 and 3/4 between two. The taps of `_DOUBLE` are for pixels with zeros between.
+_HALVE = {"kornia": tuple(t / 32 for t in (1, 5, 10, 10, 5, 1)), "opencv": _BLUR}
+_DOUBLE = {"kornia": tuple(t / 64 for t in (1, 7, 21, 35, 35, 21, 7, 1)), "opencv": tuple(2 * t for t in _BLUR)}
 
 _SMALL = 128
+_ONEDNN = torch.backends.mkldnn.is_available()
+
+Constants = TypeVar("Constants")
+Arguments = ParamSpec("Arguments")
+
+
+def constant(function: Callable[Arguments, Constants]) -> Callable[Arguments, Constants]:
+    """Remember the tensors that a function makes of sizes and settings alone; a compiled graph makes its own."""
+
+    @lru_cache(maxsize=256)
+    def remember(*args: Any) -> Any:
+        # What is made during inference must serve a later gradient too.
+        with torch.inference_mode(False), torch.no_grad():
+            return function(*args)  # type: ignore[call-arg]
+
+    @wraps(function)
+    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Constants:
+        if torch.compiler.is_compiling():
+            return function(*args, **kwargs)
+        result: Constants = remember(*args, **kwargs)
+        return result
+
+    return call
 
 
 @dataclass(frozen=True)
@@ -45,9 +68,13 @@ class Bands:
     def places(self, k: int, axis: int) -> Tensor:
         """Where in the image the pixels of band k lie, along y (axis -2) or x (-1): `(n,)`, in image pixels."""
         band = self.details[k]
-        count, length = band.shape[axis], self.size[axis]
-        place = torch.arange(count, dtype=band.dtype, device=band.device)
-        return place * 2**k if self.convention == "opencv" else (place + 0.5) * (length / count) - 0.5
+        return places(band.shape[axis], self.size[axis], k, self.convention).to(band)
+
+
+def places(count: int, length: int, k: int, convention: Convention) -> Tensor:
+    """Where on a line of `length` pixels those of its `count` in band k lie: `(count,)`, double precision."""
+    place = torch.arange(count, dtype=torch.float64)
+    return place * 2**k if convention == "opencv" else (place + 0.5) * (length / count) - 0.5
 
 
 def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
@@ -72,9 +99,7 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     if max(height, width) <= _SMALL and not torch.compiler.is_compiling():
         down, across = (_matrix(n, None, convention, image.dtype, image.device) for n in (height, width))
         return down @ image @ across.mT
-    for axis in (-2, -1):
-        image = _reduce(image, axis, convention)
-    return image
+    return _reduce(_reduce(image, convention).mT, convention).mT
 
 
 def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia") -> Tensor:
@@ -100,7 +125,9 @@ def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia
         lengths = zip(image.shape[-2:], size, strict=True)
         down, across = (_matrix(n, length, convention, image.dtype, image.device) for n, length in lengths)
         return down @ image @ across.mT
-    return _expand(_expand(image, -1, size[1], convention), -2, size[0], convention)
+    # Copies for the sake of speed: the transposed convolution is quick in one memory layout only.
+    across = _expand(image.mT.contiguous(), size[1], convention).mT.contiguous()
+    return _expand(across, size[0], convention)
 
 
 def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> Bands:
@@ -122,120 +149,109 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
     details = []
     for _ in range(levels):
         smaller = pyrdown(image, convention)
-        details.append(image - pyrup(smaller, (image.shape[-2], image.shape[-1]), convention))
+        expanded = pyrup(smaller, (image.shape[-2], image.shape[-1]), convention)
+        # Fresh memory costs more than the difference itself, so it is taken only where a gradient or a graph needs it.
+        fresh = expanded.requires_grad or torch.compiler.is_compiling()
+        details.append(image - expanded if fresh else torch.sub(image, expanded, out=expanded))
         image = smaller
     return Bands(tuple(details), image, convention)
 
 
-@lru_cache(maxsize=256)
+@constant
 def _matrix(count: int, length: int | None, convention: Convention, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix that reduces a line of `count` pixels, or expands it to `length`.
 
     Levels of a few thousand pixels cost less as two matrix products than as many short sums.
     """
-    with torch.no_grad():
-        lines = torch.eye(count, dtype=torch.float64)[None, None]
-        lines = _reduce(lines, -2, convention) if length is None else _expand(lines, -2, length, convention)
-        return lines[0, 0].to(dtype=dtype, device=device)
+    lines = torch.eye(count, dtype=torch.float64)[None, None]
+    lines = _reduce(lines, convention) if length is None else _expand(lines, length, convention)
+    return lines[0, 0].to(dtype=dtype, device=device)
 
 
-def _reduce(image: Tensor, axis: int, convention: Convention) -> Tensor:
-    """`pyrdown` along one axis."""
-    count = image.shape[axis]
-    if convention == "opencv":
-        return _halve(image, axis, _BLUR)
-    if count % 2 == 0 and count >= 4:
-        return _halve(image, axis, _HALVE)
-    return _resize(_blur(image, axis), axis, max(count // 2, 1))
+def _reduce(image: Tensor, convention: Convention) -> Tensor:
+    """`pyrdown` along the height."""
+    count = image.shape[-2]
+    if _convolves(image) and (convention == "opencv" or count % 2 == 0):
+        return _convolve(image, (count + 1) // 2, convention)
+    return _blur(image)[..., ::2, :] if convention == "opencv" else _resize(_blur(image), max(count // 2, 1))
 
 
-def _expand(image: Tensor, axis: int, length: int, convention: Convention) -> Tensor:
-    """`pyrup` along one axis."""
-    count = image.shape[axis]
-    if convention == "opencv":
-        return _double_opencv(image, axis).narrow(axis, 0, length)
-    if length == 2 * count and count >= 4:
-        return _double(image, axis)
-    return _blur(_resize(image, axis, length), axis)
+def _expand(image: Tensor, length: int, convention: Convention) -> Tensor:
+    """`pyrup` along the height."""
+    count = image.shape[-2]
+    if _convolves(image) and (convention == "opencv" or length == 2 * count):
+        return _convolve(image, length, convention)
+    if convention == "kornia":
+        return _blur(_resize(image, length))
+    before = torch.cat([image[..., min(1, count - 1), None, :], image[..., :-1, :]], -2)
+    after = torch.cat([image[..., 1:, :], image[..., -1:, :]], -2)
+    pairs = torch.stack([(before + 6 * image + after) / 8, (image + after) / 2], -2)
+    return pairs.flatten(-3, -2)[..., :length, :]
 
 
-def _filter(pieces: list[Tensor], taps: tuple[float, ...]) -> Tensor:
-    """Weighted sum of shifted views; on a CPU several times faster than a convolution of one channel."""
-    result = pieces[0] * taps[0]
-    for piece, tap in zip(pieces[1:], taps[1:], strict=True):
-        # The sum is ours to write to, unless a gradient is to flow back through it.
-        result = torch.add(result, piece, alpha=tap) if torch.is_grad_enabled() else result.add_(piece, alpha=tap)
+def _blur(image: Tensor) -> Tensor:
+    """Five taps along the height, the image mirrored at its outermost pixels, to and fro where it has but one or two."""
+    count = image.shape[-2]
+    place = torch.arange(-2, count + 2, device=image.device).abs() % max(2 * count - 2, 1)
+    extended = image.index_select(-2, torch.minimum(place, 2 * count - 2 - place))
+    result = extended[..., :count, :] * _BLUR[0]
+    for i in range(1, 5):
+        result = torch.add(result, extended[..., i : i + count, :], alpha=_BLUR[i])
     return result
 
 
-def _part(image: Tensor, axis: int, start: int, stop: int) -> Tensor:
-    return image[..., start:stop, :] if axis == -2 else image[..., start:stop]
+def _resize(image: Tensor, length: int) -> Tensor:
+    """Bilinear resizing along the height, without antialiasing."""
+    return F.interpolate(image, (length, image.shape[-1]), mode="bilinear", align_corners=False)
 
 
-def _reflect(image: Tensor, axis: int) -> Tensor:
-    """Continue an image by two pixels beyond its borders along one axis, mirrored at the outermost pixels."""
-    count = image.shape[axis]
-    if count > 2:
-        return F.pad(image, (2, 2, 0, 0) if axis == -1 else (0, 0, 2, 2), mode="reflect")
-    # A line of one or two pixels is mirrored to and fro, as `BORDER_REFLECT_101` of OpenCV does.
-    place = torch.arange(-2, count + 2, device=image.device) % max(2 * count - 2, 1)
-    return image.index_select(axis, place)
+def _convolves(image: Tensor) -> bool:
+    """Whether `_convolve` is fast here: on a CPU it takes oneDNN, which computes in single precision."""
+    fast = image.device.type != "cpu" or (_ONEDNN and image.dtype == torch.float32)
+    return fast and image.shape[-2] >= 8 and not torch.compiler.is_compiling()
 
 
-def _blur(image: Tensor, axis: int) -> Tensor:
-    extended, count = _reflect(image, axis), image.shape[axis]
-    return _filter([_part(extended, axis, i, i + count) for i in range(5)], _BLUR)
+def _convolve(image: Tensor, length: int, convention: Convention) -> Tensor:
+    """Halve or double the height in one pass: a depthwise convolution whose channels are the columns."""
+    top, bottom = _borders(image.shape[-2], length, convention, image.dtype, image.device)
+    planes = image.flatten(0, -3)
+    result = _convolve_zeros(planes, length, convention)
+    count = planes.shape[0]
+    result[:, :3].baddbmm_(top.expand(count, 3, 3), planes[:, :3])
+    result[:, -3:].baddbmm_(bottom.expand(count, 3, 3), planes[:, -3:])
+    return result.unflatten(0, image.shape[:-2])
 
 
-def _resize(image: Tensor, axis: int, length: int) -> Tensor:
-    """Bilinear resizing along one axis, without antialiasing."""
-    size = (length, image.shape[-1]) if axis == -2 else (image.shape[-2], length)
-    return F.interpolate(image, size, mode="bilinear", align_corners=False)
+def _convolve_zeros(planes: Tensor, length: int, convention: Convention) -> Tensor:
+    """The same for planes `(N, height, width)` with zeros beyond their borders."""
+    count, width = planes.shape[-2:]
+    columns = planes[:, None].permute(0, 3, 1, 2)
+    kernel = _kernel(length < count, width, convention, planes.dtype, planes.device)
+    taps = kernel.shape[-1]
+    padding = (0, (taps - 1) // 2)
+    if length < count:
+        result = F.conv2d(columns, kernel, None, (1, 2), padding, groups=width)
+    else:
+        rest = (0, length - 2 * count + taps % 2)
+        result = F.conv_transpose2d(columns, kernel, None, (1, 2), padding, rest, groups=width)
+    return result.permute(0, 2, 3, 1)[:, 0]
 
 
-def _halve(image: Tensor, axis: int, taps: tuple[float, ...]) -> Tensor:
-    """Correlate with 5 or 6 taps at every second place, from two pixels before the border on."""
-    extended = _reflect(image, axis)
-    count = (extended.shape[axis] - len(taps)) // 2 + 1
-    even, odd = _phases(extended, axis)
-    pieces = [_part(odd if i % 2 else even, axis, i // 2, i // 2 + count) for i in range(len(taps))]
-    return _filter(pieces, taps)
+@constant
+def _kernel(halve: bool, width: int, convention: Convention, dtype: torch.dtype, device: torch.device) -> Tensor:
+    taps = (_HALVE if halve else _DOUBLE)[convention]
+    return torch.tensor(taps, dtype=dtype, device=device).expand(width, 1, 1, -1).contiguous()
 
 
-def _phases(image: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-    """Pixels with even and with odd numbers along one axis, laid out for sums of shifted views."""
-    if axis == -2:
-        return image[..., 0::2, :], image[..., 1::2, :]
-    return image[..., 0::2].contiguous(), image[..., 1::2].contiguous()
-
-
-def _interleave(even: Tensor, odd: Tensor, axis: int) -> Tensor:
-    """Even and odd pixels in turn."""
-    if axis == -1 and even.dtype in (torch.float32, torch.float64):
-        # Pairs of neighbours are laid out as complex numbers are, and those are written in one pass.
-        return torch.view_as_real(torch.complex(even, odd)).flatten(-2)
-    return torch.stack([even, odd], axis).flatten(axis - 1, axis)
-
-
-def _double(image: Tensor, axis: int) -> Tensor:
-    """Kornia's enlargement to twice the size: two filters of four taps, for even and for odd pixels."""
-    count = image.shape[axis]
-    first, second = _part(image, axis, 0, 1), _part(image, axis, 1, 2)
-    last, previous = _part(image, axis, count - 1, count), _part(image, axis, count - 2, count - 1)
-    # Continued like this, the inner filters give what clamped resizing and reflected blur give at the borders,
-    # but for one pixel of each phase, which is put right afterwards.
-    extended = torch.cat([7 * second - 6 * first, first, image, last, 7 * previous - 6 * last], axis)
-    pieces = [_part(extended, axis, i, i + count) for i in range(5)]
-    even, odd = _filter(pieces[:4], _DOUBLE_EVEN), _filter(pieces[1:], _DOUBLE_ODD)
-    _part(even, axis, count - 1, count).add_(previous - last, alpha=1 / 64)
-    _part(odd, axis, 0, 1).add_(second - first, alpha=1 / 64)
-    return _interleave(even, odd, axis)
-
-
-def _double_opencv(image: Tensor, axis: int) -> Tensor:
-    """OpenCV's enlargement: pixels with zeros between them, blurred and doubled."""
-    count = image.shape[axis]
-    second = _part(image, axis, min(1, count - 1), min(1, count - 1) + 1)
-    extended = torch.cat([second, image, _part(image, axis, count - 1, count)], axis)
-    pieces = [_part(extended, axis, i, i + count) for i in range(3)]
-    return _interleave(_filter(pieces, (1 / 8, 6 / 8, 1 / 8)), _filter(pieces[1:], (1 / 2, 1 / 2)), axis)
+@constant
+def _borders(
+    count: int, length: int, convention: Convention, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """What zeros beyond the borders leave out: `(3, 3)`, of the first three pixels and of the last three."""
+    # A line of 8 or 9 pixels has the borders of a long one.
+    short = 8 + count % 2
+    length += (short - count) // 2 if length < count else 2 * (short - count)
+    lines = torch.eye(short, dtype=torch.float64)[None]
+    exact = _reduce(lines[None], convention) if length < short else _expand(lines[None], length, convention)
+    missing = (exact[0] - _convolve_zeros(lines, length, convention))[0].to(dtype=dtype, device=device)
+    return missing[:3, :3], missing[-3:, -3:]

@@ -194,5 +194,5 @@ def test_inverse_digamma_inverts():
     ],
 )
 def test_bad_arguments_are_named(call):
-    with pytest.raises(InputError, match="expected|did you mean"):
+    with pytest.raises(InputError, match=r"expected|did you mean"):
         call()

@@ -1,38 +1,51 @@
-"""Linear maps along one axis of an image as banded matrices: blur, subsampling and enlargement as few matrix products.
+"""Blur and enlargement of images as products of matrices with their lines.
 
-On a CPU this is several times faster than a convolution of one channel, and the borders are part of the matrix.
+On a CPU this is several times faster than a convolution of few channels, above all for wide kernels.
 """
 
 from functools import lru_cache
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-# Rows of one block: a larger block multiplies more zeros, a smaller one makes smaller products.
-_ROWS = 48
+from semfov.errors import check, check_shape
 
-Blocks = tuple[tuple[int, int, Tensor], ...]
+# Pixels that one product makes at once: more of them multiply more zeros, fewer copy more pixels twice.
+_TILE = 64
 
 
-def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor:
-    r"""Blur with a Gaussian, the outermost pixels continued beyond the borders.
+def gaussian_kernel(sigma: float) -> Tensor:
+    r"""Weights of a Gaussian, `(2r+1,)` in float64.
 
     .. math:: w_i \propto \exp(-i^2 / 2\sigma^2), \quad |i| \le r, \quad 2r + 1 = \mathrm{round}(8\sigma + 1)
 
-    the odd number of taps rounded up: `cv2.GaussianBlur` of floats with `BORDER_REPLICATE` and no kernel size.
+    the number of taps made odd by rounding up: OpenCV's kernel for floats where no size is given.
+
+    >>> gaussian_kernel(0.25)
+    tensor([3.3524e-04, 9.9933e-01, 3.3524e-04], dtype=torch.float64)
+    """
+    check(sigma > 0, "sigma", "a positive number of pixels", sigma)
+    radius = (round(8 * sigma + 1) | 1) // 2
+    weight = torch.exp(-(torch.arange(-radius, radius + 1).double() ** 2) / (2 * sigma**2))
+    return weight / weight.sum()
+
+
+def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor:
+    """Blur with a Gaussian, borders continued: `cv2.GaussianBlur` of floats with `BORDER_REPLICATE`.
 
     Args:
-        image: `(..., H, W)`.
-        sigma: standard deviation in pixels.
-        halve: keep only pixels `floor(i n / m)` of each axis, `m = floor(n / 2)` of n (nearest-neighbour halving).
+        image: `(B, C, H, W)`.
+        sigma: standard deviation in pixels, see `gaussian_kernel`.
+        halve: keep only the first of every two pixels, `floor(n / 2)` of n (at least 1) along each axis.
 
     >>> gaussian_blur(torch.ones(1, 3, 5, 7), 2.0, halve=True).shape
     torch.Size([1, 3, 2, 3])
     """
+    check_shape(image, "image", None, None, None, None)
+    check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
     step = 2 if halve else 1
-    for axis in (-2, -1):
-        image = _apply(_blocks("gaussian", image, axis, sigma, max(image.shape[axis] // step, 1)), image, axis)
-    return image
+    return _blur(_blur(image, -1, sigma, step), -2, sigma, step)
 
 
 def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
@@ -41,73 +54,68 @@ def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
     >>> enlarge(torch.rand(1, 2, 3), (4, 5)).shape
     torch.Size([1, 4, 5])
     """
-    for axis in (-2, -1):
-        if image.shape[axis] != size[axis]:
-            image = _apply(_blocks("cubic", image, axis, 0.0, size[axis]), image, axis)
+    check_shape(image, "image", None, None)
+    height, width = size
+    # A compiler traces the matrices into its graph; a cache would be a side effect.
+    matrix = _cubic_matrix if torch.compiler.is_compiling() else _cached_cubic_matrix
+    if image.shape[-1] != width:
+        image = image @ matrix(image.shape[-1], width, image.dtype, image.device).mT
+    if image.shape[-2] != height:
+        image = matrix(image.shape[-2], height, image.dtype, image.device) @ image
     return image
 
 
-def _apply(blocks: Blocks, image: Tensor, axis: int) -> Tensor:
-    if axis == -2:
-        pieces = [matrix @ image[..., start:stop, :] for start, stop, matrix in blocks]
-    else:
-        pieces = [image[..., start:stop] @ matrix.mT for start, stop, matrix in blocks]
-    return pieces[0] if len(pieces) == 1 else torch.cat(pieces, axis)
+def _blur(image: Tensor, axis: int, sigma: float, step: int) -> Tensor:
+    """Blur along one axis and keep the first of every `step` pixels."""
+    batch, channels, _, width = image.shape
+    count = image.shape[axis]
+    length = max(count // step, 1)
+    tile = min(_TILE, length)
+    tiles = -(-length // tile)
+    blocks = _block if torch.compiler.is_compiling() else _cached_block
+    block = blocks(sigma, tile, step, image.dtype, image.device)
+    # Every tile is the same product with a window of the line that reaches as far as its outermost taps.
+    window = block.shape[1]
+    radius = (window - (tile - 1) * step) // 2
+    after = max((tiles - 1) * tile * step + window - radius - count, 0)
+    padding = (radius, after, 0, 0) if axis == -1 else (0, 0, radius, after)
+    windows = F.pad(image, padding, mode="replicate").unfold(axis, window, tile * step)
+    if axis == -1:
+        return (windows @ block.mT).flatten(-2)[..., :length]
+    windows = windows.mT.reshape(-1, window, width)
+    blurred = torch.bmm(block.expand(len(windows), -1, -1), windows)
+    return blurred.reshape(batch, channels, tiles * tile, width)[..., :length, :]
 
 
-def _blocks(kind: str, image: Tensor, axis: int, sigma: float, length: int) -> Blocks:
-    # A compiler traces the matrices into its graph; a cache would be a side effect.
-    build = _build if torch.compiler.is_compiling() else _cached
-    return build(kind, image.shape[axis], sigma, length, image.dtype, image.device)
+def _block(sigma: float, tile: int, step: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`(tile, window)`: the kernel in every row, each `step` pixels further than the one before."""
+    kernel = gaussian_kernel(sigma)
+    index = torch.arange(tile)[:, None] * step + torch.arange(len(kernel))
+    block = torch.zeros(tile, (tile - 1) * step + len(kernel), dtype=torch.float64)
+    return block.scatter(1, index, kernel.expand(tile, -1)).to(device, dtype)
 
 
-def _build(kind: str, count: int, sigma: float, length: int, dtype: torch.dtype, device: torch.device) -> Blocks:
-    """Blocks `(first pixel, end, matrix)` of the map from lines of `count` pixels to lines of `length`."""
-    index, weight = _gaussian(count, sigma, length) if kind == "gaussian" else _cubic(count, length)
-    reach = int(weight.shape[1])
-    blocks = []
-    for first in range(0, length, _ROWS):
-        last = min(first + _ROWS, length) - 1
-        # Where the outermost taps of the block's first and last row lie.
-        start = max(_middle(kind, first, count, length) - reach // 2, 0)
-        stop = min(_middle(kind, last, count, length) + reach // 2 + 1, count)
-        matrix = torch.zeros(last + 1 - first, stop - start, dtype=torch.float64)
-        matrix = matrix.scatter_add(1, index[first : last + 1] - start, weight[first : last + 1])
-        blocks.append((start, stop, matrix.to(device, dtype)))
-    return tuple(blocks)
-
-
-@lru_cache(maxsize=256)
-def _cached(kind: str, count: int, sigma: float, length: int, dtype: torch.dtype, device: torch.device) -> Blocks:
-    # Tensors born in inference mode could not take part in a later backward pass.
-    with torch.inference_mode(False), torch.no_grad():
-        return _build(kind, count, sigma, length, dtype, device)
-
-
-def _middle(kind: str, row: int, count: int, length: int) -> int:
-    """Pixel on which the taps of a row of the matrix are centred."""
-    if kind == "gaussian":
-        return row * count // length
-    return ((2 * row + 1) * count - length) // (2 * length)
-
-
-def _gaussian(count: int, sigma: float, length: int) -> tuple[Tensor, Tensor]:
-    """Pixels and weights of every tap, `(length, taps)`."""
-    radius = (round(8 * sigma + 1) | 1) // 2
-    offset = torch.arange(-radius, radius + 1)
-    weight = torch.exp(-(offset.double() ** 2) / (2 * sigma**2))
-    middle = torch.arange(length) * count // length
-    return (middle[:, None] + offset).clamp(0, count - 1), (weight / weight.sum()).expand(length, -1)
-
-
-def _cubic(count: int, length: int) -> tuple[Tensor, Tensor]:
-    """Pixels and weights of every tap, `(length, 5)`; the first tap is idle, so that the taps have a middle."""
-    numerator = (2 * torch.arange(length) + 1) * count - length
-    middle = numerator.div(2 * length, rounding_mode="floor")
-    offset = torch.arange(-2, 3)
-    distance = (numerator.double() / (2 * length) - middle)[:, None].sub(offset).abs()
+def _cubic_matrix(count: int, length: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`(length, count)`: Keys' cubic convolution with a = -0.75, pixels as areas, borders continued."""
+    place = (torch.arange(length).double() + 0.5) * (count / length) - 0.5
+    index = place.floor().long()[:, None] + torch.arange(-1, 3)
+    distance = (place[:, None] - index).abs()
     a = -0.75
     near = ((a + 2) * distance - (a + 3)) * distance**2 + 1
     far = a * (((distance - 5) * distance + 8) * distance - 4)
-    weight = torch.where(distance <= 1, near, torch.where(distance < 2, far, 0.0))
-    return (middle[:, None] + offset).clamp(0, count - 1), weight
+    matrix = torch.zeros(length, count, dtype=torch.float64)
+    matrix = matrix.scatter_add(1, index.clamp(0, count - 1), torch.where(distance <= 1, near, far))
+    return matrix.to(device, dtype)
+
+
+@lru_cache(maxsize=64)
+def _cached_block(sigma: float, tile: int, step: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    # Tensors born in inference mode could not take part in a later backward pass.
+    with torch.inference_mode(False), torch.no_grad():
+        return _block(sigma, tile, step, dtype, device)
+
+
+@lru_cache(maxsize=64)
+def _cached_cubic_matrix(count: int, length: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False), torch.no_grad():
+        return _cubic_matrix(count, length, dtype, device)

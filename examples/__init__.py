@@ -1,0 +1,1 @@
+"""Short programs that use semfov as a library."""

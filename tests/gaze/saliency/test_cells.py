@@ -1,0 +1,65 @@
+"""Cells of a saliency map against a brute force on repeated pixels."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.belief import Grid
+from semfov.errors import InputError
+from semfov.gaze.saliency import cell_saliency
+
+
+@given(st.integers(1, 23), st.integers(1, 23), st.integers(1, 8), st.integers(1, 8))
+def test_mean_and_max_are_the_brute_forces(height: int, width: int, columns: int, rows: int) -> None:
+    saliency = np.random.default_rng(height + 100 * width).random((2, height, width))
+    # Every pixel as rows x columns pieces: then every cell has height x width whole pieces.
+    pieces = saliency.repeat(rows, 1).repeat(columns, 2)
+    cells = pieces.reshape(2, rows, height, columns, width).transpose(0, 1, 3, 2, 4).reshape(2, rows * columns, -1)
+    for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 2e-6)):
+        tensor = torch.from_numpy(saliency).to(dtype)
+        mean, largest = cell_saliency(tensor, columns, rows), cell_saliency(tensor, columns, rows, "max")
+        np.testing.assert_allclose(mean.numpy(), cells.mean(-1), atol=tolerance)
+        np.testing.assert_allclose(largest.numpy(), cells.max(-1), atol=tolerance)
+
+
+def test_cells_are_the_grids() -> None:
+    saliency = torch.zeros(1, 47, 61)
+    saliency[0, 33, 50] = 1.0
+    expected = Grid(7, 5, (61, 47)).cell_of(torch.tensor([50.0, 33.0]))
+    for reduction in ("mean", "max"):
+        assert cell_saliency(saliency, 7, 5, reduction).argmax() == expected
+
+
+def test_mean_keeps_the_mass(device: torch.device) -> None:
+    saliency = torch.rand(3, 31, 50, dtype=torch.float64, device=device)
+    torch.testing.assert_close(cell_saliency(saliency, 8, 7).mean(-1), saliency.mean((-2, -1)))
+
+
+def test_gradients_and_compilation() -> None:
+    saliency = torch.rand(2, 5, 7, dtype=torch.float64, requires_grad=True)
+    for reduction in ("mean", "max"):
+        assert torch.autograd.gradcheck(lambda x, how=reduction: cell_saliency(x, 3, 2, how), saliency)
+        compiled = torch.compile(cell_saliency, fullgraph=True, backend="eager")
+        assert torch.equal(compiled(saliency, 3, 2, reduction), cell_saliency(saliency, 3, 2, reduction))
+
+
+@pytest.mark.parametrize(
+    ("shape", "columns", "rows", "reduction", "named"),
+    [
+        ((4, 4), 2, 2, "mean", "saliency"),
+        ((1, 1, 4, 4), 2, 2, "mean", "saliency"),
+        ((1, 0, 4), 2, 2, "mean", "saliency"),
+        ((1, 4, 4), 0, 2, "mean", "columns"),
+        ((1, 4, 4), 2, 2, "sum", "reduction"),
+    ],
+)
+def test_bad_input(shape: tuple[int, ...], columns: int, rows: int, reduction: str, named: str) -> None:
+    with pytest.raises(InputError, match=named):
+        cell_saliency(torch.zeros(shape), columns, rows, reduction)
+
+
+def test_whole_numbers_are_refused() -> None:
+    with pytest.raises(InputError, match="saliency"):
+        cell_saliency(torch.zeros(1, 4, 4, dtype=torch.long), 2, 2)

@@ -1,0 +1,210 @@
+"""Itti, Koch and Niebur's model against its steps written with OpenCV and loops."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from semfov.errors import InputError
+from semfov.gaze.saliency import IttiKoch, itti_koch_saliency
+from semfov.gaze.saliency.itti import (
+    across_scales,
+    gabor_kernels,
+    gaussian_pyramid,
+    local_maxima,
+    orientation_energy,
+    promote,
+)
+
+
+def numpy_promote(image: np.ndarray) -> np.ndarray:
+    """N(.) of one map, looking for peaks pixel by pixel."""
+    low, high = image.min(), image.max()
+    if high - low < 1e-5:
+        return np.zeros_like(image)
+    image = (image - low) / (high - low)
+    height, width = image.shape
+    peaks = []
+    for y, x in np.argwhere(image > 0.1):
+        around = [
+            (image[v, u], -(v * width + u))
+            for v in range(max(y - 1, 0), min(y + 2, height))
+            for u in range(max(x - 1, 0), min(x + 2, width))
+            if (v, u) != (y, x)
+        ]
+        if all((image[y, x], -(y * width + x)) > other for other in around):
+            peaks.append(image[y, x])
+    others = sorted(peaks)[:-1]
+    return image * (1 - (np.mean(others) if others else 0)) ** 2
+
+
+def opencv_gabor(angle: float, phase: float) -> np.ndarray:
+    """OpenCV turns the other way, and its phase is added to the wave."""
+    kernel = cv2.getGaborKernel((9, 9), 7 / 3, np.deg2rad(angle), 7.0, 1.0, phase)[::-1, ::-1]
+    kernel = kernel - kernel.mean()
+    return kernel / np.abs(kernel).sum()
+
+
+def opencv_energy(image: np.ndarray, angle: float) -> np.ndarray:
+    answers = [
+        cv2.filter2D(image, -1, opencv_gabor(angle, phase), borderType=cv2.BORDER_REPLICATE) for phase in (0, np.pi / 2)
+    ]
+    return np.abs(answers).sum(0)
+
+
+def opencv_itti_koch(image: np.ndarray) -> np.ndarray:
+    intensity = image.mean(-1)
+    visible = intensity > intensity.max() / 10
+    r, g, b = np.moveaxis(np.where(visible[..., None], image / np.maximum(intensity, 1e-12)[..., None], 0), -1, 0)
+    red, green = np.maximum(r - (g + b) / 2, 0), np.maximum(g - (r + b) / 2, 0)
+    blue, yellow = np.maximum(b - (r + g) / 2, 0), np.maximum((r + g) / 2 - np.abs(r - g) / 2 - b, 0)
+
+    def pyramid(channel: np.ndarray) -> list[np.ndarray]:
+        levels = [channel]
+        for _ in range(8):
+            levels.append(cv2.pyrDown(levels[-1]).reshape([(n + 1) // 2 for n in levels[-1].shape]))
+        return levels
+
+    def across(levels: list[np.ndarray]) -> np.ndarray:
+        total = np.zeros_like(levels[4])
+        for c in (2, 3, 4):
+            for s in (c + 3, c + 4):
+                surround = cv2.resize(levels[s], levels[c].shape[::-1], interpolation=cv2.INTER_LINEAR)
+                each = numpy_promote(np.abs(levels[c] - surround))
+                for _ in range(4 - c):
+                    each = cv2.pyrDown(each)
+                total += each
+        return total
+
+    levels = pyramid(intensity)
+    angles = (0, 45, 90, 135)
+    orientation = sum(numpy_promote(across([opencv_energy(level, angle) for level in levels])) for angle in angles)
+    colour = across(pyramid(red - green)) + across(pyramid(blue - yellow))
+    saliency = sum(numpy_promote(each) for each in (across(levels), colour, orientation)) / 3
+    saliency = cv2.resize(saliency, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    return (saliency - saliency.min()) / (saliency.max() - saliency.min())
+
+
+def test_saliency_is_opencvs(photograph: np.ndarray, dtype: torch.dtype) -> None:
+    image = torch.from_numpy(photograph).permute(2, 0, 1)[None].to(dtype)
+    saliency = IttiKoch()(image)
+    assert saliency.dtype == dtype
+    np.testing.assert_allclose(saliency[0].numpy(), opencv_itti_koch(photograph), atol=2e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 50), (48, 64), (97, 131)])
+def test_pyramid_is_opencvs(size: tuple[int, int], dtype: torch.dtype, tolerance: float) -> None:
+    image = np.random.default_rng(1).random((*size, 3))
+    levels = gaussian_pyramid(torch.from_numpy(image).permute(2, 0, 1)[None].to(dtype), 8)
+    assert len(levels) == 9
+    for level in levels:
+        np.testing.assert_allclose(level[0].permute(1, 2, 0).numpy(), image, atol=tolerance)
+        image = cv2.pyrDown(image).reshape((image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2, 3)
+
+
+def test_gabor_kernels_are_opencvs() -> None:
+    kernels = gabor_kernels().unflatten(0, (4, 2))
+    for angle, pair in zip((0, 45, 90, 135), kernels, strict=True):
+        for phase, kernel in zip((0, np.pi / 2), pair, strict=True):
+            np.testing.assert_allclose(kernel.numpy(), opencv_gabor(angle, phase), atol=1e-12)
+
+
+def test_orientation_energy_is_opencvs(dtype: torch.dtype, tolerance: float) -> None:
+    image = np.random.default_rng(2).random((19, 26))
+    energy = orientation_energy(torch.from_numpy(image)[None, None].to(dtype))
+    for angle, answer in zip((0, 45, 90, 135), energy[0], strict=True):
+        np.testing.assert_allclose(answer.numpy(), opencv_energy(image, angle), atol=tolerance)
+
+
+def test_bars_answer_at_their_orientation() -> None:
+    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(40.0), indexing="ij")
+    for index, angle in enumerate(torch.tensor([0.0, 45.0, 90.0, 135.0]).deg2rad()):
+        waves = torch.cos(2 * torch.pi / 7 * (x * angle.cos() + y * angle.sin()))
+        assert orientation_energy(waves[None, None])[0, :, 20, 20].argmax() == index
+
+
+def test_across_scales_is_opencvs(dtype: torch.dtype, tolerance: float) -> None:
+    rng = np.random.default_rng(3)
+    centre, surround = rng.random((31, 44)), rng.random((4, 6))
+    difference = across_scales(*(torch.from_numpy(each)[None, None].to(dtype) for each in (centre, surround)))
+    expected = np.abs(centre - cv2.resize(surround, (44, 31), interpolation=cv2.INTER_LINEAR))
+    np.testing.assert_allclose(difference[0, 0].numpy(), expected, atol=tolerance)
+
+
+@pytest.mark.parametrize("steps", [3, 10, 1000])
+def test_promotion_is_the_loops(steps: int, dtype: torch.dtype, tolerance: float) -> None:
+    # Few steps make plateaus: of equal neighbours only the first may count.
+    maps = torch.randint(steps, (2, 3, 9, 11)).to(dtype)
+    promoted = promote(maps)
+    for image, result in zip(maps.flatten(0, 1), promoted.flatten(0, 1), strict=True):
+        np.testing.assert_allclose(result.numpy(), numpy_promote(image.double().numpy()), atol=tolerance)
+
+
+def test_one_peak_is_promoted_above_many() -> None:
+    one, many = torch.zeros(2, 32, 32)
+    one[16, 16] = 1.0
+    many[::4, ::4] = 1.0
+    assert promote(one).max() == 1
+    assert promote(many).max() == 0
+    assert local_maxima(many).sum() >= 64
+
+
+def test_rounding_errors_are_not_promoted(dtype: torch.dtype) -> None:
+    noise = 0.3 + torch.finfo(dtype).eps * torch.rand(1, 16, 16, dtype=dtype)
+    assert promote(noise).abs().max() == 0
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (2, 3), (20, 33), (64, 64)])
+def test_any_size_and_uniform_images(size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> None:
+    image = torch.rand(1, 3, *size, dtype=dtype, device=device)
+    saliency = itti_koch_saliency(image)
+    assert saliency.shape == (1, *size)
+    assert torch.isfinite(saliency).all()
+    for uniform in (image[..., :1, :1].expand_as(image), torch.zeros_like(image)):
+        assert itti_koch_saliency(uniform).abs().max() == 0
+
+
+def test_batch_is_a_loop(dtype: torch.dtype, device: torch.device) -> None:
+    images = torch.rand(3, 3, 80, 101, dtype=dtype, device=device)
+    images[1] *= 0.2
+    loop = torch.cat([itti_koch_saliency(image[None]) for image in images])
+    torch.testing.assert_close(itti_koch_saliency(images), loop, atol=2e-5, rtol=0)
+
+
+def test_red_pops_out(pop_out: torch.Tensor) -> None:
+    row, column = divmod(int(itti_koch_saliency(pop_out).argmax()), 320)
+    # A pixel of the map is 16 of the image.
+    assert 92 <= row < 124
+    assert 172 <= column < 204
+
+
+@pytest.mark.parametrize("normalise", [True, False])
+def test_gradients(normalise: bool) -> None:
+    image = torch.rand(1, 3, 20, 26, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(IttiKoch(normalise=normalise), image, fast_mode=True)
+
+
+def test_gradients_of_a_uniform_image_are_finite() -> None:
+    image = torch.full((1, 3, 40, 40), 0.5, requires_grad=True)
+    itti_koch_saliency(image).sum().backward()
+    assert image.grad is not None
+    assert torch.isfinite(image.grad).all()
+
+
+def test_compilation() -> None:
+    model, image = IttiKoch(), torch.rand(1, 3, 66, 70)
+    compiled = torch.compile(model, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(image), model(image), atol=1e-5, rtol=0)
+
+
+def test_bad_input() -> None:
+    with pytest.raises(InputError, match="image"):
+        IttiKoch()(torch.zeros(1, 4, 8, 8))
+    with pytest.raises(InputError, match="levels"):
+        gaussian_pyramid(torch.zeros(1, 3, 8, 8), -1)
+    with pytest.raises(InputError, match="intensity"):
+        orientation_energy(torch.zeros(1, 3, 8, 8))
+
+
+def test_settings_are_shown() -> None:
+    assert repr(IttiKoch()) == "IttiKoch(normalise=True)"

@@ -1,0 +1,66 @@
+"""Opponent colours against plain Python, pixel by pixel."""
+
+import pytest
+import torch
+
+from semfov.errors import InputError
+from semfov.gaze.saliency.opponent import anchor, double_opponency, opponent_colours
+
+
+def test_opponent_colours(dtype: torch.dtype) -> None:
+    image = torch.rand(2, 3, 5, 4, dtype=dtype)
+    colours = opponent_colours(image)
+    assert colours.dtype == dtype
+    pixels, results = (each.permute(0, 2, 3, 1).reshape(-1, 3) for each in (image, colours))
+    for pixel, result in zip(pixels, results, strict=True):
+        red, green, blue = pixel.tolist()
+        expected = [(red + green + blue) / 3, red - green, blue - (red + green) / 2]
+        assert result.tolist() == pytest.approx(expected, abs=1e-6)
+
+
+def test_double_opponency(dtype: torch.dtype) -> None:
+    image = torch.rand(2, 3, 6, 5, dtype=dtype) ** 3
+    image[1] *= 0.1  # the threshold is each image's own
+    for single, result in zip(image, double_opponency(image), strict=True):
+        brightest = max(sum(pixel.tolist()) / 3 for pixel in single.flatten(1).T)
+        for pixel, got in zip(single.flatten(1).T, result.flatten(1).T, strict=True):
+            intensity = sum(pixel.tolist()) / 3
+            r, g, b = (v / intensity if intensity > brightest / 10 else 0.0 for v in pixel.tolist())
+            red, green = max(r - (g + b) / 2, 0), max(g - (r + b) / 2, 0)
+            blue, yellow = max(b - (r + g) / 2, 0), max((r + g) / 2 - abs(r - g) / 2 - b, 0)
+            assert got.tolist() == pytest.approx([intensity, red - green, blue - yellow], abs=2e-6)
+
+
+@pytest.mark.parametrize("level", [0.0, 1e-30, 0.3, 1.0])
+def test_grey_has_no_colour(level: float, dtype: torch.dtype) -> None:
+    image = torch.full((1, 3, 4, 4), level, dtype=dtype)
+    for channels in (opponent_colours(image), double_opponency(image)):
+        assert torch.isfinite(channels).all()
+        assert channels[:, 1:].abs().max() == 0
+
+
+def test_hue_does_not_depend_on_intensity() -> None:
+    image = torch.rand(1, 3, 8, 8, dtype=torch.float64) * 0.5 + 0.5
+    torch.testing.assert_close(double_opponency(image)[:, 1:], double_opponency(0.1 * image)[:, 1:])
+
+
+def test_anchor_leaves_differences() -> None:
+    channels = torch.rand(2, 3, 4, 5, dtype=torch.float64)
+    shifted = channels - anchor(channels)
+    torch.testing.assert_close(shifted, channels[..., :1, :1].expand_as(channels))
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        torch.zeros(3, 4, 4),
+        torch.zeros(1, 1, 4, 4),
+        torch.zeros(1, 1, 3, 4, 4),
+        torch.zeros(1, 3, 0, 4),
+        torch.zeros(1, 3, 4, 4, dtype=torch.uint8),
+    ],
+)
+def test_bad_image(image: torch.Tensor) -> None:
+    for function in (opponent_colours, double_opponency):
+        with pytest.raises(InputError, match="image: expected"):
+            function(image)

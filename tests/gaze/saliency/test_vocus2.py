@@ -1,0 +1,171 @@
+"""VOCUS2 against the published program's steps written with OpenCV."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from semfov.errors import InputError
+from semfov.gaze.saliency import VOCUS2, vocus2_saliency
+from semfov.gaze.saliency.vocus2 import on_off_contrasts, twin_pyramids
+
+
+def blur(image: np.ndarray, sigma: float) -> np.ndarray:
+    return cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE).reshape(image.shape)
+
+
+def opencv_pyramids(
+    channel: np.ndarray, centre: float, surround: float, layers: int, scales: int
+) -> list[list[tuple[np.ndarray, np.ndarray]]]:
+    """Centres and surrounds of one channel; the scale that starts the next layer is computed in full and sampled."""
+    pyramids = []
+    image = blur(channel, centre)
+    for layer in range(min(layers, int(np.log2(min(channel.shape))) + 1)):
+        if layer:
+            image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_NEAREST)
+        twins, sigma = [], centre
+        for scale in range(scales):
+            if scale:
+                wanted = centre * 2 ** (scale / scales)
+                image, sigma = blur(image, np.sqrt(wanted**2 - sigma**2)), wanted
+            twins.append((image, blur(image, np.sqrt(surround**2 - centre**2) * 2 ** (scale / scales))))
+        image = blur(image, np.sqrt((2 * centre) ** 2 - sigma**2))
+        pyramids.append(twins)
+    return pyramids
+
+
+def opencv_vocus2(image: np.ndarray, centre: float, surround: float, scales: int, fusion: str) -> np.ndarray:
+    """Feature maps, then conspicuity maps, then saliency, in [0, 1]."""
+    red, green, blue = np.moveaxis(image, -1, 0)
+    join = np.mean if fusion == "mean" else np.max
+    conspicuities = []
+    for channel in ((red + green + blue) / 3, red - green, blue - (red + green) / 2):
+        pyramids = opencv_pyramids(channel, centre, surround, 5, scales)
+        features = []
+        for sign in (1, -1):
+            contrasts = [np.maximum(sign * (c - s), 0) for layer in pyramids for c, s in layer]
+            size = image.shape[1::-1]
+            enlarged = [cv2.resize(each, size, interpolation=cv2.INTER_CUBIC) for each in contrasts]
+            features.append(join(enlarged, axis=0))
+        conspicuities.append(join(features, axis=0))
+    saliency = join(conspicuities, axis=0)
+    return (saliency - saliency.min()) / (saliency.max() - saliency.min())
+
+
+@pytest.mark.parametrize(("centre", "surround"), [(2.0, 6.0), (3.0, 13.0)])
+@pytest.mark.parametrize("scales", [1, 2, 3])
+def test_pyramids_are_opencvs(centre: float, surround: float, scales: int, dtype: torch.dtype) -> None:
+    channels = np.random.default_rng(scales).random((41, 75, 3))
+    tensor = torch.from_numpy(channels).permute(2, 0, 1)[None].to(dtype)
+    pyramids = twin_pyramids(tensor, centre, surround, layers=5, scales=scales)
+    for c in range(3):
+        expected = opencv_pyramids(channels[..., c], centre, surround, 5, scales)
+        assert [len(layer) for layer in pyramids] == [len(layer) for layer in expected]
+        for layer, twins in zip(pyramids, expected, strict=True):
+            for twin, (middle, around) in zip(layer, twins, strict=True):
+                np.testing.assert_allclose(twin.centre[0, c].numpy(), middle, atol=3e-6)
+                np.testing.assert_allclose(twin.surround[0, c].numpy(), around, atol=3e-6)
+
+
+def test_contrasts(dtype: torch.dtype) -> None:
+    centre, surround = torch.rand(2, 2, 3, 4, 5, dtype=dtype)
+    on, off = on_off_contrasts(centre, surround)
+    difference = centre.numpy() - surround.numpy()
+    assert np.array_equal(on.numpy(), difference.clip(min=0))
+    assert np.array_equal(off.numpy(), (-difference).clip(min=0))
+
+
+@pytest.mark.parametrize("fusion", ["mean", "max"])
+@pytest.mark.parametrize(("centre", "surround", "scales"), [(2.0, 6.0, 2), (3.0, 13.0, 2), (2.0, 6.0, 3)])
+def test_saliency_is_opencvs(
+    photograph: np.ndarray, fusion: str, centre: float, surround: float, scales: int, dtype: torch.dtype
+) -> None:
+    image = torch.from_numpy(photograph).permute(2, 0, 1)[None].to(dtype)
+    saliency = VOCUS2(centre, surround, scales=scales, fusion=fusion)(image)
+    assert saliency.dtype == dtype
+    expected = opencv_vocus2(photograph, centre, surround, scales, fusion)
+    np.testing.assert_allclose(saliency[0].numpy(), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (2, 3), (7, 5), (33, 200)])
+def test_any_size_and_uniform_images(size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> None:
+    image = torch.rand(1, 3, *size, dtype=dtype, device=device)
+    saliency = vocus2_saliency(image)
+    assert saliency.shape == (1, *size)
+    assert torch.isfinite(saliency).all()
+    for fusion in ("mean", "max"):
+        assert vocus2_saliency(image[..., :1, :1].expand_as(image), fusion=fusion).abs().max() == 0
+
+
+def test_batch_is_a_loop(dtype: torch.dtype, device: torch.device) -> None:
+    images = torch.rand(3, 3, 40, 52, dtype=dtype, device=device)
+    images[1] *= 0.2
+    for fusion in ("mean", "max"):
+        model = VOCUS2(fusion=fusion)
+        loop = torch.cat([model(image[None]) for image in images])
+        torch.testing.assert_close(model(images), loop, atol=1e-5, rtol=0)
+
+
+def test_red_pops_out(pop_out: torch.Tensor) -> None:
+    for model in (VOCUS2(), VOCUS2(3.0, 13.0), VOCUS2(fusion="max")):
+        row, column = divmod(int(model(pop_out).argmax()), 320)
+        assert 100 <= row < 116
+        assert 180 <= column < 196
+
+
+def test_saliency_is_linear_in_contrast(photograph: np.ndarray) -> None:
+    image = torch.from_numpy(photograph).permute(2, 0, 1)[None]
+    model = VOCUS2(normalise=False)
+    torch.testing.assert_close(model(0.25 * image + 0.5), 0.25 * model(image))
+
+
+@pytest.mark.parametrize("fusion", ["mean", "max"])
+@pytest.mark.parametrize("normalise", [True, False])
+def test_gradients(fusion: str, normalise: bool) -> None:
+    image = torch.rand(1, 3, 6, 7, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(VOCUS2(1.0, 2.0, fusion=fusion, normalise=normalise), image)
+
+
+def test_nothing_is_written_in_place_and_views_are_welcome() -> None:
+    picture = torch.rand(20, 24, 3)
+    image = picture.permute(2, 0, 1)[None]
+    before = picture.clone()
+    assert torch.equal(vocus2_saliency(image), vocus2_saliency(image.contiguous()))
+    assert torch.equal(picture, before)
+
+
+@pytest.mark.parametrize("fusion", ["mean", "max"])
+def test_compilation(fusion: str) -> None:
+    model, image = VOCUS2(fusion=fusion), torch.rand(1, 3, 33, 70)
+    compiled = torch.compile(model, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(image), model(image))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"centre_sigma": 0.0},
+        {"centre_sigma": 6.0},
+        {"centre_sigma": float("nan")},
+        {"surround_sigma": 1.0},
+        {"layers": 0},
+        {"scales": 0},
+        {"fusion": "sum"},
+    ],
+)
+def test_bad_settings(settings: dict[str, object]) -> None:
+    with pytest.raises(InputError, match=r"sigma|layers|scales|fusion"):
+        VOCUS2(**settings)
+    with pytest.raises(InputError, match=r"sigma|layers|scales|fusion"):
+        vocus2_saliency(torch.rand(1, 3, 8, 8), **settings)
+
+
+def test_bad_image() -> None:
+    with pytest.raises(InputError, match="image"):
+        VOCUS2()(torch.zeros(3, 8, 8))
+    with pytest.raises(InputError, match="channels"):
+        twin_pyramids(torch.zeros(1, 3, 0, 8))
+
+
+def test_settings_are_shown() -> None:
+    assert repr(VOCUS2(3, 13)) == "VOCUS2(centre_sigma=3, surround_sigma=13, layers=5, scales=2, fusion='mean')"

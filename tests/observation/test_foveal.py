@@ -1,0 +1,409 @@
+"""The observation model: likelihoods, calibration and fit against explicit Dirichlets; files; compatibility."""
+
+import json
+import struct
+import warnings
+
+import numpy as np
+import pytest
+import scipy.stats
+import torch
+
+from semfov.errors import DataError, InputError
+from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet, foveal
+from semfov.observation.fitting import estimate_prior, expected_table, fit_table
+
+CLASSES = ["cup", "cat", "dog"]
+EDGES = [0.1, 0.25]
+DETECTOR = {
+    "name": "toy",
+    "digest": "ab" * 32,
+    "input_size": [416, 416],
+    "background": "residual",
+    "selection": {"threshold": 0.02, "iou": 0.5},
+}
+
+
+def table(dtype=torch.float64, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return (torch.randn(4, 3, 4, generator=generator, dtype=torch.float64) * 1.2 + 0.5).exp().to(dtype)
+
+
+def looks(shape=(5, 7), dtype=torch.float64, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    scores = torch.rand(*shape, 4, generator=generator, dtype=torch.float64) ** 3
+    scores = scores / scores.sum(-1, keepdim=True)
+    return scores.to(dtype), (torch.rand(*shape, generator=generator, dtype=torch.float64) * 0.5).to(dtype)
+
+
+def draw(alpha, counts, seed=0):
+    """Samples of every class and level, and their statistics."""
+    rng = np.random.default_rng(seed)
+    statistics = DirichletStatistics(alpha.shape[:2], alpha.shape[2])
+    for k in range(alpha.shape[0]):
+        for d in range(alpha.shape[1]):
+            rows = torch.from_numpy(rng.dirichlet(alpha[k, d].numpy(), int(counts[k, d])))
+            here = torch.ones(len(rows), dtype=torch.int64)
+            statistics.update(rows, (here * k, here * d))
+    return statistics
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-4), (torch.float64, 1e-11)])
+def test_likelihoods_are_the_dirichlets_of_scipy(dtype, tolerance):
+    model = FovealObservationModel(table(dtype), EDGES, CLASSES)
+    scores, distance = looks(dtype=dtype)
+    got = model.log_likelihood(scores, distance)
+    assert got.dtype == dtype
+    assert got.shape == (5, 7, 4)
+    for i, j in np.ndindex(5, 7):
+        level = int(np.searchsorted(EDGES, float(distance[i, j])))
+        point = np.maximum(scores[i, j].double().numpy(), 1e-6)
+        for k in range(4):
+            alpha = model.alpha[k, level].detach().double().numpy()
+            expected = scipy.stats.dirichlet.logpdf(point / point.sum(), alpha)
+            assert float(got[i, j, k]) == pytest.approx(expected, rel=tolerance, abs=tolerance)
+
+
+def test_large_parameters_keep_their_digits_in_single_precision():
+    alpha = torch.tensor([9e3, 1e3, 10.0])[None, None].repeat(3, 2, 1)
+    alpha[1, :, 0] += 30
+    scores, distance = torch.tensor([0.9, 0.099, 0.001]), torch.tensor(0.0)
+    exact = FovealObservationModel(alpha.double(), [0.1], ["a", "b"]).log_likelihood(scores.double(), distance)
+    got = FovealObservationModel(alpha, [0.1], ["a", "b"]).log_likelihood(scores, distance)
+    torch.testing.assert_close(got.double(), exact, rtol=0, atol=0.02)
+
+
+def test_calibration_is_bayes():
+    alpha, scores, distance = table(), *looks()
+    log_prior = torch.randn(4, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    model = FovealObservationModel(alpha, EDGES, CLASSES, log_prior=log_prior, tempering=0.3)
+    level = torch.bucketize(distance, torch.tensor(EDGES, dtype=torch.float64))
+    density = torch.distributions.Dirichlet(alpha[:, level].movedim(0, -2)).log_prob(scores[..., None, :])
+    joint = (0.3 * density + log_prior[:, level].movedim(0, -1)).exp()
+    torch.testing.assert_close(model.calibrate(scores, distance), joint / joint.sum(-1, keepdim=True))
+    torch.testing.assert_close(model(scores, distance), model.calibrate(scores, distance))
+
+
+def test_extreme_scores_neither_overflow_nor_vanish():
+    alpha = torch.full((4, 3, 4), 0.2)
+    alpha += 500 * torch.eye(4)[:, None]
+    model = FovealObservationModel(alpha, EDGES, CLASSES)
+    scores = torch.tensor([[0.0, 1.0, 0.0, 0.0], [0.25] * 4, [1e-30, 0.0, 1.0, 0.0]])
+    got = model.calibrate(scores, torch.zeros(3))
+    assert bool(got.isfinite().all())
+    torch.testing.assert_close(got.sum(-1), torch.ones(3))
+    assert got[0].argmax() == 1
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_identity_returns_the_scores(dtype):
+    model = FovealObservationModel.identity(CLASSES, EDGES).to(dtype)
+    scores, distance = looks(dtype=dtype)
+    torch.testing.assert_close(model.calibrate(scores, distance), dirichlet.floor(scores, 1e-6))
+
+
+def test_levels_are_those_of_the_edges():
+    model = FovealObservationModel(table(torch.float32), EDGES, CLASSES)
+    distance = torch.tensor([0.0, 0.1, 0.1001, 0.25, 0.26, 9.0])
+    assert model.level(distance).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_expected_scores_are_the_means():
+    model = FovealObservationModel(table(), EDGES, CLASSES)
+    torch.testing.assert_close(model.expected_scores(), torch.distributions.Dirichlet(table()).mean)
+    given = torch.full((4, 3, 4), 0.25, dtype=torch.float64)
+    fixed = FovealObservationModel(table(), EDGES, CLASSES, expected=given)
+    assert torch.equal(fixed.expected_scores(), given)
+
+
+def test_everything_is_differentiable():
+    model = FovealObservationModel(table(), EDGES, CLASSES, tempering=0.5)
+    scores, distance = looks(shape=(3,))
+    inputs = (model.log_alpha.detach().requires_grad_(), scores.requires_grad_())
+
+    def call(method):
+        return lambda log_alpha, s: torch.func.functional_call(
+            Method(model, method), {"model.log_alpha": log_alpha}, (s, distance)
+        )
+
+    assert torch.autograd.gradcheck(call("log_likelihood"), inputs)
+    assert torch.autograd.gradcheck(call("calibrate"), inputs)
+    assert torch.autograd.gradcheck(lambda a, s: call("expected_scores")(a, s), inputs)
+
+
+class Method(torch.nn.Module):
+    """Calls one method of a model, for `functional_call`."""
+
+    def __init__(self, model, method):
+        super().__init__()
+        self.model = model
+        self.method = method
+
+    def forward(self, scores, distance):
+        if self.method == "expected_scores":
+            return self.model.expected_scores()
+        return getattr(self.model, self.method)(scores, distance)
+
+
+def test_alpha_learns_and_stays_positive():
+    model = FovealObservationModel(table(torch.float32), EDGES, CLASSES)
+    scores, distance = looks(shape=(64,), dtype=torch.float32)
+    labels = scores.argmax(-1)
+    optimiser = torch.optim.Adam(model.parameters(), lr=0.3)
+    losses = []
+    for _ in range(40):
+        optimiser.zero_grad()
+        loss = torch.nn.functional.nll_loss(model.calibrate(scores, distance).clamp(min=1e-12).log(), labels)
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss))
+        assert bool((model.alpha > 0).all())
+    assert losses[-1] < losses[0] / 2
+
+
+@pytest.mark.parametrize("method", ["log_likelihood", "calibrate"])
+def test_model_compiles_in_one_piece(method):
+    model = FovealObservationModel(table(torch.float32), EDGES, CLASSES)
+    scores, distance = looks(dtype=torch.float32)
+    compiled = torch.compile(getattr(model, method), fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(scores, distance), getattr(model, method)(scores, distance))
+
+
+def test_nothing_stale_is_kept_between_calls():
+    model = FovealObservationModel(table(), EDGES, CLASSES).eval()
+    scores, distance = looks()
+    with torch.inference_mode():
+        first = model.calibrate(scores, distance)
+        assert torch.equal(model.calibrate(scores, distance), first)
+    optimiser = torch.optim.SGD(model.parameters(), lr=1.0)
+    model.calibrate(scores.requires_grad_(), distance)[..., 0].sum().backward()
+    optimiser.step()
+    with torch.no_grad():
+        changed = model.calibrate(scores, distance)
+    assert not torch.allclose(changed, first)
+    fresh = FovealObservationModel(model.alpha, EDGES, CLASSES)
+    torch.testing.assert_close(changed, fresh.calibrate(scores, distance))
+    model.load_state_dict(FovealObservationModel(table(), EDGES, CLASSES).state_dict())
+    with torch.no_grad():
+        torch.testing.assert_close(model.calibrate(scores, distance), first.clone())
+    model.to(torch.float32)
+    with torch.no_grad():
+        torch.testing.assert_close(model.calibrate(scores.float(), distance.float()), first.float())
+
+
+def test_inputs_stay_as_they_are():
+    scores, distance = looks()
+    scores[0, 0] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    alpha, before = table(), (scores.clone(), distance.clone())
+    model = FovealObservationModel(alpha, EDGES, CLASSES)
+    model.calibrate(scores, distance)
+    with torch.no_grad():
+        model.log_alpha.zero_()
+    assert torch.equal(scores, before[0])
+    assert torch.equal(distance, before[1])
+    assert torch.equal(alpha, table())
+
+
+@pytest.mark.parametrize("method", ["newton", "fixed_point", "gradient"])
+def test_fit_recovers_the_dirichlets_of_much_data(method):
+    alpha = table()
+    statistics = draw(alpha, torch.full((4, 3), 4000))
+    model = FovealObservationModel.identity(CLASSES, EDGES).fit(statistics, method=method)
+    np.testing.assert_allclose(model.alpha.detach(), alpha, rtol=0.15)
+    assert model.metadata["fallback"] == {}
+    assert model.metadata["counts"] == statistics.count.tolist()
+    assert float(model.log_prior.abs().max()) == 0
+    reference = FovealObservationModel.identity(CLASSES, EDGES).fit(statistics)
+    torch.testing.assert_close(model.alpha, reference.alpha, rtol=2e-6, atol=0)
+
+
+def test_cells_with_little_data_lean_on_their_class():
+    alpha = table()[:, :1].repeat(1, 3, 1)
+    counts = torch.full((4, 3), 3000)
+    counts[2, 1] = 0
+    counts[3] = 0
+    fitted, fallback = fit_table(draw(alpha, counts), shrinkage=10.0)
+    assert fallback == {}
+    np.testing.assert_allclose(fitted[2, 1], alpha[2, 1], rtol=0.15)
+    torch.testing.assert_close(fitted[3], torch.ones(3, 4, dtype=torch.float64))
+
+
+def test_no_data_at_all_is_the_uniform_density():
+    model = FovealObservationModel.identity(CLASSES, EDGES)
+    with pytest.warns(UserWarning, match="level 0 has no inner neighbour"):
+        model.fit(DirichletStatistics((4, 3), 4), prior=True, expected="empirical")
+    torch.testing.assert_close(model.alpha, torch.ones(4, 3, 4))
+    torch.testing.assert_close(model.expected_scores(), torch.full((4, 3, 4), 0.25))
+    torch.testing.assert_close(model.log_prior.exp(), torch.full((4, 3), 0.25))
+
+
+def test_identical_samples_and_zeros_give_finite_parameters():
+    statistics = DirichletStatistics((4, 3), 4)
+    rows = torch.tensor([[0.0, 1.0, 0.0, 0.0]]).repeat(500, 1)
+    statistics.update(rows, (torch.ones(500).long(), torch.zeros(500).long()))
+    alpha, _ = fit_table(statistics, minimum=0)
+    assert bool(alpha.isfinite().all())
+    assert bool((alpha > 0).all())
+    assert alpha[1, 0].argmax() == 1
+
+
+def test_poor_levels_fall_back_on_their_inner_neighbour_and_say_so():
+    alpha = table()
+    counts = torch.full((4, 3), 400)
+    counts[1:, 1:] = 5
+    statistics = draw(alpha, counts)
+    model = FovealObservationModel.identity(CLASSES, EDGES)
+    with pytest.warns(UserWarning, match="level 1 as level 0, level 2 as level 0"):
+        model.fit(statistics, minimum=20, expected="empirical")
+    assert model.metadata["fallback"] == {"1": 0, "2": 0}
+    for level in (1, 2):
+        assert torch.equal(model.alpha[:, level], model.alpha[:, 0])
+        assert torch.equal(model.expected_scores()[:, level], model.expected_scores()[:, 0])
+
+
+def test_empirical_expected_scores_are_the_means_of_the_data():
+    statistics = draw(table(), torch.full((4, 3), 500))
+    got = expected_table(statistics, {}, shrinkage=1e-6)
+    torch.testing.assert_close(got, statistics.mean, rtol=0, atol=1e-6)
+
+
+def test_prior_is_the_frequency_of_the_classes():
+    count = torch.tensor([[9000, 900], [1000, 100], [0, 0]])
+    prior = estimate_prior(count).exp()
+    torch.testing.assert_close(prior.sum(0), torch.ones(2, dtype=torch.float64))
+    np.testing.assert_allclose(prior[0], [0.9, 0.9], atol=2e-3)
+    assert bool((prior > 0).all())
+
+
+@pytest.mark.parametrize("expected", [None, table(torch.float32) / table(torch.float32).sum(-1, keepdim=True)])
+def test_a_file_gives_back_the_same_model(tmp_path, expected):
+    metadata = {"detector": DETECTOR, "sensor": {"sigma": 100.0}, "counts": [[1, 2], [3, 4]]}
+    model = FovealObservationModel(
+        table(torch.float32),
+        EDGES,
+        CLASSES,
+        epsilon=1e-5,
+        log_prior=torch.rand(4, 3),
+        tempering=0.2,
+        expected=expected,
+        metadata=metadata,
+    )
+    path = tmp_path / "model.safetensors"
+    model.save(path)
+    first = path.read_bytes()
+    model.save(path)
+    assert path.read_bytes() == first
+    assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]
+
+    loaded = FovealObservationModel.from_pretrained(path)
+    assert not loaded.training
+    assert loaded.classes == tuple(CLASSES)
+    assert loaded.epsilon == 1e-5
+    assert loaded.metadata == metadata
+    state = model.state_dict()
+    assert loaded.state_dict().keys() == state.keys()
+    for name, tensor in loaded.state_dict().items():
+        assert torch.equal(tensor, state[name])
+    scores, distance = looks(dtype=torch.float32)
+    assert torch.equal(loaded.calibrate(scores, distance), model.calibrate(scores, distance))
+
+
+def test_header_is_readable_json(tmp_path):
+    path = tmp_path / "model.safetensors"
+    FovealObservationModel(table(), EDGES, CLASSES, metadata={"detector": DETECTOR}).save(path)
+    data = path.read_bytes()
+    header = json.loads(data[8 : 8 + struct.unpack("<Q", data[:8])[0]])
+    record = json.loads(header["__metadata__"]["semfov"])
+    assert record["classes"] == CLASSES
+    assert record["metadata"]["detector"]["digest"] == DETECTOR["digest"]
+    assert record["version"]
+    assert record["epsilon"] == 1e-6
+
+
+def test_shipped_models_are_found_by_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(foveal, "SHIPPED", tmp_path)
+    FovealObservationModel(table(), EDGES, CLASSES).save(tmp_path / "toy-tiny.safetensors")
+    assert FovealObservationModel.from_pretrained("toy-tiny").classes == tuple(CLASSES)
+    with pytest.raises(InputError, match="did you mean 'toy-tiny'"):
+        FovealObservationModel.from_pretrained("toy-tyni")
+
+
+def test_bad_files_are_refused(tmp_path):
+    path = tmp_path / "model.safetensors"
+    with pytest.raises(DataError, match="no such file"):
+        FovealObservationModel.from_pretrained(path)
+    path.write_bytes(b"not a model")
+    with pytest.raises(DataError, match="not a readable"):
+        FovealObservationModel.from_pretrained(path)
+    DirichletStatistics((2,), 3).save(path)
+    with pytest.raises(DataError, match="expected foveal-observation-model, got dirichlet-statistics"):
+        FovealObservationModel.from_pretrained(path)
+
+
+class Toy:
+    """What a model asks of a detector."""
+
+    def __init__(self, classes=tuple(CLASSES), **settings):
+        self.classes = classes
+        self._settings = {**DETECTOR, **settings}
+
+    def settings(self):
+        return self._settings
+
+
+def test_a_detector_that_fits_is_accepted_and_others_are_not(tmp_path):
+    path = tmp_path / "model.safetensors"
+    FovealObservationModel(table(), EDGES, CLASSES, metadata={"detector": DETECTOR}).save(path)
+    load = FovealObservationModel.from_pretrained
+    load(path, detector=Toy())
+    load(path, detector=Toy(name="renamed"))
+    load(path, detector=Toy(input_size=(416, 416)))
+    with pytest.raises(InputError, match=r"fitted for 'toy' \(sha256 abab"):
+        load(path, detector=Toy(digest="cd" * 32))
+    with pytest.raises(InputError, match="got 'other'"):
+        load(path, detector=Toy(name="other", digest=""))
+    with pytest.raises(InputError, match="background policy 'residual', got 'uniform'"):
+        load(path, detector=Toy(background="uniform"))
+    with pytest.raises(InputError, match="'cat' as class 2, got 'cow'"):
+        load(path, detector=Toy(classes=("cup", "cow", "dog")))
+    with pytest.raises(InputError, match="3 classes, got 2"):
+        load(path, detector=Toy(classes=("cup", "cow")))
+    with pytest.warns(UserWarning, match=r"input_size is \[320, 320\], fitted with \[416, 416\]"):
+        load(path, detector=Toy(input_size=[320, 320]))
+
+
+def test_settings_of_an_eye_are_checked_too():
+    metadata = {"detector": DETECTOR, "sensor": {"sigma": 100.0}}
+    model = FovealObservationModel(table(), EDGES, CLASSES, metadata=metadata)
+    model.check_compatible({"detector": DETECTOR, "sensor": {"sigma": 100.0}}, CLASSES)
+    with pytest.warns(UserWarning, match=r"another sensor: sigma is 50.0"):
+        model.check_compatible({"detector": DETECTOR, "sensor": {"sigma": 50.0}}, CLASSES)
+    with pytest.raises(InputError, match="background"):
+        model.check_compatible(background="none")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        FovealObservationModel(table(), EDGES, CLASSES).check_compatible({"detector": DETECTOR}, CLASSES)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: FovealObservationModel(table()[:, :2], EDGES, CLASSES),
+        lambda: FovealObservationModel(table() * 0, EDGES, CLASSES),
+        lambda: FovealObservationModel(table() * torch.nan, EDGES, CLASSES),
+        lambda: FovealObservationModel(table(), [0.3, 0.2], CLASSES),
+        lambda: FovealObservationModel(table(), [0.0, 0.2], CLASSES),
+        lambda: FovealObservationModel(table(), EDGES, CLASSES, epsilon=0.0),
+        lambda: FovealObservationModel(table(), EDGES, CLASSES, tempering=0.0),
+        lambda: FovealObservationModel(table(), EDGES, CLASSES, log_prior=torch.zeros(3)),
+        lambda: FovealObservationModel(table(), EDGES, CLASSES).calibrate(torch.ones(3) / 3, torch.tensor(0.1)),
+        lambda: FovealObservationModel(table(), EDGES, CLASSES).calibrate(torch.ones(2, 4) / 4, torch.tensor(0.1)),
+        lambda: FovealObservationModel(table(), EDGES, CLASSES).calibrate(-torch.ones(4), torch.tensor(0.1)),
+        lambda: FovealObservationModel(table(), EDGES, CLASSES).fit(DirichletStatistics((4, 2), 4)),
+        lambda: FovealObservationModel(table(), EDGES, CLASSES).fit(DirichletStatistics((4, 3), 4, epsilon=1e-4)),
+        lambda: FovealObservationModel(table(), EDGES, CLASSES).fit(DirichletStatistics((4, 3), 4), expected="both"),
+    ],
+)
+def test_bad_arguments_are_named(call):
+    with pytest.raises(InputError, match="expected"):
+        call()

@@ -1,0 +1,173 @@
+"""Sums that merge: values against numpy, bits against every order and split, files and errors."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from semfov.errors import DataError, InputError
+from semfov.observation import DirichletStatistics
+from semfov.observation.storage import write
+
+
+def samples(count, components=5, seed=0, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(seed)
+    scores = torch.rand(count, components, generator=generator, dtype=torch.float64) ** 8
+    scores[torch.rand(count, components, generator=generator) < 0.2] = 0.0
+    scores[:, 0] += 1e-3
+    scores = scores / scores.sum(-1, keepdim=True)
+    labels = torch.randint(3, (count,), generator=generator)
+    levels = torch.randint(2, (count,), generator=generator)
+    return scores.to(dtype), labels, levels
+
+
+def gather(scores, labels, levels):
+    return DirichletStatistics((3, 2), scores.shape[-1]).update(scores, (labels, levels))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_sums_are_those_of_numpy(dtype):
+    scores, labels, levels = samples(300, dtype=dtype)
+    kept = scores.clone()
+    got = gather(scores, labels, levels)
+    assert torch.equal(scores, kept)
+    floored = np.maximum(scores.double().numpy(), 1e-6)
+    floored = floored / floored.sum(1, keepdims=True)
+    for k in range(3):
+        for d in range(2):
+            rows = floored[(labels == k).numpy() & (levels == d).numpy()]
+            assert int(got.count[k, d]) == len(rows)
+            np.testing.assert_allclose(got.mean_log[k, d], np.log(rows).mean(0), rtol=0, atol=2e-10)
+            np.testing.assert_allclose(got.mean[k, d], rows.mean(0), rtol=0, atol=2e-10)
+            np.testing.assert_allclose(got.variance[k, d], rows.var(0), rtol=0, atol=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.lists(st.integers(0, 4), min_size=1, max_size=40), st.randoms())
+def test_no_order_and_no_split_changes_a_bit(seed, shards, random):
+    scores, labels, levels = samples(len(shards), seed=seed)
+    whole = gather(scores, labels, levels)
+
+    parts = []
+    for shard in set(shards):
+        rows = [i for i, s in enumerate(shards) if s == shard]
+        random.shuffle(rows)
+        part = DirichletStatistics((3, 2), 5)
+        while rows:
+            size = random.randint(1, len(rows))
+            batch, rows = torch.tensor(rows[:size]), rows[size:]
+            # Columns of a transposed copy: another memory layout, the same numbers.
+            laid_out = scores[batch].t().contiguous().t()
+            part.update(laid_out, labels[batch] * 2 + levels[batch])
+        parts.append(part)
+    random.shuffle(parts)
+    while len(parts) > 1:
+        first = parts.pop(random.randrange(len(parts)))
+        parts[random.randrange(len(parts))].merge(first)
+    assert parts[0] == whole
+
+
+def test_batches_of_any_size_give_the_same_bits():
+    scores, labels, levels = samples(2000, components=81)
+    whole = gather(scores, labels, levels)
+    for size in (1, 7, 333):
+        pieces = DirichletStatistics((3, 2), 81)
+        for first in range(0, 2000, size):
+            rows = slice(first, first + size)
+            pieces.update(scores[rows], (labels[rows], levels[rows]))
+        assert pieces == whole
+
+
+def test_pooling_is_the_sum_of_the_cells():
+    scores, labels, levels = samples(200)
+    pooled = gather(scores, labels, levels).sum(1)
+    assert pooled == DirichletStatistics((3,), 5).update(scores, labels)
+    assert gather(scores, labels, levels).sum(-2) == DirichletStatistics((2,), 5).update(scores, levels)
+
+
+def test_merging_leaves_the_other_as_it_is():
+    one, two = (gather(*samples(20, seed=seed)) for seed in (0, 1))
+    before = gather(*samples(20, seed=1))
+    one.merge(two)
+    assert two == before
+    assert one != two
+    assert int(one.count.sum()) == 40
+
+
+def test_cells_without_samples_have_no_mean():
+    empty = DirichletStatistics((2,), 3).update(torch.empty(0, 3), torch.empty(0, dtype=torch.int64))
+    assert int(empty.count.sum()) == 0
+    for mean in (empty.mean_log, empty.mean, empty.variance):
+        assert bool(mean.isnan().all())
+
+
+def test_a_file_gives_back_every_bit_and_is_the_same_each_time(tmp_path):
+    statistics = gather(*samples(100))
+    statistics.save(tmp_path / "a.safetensors", shard=3, key="abc")
+    statistics.save(tmp_path / "b.safetensors", shard=3, key="abc")
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+    loaded, record = DirichletStatistics.load(tmp_path / "a.safetensors")
+    assert loaded == statistics
+    assert (record["shard"], record["key"]) == (3, "abc")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.safetensors", "b.safetensors"]
+
+
+def test_damaged_and_foreign_files_are_refused(tmp_path):
+    path = tmp_path / "x.safetensors"
+    with pytest.raises(DataError, match="no such file"):
+        DirichletStatistics.load(path)
+    gather(*samples(10)).save(path)
+    path.write_bytes(path.read_bytes()[:-50])
+    with pytest.raises(DataError, match="not a readable"):
+        DirichletStatistics.load(path)
+    write(path, {"count": torch.zeros(2)}, {"kind": "dirichlet-statistics", "epsilon": 1e-6, "fraction_bits": 32})
+    with pytest.raises(DataError, match="fit together"):
+        DirichletStatistics.load(path)
+    write(path, {}, {"kind": "something else"})
+    with pytest.raises(DataError, match="something else"):
+        DirichletStatistics.load(path)
+    count, sums = torch.zeros(2, dtype=torch.int64), torch.zeros(3, 2, 4, dtype=torch.int64)
+    record = {"kind": "dirichlet-statistics", "epsilon": 1e-6, "fraction_bits": 20}
+    write(path, {"count": count, "sums": sums}, record)
+    with pytest.raises(DataError, match=r"2\^-32"):
+        DirichletStatistics.load(path)
+
+
+GOOD = torch.tensor([[0.2, 0.3, 0.5]])
+CELL = torch.tensor([0])
+
+
+@pytest.mark.parametrize(
+    ("scores", "index", "named"),
+    [
+        (torch.tensor([[0.2, torch.nan, 0.5]]), CELL, "scores"),
+        (torch.tensor([[-0.2, 0.7, 0.5]]), CELL, "scores"),
+        (torch.tensor([[0.2, 0.2, 0.2]]), CELL, "scores"),
+        (torch.ones(1, 2) / 2, CELL, "scores"),
+        (GOOD, torch.tensor([6]), "index"),
+        (GOOD, torch.tensor([-1]), "index"),
+        (GOOD, torch.tensor([0.0]), "index"),
+        (GOOD, torch.tensor([0, 1]), "index"),
+        (GOOD, (CELL, CELL, CELL), "index"),
+        (GOOD, (CELL, CELL + 2), "index"),
+    ],
+)
+def test_bad_updates_are_refused_and_change_nothing(scores, index, named):
+    statistics = DirichletStatistics((3, 2), 3)
+    with pytest.raises(InputError, match=named):
+        statistics.update(scores, index)
+    assert statistics == DirichletStatistics((3, 2), 3)
+
+
+def test_unlike_tables_do_not_merge():
+    for other in (DirichletStatistics((2,), 4), DirichletStatistics((3,), 3), DirichletStatistics((2,), 3, epsilon=1e-4)):
+        with pytest.raises(InputError, match="other"):
+            DirichletStatistics((2,), 3).merge(other)
+
+
+def test_a_full_cell_is_an_error():
+    statistics = DirichletStatistics((1,), 2).update(torch.tensor([[1.0, 0.0]]), CELL)
+    with pytest.raises(InputError, match="more samples"):  # noqa: PT012 (doubling is the point)
+        for _ in range(40):
+            statistics.merge(statistics)
