@@ -67,7 +67,7 @@ def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 def _blur(image: Tensor, axis: int, sigma: float, step: int) -> Tensor:
     """Blur along one axis and keep the first of every `step` pixels."""
-    batch, channels, _, width = image.shape
+    batch, channels, height, width = image.shape
     count = image.shape[axis]
     length = max(count // step, 1)
     tile = min(_TILE, length)
@@ -81,7 +81,9 @@ def _blur(image: Tensor, axis: int, sigma: float, step: int) -> Tensor:
     padding = (radius, after, 0, 0) if axis == -1 else (0, 0, radius, after)
     windows = F.pad(image, padding, mode="replicate").unfold(axis, window, tile * step)
     if axis == -1:
-        return (windows @ block.mT).flatten(-2)[..., :length]
+        # One product for all lines: `matmul` would make one of each.
+        blurred = windows.reshape(-1, window) @ block.mT
+        return blurred.reshape(batch, channels, height, tiles * tile)[..., :length]
     windows = windows.mT.reshape(-1, window, width)
     blurred = torch.bmm(block.expand(len(windows), -1, -1), windows)
     return blurred.reshape(batch, channels, tiles * tile, width)[..., :length, :]
