@@ -43,9 +43,7 @@ def image():
 
 @pytest.fixture
 def agent():
-    return ActivePerception(
-        Foveation(40.0), Squares(), None, (8, 6), search_policy("non-predictive"), reference=160.0
-    )
+    return ActivePerception(Foveation(40.0), Squares(), None, (8, 6), search_policy("non-predictive"), reference=160.0)
 
 
 def test_search_goes_to_the_target(agent, image):

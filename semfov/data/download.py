@@ -233,9 +233,7 @@ def _transfer(url: str, archive: Archive, part: Path) -> None:
                 bar.update(len(chunk))
                 if sink.tell() > archive.size:
                     sink.truncate(0)
-                    raise DataError(
-                        f"{url}: expected {archive.size:,} bytes, the server sends more; check the address"
-                    )
+                    raise DataError(f"{url}: expected {archive.size:,} bytes, the server sends more; check the address")
     if _size(part) < archive.size:
         raise ConnectionError("the connection closed early")
 

@@ -47,9 +47,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
 
     name = f"image {Path(path)}"
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # of damaged metadata and of large files; the limit below refuses the latter
+        warnings.simplefilter("ignore")  # of damaged metadata and of large files; the limit below refuses the latter
         try:
             with Image.open(path) as image:
                 _check_pixels(image.size, name)
@@ -59,9 +57,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
         except DataError:
             raise
         except FileNotFoundError:
-            raise DataError(
-                f"{name}: no such file; check data.root and the file names of the annotations"
-            ) from None
+            raise DataError(f"{name}: no such file; check data.root and the file names of the annotations") from None
         except IsADirectoryError:
             raise DataError(f"{name}: expected a file, got a folder") from None
         except PermissionError:
@@ -81,9 +77,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
 def _check_pixels(size: tuple[int, int], name: str) -> None:
     width, height = size
     if not 0 < width * height <= MAX_PIXELS:
-        raise DataError(
-            f"{name}: expected 1 to {MAX_PIXELS:,} pixels, got {width} × {height}; reduce or replace it"
-        )
+        raise DataError(f"{name}: expected 1 to {MAX_PIXELS:,} pixels, got {width} × {height}; reduce or replace it")
 
 
 def _upright(image: Any) -> Any:
@@ -114,9 +108,7 @@ def _rgb(image: Any, name: str) -> NDArray[np.float32]:
         grey = np.asarray(image, dtype=np.float32)
         white = 1.0 if image.mode == "F" else 65535.0
         if not (grey.min() >= 0 and grey.max() <= white):  # also refuses NaN
-            raise DataError(
-                f"{name}: expected values from 0 to {white:g} in mode {image.mode}; convert it to 8 bits"
-            )
+            raise DataError(f"{name}: expected values from 0 to {white:g} in mode {image.mode}; convert it to 8 bits")
         return np.repeat(grey[..., None] / np.float32(white), 3, axis=-1)
     if "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La"):
         if image.mode == "La":

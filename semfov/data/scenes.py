@@ -62,9 +62,7 @@ OBJECTS = (
     Photograph("cameraman", "skimage", "camera.png", (0, 30, 390, 512), "person", (20, 60, 320, 512)),
     Photograph("cat", "skimage", "chelsea.png", (60, 0, 390, 300), "cat", (60, 0, 384, 300)),
     Photograph("cup", "skimage", "coffee.png", (140, 0, 440, 330), "cup", (172, 17, 408, 312)),
-    Photograph(
-        "motorcycle", "skimage", "motorcycle_left.png", (80, 60, 700, 470), "motorcycle", (94, 76, 686, 452)
-    ),
+    Photograph("motorcycle", "skimage", "motorcycle_left.png", (80, 60, 700, 470), "motorcycle", (94, 76, 686, 452)),
 )
 DISTRACTORS = (
     Photograph("rocket", "skimage", "rocket.jpg", (180, 60, 460, 420)),
@@ -190,9 +188,7 @@ def _layout(generator: np.random.Generator) -> list[Item]:
         longer = max(right - left, bottom - top)
         width, height = side * (right - left) // longer, side * (bottom - top) // longer
         x = slot % columns * pitch[0] + int(generator.integers(_MARGIN, pitch[0] - width - _MARGIN, endpoint=True))
-        y = slot // columns * pitch[1] + int(
-            generator.integers(_MARGIN, pitch[1] - height - _MARGIN, endpoint=True)
-        )
+        y = slot // columns * pitch[1] + int(generator.integers(_MARGIN, pitch[1] - height - _MARGIN, endpoint=True))
         items.append(Item(photograph, (x, y, x + width, y + height), bool(generator.integers(2))))
     return items
 

@@ -62,9 +62,7 @@ def score_vectors(candidates: Candidates, policy: BackgroundPolicy = "residual")
     check_shape(classes, "classes", None)
     if policy == "own":
         if candidates.background is None:
-            raise InputError(
-                "background policy 'own': expected a head with a background score of its own, got none"
-            )
+            raise InputError("background policy 'own': expected a head with a background score of its own, got none")
         background = candidates.background
     elif policy == "residual":
         background = 1 - (classes.amax(-1) if candidates.objectness is None else candidates.objectness)

@@ -76,27 +76,35 @@ def fit_discriminative(
 
     unit = torch.eye(components).to(scores)
     start = unit.log1p()[:, None]
-    across = scores.new_zeros(components, 1, components, requires_grad=True)
-    within = scores.new_zeros(components, levels, components, requires_grad=True)
-    common = scores.new_zeros(components, 1, requires_grad=True)
-    own = scores.new_zeros(components, levels, requires_grad=True)
-    precision = torch.where(unit[:, None] > 0, bias_decay, decay)
+    # Each variable is counted in standard deviations of its prior, which puts them all on one scale.
+    deviations = [
+        torch.where(unit[:, None] > 0, bias_decay, decay).rsqrt(),
+        scores.new_tensor(level_decay).rsqrt(),
+        scores.new_tensor(bias_decay).rsqrt(),
+        scores.new_tensor(bias_decay).rsqrt(),
+    ]
+    shapes = [(components, 1, components), (components, levels, components), (components, 1), (components, levels)]
+    variables = [scores.new_zeros(shape, requires_grad=True) for shape in shapes]
     optimiser = torch.optim.LBFGS(
-        [across, within, common, own],
+        variables,
         max_iter=iterations,
         history_size=10,
-        tolerance_grad=1e-6,
+        tolerance_grad=0.0,
         tolerance_change=1e-7,
         line_search_fn="strong_wolfe",
     )
 
+    def current() -> tuple[Tensor, Tensor]:
+        across, within, common, own = (v * d for v, d in zip(variables, deviations, strict=True))
+        return (start + across + within).exp(), common + own
+
     def loss() -> Tensor:
         optimiser.zero_grad()
-        weight, constant = (start + across + within).exp() - 1, common + own
-        total = (precision * across.square()).sum() + level_decay * within.square().sum()
-        total = (total + bias_decay * (common.square().sum() + own.square().sum())) / 2
+        alpha, constant = current()
+        total = sum((v.square().sum() for v in variables), scores.new_zeros(())) / 2
         for n, (rows, truth) in enumerate(groups):
-            total = total + F.cross_entropy(F.linear(rows, weight[:, n], constant[:, n]), truth, reduction="sum")
+            logits = F.linear(rows, alpha[:, n] - 1, constant[:, n])
+            total = total + F.cross_entropy(logits, truth, reduction="sum")
         mean = total / samples
         mean.backward()
         return mean
@@ -104,7 +112,7 @@ def fit_discriminative(
     with torch.enable_grad():
         optimiser.step(loss)
 
-    alpha = (start + across + within).detach().exp()
+    alpha, constant = (t.detach() for t in current())
     # c is ln π, less the normaliser of Dir(α), plus the shift by the floor.
     shift = log_normaliser(alpha.double()).to(alpha) - (alpha - 1).sum(-1) * lowest
     trained = {"decay": decay, "level_decay": level_decay, "bias_decay": bias_decay, "iterations": iterations}
@@ -113,7 +121,7 @@ def fit_discriminative(
         model.edges.to(alpha),
         model.classes,
         epsilon=model.epsilon,
-        log_prior=(common + own).detach() + shift,
+        log_prior=constant + shift,
         expected=model.expected_scores().detach(),
         metadata={**model.metadata, "method": "discriminative", "discriminative": trained},
     )

@@ -1,5 +1,6 @@
 """Sufficient statistics of Dirichlets: sums that merge, and do not depend on the order in which they were made."""
 
+import math
 from collections.abc import Sequence
 from os import PathLike
 from typing import Any, Self
@@ -12,7 +13,6 @@ from semfov.observation.storage import read, write
 
 # Sums count quanta of 2^-32. Integers add exactly, so any order and any split of the samples give the same bits.
 FRACTION_BITS = 32
-_FULL = 2**62
 # Scores in half precision sum to 1 within this.
 _OFF_SIMPLEX = 1e-2
 
@@ -69,10 +69,12 @@ class DirichletStatistics:
         check(not bool(off.any()), "scores", "vectors that sum to 1", f"{int(off.sum())} that do not")
         scores = scores.reshape(-1, self.components)
         cells = self._cells(index, len(scores)).to(self.count.device)
+        count = self.count + torch.bincount(cells, minlength=self.count.numel()).view(self.shape)
+        self._check_room(count)
         terms = quantise(scores.to(self.count.device), self.epsilon)
-        self.count.view(-1).index_add_(0, cells, torch.ones_like(cells))
+        self.count = count
         self.sums.view(3, -1, self.components).index_add_(1, cells, terms)
-        return self._checked()
+        return self
 
     def merge(self, other: "DirichletStatistics") -> Self:
         """Add the sums of other samples, and return the statistics themselves.
@@ -82,9 +84,11 @@ class DirichletStatistics:
         """
         mine, theirs = (self.shape, self.components, self.epsilon), (other.shape, other.components, other.epsilon)
         check(mine == theirs, "other", f"statistics of shape, components and epsilon {mine}", theirs)
-        self.count += other.count.to(self.count.device)
-        self.sums += other.sums.to(self.sums.device)
-        return self._checked()
+        count = self.count + other.count.to(self.count.device)
+        self._check_room(count)
+        self.count = count
+        self.sums = self.sums + other.sums.to(self.sums.device)
+        return self
 
     @property
     def mean_log(self) -> Tensor:
@@ -105,12 +109,9 @@ class DirichletStatistics:
         """Statistics pooled over a dimension of the table, which must have more than one."""
         check(len(self.shape) > 1, "dim", "a table of two dimensions or more", self.shape)
         dim = range(len(self.shape))[dim]
-        pooled = DirichletStatistics(
-            self.shape[:dim] + self.shape[dim + 1 :], self.components, epsilon=self.epsilon
-        )
-        largest = float(self.sums.abs().to(torch.float64).sum(dim + 1).max())
-        check(largest < _FULL, "dim", "sums that fit into 63 bits when pooled", largest)
+        pooled = DirichletStatistics(self.shape[:dim] + self.shape[dim + 1 :], self.components, epsilon=self.epsilon)
         pooled.count, pooled.sums = self.count.sum(dim), self.sums.sum(dim + 1)
+        self._check_room(pooled.count)
         return pooled
 
     def save(self, path: str | PathLike[str], **record: Any) -> None:
@@ -136,9 +137,7 @@ class DirichletStatistics:
             shapes = {name: tuple(t.shape) for name, t in tensors.items()}
             raise DataError(f"{path}: expected tensors count and sums that fit together, got {shapes}")
         if record.get("fraction_bits") != FRACTION_BITS:
-            raise DataError(
-                f"{path}: expected sums in units of 2^-{FRACTION_BITS}, got {record.get('fraction_bits')}"
-            )
+            raise DataError(f"{path}: expected sums in units of 2^-{FRACTION_BITS}, got {record.get('fraction_bits')}")
         statistics = cls(tuple(count.shape), sums.shape[-1], epsilon=record["epsilon"])
         statistics.count, statistics.sums = count, sums
         return statistics, record
@@ -174,10 +173,12 @@ class DirichletStatistics:
             cells = cells * size + part
         return cells
 
-    def _checked(self) -> Self:
-        if int(self.sums.abs().max()) >= _FULL:
-            raise InputError("statistics: a cell holds more samples than its sums can count; fit on fewer")
-        return self
+    def _check_room(self, count: Tensor) -> None:
+        """Raise `InputError` where the sums of so many samples might not fit into 63 bits."""
+        longest = math.log((2 + self.components * self.epsilon) / self.epsilon)
+        room = int(2.0 ** (63 - FRACTION_BITS) / longest)
+        if int(count.max()) > room:
+            raise InputError(f"statistics: a cell has room for {room} samples, got {int(count.max())}; fit on fewer")
 
 
 def quantise(scores: Tensor, epsilon: float) -> Tensor:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, wraps
-from typing import Any, Literal, ParamSpec, TypeVar, get_args
+from typing import Any, Literal, TypeVar, TypeVarTuple, get_args
 
 import torch
 from torch import Tensor
@@ -22,24 +22,24 @@ _DOUBLE = {"kornia": tuple(t / 64 for t in (1, 7, 21, 35, 35, 21, 7, 1)), "openc
 _SMALL = 128
 _ONEDNN = torch.backends.mkldnn.is_available()
 
-Constants = TypeVar("Constants")
-Arguments = ParamSpec("Arguments")
+Constant = TypeVar("Constant")
+Settings = TypeVarTuple("Settings")
 
 
-def constant(function: Callable[Arguments, Constants]) -> Callable[Arguments, Constants]:
+def constant(function: Callable[[*Settings], Constant]) -> Callable[[*Settings], Constant]:
     """Remember the tensors that a function makes of sizes and settings alone; a compiled graph makes its own."""
 
     @lru_cache(maxsize=256)
-    def remember(*args: Any) -> Any:
+    def remember(*settings: Any) -> Any:
         # What is made during inference must serve a later gradient too.
         with torch.inference_mode(False), torch.no_grad():
-            return function(*args)  # type: ignore[call-arg]
+            return function(*settings)
 
     @wraps(function)
-    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Constants:
+    def call(*settings: *Settings) -> Constant:
         if torch.compiler.is_compiling():
-            return function(*args, **kwargs)
-        result: Constants = remember(*args, **kwargs)
+            return function(*settings)
+        result: Constant = remember(*settings)
         return result
 
     return call
@@ -161,7 +161,7 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
 def _matrix(count: int, length: int | None, convention: Convention, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix that reduces a line of `count` pixels, or expands it to `length`.
 
-    Levels of a few thousand pixels cost less as two matrix products than as many short sums.
+    Levels of a few thousand pixels cost less as two matrix products than as many short passes.
     """
     lines = torch.eye(count, dtype=torch.float64)[None, None]
     lines = _reduce(lines, convention) if length is None else _expand(lines, length, convention)
@@ -190,13 +190,14 @@ def _expand(image: Tensor, length: int, convention: Convention) -> Tensor:
 
 
 def _blur(image: Tensor) -> Tensor:
-    """Five taps along the height, the image mirrored at its outermost pixels, to and fro where it has but one or two."""
+    """Five taps along the height, the image mirrored at its outermost pixels."""
     count = image.shape[-2]
+    # A line of one or two pixels is mirrored to and fro, as `BORDER_REFLECT_101` of OpenCV does.
     place = torch.arange(-2, count + 2, device=image.device).abs() % max(2 * count - 2, 1)
     extended = image.index_select(-2, torch.minimum(place, 2 * count - 2 - place))
     result = extended[..., :count, :] * _BLUR[0]
     for i in range(1, 5):
-        result = torch.add(result, extended[..., i : i + count, :], alpha=_BLUR[i])
+        result.add_(extended[..., i : i + count, :], alpha=_BLUR[i])
     return result
 
 
@@ -206,8 +207,8 @@ def _resize(image: Tensor, length: int) -> Tensor:
 
 
 def _convolves(image: Tensor) -> bool:
-    """Whether `_convolve` is fast here: on a CPU it takes oneDNN, which computes in single precision."""
-    fast = image.device.type != "cpu" or (_ONEDNN and image.dtype == torch.float32)
+    """Whether `_convolve` is fast and precise here: oneDNN's convolutions are, for single precision on a CPU."""
+    fast = _ONEDNN and image.device.type == "cpu" and image.dtype == torch.float32
     return fast and image.shape[-2] >= 8 and not torch.compiler.is_compiling()
 
 
@@ -223,7 +224,7 @@ def _convolve(image: Tensor, length: int, convention: Convention) -> Tensor:
 
 
 def _convolve_zeros(planes: Tensor, length: int, convention: Convention) -> Tensor:
-    """The same for planes `(N, height, width)` with zeros beyond their borders."""
+    """`_convolve` of planes `(N, height, width)`, with zeros beyond their borders."""
     count, width = planes.shape[-2:]
     columns = planes[:, None].permute(0, 3, 1, 2)
     kernel = _kernel(length < count, width, convention, planes.dtype, planes.device)

@@ -23,9 +23,7 @@ def exact_posterior_mean(beta: list[float], likelihood: list[float]) -> list[flo
 def scalar_kaplan(beta: list[float], likelihood: list[float]) -> list[float]:
     """The published formula, letter by letter."""
     expected = sum(b * l for b, l in zip(beta, likelihood, strict=True))
-    return [
-        b * (1 + l / expected) / (1 + min(likelihood) / expected) for b, l in zip(beta, likelihood, strict=True)
-    ]
+    return [b * (1 + l / expected) / (1 + min(likelihood) / expected) for b, l in zip(beta, likelihood, strict=True)]
 
 
 @given(likelihoods, st.data())

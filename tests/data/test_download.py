@@ -131,9 +131,7 @@ def test_broken_transfers_go_on_where_they_stopped(server, tmp_path):
 def test_a_later_run_resumes(server, tmp_path):
     server.stop_after = 0
     (tmp_path / "val2017.zip.part").write_bytes(FILES["/zips/val2017.zip"][:70_000])
-    with pytest.raises(
-        DataError, match=r"failed at 70,000 of [\d,]+ bytes \(the connection closed early\); run again"
-    ):
+    with pytest.raises(DataError, match=r"failed at 70,000 of [\d,]+ bytes \(the connection closed early\); run again"):
         fetch(IMAGES, tmp_path, address=server.address, pause=0)
     assert (tmp_path / "val2017.zip.part").stat().st_size == 70_000
     server.stop_after = None

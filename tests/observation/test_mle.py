@@ -116,9 +116,10 @@ def test_bounded_precision_is_the_constrained_maximum():
 
     def loss(x):
         alpha = bound * np.exp(x) / np.exp(x).sum()
-        return -scipy.stats.dirichlet(alpha).logpdf(np.exp(mean_log) / np.exp(mean_log).sum()) + (
-            (alpha - 1) * (mean_log - np.log(np.exp(mean_log).sum()) - mean_log)
-        ).sum()
+        return (
+            -scipy.stats.dirichlet(alpha).logpdf(np.exp(mean_log) / np.exp(mean_log).sum())
+            + ((alpha - 1) * (mean_log - np.log(np.exp(mean_log).sum()) - mean_log)).sum()
+        )
 
     best = scipy.optimize.minimize(loss, np.zeros(3), options={"gtol": 1e-10}).x
     expected = bound * np.exp(best) / np.exp(best).sum()

@@ -215,6 +215,42 @@ def test_same_with_and_without_gradient(convention, size):
         close(recorded.detach(), foveate(image, gaze, sigma=8.0, convention=convention))
 
 
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_gradients_in_single_precision(convention):
+    # Single and double precision take different ways through the pyramid.
+    gradients = []
+    for dtype in (torch.float32, torch.float64):
+        image = draw(2, 3, 150, 132).to(dtype).requires_grad_()
+        gaze = (100 * draw(2, 3, 2)).to(dtype).requires_grad_()
+        sigma = torch.tensor([30.0, 20.0], dtype=dtype, requires_grad=True)
+        foveate(image, gaze, sigma=sigma, levels=3, convention=convention).square().mean().backward()
+        gradients.append([t.grad.double() / t.grad.double().norm() for t in (image, gaze, sigma)])
+    for single, double in zip(*gradients, strict=True):
+        close(single, double, 1e-5)
+
+
+def test_gradient_after_inference():
+    image = draw(1, 1, 135, 142, dtype=torch.float32)
+    gaze = torch.tensor([30.0, 40.0], requires_grad=True)
+    with torch.inference_mode():
+        expected = foveate(image, gaze, sigma=11.0)
+    result = foveate(image.clone().requires_grad_(), gaze, sigma=11.0)
+    result.sum().backward()
+    close(result.detach(), expected.clone(), 1e-6)
+    assert torch.isfinite(gaze.grad).all()
+
+
+@pytest.mark.parametrize("sigma", [1e-30, 1e-3, 1e30, math.inf])
+def test_extreme_windows(sigma):
+    image = draw(1, 1, 20, 27, dtype=torch.float32).requires_grad_()
+    gaze = torch.tensor([[[5.0, 6.0], [1e30, -1e30]]], requires_grad=True)
+    result = foveate(image, gaze, sigma=sigma)
+    result.sum().backward()
+    assert torch.isfinite(result).all()
+    assert torch.isfinite(image.grad).all()
+    assert torch.isfinite(gaze.grad).all()
+
+
 def test_gaze_gradient_through_a_reused_pyramid():
     bands = laplacian_pyramid(draw(1, 3, 150, 132), 4)
     for _ in range(2):

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from semfov.errors import check, check_shape
 
 # Pixels that one product makes at once: more of them multiply more zeros, fewer copy more pixels twice.
-_TILE = 64
+_TILE = 32
 
 
 def gaussian_kernel(sigma: float) -> Tensor:
