@@ -16,7 +16,7 @@ from eval.parallel import available_cores, mine, run_tasks, wait_for_all
 from eval.protocol import generator_for
 from eval.setup import make_eye, make_scenes, prepare_worker
 from eval.store import code_digest
-from semfov import Grid
+from semfov import Detections, Grid
 from semfov.data.scene import Scenes
 from semfov.errors import DataError
 from semfov.eye import Eye
@@ -25,33 +25,50 @@ from semfov.observation.matching import match
 
 @dataclass(frozen=True)
 class Samples:
-    """Detections with their true classes.
+    """Detections with their true classes, and the looks that they come from.
 
     Attributes:
+        boxes: `(M, 4)`, in pixels of the image.
         scores: `(M, K+1)`, score vectors.
         distance: `(M,)`, from the box's centre to the fixation, in longer sides of the image.
         labels: `(M,)`, true classes, 0 where a detection shows no object.
-        scene: `(M,)`, index of the scene.
+        look: `(M,)`, the look that a detection belongs to, an index into `scenes` and `fixations`.
+        scenes: `(R,)`, index of the scene that each look was at; a look may have seen nothing.
+        fixations: `(R, 2)`, where each look was fixated.
     """
 
+    boxes: Tensor
     scores: Tensor
     distance: Tensor
     labels: Tensor
-    scene: Tensor
+    look: Tensor
+    scenes: Tensor
+    fixations: Tensor
 
     def __len__(self) -> int:
         return len(self.labels)
 
     def __getitem__(self, index: Tensor) -> Samples:
-        return Samples(self.scores[index], self.distance[index], self.labels[index], self.scene[index])
+        """Some of the detections; the looks stay."""
+        chosen = {name: getattr(self, name)[index] for name in _DETECTIONS}
+        return Samples(**chosen, scenes=self.scenes, fixations=self.fixations)
+
+    @property
+    def scene(self) -> Tensor:
+        """Index of the scene of each detection, `(M,)`."""
+        return self.scenes[self.look]
 
     @classmethod
     def join(cls, parts: list[Samples]) -> Samples:
         """All samples of several sets, in order."""
-        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in _NAMES))
+        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in _NAMES}
+        counts = torch.tensor([len(part.scenes) for part in parts])
+        first = (counts.cumsum(0) - counts).repeat_interleave(torch.tensor([len(part) for part in parts]))
+        return cls(**{**joined, "look": joined["look"] + first})
 
 
-_NAMES = ("scores", "distance", "labels", "scene")
+_DETECTIONS = ("boxes", "scores", "distance", "labels", "look")
+_NAMES = (*_DETECTIONS, "scenes", "fixations")
 
 
 @dataclass(frozen=True)
@@ -121,20 +138,24 @@ class Sampler:
         grid = Grid(1, 1, scene.size)
         generator = generator_for("fixations", settings.seed, scene.id)
         points = torch.rand(settings.fixations, 2, generator=generator) * grid.extent - 0.5
-        parts = []
         with torch.inference_mode():
             view = self.eye.open(scene.image[None])
-            for point in points:
-                seen = self.eye.look(view, point[None])
-                parts.append(
-                    Samples(
-                        seen.scores[0],
-                        grid.box_distance(seen.boxes[0], point),
-                        match(seen.boxes[0], scene.boxes, scene.labels, iou=settings.iou),
-                        torch.full((int(seen.count),), index),
-                    )
-                )
-        return Samples.join(parts)
+            # One view at a time: the bits then do not depend on which views share a batch.
+            seen = Detections.stack([self.eye.look(view, point[None]) for point in points])
+            distance = grid.box_distance(seen.boxes, points)
+            labels = [
+                match(boxes[mask], scene.boxes, scene.labels, iou=settings.iou)
+                for boxes, mask in zip(seen.boxes, seen.mask, strict=True)
+            ]
+            return Samples(
+                boxes=seen.boxes[seen.mask],
+                scores=seen.scores[seen.mask],
+                distance=distance[seen.mask],
+                labels=torch.cat(labels),
+                look=seen.mask.nonzero()[:, 0],
+                scenes=torch.full((len(points),), index),
+                fixations=points,
+            )
 
 
 _process: dict[str, tuple[Sampler, Path]] = {}

@@ -24,7 +24,7 @@ def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
     if data.root is None:
         from semfov.data.scenes import EmbeddedScenes
 
-        return EmbeddedScenes(count=data.limit or 8, seed=data.scene_seed, classes=classes)
+        return EmbeddedScenes(classes, count=data.limit or 8, seed=data.scene_seed)
     from semfov.data.coco import CocoScenes
 
     return CocoScenes(

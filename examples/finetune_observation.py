@@ -58,7 +58,7 @@ def main() -> None:
     detector = semfov.load_detector("yolov3-tiny")
     eye = semfov.Eye(semfov.Foveation(100.0), detector).requires_grad_(False)
     train, test = (
-        looks_at(semfov.EmbeddedScenes(arguments.scenes, seed, classes=detector.classes), eye, arguments.starts)
+        looks_at(semfov.EmbeddedScenes(detector.classes, count=arguments.scenes, seed=seed), eye, arguments.starts)
         for seed in (1, 2)
     )
     published = semfov.FovealObservationModel.from_pretrained("yolov3-tiny-published")

@@ -9,7 +9,7 @@ from semfov.detection import Detections, Detector, Selection
 from semfov.detection.load import load_detector
 from semfov.errors import DataError, InputError, SemfovError
 from semfov.eye import Eye
-from semfov.gaze import acquisition, search_policy
+from semfov.gaze import acquisition, saliency, search_policy
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
 from semfov.scanpath import Scanpath
 from semfov.sensor import Foveation, foveate
@@ -43,6 +43,7 @@ __all__ = [
     "fusion",
     "load_detector",
     "read_image",
+    "saliency",
     "search_policy",
     "weigh",
 ]

@@ -35,6 +35,7 @@ SURFACE = {
     "fusion",
     "load_detector",
     "read_image",
+    "saliency",
     "search_policy",
     "weigh",
 }

@@ -48,12 +48,10 @@ def fit_fom(config: FitConfig) -> None:
 
 def fit_model(config: FitConfig, sampler: Sampler, samples: Samples) -> semfov.FovealObservationModel:
     """The model of the method that the settings name."""
-    generative = "newton" if config.method == "discriminative" else config.method
-    model = published_model(config, sampler, samples, generative)
-    if config.method == "discriminative":
-        model = fit_discriminative(model, samples.scores, samples.distance, samples.labels)
-        model.metadata["method"] = "discriminative"
-    return model
+    if config.method != "discriminative":
+        return published_model(config, sampler, samples, config.method)
+    start = published_model(config, sampler, samples, "newton", expected="empirical")
+    return fit_discriminative(start, samples.scores, samples.distance, samples.labels)
 
 
 def published_model(

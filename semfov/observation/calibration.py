@@ -20,7 +20,7 @@ def fit_discriminative(
     decay: float = 2000.0,
     level_decay: float = 10000.0,
     bias_decay: float = 10.0,
-    iterations: int = 200,
+    iterations: int = 100,
 ) -> FovealObservationModel:
     r"""A model whose posterior is calibrated: α and π minimise the cross-entropy of the true classes.
 
@@ -35,9 +35,9 @@ def fit_discriminative(
               u \sim N(0, 1/\texttt{decay}), \; v \sim N(0, 1/\texttt{level\_decay}), \;
               c \sim N(0, 1/\texttt{bias\_decay})
 
-    with `c` again the sum of a common part and one for each level. The diagonal of u, which acts as the temperature
-    of the scores, has the weaker prior of c. The objective, the posterior of these under the samples, is maximised by
-    L-BFGS on all samples from a fixed start, so that the result depends on nothing random.
+    with `c` again the sum of a common part and one for each level. The diagonal of u, which acts as a temperature of
+    each score, has the weaker prior of c. The maximum a posteriori is found by L-BFGS on all samples from a fixed
+    start, so that the result depends on nothing random.
 
     Trained so, Dir(α) no longer describes the scores: the expected scores are kept from `model`.
 
@@ -76,32 +76,27 @@ def fit_discriminative(
 
     unit = torch.eye(components).to(scores)
     start = unit.log1p()[:, None]
-    # Each variable is counted in standard deviations of its prior, which puts them all on one scale.
-    deviations = [
-        torch.where(unit[:, None] > 0, bias_decay, decay).rsqrt(),
-        scores.new_tensor(level_decay).rsqrt(),
-        scores.new_tensor(bias_decay).rsqrt(),
-        scores.new_tensor(bias_decay).rsqrt(),
-    ]
-    shapes = [(components, 1, components), (components, levels, components), (components, 1), (components, levels)]
-    variables = [scores.new_zeros(shape, requires_grad=True) for shape in shapes]
+    weak, tied = scores.new_tensor(bias_decay), scores.new_tensor(level_decay)
+    precisions = [torch.where(unit[:, None] > 0, bias_decay, decay), tied, weak, weak]
+    scales = [(c + p).rsqrt() for c, p in zip(_curvatures(groups, start.exp()), precisions, strict=True)]
+    variables = [torch.zeros_like(scale, requires_grad=True) for scale in scales]
     optimiser = torch.optim.LBFGS(
         variables,
         max_iter=iterations,
         history_size=10,
         tolerance_grad=0.0,
-        tolerance_change=1e-7,
+        tolerance_change=1e-9,
         line_search_fn="strong_wolfe",
     )
 
-    def current() -> tuple[Tensor, Tensor]:
-        across, within, common, own = (v * d for v, d in zip(variables, deviations, strict=True))
-        return (start + across + within).exp(), common + own
+    def current() -> list[Tensor]:
+        return [v * scale for v, scale in zip(variables, scales, strict=True)]
 
     def loss() -> Tensor:
         optimiser.zero_grad()
-        alpha, constant = current()
-        total = sum((v.square().sum() for v in variables), scores.new_zeros(())) / 2
+        across, within, common, own = values = current()
+        alpha, constant = (start + across + within).exp(), common + own
+        total = torch.stack([(p * v.square()).sum() for p, v in zip(precisions, values, strict=True)]).sum() / 2
         for n, (rows, truth) in enumerate(groups):
             logits = F.linear(rows, alpha[:, n] - 1, constant[:, n])
             total = total + F.cross_entropy(logits, truth, reduction="sum")
@@ -112,7 +107,8 @@ def fit_discriminative(
     with torch.enable_grad():
         optimiser.step(loss)
 
-    alpha, constant = (t.detach() for t in current())
+    across, within, common, own = (value.detach() for value in current())
+    alpha, constant = (start + across + within).exp(), common + own
     # c is ln π, less the normaliser of Dir(α), plus the shift by the floor.
     shift = log_normaliser(alpha.double()).to(alpha) - (alpha - 1).sum(-1) * lowest
     trained = {"decay": decay, "level_decay": level_decay, "bias_decay": bias_decay, "iterations": iterations}
@@ -125,3 +121,18 @@ def fit_discriminative(
         expected=model.expected_scores().detach(),
         metadata={**model.metadata, "method": "discriminative", "discriminative": trained},
     )
+
+
+def _curvatures(groups: list[tuple[Tensor, Tensor]], alpha: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Diagonal of the Hessian of the cross-entropy at the start, for u, v and the two parts of c.
+
+    Scaled by it, directions of which the samples tell much and little are on one footing for L-BFGS.
+    """
+    weights, constants = [], []
+    for rows, _ in groups:
+        p = F.linear(rows, alpha[:, 0] - 1).softmax(-1)
+        spread = (p * (1 - p)).t()
+        weights.append(spread @ rows.square() * alpha[:, 0].square())
+        constants.append(spread.sum(-1))
+    weight, constant = torch.stack(weights, 1), torch.stack(constants, 1)
+    return weight.sum(1, keepdim=True), weight, constant.sum(1, keepdim=True), constant

@@ -86,7 +86,7 @@ class FovealObservationModel(nn.Module):
         shape = (components, len(borders) + 1, components)
         check(tuple(alpha.shape) == shape, "alpha", f"shape (K+1, N, K+1) = {shape}", tuple(alpha.shape))
         check_finite(alpha, "alpha")
-        check(bool((alpha > 0).all()), "alpha", "positive numbers", float(alpha.min()))
+        check(bool((alpha > 0).all()), "alpha", "positive numbers", float(alpha.detach().min()))
         check(0 < epsilon < 1, "epsilon", "a number between 0 and 1", epsilon)
         check(tempering > 0, "tempering", "a positive number", tempering)
         self.classes = tuple(classes)

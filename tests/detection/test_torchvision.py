@@ -65,7 +65,6 @@ NAMED = {
     "fasterrcnn_mobilenet_v3_large_320_fpn": SMALL | {"box_score_thresh": 0.2},
     "retinanet_resnet50_fpn_v2": SMALL | {"score_thresh": 0.1},
     "fcos_resnet50_fpn": SMALL | {"score_thresh": 0.1},
-    "ssd300_vgg16": {"score_thresh": 0.25},
     LITE: {"score_thresh": 0.25},
 }
 
@@ -80,9 +79,17 @@ def spread(model: nn.Module) -> nn.Module:
                 parameter.copy_(torch.tensor([-50.0, 0, 0, 0]).repeat(len(parameter) // 4))
             elif "cls_logits" in name or "cls_score" in name or "bbox" in name:
                 parameter.normal_(0, 0.1, generator=generator)
-            elif "classification_head.module_list" in name:
-                parameter.mul_(0.3)
     return model.double()
+
+
+def normalise(model: nn.Module) -> None:
+    """Give batch norm the statistics of noise, without which a fresh network's features fade layer by layer."""
+    for layer in model.modules():
+        if isinstance(layer, nn.BatchNorm2d):
+            layer.train().reset_running_stats()
+            layer.momentum = None
+    model.head(list(model.backbone(noise(2, 3, 320, 320)).values()))
+    model.eval()
 
 
 @pytest.fixture(scope="module", params=MODELS)
@@ -134,7 +141,7 @@ def assert_same_as_stock(detector, images):
     if isinstance(model, RetinaNet | FCOS):
         each = model.anchor_generator.num_anchors_per_location()[0]
         levels = [min(model.topk_candidates, each * count) for count in pixels[0]]
-    assert sum(len(found["boxes"]) for found in stock) > 20
+    assert sum(len(found["boxes"]) for found in stock) > 10
     for theirs, (boxes, scores, labels) in zip(stock, filtered(raw, model, levels), strict=True):
         torch.testing.assert_close(scores, theirs["scores"])
         assert torch.equal(labels, theirs["labels"])
@@ -152,6 +159,8 @@ def test_same_boxes_as_the_published_architectures(name):
     torch.manual_seed(0)
     detector = load_torchvision(name, weights=None, classes=NAMES, **NAMED[name])
     spread(detector.model)
+    if name == LITE:
+        normalise(detector.model)
     assert_same_as_stock(detector, noise(1, 3, 70, 90))
 
 

@@ -52,7 +52,7 @@ def draw(alpha, counts, seed=0):
 def test_likelihoods_are_the_dirichlets_of_scipy(dtype, tolerance):
     model = FovealObservationModel(table(dtype), EDGES, CLASSES)
     scores, distance = looks(dtype=dtype)
-    got = model.log_likelihood(scores, distance)
+    got = model.log_likelihood(scores, distance).detach()
     assert got.dtype == dtype
     assert got.shape == (5, 7, 4)
     for i, j in np.ndindex(5, 7):
@@ -156,7 +156,7 @@ def test_alpha_learns_and_stays_positive():
         loss = torch.nn.functional.nll_loss(model.calibrate(scores, distance).clamp(min=1e-12).log(), labels)
         loss.backward()
         optimiser.step()
-        losses.append(float(loss))
+        losses.append(float(loss.detach()))
         assert bool((model.alpha > 0).all())
     assert losses[-1] < losses[0] / 2
 

@@ -1,0 +1,115 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.export import OUTPUTS, export_onnx, largest_difference
+from semfov.detection.load import load_detector, load_yolo
+from semfov.detection.onnx import load_onnx
+from semfov.errors import DataError, InputError
+
+CLASSES = ("cat", "dog")
+
+
+@pytest.fixture
+def small_weights(write_weights):
+    return write_weights()
+
+
+@pytest.fixture
+def small(small_cfg, small_weights):
+    """A network with every kind of layer and activation but one."""
+    return lambda **options: load_yolo(
+        str(small_cfg), weights=small_weights, classes=CLASSES, **{"winograd": False, "stride": 16, **options}
+    )
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_equal_outputs(small, tmp_path, static):
+    detector = small(stride=None if static else 16)
+    path = tmp_path / "small.onnx"
+    export_onnx(detector, path, static=static)
+    exported = load_onnx(path)
+    assert exported.head == "candidates"
+    image = torch.rand(2, 3, 50, 90, generator=torch.Generator().manual_seed(0))
+    ours, theirs = detector.propose(detector.fit(image)[0]), exported.propose(exported.fit(image)[0])
+    torch.testing.assert_close(theirs.boxes, ours.boxes, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(theirs.classes, ours.classes, rtol=0, atol=1e-5)
+    torch.testing.assert_close(theirs.objectness, ours.objectness, rtol=0, atol=1e-5)
+    assert largest_difference(detector, path) <= 1e-4
+    ours, theirs = detector(image), exported(image)
+    assert ours.count.min() > 3
+    torch.testing.assert_close(theirs.scores, ours.scores, rtol=0, atol=1e-4)
+    torch.testing.assert_close(theirs.boxes, ours.boxes, rtol=1e-3, atol=1e-2)
+
+
+@pytest.mark.parametrize("size", [(16, 16), (64, 32), (32, 80)])
+def test_a_dynamic_export_takes_any_multiple_of_the_stride(small, tmp_path, size):
+    detector = small()
+    export_onnx(detector, tmp_path / "small.onnx")
+    exported = load_onnx(tmp_path / "small.onnx")
+    canvas = torch.rand(3, 3, *size, generator=torch.Generator().manual_seed(0))
+    ours, theirs = detector.propose(canvas), exported.propose(canvas)
+    torch.testing.assert_close(theirs.boxes, ours.boxes, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(theirs.classes, ours.classes, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("activation", ["linear", "leaky", "relu", "mish", "swish", "logistic"])
+def test_every_activation(small_cfg, small_weights, tmp_path, activation):
+    small_cfg.write_text(small_cfg.read_text().replace("activation=leaky", f"activation={activation}"))
+    detector = load_yolo(str(small_cfg), weights=small_weights, classes=CLASSES, winograd=False, stride=16)
+    export_onnx(detector, tmp_path / "small.onnx")
+    assert largest_difference(detector, tmp_path / "small.onnx") <= 1e-4
+
+
+def test_the_model_says_what_it_is(small, tmp_path):
+    import onnx
+
+    detector = small(background="uniform", input_size=(96, 64))
+    path = tmp_path / "small.onnx"
+    export_onnx(detector, path)
+    model = onnx.load(path)
+    onnx.checker.check_model(model, full_check=True)
+    assert [output.name for output in model.graph.output] == list(OUTPUTS)
+    exported = load_onnx(path)
+    ours, theirs = (json.loads(json.dumps(each.settings())) for each in (detector, exported))
+    shared = (ours.keys() & theirs.keys()) - {"digest"}
+    assert {"name", "background", "input_size", "stride", "fill"} <= shared
+    assert {key: theirs[key] for key in shared} == {key: ours[key] for key in shared}
+    assert exported.classes == CLASSES
+
+
+def test_what_cannot_be_exported(small, tmp_path, make_onnx):
+    with pytest.raises(InputError, match="winograd=False"):
+        export_onnx(small(winograd=True), tmp_path / "out.onnx")
+    other = load_onnx(make_onnx({"output0": np.ones((1, 84, 7), np.float32).swapaxes(1, 2)}), classes=("a", "b", "c"))
+    with pytest.raises(InputError, match="OnnxDetector"):
+        export_onnx(other, tmp_path / "out.onnx")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="cannot write"):
+        export_onnx(small(), tmp_path / "file" / "out.onnx")
+    assert not (tmp_path / "out.onnx").exists()
+
+
+@pytest.mark.weights
+def test_command_line(tiny_weights, tmp_path):
+    path = tmp_path / "tiny.onnx"
+    command = [
+        sys.executable,
+        "-m",
+        "semfov.detection.export",
+        "yolov3-tiny",
+        str(path),
+        "--weights",
+        str(tiny_weights),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "largest difference" in done.stdout
+    detector, exported = load_detector("yolov3-tiny", weights=tiny_weights, winograd=False), load_detector(path)
+    assert exported.classes == COCO_CLASSES
+    assert exported.name == "yolov3-tiny"
+    assert largest_difference(detector, path) <= 1e-4
