@@ -35,13 +35,15 @@ class DetectorConfig:
     """Which detector looks through the fovea.
 
     Args:
-        name: `yolov3-tiny`, `yolov3`, `yolov3-spp`, a Darknet cfg file or an ONNX model.
+        name: `yolov3-tiny`, `yolov3`, `yolov3-spp`, `yolox-nano`, `yolox-tiny`, `yolox-s`, a Darknet cfg file, an
+            ONNX model, or `torchvision:<model>`.
         weights: file with the weights (None: those registered for the name).
         background: where the background score comes from (`semfov.detection.scores`).
         threshold: boxes with a lower confidence are dropped.
         iou: class-agnostic non-maximum suppression drops boxes that overlap a better one by more.
         limit: most boxes kept in a view.
-        stride: pad the view only to a multiple of this (None: to the detector's square input, as published).
+        stride: pad the view only to a multiple of this (None: to the detector's square input, as published; `auto`:
+            what is fastest, 32 for Darknet's networks).
     """
 
     name: str = "yolov3-tiny"
@@ -50,7 +52,7 @@ class DetectorConfig:
     threshold: float = 0.02
     iou: float = 0.5
     limit: int = 100
-    stride: int | None = 32
+    stride: int | Literal["auto"] | None = "auto"
 
 
 @dataclass(frozen=True)

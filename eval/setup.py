@@ -39,15 +39,17 @@ def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
 
 def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
     """The foveal sensor and the detector behind it."""
-    model = semfov.load_detector(
-        detector.name,
-        weights=detector.weights,
-        background=detector.background,
-        threshold=detector.threshold,
-        iou=detector.iou,
-        limit=detector.limit,
-        stride=detector.stride,
-    )
+    options: dict[str, object] = {
+        "background": detector.background,
+        "threshold": detector.threshold,
+        "iou": detector.iou,
+        "limit": detector.limit,
+    }
+    if detector.weights is not None:
+        options["weights"] = detector.weights
+    if detector.stride != "auto":
+        options["stride"] = detector.stride
+    model = semfov.load_detector(detector.name, **options)
     foveation = semfov.Foveation(sensor.sigma, levels=sensor.levels, growth=sensor.growth, convention=sensor.convention)
     return Eye(foveation, model, reference=sensor.reference).eval().requires_grad_(False)
 

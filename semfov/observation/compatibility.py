@@ -35,14 +35,17 @@ def check_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any]) -> No
     if not detector or not fitted:
         return
     mine, theirs = fitted.get("digest"), detector.get("digest")
-    key = "digest" if mine and theirs else "name"
-    if fitted.get(key) != detector.get(key):
+    same = fitted.get("name") == detector.get("name")
+    if mine and theirs:
+        # A model card may name other conversions of the same checkpoint.
+        same = theirs in (mine, *fitted.get("equivalent", ()))
+    if not same:
         raise InputError(
             f"detector: the observation model was fitted for {_describe(fitted)}, got {_describe(detector)}; fit a "
             f"model for this detector, or take the one it was fitted for"
         )
     check_background(fitted, detector.get("background"))
-    _warn_of_others("detector", fitted, detector, {"name", "digest", "background"})
+    _warn_of_others("detector", fitted, detector, {"name", "digest", "equivalent", "background", "winograd", "dtype"})
 
 
 def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any]) -> None:
