@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from semfov.belief import Footprint
+from semfov.belief import Footprint, Memory
 from semfov.detection.scores import BackgroundPolicy
 
 
@@ -83,7 +83,9 @@ class BeliefConfig:
         rows: cells in a column.
         prior: Dirichlet parameter of every class before the first look.
         fusion: `kaplan` (published), `product` or `sum`.
-        footprint: which cells a detection updates: `overlap` (published), `centre` or `box_centre`.
+        footprint: which cells a detection updates: `overlap` (published), `centre`, `box_centre` or `soft`.
+        tempering: exponent of the likelihoods (published: 1).
+        memory: fuse `all` looks (published), or keep what the `closest` look at each cell says.
         model: fitted observation model, by name or file (None: the one shipped for the detector).
     """
 
@@ -92,6 +94,8 @@ class BeliefConfig:
     prior: float = 0.5
     fusion: Literal["kaplan", "product", "sum"] = "kaplan"
     footprint: Footprint = "overlap"
+    tempering: float = 1.0
+    memory: Memory = "all"
     model: str | None = None
 
 

@@ -3,14 +3,15 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from eval.config import ProtocolConfig
-from semfov import Grid
+from semfov import Detections, Grid
 from semfov.agent import step
-from semfov.belief import Evidence
+from semfov.belief import Observer
 from semfov.data.scene import Scenes
 from semfov.gaze import Policy
 
@@ -34,6 +35,19 @@ class Episode:
     start: int
     goal: tuple[int, ...]
     commonest: bool
+
+
+@dataclass(frozen=True)
+class Searcher:
+    """How to search: what looks are taken to say, and where to look next.
+
+    Attributes:
+        observer: turns looks into belief.
+        policy: makes the acquisition function for a target.
+    """
+
+    observer: Observer
+    policy: Policy
 
 
 @dataclass(frozen=True)
@@ -88,12 +102,11 @@ def tie_noise(scenes: Scenes, episode: Episode, cells: int, protocol: ProtocolCo
 
 def run_episodes(
     episodes: Sequence[Episode],
-    evidence: Evidence,
+    searcher: Searcher,
+    detections: Detections,
+    grid: Grid,
     noise: Tensor,
-    policy: Policy,
     *,
-    prior: float,
-    fusion: str,
     shifts: int,
     batch: int,
 ) -> list[Outcome]:
@@ -101,41 +114,63 @@ def run_episodes(
 
     Args:
         episodes: of one and the same scene.
-        evidence: what a look from every cell of it says, a batch of X·Y.
+        searcher: how they search.
+        detections: what is seen from every cell of the scene, a batch of X·Y.
+        grid: the grid over the scene.
         noise: `(episodes, shifts+1, X·Y)`, from `tie_noise`.
-        policy: makes the acquisition function for the targets.
-        prior: Dirichlet parameter before the first look.
-        fusion: rule of fusion.
         shifts: most gaze shifts.
         batch: episodes in a tensor.
     """
+    looks = Looks(searcher.observer, detections, grid, sorted({episode.target for episode in episodes}))
     outcomes: list[Outcome] = []
     for first in range(0, len(episodes), batch):
         part = slice(first, first + batch)
-        outcomes += _run_batch(episodes[part], evidence, noise[part], policy, prior, fusion, shifts)
+        outcomes += _run_batch(episodes[part], searcher, looks, noise[part], shifts)
     return outcomes
 
 
+class Looks:
+    """What a look from every cell of a scene says, for the targets that are searched for in it.
+
+    Args:
+        observer: weighs the detections.
+        detections: a batch of X·Y.
+        grid: the grid over the scene.
+        targets: classes, ascending.
+    """
+
+    def __init__(self, observer: Observer, detections: Detections, grid: Grid, targets: Sequence[int]) -> None:
+        self.grid = grid
+        self.like = detections.scores
+        # One row of evidence for each cell, or for each target and cell.
+        self._first = torch.zeros(max(targets) + 1, dtype=torch.long)
+        if observer.by_target:
+            self._first[list(targets)] = torch.arange(len(targets)) * len(grid)
+            said = [observer.weigh(detections, grid.centres, grid, target) for target in targets]
+            self._evidence = type(said[0]).join(said)
+        else:
+            self._evidence = observer.weigh(detections, grid.centres, grid)
+
+    def __call__(self, targets: Tensor, cell: Tensor) -> Any:
+        """Evidence of looks from cells `(B,)` by episodes that search for `targets` `(B,)`."""
+        return self._evidence[self._first[targets] + cell]
+
+
 def _run_batch(
-    episodes: Sequence[Episode],
-    evidence: Evidence,
-    noise: Tensor,
-    policy: Policy,
-    prior: float,
-    fusion: str,
-    shifts: int,
+    episodes: Sequence[Episode], searcher: Searcher, looks: Looks, noise: Tensor, shifts: int
 ) -> list[Outcome]:
-    count, cells, components = len(episodes), evidence.footprint.shape[-1], evidence.likelihood.shape[-1]
+    count, cells = len(episodes), len(looks.grid)
     goals = torch.zeros(count, cells, dtype=torch.bool)
     for row, episode in enumerate(episodes):
         goals[row, list(episode.goal)] = True
     targets = torch.tensor([episode.target for episode in episodes])
     visits = torch.full((count, shifts + 1), -1)
     found_at = torch.full((count,), -1)
+    observer = searcher.observer
 
     active = torch.arange(count)
     cell = torch.tensor([episode.start for episode in episodes])
-    beta = evidence.likelihood.new_full((count, cells, components), prior)
+    belief = observer.start(count, looks.grid, looks.like)
     visited = torch.zeros(count, cells, dtype=torch.bool)
     for shift in range(shifts + 1):
         visits[active, shift] = cell
@@ -144,8 +179,10 @@ def _run_batch(
         go_on = ~found
         if shift == shifts or not go_on.any():
             break
-        active, cell, beta, visited = active[go_on], cell[go_on], beta[go_on], visited[go_on]
-        after = step(beta, visited, cell, evidence[cell], policy(targets[active]), noise[active, shift], fusion=fusion)
+        active, cell, belief, visited = active[go_on], cell[go_on], belief[go_on], visited[go_on]
+        wanted = targets[active]
+        acquisition = searcher.policy(observer.component(wanted), looks.grid)
+        after = step(observer, belief, visited, cell, looks(wanted, cell), acquisition, noise[active, shift])
         left = after.cell >= 0
-        active, cell, beta, visited = active[left], after.cell[left], after.beta[left], after.visited[left]
+        active, cell, belief, visited = active[left], after.cell[left], after.belief[left], after.visited[left]
     return [Outcome(tuple(row[row >= 0].tolist()), int(at)) for row, at in zip(visits, found_at, strict=True)]

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 import semfov
 from eval.cached import checksum
 from eval.metrics import cumulative_performance, random_search, standard_error
+from eval.protocol import Looks
 from eval.setup import plain
 from eval.tasks import Parts, SearchRun
-from semfov.belief import fuse, weigh
 from semfov.errors import DataError
 from semfov.files import replacing, write_text
 from semfov.gaze import select_fixation
@@ -127,12 +127,12 @@ def expected_random(records: list[dict[str, Any]], shifts: int, cells: int) -> N
 
 def milliseconds_per_decision(run: SearchRun, name: str, repetitions: int = 50) -> float:
     """Median time from a belief to the next fixation, one episode on one thread."""
-    belief, classes = run.config.belief, len(run.scenes.classes)
-    cells = belief.columns * belief.rows
+    searcher, grid = run.searcher(name), run.grid(0)
     generator = torch.Generator().manual_seed(0)
-    beta = belief.prior + torch.rand(1, cells, classes + 1, generator=generator)
-    visited, noise = torch.zeros(1, cells, dtype=torch.bool), torch.rand(1, cells, generator=generator)
-    acquisition = run.policy(name)(torch.tensor([1]))
+    start = searcher.observer.start(1, grid, torch.empty(0)).beta
+    beta = start + torch.rand(start.shape, generator=generator)
+    visited, noise = torch.zeros(1, len(grid), dtype=torch.bool), torch.rand(1, len(grid), generator=generator)
+    acquisition = searcher.policy(searcher.observer.component(torch.tensor([1])), grid)
     times = []
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -294,20 +294,19 @@ def draw_scanpaths(run: SearchRun, records: list[dict[str, Any]]) -> list[Path]:
 
 def replay(run: SearchRun, index: int, record: dict[str, Any]) -> Scanpath:
     """The scanpath of a recorded episode, with what was seen and believed at each fixation."""
-    belief, grid, detections = run.config.belief, run.grid(index), run.detections(index)
-    name = record["policy"]
-    observation = run.model if name.endswith("-calibrated") else None
-    evidence = weigh(detections, grid.centres, grid, observation, belief.footprint)
-    acquisition = run.policy(name)(record["target"])
-    beta = evidence.likelihood.new_full((1, len(grid), evidence.likelihood.shape[-1]), belief.prior)
+    grid, detections, target = run.grid(index), run.detections(index), int(record["target"])
+    searcher = run.searcher(record["policy"])
+    observer = searcher.observer
+    looks = Looks(observer, detections, grid, [target])
+    acquisition = searcher.policy(observer.component(target), grid)
+    belief = observer.start(1, grid, detections.scores)
     cells = torch.tensor(record["cells"])
     beliefs, values = [], []
     with torch.no_grad():
         for cell in cells:
-            look = evidence[cell[None]]
-            beta = fuse(beta, look.likelihood, look.footprint, belief.fusion)
-            beliefs.append(beta[0])
-            values.append(acquisition(beta)[0])
+            belief = observer.update(belief, looks(torch.tensor([target]), cell[None]))
+            beliefs.append(belief.beta[0])
+            values.append(acquisition(belief.beta)[0])
     return Scanpath(
         grid=grid,
         classes=("background", *run.scenes.classes),

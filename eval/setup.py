@@ -10,11 +10,13 @@ from typing import Any
 import torch
 
 import semfov
-from eval.config import DataConfig, DetectorConfig, SearchConfig, SensorConfig
+from eval.config import BeliefConfig, DataConfig, DetectorConfig, SearchConfig, SensorConfig
+from eval.protocol import Searcher
+from semfov.belief import SemanticObserver
 from semfov.data.scene import Scenes
 from semfov.errors import InputError, check, lookup
 from semfov.eye import Eye
-from semfov.gaze import SEARCH_POLICIES
+from semfov.gaze import SEARCH_POLICIES, search_policy
 
 
 def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
@@ -73,6 +75,23 @@ def needs_model(policies: tuple[str, ...]) -> bool:
     """Whether a policy of the run predicts or calibrates."""
     check(len(policies) > 0, "policies", "at least one policy", "none")
     return any(base == "predictive" or calibrated for base, calibrated in map(split_policy, policies))
+
+
+def make_searcher(
+    name: str, belief: BeliefConfig, components: int, model: semfov.FovealObservationModel | None
+) -> Searcher:
+    """How the policy of this name searches."""
+    base, calibrated = split_policy(name)
+    observer = SemanticObserver(
+        components,
+        model if calibrated else None,
+        prior=belief.prior,
+        fusion=belief.fusion,
+        footprint=belief.footprint,
+        tempering=belief.tempering,
+        memory=belief.memory,
+    )
+    return Searcher(observer, search_policy(base, model, calibrated=calibrated))
 
 
 def plain(settings: dict[str, Any]) -> Any:

@@ -12,14 +12,13 @@ import torch
 
 from eval.cached import checksum
 from eval.config import SearchConfig
-from eval.protocol import Outcome, episodes_of, run_episodes, tie_noise
-from eval.setup import make_eye, make_observation, make_scenes, needs_model, prepare_worker, split_policy
+from eval.protocol import Outcome, Searcher, episodes_of, run_episodes, tie_noise
+from eval.setup import make_eye, make_observation, make_scenes, make_searcher, needs_model, prepare_worker
 from eval.store import DetectionStore, see_all
-from semfov import Detections, Grid, weigh
+from semfov import Detections, Grid
 from semfov.data.scene import Scenes
 from semfov.errors import DataError
 from semfov.files import write_text
-from semfov.gaze import Policy, search_policy
 
 
 class SearchRun:
@@ -48,10 +47,9 @@ class SearchRun:
         what = [self.store.key, self.scenes.fingerprint, belief, protocol, list(config.policies)]
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
-    def policy(self, name: str) -> Policy:
-        """The policy of this name, with this run's observation model."""
-        base, calibrated = split_policy(name)
-        return search_policy(base, self.model, calibrated=calibrated)
+    def searcher(self, name: str) -> Searcher:
+        """How the policy of this name searches, with this run's observation model."""
+        return make_searcher(name, self.config.belief, len(self.scenes.classes) + 1, self.model)
 
     def grid(self, index: int) -> Grid:
         """The grid over a scene."""
@@ -69,7 +67,8 @@ class SearchRun:
 
     def outcomes(self, index: int) -> tuple[list[dict[str, object]], dict[str, float]]:
         """Records of all episodes of a scene under all policies, and the seconds that they took."""
-        config, protocol, belief = self.config, self.config.protocol, self.config.belief
+        config, protocol = self.config, self.config.protocol
+        belief = config.belief
         episodes = episodes_of(self.scenes, index, belief.columns, belief.rows, protocol)
         seconds: dict[str, float] = {}
         records: list[dict[str, object]] = []
@@ -81,15 +80,13 @@ class SearchRun:
         noise = torch.stack([tie_noise(self.scenes, episode, len(grid), protocol) for episode in episodes])
         for name in config.policies:
             began = time.perf_counter()
-            observation = self.model if split_policy(name)[1] else None
             with torch.inference_mode():
                 outcomes = run_episodes(
                     episodes,
-                    weigh(detections, grid.centres, grid, observation, belief.footprint),
+                    self.searcher(name),
+                    detections,
+                    grid,
                     noise,
-                    self.policy(name),
-                    prior=belief.prior,
-                    fusion=belief.fusion,
                     shifts=protocol.shifts,
                     batch=protocol.batch,
                 )

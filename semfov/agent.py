@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from semfov.belief.evidence import Evidence, Observation, weigh
+from semfov.belief.evidence import Observation
 from semfov.belief.grid import Footprint, Grid
-from semfov.belief.update import fuse
+from semfov.belief.observer import Observer, SemanticObserver
+from semfov.belief.state import Belief
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.errors import check, check_shape, lookup
@@ -24,43 +26,42 @@ class Step:
     """What one look leaves behind.
 
     Attributes:
-        beta: `(B, X·Y, K+1)`, the belief after the look.
+        belief: the belief after the look.
         visited: `(B, X·Y)`, cells that inhibition of return keeps the gaze from.
         values: `(B, X·Y)`, acquisition values.
         cell: `(B,)`, the next cell to fixate, -1 where none is left.
     """
 
-    beta: Tensor
+    belief: Belief
     visited: Tensor
     values: Tensor
     cell: Tensor
 
 
 def step(
-    beta: Tensor,
+    observer: Observer,
+    belief: Belief,
     visited: Tensor,
     cell: Tensor,
-    evidence: Evidence,
+    evidence: Any,
     acquisition: Callable[[Tensor], Tensor],
     noise: Tensor,
-    *,
-    fusion: str = "kaplan",
 ) -> Step:
     """One cycle of active perception for a batch of episodes; agent and evaluation both call it.
 
     Args:
-        beta: `(B, X·Y, K+1)`, the belief before the look.
+        observer: turns looks into belief.
+        belief: before the look.
         visited: `(B, X·Y)` boolean, cells fixated before.
         cell: `(B,)`, the cell that is fixated now.
-        evidence: what the look from there says.
-        acquisition: maps the new belief to values `(B, X·Y)`.
+        evidence: what the look from there says (`Observer.weigh`).
+        acquisition: maps the new belief's parameters `(B, X·Y, C)` to values `(B, X·Y)`.
         noise: `(B, X·Y)`, random numbers that break ties.
-        fusion: `kaplan`, `product` or `sum`.
     """
-    beta = fuse(beta, evidence.likelihood, evidence.footprint, fusion)
+    belief = observer.update(belief, evidence)
     visited = visited.scatter(-1, cell[:, None], True)
-    values = acquisition(beta)
-    return Step(beta, visited, values, select_fixation(values, visited, noise))
+    values = acquisition(belief.beta)
+    return Step(belief, visited, values, select_fixation(values, visited, noise))
 
 
 class ActivePerception(nn.Module):
@@ -71,10 +72,11 @@ class ActivePerception(nn.Module):
         detector: turns foveated views into detections.
         observation: calibrates scores by class and distance to the fovea; None takes them raw.
         grid: `(columns, rows)` of the belief.
-        policy: makes the acquisition function for a target (`semfov.gaze.search_policy`).
+        policy: makes the acquisition function for a target (`semfov.search_policy`).
         prior: Dirichlet parameter of every class before the first look.
         fusion: `kaplan`, `product` or `sum`.
         footprint: which cells a detection updates (`Grid.footprint`).
+        observer: turns looks into belief; None makes a `SemanticObserver` of the four settings before.
         reference: longer side in pixels of the image that the sensor's σ is meant for.
 
     Example::
@@ -96,17 +98,18 @@ class ActivePerception(nn.Module):
         prior: float = 0.5,
         fusion: str = "kaplan",
         footprint: Footprint = "overlap",
+        observer: Observer | None = None,
         reference: float = 640.0,
     ) -> None:
         super().__init__()
-        check(prior > 0, "prior", "a positive number", prior)
         self.eye = Eye(sensor, detector, reference=reference)
         self.observation = observation
         self.columns, self.rows = grid
         self.policy = policy
-        self.prior = prior
-        self.fusion = fusion
-        self.footprint: Footprint = footprint
+        components = len(self.classes)
+        self.observer: Observer = observer or SemanticObserver(
+            components, observation, prior=prior, fusion=fusion, footprint=footprint
+        )
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -154,21 +157,21 @@ class ActivePerception(nn.Module):
         goal = None if boxes is None else grid.footprint(boxes.to(image)).any(-2)
 
         view = self.eye.open(image)
-        acquisition = self.policy(index)
-        beta = image.new_full((1, len(grid), len(self.classes)), self.prior)
+        acquisition = self.policy(self.observer.component(index), grid)
+        belief = self.observer.start(1, grid, image)
         visited = torch.zeros(1, len(grid), dtype=torch.bool, device=image.device)
         cell, cells, seen, beliefs, values, found = start, [], [], [], [], False
         while True:
             fixation = grid.centres[cell].to(image)[None]
             detections = self.eye.look(view, fixation)
-            evidence = weigh(detections, fixation, grid, self.observation, self.footprint)
+            evidence = self.observer.weigh(detections, fixation, grid, index)
             noise = torch.rand(1, len(grid), generator=generator).to(image)
             here = torch.tensor([cell], device=image.device)
-            after = step(beta, visited, here, evidence, acquisition, noise, fusion=self.fusion)
-            beta, visited = after.beta, after.visited
+            after = step(self.observer, belief, visited, here, evidence, acquisition, noise)
+            belief, visited = after.belief, after.visited
             cells.append(cell)
             seen.append(detections)
-            beliefs.append(beta[0])
+            beliefs.append(belief.beta[0])
             values.append(after.values[0])
             found = bool(goal[cell]) if goal is not None else confirms(detections, grid, cell, index, confirm)
             cell = int(after.cell)

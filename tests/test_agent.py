@@ -5,7 +5,7 @@ import torch
 
 from semfov import ActivePerception, Foveation, Grid, SemanticMap, search_policy
 from semfov.agent import confirms, step
-from semfov.belief import weigh
+from semfov.belief import SemanticObserver
 from semfov.detection import Candidates, Detections, Detector
 from semfov.errors import InputError
 from semfov.eye import Eye
@@ -105,16 +105,17 @@ def test_class_names_are_suggested(agent, image):
 def test_step_marks_visits_and_fuses(image):
     grid = Grid(8, 6, SIZE)
     detections = Squares()(image[None])
-    evidence = weigh(detections, grid.centres[:1], grid)
-    beta, visited = torch.full((1, 48, 3), 0.5), torch.zeros(1, 48, dtype=torch.bool)
+    observer = SemanticObserver(3)
+    evidence = observer.weigh(detections, grid.centres[:1], grid)
+    belief, visited = observer.start(1, grid, image), torch.zeros(1, 48, dtype=torch.bool)
     visited[0, 9] = True
-    cell = torch.tensor([0])
-    after = step(beta, visited, cell, evidence, search_policy("non-predictive")(1), torch.rand(1, 48))
+    acquisition = search_policy("non-predictive")(1, grid)
+    after = step(observer, belief, visited, torch.tensor([0]), evidence, acquisition, torch.rand(1, 48))
     assert after.visited[0].nonzero()[:, 0].tolist() == [0, 9]
     red = Grid(8, 6, SIZE).footprint(torch.tensor([[8.0, 8, 28, 28]]))[0]
     assert red[after.cell[0]]
     assert after.cell[0] not in (0, 9)
-    assert torch.equal(beta, torch.full((1, 48, 3), 0.5))
+    assert torch.equal(belief.beta, torch.full((1, 48, 3), 0.5))
 
 
 def test_confirmation_needs_place_class_and_score():

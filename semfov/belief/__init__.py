@@ -3,7 +3,22 @@
 from semfov.belief import fusion
 from semfov.belief.evidence import Evidence, Observation, weigh
 from semfov.belief.grid import Footprint, Grid
+from semfov.belief.observer import Memory, Observer, SemanticObserver
 from semfov.belief.semantic_map import SemanticMap
+from semfov.belief.state import Belief
 from semfov.belief.update import fuse
 
-__all__ = ["Evidence", "Footprint", "Grid", "Observation", "SemanticMap", "fuse", "fusion", "weigh"]
+__all__ = [
+    "Belief",
+    "Evidence",
+    "Footprint",
+    "Grid",
+    "Memory",
+    "Observation",
+    "Observer",
+    "SemanticMap",
+    "SemanticObserver",
+    "fuse",
+    "fusion",
+    "weigh",
+]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Footprint, Grid
 from semfov.detection.detections import Detections
-from semfov.errors import check_shape
+from semfov.errors import check, check_shape
 
 
 class Observation(Protocol):
@@ -25,15 +25,18 @@ class Evidence:
 
     Attributes:
         likelihood: `(B, L, K+1)`, likelihood of each class for each detection, up to a factor.
-        footprint: `(B, L, X·Y)` boolean, the cells that each detection concerns; false for padding.
+        footprint: `(B, L, X·Y)`, the cells that each detection concerns: boolean, or weights in [0, 1] that are the
+            exponents of the likelihood; false or 0 for padding.
+        distance: `(B, X·Y)`, from the fixation to every cell, in longer sides of the image.
     """
 
     likelihood: Tensor
     footprint: Tensor
+    distance: Tensor
 
-    def __getitem__(self, index: Tensor | slice | tuple[Tensor, ...]) -> "Evidence":
+    def __getitem__(self, index: Tensor | slice) -> "Evidence":
         """Evidence of some of the looks."""
-        return Evidence(self.likelihood[index], self.footprint[index])
+        return Evidence(self.likelihood[index], self.footprint[index], self.distance[index])
 
 
 def weigh(
@@ -42,8 +45,14 @@ def weigh(
     grid: Grid,
     observation: Observation | None = None,
     footprint: Footprint = "overlap",
+    *,
+    tempering: float = 1.0,
 ) -> Evidence:
-    """Evidence of the detections seen from `fixation`.
+    r"""Evidence of the detections seen from `fixation`.
+
+    Successive looks at a static scene are not independent. With `tempering` τ < 1 a likelihood counts as
+
+    .. math:: \lambda_k^\tau, \quad \lambda_k \propto P(C = k \mid S, d)
 
     Args:
         detections: boxes in pixels of the grid's image, batch `(B, L)`.
@@ -51,15 +60,20 @@ def weigh(
         grid: the cells.
         observation: calibrates the scores by class and distance; None takes the raw scores as likelihoods.
         footprint: which cells a box concerns (`Grid.footprint`).
+        tempering: exponent τ of the likelihoods.
     """
     check_shape(fixation, "fixation", detections.mask.shape[0], 2)
-    if observation is None:
-        likelihood = detections.scores
-    else:
+    check(tempering > 0, "tempering", "a positive number", tempering)
+    # Padding has no scores that a model could read: it gets a uniform vector, and covers no cell.
+    uniform = torch.full_like(detections.scores, 1 / detections.scores.shape[-1])
+    likelihood = torch.where(detections.mask[..., None], detections.scores, uniform)
+    if observation is not None:
         distance = grid.box_distance(detections.boxes, fixation)
-        # Padding has no scores that a model could read: it gets a uniform vector, and covers no cell.
-        uniform = torch.full_like(detections.scores, 1 / detections.scores.shape[-1])
-        scores = torch.where(detections.mask[..., None], detections.scores, uniform)
-        likelihood = observation.calibrate(scores, distance)
-    cells = grid.footprint(detections.boxes, footprint) & detections.mask[..., None]
-    return Evidence(likelihood, cells)
+        likelihood = observation.calibrate(likelihood, distance)
+    if tempering != 1:
+        likelihood = likelihood.pow(tempering)
+    cells = grid.footprint(detections.boxes, footprint)
+    cells = cells * detections.mask[..., None]
+    offset = grid.centres.to(fixation) - fixation[:, None]
+    distance = torch.linalg.vector_norm(offset, dim=-1) / grid.extent.amax(-1).to(fixation)[..., None]
+    return Evidence(likelihood, cells, distance.to(likelihood))

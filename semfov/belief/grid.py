@@ -8,7 +8,7 @@ from torch import Tensor
 
 from semfov.errors import check, check_shape, lookup
 
-Footprint = Literal["overlap", "centre", "box_centre"]
+Footprint = Literal["overlap", "centre", "box_centre", "soft"]
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,18 @@ class Grid:
         return row * self.columns + column
 
     def footprint(self, boxes: Tensor, rule: Footprint = "overlap") -> Tensor:
-        """Which cells each box covers, `(..., L, X·Y)` boolean, for boxes `(..., L, 4)`.
+        r"""Which cells each box covers, `(..., L, X·Y)`, for boxes `(..., L, 4)`; boolean, or weights if `soft`.
 
         - `overlap`: cells that share a positive area with the box (the published rule).
         - `centre`: cells whose centre lies in the box, or the cell of the box's centre where there is none.
         - `box_centre`: only the cell in which the centre of the box lies.
+        - `soft`: cells that share an area with the box, with weights that fall off towards its borders, for objects
+          rarely fill the corners of their boxes. For a box of half sizes (a, b), a cell of half sizes (u, v) and the
+          offset (x, y) between their centres,
+
+          .. math:: w = \exp\left(-\frac{x^2}{2 (a^2 + u^2)/3} - \frac{y^2}{2 (b^2 + v^2)/3}\right),
+
+          a normal window with the variance of a uniform box blurred by the cell.
 
         With a batch of sizes `(B, 2)` the boxes are `(B, L, 4)`. Boxes without area cover nothing.
 
@@ -96,6 +103,8 @@ class Grid:
             across = _overlaps(self._borders(0).to(boxes), low[..., 0], high[..., 0])
             down = _overlaps(self._borders(1).to(boxes), low[..., 1], high[..., 1])
             return (down[..., :, None] & across[..., None, :] & full[..., None, None]).flatten(-2)
+        if rule == "soft":
+            return self._window(boxes) * self.footprint(boxes)
         own = self.cell_of((boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5)
         central = own[..., None] == torch.arange(len(self), device=boxes.device)
         if rule == "centre":
@@ -114,6 +123,14 @@ class Grid:
         centre = (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
         offset = torch.linalg.vector_norm(centre - fixation[..., None, :], dim=-1)
         return offset / self.extent.amax(-1)[..., None].to(offset)
+
+    def _window(self, boxes: Tensor) -> Tensor:
+        """Weights of the `soft` footprint, before cells that a box does not touch are taken out."""
+        half = self._align(self._cell_size(), boxes[..., :2])[..., None, :] / 2
+        box_half = (boxes[..., None, 2:] - boxes[..., None, :2]) / 2
+        middle = (boxes[..., None, :2] + boxes[..., None, 2:]) / 2
+        offset = (self.centres + 0.5)[..., None, :, :].to(boxes) - middle
+        return (-1.5 * offset.square() / (box_half.square() + half.square())).sum(-1).exp()
 
     @property
     def cell_distance(self) -> Tensor:

@@ -1,15 +1,15 @@
 """The map that an agent keeps: a Dirichlet belief about the class of every cell."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
 
-from semfov.belief.evidence import Observation, weigh
+from semfov.belief.evidence import Observation
 from semfov.belief.grid import Footprint, Grid
-from semfov.belief.update import fuse
+from semfov.belief.observer import Memory, SemanticObserver
+from semfov.belief.state import Belief
 from semfov.detection.detections import Detections
-from semfov.errors import check
 
 
 class SemanticMap(nn.Module):
@@ -21,8 +21,9 @@ class SemanticMap(nn.Module):
         prior: Dirichlet parameter of every class before the first look.
         batch: number of maps.
         fusion: `kaplan`, `product` or `sum` (`semfov.fusion`).
-        footprint: which cells a detection updates: `overlap`, `centre` or `box_centre` (`Grid.footprint`).
+        footprint: which cells a detection updates: `overlap`, `centre`, `box_centre` or `soft` (`Grid.footprint`).
         observation: calibrates the scores; None takes raw scores as likelihoods.
+        tempering: see `SemanticObserver`, as for `memory` and `misses`.
 
     >>> from semfov import Detections
     >>> m = SemanticMap(Grid(2, 1, (10, 10)), ["cup"])
@@ -32,6 +33,7 @@ class SemanticMap(nn.Module):
     """
 
     beta: Tensor
+    closest: Tensor
 
     def __init__(
         self,
@@ -43,16 +45,29 @@ class SemanticMap(nn.Module):
         fusion: str = "kaplan",
         footprint: Footprint = "overlap",
         observation: Observation | None = None,
+        tempering: float = 1.0,
+        memory: Memory = "all",
+        misses: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         super().__init__()
-        check(prior > 0, "prior", "a positive number", prior)
         self.grid = grid
         self.classes = tuple(classes)
-        self.prior = prior
-        self.fusion = fusion
-        self.footprint: Footprint = footprint
+        components = len(self.classes) + 1
         self.observation = observation
-        self.register_buffer("beta", torch.full((batch, len(grid), len(self.classes) + 1), prior))
+        self.misses = misses
+        self._observer = SemanticObserver(
+            components,
+            observation,
+            prior=prior,
+            fusion=fusion,
+            footprint=footprint,
+            tempering=tempering,
+            memory=memory,
+            misses=misses,
+        )
+        start = self._observer.start(batch, grid, torch.empty(0))
+        self.register_buffer("beta", start.beta)
+        self.register_buffer("closest", start.closest)
 
     @property
     def probabilities(self) -> Tensor:
@@ -61,8 +76,9 @@ class SemanticMap(nn.Module):
 
     def update(self, detections: Detections, fixation: Tensor) -> "SemanticMap":
         """Fuse the detections of one look from `fixation` `(B, 2)` and return the map itself."""
-        evidence = weigh(detections, fixation, self.grid, self.observation, self.footprint)
-        self.beta = fuse(self.beta, evidence.likelihood.to(self.beta.dtype), evidence.footprint, self.fusion)
+        evidence = self._observer.weigh(detections, fixation, self.grid)
+        belief = self._observer.update(Belief(self.beta, self.closest), evidence)
+        self.beta, self.closest = belief.beta, belief.closest
         return self
 
     def forward(self, detections: Detections, fixation: Tensor) -> Tensor:

@@ -16,7 +16,8 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     Args:
         beta: `(B, X·Y, K+1)`, Dirichlet parameters.
         likelihood: `(B, L, K+1)`, likelihoods of the classes given each detection, in order of fusion.
-        footprint: `(B, L, X·Y)` boolean, the cells that each detection updates (false for padding).
+        footprint: `(B, L, X·Y)`, the cells that each detection updates (false or 0 for padding): boolean, or weights
+            in [0, 1] that are taken as exponents of the likelihood.
         rule: `kaplan`, `product` or `sum` (`semfov.fusion`).
 
     Returns:
@@ -31,19 +32,24 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     check_shape(likelihood, "likelihood", batch, None, components)
     check_shape(footprint, "footprint", batch, likelihood.shape[1], cells)
     update = RULES[lookup(rule, RULES, "fusion rule")]
-    check(footprint.dtype == torch.bool, "footprint", "a boolean tensor", footprint.dtype)
-    image, detection, cell = footprint.nonzero(as_tuple=True)
+    soft = footprint.is_floating_point()
+    check(soft or footprint.dtype == torch.bool, "footprint", "a boolean or floating-point tensor", footprint.dtype)
+    covered = footprint > 0 if soft else footprint
+    image, detection, cell = covered.nonzero(as_tuple=True)
     if len(image) == 0:
         return beta.clone()
-    rank = footprint.cumsum(1, dtype=torch.int32)[image, detection, cell]
+    rank = covered.cumsum(1, dtype=torch.int32)[image, detection, cell]
     order = rank.argsort(stable=True)
     rows = (image * cells + cell)[order]
     sources = (image * likelihood.shape[1] + detection)[order]
     steps = torch.bincount(rank)[1:].tolist()
     flat = beta.reshape(-1, components).clone()
     # Padding may hold zeros, which no rule accepts; nothing reads it.
-    used = footprint.any(-1, keepdim=True)
+    used = covered.any(-1, keepdim=True)
     evidence = scale_likelihood(torch.where(used, likelihood, 1.0)).reshape(-1, components)
-    for row, source in zip(rows.split(steps), sources.split(steps), strict=True):
-        flat.index_copy_(0, row, update(flat.index_select(0, row), evidence.index_select(0, source)))
+    weights = footprint[image, detection, cell][order, None].to(evidence).split(steps) if soft else None
+    for i, (row, source) in enumerate(zip(rows.split(steps), sources.split(steps), strict=True)):
+        said = evidence.index_select(0, source)
+        said = said if weights is None else said.pow(weights[i])
+        flat.index_copy_(0, row, update(flat.index_select(0, row), said))
     return flat.view(batch, cells, components)

@@ -4,12 +4,13 @@ from collections.abc import Callable
 
 from torch import Tensor, nn
 
+from semfov.belief.grid import Grid
 from semfov.errors import InputError, lookup
 from semfov.gaze.acquisition.search import FovealModel, PredictedTargetPosterior, TargetPosterior
 from semfov.gaze.acquisition.static import Uniform
 
-Policy = Callable[[int | Tensor], nn.Module]
-"""Makes the acquisition function for a target class (an index, or one for each episode)."""
+Policy = Callable[[int | Tensor, Grid], nn.Module]
+"""Makes the acquisition function for a component of the belief (an index, or one for each episode) on a grid."""
 
 SEARCH_POLICIES = ("random", "non-predictive", "predictive")
 
@@ -25,14 +26,14 @@ def search_policy(name: str, model: FovealModel | None = None, *, calibrated: bo
     Raises:
         InputError: the name is unknown, or `predictive` came without a model.
 
-    >>> search_policy("non-predictive")(3)
+    >>> search_policy("non-predictive")(3, Grid(10, 10, (640, 480)))
     TargetPosterior()
     """
     lookup(name, SEARCH_POLICIES, "search policy")
     if name == "random":
-        return lambda target: Uniform()
+        return lambda target, grid: Uniform()
     if name == "non-predictive":
-        return TargetPosterior
+        return lambda target, grid: TargetPosterior(target)
     if model is None:
         raise InputError("policy 'predictive': expected an observation model for the scores to expect, got none")
-    return lambda target: PredictedTargetPosterior(target, model, calibrated=calibrated)
+    return lambda target, grid: PredictedTargetPosterior(target, model, calibrated=calibrated)

@@ -105,7 +105,7 @@ def test_map_is_a_module():
     module = SemanticMap(Grid(2, 2, (10, 10)), ["cup"], batch=3).double()
     assert module.beta.shape == (3, 4, 2)
     assert module.beta.dtype == torch.float64
-    assert set(module.state_dict()) == {"beta"}
+    assert set(module.state_dict()) == {"beta", "closest"}
 
 
 def test_bad_input():
@@ -113,7 +113,7 @@ def test_bad_input():
     with pytest.raises(InputError, match="likelihood"):
         fuse(beta, torch.ones(1, 2, 5), torch.ones(1, 2, 4, dtype=torch.bool))
     with pytest.raises(InputError, match="footprint"):
-        fuse(beta, torch.ones(1, 2, 3), torch.ones(1, 2, 4))
+        fuse(beta, torch.ones(1, 2, 3), torch.ones(1, 2, 4, dtype=torch.int64))
     with pytest.raises(InputError, match="fusion rule"):
         fuse(beta, torch.ones(1, 2, 3), torch.ones(1, 2, 4, dtype=torch.bool), "kalman")
     with pytest.raises(InputError, match="prior"):

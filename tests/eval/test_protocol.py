@@ -8,8 +8,9 @@ import torch
 
 from eval.config import ProtocolConfig
 from eval.metrics import cumulative_performance, random_search
-from eval.protocol import Outcome, episodes_of, run_episodes, tie_noise
-from semfov import Evidence, fusion, search_policy
+from eval.protocol import Outcome, Searcher, episodes_of, run_episodes, tie_noise
+from semfov import Detections, Evidence, Grid, fusion, search_policy
+from semfov.belief import SemanticObserver
 from semfov.data.scene import Annotation
 
 CLASSES = ("cat", "cup", "person")
@@ -47,15 +48,29 @@ def evidence():
     """What three detections from each of 25 cells say about four classes."""
     torch.manual_seed(0)
     likelihood = torch.rand(25, 3, 4) ** 3
-    return Evidence(likelihood, torch.rand(25, 3, 25) < 0.15)
+    return Evidence(likelihood, torch.rand(25, 3, 25) < 0.15, torch.zeros(25, 25))
+
+
+class Told(SemanticObserver):
+    """An observer that is told what looks say."""
+
+    def __init__(self, evidence):
+        super().__init__(4)
+        self.evidence = evidence
+
+    def weigh(self, detections, fixation, grid, target=None):
+        return self.evidence
+
+
+GRID = Grid(5, 5, (100, 100))
+NOTHING = Detections.empty(25, 3)
 
 
 def run(scenes, evidence, policy, protocol, batch=1024, index=0):
     episodes = episodes_of(scenes, index, 5, 5, protocol)
     noise = torch.stack([tie_noise(scenes, episode, 25, protocol) for episode in episodes])
-    outcomes = run_episodes(
-        episodes, evidence, noise, policy, prior=0.5, fusion="kaplan", shifts=protocol.shifts, batch=batch
-    )
+    searcher = Searcher(Told(evidence), policy)
+    outcomes = run_episodes(episodes, searcher, NOTHING, GRID, noise, shifts=protocol.shifts, batch=batch)
     return episodes, noise, outcomes
 
 
@@ -146,8 +161,7 @@ def test_no_cell_left_ends_the_search(scenes, evidence):
     episodes = episodes_of(scenes, 0, 5, 5, protocol)[:1]
     hidden = [episodes[0].__class__(**{**episodes[0].__dict__, "goal": ()})]
     noise = tie_noise(scenes, episodes[0], 25, protocol)[None]
-    outcome = run_episodes(
-        hidden, evidence, noise, search_policy("random"), prior=0.5, fusion="kaplan", shifts=40, batch=8
-    )[0]
+    searcher = Searcher(Told(evidence), search_policy("random"))
+    outcome = run_episodes(hidden, searcher, NOTHING, GRID, noise, shifts=40, batch=8)[0]
     assert outcome.found_at == -1
     assert sorted(outcome.cells) == list(range(25))

@@ -3,10 +3,13 @@
 import pytest
 import torch
 
-from semfov.belief import fusion
+from semfov.belief import Grid, fusion
 from semfov.errors import InputError
 from semfov.gaze import search_policy
 from semfov.gaze.acquisition import PredictedTargetPosterior, Static, TargetPosterior, Uniform
+
+
+GRID = Grid(3, 2, (30, 20))
 
 
 class Model:
@@ -67,9 +70,9 @@ def test_static_and_uniform(beta):
 
 def test_policies_by_name(beta):
     model = Model(5)
-    assert torch.equal(search_policy("random")(1)(beta), Uniform()(beta))
-    assert torch.equal(search_policy("non-predictive")(1)(beta), TargetPosterior(1)(beta))
-    predicted = search_policy("predictive", model, calibrated=True)(1)
+    assert torch.equal(search_policy("random")(1, GRID)(beta), Uniform()(beta))
+    assert torch.equal(search_policy("non-predictive")(1, GRID)(beta), TargetPosterior(1)(beta))
+    predicted = search_policy("predictive", model, calibrated=True)(1, GRID)
     assert torch.equal(predicted(beta), PredictedTargetPosterior(1, model, calibrated=True)(beta))
     with pytest.raises(InputError, match="did you mean 'predictive'"):
         search_policy("predicitve")
