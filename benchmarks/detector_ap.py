@@ -19,10 +19,10 @@ from semfov.detection.load import load_detector
 from semfov.detection.selection import suppress
 from semfov.errors import lookup
 
-# COCO's evaluation counts at most 100 boxes of an image, at any confidence.
+# COCOeval cuts for itself: it counts at most 100 boxes of each class in an image, at any confidence.
 SELECTIONS = {
-    "per-class NMS": Selection(threshold=0.001, iou=0.5, limit=100, per_class=True),
-    "class-agnostic NMS": Selection(threshold=0.001, iou=0.5, limit=100),
+    "per-class NMS": Selection(threshold=0.001, iou=0.5, limit=10_000, per_class=True),
+    "class-agnostic NMS": Selection(threshold=0.001, iou=0.5, limit=10_000),
 }
 
 

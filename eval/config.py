@@ -6,6 +6,7 @@ from typing import Literal
 
 from semfov.belief import Footprint, Memory
 from semfov.detection.scores import BackgroundPolicy
+from semfov.gaze.saliency.cells import Reduction
 
 
 @dataclass(frozen=True)
@@ -100,12 +101,27 @@ class BeliefConfig:
 
 
 @dataclass(frozen=True)
+class SaliencyConfig:
+    """The saliency baselines, `vocus2` and `itti-koch`.
+
+    Args:
+        view: `foveated`, the saliency of what the eye sees from each fixation (published), or `picture`, that of the
+            whole photograph, once.
+        reduction: a cell is as salient as its most salient pixel (`max`) or as the `mean` of its pixels.
+    """
+
+    view: Literal["foveated", "picture"] = "foveated"
+    reduction: Reduction = "max"
+
+
+@dataclass(frozen=True)
 class ProtocolConfig:
     """The experiment.
 
     Args:
-        starts: searches for each image and target, each from another cell that holds no target.
-        shifts: gaze shifts of a search.
+        starts: episodes for each image (and target of a search), each from another cell; no search starts on its
+            target.
+        shifts: gaze shifts of an episode.
         ties: equal cells are chosen at `random`, or the `first` by number.
         seed: seed of starts and tie-breaking; the same seed gives the same result to the last bit.
         batch: episodes that are run as one tensor (no influence on the result).
@@ -127,9 +143,10 @@ class SearchConfig:
         detector: which detector looks through the fovea.
         sensor: the foveal sensor.
         belief: the grid of beliefs.
+        saliency: the saliency baselines.
         protocol: the experiment.
-        policies: policies to compare: `random`, or `non-predictive` / `predictive` followed by `-raw` (scores are
-            likelihoods) or `-calibrated` (scores go through the observation model).
+        policies: policies to compare: `random`, `vocus2`, `itti-koch`, or `non-predictive` / `predictive` followed by
+            `-raw` (scores are likelihoods) or `-calibrated` (scores go through the observation model).
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what the detector saw from every cell, shared between runs (None: the user's cache).
         store: keep what the detector saw on disk; false recomputes it (the result is the same).
@@ -141,6 +158,7 @@ class SearchConfig:
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
+    saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     policies: tuple[str, ...] = (
         "random",
@@ -154,3 +172,50 @@ class SearchConfig:
     store: bool = True
     workers: int | None = None
     scanpaths: int = 3
+
+
+@dataclass(frozen=True)
+class ExploreConfig:
+    """Scene exploration: learn what is where by moving a fovea, and count the cells whose class is right.
+
+    Args:
+        data: which scenes to explore.
+        detector: which detector looks through the fovea.
+        sensor: the foveal sensor.
+        belief: the grid of beliefs.
+        saliency: the saliency baselines.
+        protocol: the experiment.
+        policies: policies to compare: `random`, `kl`, `negative-entropy`, `two-peaks`, `upper-confidence-bound`,
+            `probability-of-improvement`, `vocus2` or `itti-koch`, each followed by `-raw` (scores are likelihoods) or
+            `-calibrated` (scores go through the observation model).
+        out: folder for tables, figures, per-episode records and the manifest.
+        cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
+        store: keep what was seen on disk; false recomputes it (the result is the same).
+        workers: processes (None: one for each CPU core).
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
+    saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
+    protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(shifts=20))
+    policies: tuple[str, ...] = (
+        "random-raw",
+        "kl-raw",
+        "negative-entropy-raw",
+        "two-peaks-raw",
+        "vocus2-raw",
+        "random-calibrated",
+        "kl-calibrated",
+        "negative-entropy-calibrated",
+        "two-peaks-calibrated",
+        "vocus2-calibrated",
+    )
+    out: Path = Path("runs/explore")
+    cache: Path | None = None
+    store: bool = True
+    workers: int | None = None
+
+
+RunConfig = SearchConfig | ExploreConfig

@@ -1,5 +1,6 @@
-"""Figures of merit of visual search."""
+"""Figures of merit of visual search and of scene exploration."""
 
+from collections.abc import Sequence
 from math import comb
 
 import numpy as np
@@ -21,6 +22,15 @@ def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> Array:
     steps = np.arange(shifts + 1)
     found = (found_at[..., None] >= 0) & (found_at[..., None] <= steps)
     return np.asarray(found.mean(-2), dtype=np.float64)
+
+
+def success_rate(right: Sequence[int], cells: int) -> Array:
+    """Share of the cells with objects whose class is right, after each gaze shift.
+
+    >>> success_rate([1, 3, 4], 4)
+    array([0.25, 0.75, 1.  ])
+    """
+    return np.asarray(right, dtype=np.float64) / cells
 
 
 def standard_error(values: Array, axis: int = 0) -> Array:

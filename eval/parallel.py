@@ -2,12 +2,17 @@
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
 import torch
 import torch.distributed
 from tqdm import tqdm
+
+from semfov.errors import SemfovError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -62,6 +67,9 @@ def run_tasks(
         settings: arguments of `setup`.
         title: label of the progress bar.
         unit: what a task is called there.
+
+    Raises:
+        SemfovError: a process died. Errors of a task are raised as they are; either ends all processes.
     """
     if not tasks:
         return
@@ -73,8 +81,26 @@ def run_tasks(
                 yield function(task)
                 bar.update()
             return
+        before = multiprocessing.active_children()
         context = multiprocessing.get_context("spawn")
-        with context.Pool(min(workers, len(tasks)), initializer=setup, initargs=settings) as pool:
-            for result in pool.imap_unordered(function, tasks):
-                yield result
-                bar.update()
+        with ProcessPoolExecutor(min(workers, len(tasks)), context, _prepare, (setup, settings)) as pool:
+            try:
+                for done in as_completed([pool.submit(function, task) for task in tasks]):
+                    yield done.result()
+                    bar.update()
+            except BrokenProcessPool:
+                raise SemfovError(
+                    f"{title}: a worker process died (killed, or out of memory); the same command goes on where this "
+                    "one stopped, with --workers 1 in one process"
+                ) from None
+            except BaseException:
+                # Nobody waits for the tasks under way: what they write is whole or not there.
+                for child in set(multiprocessing.active_children()) - set(before):
+                    child.terminate()
+                raise
+
+
+def _prepare(setup: Callable[..., None], settings: tuple[object, ...]) -> None:
+    # Ctrl-C reaches every process of a terminal; the first one ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    setup(*settings)

@@ -1,7 +1,7 @@
 """The search protocol: which episodes there are, and running them as tensors."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from semfov.agent import step
 from semfov.belief import Observer
 from semfov.data.scene import Scenes
 from semfov.gaze import Policy
+from semfov.gaze.acquisition import Static
 
 
 @dataclass(frozen=True)
@@ -44,10 +45,18 @@ class Searcher:
     Attributes:
         observer: turns looks into belief.
         policy: makes the acquisition function for a target.
+        saliency: `(X·Y, X·Y)`, values of all cells seen from each cell, or `(1, X·Y)`; they take the policy's place.
     """
 
     observer: Observer
     policy: Policy
+    saliency: Tensor | None = None
+
+    def acquisition(self, component: int | Tensor | None, grid: Grid, cell: Tensor) -> Callable[[Tensor], Tensor]:
+        """The acquisition function of episodes that fixate `cell` `(B,)`."""
+        if self.saliency is None:
+            return self.policy(component, grid)
+        return Static(self.saliency[cell if len(self.saliency) > 1 else torch.zeros_like(cell)])
 
 
 @dataclass(frozen=True)
@@ -93,11 +102,15 @@ def episodes_of(scenes: Scenes, index: int, columns: int, rows: int, protocol: P
 
 def tie_noise(scenes: Scenes, episode: Episode, cells: int, protocol: ProtocolConfig) -> Tensor:
     """Random numbers that break an episode's ties, `(shifts+1, X·Y)`; the same for every policy."""
+    return noise_for(protocol, cells, scenes.ids[episode.scene], episode.target, episode.repetition)
+
+
+def noise_for(protocol: ProtocolConfig, cells: int, *episode: object) -> Tensor:
+    """Random numbers that break the ties of the episode that `episode` names, `(shifts+1, X·Y)`."""
     shape = protocol.shifts + 1, cells
     if protocol.ties == "first":
         return torch.linspace(1, 0, cells).expand(shape)
-    what = "ties", protocol.seed, scenes.ids[episode.scene], episode.target, episode.repetition
-    return torch.rand(shape, generator=generator_for(*what))
+    return torch.rand(shape, generator=generator_for("ties", protocol.seed, *episode))
 
 
 def run_episodes(
@@ -181,7 +194,7 @@ def _run_batch(
             break
         active, cell, belief, visited = active[go_on], cell[go_on], belief[go_on], visited[go_on]
         wanted = targets[active]
-        acquisition = searcher.policy(observer.component(wanted), looks.grid)
+        acquisition = searcher.acquisition(observer.component(wanted), looks.grid, cell)
         after = step(observer, belief, visited, cell, looks(wanted, cell), acquisition, noise[active, shift])
         left = after.cell >= 0
         active, cell, belief, visited = active[left], after.cell[left], after.belief[left], after.visited[left]

@@ -13,28 +13,16 @@ from collections.abc import Sequence
 
 from eval.command import run_command
 from eval.config import SearchConfig
-from eval.parallel import available_cores, mine, rank, run_tasks, wait_for_all
-from eval.report import report
-from eval.tasks import Parts, SearchRun, prepare_process, search_scene
+from eval.parallel import rank
+from eval.run import finish
+from eval.search_report import report
+from eval.tasks import SearchRun
 
 
 def search(config: SearchConfig) -> None:
     """Run a visual search experiment and write its tables, figures and records."""
     run = SearchRun(config)
-    parts = Parts(config.out / "parts", run.key)
-    todo = [index for index in mine(range(len(run.scenes))) if parts.load(index) is None]
-    done = run_tasks(
-        search_scene,
-        todo,
-        workers=config.workers or available_cores(),
-        setup=prepare_process,
-        settings=(config,),
-        title="searching",
-        unit="scene",
-    )
-    for _ in done:
-        pass
-    wait_for_all()
+    parts = finish(run, "searching")
     if rank() == 0:
         report(run, parts)
 

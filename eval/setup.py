@@ -5,18 +5,28 @@ from __future__ import annotations
 import json
 import logging
 import multiprocessing
-from typing import Any
+from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 import semfov
-from eval.config import BeliefConfig, DataConfig, DetectorConfig, SearchConfig, SensorConfig
+from eval.config import BeliefConfig, DataConfig, DetectorConfig, RunConfig, SensorConfig
 from eval.protocol import Searcher
+from eval.saliency import SALIENCY_MODELS
 from semfov.belief import SemanticObserver
 from semfov.data.scene import Scenes
 from semfov.errors import InputError, check, lookup
 from semfov.eye import Eye
-from semfov.gaze import SEARCH_POLICIES, search_policy
+from semfov.gaze import EXPLORATION_POLICIES, SEARCH_POLICIES, exploration_policy, search_policy
+
+Kind = Literal["search", "exploration"]
+
+_POLICIES: dict[Kind, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "search": (SEARCH_POLICIES[1:], ("random", *SALIENCY_MODELS)),
+    "exploration": ((*EXPLORATION_POLICIES, *SALIENCY_MODELS), ()),
+}
+"""Names of policies that come with `-raw` or `-calibrated`, and of those that come alone."""
 
 
 def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
@@ -56,32 +66,60 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
     return Eye(foveation, model, reference=sensor.reference).eval().requires_grad_(False)
 
 
-def make_observation(config: SearchConfig, eye: Eye) -> semfov.FovealObservationModel:
+def make_observation(config: RunConfig, eye: Eye) -> semfov.FovealObservationModel:
     """The observation model, checked to belong to this detector, background policy and class list."""
     model = semfov.FovealObservationModel.from_pretrained(config.belief.model or eye.detector.name)
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)
 
 
-def split_policy(name: str) -> tuple[str, bool]:
-    """`predictive-calibrated` -> (`predictive`, True); `random` -> (`random`, False)."""
-    known = ["random"] + [f"{p}-{m}" for p in SEARCH_POLICIES[1:] for m in ("raw", "calibrated")]
+def split_policy(name: str, kind: Kind) -> tuple[str, bool]:
+    """The policy and whether scores are calibrated: `predictive-calibrated` -> (`predictive`, True).
+
+    For search, policies that do not look at the belief have no such ending.
+    """
+    moded, bare = _POLICIES[kind]
+    known = [*bare, *(f"{policy}-{mode}" for policy in moded for mode in ("raw", "calibrated"))]
     lookup(name, known, "policy")
     base, _, mode = name.rpartition("-")
-    return (base, mode == "calibrated") if base else (name, False)
+    return (name, False) if name in bare else (base, mode == "calibrated")
 
 
-def needs_model(policies: tuple[str, ...]) -> bool:
+def saliency_policies(policies: tuple[str, ...], kind: Kind) -> list[str]:
+    """Saliency models that a run needs, each once."""
+    return list(dict.fromkeys(base for base, _ in _split(policies, kind) if base in SALIENCY_MODELS))
+
+
+def needs_model(policies: tuple[str, ...], kind: Kind) -> bool:
     """Whether a policy of the run predicts or calibrates."""
     check(len(policies) > 0, "policies", "at least one policy", "none")
-    return any(base == "predictive" or calibrated for base, calibrated in map(split_policy, policies))
+    without = ("random", "non-predictive", "neighbourhood", *SALIENCY_MODELS)
+    return any(base not in without or calibrated for base, calibrated in _split(policies, kind))
+
+
+def _split(policies: tuple[str, ...], kind: Kind) -> list[tuple[str, bool]]:
+    return [split_policy(name, kind) for name in policies]
 
 
 def make_searcher(
-    name: str, belief: BeliefConfig, components: int, model: semfov.FovealObservationModel | None
+    name: str,
+    kind: Kind,
+    belief: BeliefConfig,
+    components: int,
+    model: semfov.FovealObservationModel | None,
+    saliency: Tensor | None = None,
 ) -> Searcher:
-    """How the policy of this name searches."""
-    base, calibrated = split_policy(name)
+    """How the policy of this name searches or explores.
+
+    Args:
+        name: of the policy.
+        kind: of the experiment.
+        belief: the grid of beliefs.
+        components: classes, background included.
+        model: the observation model, where one is needed.
+        saliency: of the scene, for the saliency policies.
+    """
+    base, calibrated = split_policy(name, kind)
     observer = SemanticObserver(
         components,
         model if calibrated else None,
@@ -91,7 +129,10 @@ def make_searcher(
         tempering=belief.tempering,
         memory=belief.memory,
     )
-    return Searcher(observer, search_policy(base, model, calibrated=calibrated))
+    if base in SALIENCY_MODELS:
+        return Searcher(observer, search_policy("random"), saliency)
+    make = search_policy if kind == "search" else exploration_policy
+    return Searcher(observer, make(base, model, calibrated=calibrated))
 
 
 def plain(settings: dict[str, Any]) -> Any:

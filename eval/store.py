@@ -1,7 +1,7 @@
-"""What the detector sees from every cell of every scene, computed once and kept on disk.
+"""What is seen from every cell of every scene, computed once and kept on disk.
 
-Scenes are static and the gaze sits on cell centres, so detections are a function of (scene, cell). The store
-remembers them under a key of everything that they depend on; it changes how long a run takes and nothing else.
+Scenes are static and the gaze sits on cell centres, so what is seen is a function of (scene, cell). A store remembers
+it under a key of everything that it depends on; it changes how long a run takes and nothing else.
 """
 
 import hashlib
@@ -33,51 +33,77 @@ def see_all(eye: Eye, image: Tensor, grid: Grid) -> Detections:
         return Detections.stack(looks)
 
 
-class DetectionStore:
-    """A folder of detections, one file for each scene.
+class SceneStore:
+    """A folder of tensors, one file for each scene.
 
     Files are written atomically and carry a checksum; one that is damaged, cut short or of another version counts
     as missing and is computed again.
 
     Args:
         folder: where the store lies; several runs and processes may share it.
-        settings: `Eye.settings()`.
-        columns: cells in a row.
-        rows: cells in a column.
+        what: settings that the tensors depend on.
+        code: sha256 of the sources that they depend on.
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, object], columns: int, rows: int) -> None:
+    def __init__(self, folder: Path, what: Mapping[str, object], code: str) -> None:
         versions = {
             "semfov": semfov.__version__,
             "torch": torch.__version__,
             "torchvision": torchvision.__version__,
             "kornia": kornia.__version__,
             "machine": [platform.machine(), torch.backends.cpu.get_cpu_capability()],
-            "code": code_digest(),
+            "code": code,
         }
-        what = {"settings": settings, "grid": [columns, rows], "versions": versions}
-        self.key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+        described = json.dumps({**what, "versions": versions}, sort_keys=True)
+        self.key = hashlib.sha256(described.encode()).hexdigest()
         self.folder = folder / self.key[:16]
 
     def path(self, digest: str) -> Path:
         """File for the scene whose image has this sha256."""
         return self.folder / f"{digest[:32]}.safetensors"
 
+    def read(self, digest: str) -> dict[str, Tensor] | None:
+        """Tensors of a scene, or None if the store does not have them whole."""
+        return read_tensors(self.path(digest), self.key)
+
+    def write(self, digest: str, tensors: Mapping[str, Tensor]) -> None:
+        """Keep the tensors of a scene."""
+        write_tensors(self.path(digest), self.key, tensors)
+
+
+class DetectionStore(SceneStore):
+    """Detections from every cell.
+
+    Args:
+        folder: where the store lies.
+        settings: `Eye.settings()`.
+        columns: cells in a row.
+        rows: cells in a column.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, object], columns: int, rows: int) -> None:
+        super().__init__(folder, {"settings": settings, "grid": [columns, rows]}, code_digest())
+
     def load(self, digest: str) -> Detections | None:
         """Detections from every cell of a scene, or None if the store does not have them whole."""
-        tensors = read_tensors(self.path(digest), self.key)
+        tensors = self.read(digest)
         return None if tensors is None else unpack(tensors)
 
     def save(self, digest: str, detections: Detections) -> None:
         """Keep the detections of a scene."""
-        write_tensors(self.path(digest), self.key, pack(detections))
+        self.write(digest, pack(detections))
 
 
 @cache
-def code_digest() -> str:
-    """sha256 over the sources that turn an image into detections: a store never outlives a change of them."""
+def code_digest(*more: str) -> str:
+    """sha256 over the sources that turn an image into detections: a store never outlives a change of them.
+
+    Args:
+        more: patterns of further files of the package.
+    """
     package = Path(semfov.__file__).parent
-    files = sorted([*package.glob("sensor/*.py"), *package.glob("detection/*.py"), package / "eye.py"])
+    patterns = ("sensor/*.py", "detection/*.py", "eye.py", *more)
+    files = sorted(file for pattern in patterns for file in package.glob(pattern))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 

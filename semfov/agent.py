@@ -65,14 +65,14 @@ def step(
 
 
 class ActivePerception(nn.Module):
-    """An agent with a foveal sensor that searches an image for a class.
+    """An agent with a foveal sensor that searches an image for a class, or explores it.
 
     Args:
         sensor: the foveal sensor; its σ is in pixels of an image whose longer side is `reference`.
         detector: turns foveated views into detections.
         observation: calibrates scores by class and distance to the fovea; None takes them raw.
         grid: `(columns, rows)` of the belief.
-        policy: makes the acquisition function for a target (`semfov.search_policy`).
+        policy: makes the acquisition function (`semfov.search_policy`, `semfov.gaze.exploration_policy`).
         prior: Dirichlet parameter of every class before the first look.
         fusion: `kaplan`, `product` or `sum`.
         footprint: which cells a detection updates (`Grid.footprint`).
@@ -146,25 +146,58 @@ class ActivePerception(nn.Module):
         Raises:
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
         """
+        image, grid = self._frame(image)
+        index = self._target(target)
+        goal = None if boxes is None else grid.footprint(boxes.to(image)).any(-2)
+
+        def ends(cell: int, detections: Detections) -> bool:
+            return bool(goal[cell]) if goal is not None else confirms(detections, grid, cell, index, confirm)
+
+        return self._gaze(image, grid, index, start, shifts, seed, ends)
+
+    def explore(self, image: Tensor, *, start: int | None = None, shifts: int = 20, seed: int = 0) -> Scanpath:
+        """Explore an image: build up the belief about the whole map, with no target.
+
+        The exploration ends after `shifts` gaze shifts, or when no cell is left. Arguments as for `search`; the
+        scanpath has no target, and nothing is found.
+
+        Raises:
+            InputError: the policy needs a target, the observer believes about one only, or an argument does not fit.
+        """
+        check(not self.observer.by_target, "observer", "one that believes about all classes", "one for a target")
+        image, grid = self._frame(image)
+        return self._gaze(image, grid, None, start, shifts, seed, lambda cell, detections: False)
+
+    def _frame(self, image: Tensor) -> tuple[Tensor, Grid]:
+        """The image as a batch of one, and the grid over it."""
         image = image[None] if image.ndim == 3 else image
         check_shape(image, "image", 1, 3, None, None)
-        index = self._target(target)
-        grid = Grid(self.columns, self.rows, (image.shape[-1], image.shape[-2]))
+        return image, Grid(self.columns, self.rows, (image.shape[-1], image.shape[-2]))
+
+    def _gaze(
+        self,
+        image: Tensor,
+        grid: Grid,
+        target: int | None,
+        start: int | None,
+        shifts: int,
+        seed: int,
+        ends: Callable[[int, Detections], bool],
+    ) -> Scanpath:
+        """Move the gaze until `ends` says so, for what is seen from a cell, or no shift or cell is left."""
         generator = torch.Generator().manual_seed(seed)
         if start is None:
             start = int(torch.randint(len(grid), (1,), generator=generator))
         check(0 <= start < len(grid), "start", f"a cell from 0 to {len(grid) - 1}", start)
-        goal = None if boxes is None else grid.footprint(boxes.to(image)).any(-2)
-
         view = self.eye.open(image)
-        acquisition = self.policy(self.observer.component(index), grid)
+        acquisition = self.policy(None if target is None else self.observer.component(target), grid)
         belief = self.observer.start(1, grid, image)
         visited = torch.zeros(1, len(grid), dtype=torch.bool, device=image.device)
         cell, cells, seen, beliefs, values, found = start, [], [], [], [], False
         while True:
             fixation = grid.centres[cell].to(image)[None]
             detections = self.eye.look(view, fixation)
-            evidence = self.observer.weigh(detections, fixation, grid, index)
+            evidence = self.observer.weigh(detections, fixation, grid, target)
             noise = torch.rand(1, len(grid), generator=generator).to(image)
             here = torch.tensor([cell], device=image.device)
             after = step(self.observer, belief, visited, here, evidence, acquisition, noise)
@@ -173,7 +206,7 @@ class ActivePerception(nn.Module):
             seen.append(detections)
             beliefs.append(belief.beta[0])
             values.append(after.values[0])
-            found = bool(goal[cell]) if goal is not None else confirms(detections, grid, cell, index, confirm)
+            found = ends(cell, detections)
             cell = int(after.cell)
             if found or len(cells) > shifts or cell < 0:
                 break
@@ -181,7 +214,7 @@ class ActivePerception(nn.Module):
         return Scanpath(
             grid=grid,
             classes=self.classes,
-            target=index,
+            target=target,
             cells=visits,
             fixations=grid.centres.to(image)[visits],
             detections=tuple(seen),

@@ -28,6 +28,15 @@ def check(condition: bool, argument: str, expected: str, got: object) -> None:
         raise InputError(f"{argument}: expected {expected}, got {got}")
 
 
+def values_known() -> bool:
+    """Whether the values of tensors can be looked at here: not while a graph is traced, nor inside `torch.func.vmap`.
+
+    >>> values_known()
+    True
+    """
+    return not torch.compiler.is_compiling() and torch._C._functorch.peek_interpreter_stack() is None
+
+
 def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
     """Raise `InputError` unless the last dimensions of `tensor` are `shape` (`None` stands for any size).
 

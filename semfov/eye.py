@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor, nn
 
 from semfov.detection.detections import Detections
@@ -28,10 +29,19 @@ class View:
 
 
 class Eye(nn.Module):
-    """Foveates at the detector's resolution and detects.
+    r"""Foveates at the detector's resolution and detects.
 
     The image is fitted into the detector's input first and blurred there: that is what a fixed number of receptors
     does, and it costs less than blurring every pixel of the photograph.
+
+    The canvas sees what the sensor shows of an image whose longer side is `reference`. With the canvas s times as
+    large, windows shrink by s, and a band of the canvas holds what is :math:`\log_2 s` bands finer there, so that
+
+    .. math:: \sigma_k' = s \, \sigma \, \mathrm{growth}^{k - \log_2 s}, \qquad
+              \sigma' = \sigma \, s^{1 - \log_2 \mathrm{growth}}
+
+    keeps the same detail at the same distance from the fovea. (With growth 2 acuity is a function of eccentricity
+    that has no scale, and σ' = σ.)
 
     Args:
         sensor: the foveal sensor; its σ is in pixels of an image whose longer side is `reference`.
@@ -51,7 +61,8 @@ class Eye(nn.Module):
         check_shape(image, "image", 1, 3, None, None)
         canvas, placement = self.detector.fit(image)
         scale = canvas.new_tensor([placement.scale]) * (max(placement.size) / self.reference)
-        return View(self.sensor.pyramid(canvas), placement, self.sensor.sigma * scale)
+        shrink = scale.pow(1 - torch.as_tensor(self.sensor.growth).to(scale).log2())
+        return View(self.sensor.pyramid(canvas), placement, self.sensor.sigma * shrink)
 
     def foveated(self, view: View, fixations: Tensor) -> Tensor:
         """What the sensor gives for fixations `(F, 2)` in image pixels: canvases `(F, 3, h, w)`."""

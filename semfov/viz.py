@@ -45,18 +45,53 @@ def plot_cumulative_performance(
 
     >>> figure = plot_cumulative_performance({"random": np.linspace(0, 0.8, 31)})
     """
-    figure, (axes,) = _figure(1, 1, width=6.2, height=4.0)
+    figure = _plot_curves(curves, errors, title, "targets found (%)")
+    figure.axes[0].set_ylim(0, 102)
+    return figure
+
+
+def plot_success_rate(
+    curves: Mapping[str, NDArray[np.float64]],
+    errors: Mapping[str, NDArray[np.float64]] | None = None,
+    *,
+    title: str = "",
+) -> Figure:
+    """Share of the cells with objects whose class is right after each gaze shift.
+
+    Arguments as for `plot_cumulative_performance`.
+    """
+    return _plot_curves(curves, errors, title, "cells with the right class (%)")
+
+
+def _plot_curves(
+    curves: Mapping[str, NDArray[np.float64]],
+    errors: Mapping[str, NDArray[np.float64]] | None,
+    title: str,
+    label: str,
+) -> Figure:
+    """Shares after each gaze shift, one curve per policy, with bands of one standard error."""
+    from matplotlib import rc_context
+
+    many = len(curves) > len(COLOURS)
+    figure, (axes,) = _figure(1, 1, width=8.0 if many else 6.2, height=4.0)
     for order, (name, curve) in enumerate(curves.items()):
-        colour, line = COLOURS[order % len(COLOURS)], LINES[order // 2 % len(LINES)]
+        line = LINES[order // (len(COLOURS) if many else 2) % len(LINES)]
+        colour = COLOURS[order % len(COLOURS)]
         shifts = np.arange(len(curve))
         axes.plot(shifts, 100 * curve, line, color=colour, label=name, linewidth=1.6)
         band = None if errors is None else errors.get(name)
         if band is not None and np.isfinite(band).all():
-            axes.fill_between(shifts, 100 * (curve - band), 100 * (curve + band), color=colour, alpha=0.15, lw=0)
-    axes.set(xlabel="gaze shifts", ylabel="targets found (%)", ylim=(0, 102), title=title)
+            alpha = 0.05 if many else 0.15
+            axes.fill_between(shifts, 100 * (curve - band), 100 * (curve + band), color=colour, alpha=alpha, lw=0)
+    axes.set(xlabel="gaze shifts", ylabel=label, title=title)
     axes.set_xlim(0, max(len(curve) for curve in curves.values()) - 1)
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.grid(alpha=0.3, linewidth=0.5)
-    axes.legend(loc="lower right", framealpha=0.9)
+    with rc_context(STYLE):
+        if many:
+            figure.legend(loc="outside right upper")
+        else:
+            axes.legend(loc="lower right", framealpha=0.9)
     return figure
 
 
@@ -219,9 +254,12 @@ def _draw_scanpath(axes: Axes, scanpath: Scanpath, image: Tensor, boxes: Tensor 
         last = number == len(path) - 1 and scanpath.found
         axes.plot(x, y, "o", markersize=13, color=COLOURS[2] if last else COLOURS[0], markeredgecolor="white")
         axes.text(x, y, str(number), color="white", ha="center", va="center", fontsize=8, fontweight="bold")
-    what = "" if scanpath.target is None else f"“{scanpath.classes[scanpath.target]}” "
-    end = f"found after {scanpath.shifts}" if scanpath.found else f"not found in {scanpath.shifts}"
-    axes.set_title(f"{what}{end} gaze shift{'s' if scanpath.shifts != 1 else ''}")
+    shifts = f"{scanpath.shifts} gaze shift{'s' if scanpath.shifts != 1 else ''}"
+    if scanpath.target is None:
+        axes.set_title(f"explored with {shifts}")
+    else:
+        found = "found after" if scanpath.found else "not found in"
+        axes.set_title(f"“{scanpath.classes[scanpath.target]}” {found} {shifts}")
 
 
 def _draw_view(axes: Axes, scanpath: Scanpath, fixation: int, view: Tensor) -> None:

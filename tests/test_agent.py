@@ -3,12 +3,14 @@
 import pytest
 import torch
 
-from semfov import ActivePerception, Foveation, Grid, SemanticMap, search_policy
+from semfov import ActivePerception, FovealObservationModel, Foveation, Grid, SemanticMap, search_policy
 from semfov.agent import confirms, step
 from semfov.belief import SemanticObserver
 from semfov.detection import Candidates, Detections, Detector
 from semfov.errors import InputError
 from semfov.eye import Eye
+from semfov.gaze import exploration_policy
+from semfov.sensor import foveate
 
 SIZE = (160, 120)
 
@@ -93,6 +95,52 @@ def test_search_ends_when_every_cell_was_visited(image):
     assert sorted(scanpath.cells.tolist()) == list(range(6))
 
 
+@pytest.fixture
+def explorer():
+    """An agent that calibrates what it sees and looks where it expects to learn most."""
+    clarity = torch.tensor([4.0, 1.0, 0.2])
+    alpha = 1 + torch.eye(3)[:, None] * clarity[:, None]
+    model = FovealObservationModel(alpha, [0.2, 0.4], ["red", "green"]).requires_grad_(False).eval()
+    policy = exploration_policy("kl", model, calibrated=True)
+    return ActivePerception(Foveation(40.0), Squares(), model, (8, 6), policy, reference=160.0)
+
+
+def test_exploration_makes_all_its_gaze_shifts(explorer, image):
+    scanpath = explorer.explore(image, start=0, shifts=6)
+    assert scanpath.shifts == 6
+    assert scanpath.target is None
+    assert not scanpath.found
+    assert len(set(scanpath.cells.tolist())) == 7
+    # Each fixation is the best that was left after the looks before.
+    for number in range(6):
+        left = scanpath.values[number].clone()
+        assert left.max() > left.min() * 1.01
+        left[scanpath.cells[: number + 1]] = -torch.inf
+        assert left[scanpath.cells[number + 1]] >= left.max() * (1 - 1e-6)
+    own = SemanticMap(Grid(8, 6, SIZE), ["red", "green"], observation=explorer.observation)
+    for fixation, seen in zip(scanpath.fixations, scanpath.detections, strict=True):
+        own.update(seen, fixation[None])
+    torch.testing.assert_close(own.beta[0], scanpath.beliefs[-1])
+
+
+def test_exploration_ends_when_every_cell_was_visited(image):
+    agent = ActivePerception(Foveation(40.0), Squares(), None, (3, 2), exploration_policy("random"), reference=160.0)
+    assert sorted(agent.explore(image, shifts=50).cells.tolist()) == list(range(6))
+    first, second = (agent.explore(image, shifts=5, seed=seed).cells for seed in (1, 2))
+    assert torch.equal(agent.explore(image, shifts=5, seed=1).cells, first)
+    assert not torch.equal(first, second)
+
+
+def test_an_agent_that_calibrates_may_see_nothing(explorer, image):
+    scanpath = explorer.explore(torch.full_like(image, 0.4), start=3, shifts=2)
+    assert scanpath.beliefs.unique().tolist() == [0.5]
+
+
+def test_exploration_needs_a_policy_without_target(agent, image):
+    with pytest.raises(InputError, match="exploration_policy"):
+        agent.explore(image)
+
+
 def test_class_names_are_suggested(agent, image):
     with pytest.raises(InputError, match="did you mean 'green'"):
         agent.search(image, "gren")
@@ -141,3 +189,23 @@ def test_view_is_foveated_at_the_resolution_of_the_detector(image):
     sharp = (small_view[0, :, 8:28, 8:28] - image[:, 8:28, 8:28]).abs().mean()
     blurred = (small_view[0, :, 100:110, 130:140] - image[:, 100:110, 130:140]).abs().mean()
     assert blurred > 3 * sharp
+
+
+@pytest.mark.parametrize("growth", [1.0, 2.0])
+def test_view_shows_what_the_sensor_shows_of_a_reference_image(growth):
+    """Blurring the photograph and shrinking it is the same as shrinking it and blurring with matched bands."""
+    generator = torch.Generator().manual_seed(0)
+    # Detail at all scales, as photographs have it.
+    picture = torch.zeros(1, 3, 480, 640)
+    for n in (2, 4, 8, 16, 32):
+        coarse = torch.rand(1, 3, 480 // n, 640 // n, generator=generator)
+        picture += torch.nn.functional.interpolate(coarse, (480, 640), mode="bilinear") / 5
+    gaze = torch.tensor([[200.0, 250.0]])
+    eye = Eye(Foveation(60.0, growth=growth), Squares())
+    view = eye.open(picture)
+    got = eye.foveated(view, gaze)
+    shown, _ = eye.detector.fit(Foveation(60.0, growth=growth)(picture, gaze[None])[0])
+    scaled = foveate(view.bands, view.placement.points_to_canvas(gaze)[None], sigma=15.0, growth=growth)[0]
+    error, other = ((each - shown).square().mean().sqrt() for each in (got, scaled))
+    assert error < 0.02
+    assert error <= other

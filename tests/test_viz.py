@@ -1,13 +1,21 @@
 """Figures hold what they should: curves, fixations, one scale for an episode."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from semfov import Detections, Grid, InputError, Scanpath
-from semfov.viz import plot_belief, plot_cumulative_performance, plot_episode, plot_reliability, plot_scanpath
+from semfov.viz import (
+    plot_belief,
+    plot_cumulative_performance,
+    plot_episode,
+    plot_reliability,
+    plot_scanpath,
+    plot_success_rate,
+)
 
 
 @pytest.fixture
@@ -55,12 +63,22 @@ def test_curves_and_bands():
     assert len(axes.collections) == 1
 
 
+def test_many_curves_can_be_told_apart():
+    curves = {f"policy {number}": np.linspace(0, number / 20, 21) for number in range(16)}
+    figure = draw(plot_success_rate(curves, title="exploration"))
+    lines = figure.axes[0].lines
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 16
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == list(curves)
+
+
 def test_scanpath_shows_numbered_fixations(scanpath, image):
     figure = draw(plot_scanpath(scanpath, image, boxes=torch.tensor([[60.0, 45, 79, 59]])))
     axes = figure.axes[0]
     assert [text.get_text() for text in axes.texts] == ["0", "1", "2"]
     np.testing.assert_allclose(axes.lines[-4].get_xydata(), scanpath.fixations + 0.5)
     assert axes.get_title() == "“cup” found after 2 gaze shifts"
+    explored = draw(plot_scanpath(replace(scanpath, target=None, found=False), image))
+    assert explored.axes[0].get_title() == "explored with 2 gaze shifts"
 
 
 def test_belief_is_the_posterior(scanpath):

@@ -22,6 +22,7 @@ from eval.samples import Sampler, Samples, SampleSettings, collect
 from semfov.errors import DataError, check
 from semfov.observation import fit_discriminative
 from train.config import FitConfig
+from train.misses import count_misses
 from train.report import write_report
 
 
@@ -38,6 +39,8 @@ def fit_fom(config: FitConfig) -> None:
     if not held_out.any() or held_out.all():
         raise DataError(f"data: too few detections to fit on and to judge by ({len(samples)}); give more photographs")
     model = fit_model(config, sampler, samples[~held_out])
+    fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
+    model.miss_rate = count_misses(sampler, samples, fitted_on, model.edges).rates().to(model.edges)
     path = config.out / f"{config.name or sampler.eye.detector.name}.safetensors"
     model.save(path)
     written = write_report(config, model, fit_all(config, sampler, samples[~held_out], model), samples, held_out)

@@ -6,6 +6,8 @@ from semfov.belief.grid import Footprint, Grid
 from semfov.belief.observer import Memory, Observer, SemanticObserver
 from semfov.belief.semantic_map import SemanticMap
 from semfov.belief.state import Belief
+from semfov.belief.target_evidence import TargetEvidence
+from semfov.belief.target_observer import TargetObserver
 from semfov.belief.update import fuse
 
 __all__ = [
@@ -18,6 +20,8 @@ __all__ = [
     "Observer",
     "SemanticMap",
     "SemanticObserver",
+    "TargetEvidence",
+    "TargetObserver",
     "fuse",
     "fusion",
     "weigh",

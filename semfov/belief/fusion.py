@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from semfov.errors import check
+from semfov.errors import check, values_known
 
 Rule = Callable[[Tensor, Tensor], Tensor]
 
@@ -27,11 +27,12 @@ def kaplan(beta: Tensor, likelihood: Tensor) -> Tensor:
         New parameters, `(..., K+1)`, nowhere smaller than `beta`.
 
     Raises:
-        InputError: a likelihood is zero for every class, negative or not finite.
+        InputError: a likelihood is zero for every class, negative or not finite, or a parameter is not positive.
 
     >>> kaplan(torch.ones(3), torch.tensor([1.0, 0.0, 0.0]))
     tensor([2., 1., 1.])
     """
+    check_parameters(beta)
     return kaplan_scaled(beta, scale_likelihood(likelihood))
 
 
@@ -45,6 +46,7 @@ def product(beta: Tensor, likelihood: Tensor) -> Tensor:
     >>> product(torch.ones(2), torch.tensor([3.0, 1.0]))
     tensor([2.2500, 0.7500])
     """
+    check_parameters(beta)
     return product_scaled(beta, scale_likelihood(likelihood))
 
 
@@ -58,6 +60,7 @@ def sum(beta: Tensor, likelihood: Tensor) -> Tensor:
     >>> sum(torch.ones(2), torch.tensor([3.0, 1.0]))
     tensor([1.7500, 1.2500])
     """
+    check_parameters(beta)
     return sum_scaled(beta, scale_likelihood(likelihood))
 
 
@@ -84,10 +87,20 @@ def sum_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
 RULES: dict[str, Rule] = {"kaplan": kaplan_scaled, "product": product_scaled, "sum": sum_scaled}
 
 
+def check_parameters(beta: Tensor) -> None:
+    """Raise `InputError` unless Dirichlet parameters are positive and finite."""
+    if not beta.numel() or not values_known():
+        return
+    # NaN survives both.
+    least, largest = beta.detach().aminmax()
+    usable = bool((least > 0) & (largest < torch.inf))
+    check(usable, "beta", "positive, finite Dirichlet parameters", f"{float(least):g} to {float(largest):g}")
+
+
 def scale_likelihood(likelihood: Tensor) -> Tensor:
     """Check likelihoods and scale each row to a largest value of 1 (every rule is blind to a common factor)."""
     largest = likelihood.amax(-1, keepdim=True)
-    if not torch.compiler.is_compiling():
+    if values_known():
         # NaN and infinity survive the maximum and the minimum, so two reductions answer everything.
         least = likelihood.detach().amin()
         usable = bool((least >= 0) & ((largest > 0) & (largest < torch.inf)).all()) if likelihood.numel() else True

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from semfov.errors import check, check_shape, lookup
+from semfov.errors import check, check_finite, check_shape, lookup, values_known
 
 Footprint = Literal["overlap", "centre", "box_centre", "soft"]
 
@@ -70,9 +70,10 @@ class Grid:
         With a batch of sizes `(B, 2)` the points are `(B, ..., 2)`.
         """
         check_shape(points, "points", 2)
-        step = ((points + 0.5) / self._align(self._cell_size(), points)).floor().long()
-        column = step[..., 0].clamp(0, self.columns - 1)
-        row = step[..., 1].clamp(0, self.rows - 1)
+        _check_numbers(points, "points")
+        step = ((points + 0.5) / self._align(self._cell_size(), points)).floor()
+        column = step[..., 0].clamp(0, self.columns - 1).long()
+        row = step[..., 1].clamp(0, self.rows - 1).long()
         return row * self.columns + column
 
     def footprint(self, boxes: Tensor, rule: Footprint = "overlap") -> Tensor:
@@ -96,6 +97,7 @@ class Grid:
                 [ True,  True]])
         """
         check_shape(boxes, "boxes", None, 4)
+        _check_numbers(boxes, "boxes")
         lookup(rule, get_args(Footprint), "footprint rule")
         full = (boxes[..., 2] > boxes[..., 0]) & (boxes[..., 3] > boxes[..., 1])
         low, high = boxes[..., None, :2], boxes[..., None, 2:]
@@ -120,6 +122,8 @@ class Grid:
         """
         check_shape(boxes, "boxes", None, 4)
         check_shape(fixation, "fixation", 2)
+        _check_numbers(boxes, "boxes")
+        _check_numbers(fixation, "fixation")
         centre = (boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5
         offset = torch.linalg.vector_norm(centre - fixation[..., None, :], dim=-1)
         return offset / self.extent.amax(-1)[..., None].to(offset)
@@ -130,7 +134,7 @@ class Grid:
         box_half = (boxes[..., None, 2:] - boxes[..., None, :2]) / 2
         middle = (boxes[..., None, :2] + boxes[..., None, 2:]) / 2
         offset = (self.centres + 0.5)[..., None, :, :].to(boxes) - middle
-        return (-1.5 * offset.square() / (box_half.square() + half.square())).sum(-1).exp()
+        return (-1.5 * (offset / torch.hypot(box_half, half)).square()).sum(-1).exp()
 
     @property
     def cell_distance(self) -> Tensor:
@@ -150,6 +154,11 @@ class Grid:
         extra = points.ndim - values.ndim
         aligned = values if values.ndim == 1 else values.reshape(values.shape[0], *[1] * extra, 2)
         return aligned.to(points)
+
+
+def _check_numbers(values: Tensor, argument: str) -> None:
+    if values_known():
+        check_finite(values, argument)
 
 
 def _overlaps(borders: Tensor, low: Tensor, high: Tensor) -> Tensor:

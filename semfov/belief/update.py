@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from semfov.belief.fusion import RULES, scale_likelihood
+from semfov.belief.fusion import RULES, check_parameters, scale_likelihood
 from semfov.errors import check, check_shape, lookup
 
 
@@ -32,6 +32,7 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     check_shape(likelihood, "likelihood", batch, None, components)
     check_shape(footprint, "footprint", batch, likelihood.shape[1], cells)
     update = RULES[lookup(rule, RULES, "fusion rule")]
+    check_parameters(beta)
     soft = footprint.is_floating_point()
     check(soft or footprint.dtype == torch.bool, "footprint", "a boolean or floating-point tensor", footprint.dtype)
     covered = footprint > 0 if soft else footprint

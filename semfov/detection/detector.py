@@ -9,7 +9,7 @@ from semfov.detection.detections import Detections
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection, select
-from semfov.errors import check_shape
+from semfov.errors import check
 
 
 class Detector(nn.Module, ABC):
@@ -61,7 +61,7 @@ class Detector(nn.Module, ABC):
 
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
         """Fit images `(B, 3, H, W)`, RGB in [0, 1], into the input: the canvas and where the image lies on it."""
-        check_shape(images, "images", None, 3, None, None)
+        check_images(images)
         return letterbox(images, self.input_size, fill=self.fill, stride=self.stride, stretch=self.stretch)
 
     def detect(self, canvas: Tensor, placement: Placement | None = None) -> Detections:
@@ -69,6 +69,7 @@ class Detector(nn.Module, ABC):
 
         Without a placement, boxes stay in canvas pixels.
         """
+        check(len(canvas) > 0, "canvas", "at least one image", 0)
         return select(self.propose(canvas), placement, self.selection, self.background)
 
     def forward(self, images: Tensor) -> Detections:
@@ -88,3 +89,10 @@ class Detector(nn.Module, ABC):
             "stride": self.stride,
             "stretch": self.stretch,
         }
+
+
+def check_images(images: Tensor) -> None:
+    """Raise `InputError` unless `images` are what every detector takes."""
+    fits = images.ndim == 4 and images.shape[1] == 3 and images.numel() > 0 and images.is_floating_point()
+    what = "floating-point RGB in [0, 1] of shape (B, 3, H, W), at least one image and one pixel"
+    check(fits, "images", what, f"{images.dtype} of shape {tuple(images.shape)}")

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from semfov.detection.class_names import keep_classes, named
 from semfov.detection.coco_classes import COCO_CLASSES
-from semfov.detection.detector import Detector
+from semfov.detection.detector import Detector, check_images
 from semfov.detection.onnx_recognition import HEADS, Signature, recognise
 from semfov.detection.onnx_session import OnnxSession
 from semfov.detection.onnx_settings import read_settings
@@ -75,12 +75,13 @@ class OnnxDetector(Detector):
         )
         fixed = None not in session.shape[2:]
         check(stride is None or not fixed, "stride", "None for a model with a fixed input size", stride)
+        check(stride is None or stride > 0, "stride", "None or a positive number of pixels", stride)
         self.session, self.head, self.preprocessing, self.logits = session, head, preprocessing, logits
         self._places, self._scores = places, len(classes)
 
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
         """Fit images `(B, 3, H, W)`, RGB in [0, 1], into the input as the network's preprocessing says."""
-        check_shape(images, "images", None, 3, None, None)
+        check_images(images)
         wanted = self.preprocessing
         return letterbox(
             images,
@@ -171,7 +172,7 @@ def load_onnx(
     options = {
         "head": head,
         "classes": classes,
-        "input_size": (input_size, input_size) if isinstance(input_size, int) else input_size,
+        "input_size": input_size,
         "stride": stride,
         "logits": logits,
         "background": background,
@@ -207,15 +208,16 @@ def load_onnx(
     )
 
 
-def canvas_size(session: OnnxSession, wanted: Sequence[int] | None) -> tuple[int, int]:
+def canvas_size(session: OnnxSession, wanted: int | Sequence[int] | None) -> tuple[int, int]:
     """`(width, height)` of a model's canvas: its own where it is fixed, else the one that is wanted."""
     height, width = session.shape[2:]
     if wanted is None:
         if height is None or width is None:
             raise InputError(f"input_size: expected (width, height), as {session.path.name} takes any size, got None")
         return width, height
-    sizes = tuple(wanted)
-    check(len(sizes) == 2 and min(sizes) > 0, "input_size", "(width, height) in pixels", sizes)
+    sizes = (wanted, wanted) if isinstance(wanted, int) else tuple(wanted)
+    whole = len(sizes) == 2 and all(isinstance(n, int) and n > 0 for n in sizes)
+    check(whole, "input_size", "(width, height) in pixels", sizes)
     fits = width in (None, sizes[0]) and height in (None, sizes[1])
     check(fits, "input_size", f"the model's own, {width} x {height}", sizes)
     return sizes[0], sizes[1]

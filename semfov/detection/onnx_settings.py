@@ -11,19 +11,19 @@ from semfov.errors import DataError
 METADATA_KEY = "semfov"
 """Key of the model's metadata under which an export by semfov keeps its settings, as JSON."""
 
-KEYS = (
-    "name",
-    "head",
-    "classes",
-    "input_size",
-    "stride",
-    "background",
-    "logits",
-    "preprocessing",
-    "licence",
-    "source",
-)
-"""What a settings file may hold; `licence` and `source` are for people."""
+KEYS: dict[str, tuple[type, ...]] = {
+    "name": (str,),
+    "head": (str,),
+    "classes": (list,),
+    "input_size": (int, list),
+    "stride": (int, type(None)),
+    "background": (str,),
+    "logits": (bool,),
+    "preprocessing": (dict,),
+    "licence": (str,),
+    "source": (str,),
+}
+"""What a settings file may hold, with the types of the values; `licence` and `source` are for people."""
 
 
 def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
@@ -53,11 +53,15 @@ def _parse(text: str, where: str) -> dict[str, Any]:
         settings = json.loads(text)
     except json.JSONDecodeError as error:
         raise DataError(f"{where}: expected JSON, got an error in line {error.lineno}: {error.msg}") from error
-    if not isinstance(settings, dict) or not isinstance(settings.get("preprocessing", {}), dict):
-        raise DataError(f"{where}: expected an object, with an object as its preprocessing")
+    if not isinstance(settings, dict):
+        raise DataError(f"{where}: expected an object, got {settings!r}")
     unknown = sorted(set(settings) - set(KEYS))
     if unknown:
         raise DataError(f"{where}: unknown {', '.join(unknown)}; known: {', '.join(KEYS)}")
+    for key, value in settings.items():
+        if not isinstance(value, KEYS[key]):
+            kinds = " or ".join(kind.__name__ for kind in KEYS[key])
+            raise DataError(f"{where}: {key}: expected {kinds}, got {value!r}")
     return settings
 
 

@@ -1,5 +1,6 @@
 """What a network wants its input to look like, as data that can stand beside the model."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, Self, get_args
@@ -38,11 +39,17 @@ class Preprocessing:
     fill: float = 114 / 255
 
     def __post_init__(self) -> None:
-        lookup(self.channels, get_args(ChannelOrder), "channel order")
+        lookup(str(self.channels), get_args(ChannelOrder), "channel order")
         for name in ("mean", "std"):
-            values = tuple(float(value) for value in getattr(self, name))
-            check(len(values) == 3, f"preprocessing.{name}", "three numbers", values)
-            object.__setattr__(self, name, values)
+            values = getattr(self, name)
+            three = isinstance(values, list | tuple) and len(values) == 3 and all(map(_is_number, values))
+            check(three, f"preprocessing.{name}", "three numbers", values)
+            object.__setattr__(self, name, tuple(map(float, values)))
+        for name in ("scale", "fill"):
+            check(_is_number(getattr(self, name)), f"preprocessing.{name}", "a number", getattr(self, name))
+        for name in ("stretch", "corner"):
+            value = getattr(self, name)
+            check(isinstance(value, bool), f"preprocessing.{name}", "true or false", value)
         check(all(value > 0 for value in self.std), "preprocessing.std", "positive numbers", self.std)
         check(self.scale > 0, "preprocessing.scale", "a positive number", self.scale)
         check(0 <= self.fill <= 1, "preprocessing.fill", "a number in [0, 1]", self.fill)
@@ -64,6 +71,10 @@ class Preprocessing:
     def settings(self) -> dict[str, Any]:
         """All settings, as JSON takes them."""
         return {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self).items()}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
 
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)

@@ -63,6 +63,8 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
 
     full = ((boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])).nonzero()[:, 0]
     boxes, confidence, labels = boxes[full], confidence[full], labels[full]
+    if boxes.dtype in (torch.float16, torch.bfloat16):  # too coarse for pixels, and not there on a CPU
+        boxes, confidence = boxes.float(), confidence.float()
     if selection.per_class:
         keep = batched_nms(boxes, confidence, labels, selection.iou)
     else:

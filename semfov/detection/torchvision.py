@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.detection.class_names import keep_classes, named
-from semfov.detection.detector import Detector
+from semfov.detection.detector import Detector, check_images
 from semfov.detection.placement import Placement
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
@@ -81,9 +81,8 @@ class TorchvisionDetector(Detector):
 
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
         """Resize images `(B, 3, H, W)`, RGB in [0, 1], as the model's transform does; nothing is padded."""
-        check_shape(images, "images", None, 3, None, None)
+        check_images(images)
         height, width = images.shape[-2:]
-        check(min(height, width) > 0, "images", "at least one pixel", tuple(images.shape))
         columns, rows = self._canvas_size(width, height)
         canvas = F.interpolate(images, (rows, columns), mode="bilinear", align_corners=False)
         return canvas, Placement((width, height), (columns / width, rows / height), (0, 0))

@@ -18,7 +18,8 @@ def roi_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
     regions = heads.box_head(heads.box_roi_pool(features, proposals, images.image_sizes))
     logits, regression = heads.box_predictor(regions)
     counts = [len(each) for each in proposals]
-    boxes = heads.box_coder.decode(regression, proposals).split(counts)
+    # Without a proposal the coder leaves the boxes flat.
+    boxes = heads.box_coder.decode(regression, proposals).reshape(len(logits), logits.shape[-1], 4).split(counts)
     scores = logits.softmax(-1).split(counts)
     return [(_clip(b, size), s) for b, s, size in zip(boxes, scores, images.image_sizes, strict=True)]
 

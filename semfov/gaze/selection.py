@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from semfov.errors import check, check_shape
+from semfov.errors import check, check_shape, values_known
 
 
 def select_fixation(values: Tensor, visited: Tensor, noise: Tensor, *, tolerance: float = 1e-6) -> Tensor:
@@ -29,7 +29,7 @@ def select_fixation(values: Tensor, visited: Tensor, noise: Tensor, *, tolerance
     check_shape(values, "values", None, None)
     check_shape(visited, "visited", *values.shape)
     check_shape(noise, "noise", *values.shape)
-    if not torch.compiler.is_compiling():
+    if values_known():
         unusable = torch.isnan(values) & ~visited
         check(not bool(unusable.any()), "values", "numbers", "NaN for a cell that is not visited")
     open_values = values.masked_fill(visited, -torch.inf)

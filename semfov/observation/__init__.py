@@ -4,6 +4,7 @@ from semfov.observation import dirichlet
 from semfov.observation.calibration import fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import match
+from semfov.observation.misses import MissCounts
 from semfov.observation.statistics import DirichletStatistics
 
-__all__ = ["DirichletStatistics", "FovealObservationModel", "dirichlet", "fit_discriminative", "match"]
+__all__ = ["DirichletStatistics", "FovealObservationModel", "MissCounts", "dirichlet", "fit_discriminative", "match"]

@@ -119,6 +119,7 @@ def fit_discriminative(
         epsilon=model.epsilon,
         log_prior=constant + shift,
         expected=model.expected_scores().detach(),
+        miss_rate=model.miss_rate,
         metadata={**model.metadata, "method": "discriminative", "discriminative": trained},
     )
 

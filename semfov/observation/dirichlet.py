@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from semfov.errors import check, check_finite, check_shape
+from semfov.errors import check, check_finite, check_shape, values_known
 from semfov.observation.mle import inverse_digamma, mle, shrink, vacuous
 
 __all__ = [
@@ -126,14 +126,17 @@ def floor(scores: Tensor, epsilon: float) -> Tensor:
     """
     check_shape(scores, "scores", None)
     check(epsilon > 0, "epsilon", "a positive number", epsilon)
-    if not torch.compiler.is_compiling():
-        check_finite(scores, "scores")
-        check(not bool((scores < 0).any()), "scores", "no negative numbers", float(scores.detach().amin()))
+    if scores.numel() and values_known():
+        # NaN survives the minimum and the maximum, so one pass answers both questions.
+        least, largest = scores.detach().aminmax()
+        if not bool(torch.isfinite(least) & torch.isfinite(largest)):
+            check_finite(scores, "scores")
+        check(bool(least >= 0), "scores", "no negative numbers", float(least))
     raised = scores.clamp(min=epsilon)
     return raised / raised.sum(-1, keepdim=True)
 
 
 def _check_parameters(alpha: Tensor, argument: str) -> None:
     check_shape(alpha, argument, None)
-    if not torch.compiler.is_compiling():
+    if values_known():
         check(bool((alpha > 0).all()), argument, "positive parameters", alpha.detach().amin().tolist())

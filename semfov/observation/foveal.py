@@ -10,13 +10,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.errors import DataError, check, check_finite, check_shape, lookup
+from semfov.errors import DataError, InputError, check, check_finite, check_shape, lookup, values_known
 from semfov.observation import compatibility
 from semfov.observation.dirichlet import floor, log_normaliser
 from semfov.observation.fitting import estimate_prior, expected_table, fit_table
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
-from semfov.observation.storage import read, write
+from semfov.observation.storage import find, read, write
 
 SHIPPED = Path(__file__).parent / "models"
 _KIND = "foveal-observation-model"
@@ -49,6 +49,8 @@ class FovealObservationModel(nn.Module):
         tempering: τ, positive.
         expected: `(K+1, N, K+1)`, what `expected_scores` returns where that is not the mean of Dir(α), as in models
             trained for the posterior; None takes the mean.
+        miss_rate: `(K+1, N)`, probability that nothing is detected where there is an object of a class (background
+            first) at a level of distance (`MissCounts.rates`); None where it is not known.
         metadata: JSON values that are kept with the model: `detector` and `sensor` (settings it was fitted for),
             `counts`, and whatever else is worth knowing.
 
@@ -64,6 +66,7 @@ class FovealObservationModel(nn.Module):
     log_prior: Tensor
     tempering: Tensor
     expected: Tensor | None
+    miss_rate: Tensor | None
 
     def __init__(
         self,
@@ -75,6 +78,7 @@ class FovealObservationModel(nn.Module):
         log_prior: Tensor | None = None,
         tempering: float = 1.0,
         expected: Tensor | None = None,
+        miss_rate: Tensor | None = None,
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
@@ -97,12 +101,13 @@ class FovealObservationModel(nn.Module):
         for name, table, size in [
             ("log_prior", log_prior, shape[:2]),
             ("expected", expected, shape),
+            ("miss_rate", miss_rate, shape[:2]),
         ]:
             if table is not None:
                 check(tuple(table.shape) == size, name, f"shape {size}", tuple(table.shape))
                 check_finite(table, name)
                 table = table.detach().to(alpha).clone()
-            elif name != "expected":
+            elif name == "log_prior":
                 table = alpha.new_zeros(size)
             self.register_buffer(name, table)
         self.register_buffer("tempering", alpha.new_tensor(tempering))
@@ -122,7 +127,9 @@ class FovealObservationModel(nn.Module):
 
     def level(self, distance: Tensor) -> Tensor:
         """Level of each distance, `(...)` from 0 (the fovea) to N - 1."""
-        return torch.bucketize(distance.to(self.edges.dtype), self.edges)
+        if distance.numel() and values_known():
+            check(bool((distance >= 0).all()), "distance", "numbers from 0 up", "NaN or a negative number")
+        return torch.bucketize(distance.to(self.edges).contiguous(), self.edges)
 
     def log_likelihood(self, scores: Tensor, distance: Tensor) -> Tensor:
         """`ln Dir(S | α_{k,d})` for every class k, `(..., K+1)`.
@@ -151,9 +158,29 @@ class FovealObservationModel(nn.Module):
         logits = self.log_likelihood(scores, distance) * self.tempering
         return (logits + self.log_prior.t()[self.level(distance)]).softmax(-1).to(scores.dtype)
 
+    def calibrate_levels(self, scores: Tensor) -> Tensor:
+        """`calibrate` for scores `(..., N, K+1)` whose row n is seen at level n, in N products instead of N²."""
+        components, levels = self.log_alpha.shape[:2]
+        check_shape(scores, "scores", levels, components)
+        weight, constant = self._linear()
+        log_scores = floor(scores, self.epsilon).log().to(weight.dtype)
+        every = torch.einsum("...nj,nkj->...nk", log_scores, weight.unflatten(0, (levels, components)))
+        offset = constant.unflatten(0, (levels, components)) * self.tempering + self.log_prior.t()
+        return (every * self.tempering + offset).softmax(-1).to(scores.dtype)
+
     def expected_scores(self) -> Tensor:
         """Scores to expect of an object, `E[S | C = k, d]`, `(K+1, N, K+1)`."""
         return self.log_alpha.softmax(-1) if self.expected is None else self.expected
+
+    def miss_likelihood(self, distance: Tensor) -> Tensor:
+        """Likelihood of seeing nothing at a distance `(...)` for what may be there, `(..., K+1)`.
+
+        Raises:
+            InputError: the model has no `miss_rate`.
+        """
+        if self.miss_rate is None:
+            raise InputError("miss_rate: expected a model that was fitted with miss rates, got none")
+        return self.miss_rate.t()[self.level(distance)]
 
     def forward(self, scores: Tensor, distance: Tensor) -> Tensor:
         """As `calibrate`."""
@@ -263,7 +290,7 @@ class FovealObservationModel(nn.Module):
             InputError: no model of that name is shipped, or it was not fitted for `detector`.
             DataError: the file is missing, damaged or not a model.
         """
-        path = _find(name_or_path)
+        path = find(name_or_path, SHIPPED, "observation model")
         tensors, record = read(path, _KIND)
         try:
             alpha = tensors.pop("log_alpha")
@@ -273,6 +300,7 @@ class FovealObservationModel(nn.Module):
                 record["classes"],
                 epsilon=record["epsilon"],
                 expected=tensors.get("expected"),
+                miss_rate=tensors.get("miss_rate"),
                 metadata=record["metadata"],
             )
             model.load_state_dict({"log_alpha": alpha, **tensors})
@@ -311,11 +339,3 @@ class FovealObservationModel(nn.Module):
         # ln Γ of large parameters needs the digits: likelihoods differ by less than it is large.
         constant = -log_normaliser(alpha.to(torch.float64)).to(alpha.dtype)
         return (alpha - 1).flatten(0, 1), constant.flatten()
-
-
-def _find(name_or_path: str | PathLike[str]) -> Path:
-    path = Path(name_or_path)
-    if path.suffix == ".safetensors" or len(path.parts) > 1:
-        return path
-    shipped = sorted(file.stem for file in SHIPPED.glob("*.safetensors"))
-    return SHIPPED / f"{lookup(str(name_or_path), shipped, 'observation model')}.safetensors"

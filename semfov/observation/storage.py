@@ -1,18 +1,21 @@
-"""Tensors and what they mean in one file: safetensors with a JSON record in its header."""
+"""Tensors and what they mean in one file: safetensors with a JSON record in its header, and a checksum over both."""
 
+import hashlib
 import json
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from semfov.errors import DataError
+from semfov.errors import DataError, lookup
 from semfov.files import replacing
 
 # One key only: the order of several would differ from one write to the next.
 _KEY = "semfov"
+_CHECKSUM = "sha256"
 
 
 def write(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> None:
@@ -23,9 +26,11 @@ def write(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapp
     """
     from safetensors.torch import save_file
 
-    header = {_KEY: json.dumps(record, sort_keys=True, allow_nan=False)}
+    whole = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    verified = {**record, _CHECKSUM: _checksum(whole, record)}
+    header = {_KEY: json.dumps(verified, sort_keys=True, allow_nan=False)}
     with replacing(Path(path)) as temporary:
-        save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, temporary, header)
+        save_file(whole, temporary, header)
 
 
 def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -47,10 +52,38 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
     except FileNotFoundError:
         raise DataError(f"{path}: no such file") from None
     except (OSError, SafetensorError, ValueError) as error:
-        raise DataError(f"{path}: not a readable safetensors file ({error}); write or fetch it again") from None
+        reason = " ".join(str(error).split())
+        raise DataError(f"{path}: not a readable safetensors file ({reason}); write or fetch it again") from None
     except KeyError:
         raise DataError(f"{path}: expected a file that semfov wrote, got one without its record") from None
     if not isinstance(record, dict) or record.get("kind") != kind:
         found = record.get("kind") if isinstance(record, dict) else type(record).__name__
         raise DataError(f"{path}: expected {kind}, got {found}")
+    # Files of before there were checksums have none to compare with.
+    told = record.pop(_CHECKSUM, None)
+    if told is not None and told != _checksum(tensors, record):
+        raise DataError(f"{path}: damaged, its content does not have the sha256 it was written with; fetch it again")
     return tensors, record
+
+
+def find(name_or_path: str | PathLike[str], shipped: Path, kind: str) -> Path:
+    """The path itself, or the file of that name among the models in `shipped`.
+
+    Raises:
+        InputError: no model of that name is shipped; `kind` says of what.
+    """
+    path = Path(name_or_path)
+    if path.suffix == ".safetensors" or len(path.parts) > 1:
+        return path
+    names = sorted(file.stem for file in shipped.glob("*.safetensors"))
+    return shipped / f"{lookup(str(name_or_path), names, kind)}.safetensors"
+
+
+def _checksum(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> str:
+    """sha256 over the record, and over names, shapes, types and bytes of the tensors."""
+    digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()

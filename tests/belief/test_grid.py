@@ -1,5 +1,7 @@
 """The grid against loops over cells and pixels."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given
@@ -73,6 +75,17 @@ def test_centre_rule_leaves_out_barely_touched_cells():
     assert set(grid.footprint(box, "centre")[0].nonzero()[:, 0].tolist()) == {21, 22}
 
 
+def test_soft_weights_are_a_normal_window_inside_the_box():
+    grid = Grid(10, 5, (100, 100))
+    box = torch.tensor([[12.0, 12.0, 38.0, 58.0], [5.0, 5.0, 5.0, 9.0]], dtype=torch.float64)
+    weights = grid.footprint(box, "soft")
+    assert torch.equal(weights > 0, grid.footprint(box))
+    for cell in grid.footprint(box)[0].nonzero()[:, 0].tolist():
+        x, y = 10 * (cell % 10) + 5 - 25, 20 * (cell // 10) + 10 - 35
+        expected = math.exp(-(x**2) / (2 * (13**2 + 5**2) / 3) - y**2 / (2 * (23**2 + 10**2) / 3))
+        assert float(weights[0, cell]) == pytest.approx(expected)
+
+
 def test_batch_of_sizes_equals_single_grids():
     sizes = [(640, 480), (300, 500)]
     torch.manual_seed(0)
@@ -80,9 +93,9 @@ def test_batch_of_sizes_equals_single_grids():
     boxes = torch.cat([corner, corner + torch.rand(2, 5, 2) * 200], -1)
     fixation = torch.rand(2, 2) * 300
     batch = Grid(5, 4, torch.tensor(sizes))
-    for rule in ("overlap", "centre", "box_centre"):
+    for rule in ("overlap", "centre", "box_centre", "soft"):
         singles = [Grid(5, 4, size).footprint(b, rule) for size, b in zip(sizes, boxes, strict=True)]
-        assert torch.equal(batch.footprint(boxes, rule), torch.stack(singles))
+        torch.testing.assert_close(batch.footprint(boxes, rule), torch.stack(singles))
     for name in ("centres", "edges", "cell_distance"):
         torch.testing.assert_close(getattr(batch, name)[1], getattr(Grid(5, 4, sizes[1]), name))
     single = Grid(5, 4, sizes[1]).box_distance(boxes[1], fixation[1])

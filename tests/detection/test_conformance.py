@@ -15,6 +15,7 @@ from semfov.detection import Detections, Detector, Selection
 from semfov.detection.load import load_yolo
 from semfov.detection.onnx import load_onnx
 from semfov.detection.torchvision import TorchvisionDetector
+from semfov.errors import InputError
 
 NAMES = ("cat", "dog", "cup")
 SHARED = Path(os.environ.get("SEMFOV_SHARED", Path(__file__).parents[3] / "shared")) / "weights"
@@ -24,12 +25,15 @@ def build_darknet(tmp_path, small_cfg, small_weights, make_onnx):
     return load_yolo(str(small_cfg), weights=small_weights, classes=NAMES[:2], stride=16)
 
 
-def build_exported(tmp_path, small_cfg, small_weights, make_onnx):
-    from semfov.detection.export import export_onnx
+def build_exported(static):
+    def build(tmp_path, small_cfg, small_weights, make_onnx):
+        from semfov.detection.export import export_onnx
 
-    options = {"weights": small_weights, "classes": NAMES[:2], "stride": 16, "winograd": False}
-    export_onnx(load_yolo(str(small_cfg), **options), tmp_path / "small.onnx")
-    return load_onnx(tmp_path / "small.onnx")
+        options = {"weights": small_weights, "classes": NAMES[:2], "stride": None if static else 16, "winograd": False}
+        export_onnx(load_yolo(str(small_cfg), **options), tmp_path / "small.onnx", static=static)
+        return load_onnx(tmp_path / "small.onnx")
+
+    return build
 
 
 def build_onnx(*shapes, **options):
@@ -60,11 +64,12 @@ def torchvision_detector(kind):
     from torchvision.models.detection import FCOS, FasterRCNN, RetinaNet
     from torchvision.models.detection.anchor_utils import AnchorGenerator, DefaultBoxGenerator
     from torchvision.models.detection.ssd import SSD
+    from torchvision.models.detection.ssdlite import SSDLiteHead
     from torchvision.ops import MultiScaleRoIAlign
 
     torch.manual_seed(0)
     backbone = nn.Sequential(nn.Conv2d(3, 32, 8, 8))
-    backbone.out_channels = [32] if kind == "SSD" else 32
+    backbone.out_channels = [32] if kind.startswith("SSD") else 32
     small = {"min_size": 64, "max_size": 96}
     anchors = AnchorGenerator(((16,),), ((0.5, 1.0, 2.0),))
     model = {
@@ -74,6 +79,13 @@ def torchvision_detector(kind):
         "RetinaNet": lambda: RetinaNet(backbone, 4, anchor_generator=anchors, **small),
         "FCOS": lambda: FCOS(backbone, 4, anchor_generator=AnchorGenerator(((8,),), ((1.0,),)), **small),
         "SSD": lambda: SSD(backbone, DefaultBoxGenerator([[2]]), (64, 48), 4),
+        "SSDlite": lambda: SSD(
+            backbone,
+            DefaultBoxGenerator([[2]]),
+            (64, 48),
+            4,
+            head=SSDLiteHead([32], [4], 4, nn.BatchNorm2d),
+        ),
     }[kind]()
     with torch.no_grad():
         for name, parameter in model.named_parameters():
@@ -99,7 +111,8 @@ class Adapter:
 
 ADAPTERS = {
     "darknet": Adapter(build_darknet, gradients=True),
-    "onnx, own export": Adapter(build_exported),
+    "onnx, own export": Adapter(build_exported(static=False)),
+    "onnx, own static export": Adapter(build_exported(static=True)),
     "onnx, yolox": Adapter(build_onnx(("output", (1, 84, 8)))),
     "onnx, yolov5": Adapter(build_onnx(("output0", (1, 252, 8)))),
     "onnx, yolov8": Adapter(build_onnx(("output0", (1, 7, 84)))),
@@ -113,14 +126,21 @@ ADAPTERS = {
             producer="PaddlePaddle",
         )
     ),
+    "onnx, nanodet": Adapter(
+        build_onnx(
+            *((f"{kind}_pred_{n}", (1, n, c)) for n in (64, 16, 4) for kind, c in (("cls", 3), ("dis", 32))),
+        )
+    ),
     "onnx, detr": Adapter(build_onnx(("logits", (1, 9, 4)), ("pred_boxes", (1, 9, 4)))),
     "onnx, rtdetr": Adapter(build_onnx(("logits", (1, 9, 3)), ("pred_boxes", (1, 9, 4)))),
+    "onnx, rtdetr in one tensor": Adapter(build_onnx(("rows", (1, 9, 7)))),
     "yolox-nano": Adapter(build_real("yolox_nano_416.onnx")),
     "picodet-s": Adapter(build_real("picodet_s_416_coco.onnx")),
     "faster r-cnn": Adapter(build_torchvision("Faster R-CNN"), gradients=True),
     "retinanet": Adapter(build_torchvision("RetinaNet"), gradients=True),
     "fcos": Adapter(build_torchvision("FCOS"), gradients=True),
     "ssd": Adapter(build_torchvision("SSD"), gradients=True),
+    "ssdlite": Adapter(build_torchvision("SSDlite"), gradients=True),
 }
 
 
@@ -193,6 +213,40 @@ def test_nothing_found(detector):
 def test_an_empty_image(detector, value):
     images = torch.full((1, 3, 48, 64), value)
     assert_valid(detector, detector(images), images)
+
+
+@pytest.mark.parametrize(
+    "images",
+    [
+        torch.zeros(0, 3, 40, 50),
+        torch.zeros(1, 3, 0, 50),
+        torch.zeros(1, 4, 40, 50),
+        torch.zeros(3, 40, 50),
+        torch.zeros(1, 1, 3, 40, 50),
+        torch.zeros(1, 3, 40, 50, dtype=torch.uint8),
+    ],
+    ids=lambda images: f"{images.dtype} {tuple(images.shape)}",
+)
+def test_what_is_no_batch_of_images(detector, images):
+    with pytest.raises(InputError, match=r"images: expected floating-point RGB in \[0, 1\] of shape \(B, 3, H, W\)"):
+        detector(images)
+
+
+def test_no_canvas(detector):
+    canvas, placement = detector.fit(photographs(1, 40, 50))
+    with pytest.raises(InputError, match="canvas: expected at least one image"):
+        detector.detect(canvas[:0], placement)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_other_precisions(detector, dtype):
+    images = photographs(1, 45, 64, dtype=torch.float64).to(dtype)
+    found = detector(images)
+    assert int(found.count) > 0
+    assert bool(torch.isfinite(found.boxes).all())
+    total = found.scores[found.mask].double().sum(-1)
+    coarse = torch.finfo(found.scores.dtype).eps
+    torch.testing.assert_close(total, torch.ones_like(total), rtol=0, atol=max(1e-5, 4 * coarse))
 
 
 def test_a_batch_is_a_loop(detector):

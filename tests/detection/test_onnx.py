@@ -213,6 +213,13 @@ def test_preprocessing_is_data(make_onnx):
     assert load_onnx(path, preprocessing=Preprocessing("rgb")).preprocessing == Preprocessing("rgb")
 
 
+@pytest.mark.parametrize("side", [SIDE, [SIDE, SIDE]])
+def test_input_size_beside_the_model(make_onnx, side):
+    path = make_onnx(yolox()[0], dynamic=True, batch="batch")
+    path.with_suffix(".json").write_text(json.dumps({"classes": NAMES, "input_size": side}))
+    assert load_onnx(path).input_size == (SIDE, SIDE)
+
+
 @pytest.mark.parametrize(
     ("settings", "offset"), [({}, (0, 16)), ({"corner": True}, (0, 0)), ({"stretch": True}, (0, 0))]
 )
@@ -232,6 +239,8 @@ def test_a_model_of_any_size(make_onnx):
     detector = load_onnx(path, classes=NAMES, input_size=SIDE, stride=32)
     assert detector.head == "yolox"
     assert detector.fit(torch.zeros(1, 3, 20, 64))[0].shape == (1, 3, 32, 64)
+    with pytest.raises(InputError, match="stride"):
+        load_onnx(path, classes=NAMES, input_size=SIDE, stride=0)
 
 
 def test_options_that_do_not_fit_the_model(make_onnx):
@@ -239,6 +248,7 @@ def test_options_that_do_not_fit_the_model(make_onnx):
     for options, message in (
         ({"input_size": 32}, "input_size: expected the model's own, 64 x 64"),
         ({"stride": 32, "classes": NAMES}, "stride: expected None"),
+        ({"input_size": (64.0, 64.0), "classes": NAMES}, "input_size: expected"),
         ({"classes": ["cat", "dog"]}, "with 2 classes"),
         ({"classes": ["cat", "dog"], "head": "yolox"}, "classes: expected 3 names, one for each score, got 2"),
         ({"classes": ["cat", "cat", "dog"]}, "names that differ"),

@@ -38,7 +38,10 @@ def test_other_metadata_of_that_name_is_left_alone(tmp_path, names):
     [
         ('{"head": ', "line 1"),
         ("[]", "an object"),
-        ('{"preprocessing": 3}', "an object"),
+        ('{"preprocessing": 3}', "preprocessing: expected dict, got 3"),
+        ('{"input_size": "416"}', "input_size: expected int or list, got '416'"),
+        ('{"classes": "cat, dog"}', "classes: expected list"),
+        ('{"logits": 1}', "logits: expected bool"),
         ('{"heads": "yolox"}', "unknown heads; known: name, head"),
     ],
 )

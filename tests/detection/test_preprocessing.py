@@ -32,7 +32,22 @@ def test_each_pixel_by_hand(channels, scale, mean, std, dtype):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"channels": "grb"}, {"mean": (0, 0)}, {"std": (1, 0, 1)}, {"scale": 0}, {"fill": 114}, {"colour": "rgb"}],
+    [
+        {"channels": "grb"},
+        {"channels": 3},
+        {"mean": (0, 0)},
+        {"mean": 0.5},
+        {"mean": (0, "0", 0)},
+        {"std": (1, 0, 1)},
+        {"std": (1, float("nan"), 1)},
+        {"scale": 0},
+        {"scale": "255"},
+        {"fill": 114},
+        {"fill": None},
+        {"stretch": "no"},
+        {"corner": 0},
+        {"colour": "rgb"},
+    ],
 )
 def test_refuses(settings):
     with pytest.raises(InputError, match=next(iter(settings)) if "channels" not in settings else "channel order"):

@@ -38,6 +38,17 @@ def test_suppression_is_the_brute_force(dtype, seed, count, per_class, iou, limi
     assert keep.tolist() == brute_force(boxes.tolist(), confidence.tolist(), labels.tolist(), selection)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("per_class", [False, True])
+def test_half_precision_is_suppressed_in_single(dtype, per_class):
+    candidates = make(40, batch=1, dtype=torch.float32)
+    boxes, confidence = candidates.boxes[0].to(dtype), candidates.confidence[0].to(dtype)
+    labels, selection = candidates.classes[0].argmax(-1), Selection(iou=0.02, per_class=per_class)
+    keep = suppress(boxes, confidence, labels, selection)
+    assert torch.equal(keep, suppress(boxes.float(), confidence.float(), labels, selection))
+    assert 0 < len(keep) < 40
+
+
 def make(count: int, batch: int = 2, classes: int = 3, dtype=torch.float64, seed: int = 0) -> Candidates:
     generator = torch.Generator().manual_seed(seed)
     corner = torch.rand(batch, count, 2, generator=generator, dtype=dtype) * 60

@@ -181,6 +181,20 @@ def test_full_vectors_before_any_threshold(small):
             assert found.background is None
 
 
+def test_faster_rcnn_without_a_proposal():
+    model = FasterRCNN(
+        Backbone(32),
+        4,
+        rpn_anchor_generator=anchors((16,), (32,)),
+        box_roi_pool=MultiScaleRoIAlign(["0", "1"], 7, 2),
+        rpn_score_thresh=1.1,
+        **SMALL,
+    )
+    found = TorchvisionDetector(model, NAMES)(torch.rand(2, 3, 64, 64))
+    assert found.boxes.shape == (2, 0, 4)
+    assert found.scores.shape == (2, 0, 4)
+
+
 def test_own_background_reaches_the_vector(small):
     image = noise(1, 3, 64, 64)
     found = small(image)

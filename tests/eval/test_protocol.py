@@ -116,6 +116,24 @@ def test_random_search_follows_the_hypergeometric_formula(scenes, evidence):
         assert (np.abs(curve - expected) <= 4.5 * error + 1e-12).all()
 
 
+def test_saliency_takes_the_place_of_the_policy(scenes, evidence):
+    protocol = ProtocolConfig(starts=3, shifts=8)
+    episodes = episodes_of(scenes, 0, 5, 5, protocol)
+    noise = torch.stack([tie_noise(scenes, episode, 25, protocol) for episode in episodes])
+    saliency = torch.rand(25, 25, generator=torch.Generator().manual_seed(0))
+    for table in (saliency, saliency[:1]):
+        searcher = Searcher(Told(evidence), search_policy("random"), table)
+        outcomes = run_episodes(episodes, searcher, NOTHING, GRID, noise, shifts=8, batch=4)
+        for episode, outcome in zip(episodes, outcomes, strict=True):
+            cells = [episode.start]
+            while len(cells) <= 8 and cells[-1] not in episode.goal:
+                seen = table[cells[-1] if len(table) > 1 else 0].clone()
+                seen[cells] = -1
+                cells.append(int(seen.argmax()))
+            assert outcome.cells == tuple(cells)
+            assert outcome.found_at == (len(cells) - 1 if cells[-1] in episode.goal else -1)
+
+
 @pytest.mark.parametrize("policy", ["random", "non-predictive"])
 def test_batches_change_nothing(scenes, evidence, policy):
     protocol = ProtocolConfig(starts=7, shifts=12)

@@ -32,7 +32,7 @@ def small(tmp_path_factory):
         data=DataConfig(limit=2),
         belief=BeliefConfig(columns=4, rows=3),
         protocol=ProtocolConfig(starts=3, shifts=6),
-        policies=("random", "non-predictive-raw"),
+        policies=("random", "itti-koch", "non-predictive-raw"),
         cache=folder / "cache",
         out=folder / "out",
         workers=1,
@@ -64,7 +64,7 @@ def test_run_leaves_everything(finished):
         assert record["found_at"] == (hits[0] if hits else -1)
     with (finished.out / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 2 * 7
+    assert len(rows) == 2 * 3 * 7
     everything = [r for r in rows if r["average"] == "all targets" and r["policy"] == "random" and r["shifts"] == "6"]
     by_scene = {}
     for record in records:

@@ -163,6 +163,7 @@ def test_floor_makes_logarithms_finite_and_keeps_the_simplex(dtype):
     torch.testing.assert_close(floored.sum(-1), torch.ones(2, dtype=dtype))
     torch.testing.assert_close(floored[0, :2], torch.full((2,), 1e-6 / (1 + 2e-6), dtype=dtype))
     assert bool(floored.log().isfinite().all())
+    assert dirichlet.floor(scores[:0], 1e-6).shape == (0, 3)
 
 
 @pytest.mark.parametrize(

@@ -84,6 +84,22 @@ def test_calibration_is_bayes():
     torch.testing.assert_close(model(scores, distance), model.calibrate(scores, distance))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_calibration_of_all_levels_at_once(dtype):
+    prior = torch.randn(4, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64).to(dtype)
+    model = FovealObservationModel(table(dtype), EDGES, CLASSES, log_prior=prior, tempering=0.6)
+    scores, _ = looks((2, 5, 3), dtype)
+    distance = torch.tensor([0.05, 0.2, 0.9], dtype=dtype).expand(2, 5, 3)
+    torch.testing.assert_close(model.calibrate_levels(scores), model.calibrate(scores, distance))
+    with pytest.raises(InputError, match="scores"):
+        model.calibrate_levels(scores[..., :2, :])
+
+
+def test_no_detections_are_calibrated_to_none():
+    model = FovealObservationModel(table(), EDGES, CLASSES)
+    assert model.calibrate(torch.zeros(2, 0, 4).double(), torch.zeros(2, 0).double()).shape == (2, 0, 4)
+
+
 def test_extreme_scores_neither_overflow_nor_vanish():
     alpha = torch.full((4, 3, 4), 0.2)
     alpha += 500 * torch.eye(4)[:, None]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from semfov.belief.fusion import scale_likelihood
-from semfov.errors import check
+from semfov.errors import check, values_known
 
 
 class FovealModel(Protocol):
@@ -85,7 +85,7 @@ class PredictedTargetPosterior(nn.Module):
 def pick(values: Tensor, target: Tensor) -> Tensor:
     """Component `target` (a scalar, or `(B,)`) of `values` `(B, X·Y, K+1)`, `(B, X·Y)`."""
     components = values.shape[-1]
-    if not torch.compiler.is_compiling():
+    if values_known():
         inside = bool(((target >= 0) & (target < components)).all())
         check(inside, "target", f"a class index from 0 to {components - 1}", target.tolist())
     if target.ndim == 0:

@@ -1,0 +1,39 @@
+"""Command line of the fuzzer."""
+
+import argparse
+import time
+from collections import Counter
+
+import torch
+
+from benchmarks.fuzz import TARGETS
+from benchmarks.fuzz.runner import run
+
+
+def main() -> None:
+    """Run targets and print the table of outcomes."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.fuzz", description="hand bad input to semfov; a finding is raised with its input"
+    )
+    parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"any of {', '.join(TARGETS)}; default: all")
+    parser.add_argument("--cases", type=int, default=1000, help="inputs for each target")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    for name in options.targets:
+        if name not in TARGETS:
+            parser.error(f"unknown target {name!r}; known: {', '.join(TARGETS)}")
+    torch.set_num_threads(1)
+    print("| target | cases | results | InputError | DataError | s |\n|---|---|---|---|---|---|", flush=True)
+    total: Counter[str] = Counter()
+    for name in options.targets or TARGETS:
+        start = time.perf_counter()
+        outcomes = run(TARGETS[name], options.cases, options.seed)
+        seconds = time.perf_counter() - start
+        total += outcomes
+        cells = [sum(outcomes.values()), *(outcomes[kind] for kind in ("result", "InputError", "DataError"))]
+        print(f"| {name} | {' | '.join(map(str, cells))} | {seconds:.0f} |", flush=True)
+    print(f"\n{sum(total.values())} cases, no finding")
+
+
+if __name__ == "__main__":
+    main()

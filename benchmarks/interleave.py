@@ -1,0 +1,207 @@
+"""What a fixation costs beside its detection, and whether sensor and detector stand in each other's way.
+
+Two thread pools work in turn here: torch's in the sensor, onnxruntime's in the detector. First, sensor and detector
+are timed each alone and then alternately; taking turns should cost no more than both alone. It does where the threads
+of onnxruntime spin while they wait, so semfov turns that off; the table has both. Second, whole fixations are timed
+part by part: sensor, detector, belief and policy.
+
+Repetitions are interleaved, with another order in each; a figure is the median over repetitions, a ratio or share
+stands with its quartiles. The observation model is one that calibrates nothing, at the price of one that does.
+
+A ratio that stays above 1 without spinning comes of memory: glibc hands freed blocks of some MB back to the system, and
+every fixation has to ask for its pages again. `--keep-memory` frees one block of 31 MB at the start, after which glibc
+keeps up to 62 MB.
+
+python -m benchmarks.interleave
+python -m benchmarks.interleave --model yolox_nano.onnx
+
+On a machine with other work, `--processor-time` counts what the calling thread computes instead of what passes on the
+clock, for one thread.
+"""
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import semfov
+from benchmarks.detector_speed import photograph
+from semfov.belief.observer import SemanticObserver
+from semfov.detection.export import export_onnx
+from semfov.detection.load import load_yolo
+from semfov.detection.onnx import OnnxDetector, load_onnx
+from semfov.detection.onnx_session import OnnxSession
+from semfov.eye import Eye, View
+from semfov.gaze.selection import select_fixation
+
+COLUMNS, ROWS, TARGET = 10, 10, 1
+EDGES = [50 * level / 640 for level in range(1, 8)]
+Clock = Callable[[], float]
+PARTS = ("sensor", "detector", "belief", "policy")
+
+
+@dataclass(frozen=True)
+class Policy:
+    """How a fixation is chosen, and whether scores are calibrated before."""
+
+    acquisition: Callable[[Tensor], Tensor]
+    observation: semfov.FovealObservationModel | None
+
+
+def load(path: Path, threads: int, spinning: bool) -> OnnxDetector:
+    """A detector of `threads` threads, which spin while they wait or do not."""
+    detector = load_onnx(path, threads=threads)
+    detector.session = OnnxSession(path, threads=threads, spinning=spinning)
+    return detector
+
+
+def taking_turns(eye: Eye, view: View, fixations: Tensor, repetitions: int, clock: Clock) -> dict[str, list[float]]:
+    """Milliseconds per fixation of the sensor alone, of the detector alone and of both in turn, in every repetition."""
+    gazes = fixations.split(1)
+    canvases = [eye.foveated(view, gaze) for gaze in gazes]
+    runs: dict[str, Callable[[], object]] = {
+        "sensor": lambda: [eye.foveated(view, gaze) for gaze in gazes],
+        "detector": lambda: [eye.detector.detect(canvas, view.placement) for canvas in canvases],
+        "in turn": lambda: [eye.look(view, gaze) for gaze in gazes],
+    }
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    names = list(runs)
+    for repetition in range(-1, repetitions):
+        first = repetition % len(names)
+        for name in names[first:] + names[:first]:
+            start = clock()
+            runs[name]()
+            if repetition >= 0:
+                times[name].append(1e3 * (clock() - start) / len(gazes))
+    return times
+
+
+def policies(classes: Sequence[str], grid: semfov.Grid) -> dict[str, Policy]:
+    """From the cheapest search to exploration."""
+    model = semfov.FovealObservationModel.identity(classes, EDGES).eval()
+    search = {
+        "search, non-predictive, raw": (semfov.search_policy("non-predictive"), None),
+        "search, predictive, calibrated": (semfov.search_policy("predictive", model, calibrated=True), model),
+    }
+    made = {name: Policy(policy(TARGET, grid), observation) for name, (policy, observation) in search.items()}
+    explore = semfov.acquisition.KLDivergence(model, grid, calibrated=True)
+    return made | {"exploration, KL divergence, calibrated": Policy(explore, model)}
+
+
+def scanpath(
+    eye: Eye, view: View, grid: semfov.Grid, policy: Policy, fixations: int, seed: int, clock: Clock
+) -> list[float]:
+    """Milliseconds per fixation of each of `PARTS` along one scanpath."""
+    generator = torch.Generator().manual_seed(seed)
+    observer = SemanticObserver(1 + len(eye.detector.classes), policy.observation)
+    visited = torch.zeros(1, len(grid), dtype=torch.bool)
+    belief = observer.start(1, grid, torch.zeros(()))
+    cell = torch.randint(len(grid), (1,), generator=generator)
+    totals = torch.zeros(len(PARTS), dtype=torch.float64)
+    for _ in range(fixations):
+        fixation = grid.centres[cell]
+        stamps = [clock()]
+        canvas = eye.foveated(view, fixation)
+        stamps.append(clock())
+        detections = eye.detector.detect(canvas, view.placement)
+        stamps.append(clock())
+        belief = observer.update(belief, observer.weigh(detections, fixation, grid))
+        stamps.append(clock())
+        visited = visited.scatter(-1, cell[:, None], True)
+        noise = torch.rand(1, len(grid), generator=generator)
+        cell = select_fixation(policy.acquisition(belief.beta), visited, noise)
+        stamps.append(clock())
+        totals += torch.tensor(stamps, dtype=torch.float64).diff()
+    return (1e3 * totals / fixations).tolist()
+
+
+def spread(values: Sequence[float], scale: float = 1.0, digits: int = 2) -> str:
+    """Median and quartiles."""
+    low, middle, high = (f"{scale * value:.{digits}f}" for value in statistics.quantiles(values, n=4))
+    return f"{middle} ({low}-{high})"
+
+
+def report_turns(path: Path, image: Tensor, options: argparse.Namespace, clock: Clock) -> None:
+    """Print sensor and detector alone and in turn."""
+    grid = semfov.Grid(COLUMNS, ROWS, (image.shape[-1], image.shape[-2]))
+    order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(0))
+    fixations = grid.centres[order[: options.fixations]]
+    print(f"\n{options.repetitions} repetitions of {len(fixations)} fixations, ms per fixation\n")
+    print("| threads | spinning | sensor | detector | in turn | in turn / (sensor + detector) |")
+    print("|---|---|---|---|---|---|")
+    for threads in options.threads:
+        torch.set_num_threads(threads)
+        for spinning in (False, True) if threads > 1 else (False,):
+            eye = Eye(semfov.Foveation(100.0), load(path, threads, spinning))
+            times = taking_turns(eye, eye.open(image), fixations, options.repetitions, clock)
+            ratios = [together / (a + b) for a, b, together in zip(*times.values(), strict=True)]
+            cells = " | ".join(f"{statistics.median(values):.2f}" for values in times.values())
+            print(f"| {threads} | {'on' if spinning else 'off'} | {cells} | {spread(ratios)} |")
+
+
+def report_parts(path: Path, image: Tensor, options: argparse.Namespace, clock: Clock) -> None:
+    """Print what the parts of a fixation cost."""
+    grid = semfov.Grid(COLUMNS, ROWS, (image.shape[-1], image.shape[-2]))
+    opened: dict[int, float] = {}
+    print("\nparts of a fixation, ms; overhead is the share of all but the detector\n")
+    print("| threads | policy | sensor | detector | belief | policy | overhead, % |")
+    print("|---|---|---|---|---|---|---|")
+    for threads in options.threads:
+        torch.set_num_threads(threads)
+        eye = Eye(semfov.Foveation(100.0), load(path, threads, spinning=False))
+        kinds = policies(eye.detector.classes, grid)
+        opening: list[float] = []
+        rows: dict[str, list[list[float]]] = {name: [] for name in kinds}
+        for repetition in range(-1, options.repetitions):
+            start = clock()
+            view = eye.open(image)
+            opening.append(1e3 * (clock() - start))
+            for name, policy in kinds.items():
+                row = scanpath(eye, view, grid, policy, options.fixations, repetition + 1, clock)
+                if repetition >= 0:
+                    rows[name].append(row)
+        for name, measured in rows.items():
+            cells = " | ".join(f"{statistics.median(column):.2f}" for column in zip(*measured, strict=True))
+            shares = [1 - row[PARTS.index("detector")] / sum(row) for row in measured]
+            print(f"| {threads} | {name} | {cells} | {spread(shares, 100, 1)} |")
+        opened[threads] = statistics.median(opening)
+
+    known = ", ".join(f"{time:.2f} ({threads})" for threads, time in opened.items())
+    print(f"\nletterbox and pyramid, once an image, ms (threads): {known}")
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", type=Path, help="any ONNX file that load_detector takes; default: YOLOv3-tiny")
+    parser.add_argument("--threads", type=int, nargs="+", help="of torch and of onnxruntime; default: 1 and all")
+    parser.add_argument("--repetitions", type=int, default=20)
+    parser.add_argument("--fixations", type=int, default=10, help="in every repetition")
+    parser.add_argument("--keep-memory", action="store_true", help="let the C library keep memory that is freed")
+    parser.add_argument("--processor-time", action="store_true", help="of the calling thread; for one thread")
+    options = parser.parse_args()
+    options.threads = options.threads or sorted({1, torch.get_num_threads()})
+    clock = time.perf_counter
+    if options.processor_time:
+        options.threads, clock = [1], time.thread_time
+    if options.keep_memory:
+        torch.empty(31 << 20, dtype=torch.uint8)
+    image = photograph(640, 480)
+    with torch.no_grad(), tempfile.TemporaryDirectory() as folder:
+        path = options.model
+        if path is None:
+            path = Path(folder) / "yolov3-tiny.onnx"
+            export_onnx(load_yolo("yolov3-tiny", winograd=False), path)
+        print(path.name)
+        report_turns(path, image, options, clock)
+        report_parts(path, image, options, clock)
+
+
+if __name__ == "__main__":
+    main()

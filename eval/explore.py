@@ -1,0 +1,36 @@
+"""Scene exploration: `python -m eval.explore` learns what is where in photographs by moving a fovea.
+
+Without arguments it explores the embedded scenes, which need no data set. With a COCO-format data set:
+
+    python -m eval.explore --data.root val2017 --data.annotations instances_val2017.json --out runs/explore_val
+
+What is seen from every cell is shared with `python -m eval.search`. A run that was stopped goes on where it was when
+the same command is given again.
+"""
+
+import sys
+from collections.abc import Sequence
+
+from eval.command import run_command
+from eval.config import ExploreConfig
+from eval.explore_report import report
+from eval.parallel import rank
+from eval.run import finish
+from eval.tasks import ExploreRun
+
+
+def explore(config: ExploreConfig) -> None:
+    """Run a scene exploration experiment and write its tables, figures and records."""
+    run = ExploreRun(config)
+    parts = finish(run, "exploring")
+    if rank() == 0:
+        report(run, parts)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    return run_command(explore, ExploreConfig, __doc__, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,86 @@
+"""What an exploration run leaves: the success rate after each gaze shift, with and without background as an answer."""
+
+from functools import partial
+from pathlib import Path
+
+from eval.metrics import success_rate
+from eval.report import (
+    Array,
+    Curve,
+    Record,
+    announce,
+    collect,
+    curve_of,
+    curve_rows,
+    curves_csv,
+    milliseconds_per_decision,
+    save_figure,
+    table,
+    write_files,
+)
+from eval.run import Parts
+from eval.tasks import ExploreRun
+from semfov.errors import DataError
+
+SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
+"""Gaze shifts at which tables show the success rate."""
+
+ANSWERS = {
+    "objects": ("right", "the answer is the most probable class but background"),
+    "background": ("right_with_background", "background is an answer too, and a wrong one"),
+}
+"""What counts as an answer: the records' field, and in words."""
+
+
+def report(run: ExploreRun, parts: Parts) -> None:
+    """Write everything that a finished run leaves, and print the tables."""
+    records, seconds = collect(run, parts)
+    if not records:
+        raise DataError("data: no scene has an object; lower data.min_instances or raise data.limit")
+    curves = {answer: success(records, run.config.policies, answer) for answer in ANSWERS}
+    decision = milliseconds_per_decision(run)
+    summary = summary_markdown(curves, run.config.protocol.shifts, decision)
+    tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("answers", "success_rate"))}
+    written = write_files(run, "eval.explore", tables, records, seconds, decision)
+    written += [draw_curves(run, curves[answer], answer) for answer in ANSWERS]
+    announce(summary, written)
+
+
+def success(records: list[Record], policies: tuple[str, ...], answer: str) -> dict[str, Curve]:
+    """Success rate of each policy after each gaze shift."""
+    measure = partial(_rate, field=ANSWERS[answer][0])
+    return {policy: curve_of((r for r in records if r["policy"] == policy), measure) for policy in policies}
+
+
+def _rate(record: Record, field: str) -> Array:
+    return success_rate(record[field], record["object_cells"])
+
+
+def summary_markdown(curves: dict[str, dict[str, Curve]], last: int, decision: dict[str, float]) -> str:
+    """The tables that the run prints: success rates with standard errors over images."""
+    shifts = [n for n in SHIFTS if n <= last]
+    head = ["policy", *(str(n) for n in shifts), "ms / decision"]
+    lines = []
+    for answer, policies in curves.items():
+        first = next(iter(policies.values()))
+        lines += [
+            f"**{ANSWERS[answer][1]}** ({first.images} images, {first.episodes} explorations per policy; % of the "
+            "cells with objects that are given the class of one, after n gaze shifts ± standard error over images)",
+            "",
+            *table([head, *curve_rows(policies, shifts, decision)]),
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def draw_curves(run: ExploreRun, curves: dict[str, Curve], answer: str) -> Path:
+    """The success-rate figure."""
+    from semfov.viz import plot_success_rate
+
+    background = "wrong" if answer == "background" else "not counted"
+    figure = plot_success_rate(
+        {name: curve.mean for name, curve in curves.items()},
+        {name: curve.over_images for name, curve in curves.items()},
+        title=f"Exploration, {run.eye.detector.name}, fovea {run.config.sensor.sigma:g} px, background {background}",
+    )
+    return save_figure(figure, run.config.out / f"success_rate_{answer}.png")

@@ -1,0 +1,165 @@
+"""What a search run leaves: cumulative performance as tables and curves, and a few scanpaths."""
+
+from collections import defaultdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from eval.metrics import cumulative_performance, random_search
+from eval.protocol import Looks
+from eval.report import (
+    Array,
+    Curve,
+    Record,
+    announce,
+    collect,
+    curve_of,
+    curve_rows,
+    curves_csv,
+    milliseconds_per_decision,
+    save_figure,
+    table,
+    write_files,
+)
+from eval.run import Parts
+from eval.saliency import foveated
+from eval.tasks import SearchRun
+from semfov.errors import DataError
+from semfov.scanpath import Scanpath
+
+SHIFTS = (1, 5, 10, 15, 30)
+"""Gaze shifts at which tables show the cumulative performance."""
+
+AVERAGES = {
+    "all targets": "mean over images, every legal target of an image",
+    "commonest": "mean over images, the target class with most instances",
+}
+
+
+def report(run: SearchRun, parts: Parts) -> None:
+    """Write everything that a finished run leaves, and print the table."""
+    records, seconds = collect(run, parts)
+    if not records:
+        raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
+    shifts = run.config.protocol.shifts
+    curves = {average: performance(records, run.config.policies, shifts, average) for average in AVERAGES}
+    expected = expected_random(records, shifts, run.config.belief.columns * run.config.belief.rows)
+    decision = milliseconds_per_decision(run)
+    summary = summary_markdown(curves, expected, decision)
+    tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("average", "performance"))}
+    written = write_files(run, "eval.search", tables, records, seconds, decision)
+    written += [draw_curves(run, curves["all targets"], expected), *draw_scanpaths(run, records)]
+    announce(summary, written)
+
+
+def performance(records: list[Record], policies: tuple[str, ...], shifts: int, average: str) -> dict[str, Curve]:
+    """Cumulative performance of each policy, over all targets or the commonest of each image."""
+    measure = partial(_found, shifts=shifts)
+    counted = [record for record in records if record["commonest"] or average == "all targets"]
+    return {policy: curve_of((r for r in counted if r["policy"] == policy), measure) for policy in policies}
+
+
+def _found(record: Record, shifts: int) -> Array:
+    return cumulative_performance(np.array([record["found_at"]]), shifts)
+
+
+def expected_random(records: list[Record], shifts: int, cells: int) -> Array:
+    """What random search must give on these targets by the hypergeometric formula, mean over images."""
+    targets: dict[Any, dict[int, int]] = defaultdict(dict)
+    for record in records:
+        targets[record["scene"]][record["target"]] = len(record["goal"])
+    curves = [
+        np.mean([random_search(count, shifts, cells) for count in goals.values()], axis=0) for goals in targets.values()
+    ]
+    return np.asarray(np.mean(curves, axis=0), dtype=np.float64)
+
+
+def summary_markdown(curves: dict[str, dict[str, Curve]], expected: Array, decision: dict[str, float]) -> str:
+    """The tables that the run prints: cumulative performance with standard errors over images."""
+    shifts = [n for n in SHIFTS if n < len(expected)]
+    head = ["policy", *(f"CP@{n}" for n in shifts), "ms / decision"]
+    lines = []
+    for average, policies in curves.items():
+        first = next(iter(policies.values()))
+        lines += [
+            f"**{AVERAGES[average]}** ({first.images} images, {first.episodes} searches per policy; "
+            "% found after n gaze shifts ± standard error over images)",
+            "",
+        ]
+        rows = curve_rows(policies, shifts, decision)
+        if average == "all targets":
+            rows.append(["random, by formula", *(f"{100 * expected[n]:.1f}" for n in shifts), ""])
+        lines += [*table([head, *rows]), ""]
+    return "\n".join(lines)
+
+
+def draw_curves(run: SearchRun, curves: dict[str, Curve], expected: Array) -> Path:
+    """The cumulative-performance figure."""
+    from semfov.viz import plot_cumulative_performance
+
+    figure = plot_cumulative_performance(
+        {**{name: curve.mean for name, curve in curves.items()}, "random, by formula": expected},
+        {name: curve.over_images for name, curve in curves.items()},
+        title=f"Visual search, {run.eye.detector.name}, fovea {run.config.sensor.sigma:g} px",
+    )
+    return save_figure(figure, run.config.out / "cumulative_performance.png")
+
+
+def draw_scanpaths(run: SearchRun, records: list[Record]) -> list[Path]:
+    """Pictures of a few episodes of the last policy, of different scenes, those with a few gaze shifts first."""
+    from semfov.viz import plot_episode
+
+    last = [record for record in records if record["policy"] == run.config.policies[-1]]
+    last.sort(key=lambda record: (record["found_at"] < 0, not 2 <= record["found_at"] <= 6))
+    chosen = list({record["scene"]: record for record in reversed(last)}.values())
+    chosen.sort(key=last.index)
+    paths = []
+    for record in chosen[: run.config.scanpaths]:
+        index = run.scenes.ids.index(record["scene"])
+        scene = run.scenes[index]
+        scanpath = replay(run, index, record)
+        views = foveated_views(run, index, scanpath)
+        boxes = scene.boxes[scene.labels == record["target"]]
+        name = f"scanpath_{record['scene']}_{record['target_name'].replace(' ', '-')}.png"
+        paths.append(save_figure(plot_episode(scanpath, scene.image, views, boxes=boxes), run.config.out / name))
+    return paths
+
+
+def replay(run: SearchRun, index: int, record: Record) -> Scanpath:
+    """The scanpath of a recorded episode, with what was seen and believed at each fixation."""
+    grid, detections, target = run.grid(index), run.detections(index), int(record["target"])
+    searcher = run.searcher(record["policy"], index)
+    observer = searcher.observer
+    looks = Looks(observer, detections, grid, [target])
+    belief = observer.start(1, grid, detections.scores)
+    cells = torch.tensor(record["cells"])
+    beliefs, values = [], []
+    with torch.no_grad():
+        for cell in cells.split(1):
+            belief = observer.update(belief, looks(torch.tensor([target]), cell))
+            beliefs.append(belief.beta[0])
+            values.append(searcher.acquisition(observer.component(target), grid, cell)(belief.beta)[0])
+    return Scanpath(
+        grid=grid,
+        classes=("background", *run.scenes.classes),
+        target=record["target"],
+        cells=cells,
+        fixations=grid.centres[cells],
+        detections=tuple(detections[cell] for cell in cells.split(1)),
+        beliefs=torch.stack(beliefs),
+        values=torch.stack(values),
+        found=record["found_at"] >= 0,
+    )
+
+
+def foveated_views(run: SearchRun, index: int, scanpath: Scanpath) -> list[torch.Tensor]:
+    """What the detector was shown at each fixation, without its canvas and at the size of the image."""
+    from semfov.detection.placement import resize
+
+    image = run.scenes[index].image
+    with torch.no_grad():
+        view = run.eye.open(image[None])
+        return list(resize(foveated(run.eye, view, scanpath.fixations), view.placement.size))

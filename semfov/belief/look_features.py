@@ -1,0 +1,69 @@
+"""What a look shows of a target in each cell, as a few numbers that do not depend on the class."""
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.detection.detections import Detections
+from semfov.errors import check, check_shape
+
+FEATURES = 10
+_FLOOR = 1e-6
+
+
+def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: int) -> Tensor:
+    r"""Describe what looks show of `target` in every cell, `(B, X·Y, 10)`.
+
+    With :math:`s_l` the scores of detection l, :math:`w_l(x)` its weight in cell x (the `soft` footprint of `Grid`),
+    and b the detection with the largest :math:`s_{lt} w_l(x)`, they are, each scaled to about unit size: the distance
+    from the fixation to the cell; :math:`\ln s_{bt} w_b`; :math:`\ln \max_l s_{lt}` over the detections that touch the
+    cell; of b the objectness :math:`1 - s_{b0}`, the weight, the size, and the share of the target in the objectness;
+    the strongest objectness :math:`\max_l (1 - s_{l0}) w_l`, and of other classes :math:`\max_l (1 - s_{l0} - s_{lt})
+    w_l`; and whether no detection touches the cell.
+
+    Args:
+        detections: a batch `(B, L)` of looks, boxes in pixels of the grid's image.
+        fixation: `(B, 2)`.
+        grid: the cells of one image.
+        target: class 1..K.
+    """
+    batch = detections.mask.shape[0]
+    check_shape(fixation, "fixation", batch, 2)
+    components = detections.scores.shape[-1]
+    check(1 <= target < components, "target", f"a class from 1 to {components - 1}", target)
+    offset = grid.centres.to(fixation) - fixation[:, None]
+    distance = torch.linalg.vector_norm(offset, dim=-1) / grid.extent.amax().to(fixation)
+    if detections.mask.shape[1] == 0:
+        nothing = fixation.new_zeros(batch, 1, components)
+        detections = Detections(fixation.new_zeros(batch, 1, 4), nothing, nothing[..., 0] > 0)
+    weight = grid.footprint(detections.boxes, "soft") * detections.mask[..., None]
+    touches = weight > 0
+    score = detections.scores[..., target, None]
+    objectness = (1 - detections.scores[..., 0, None]).clamp(min=_FLOOR)
+    strongest, best = (score * weight).max(1, keepdim=True)
+
+    def of_best(values: Tensor) -> Tensor:
+        return values.expand(weight.shape).gather(1, best)[:, 0] * seen
+
+    seen = touches.any(1)
+    edges = detections.boxes[..., 2:] - detections.boxes[..., :2]
+    size = (edges.clamp(min=0).prod(-1, keepdim=True) / grid.extent.prod().to(edges)).sqrt()
+    return torch.stack(
+        [
+            4 * distance,
+            _log(strongest[:, 0]),
+            _log((score * touches).amax(1)),
+            2 * of_best(objectness),
+            2 * of_best(weight),
+            3 * of_best(size),
+            2 * of_best(score / objectness),
+            2 * (objectness * weight).amax(1),
+            2 * ((objectness - score).clamp(min=0) * weight).amax(1),
+            (~seen).to(weight.dtype),
+        ],
+        -1,
+    )
+
+
+def _log(score: Tensor) -> Tensor:
+    return score.clamp(min=_FLOOR).log() / 4 + 1

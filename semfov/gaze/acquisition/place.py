@@ -1,0 +1,125 @@
+"""Acquisition functions of visual search that look beyond the fixated cell: what a fovea takes in."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from semfov.belief.grid import Grid
+from semfov.errors import InputError, check
+from semfov.gaze.acquisition.search import pick
+
+
+class MissModel(Protocol):
+    """What these functions need of an observation model (`semfov.FovealObservationModel`)."""
+
+    miss_rate: Tensor | None
+
+    def level(self, distance: Tensor) -> Tensor:
+        """Level of each distance, `(...)` from 0 to N - 1."""
+        ...
+
+
+class NeighbourhoodPosterior(nn.Module):
+    r"""Probability of the target in a cell and, with less weight, around it.
+
+    .. math:: a(f) = \sum_x \exp\left(-\frac{\|x - f\|^2}{2 \sigma^2}\right) p_t(x)
+
+    The paper names it as future work: boxes and beliefs are a cell or so off, and targets are larger than a cell.
+
+    Args:
+        target: component of the belief that stands for the target, or a tensor `(B,)` with one for each episode.
+        grid: the cells.
+        sigma: σ in cells.
+
+    >>> beta = torch.tensor([[[1.0, 1.0], [1.0, 1.2], [1.0, 1.0]]])
+    >>> NeighbourhoodPosterior(1, Grid(3, 1, (3, 1)), sigma=0.5)(beta)
+    tensor([[0.5740, 0.6808, 0.5740]])
+    """
+
+    target: Tensor
+    kernel: Tensor
+
+    def __init__(self, target: int | Tensor, grid: Grid, *, sigma: float = 0.7) -> None:
+        super().__init__()
+        check(sigma > 0, "sigma", "a positive number of cells", sigma)
+        self.register_buffer("target", torch.as_tensor(target))
+        cell = torch.arange(len(grid))
+        place = torch.stack([cell % grid.columns, cell // grid.columns], -1).to(torch.get_default_dtype())
+        self.register_buffer("kernel", (-torch.cdist(place, place).square() / (2 * sigma**2)).exp())
+
+    def forward(self, beta: Tensor) -> Tensor:
+        """Values `(..., X·Y)` for a belief `(..., X·Y, C)`."""
+        return (pick(beta, self.target) / beta.sum(-1)) @ self.kernel.to(beta)
+
+
+class FovealHit(nn.Module):
+    r"""Probability that the target is detected anywhere from the next fixation, if cells are independent.
+
+    .. math:: a(f) = 1 - \prod_x \bigl(1 - p_t(x) \, v_t(d(x, f))\bigr), \qquad v_t = 1 - m_t
+
+    with m the miss rates of the observation model: the probability of finding the target within the fovea.
+
+    Args:
+        target: class 1..K, or a tensor `(B,)` with one for each episode.
+        model: the observation model, with miss rates.
+        grid: the cells of one image.
+    """
+
+    target: Tensor
+    visibility: Tensor
+
+    def __init__(self, target: int | Tensor, model: MissModel, grid: Grid) -> None:
+        super().__init__()
+        self.register_buffer("target", torch.as_tensor(target))
+        self.register_buffer("visibility", visibility(model, grid, self.target))
+
+    def forward(self, beta: Tensor) -> Tensor:
+        """Values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
+        present = pick(beta, self.target) / beta.sum(-1)
+        return -torch.expm1(torch.log1p(-present[..., None, :] * self.visibility.to(beta)).sum(-1))
+
+
+class PlaceInformation(nn.Module):
+    r"""How much the next look is expected to tell of the target's place.
+
+    With the place distributed as :math:`q(x) \propto p_t(x)`, a look from f detects the target with probability
+    :math:`v_t(d(x, f))` if it is at x, and its place is then known; if it does not, q becomes
+    :math:`q'(x) \propto q(x) (1 - v_t)`:
+
+    .. math:: a(f) = H(q) - \Bigl(\sum_x q(x) (1 - v_t(d(x, f)))\Bigr) H(q')
+
+    (The expected information gain of an ideal searcher, after Najemnik and Geisler, 2005, with a detector that either
+    sees or misses.)
+
+    Args:
+        target: class 1..K, or a tensor `(B,)` with one for each episode.
+        model: the observation model, with miss rates.
+        grid: the cells of one image.
+    """
+
+    target: Tensor
+    visibility: Tensor
+
+    def __init__(self, target: int | Tensor, model: MissModel, grid: Grid) -> None:
+        super().__init__()
+        self.register_buffer("target", torch.as_tensor(target))
+        self.register_buffer("visibility", visibility(model, grid, self.target))
+
+    def forward(self, beta: Tensor) -> Tensor:
+        """Values `(..., X·Y)` in nats for a belief `(..., X·Y, K+1)`."""
+        present = pick(beta, self.target) / beta.sum(-1)
+        place = present / present.sum(-1, keepdim=True)
+        missed = place[..., None, :] * (1 - self.visibility.to(beta))
+        nothing = missed.sum(-1)
+        # P(nothing) H(q') = -Σ m ln m + P ln P with m = q (1 - v)
+        left = torch.xlogy(nothing, nothing) - torch.xlogy(missed, missed).sum(-1)
+        return -torch.xlogy(place, place).sum(-1, keepdim=True) - left
+
+
+def visibility(model: MissModel, grid: Grid, target: Tensor) -> Tensor:
+    """Probability that a target in cell x is detected from f, `(..., f, x)` with the dimensions of `target` leading."""
+    if model.miss_rate is None:
+        raise InputError("model: expected an observation model with miss rates, got one without")
+    level = model.level(grid.cell_distance)
+    return 1 - model.miss_rate[target][..., level]

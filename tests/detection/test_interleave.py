@@ -1,0 +1,35 @@
+"""The benchmark of sensor and detector in turn runs, and its shares are shares."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.interleave import main
+
+
+@pytest.fixture(autouse=True)
+def same_threads():
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("options", [["--threads", "1", "2"], ["--processor-time", "--keep-memory"]])
+def test_tables(make_onnx, monkeypatch, capsys, options):
+    model = make_onnx({"output": np.random.default_rng(0).random((1, 84, 85)).astype(np.float32)})
+    arguments = ["interleave", "--model", str(model), "--repetitions", "2", "--fixations", "2", *options]
+    monkeypatch.setattr("sys.argv", arguments)
+    main()
+    lines = capsys.readouterr().out.splitlines()
+    threads = 2 if "--threads" in options else 1
+    turns = [line for line in lines if re.match(r"\| \d \| (on|off) ", line)]
+    assert len(turns) == (3 if threads == 2 else 1)  # one thread has nobody to wait for
+    parts = [line for line in lines if re.match(r"\| \d \| (search|exploration)", line)]
+    assert len(parts) == 3 * threads
+    for line in parts:
+        sensor, detector, belief, policy = (float(cell) for cell in line.split("|")[3:7])
+        assert min(sensor, detector, belief, policy) > 0
+        low, high = (float(number) for number in re.search(r"\(([-.\d]+)-([-.\d]+)\)", line).groups())
+        assert 0 < low <= high < 100

@@ -1,0 +1,159 @@
+"""The exploration protocol against a scalar twin."""
+
+import numpy as np
+import pytest
+import torch
+
+from eval.config import ProtocolConfig
+from eval.exploration import (
+    Exploration,
+    answers_of,
+    count_right,
+    explorations_of,
+    explore_noise,
+    run_explorations,
+)
+from eval.protocol import Searcher
+from semfov import Detections, Evidence, FovealObservationModel, Grid, fusion
+from semfov.belief import SemanticObserver
+from semfov.data.scene import Annotation
+from semfov.gaze import exploration_policy, search_policy
+
+GRID = Grid(4, 3, (80, 60))
+NOTHING = Detections.empty(12, 3)
+ANNOTATION = Annotation(
+    torch.tensor([[1.0, 1, 19, 19], [15, 5, 45, 15], [62, 42, 78, 58]]),
+    torch.tensor([1, 2, 3]),
+    torch.zeros(3, dtype=torch.bool),
+    (80, 60),
+)
+
+
+class Scenes:
+    """Two scenes of which only the ids matter."""
+
+    ids = (7, 8)
+
+
+class Told(SemanticObserver):
+    """An observer that is told what looks say."""
+
+    def __init__(self, evidence):
+        super().__init__(4)
+        self.evidence = evidence
+
+    def weigh(self, detections, fixation, grid, target=None):
+        return self.evidence
+
+
+@pytest.fixture
+def evidence():
+    """What three detections from each of 12 cells say about four classes."""
+    torch.manual_seed(0)
+    likelihood = torch.rand(12, 3, 4) ** 3
+    return Evidence(likelihood, torch.rand(12, 3, 12) < 0.25, torch.zeros(12, 12))
+
+
+@pytest.fixture
+def model():
+    clarity = torch.tensor([6.0, 1.0])
+    alpha = 1 + torch.eye(4)[:, None] * clarity[:, None]
+    return FovealObservationModel(alpha, [0.3], ["cat", "cup", "dog"]).requires_grad_(False).eval()
+
+
+def explore_by_loop(episode, evidence, model, answers, noise, shifts):
+    """KL exploration of one episode, cell by cell, from the description in the paper."""
+    beta = np.full((12, 4), 0.5)
+    cell, cells, right, with_background = episode.start, [], [], []
+    for shift in range(shifts + 1):
+        cells.append(cell)
+        for likelihood, footprint in zip(evidence.likelihood[cell], evidence.footprint[cell], strict=True):
+            for covered in footprint.nonzero()[:, 0].tolist():
+                beta[covered] = fusion.kaplan(torch.from_numpy(beta[covered]), likelihood.double()).numpy()
+        counts = [0, 0]
+        for place in range(12):
+            for number, offered in enumerate(([1, 2, 3], [0, 1, 2, 3])):
+                best = max(beta[place, k] for k in offered)
+                winners = [k for k in offered if beta[place, k] > best * (1 - 1e-6)]
+                counts[number] += len(winners) == 1 and winners[0] in answers[place]
+        right.append(counts[0])
+        with_background.append(counts[1])
+        values = []
+        for fixation in range(12):
+            total = 0.0
+            for place in range(12):
+                distance = float((GRID.centres[place] - GRID.centres[fixation]).norm()) / 80
+                p = beta[place] / beta[place].sum()
+                scores = p @ model.expected_scores()[:, int(distance > 0.3)].double().numpy()
+                after = fusion.kaplan(torch.from_numpy(beta[place]), torch.from_numpy(scores)).numpy()
+                after = after / after.sum()
+                total += float((after * np.log(after / p)).sum())
+            values.append(total)
+        free = [c for c in range(12) if c not in cells]
+        if not free:
+            right += [right[-1]] * (shifts - shift)
+            with_background += [with_background[-1]] * (shifts - shift)
+            break
+        best = max(values[c] for c in free)
+        tied = [c for c in free if values[c] > best * (1 - 1e-6)]
+        cell = max(tied, key=lambda c: float(noise[shift, c]))
+    return tuple(cells), tuple(right), tuple(with_background)
+
+
+@pytest.mark.parametrize("batch", [2, 100])
+@pytest.mark.parametrize("shifts", [5, 14])
+def test_exploration_equals_a_scalar_twin(evidence, model, shifts, batch):
+    protocol = ProtocolConfig(starts=5, shifts=shifts)
+    episodes = explorations_of(Scenes(), 0, 12, protocol)
+    noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
+    answers = answers_of(ANNOTATION, GRID, 4)
+    # In float64, so that the twin breaks ties alike.
+    double = Evidence(evidence.likelihood.double(), evidence.footprint, evidence.distance.double())
+    explorer = Searcher(Told(double), exploration_policy("kl", model.double()))
+    like = Detections(NOTHING.boxes.double(), NOTHING.scores.double(), NOTHING.mask)
+    progress = run_explorations(episodes, explorer, like, GRID, answers, noise, shifts=shifts, batch=batch)
+    right_classes = [set(row.nonzero()[:, 0].tolist()) for row in answers]
+    for episode, random, outcome in zip(episodes, noise, progress, strict=True):
+        expected = explore_by_loop(episode, evidence, model, right_classes, random, shifts)
+        assert (outcome.cells, outcome.right, outcome.right_with_background) == expected
+
+
+def test_answers_are_the_classes_of_overlapping_objects():
+    answers = answers_of(ANNOTATION, GRID, 4)
+    found = {cell: set(row.nonzero()[:, 0].tolist()) for cell, row in enumerate(answers) if row.any()}
+    assert found == {0: {1, 2}, 1: {2}, 2: {2}, 11: {3}}
+
+
+def test_what_is_not_known_is_not_right():
+    answers = torch.tensor([[False, True], [False, True], [True, True]])
+    beta = torch.tensor([[[0.5, 0.5], [0.5, 0.6], [0.6, 0.5]]])
+    assert count_right(beta, answers).tolist() == [2]
+
+
+def test_saliency_takes_the_place_of_the_policy(evidence):
+    """From each cell the next one is the most salient as seen from there, whatever is believed."""
+    protocol = ProtocolConfig(starts=12, shifts=11)
+    episodes = explorations_of(Scenes(), 1, 12, protocol)
+    assert sorted(episode.start for episode in episodes) == list(range(12))
+    noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
+    saliency = torch.rand(12, 12, generator=torch.Generator().manual_seed(1))
+    for table in (saliency, saliency[:1]):
+        explorer = Searcher(Told(evidence), search_policy("random"), table)
+        answers = answers_of(ANNOTATION, GRID, 4)
+        progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=11, batch=100)
+        for episode, outcome in zip(episodes, progress, strict=True):
+            cells = [episode.start]
+            while len(cells) < 12:
+                seen = table[cells[-1] if len(table) > 1 else 0].clone()
+                seen[cells] = -1
+                cells.append(int(seen.argmax()))
+            assert outcome.cells == tuple(cells)
+
+
+def test_starts_and_ties_have_seeds():
+    one, other = ProtocolConfig(starts=6), ProtocolConfig(starts=6, seed=1)
+    assert explorations_of(Scenes(), 0, 100, one) != explorations_of(Scenes(), 0, 100, other)
+    assert explorations_of(Scenes(), 0, 100, one) == explorations_of(Scenes(), 0, 100, one)
+    episode = Exploration(0, 2, 5)
+    assert torch.equal(explore_noise(Scenes(), episode, 9, one), explore_noise(Scenes(), episode, 9, one))
+    assert not torch.equal(explore_noise(Scenes(), episode, 9, one), explore_noise(Scenes(), episode, 9, other))

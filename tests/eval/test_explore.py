@@ -1,0 +1,178 @@
+"""`python -m eval.explore` as a user runs it: small, on the embedded scenes, with the real detector."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from eval.config import BeliefConfig, DataConfig, ExploreConfig, ProtocolConfig, SaliencyConfig
+from eval.explore import explore, main
+from eval.saliency import SaliencyStore, saliency_table
+from eval.tasks import ExploreRun
+from semfov import SemanticMap
+from semfov.gaze.saliency import VOCUS2
+
+pytestmark = pytest.mark.weights
+
+RECORDS = ("episodes.jsonl", "summary.csv")
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="session")
+def small(tmp_path_factory):
+    """A run of two scenes on 4 × 3 cells."""
+    folder = tmp_path_factory.mktemp("explore")
+    return ExploreConfig(
+        data=DataConfig(limit=2),
+        belief=BeliefConfig(columns=4, rows=3),
+        protocol=ProtocolConfig(starts=2, shifts=4),
+        policies=("random-raw", "kl-calibrated", "vocus2-raw"),
+        cache=folder / "cache",
+        out=folder / "out",
+        workers=1,
+    )
+
+
+@pytest.fixture(scope="session")
+def finished(small):
+    """The small run, done once."""
+    threads = torch.get_num_threads()
+    explore(small)
+    torch.set_num_threads(threads)
+    return small
+
+
+def records_of(config: ExploreConfig) -> list[bytes]:
+    return [(config.out / name).read_bytes() for name in RECORDS]
+
+
+def right_by_hand(run: ExploreRun, record: dict) -> tuple[list[int], list[int], int]:
+    """Right answers after each shift with a `SemanticMap` and loops over cells and objects."""
+    index = run.scenes.ids.index(record["scene"])
+    scene, grid, looks = run.scenes[index], run.grid(index), run.detections(index)
+    observation = run.model if record["policy"].endswith("calibrated") else None
+    belief = SemanticMap(grid, run.scenes.classes, observation=observation)
+    right, with_background = [], []
+    holds = grid.footprint(scene.boxes)
+    objects = [{int(label) for label, there in zip(scene.labels, holds[:, c], strict=True) if there} for c in range(12)]
+    for cell in record["cells"]:
+        belief.update(looks[torch.tensor([cell])], grid.centres[cell][None])
+        counts = [0, 0]
+        for place, classes in enumerate(objects):
+            p = belief.probabilities[0, place]
+            known = bool((p != p[0]).any())
+            counts[0] += known and int(p[1:].argmax()) + 1 in classes
+            counts[1] += known and int(p.argmax()) in classes
+        right.append(counts[0])
+        with_background.append(counts[1])
+    return right, with_background, sum(map(bool, objects))
+
+
+def test_run_leaves_everything(finished):
+    run = ExploreRun(finished)
+    records = [json.loads(line) for line in (finished.out / "episodes.jsonl").read_text().splitlines()]
+    assert len(records) == 2 * 2 * 3
+    for record in records:
+        assert record["start"] == record["cells"][0]
+        assert len(set(record["cells"])) == 5
+        counted = record["right"], record["right_with_background"], record["object_cells"]
+        assert counted == right_by_hand(run, record)
+    with (finished.out / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 3 * 5
+    assert any(record["right"][-1] > 0 for record in records)
+    for row in rows:
+        field = {"objects": "right", "background": "right_with_background"}[row["answers"]]
+        by_scene = {}
+        for record in records:
+            if record["policy"] == row["policy"]:
+                rate = record[field][int(row["shifts"])] / record["object_cells"]
+                by_scene.setdefault(record["scene"], []).append(rate)
+        expected = sum(sum(rates) / len(rates) for rates in by_scene.values()) / len(by_scene)
+        assert float(row["success_rate"]) == pytest.approx(expected, abs=1e-6)
+    manifest = json.loads((finished.out / "manifest.json").read_text())
+    assert manifest["command"][2] == "eval.explore"
+    assert set(manifest["milliseconds_per_decision"]) == set(finished.policies)
+    assert {path.name for path in finished.out.glob("*.png")} == {
+        "success_rate_objects.png",
+        "success_rate_background.png",
+    }
+    assert "kl-calibrated" in (finished.out / "summary.md").read_text()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"store": False}, {"workers": 2}, {"protocol": ProtocolConfig(starts=2, shifts=4, batch=1)}],
+    ids=["without the stores", "two workers", "small batches"],
+)
+def test_same_bits(finished, change, tmp_path):
+    again = replace(finished, out=tmp_path / "out", **change)
+    explore(again)
+    assert records_of(again) == records_of(finished)
+
+
+def test_saliency_is_that_of_what_the_eye_sees(finished):
+    run = ExploreRun(finished)
+    image, grid = run.scenes[0].image, run.grid(0)
+    stored = run.saliency("vocus2", 0)
+    assert stored.shape == (12, 12)
+    view = run.eye.open(image[None])
+    with torch.inference_mode():
+        left, top = view.placement.offset
+        canvas = run.eye.foveated(view, grid.centres[5][None])
+        height, width = (round(n * view.placement.scale[0]) for n in image.shape[-2:])
+        seen = VOCUS2()(canvas[..., top : top + height, left : left + width])[0]
+    peak = divmod(int(seen.argmax()), seen.shape[-1])
+    peak_cell = int(peak[0] * 3 / seen.shape[0]) * 4 + int(peak[1] * 4 / seen.shape[1])
+    assert stored[5].argmax() == peak_cell
+    picture = saliency_table("vocus2", SaliencyConfig(view="picture", reduction="mean"), run.eye, image, grid)
+    assert picture.shape == (1, 12)
+    expected = VOCUS2()(image[None]).unflatten(-1, (4, -1)).unflatten(1, (3, -1)).mean((2, 4)).flatten(1)
+    torch.testing.assert_close(picture, expected)
+
+
+def test_saliency_store_knows_what_it_depends_on(finished):
+    run, folder = ExploreRun(finished), finished.cache / "saliency"
+    settings = run.eye.settings()
+
+    def key(name="vocus2", view="foveated", reduction="max", eye=settings, grid=(4, 3)):
+        return SaliencyStore(folder, name, SaliencyConfig(view, reduction), eye, grid).key
+
+    other = {**settings, "sensor": {**settings["sensor"], "sigma": 50.0}}
+    keys = [key(), key(name="itti-koch"), key(view="picture"), key(reduction="mean"), key(eye=other), key(grid=(3, 4))]
+    assert len(set(keys)) == 6
+    assert key() == run.saliency_stores["vocus2"].key
+    # The whole photograph looks the same to every eye.
+    assert key(view="picture", eye=other) == key(view="picture")
+
+
+@pytest.mark.slow
+def test_killed_run_resumes_with_the_same_result(finished, tmp_path):
+    call = [
+        sys.executable, "-m", "eval.explore", "--data.limit", "2", "--belief.columns", "4", "--belief.rows", "3",
+        "--protocol.starts", "2", "--protocol.shifts", "4", "--policies", json.dumps(list(finished.policies)),
+        "--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache"), "--workers", "1",
+    ]  # fmt: skip
+    process = subprocess.Popen(call, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("out/parts/*/*.json")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "out/summary.csv").exists()
+    subprocess.run(call, cwd=ROOT, check=True, capture_output=True)
+    assert records_of(replace(finished, out=tmp_path / "out")) == records_of(finished)
+
+
+def test_errors_are_one_line(capsys, tmp_path):
+    assert main(["--policies", '["kl-row"]', "--out", str(tmp_path)]) == 1
+    assert "did you mean 'kl-raw'" in capsys.readouterr().err
+    assert main(["--policies", '["random"]', "--out", str(tmp_path)]) == 1
+    assert "random-raw" in capsys.readouterr().err

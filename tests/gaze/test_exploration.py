@@ -1,0 +1,241 @@
+"""Exploration against a brute force that updates every cell for every fixation, one by one."""
+
+import pytest
+import torch
+from scipy import stats
+
+from semfov import FovealObservationModel, Grid, search_policy
+from semfov.belief import fusion
+from semfov.errors import InputError
+from semfov.gaze import EXPLORATION_POLICIES, exploration_policy, select_fixation
+from semfov.gaze.acquisition import (
+    KLDivergence,
+    NegativeEntropy,
+    ProbabilityOfImprovement,
+    TwoPeaks,
+    UpperConfidenceBound,
+)
+
+ACQUISITIONS = {
+    "kl": KLDivergence,
+    "kl of Dirichlets": lambda *args, **options: KLDivergence(*args, of="dirichlet", **options),
+    "negative entropy": NegativeEntropy,
+    "two peaks": TwoPeaks,
+    "upper confidence bound": UpperConfidenceBound,
+    "probability of improvement": ProbabilityOfImprovement,
+}
+GRIDS = {"wide": Grid(4, 2, (64, 30)), "tall": Grid(2, 5, (30, 70)), "row": Grid(3, 1, (9, 9))}
+CLASSES = ("cat", "cup", "dog", "hat")
+
+
+def entropy(p):
+    return -float((p * p.log()).sum())
+
+
+def lead(p):
+    first, second = p.sort(descending=True).values[:2]
+    return float(first - second)
+
+
+def bound(beta):
+    p, total = float(beta.max() / beta.sum()), float(beta.sum())
+    return p + 2 * (p * (1 - p) / (total + 1)) ** 0.5
+
+
+def improvement(before, after):
+    p, total = float(after.max() / after.sum()), float(after.sum())
+    deviation = (p * (1 - p) / (total + 1)) ** 0.5
+    return float(stats.norm.cdf((p - float(before.max() / before.sum())) / deviation))
+
+
+def dirichlet_kl(before, after):
+    one, other = torch.distributions.Dirichlet(after), torch.distributions.Dirichlet(before)
+    return float(torch.distributions.kl_divergence(one, other))
+
+
+def mean_kl(before, after):
+    return float(stats.entropy(after / after.sum(), before / before.sum()))
+
+
+def normal(beta):
+    return beta / beta.sum()
+
+
+CHANGES = {
+    "kl": mean_kl,
+    "kl of Dirichlets": dirichlet_kl,
+    "negative entropy": lambda before, after: entropy(normal(before)) - entropy(normal(after)),
+    "two peaks": lambda before, after: abs(lead(normal(after)) - lead(normal(before))),
+    "upper confidence bound": lambda before, after: bound(after) - bound(before),
+    "probability of improvement": improvement,
+}
+
+
+def brute_force(name, beta, model, grid, calibrated):
+    """Values of all fixations for one belief, from the formulas, in (X·Y)² simulated updates."""
+    values = []
+    for fixation in range(len(grid)):
+        changes = []
+        for cell in range(len(grid)):
+            offset = grid.centres[cell].double() - grid.centres[fixation].double()
+            distance = offset.norm() / float(grid.extent.max())
+            level = int((model.edges < distance).sum())
+            scores = normal(beta[cell]) @ model.expected_scores()[:, level]
+            likelihood = model.calibrate(scores, distance) if calibrated else scores
+            changes.append(CHANGES[name](beta[cell], fusion.kaplan(beta[cell], likelihood)))
+        values.append(max(changes) if name == "two peaks" else sum(changes))
+    return torch.tensor(values, dtype=torch.float64)
+
+
+@pytest.fixture
+def model():
+    generator = torch.Generator().manual_seed(3)
+    alpha = torch.rand(5, 3, 5, generator=generator).double() + 0.2
+    alpha += 4 * torch.eye(5).double()[:, None] / torch.arange(1, 4)[None, :, None]
+    prior = torch.randn(5, 3, generator=generator).double()
+    edges = torch.tensor([0.2, 0.45]).double()
+    return FovealObservationModel(alpha, edges, CLASSES, log_prior=prior, tempering=0.7).requires_grad_(False).eval()
+
+
+def beliefs(grid, batch=3, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(batch, len(grid), 5, generator=generator).double() ** 3 * 4 + 0.1
+
+
+@pytest.mark.parametrize("calibrated", [False, True], ids=["raw", "calibrated"])
+@pytest.mark.parametrize("shape", GRIDS)
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_equals_brute_force(name, shape, calibrated, model):
+    grid = GRIDS[shape]
+    acquisition = ACQUISITIONS[name](model, grid, calibrated=calibrated)
+    generator = torch.Generator().manual_seed(1)
+    beta = beliefs(grid, batch=2).float()
+    expected = torch.stack([brute_force(name, row.double(), model, grid, calibrated) for row in beta])
+    for dtype, tolerance in ((torch.float64, 1e-9), (torch.float32, 1e-4)):
+        values = acquisition(beta.to(dtype))
+        assert values.dtype == dtype
+        torch.testing.assert_close(values.double(), expected, rtol=tolerance, atol=tolerance * 1e-2)
+        # Inhibition of return leaves both the same choice.
+        visited = torch.rand(values.shape, generator=generator) < 0.3
+        noise = torch.rand(values.shape, generator=generator)
+        chosen = select_fixation(values, visited, noise)
+        best = expected.masked_fill(visited, -torch.inf).topk(2).values
+        clear = (best[:, 0] - best[:, 1]) > 1e-3 * best[:, 0].abs()
+        assert torch.equal(chosen[clear], expected.masked_fill(visited, -torch.inf).argmax(-1)[clear])
+
+
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_brute_force_has_clear_choices(name, model):
+    """The comparison of choices above is no empty one."""
+    grid = GRIDS["wide"]
+    values = ACQUISITIONS[name](model, grid)(beliefs(grid, batch=40))
+    best = values.topk(2).values
+    assert ((best[:, 0] - best[:, 1]) > 1e-3 * best[:, 0].abs()).sum() > 20
+    assert len(values.argmax(-1).unique()) > 1
+
+
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_batches_are_rows(name, model):
+    grid = GRIDS["tall"]
+    acquisition, beta = ACQUISITIONS[name](model, grid, calibrated=True), beliefs(grid, batch=4)
+    together = acquisition(beta)
+    assert together.shape == (4, 10)
+    torch.testing.assert_close(torch.stack([acquisition(row) for row in beta]), together)
+    torch.testing.assert_close(acquisition(beta.view(2, 2, 10, 5)), together.view(2, 2, 10))
+
+
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_every_image_of_a_batch_has_its_own_distances(name, model):
+    sizes = torch.tensor([[64.0, 30.0], [30.0, 90.0]])
+    beta = beliefs(Grid(4, 2, (64, 30)), batch=2)
+    both = ACQUISITIONS[name](model, Grid(4, 2, sizes))(beta)
+    for row, size in enumerate(sizes.tolist()):
+        alone = ACQUISITIONS[name](model, Grid(4, 2, tuple(size)))(beta[row])
+        torch.testing.assert_close(both[row], alone)
+
+
+@pytest.mark.parametrize("calibrated", [False, True], ids=["raw", "calibrated"])
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_gradients(name, calibrated, model):
+    grid = GRIDS["row"]
+    acquisition = ACQUISITIONS[name](model, grid, calibrated=calibrated)
+    beta = beliefs(grid, batch=1).requires_grad_()
+    assert torch.autograd.gradcheck(acquisition, (beta,))
+
+
+def test_gradients_reach_the_model(model):
+    model.train().requires_grad_(True)
+    KLDivergence(model, GRIDS["row"], calibrated=True)(beliefs(GRIDS["row"])).sum().backward()
+    assert model.log_alpha.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_compiles_whole(name, model):
+    grid = GRIDS["wide"]
+    acquisition, beta = ACQUISITIONS[name](model, grid, calibrated=True), beliefs(grid)
+    compiled = torch.compile(acquisition, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(beta), acquisition(beta))
+
+
+def test_small_divergences_survive_float32(model):
+    """A belief that is nearly certain changes by next to nothing; the rest must not drown in rounding."""
+    grid = GRIDS["wide"]
+    beta = (beliefs(grid) * 3000).float().double()
+    for name in ("kl", "negative entropy"):
+        acquisition = ACQUISITIONS[name](model, grid)
+        torch.testing.assert_close(acquisition(beta.float()).double(), acquisition(beta), rtol=1e-2, atol=0)
+
+
+def test_an_eye_that_sees_well_nearby_starts_at_the_centre():
+    """With one belief everywhere, the best fixation is where most cells are near."""
+    near, far = 1 + 8 * torch.eye(3), 1 + 0.2 * torch.eye(3)
+    model = FovealObservationModel(torch.stack([near, far], 1), [0.42], ["cup", "cat"]).requires_grad_(False)
+    grid = Grid(5, 5, (50, 50))
+    beta = torch.tensor([1.0, 2.0, 0.5]).expand(1, 25, 3)
+    for acquisition in (KLDivergence, NegativeEntropy, UpperConfidenceBound):
+        assert acquisition(model, grid)(beta).argmax() == 12
+
+
+def test_nothing_of_the_callers_is_changed(model):
+    grid = GRIDS["wide"]
+    beta = beliefs(grid)
+    kept = beta.clone()
+    for acquisition in ACQUISITIONS.values():
+        acquisition(model, grid, calibrated=True)(beta)
+    assert torch.equal(beta, kept)
+
+
+def test_policies_by_name(model):
+    grid, beta = GRIDS["wide"], beliefs(GRIDS["wide"])
+    named = {
+        "kl": KLDivergence,
+        "negative-entropy": NegativeEntropy,
+        "two-peaks": TwoPeaks,
+        "upper-confidence-bound": UpperConfidenceBound,
+        "probability-of-improvement": ProbabilityOfImprovement,
+    }
+    assert {"random", *named} <= set(EXPLORATION_POLICIES)
+    for name, acquisition in named.items():
+        got = exploration_policy(name, model, calibrated=True)(None, grid)(beta)
+        assert torch.equal(got, acquisition(model, grid, calibrated=True)(beta))
+    assert torch.equal(exploration_policy("random")(None, grid)(beta), torch.zeros(3, 8).double())
+    with pytest.raises(InputError, match="did you mean 'two-peaks'"):
+        exploration_policy("two-peak", model)
+    with pytest.raises(InputError, match="observation model"):
+        exploration_policy("kl")
+    with pytest.raises(InputError, match="exploration_policy"):
+        search_policy("non-predictive")(None, grid)
+
+
+def test_bad_arguments(model):
+    grid = GRIDS["wide"]
+    with pytest.raises(InputError, match="beta"):
+        KLDivergence(model, grid)(torch.ones(1, 9, 5))
+    with pytest.raises(InputError, match="classes"):
+        KLDivergence(model, grid)(torch.ones(1, 8, 4))
+    with pytest.raises(InputError, match="divergence"):
+        KLDivergence(model, grid, of="median")
+    with pytest.raises(InputError, match="kappa"):
+        UpperConfidenceBound(model, grid, kappa=-1.0)
+    with pytest.raises(InputError, match="margin"):
+        ProbabilityOfImprovement(model, grid, margin=1.0)

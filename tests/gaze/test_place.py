@@ -1,0 +1,92 @@
+"""Search acquisitions that look beyond the fixated cell, against loops and closed forms."""
+
+import math
+
+import pytest
+import torch
+
+from semfov.belief import Grid
+from semfov.errors import InputError
+from semfov.gaze import search_policy
+from semfov.gaze.acquisition import FovealHit, NeighbourhoodPosterior, PlaceInformation
+
+GRID = Grid(4, 3, (80, 60))
+
+
+class Misses:
+    """Miss rates of two classes at three levels."""
+
+    miss_rate = torch.tensor([[0.9, 0.9, 0.9], [0.1, 0.5, 1.0], [0.3, 0.6, 0.8]], dtype=torch.float64)
+
+    def level(self, distance):
+        return torch.bucketize(distance, torch.tensor([0.2, 0.5]))
+
+
+@pytest.fixture
+def beta():
+    torch.manual_seed(0)
+    return torch.rand(2, 12, 3, dtype=torch.float64) + 0.1
+
+
+def parts(beta, episode, target):
+    p = (beta[episode, :, target] / beta[episode].sum(-1)).tolist()
+    rates = Misses.miss_rate[target, Misses().level(GRID.cell_distance)].tolist()
+    return p, rates
+
+
+def test_neighbourhood_equals_the_loop(beta):
+    got = NeighbourhoodPosterior(2, GRID, sigma=0.6)(beta)
+    for episode in range(2):
+        p, _ = parts(beta, episode, 2)
+        for f in range(12):
+            expected = sum(
+                p[x] * math.exp(-((x % 4 - f % 4) ** 2 + (x // 4 - f // 4) ** 2) / (2 * 0.36)) for x in range(12)
+            )
+            assert float(got[episode, f]) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("target", [1, torch.tensor([2, 1])])
+def test_foveal_hit_equals_the_loop(beta, target):
+    got = FovealHit(target, Misses(), GRID)(beta)
+    for episode in range(2):
+        p, rates = parts(beta, episode, int(torch.as_tensor(target).expand(2)[episode]))
+        for f in range(12):
+            missed = math.prod(1 - p[x] * (1 - rates[f][x]) for x in range(12))
+            assert float(got[episode, f]) == pytest.approx(1 - missed)
+
+
+@pytest.mark.parametrize("target", [1, torch.tensor([2, 1])])
+def test_information_is_the_expected_loss_of_entropy(beta, target):
+    got = PlaceInformation(target, Misses(), GRID)(beta)
+    for episode in range(2):
+        p, rates = parts(beta, episode, int(torch.as_tensor(target).expand(2)[episode]))
+        q = [value / sum(p) for value in p]
+        for f in range(12):
+            missed = [q[x] * rates[f][x] for x in range(12)]
+            after = [value / sum(missed) for value in missed]
+            expected = entropy(q) - sum(missed) * entropy(after)
+            assert float(got[episode, f]) == pytest.approx(expected, abs=1e-9)
+    assert (got > -1e-12).all()
+
+
+def entropy(q):
+    return -sum(value * math.log(value) for value in q if value > 0)
+
+
+@pytest.mark.parametrize("name", ["foveal-hit", "place-information"])
+def test_policies_need_miss_rates(name, beta):
+    acquisition = search_policy(name, Misses())(1, GRID)
+    assert acquisition(beta).shape == (2, 12)
+    assert torch.autograd.gradcheck(acquisition, beta[:1].requires_grad_())
+    blind = Misses()
+    blind.miss_rate = None
+    with pytest.raises(InputError, match="miss rates"):
+        search_policy(name, blind)(1, GRID)
+    with pytest.raises(InputError, match="observation model"):
+        search_policy(name)
+
+
+def test_neighbourhood_compiles(beta):
+    acquisition = search_policy("neighbourhood")(1, GRID)
+    compiled = torch.compile(acquisition, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(beta), acquisition(beta))
