@@ -1,7 +1,7 @@
 """Runs that are killed at a random moment and started again: is the result the same to the last bit?
 
-Each repetition starts a command on the embedded scenes, kills it (SIGKILL) after a random share of the time that a whole
-run takes, starts it again, and compares what it leaves with what a run leaves that nobody disturbs:
+Each repetition starts a command on the embedded scenes, kills it (SIGKILL) after a random share of the time that a
+whole run takes, starts it again, and compares what it leaves with what a run leaves that nobody disturbs:
 
 - `store`: `eval.search` while it looks from every cell and keeps what it saw;
 - `evaluation`: `eval.search` with that store there, while it runs policies and writes its report;
@@ -158,13 +158,14 @@ def main() -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repetitions", type=int, default=50, help="of each command")
+    parser.add_argument("--only", nargs="+", choices=[c.name for c in COMMANDS], help="these commands; default: all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the figures here too")
     options = parser.parse_args()
     print("| run | s | repetitions | killed before the end | finished files then | unfinished | same bits |")
     print("|---|---|---|---|---|---|---|", flush=True)
     figures = {}
-    for command in COMMANDS:
+    for command in [c for c in COMMANDS if options.only is None or c.name in options.only]:
         came = survive(command, options.repetitions, options.seed)
         figures[command.name] = came.__dict__
         files = f"{min(came.progress)} to {max(came.progress)}"

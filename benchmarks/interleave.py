@@ -123,7 +123,9 @@ def scanpath(
 
 def spread(values: Sequence[float], scale: float = 1.0, digits: int = 2) -> str:
     """Median and quartiles."""
-    low, middle, high = (f"{scale * value:.{digits}f}" for value in statistics.quantiles(values, n=4))
+    low, middle, high = (
+        f"{scale * value:.{digits}f}" for value in statistics.quantiles(values, n=4, method="inclusive")
+    )
     return f"{middle} ({low}-{high})"
 
 

@@ -12,22 +12,27 @@ from semfov.files import replacing
 
 
 def write_tensors(path: Path, key: str, tensors: Mapping[str, Tensor]) -> None:
-    """Write tensors atomically, with a checksum and the key of what they depend on."""
+    """Write tensors atomically, with a checksum, the key of what they depend on, and the name of their file."""
     whole = {name: tensor.contiguous() for name, tensor in tensors.items()}
-    content = save(whole, {"key": key, "sha256": checksum(whole)})
+    content = save(whole, {"key": key, "sha256": checksum(whole), "file": path.name})
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
 def read_tensors(path: Path, key: str) -> dict[str, Tensor] | None:
-    """Tensors that `write_tensors` wrote under this key; None where they are missing, damaged or of another key."""
+    """Tensors that `write_tensors` wrote to this file under this key; None where they are missing or damaged.
+
+    A file that was written under another key or by another name, such as that of another scene, counts as missing.
+    """
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     except (OSError, SafetensorError):
         return None
-    return tensors if metadata == {"key": key, "sha256": checksum(tensors)} else None
+    # Files of before names were kept have none.
+    wanted = {"key": key, "sha256": checksum(tensors), "file": path.name}
+    return tensors if {"file": path.name, **metadata} == wanted else None
 
 
 def checksum(tensors: Mapping[str, Tensor]) -> str:

@@ -87,7 +87,9 @@ class BeliefConfig:
         footprint: which cells a detection updates: `overlap` (published), `centre`, `box_centre` or `soft`.
         tempering: exponent of the likelihoods (published: 1).
         memory: fuse `all` looks (published), or keep what the `closest` look at each cell says.
+        misses: take account of cells in which nothing was detected, by the observation model's miss rates.
         model: fitted observation model, by name or file (None: the one shipped for the detector).
+        target_model: learned target evidence, by name or file (None: the one shipped for the detector).
     """
 
     columns: int = 10
@@ -97,7 +99,9 @@ class BeliefConfig:
     footprint: Footprint = "overlap"
     tempering: float = 1.0
     memory: Memory = "all"
+    misses: bool = False
     model: str | None = None
+    target_model: str | None = None
 
 
 @dataclass(frozen=True)
@@ -145,8 +149,10 @@ class SearchConfig:
         belief: the grid of beliefs.
         saliency: the saliency baselines.
         protocol: the experiment.
-        policies: policies to compare: `random`, `vocus2`, `itti-koch`, or `non-predictive` / `predictive` followed by
-            `-raw` (scores are likelihoods) or `-calibrated` (scores go through the observation model).
+        policies: policies to compare: `target-evidence` (learned; recommended), `random`, `vocus2`, `itti-koch`, or
+            `non-predictive`, `predictive`, `neighbourhood`, `foveal-hit` or `place-information` followed by `-raw`
+            (scores are likelihoods) or `-calibrated` (scores go through the observation model). These may be followed
+            by `+tempered`, `+closest`, `+soft`, `+central` and `+misses`, which change `belief` for this policy alone.
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what the detector saw from every cell, shared between runs (None: the user's cache).
         store: keep what the detector saw on disk; false recomputes it (the result is the same).
@@ -186,8 +192,9 @@ class ExploreConfig:
         saliency: the saliency baselines.
         protocol: the experiment.
         policies: policies to compare: `random`, `kl`, `negative-entropy`, `two-peaks`, `upper-confidence-bound`,
-            `probability-of-improvement`, `vocus2` or `itti-koch`, each followed by `-raw` (scores are likelihoods) or
-            `-calibrated` (scores go through the observation model).
+            `probability-of-improvement`, `expected-accuracy`, `vocus2` or `itti-koch`, each followed by `-raw` (scores
+            are likelihoods) or `-calibrated` (scores go through the observation model), and `+` options as for
+            `eval.search`.
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
         store: keep what was seen on disk; false recomputes it (the result is the same).

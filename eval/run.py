@@ -19,18 +19,21 @@ from eval.parallel import available_cores, mine, run_tasks, wait_for_all
 from eval.protocol import Searcher
 from eval.saliency import SaliencyStore, saliency_table
 from eval.setup import (
+    TARGET_EVIDENCE,
     Kind,
     make_eye,
     make_observation,
     make_scenes,
     make_searcher,
+    make_target_evidence,
     needs_model,
     prepare_worker,
     saliency_policies,
     split_policy,
 )
 from eval.store import DetectionStore, see_all
-from semfov import Detections, Grid
+from semfov import Detections, Grid, search_policy
+from semfov.belief import TargetObserver
 from semfov.data.scene import Scenes
 from semfov.errors import DataError
 from semfov.files import write_text
@@ -53,6 +56,7 @@ class Run(ABC):
         if not len(self.scenes):
             raise DataError("data: no scene passes the selection; lower data.min_instances or raise data.limit")
         self.model = make_observation(config, self.eye) if needs_model(config.policies, self.kind) else None
+        self.target = make_target_evidence(config, self.eye) if TARGET_EVIDENCE in config.policies else None
         belief, settings, cache = config.belief, self.eye.settings(), cache_folder(config)
         size = belief.columns, belief.rows
         self.store = DetectionStore(cache / "looks", settings, *size)
@@ -64,8 +68,11 @@ class Run(ABC):
 
     def _key(self) -> str:
         config = self.config
-        model = None if self.model is None else checksum(self.model.state_dict())
-        belief = {**asdict(config.belief), "model": model}
+        models = {
+            name: None if model is None else checksum(model.state_dict())
+            for name, model in (("model", self.model), ("target_model", self.target))
+        }
+        belief = {**asdict(config.belief), **models}
         protocol = {name: value for name, value in asdict(config.protocol).items() if name != "batch"}
         saliency = {name: store.key for name, store in self.saliency_stores.items()}
         what = [self.kind, self.store.key, self.scenes.fingerprint, belief, protocol, list(config.policies), saliency]
@@ -78,6 +85,8 @@ class Run(ABC):
     def searcher(self, name: str, index: int) -> Searcher:
         """How the policy of this name searches or explores a scene, with this run's observation model."""
         base, _ = split_policy(name, self.kind)
+        if self.target is not None and base == TARGET_EVIDENCE:
+            return Searcher(TargetObserver(self.target), search_policy("non-predictive"))
         saliency = self.saliency(base, index) if base in self.saliency_stores else None
         components = len(self.scenes.classes) + 1
         return make_searcher(name, self.kind, self.config.belief, components, self.model, saliency)
@@ -151,19 +160,19 @@ class Parts:
         """Outcomes of a scene, or None if they are not there whole."""
         try:
             part = json.loads(self.path(index).read_text(encoding="utf-8"))
-            whole = part["key"] == self.key and part["sha256"] == _digest(part["records"])
+            whole = part["key"] == self.key and part["sha256"] == _digest(index, part["records"])
         except (OSError, ValueError, KeyError, TypeError):
             return None
         return part if whole else None
 
     def save(self, index: int, records: list[dict[str, object]], seconds: dict[str, float]) -> None:
         """Keep the outcomes of a scene."""
-        part = {"key": self.key, "sha256": _digest(records), "records": records, "seconds": seconds}
+        part = {"key": self.key, "sha256": _digest(index, records), "records": records, "seconds": seconds}
         write_text(self.path(index), json.dumps(part))
 
 
-def _digest(records: Sequence[object]) -> str:
-    return hashlib.sha256(json.dumps(records).encode()).hexdigest()
+def _digest(index: int, records: Sequence[object]) -> str:
+    return hashlib.sha256(json.dumps([index, records]).encode()).hexdigest()
 
 
 def finish(run: Run, title: str) -> Parts:

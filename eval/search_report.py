@@ -27,6 +27,8 @@ from eval.report import (
 from eval.run import Parts
 from eval.saliency import foveated
 from eval.tasks import SearchRun
+from semfov.agent import probability
+from semfov.belief import SemanticObserver
 from semfov.errors import DataError
 from semfov.scanpath import Scanpath
 
@@ -135,12 +137,16 @@ def replay(run: SearchRun, index: int, record: Record) -> Scanpath:
     observer = searcher.observer
     looks = Looks(observer, detections, grid, [target])
     belief = observer.start(1, grid, detections.scores)
-    cells = torch.tensor(record["cells"])
-    beliefs, values = [], []
+    # A belief about the target alone tells nothing of other classes: the map beside it does.
+    semantics = observer if isinstance(observer, SemanticObserver) else SemanticObserver(len(run.scenes.classes) + 1)
+    seen, known = Looks(semantics, detections, grid, [target]), semantics.start(1, grid, detections.scores)
+    cells, wanted = torch.tensor(record["cells"]), torch.tensor([target])
+    beliefs, present, values = [], [], []
     with torch.no_grad():
         for cell in cells.split(1):
-            belief = observer.update(belief, looks(torch.tensor([target]), cell))
-            beliefs.append(belief.beta[0])
+            belief, known = observer.update(belief, looks(wanted, cell)), semantics.update(known, seen(wanted, cell))
+            beliefs.append(known.beta[0])
+            present.append(probability(belief.beta[0], int(observer.component(target))))
             values.append(searcher.acquisition(observer.component(target), grid, cell)(belief.beta)[0])
     return Scanpath(
         grid=grid,
@@ -152,6 +158,7 @@ def replay(run: SearchRun, index: int, record: Record) -> Scanpath:
         beliefs=torch.stack(beliefs),
         values=torch.stack(values),
         found=record["found_at"] >= 0,
+        posterior=torch.stack(present),
     )
 
 

@@ -5,16 +5,17 @@ from __future__ import annotations
 import json
 import logging
 import multiprocessing
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 import semfov
-from eval.config import BeliefConfig, DataConfig, DetectorConfig, RunConfig, SensorConfig
+from eval.config import BeliefConfig, DataConfig, DetectorConfig, RunConfig, SearchConfig, SensorConfig
 from eval.protocol import Searcher
 from eval.saliency import SALIENCY_MODELS
-from semfov.belief import SemanticObserver
+from semfov.belief import SemanticObserver, TargetEvidence
 from semfov.data.scene import Scenes
 from semfov.errors import InputError, check, lookup
 from semfov.eye import Eye
@@ -22,8 +23,19 @@ from semfov.gaze import EXPLORATION_POLICIES, SEARCH_POLICIES, exploration_polic
 
 Kind = Literal["search", "exploration"]
 
+TARGET_EVIDENCE = "target-evidence"
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "tempered": {"tempering": 0.25},
+    "closest": {"memory": "closest"},
+    "soft": {"footprint": "soft"},
+    "central": {"footprint": "box_centre"},
+    "misses": {"misses": True},
+}
+"""Settings of the belief that a policy may be followed by, `+tempered` and so on."""
+
 _POLICIES: dict[Kind, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "search": (SEARCH_POLICIES[1:], ("random", *SALIENCY_MODELS)),
+    "search": (SEARCH_POLICIES[1:], (TARGET_EVIDENCE, "random", *SALIENCY_MODELS)),
     "exploration": ((*EXPLORATION_POLICIES, *SALIENCY_MODELS), ()),
 }
 """Names of policies that come with `-raw` or `-calibrated`, and of those that come alone."""
@@ -73,16 +85,31 @@ def make_observation(config: RunConfig, eye: Eye) -> semfov.FovealObservationMod
     return model.requires_grad_(False)
 
 
+def make_target_evidence(config: SearchConfig, eye: Eye) -> TargetEvidence:
+    """The learned evidence for a target, checked to belong to this detector."""
+    model = TargetEvidence.from_pretrained(config.belief.target_model or eye.detector.name)
+    model.check_compatible(eye.settings())
+    return model.requires_grad_(False)
+
+
 def split_policy(name: str, kind: Kind) -> tuple[str, bool]:
-    """The policy and whether scores are calibrated: `predictive-calibrated` -> (`predictive`, True).
+    """The policy and whether scores are calibrated: `predictive-calibrated+soft` -> (`predictive`, True).
 
     For search, policies that do not look at the belief have no such ending.
     """
     moded, bare = _POLICIES[kind]
+    name = name.partition("+")[0]
     known = [*bare, *(f"{policy}-{mode}" for policy in moded for mode in ("raw", "calibrated"))]
     lookup(name, known, "policy")
     base, _, mode = name.rpartition("-")
     return (name, False) if name in bare else (base, mode == "calibrated")
+
+
+def belief_of(name: str, belief: BeliefConfig) -> BeliefConfig:
+    """Settings of the belief for a policy: those of the run, changed as the `+` endings of its name say."""
+    for variant in name.split("+")[1:]:
+        belief = replace(belief, **VARIANTS[lookup(variant, VARIANTS, "belief setting")])
+    return belief
 
 
 def saliency_policies(policies: tuple[str, ...], kind: Kind) -> list[str]:
@@ -91,10 +118,11 @@ def saliency_policies(policies: tuple[str, ...], kind: Kind) -> list[str]:
 
 
 def needs_model(policies: tuple[str, ...], kind: Kind) -> bool:
-    """Whether a policy of the run predicts or calibrates."""
+    """Whether a policy of the run needs an observation model: to predict, to calibrate, or for its miss rates."""
     check(len(policies) > 0, "policies", "at least one policy", "none")
-    without = ("random", "non-predictive", "neighbourhood", *SALIENCY_MODELS)
-    return any(base not in without or calibrated for base, calibrated in _split(policies, kind))
+    without = (TARGET_EVIDENCE, "random", "non-predictive", "neighbourhood", *SALIENCY_MODELS)
+    predicts = any(base not in without or calibrated for base, calibrated in _split(policies, kind))
+    return predicts or any(belief_of(name, BeliefConfig()).misses for name in policies)
 
 
 def _split(policies: tuple[str, ...], kind: Kind) -> list[tuple[str, bool]]:
@@ -120,6 +148,9 @@ def make_searcher(
         saliency: of the scene, for the saliency policies.
     """
     base, calibrated = split_policy(name, kind)
+    belief = belief_of(name, belief)
+    if belief.misses and model is None:
+        raise InputError("belief.misses: expected a policy that uses an observation model, or add +misses to its name")
     observer = SemanticObserver(
         components,
         model if calibrated else None,
@@ -128,6 +159,7 @@ def make_searcher(
         footprint=belief.footprint,
         tempering=belief.tempering,
         memory=belief.memory,
+        misses=model.miss_likelihood if belief.misses and model is not None else None,
     )
     if base in SALIENCY_MODELS:
         return Searcher(observer, search_policy("random"), saliency)

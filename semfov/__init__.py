@@ -3,13 +3,13 @@
 from typing import TYPE_CHECKING, Any
 
 from semfov.agent import ActivePerception
-from semfov.belief import Evidence, Grid, SemanticMap, fusion, weigh
+from semfov.belief import Evidence, Grid, SemanticMap, TargetEvidence, fusion, weigh
 from semfov.data import EmbeddedScenes, read_image
 from semfov.detection import Detections, Detector, Selection
 from semfov.detection.load import load_detector
 from semfov.errors import DataError, InputError, SemfovError
 from semfov.eye import Eye
-from semfov.gaze import acquisition, saliency, search_policy
+from semfov.gaze import acquisition, exploration_policy, saliency, search_policy
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
 from semfov.scanpath import Scanpath
 from semfov.sensor import Foveation, foveate
@@ -37,8 +37,10 @@ __all__ = [
     "Selection",
     "SemanticMap",
     "SemfovError",
+    "TargetEvidence",
     "acquisition",
     "dirichlet",
+    "exploration_policy",
     "foveate",
     "fusion",
     "load_detector",

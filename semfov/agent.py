@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -11,12 +11,16 @@ from semfov.belief.evidence import Observation
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.observer import Observer, SemanticObserver
 from semfov.belief.state import Belief
+from semfov.belief.target_evidence import TargetEvidence
+from semfov.belief.target_observer import TargetObserver
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
+from semfov.detection.load import load_detector
 from semfov.errors import check, check_shape, lookup
 from semfov.eye import Eye
-from semfov.gaze.policies import Policy
+from semfov.gaze.policies import Policy, exploration_policy, search_policy
 from semfov.gaze.selection import select_fixation
+from semfov.observation.foveal import FovealObservationModel
 from semfov.scanpath import Scanpath
 from semfov.sensor.foveation import Foveation
 
@@ -64,6 +68,10 @@ def step(
     return Step(belief, visited, values, select_fixation(values, visited, noise))
 
 
+RECOMMENDED: dict[str, Any] = {"tempering": 0.25, "footprint": "soft"}
+"""Settings of the belief about all classes that account for looks that are not independent."""
+
+
 class ActivePerception(nn.Module):
     """An agent with a foveal sensor that searches an image for a class, or explores it.
 
@@ -72,18 +80,18 @@ class ActivePerception(nn.Module):
         detector: turns foveated views into detections.
         observation: calibrates scores by class and distance to the fovea; None takes them raw.
         grid: `(columns, rows)` of the belief.
-        policy: makes the acquisition function (`semfov.search_policy`, `semfov.gaze.exploration_policy`).
+        policy: makes the acquisition function (`semfov.search_policy`, `semfov.exploration_policy`).
         prior: Dirichlet parameter of every class before the first look.
         fusion: `kaplan`, `product` or `sum`.
         footprint: which cells a detection updates (`Grid.footprint`).
-        observer: turns looks into belief; None makes a `SemanticObserver` of the four settings before.
+        semantics: observer that keeps the map of all classes; None makes one of the four settings before.
+        observer: observer that search goes by, where it is another one (`semfov.belief.TargetObserver`).
+        exploration: policy of `explore`, where it is another one.
         reference: longer side in pixels of the image that the sensor's σ is meant for.
 
     Example::
 
-        agent = ActivePerception(
-            Foveation(100.0), load_detector("yolov3-tiny"), None, (10, 10), search_policy("non-predictive")
-        )
+        agent = ActivePerception.from_pretrained("yolov3-tiny")
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
     """
 
@@ -98,7 +106,9 @@ class ActivePerception(nn.Module):
         prior: float = 0.5,
         fusion: str = "kaplan",
         footprint: Footprint = "overlap",
+        semantics: SemanticObserver | None = None,
         observer: Observer | None = None,
+        exploration: Policy | None = None,
         reference: float = 640.0,
     ) -> None:
         super().__init__()
@@ -106,10 +116,52 @@ class ActivePerception(nn.Module):
         self.observation = observation
         self.columns, self.rows = grid
         self.policy = policy
-        components = len(self.classes)
-        self.observer: Observer = observer or SemanticObserver(
-            components, observation, prior=prior, fusion=fusion, footprint=footprint
+        self.exploration = exploration or policy
+        self.semantics = semantics or SemanticObserver(
+            len(self.classes), observation, prior=prior, fusion=fusion, footprint=footprint
         )
+        self.observer: Observer = observer or self.semantics
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        name: str = "yolov3-tiny",
+        *,
+        sigma: float = 100.0,
+        growth: float = 2.0,
+        grid: tuple[int, int] = (10, 10),
+        **options: Any,
+    ) -> Self:
+        """The recommended agent: learned target evidence for search, expected accuracy for exploration.
+
+        Args:
+            name: a detector for which models are shipped, `yolov3-tiny` or `yolox-nano`.
+            sigma: width of the fovea in pixels of an image of 640; the models are fitted for 100.
+            growth: see `Foveation`; the models are fitted for 2.
+            grid: `(columns, rows)` of the belief.
+            options: of `semfov.load_detector`.
+
+        Raises:
+            InputError: no models are shipped for a detector of this name.
+            DataError: the weights cannot be had, or are damaged.
+        """
+        detector = load_detector(name, **options)
+        observation = FovealObservationModel.from_pretrained(detector.name, detector=detector).requires_grad_(False)
+        evidence = TargetEvidence.from_pretrained(detector.name).requires_grad_(False)
+        agent = cls(
+            Foveation(sigma, growth=growth),
+            detector,
+            observation,
+            grid,
+            search_policy("non-predictive"),
+            semantics=SemanticObserver(
+                len(detector.classes) + 1, observation, misses=observation.miss_likelihood, **RECOMMENDED
+            ),
+            observer=TargetObserver(evidence),
+            exploration=exploration_policy("expected-accuracy", observation),
+        )
+        evidence.check_compatible(agent.eye.settings())
+        return agent.eval().requires_grad_(False)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -153,7 +205,8 @@ class ActivePerception(nn.Module):
         def ends(cell: int, detections: Detections) -> bool:
             return bool(goal[cell]) if goal is not None else confirms(detections, grid, cell, index, confirm)
 
-        return self._gaze(image, grid, index, start, shifts, seed, ends)
+        policy = self.policy(self.observer.component(index), grid)
+        return self._gaze(image, grid, self.observer, policy, index, start, shifts, seed, ends)
 
     def explore(self, image: Tensor, *, start: int | None = None, shifts: int = 20, seed: int = 0) -> Scanpath:
         """Explore an image: build up the belief about the whole map, with no target.
@@ -162,11 +215,13 @@ class ActivePerception(nn.Module):
         scanpath has no target, and nothing is found.
 
         Raises:
-            InputError: the policy needs a target, the observer believes about one only, or an argument does not fit.
+            InputError: the policy needs a target, or an argument does not fit.
         """
-        check(not self.observer.by_target, "observer", "one that believes about all classes", "one for a target")
         image, grid = self._frame(image)
-        return self._gaze(image, grid, None, start, shifts, seed, lambda cell, detections: False)
+        policy = self.exploration(None, grid)
+        return self._gaze(
+            image, grid, self.semantics, policy, None, start, shifts, seed, lambda cell, detections: False
+        )
 
     def _frame(self, image: Tensor) -> tuple[Tensor, Grid]:
         """The image as a batch of one, and the grid over it."""
@@ -178,6 +233,8 @@ class ActivePerception(nn.Module):
         self,
         image: Tensor,
         grid: Grid,
+        observer: Observer,
+        acquisition: nn.Module,
         target: int | None,
         start: int | None,
         shifts: int,
@@ -190,21 +247,26 @@ class ActivePerception(nn.Module):
             start = int(torch.randint(len(grid), (1,), generator=generator))
         check(0 <= start < len(grid), "start", f"a cell from 0 to {len(grid) - 1}", start)
         view = self.eye.open(image)
-        acquisition = self.policy(None if target is None else self.observer.component(target), grid)
-        belief = self.observer.start(1, grid, image)
+        belief, semantics = observer.start(1, grid, image), self.semantics.start(1, grid, image)
         visited = torch.zeros(1, len(grid), dtype=torch.bool, device=image.device)
-        cell, cells, seen, beliefs, values, found = start, [], [], [], [], False
+        cell, cells, seen, beliefs, present, values, found = start, [], [], [], [], [], False
         while True:
             fixation = grid.centres[cell].to(image)[None]
             detections = self.eye.look(view, fixation)
-            evidence = self.observer.weigh(detections, fixation, grid, target)
+            evidence = observer.weigh(detections, fixation, grid, target)
             noise = torch.rand(1, len(grid), generator=generator).to(image)
             here = torch.tensor([cell], device=image.device)
-            after = step(self.observer, belief, visited, here, evidence, acquisition, noise)
+            after = step(observer, belief, visited, here, evidence, acquisition, noise)
             belief, visited = after.belief, after.visited
+            if observer is self.semantics:
+                semantics = belief
+            else:
+                semantics = self.semantics.update(semantics, self.semantics.weigh(detections, fixation, grid))
             cells.append(cell)
             seen.append(detections)
-            beliefs.append(belief.beta[0])
+            beliefs.append(semantics.beta[0])
+            if target is not None:
+                present.append(probability(belief.beta[0], int(observer.component(target))))
             values.append(after.values[0])
             found = ends(cell, detections)
             cell = int(after.cell)
@@ -221,6 +283,7 @@ class ActivePerception(nn.Module):
             beliefs=torch.stack(beliefs),
             values=torch.stack(values),
             found=found,
+            posterior=torch.stack(present) if present else None,
         )
 
     def _target(self, target: str | int) -> int:
@@ -228,6 +291,11 @@ class ActivePerception(nn.Module):
             return self.classes.index(lookup(target, self.classes[1:], "target class"))
         check(1 <= target < len(self.classes), "target", f"a class from 1 to {len(self.classes) - 1}", target)
         return target
+
+
+def probability(beta: Tensor, component: int) -> Tensor:
+    """Mean of a component of Dirichlet beliefs `(..., C)`, `(...)`."""
+    return beta[..., component] / beta.sum(-1)
 
 
 def confirms(detections: Detections, grid: Grid, cell: int, target: int, score: float) -> bool:

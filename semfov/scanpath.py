@@ -22,6 +22,8 @@ class Scanpath:
         beliefs: `(n, X·Y, K+1)`, Dirichlet parameters after each look.
         values: `(n, X·Y)`, acquisition values that the next fixation was chosen by.
         found: whether the search ended on its target.
+        posterior: `(n, X·Y)`, probability of the target in each cell as the search believed it after each look; None
+            for exploration.
     """
 
     grid: Grid
@@ -33,6 +35,7 @@ class Scanpath:
     beliefs: Tensor
     values: Tensor
     found: bool
+    posterior: Tensor | None = None
 
     def __len__(self) -> int:
         """Number of fixations, the start included."""

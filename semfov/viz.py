@@ -71,6 +71,7 @@ def _plot_curves(
 ) -> Figure:
     """Shares after each gaze shift, one curve per policy, with bands of one standard error."""
     from matplotlib import rc_context
+    from matplotlib.ticker import MaxNLocator
 
     many = len(curves) > len(COLOURS)
     figure, (axes,) = _figure(1, 1, width=8.0 if many else 6.2, height=4.0)
@@ -83,11 +84,11 @@ def _plot_curves(
         if band is not None and np.isfinite(band).all():
             alpha = 0.05 if many else 0.15
             axes.fill_between(shifts, 100 * (curve - band), 100 * (curve + band), color=colour, alpha=alpha, lw=0)
-    axes.set(xlabel="gaze shifts", ylabel=label, title=title)
     axes.set_xlim(0, max(len(curve) for curve in curves.values()) - 1)
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3, linewidth=0.5)
     with rc_context(STYLE):
+        axes.set(xlabel="gaze shifts", ylabel=label, title=title)
         if many:
             figure.legend(loc="outside right upper")
         else:

@@ -15,7 +15,6 @@ from semfov.detection.detections import Detections
 from semfov.errors import check, lookup
 
 Memory = Literal["all", "closest"]
-Update = Callable[[Belief, Any], Belief]
 
 
 class Observer(Protocol):
@@ -27,15 +26,15 @@ class Observer(Protocol):
 
     by_target: bool
 
-    def start(self, batch: int, grid: Grid, like: Tensor) -> Belief:
-        """The belief of `batch` episodes before the first look; dtype and device as `like`."""
+    def start(self, batch: int, grid: Grid, like: Tensor) -> Any:
+        """The belief (`Belief`) of `batch` episodes before the first look; dtype and device as `like`."""
         ...
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> Any:
         """What looks from `fixation` `(B, 2)` say."""
         ...
 
-    def update(self, belief: Belief, evidence: Any) -> Belief:
+    def update(self, belief: Any, evidence: Any) -> Any:
         """The belief after a look in each episode."""
         ...
 

@@ -16,6 +16,18 @@ MAX_PIXELS = 89_478_485
 """Largest picture that is read, in pixels (1 GiB as float32 RGB): Pillow's limit against decompression bombs."""
 
 _ORIENTATION_TAG = 0x0112
+# How to turn a picture with this orientation upright; all undo themselves but 6 and 8, which undo each other.
+_MOVES = {
+    1: "",
+    2: "FLIP_LEFT_RIGHT",
+    3: "ROTATE_180",
+    4: "FLIP_TOP_BOTTOM",
+    5: "TRANSPOSE",
+    6: "ROTATE_270",
+    7: "TRANSVERSE",
+    8: "ROTATE_90",
+}
+_INVERSE = {6: 8, 8: 6}
 _SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N", "I")
 
 
@@ -49,10 +61,12 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of damaged metadata and of large files; the limit below refuses the latter
         try:
-            with Image.open(path) as image:
+            # By its name Pillow would map a plain TIFF into memory, and mix up its rows where it is to be turned.
+            with Path(path).open("rb") as file, Image.open(file) as image:
                 _check_pixels(image.size, name)
+                stored = _orientation(image)
                 image.load()
-                picture = _upright(image) if oriented else image
+                picture = _turned(image, stored, _orientation(image), upright=oriented)
                 array = _rgb(picture, name)
         except DataError:
             raise
@@ -80,24 +94,28 @@ def _check_pixels(size: tuple[int, int], name: str) -> None:
         raise DataError(f"{name}: expected 1 to {MAX_PIXELS:,} pixels, got {width} × {height}; reduce or replace it")
 
 
-def _upright(image: Any) -> Any:
-    """Apply the EXIF orientation; a picture with damaged EXIF data stays as stored."""
-    from PIL.Image import Transpose
-
+def _orientation(image: Any) -> int:
+    """The EXIF orientation, 1 to 8; 1, as stored, where the data are damaged or say something else."""
     try:
         orientation = image.getexif().get(_ORIENTATION_TAG, 1)
     except Exception:
-        return image
-    moves = {
-        2: Transpose.FLIP_LEFT_RIGHT,
-        3: Transpose.ROTATE_180,
-        4: Transpose.FLIP_TOP_BOTTOM,
-        5: Transpose.TRANSPOSE,
-        6: Transpose.ROTATE_270,
-        7: Transpose.TRANSVERSE,
-        8: Transpose.ROTATE_90,
-    }
-    return image.transpose(moves[orientation]) if orientation in moves else image
+        return 1
+    return orientation if orientation in _MOVES else 1
+
+
+def _turned(image: Any, stored: int, left: int, *, upright: bool) -> Any:
+    """A picture upright, or as stored.
+
+    Args:
+        image: the picture.
+        stored: orientation in its file.
+        left: orientation after it was loaded; Pillow turns TIFFs itself, and then nothing is left.
+        upright: False for the frame of the file.
+    """
+    from PIL.Image import Transpose
+
+    orientation = left if upright else _INVERSE.get(stored, stored) if left != stored else 1
+    return image if orientation == 1 else image.transpose(Transpose[_MOVES[orientation]])
 
 
 def _rgb(image: Any, name: str) -> NDArray[np.float32]:

@@ -1,0 +1,209 @@
+"""Kills, full disks, damaged and shared files: a run ends in one line, and goes on to the undisturbed result."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SEARCH = [
+    sys.executable, "-m", "eval.search", "--data.limit", "2", "--belief.columns", "3", "--belief.rows", "2",
+    "--protocol.starts", "2", "--protocol.shifts", "4", "--policies", '["random"]', "--scanpaths", "0",
+]  # fmt: skip
+RESULTS = ("episodes.jsonl", "summary.csv")
+
+pytestmark = [pytest.mark.weights, pytest.mark.slow]
+
+
+def start(out: Path, cache: Path, *more: str, **options: Any) -> subprocess.Popen[str]:
+    """Start a small search in a session of its own."""
+    call = [*SEARCH, "--out", str(out), "--cache", str(cache), *more]
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(call, cwd=ROOT, env=environment, start_new_session=True, **pipes, **options)
+
+
+def ends(process: subprocess.Popen[str], code: int) -> str:
+    """Last line of what the process says when it ends, as it must, with this exit code and without a traceback."""
+    error = process.communicate(timeout=120)[1]
+    assert process.returncode == code, error
+    assert "Traceback" not in error
+    return error.strip().splitlines()[-1] if code else ""
+
+
+def bits(out: Path) -> list[bytes]:
+    return [(out / name).read_bytes() for name in RESULTS]
+
+
+def wait_for(found: Callable[[], Any]) -> Any:
+    deadline = time.monotonic() + 120
+    while not (what := found()):
+        assert time.monotonic() < deadline, "nothing happened"
+        time.sleep(0.005)
+    return what
+
+
+def workers_of(process: subprocess.Popen[str]) -> list[int]:
+    """Worker processes of a run."""
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    commands = {int(child): Path(f"/proc/{child}/cmdline") for child in children}
+    return [child for child, command in commands.items() if b"spawn_main" in command.read_bytes()]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """Folder of a small search that nobody disturbs, `out` and `cache`."""
+    folder = tmp_path_factory.mktemp("whole")
+    ends(start(folder / "out", folder / "cache", "--workers", "1"), 0)
+    return folder
+
+
+@pytest.mark.parametrize("command", ["store", "evaluation", "fit"])
+def test_killed_runs_resume_to_the_same_bits(command, tmp_path):
+    figures = tmp_path / "figures.json"
+    call = [sys.executable, "-m", "benchmarks.faults", "--only", command, "--repetitions", "3", "--json", str(figures)]
+    subprocess.run(call, cwd=ROOT, check=True, capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    came = json.loads(figures.read_text())[command]
+    assert came["identical"] == 3
+    assert came["killed"] >= 1
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
+def test_one_misfortune_after_another(whole, tmp_path):
+    """A worker is killed, the next run meets a full disk, the next is interrupted, and the last one finishes."""
+    out, cache = tmp_path / "out", tmp_path / "cache"
+    process = start(out, cache, "--workers", "2")
+    os.kill(wait_for(partial(workers_of, process))[-1], signal.SIGKILL)
+    assert "a worker process died" in ends(process, 1)
+
+    limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (2000, 2000))
+    message = ends(start(out, cache, "--workers", "1", preexec_fn=limit), 1)
+    assert message.startswith("error: cannot write")
+    assert str(cache) in message
+
+    process = start(out, cache, "--workers", "2")
+    workers = wait_for(partial(workers_of, process))
+    wait_for(lambda: list(tmp_path.rglob("*.safetensors")))
+    os.killpg(process.pid, signal.SIGINT)
+    assert "interrupted" in ends(process, 130)
+    wait_for(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
+
+    ends(start(out, cache, "--workers", "2"), 0)
+    assert bits(out) == bits(whole / "out")
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_full_disk(whole, tmp_path):
+    """A file system of 64 kB: the error names the file, nothing half-written counts, and space is all it needs."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", disk], capture_output=True, check=False)
+    if mount.returncode != 0:
+        pytest.skip("may not mount a file system")
+    try:
+        message = ends(start(tmp_path / "out", disk, "--workers", "1"), 1)
+        assert message.startswith(f"error: cannot write {disk}")
+        assert "No space left" in message
+        assert not list(disk.rglob("*.part"))
+        subprocess.run(["mount", "-o", "remount,size=64m", disk], check=True)
+        ends(start(tmp_path / "out", disk, "--workers", "1"), 0)
+        assert bits(tmp_path / "out") == bits(whole / "out")
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+def test_two_processes_share_a_cache(whole, tmp_path):
+    together = [start(tmp_path / name, tmp_path / "cache", "--workers", "1") for name in ("first", "second")]
+    for process in together:
+        ends(process, 0)
+    assert bits(tmp_path / "first") == bits(tmp_path / "second") == bits(whole / "out")
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_damaged_and_swapped_files_are_computed_again(whole, tmp_path):
+    """Of the scenes' looks one is cut and both are swapped; of their outcomes too; a reader would not notice."""
+    looks = sorted((whole / "cache" / "looks").rglob("*.safetensors"))
+    parts = sorted((whole / "out" / "parts").rglob("*.json"))
+    assert len(looks) == len(parts) == 2
+    kept = {file: file.read_bytes() for file in (*looks, *parts)}
+    expected = bits(whole / "out")
+    for files in (looks, parts):
+        for damage in ("swapped", "cut", "flipped"):
+            for file, other in zip(files, reversed(files), strict=True):
+                content = bytearray(kept[other if damage == "swapped" else file])
+                content[-100] ^= 4 if damage == "flipped" else 0
+                file.write_bytes(content[: len(content) // 2] if damage == "cut" else content)
+            if files is looks:
+                for part in parts:
+                    part.unlink()
+            assert run_here(whole) == 0
+            assert bits(whole / "out") == expected, damage
+    again = {file: file.read_bytes() for file in looks}
+    assert [len(again[file]) for file in looks] == [len(kept[file]) for file in looks]
+
+
+def run_here(folder: Path) -> int:
+    """The small search in this process."""
+    import torch
+
+    from eval.search import main
+
+    threads = torch.get_num_threads()
+    try:
+        return main([*SEARCH[3:], "--out", str(folder / "out"), "--cache", str(folder / "cache"), "--workers", "1"])
+    finally:
+        torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "of another kind"])
+def test_damaged_models_are_refused(whole, tmp_path, capsys, damage):
+    from eval.search import main
+    from semfov.observation.foveal import SHIPPED, FovealObservationModel
+
+    model = tmp_path / "model.safetensors"
+    FovealObservationModel.from_pretrained(SHIPPED / "yolov3-tiny.safetensors").save(model)
+    content = bytearray(model.read_bytes())
+    if damage == "cut":
+        content = content[: len(content) // 2]
+    elif damage == "flipped":
+        content[-1000] ^= 1
+    else:
+        content = bytearray(next((whole / "cache" / "looks").rglob("*.safetensors")).read_bytes())
+    model.write_bytes(content)
+    arguments = ["--policies", '["predictive-calibrated"]', "--belief.model", str(model), "--out", str(tmp_path)]
+    assert main([*arguments, "--data.limit", "1", "--workers", "1"]) == 1
+    error = capsys.readouterr().err
+    assert str(model) in error
+    assert error.count("\n") == 1
+
+
+def test_damaged_weights_are_refused(tmp_path, capsys, monkeypatch):
+    from eval.search import main
+    from semfov.detection.weights import fetch
+
+    content = fetch("yolov3-tiny").read_bytes()
+    weights = tmp_path / "tiny.weights"
+    weights.write_bytes(content[:-4])
+    arguments = ["--data.limit", "1", "--workers", "1", "--out", str(tmp_path)]
+    assert main([*arguments, "--detector.weights", str(weights)]) == 1
+    assert "truncated" in capsys.readouterr().err
+
+
+def test_unwritable_output_is_named(tmp_path, capsys, whole):
+    """No user, root included, can make a folder there."""
+    from eval.search import main
+
+    cache = str(whole / "cache")
+    assert main([*SEARCH[3:], "--out", "/proc/semfov", "--cache", cache, "--workers", "1"]) == 1
+    error = capsys.readouterr().err
+    assert "/proc/semfov" in error.splitlines()[-1]
+    assert "Traceback" not in error
