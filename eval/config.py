@@ -127,6 +127,8 @@ class ProtocolConfig:
             target.
         shifts: gaze shifts of an episode.
         ties: equal cells are chosen at `random`, or the `first` by number.
+        control: `none`; `wrong-class`, the searcher is told another class than the one that counts, drawn at random; or
+            `permuted`, the cells that count are drawn at random, as many as hold the target.
         seed: seed of starts and tie-breaking; the same seed gives the same result to the last bit.
         batch: episodes that are run as one tensor (no influence on the result).
     """
@@ -134,6 +136,7 @@ class ProtocolConfig:
     starts: int = 10
     shifts: int = 30
     ties: Literal["random", "first"] = "random"
+    control: Literal["none", "wrong-class", "permuted"] = "none"
     seed: int = 0
     batch: int = 1024
 
@@ -172,6 +175,7 @@ class SearchConfig:
         "predictive-raw",
         "non-predictive-calibrated",
         "predictive-calibrated",
+        "target-evidence",
     )
     out: Path = Path("runs/search")
     cache: Path | None = None

@@ -24,6 +24,7 @@ class Episode:
     Attributes:
         scene: index of the scene in its data set.
         target: class index, 1..K.
+        cue: class that the searcher is told to look for, the target except in a control.
         repetition: which of the starts, from 0.
         start: cell of the first fixation.
         goal: cells that an object of the target class overlaps.
@@ -32,6 +33,7 @@ class Episode:
 
     scene: int
     target: int
+    cue: int
     repetition: int
     start: int
     goal: tuple[int, ...]
@@ -85,7 +87,15 @@ def episodes_of(scenes: Scenes, index: int, columns: int, rows: int, protocol: P
     commonest = max(targets, key=lambda t: (int(counts[t]), -t)) if targets else None
     episodes = []
     for target in targets:
-        goal = covered[labels == target].any(0)
+        goal, cue = covered[labels == target].any(0), target
+        if protocol.control == "permuted":
+            goal = goal[
+                torch.randperm(len(goal), generator=generator_for("goal", protocol.seed, scenes.ids[index], target))
+            ]
+        elif protocol.control == "wrong-class":
+            others = [other for other in range(1, len(scenes.classes) + 1) if other != target]
+            draw = generator_for("cue", protocol.seed, scenes.ids[index], target)
+            cue = others[int(torch.randint(len(others), (1,), generator=draw))]
         free = (~goal).nonzero()[:, 0]
         if not len(free) or not goal.any():
             continue
@@ -94,7 +104,7 @@ def episodes_of(scenes: Scenes, index: int, columns: int, rows: int, protocol: P
         order = torch.cat([torch.randperm(len(free), generator=generator) for _ in range(rounds)])
         cells = tuple(goal.nonzero()[:, 0].tolist())
         episodes += [
-            Episode(index, target, repetition, start, cells, target == commonest)
+            Episode(index, target, cue, repetition, start, cells, target == commonest)
             for repetition, start in enumerate(free[order[: protocol.starts]].tolist())
         ]
     return episodes
@@ -134,7 +144,7 @@ def run_episodes(
         shifts: most gaze shifts.
         batch: episodes in a tensor.
     """
-    looks = Looks(searcher.observer, detections, grid, sorted({episode.target for episode in episodes}))
+    looks = Looks(searcher.observer, detections, grid, sorted({episode.cue for episode in episodes}))
     outcomes: list[Outcome] = []
     for first in range(0, len(episodes), batch):
         part = slice(first, first + batch)
@@ -176,7 +186,7 @@ def _run_batch(
     goals = torch.zeros(count, cells, dtype=torch.bool)
     for row, episode in enumerate(episodes):
         goals[row, list(episode.goal)] = True
-    targets = torch.tensor([episode.target for episode in episodes])
+    cues = torch.tensor([episode.cue for episode in episodes])
     visits = torch.full((count, shifts + 1), -1)
     found_at = torch.full((count,), -1)
     observer = searcher.observer
@@ -193,7 +203,7 @@ def _run_batch(
         if shift == shifts or not go_on.any():
             break
         active, cell, belief, visited = active[go_on], cell[go_on], belief[go_on], visited[go_on]
-        wanted = targets[active]
+        wanted = cues[active]
         acquisition = searcher.acquisition(observer.component(wanted), looks.grid, cell)
         after = step(observer, belief, visited, cell, looks(wanted, cell), acquisition, noise[active, shift])
         left = after.cell >= 0

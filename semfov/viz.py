@@ -280,7 +280,9 @@ def _draw_belief(axes: Axes, scanpath: Scanpath, fixation: int, target: int | No
     width, height = grid.extent.tolist()
     if image is not None:
         _draw_image(axes, scanpath, image, dim=0.3)
-    posteriors = mean(scanpath.beliefs.detach().cpu())[..., index]
+    posteriors = mean(scanpath.beliefs)[..., index].detach().cpu()
+    if scanpath.posterior is not None and index == scanpath.target:
+        posteriors = scanpath.posterior.detach().cpu()
     posterior = posteriors[fixation].reshape(grid.rows, grid.columns)
     # One scale for the whole episode, so that its pictures can be compared.
     axes.imshow(

@@ -1,6 +1,6 @@
 """The search protocol against a scalar twin, the hypergeometric formula and its own independence of batches."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -151,6 +151,18 @@ def test_episodes_start_off_target_and_differ(scenes):
         assert all(episode.start not in episode.goal for episode in mine)
         assert {episode.goal for episode in mine} == {{1: (0, 3), 2: (12,), 3: (20, 21, 22, 23, 24)}[target]}
         assert all(episode.commonest == (target == 1) for episode in mine)
+
+
+def test_controls_change_the_cue_or_the_goal_and_nothing_else(scenes):
+    plain = episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=3))
+    wrong = episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=3, control="wrong-class"))
+    moved = episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=3, control="permuted"))
+    assert all(episode.cue == episode.target for episode in plain + moved)
+    assert all(episode.cue != episode.target and 1 <= episode.cue <= 3 for episode in wrong)
+    assert [replace(episode, cue=episode.target) for episode in wrong] == plain
+    assert [len(episode.goal) for episode in moved] == [len(episode.goal) for episode in plain]
+    assert [episode.goal for episode in moved] != [episode.goal for episode in plain]
+    assert all(episode.start not in episode.goal for episode in moved)
 
 
 def test_an_episode_does_not_depend_on_other_scenes(scenes):
