@@ -21,9 +21,11 @@ from numpy.typing import NDArray
 import semfov
 from eval.cached import checksum
 from eval.metrics import standard_error
+from eval.protocol import Searcher
 from eval.run import Parts, Run
 from eval.saliency import milliseconds_per_map
-from eval.setup import plain, split_policy
+from eval.setup import TARGET_EVIDENCE, plain, split_policy
+from semfov import Detections, Grid
 from semfov.errors import DataError
 from semfov.files import replacing, write_text
 from semfov.gaze import select_fixation
@@ -134,6 +136,8 @@ def _milliseconds(run: Run, name: str, repetitions: int) -> float:
         return milliseconds_per_map(base, run.config.saliency, run.eye, run.scenes[0].image, run.grid(0))
     searcher, grid = run.searcher(name, 0), run.grid(0)
     generator = torch.Generator().manual_seed(0)
+    if base == TARGET_EVIDENCE:
+        return _milliseconds_to_weigh(searcher, grid, len(run.scenes.classes), repetitions)
     start = searcher.observer.start(1, grid, torch.empty(0)).beta
     beta = start + torch.rand(start.shape, generator=generator)
     visited, noise = torch.zeros(1, len(grid), dtype=torch.bool), torch.rand(1, len(grid), generator=generator)
@@ -144,6 +148,20 @@ def _milliseconds(run: Run, name: str, repetitions: int) -> float:
         for _ in range(repetitions):
             began = time.perf_counter()
             select_fixation(acquisition(beta), visited, noise)
+            times.append(time.perf_counter() - began)
+    return 1000 * float(np.median(times))
+
+
+def _milliseconds_to_weigh(searcher: Searcher, grid: Grid, classes: int, repetitions: int) -> float:
+    """As above, where the update of the belief is what decides and takes the time."""
+    observer, nothing = searcher.observer, Detections.empty(1, classes)
+    acquisition, times = searcher.policy(1, grid), []
+    with torch.inference_mode():
+        belief, look = observer.start(1, grid, torch.empty(0)), observer.weigh(nothing, grid.centres[:1], grid, 1)
+        for _ in range(repetitions):
+            began = time.perf_counter()
+            belief = observer.update(belief, look)
+            select_fixation(acquisition(belief.beta), belief.visited, torch.zeros(1, len(grid)))
             times.append(time.perf_counter() - began)
     return 1000 * float(np.median(times))
 

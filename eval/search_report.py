@@ -132,7 +132,7 @@ def draw_scanpaths(run: SearchRun, records: list[Record]) -> list[Path]:
 
 def replay(run: SearchRun, index: int, record: Record) -> Scanpath:
     """The scanpath of a recorded episode, with what was seen and believed at each fixation."""
-    grid, detections, target = run.grid(index), run.detections(index), int(record["target"])
+    grid, detections, target = run.grid(index), run.detections(index), int(record["cue"])
     searcher = run.searcher(record["policy"], index)
     observer = searcher.observer
     looks = Looks(observer, detections, grid, [target])

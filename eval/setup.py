@@ -175,5 +175,7 @@ def plain(settings: dict[str, Any]) -> Any:
 def prepare_worker() -> None:
     """One thread a process, so that detections do not depend on how many share the work; and no repeated notices."""
     torch.set_num_threads(1)
+    # Freeing one large block raises glibc's threshold for handing memory back, or it would do so after every look.
+    torch.empty(31 << 20, dtype=torch.uint8)
     if multiprocessing.parent_process() is not None:
         logging.getLogger("semfov").setLevel(logging.ERROR)

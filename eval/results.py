@@ -1,0 +1,209 @@
+"""Regenerate docs/results.md: `python -m eval.results` runs its experiments and fills in the page.
+
+    python -m eval.results --root val2017 --annotations instances_val2017.json --yolox yolox_nano.onnx
+
+The page's text is docs/results.template.md, in which a line `@@ experiment table` stands for a table of an experiment.
+What a detector sees is computed once and shared; a run that was stopped goes on where it was.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from eval.command import run_command
+from eval.config import (
+    BeliefConfig,
+    DataConfig,
+    DetectorConfig,
+    ExploreConfig,
+    ProtocolConfig,
+    RunConfig,
+    SaliencyConfig,
+    SearchConfig,
+)
+from eval.explore import explore
+from eval.metrics import cumulative_performance, standard_error, success_rate
+from eval.report import Array, Record, table
+from eval.search import search
+from semfov.errors import DataError, lookup
+from semfov.files import write_text
+
+PUBLISHED = ("random", "non-predictive-raw", "predictive-raw", "non-predictive-calibrated", "predictive-calibrated")
+BEYOND = (
+    *PUBLISHED,
+    "vocus2",
+    "itti-koch",
+    "non-predictive-raw+tempered",
+    "non-predictive-raw+central",
+    "non-predictive-raw+tempered+central",
+    "non-predictive-raw+closest",
+    "non-predictive-calibrated+tempered+soft",
+    "non-predictive-calibrated+tempered+soft+misses",
+    "neighbourhood-calibrated+tempered+soft",
+    "foveal-hit-calibrated+tempered+soft+misses",
+    "place-information-calibrated+tempered+soft+misses",
+    "target-evidence",
+)
+EXPLORE = (
+    "random-raw",
+    "kl-raw",
+    "negative-entropy-raw",
+    "two-peaks-raw",
+    "upper-confidence-bound-raw",
+    "vocus2-raw",
+    "itti-koch-raw",
+    "random-calibrated",
+    "kl-calibrated",
+    "expected-accuracy-raw+misses",
+    "expected-accuracy-calibrated+tempered+soft+misses",
+    "random-calibrated+tempered+soft+misses",
+)
+
+
+@dataclass(frozen=True)
+class ResultsConfig:
+    """Which photographs, and where the page goes.
+
+    Args:
+        root: folder of the photographs.
+        annotations: COCO-format instances file for them.
+        yolox: ONNX file of YOLOX-nano (None: the published one).
+        limit: only the first so many photographs, for a trial.
+        only: experiments to run (None: all); the page is written when all have been.
+        page: file to write.
+        template: its text.
+        out: folder for the runs.
+        cache: folder for what the detectors saw (None: the user's cache).
+        workers: processes (None: one for each CPU core).
+    """
+
+    root: Path
+    annotations: Path
+    yolox: Path | None = None
+    limit: int | None = None
+    only: tuple[str, ...] | None = None
+    page: Path = Path("docs/results.md")
+    template: Path = Path("docs/results.template.md")
+    out: Path = Path("runs/results")
+    cache: Path | None = None
+    workers: int | None = None
+
+
+def experiments(config: ResultsConfig) -> dict[str, RunConfig]:
+    """The experiments of the page, by name."""
+    data = DataConfig(root=config.root, annotations=config.annotations, limit=config.limit)
+    detectors = {"tiny": DetectorConfig(), "nano": DetectorConfig(name="yolox-nano", weights=config.yolox)}
+    picture = SaliencyConfig(view="picture")
+    runs: dict[str, RunConfig] = {}
+    for name, detector in detectors.items():
+        common = {"data": data, "detector": detector, "cache": config.cache, "workers": config.workers}
+        seek = partial(SearchConfig, **common, saliency=picture)
+        runs[f"search-{name}"] = seek(policies=BEYOND)
+        for control in ("wrong-class", "permuted"):
+            protocol = ProtocolConfig(control=control)
+            runs[f"{control}-{name}"] = seek(policies=("random", "target-evidence"), protocol=protocol, scanpaths=0)
+        first = ProtocolConfig(ties="first")
+        runs[f"first-index-{name}"] = seek(policies=PUBLISHED, protocol=first, scanpaths=0)
+        tour = partial(ExploreConfig, **common, saliency=picture)
+        runs[f"explore-{name}"] = tour(policies=EXPLORE)
+        published = BeliefConfig(model=f"{'yolov3-tiny' if name == 'tiny' else 'yolox-nano'}-published")
+        models = ("random-calibrated", "kl-calibrated", "negative-entropy-calibrated", "two-peaks-calibrated")
+        runs[f"explore-published-{name}"] = tour(policies=models, belief=published)
+    return {name: replace(run, out=config.out / name) for name, run in runs.items()}
+
+
+def results(config: ResultsConfig) -> None:
+    """Run the experiments and write the page."""
+    runs = experiments(config)
+    chosen = list(runs) if config.only is None else [lookup(name, runs, "experiment") for name in config.only]
+    for name in chosen:
+        print(f"\n== {name}")
+        run = runs[name]
+        if isinstance(run, SearchConfig):
+            search(run)
+        else:
+            explore(run)
+    missing = [name for name, run in runs.items() if not (run.out / "summary.md").exists()]
+    if missing:
+        print(f"not run yet, so {config.page} is left as it is: {', '.join(missing)}")
+        return
+    try:
+        template = config.template.read_text(encoding="utf-8")
+    except OSError as error:
+        raise DataError(f"{config.template}: cannot be read ({error.strerror})") from None
+    write_text(config.page, fill(template, runs))
+    print(f"written: {config.page}")
+
+
+def fill(template: str, runs: dict[str, RunConfig]) -> str:
+    """The template with every line `@@ experiment table` replaced by that table."""
+    lines: list[str] = []
+    for line in template.splitlines():
+        if not line.startswith("@@ "):
+            lines.append(line)
+            continue
+        name, kind = line.removeprefix("@@ ").split()
+        folder = runs[lookup(name, runs, "experiment")].out
+        lines += TABLES[lookup(kind, TABLES, "table")](folder)
+    return "\n".join(lines) + "\n"
+
+
+def summary(folder: Path, section: int | None = None) -> list[str]:
+    """The tables that a run printed, or one of them."""
+    text = (folder / "summary.md").read_text(encoding="utf-8").strip()
+    parts = ["**" + part.strip() for part in text.split("\n**")]
+    parts[0] = parts[0].removeprefix("**")
+    return text.splitlines() if section is None else parts[section].splitlines()
+
+
+def paired(folder: Path, baseline: str, shifts: Sequence[int]) -> list[str]:
+    """Differences of every policy to `baseline` over the same images, in points, with standard errors."""
+    records = [json.loads(line) for line in (folder / "episodes.jsonl").read_text(encoding="utf-8").splitlines()]
+    last = max(shifts)
+    policies = list(dict.fromkeys(record["policy"] for record in records))
+    curves = {policy: per_image([r for r in records if r["policy"] == policy], last) for policy in policies}
+    rows = [[f"difference to {baseline}", *(str(n) for n in shifts), "behind at"]]
+    for policy in policies:
+        if policy == baseline:
+            continue
+        difference = curves[policy] - curves[baseline]
+        mean, error = difference.mean(0), standard_error(difference)
+        cells = [f"{100 * mean[n]:+.1f} ± {100 * error[n]:.1f}" for n in shifts]
+        behind = [n for n in range(1, last + 1) if mean[n] < 0]
+        rows.append([policy, *cells, f"{behind[0]} to {behind[-1]}" if behind else "no shift"])
+    return table(rows)
+
+
+def per_image(records: list[Record], last: int) -> Array:
+    """Figure of merit of each image after 0..`last` gaze shifts, in order of the images, `(images, last+1)`."""
+    images: dict[str, list[Array]] = {}
+    for record in records:
+        if "found_at" in record:
+            curve = cumulative_performance(np.array([record["found_at"]]), last)
+        else:
+            curve = success_rate(record["right"], record["object_cells"])[: last + 1]
+        images.setdefault(str(record["scene"]), []).append(curve)
+    return np.stack([np.mean(images[scene], axis=0) for scene in sorted(images)])
+
+
+TABLES: dict[str, Callable[[Path], list[str]]] = {
+    "all": summary,
+    "first": partial(summary, section=0),
+    "second": partial(summary, section=1),
+    "paired-search": partial(paired, baseline="random", shifts=(1, 5, 15, 30)),
+    "paired-explore": partial(paired, baseline="random-raw", shifts=(1, 2, 3, 4, 10, 20)),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    return run_command(results, ResultsConfig, __doc__, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
