@@ -88,16 +88,16 @@ def run_tasks(
                 for done in as_completed([pool.submit(function, task) for task in tasks]):
                     yield done.result()
                     bar.update()
-            except BrokenProcessPool:
+            except BaseException as error:
+                # Nobody waits for the tasks under way: what they write is whole or not there.
+                for child in set(multiprocessing.active_children()) - set(before):
+                    child.terminate()
+                if not isinstance(error, BrokenProcessPool):
+                    raise
                 raise SemfovError(
                     f"{title}: a worker process died (killed, or out of memory); the same command goes on where this "
                     "one stopped, with --workers 1 in one process"
                 ) from None
-            except BaseException:
-                # Nobody waits for the tasks under way: what they write is whole or not there.
-                for child in set(multiprocessing.active_children()) - set(before):
-                    child.terminate()
-                raise
 
 
 def _prepare(setup: Callable[..., None], settings: tuple[object, ...]) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -101,7 +102,7 @@ def experiments(config: ResultsConfig) -> dict[str, RunConfig]:
     picture = SaliencyConfig(view="picture")
     runs: dict[str, RunConfig] = {}
     for name, detector in detectors.items():
-        common = {"data": data, "detector": detector, "cache": config.cache, "workers": config.workers}
+        common: dict[str, Any] = {"data": data, "detector": detector, "cache": config.cache, "workers": config.workers}
         seek = partial(SearchConfig, **common, saliency=picture)
         runs[f"search-{name}"] = seek(policies=BEYOND)
         for control in ("wrong-class", "permuted"):

@@ -103,10 +103,10 @@ def test_one_misfortune_after_another(whole, tmp_path):
 
 
 def test_full_disk(whole, tmp_path):
-    """A file system of 64 kB: the error names the file, nothing half-written counts, and space is all it needs."""
+    """A file system of 8 kB: the error names the file, nothing half-written counts, and space is all it needs."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    mount = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", disk], capture_output=True, check=False)
+    mount = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8k", "tmpfs", disk], capture_output=True, check=False)
     if mount.returncode != 0:
         pytest.skip("may not mount a file system")
     try:

@@ -1,0 +1,60 @@
+"""The results page: tables come from what runs wrote, and differences are paired."""
+
+import json
+
+import numpy as np
+import pytest
+
+from eval.results import ResultsConfig, experiments, fill, paired, summary
+from eval.setup import split_policy
+from semfov.errors import InputError
+
+
+@pytest.fixture
+def runs(tmp_path):
+    config = ResultsConfig(root=tmp_path, annotations=tmp_path / "a.json", out=tmp_path)
+    made = experiments(config)
+    folder = made["search-tiny"].out
+    folder.mkdir()
+    (folder / "summary.md").write_text("**one** (1)\n\n| a |\n|---|\n| 1 |\n\n**two** (2)\n\n| b |\n")
+    rng = np.random.default_rng(0)
+    records = [
+        {"policy": policy, "scene": scene, "found_at": int(rng.integers(-1, 12))}
+        for policy in ("random", "clever")
+        for scene in range(6)
+        for _ in range(4)
+    ]
+    (folder / "episodes.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    return made, records
+
+
+def test_every_policy_of_the_page_is_known(runs):
+    for run in runs[0].values():
+        kind = "search" if hasattr(run, "scanpaths") else "exploration"
+        for policy in run.policies:
+            split_policy(policy, kind)
+
+
+def test_lines_become_tables(runs):
+    text = fill("before\n@@ search-tiny second\nafter\n", runs[0])
+    assert text == "before\n**two** (2)\n\n| b |\nafter\n"
+    assert summary(runs[0]["search-tiny"].out, 0)[0] == "**one** (1)"
+    with pytest.raises(InputError, match="did you mean 'search-tiny'"):
+        fill("@@ search-tin first\n", runs[0])
+    with pytest.raises(InputError, match="table"):
+        fill("@@ search-tiny third\n", runs[0])
+
+
+def test_differences_are_paired_over_images(runs):
+    made, records = runs
+    rows = paired(made["search-tiny"].out, "random", (1, 5))
+    differences = []
+    for scene in range(6):
+        rate = {
+            policy: np.mean([0 <= r["found_at"] <= 5 for r in records if (r["policy"], r["scene"]) == (policy, scene)])
+            for policy in ("random", "clever")
+        }
+        differences.append(rate["clever"] - rate["random"])
+    expected = f"{100 * np.mean(differences):+.1f} ± {100 * np.std(differences, ddof=1) / np.sqrt(6):.1f}"
+    assert len(rows) == 3
+    assert expected in rows[2]
