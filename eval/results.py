@@ -40,30 +40,53 @@ BEYOND = (
     "vocus2",
     "itti-koch",
     "non-predictive-raw+tempered",
-    "non-predictive-raw+central",
     "non-predictive-raw+tempered+central",
-    "non-predictive-raw+closest",
     "non-predictive-calibrated+tempered+soft",
+    "target-evidence",
+)
+ABLATIONS = (
+    "non-predictive-raw+central",
+    "non-predictive-raw+closest",
     "non-predictive-calibrated+tempered+soft+misses",
     "neighbourhood-calibrated+tempered+soft",
     "foveal-hit-calibrated+tempered+soft+misses",
     "place-information-calibrated+tempered+soft+misses",
-    "target-evidence",
 )
 EXPLORE = (
     "random-raw",
     "kl-raw",
     "negative-entropy-raw",
     "two-peaks-raw",
-    "upper-confidence-bound-raw",
     "vocus2-raw",
     "itti-koch-raw",
     "random-calibrated",
     "kl-calibrated",
     "expected-accuracy-raw+misses",
     "expected-accuracy-calibrated+tempered+soft+misses",
-    "random-calibrated+tempered+soft+misses",
 )
+
+SENSITIVITY: dict[str, dict[str, dict[str, object]]] = {
+    "as published": {},
+    "fovea 50 px": {"sensor": {"sigma": 50.0}},
+    "fovea 200 px": {"sensor": {"sigma": 200.0}},
+    "growth 1": {"sensor": {"growth": 1.0}},
+    "background policy uniform": {"detector": {"background": "uniform"}},
+    "background policy none": {"detector": {"background": "none"}},
+    "score threshold 0.1": {"detector": {"threshold": 0.1}},
+    "prior 0.1": {"belief": {"prior": 0.1}},
+    "prior 2": {"belief": {"prior": 2.0}},
+    "footprint centre": {"belief": {"footprint": "centre"}},
+    "footprint box_centre": {"belief": {"footprint": "box_centre"}},
+    "footprint soft": {"belief": {"footprint": "soft"}},
+    "ties by first index": {"protocol": {"ties": "first"}},
+    "fusion product": {"belief": {"fusion": "product"}},
+    "fusion sum": {"belief": {"fusion": "sum"}},
+    "tempering 0.1": {"belief": {"tempering": 0.1}},
+    "tempering 0.25": {"belief": {"tempering": 0.25}},
+    "tempering 0.5": {"belief": {"tempering": 0.5}},
+    "closest look": {"belief": {"memory": "closest"}},
+}
+"""Settings that change one thing each; of non-predictive search with raw scores."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +98,7 @@ class ResultsConfig:
         annotations: COCO-format instances file for them.
         yolox: ONNX file of YOLOX-nano (None: the published one).
         limit: only the first so many photographs, for a trial.
+        sensitivity: photographs for the study of sensitivity, which has to look anew for every sensor.
         only: experiments to run (None: all); the page is written when all have been.
         page: file to write.
         template: its text.
@@ -87,6 +111,7 @@ class ResultsConfig:
     annotations: Path
     yolox: Path | None = None
     limit: int | None = None
+    sensitivity: int = 30
     only: tuple[str, ...] | None = None
     page: Path = Path("docs/results.md")
     template: Path = Path("docs/results.template.md")
@@ -98,24 +123,37 @@ class ResultsConfig:
 def experiments(config: ResultsConfig) -> dict[str, RunConfig]:
     """The experiments of the page, by name."""
     data = DataConfig(root=config.root, annotations=config.annotations, limit=config.limit)
-    detectors = {"tiny": DetectorConfig(), "nano": DetectorConfig(name="yolox-nano", weights=config.yolox)}
+    detectors = {"nano": DetectorConfig(name="yolox-nano", weights=config.yolox), "tiny": DetectorConfig()}
     picture = SaliencyConfig(view="picture")
     runs: dict[str, RunConfig] = {}
     for name, detector in detectors.items():
         common: dict[str, Any] = {"data": data, "detector": detector, "cache": config.cache, "workers": config.workers}
         seek = partial(SearchConfig, **common, saliency=picture)
-        runs[f"search-{name}"] = seek(policies=BEYOND)
+        runs[f"search-{name}"] = seek(policies=(*ABLATIONS, *BEYOND) if name == "nano" else BEYOND)
         for control in ("wrong-class", "permuted"):
             protocol = ProtocolConfig(control=control)
             runs[f"{control}-{name}"] = seek(policies=("random", "target-evidence"), protocol=protocol, scanpaths=0)
-        first = ProtocolConfig(ties="first")
-        runs[f"first-index-{name}"] = seek(policies=PUBLISHED, protocol=first, scanpaths=0)
+        if name == "nano":
+            first = ProtocolConfig(ties="first")
+            runs[f"first-index-{name}"] = seek(policies=PUBLISHED, protocol=first, scanpaths=0)
         tour = partial(ExploreConfig, **common, saliency=picture)
         runs[f"explore-{name}"] = tour(policies=EXPLORE)
         published = BeliefConfig(model=f"{'yolov3-tiny' if name == 'tiny' else 'yolox-nano'}-published")
         models = ("random-calibrated", "kl-calibrated", "negative-entropy-calibrated", "two-peaks-calibrated")
         runs[f"explore-published-{name}"] = tour(policies=models, belief=published)
-    return {name: replace(run, out=config.out / name) for name, run in runs.items()}
+    some = replace(data, limit=config.sensitivity)
+    base = SearchConfig(
+        some,
+        detectors["nano"],
+        policies=("non-predictive-raw",),
+        cache=config.cache,
+        workers=config.workers,
+        scanpaths=0,
+    )
+    for label, changes in SENSITIVITY.items():
+        parts = {part: replace(getattr(base, part), **values) for part, values in changes.items()}
+        runs[f"sensitivity {label}"] = replace(base, **parts)
+    return {name: replace(run, out=config.out / name.replace(" ", "-")) for name, run in runs.items()}
 
 
 def results(config: ResultsConfig) -> None:
@@ -148,10 +186,26 @@ def fill(template: str, runs: dict[str, RunConfig]) -> str:
         if not line.startswith("@@ "):
             lines.append(line)
             continue
+        if line == "@@ sensitivity":
+            lines += sensitivity_table(runs)
+            continue
         name, kind = line.removeprefix("@@ ").split()
         folder = runs[lookup(name, runs, "experiment")].out
         lines += TABLES[lookup(kind, TABLES, "table")](folder)
     return "\n".join(lines) + "\n"
+
+
+def sensitivity_table(runs: dict[str, RunConfig]) -> list[str]:
+    """One row for each setting, of the curves over all targets."""
+    shifts = (1, 5, 10, 15, 30)
+    rows = [["setting", *(f"CP@{n}" for n in shifts)]]
+    for label in SENSITIVITY:
+        folder = runs[f"sensitivity {label}"].out
+        records = [json.loads(line) for line in (folder / "episodes.jsonl").read_text(encoding="utf-8").splitlines()]
+        curves = per_image(records, max(shifts))
+        mean, error = curves.mean(0), standard_error(curves)
+        rows.append([label, *(f"{100 * mean[n]:.1f} ± {100 * error[n]:.1f}" for n in shifts)])
+    return table(rows)
 
 
 def summary(folder: Path, section: int | None = None) -> list[str]:

@@ -68,10 +68,6 @@ def step(
     return Step(belief, visited, values, select_fixation(values, visited, noise))
 
 
-RECOMMENDED: dict[str, Any] = {"tempering": 0.25, "footprint": "soft"}
-"""Settings of the belief about all classes that account for looks that are not independent."""
-
-
 class ActivePerception(nn.Module):
     """An agent with a foveal sensor that searches an image for a class, or explores it.
 
@@ -154,9 +150,7 @@ class ActivePerception(nn.Module):
             observation,
             grid,
             search_policy("non-predictive"),
-            semantics=SemanticObserver(
-                len(detector.classes) + 1, observation, misses=observation.miss_likelihood, **RECOMMENDED
-            ),
+            semantics=SemanticObserver(len(detector.classes) + 1, misses=observation.miss_likelihood),
             observer=TargetObserver(evidence),
             exploration=exploration_policy("expected-accuracy", observation),
         )

@@ -36,7 +36,7 @@ class FitConfig:
     sensor: SensorConfig = field(default_factory=SensorConfig)
     name: str | None = None
     method: Literal["newton", "fixed_point", "gradient", "discriminative"] = "discriminative"
-    fixations: int = 6
+    fixations: int = 8
     levels: int = 8
     width: float = 50.0
     holdout: int = 10

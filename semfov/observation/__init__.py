@@ -2,9 +2,18 @@
 
 from semfov.observation import dirichlet
 from semfov.observation.calibration import fit_discriminative
+from semfov.observation.folded import FoldedObservationModel
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import match
 from semfov.observation.misses import MissCounts
 from semfov.observation.statistics import DirichletStatistics
 
-__all__ = ["DirichletStatistics", "FovealObservationModel", "MissCounts", "dirichlet", "fit_discriminative", "match"]
+__all__ = [
+    "DirichletStatistics",
+    "FoldedObservationModel",
+    "FovealObservationModel",
+    "MissCounts",
+    "dirichlet",
+    "fit_discriminative",
+    "match",
+]

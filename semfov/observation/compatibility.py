@@ -7,6 +7,16 @@ from typing import Any
 
 from semfov.errors import InputError
 
+CONVERSIONS = (
+    frozenset(
+        {
+            "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14",
+            "c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d",
+        }
+    ),
+)
+"""sha256 of files that are conversions of one checkpoint: here YOLOX-nano's, by Kazuhito00 and by its authors."""
+
 
 def check_classes(fitted: Sequence[str], classes: Sequence[str] | None) -> None:
     """Raise `InputError` unless the class lists are the same."""
@@ -37,15 +47,14 @@ def check_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any]) -> No
     mine, theirs = fitted.get("digest"), detector.get("digest")
     same = fitted.get("name") == detector.get("name")
     if mine and theirs:
-        # A model card may name other conversions of the same checkpoint.
-        same = theirs in (mine, *fitted.get("equivalent", ()))
+        same = mine == theirs or any({mine, theirs} <= files for files in CONVERSIONS)
     if not same:
         raise InputError(
             f"detector: the observation model was fitted for {_describe(fitted)}, got {_describe(detector)}; fit a "
             f"model for this detector, or take the one it was fitted for"
         )
     check_background(fitted, detector.get("background"))
-    _warn_of_others("detector", fitted, detector, {"name", "digest", "equivalent", "background", "winograd", "dtype"})
+    _warn_of_others("detector", fitted, detector, {"name", "digest", "background", "winograd", "dtype"})
 
 
 def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any]) -> None:

@@ -156,7 +156,7 @@ class FovealObservationModel(nn.Module):
     def calibrate(self, scores: Tensor, distance: Tensor) -> Tensor:
         """Calibrated scores, the posterior of the classes, `(..., K+1)`; arguments and errors as `log_likelihood`."""
         logits = self.log_likelihood(scores, distance) * self.tempering
-        return (logits + self.log_prior.t()[self.level(distance)]).softmax(-1).to(scores.dtype)
+        return (logits + F.embedding(self.level(distance), self.log_prior.t())).softmax(-1).to(scores.dtype)
 
     def calibrate_levels(self, scores: Tensor) -> Tensor:
         """`calibrate` for scores `(..., N, K+1)` whose row n is seen at level n, in N products instead of N²."""
@@ -180,7 +180,7 @@ class FovealObservationModel(nn.Module):
         """
         if self.miss_rate is None:
             raise InputError("miss_rate: expected a model that was fitted with miss rates, got none")
-        return self.miss_rate.t()[self.level(distance)]
+        return F.embedding(self.level(distance), self.miss_rate.t())
 
     def forward(self, scores: Tensor, distance: Tensor) -> Tensor:
         """As `calibrate`."""

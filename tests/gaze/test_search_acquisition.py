@@ -8,7 +8,6 @@ from semfov.errors import InputError
 from semfov.gaze import search_policy
 from semfov.gaze.acquisition import PredictedTargetPosterior, Static, TargetPosterior, Uniform
 
-
 GRID = Grid(3, 2, (30, 20))
 
 

@@ -11,6 +11,7 @@ import torch
 
 from semfov.errors import DataError, InputError
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet, foveal
+from semfov.observation.compatibility import CONVERSIONS, check_detector
 from semfov.observation.fitting import estimate_prior, expected_table, fit_table
 
 CLASSES = ["cup", "cat", "dog"]
@@ -423,3 +424,10 @@ def test_settings_of_an_eye_are_checked_too():
 def test_bad_arguments_are_named(call):
     with pytest.raises(InputError, match="expected"):
         call()
+
+
+def test_conversions_of_one_checkpoint_are_one_detector():
+    pair = sorted(CONVERSIONS[0])
+    check_detector({"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": pair[1]})
+    with pytest.raises(InputError, match="fitted for"):
+        check_detector({"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": "0" * 64})

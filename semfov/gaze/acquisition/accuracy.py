@@ -49,7 +49,7 @@ class ExpectedAccuracy(nn.Module):
         super().__init__()
         if model.miss_rate is None:
             raise InputError("model: expected an observation model with miss rates, got one without")
-        right = model.expected_scores().diagonal(dim1=0, dim2=2).t()
+        right = model.expected_scores().detach().diagonal(dim1=0, dim2=2).t()
         self.register_buffer("levels", model.level(grid.cell_distance))
         self.register_buffer("miss", model.miss_rate[1:])
         self.register_buffer("named", (1 - model.miss_rate[1:]) * right[1:])

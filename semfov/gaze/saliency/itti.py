@@ -170,7 +170,9 @@ def itti_koch_saliency(image: Tensor, *, normalise: bool = True) -> Tensor:
     >>> 72 <= row < 104 and 40 <= column < 72
     True
     """
-    saliency = promote(conspicuity(image)).mean(1, keepdim=True)
+    # Whether a pixel is a peak hangs on its last digits: half precision finds peaks everywhere, and saliency nowhere.
+    with torch.autocast(image.device.type, enabled=False):
+        saliency = promote(conspicuity(image)).mean(1, keepdim=True)
     size = (image.shape[-2], image.shape[-1])
     saliency = F.interpolate(saliency, size, mode="bilinear", align_corners=False)[:, 0]
     return rescale(saliency) if normalise else saliency

@@ -1,0 +1,71 @@
+"""The models that the package ships: whole, small, told apart by detector, and fitted as the cards say."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import semfov
+from semfov.belief import target_evidence
+from semfov.observation import foveal
+
+OBSERVATION = sorted(foveal.SHIPPED.glob("*.safetensors"))
+TARGET = sorted(target_evidence.SHIPPED.glob("*.safetensors"))
+
+
+@pytest.mark.parametrize("path", OBSERVATION, ids=lambda path: path.stem)
+def test_observation_model(path):
+    model = semfov.FovealObservationModel.from_pretrained(path.stem)
+    assert path.stat().st_size < 1_100_000
+    assert len(model.classes) == 80
+    assert model.alpha.shape == (81, 8, 81)
+    assert bool((model.miss_rate > 0).all() and (model.miss_rate < 1).all())
+    # Objects are missed more often far out than near the fovea.
+    assert model.miss_rate[1:, -1].mean() > model.miss_rate[1:, 0].mean()
+    assert sum(map(sum, model.metadata["counts"])) == model.metadata["samples"]
+    card = (Path(path).parent / "README.md").read_text(encoding="utf-8")
+    assert f"`{path.stem}`" in card
+    text = json.dumps(model.metadata)
+    assert "/" not in text.replace("://", "")
+
+
+@pytest.mark.parametrize("path", TARGET, ids=lambda path: path.stem)
+def test_target_evidence(path):
+    model = semfov.TargetEvidence.from_pretrained(path.stem)
+    assert path.stat().st_size < 100_000
+    assert model.metadata["detector"]["name"] == path.stem
+    grid = semfov.Grid(10, 10, (640, 480))
+    box = torch.tensor([[[300.0, 200.0, 360.0, 260.0]]])
+    scores = torch.full((1, 1, 81), 0.001)
+    scores[..., 7] = 0.92
+    seen = semfov.Detections(box, scores, torch.ones(1, 1, dtype=torch.bool))
+    with torch.no_grad():
+        odds = model(seen, torch.tensor([[330.0, 230.0]]), grid, 7)[0]
+        other = model(seen, torch.tensor([[330.0, 230.0]]), grid, 8)[0]
+    middle = int(grid.cell_of(torch.tensor([330.0, 230.0])))
+    assert odds.argmax() == middle
+    assert odds[middle] > 0 > other[middle]
+
+
+def test_both_kinds_exist_for_every_detector():
+    names = {path.stem for path in TARGET}
+    assert names == {"yolov3-tiny", "yolox-nano"}
+    assert {path.stem for path in OBSERVATION} == names | {f"{name}-published" for name in names}
+
+
+@pytest.mark.weights
+def test_recommended_agent_searches_and_explores():
+    agent = semfov.ActivePerception.from_pretrained("yolov3-tiny")
+    scenes = semfov.EmbeddedScenes(agent.eye.detector.classes, count=1)
+    scene = scenes[0]
+    target = scenes.targets(0)[0]
+    found = agent.search(scene.image, target, boxes=scene.boxes[scene.labels == target], start=0)
+    assert found.found
+    assert found.shifts <= 10
+    assert found.beliefs.shape[-1] == 81
+    assert found.posterior.shape == (len(found), 100)
+    assert bool(((found.posterior >= 0) & (found.posterior <= 1)).all())
+    explored = agent.explore(scene.image, start=0, shifts=2)
+    assert explored.posterior is None
+    assert len(explored) == 3
