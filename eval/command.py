@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 from jsonargparse import ArgumentParser, set_parsing_settings
@@ -11,14 +12,24 @@ from semfov.errors import SemfovError
 Config = TypeVar("Config")
 
 
-def make_parser(config: type[Any], description: str | None) -> ArgumentParser:
-    """A parser with an option for every field of `config`, nested fields dotted, and `--config FILE.yaml`."""
+def make_parser(
+    config: type[Any], description: str | None, positional: tuple[str, str] | None = None
+) -> ArgumentParser:
+    """A parser with an option for every field of `config`, nested fields dotted, and `--config FILE.yaml`.
+
+    Args:
+        config: dataclass of the settings.
+        description: for `--help`.
+        positional: a path among the fields that is given without its name and may be left out, and its help.
+    """
     set_parsing_settings(docstring_parse_attribute_docstrings=False)
     parser = ArgumentParser(
         prog=None, description=description, default_env=False, formatter_class=_formatter(), exit_on_error=True
     )
     parser.add_argument("--config", action="config", help="YAML file with settings; options after it override it.")
-    parser.add_class_arguments(config, as_group=True)
+    if positional is not None:
+        parser.add_argument(positional[0], nargs="?", type=Path, help=positional[1])
+    parser.add_class_arguments(config, as_group=True, skip=set() if positional is None else {positional[0]})
     return parser
 
 
@@ -38,13 +49,15 @@ def run_command(
     config: type[Config],
     description: str | None,
     arguments: Sequence[str] | None = None,
+    *,
+    positional: tuple[str, str] | None = None,
 ) -> int:
     """Parse `arguments` into a `config` and call `main` with it.
 
     Returns:
         0, or 1 after a `SemfovError` (printed in one line), or 130 after Ctrl-C; usage errors exit with 2.
     """
-    parser = make_parser(config, description)
+    parser = make_parser(config, description, positional)
     parsed = parser.parse_args(arguments)
     parsed.pop("config", None)
     settings = parser.instantiate(parsed)

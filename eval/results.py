@@ -99,7 +99,7 @@ class ResultsConfig:
         yolox: ONNX file of YOLOX-nano (None: the published one).
         limit: only the first so many photographs, for a trial.
         sensitivity: photographs for the study of sensitivity, which has to look anew for every sensor.
-        only: experiments to run (None: all); the page is written when all have been.
+        only: experiments to run (None: all); the page says of the others what is there from before, or nothing.
         page: file to write.
         template: its text.
         out: folder for the runs.
@@ -167,10 +167,6 @@ def results(config: ResultsConfig) -> None:
             search(run)
         else:
             explore(run)
-    missing = [name for name, run in runs.items() if not (run.out / "summary.md").exists()]
-    if missing:
-        print(f"not run yet, so {config.page} is left as it is: {', '.join(missing)}")
-        return
     try:
         template = config.template.read_text(encoding="utf-8")
     except OSError as error:
@@ -191,7 +187,8 @@ def fill(template: str, runs: dict[str, RunConfig]) -> str:
             continue
         name, kind = line.removeprefix("@@ ").split()
         folder = runs[lookup(name, runs, "experiment")].out
-        lines += TABLES[lookup(kind, TABLES, "table")](folder)
+        make = TABLES[lookup(kind, TABLES, "table")]
+        lines += make(folder) if (folder / "summary.md").exists() else ["*Not run yet.*"]
     return "\n".join(lines) + "\n"
 
 
@@ -201,6 +198,9 @@ def sensitivity_table(runs: dict[str, RunConfig]) -> list[str]:
     rows = [["setting", *(f"CP@{n}" for n in shifts)]]
     for label in SENSITIVITY:
         folder = runs[f"sensitivity {label}"].out
+        if not (folder / "summary.md").exists():
+            rows.append([label, *("not run yet" for _ in shifts)])
+            continue
         records = [json.loads(line) for line in (folder / "episodes.jsonl").read_text(encoding="utf-8").splitlines()]
         curves = per_image(records, max(shifts))
         mean, error = curves.mean(0), standard_error(curves)

@@ -5,16 +5,53 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
+
+import semfov
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow]
 
+ROOT = Path(__file__).parents[1]
+
+
+def run(name, *arguments):
+    """What an example prints."""
+    call = [sys.executable, "-m", f"examples.{name}", *map(str, arguments)]
+    return subprocess.run(call, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+
 
 def test_finetuning_raises_the_chance_of_a_hit():
-    call = [sys.executable, "-m", "examples.finetune_observation", "--scenes", "2", "--starts", "4", "--steps", "12"]
-    root = Path(__file__).parents[1]
-    output = subprocess.run(call, cwd=root, check=True, capture_output=True, text=True).stdout
+    output = run("finetune_observation", "--scenes", 2, "--starts", 4, "--steps", 12)
     steps = [float(value) for value in re.findall(r"step .*fixation ([\d.]+) %", output)]
     assert len(steps) == 2
     assert steps[1] > steps[0]
     assert "after training" in output
+
+
+def test_foveating_keeps_what_is_looked_at(tmp_path):
+    photo, out = tmp_path / "photo.png", tmp_path / "foveated.png"
+    noise = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(photo)
+    run("foveate_image", photo, "--gaze", 40, 60, "--sigma", 12, "--out", out)
+    change = np.abs(np.asarray(Image.open(out), dtype=float) - noise).mean(-1)
+    assert change[59:62, 39:42].mean() < 3
+    assert change[:, 130:].mean() > 40
+
+
+def test_searching_draws_the_scanpath(tmp_path):
+    output = run("search_photograph", "--out", tmp_path / "scanpath.png")
+    assert "fixation 0 at (32, 24)" in output
+    assert re.search(r"“cup” (found after|not found in) \d+ gaze shift", output)
+    with Image.open(tmp_path / "scanpath.png") as picture:
+        assert min(picture.size) > 500
+
+
+def test_own_detector_gets_an_observation_model(tmp_path):
+    output = run("own_onnx_detector", "--scenes", 3, "--looks", 4, "--out", tmp_path / "model.safetensors")
+    raw, fitted = (float(value) for value in re.findall(r": ([\d.]+) nats", output))
+    assert fitted < raw
+    model = semfov.FovealObservationModel.from_pretrained(tmp_path / "model.safetensors")
+    assert len(model.classes) == 80
+    assert int(np.sum(model.metadata["counts"])) == int(re.search(r"fitted to (\d+)", output)[1])

@@ -2,18 +2,29 @@
 
 import warnings
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
 import torch
+from mpl_toolkits.mplot3d import Axes3D
 
 from semfov import Detections, Grid, InputError, Scanpath
+from semfov.gaze.saliency import cell_saliency
 from semfov.viz import (
+    COLOURS,
+    entropy,
     plot_belief,
+    plot_belief_bars,
+    plot_belief_strip,
     plot_cumulative_performance,
     plot_episode,
+    plot_fixation,
+    plot_foveated_strip,
     plot_reliability,
+    plot_saliency,
     plot_scanpath,
+    plot_semantic_map,
     plot_success_rate,
 )
 
@@ -74,8 +85,14 @@ def test_many_curves_can_be_told_apart():
 def test_scanpath_shows_numbered_fixations(scanpath, image):
     figure = draw(plot_scanpath(scanpath, image, boxes=torch.tensor([[60.0, 45, 79, 59]])))
     axes = figure.axes[0]
-    assert [text.get_text() for text in axes.texts] == ["0", "1", "2"]
+    assert [text.get_text() for text in axes.texts] == ["0", "1", "2", "cat 0.80", "cup 0.60"]
+    numbers = np.array([text.get_position() for text in axes.texts[:3]])
+    np.testing.assert_allclose(numbers, scanpath.fixations + 0.5)
     np.testing.assert_allclose(axes.lines[-4].get_xydata(), scanpath.fixations + 0.5)
+    framed = {patch.get_bbox().bounds: patch.get_linestyle() for patch in axes.patches}
+    assert framed == {(60, 45, 19, 14): "--", (10, 10, 20, 20): "-", (50, 40, 20, 15): "-"}
+    bare = draw(plot_scanpath(scanpath, image, detections=False))
+    assert len(bare.axes[0].texts) == 3
     assert axes.get_title() == "“cup” found after 2 gaze shifts"
     explored = draw(plot_scanpath(replace(scanpath, target=None, found=False), image))
     assert explored.axes[0].get_title() == "explored with 2 gaze shifts"
@@ -86,6 +103,142 @@ def test_belief_is_the_posterior(scanpath):
     shown = np.asarray(figure.axes[0].images[0].get_array())
     belief = scanpath.beliefs[1]
     np.testing.assert_allclose(shown, (belief[:, 2] / belief.sum(1)).reshape(3, 4), rtol=1e-6)
+
+
+def test_belief_refuses_what_is_not_there(scanpath):
+    for arguments, named in [((3,), "fixation"), ((-4,), "fixation")]:
+        with pytest.raises(InputError, match=named):
+            plot_belief(scanpath, *arguments)
+    with pytest.raises(InputError, match="target"):
+        plot_belief(scanpath, target=3)
+
+
+def test_belief_of_the_search_comes_before_that_of_the_map(scanpath):
+    searched = replace(scanpath, posterior=torch.rand(3, 12))
+    shown = np.asarray(draw(plot_belief(searched)).axes[0].images[0].get_array())
+    np.testing.assert_allclose(shown, searched.posterior[-1].reshape(3, 4))
+    other = np.asarray(draw(plot_belief(searched, target=1)).axes[0].images[0].get_array())
+    belief = scanpath.beliefs[-1]
+    np.testing.assert_allclose(other, (belief[:, 1] / belief.sum(1)).reshape(3, 4), rtol=1e-6)
+
+
+def test_belief_strip_shows_every_fixation_on_one_scale(scanpath, image):
+    figure = draw(plot_belief_strip(scanpath, image=image, columns=2))
+    belief = scanpath.beliefs[..., 2] / scanpath.beliefs.sum(-1)
+    maps = [axes.images[-1] for axes in figure.axes if axes.get_title()]
+    np.testing.assert_allclose([np.asarray(m.get_array()).ravel() for m in maps], belief, rtol=1e-6)
+    assert {m.get_clim() for m in maps} == {(0, float(belief.max()))}
+
+
+def test_bars_are_as_high_as_the_posterior(scanpath):
+    with mock.patch.object(Axes3D, "bar3d", autospec=True, side_effect=Axes3D.bar3d) as drawn:
+        draw(plot_belief_bars(scanpath, most=2))
+    belief = scanpath.beliefs[..., 2] / scanpath.beliefs.sum(-1)
+    assert drawn.call_count == 2
+    for call, fixation in zip(drawn.call_args_list, (0, 2), strict=True):
+        axes, x, y, bottom, _, _, height = call.args
+        assert bottom == 0
+        np.testing.assert_allclose(height, belief[fixation], rtol=1e-6)
+        np.testing.assert_allclose(x, np.tile(np.arange(4), 3) + 0.1)
+        np.testing.assert_allclose(y, np.repeat([2, 1, 0], 4) + 0.1)
+        assert axes.get_zlim()[1] >= float(belief.max())
+
+
+def test_strip_shows_views_with_their_detections(scanpath, image):
+    views = [image * share for share in (0.2, 0.5, 0.8)]
+    figure = draw(plot_foveated_strip(scanpath, views, most=2))
+    assert [axes.get_title() for axes in figure.axes] == ["fixation 0", "fixation 2"]
+    for axes, view in zip(figure.axes, (views[0], views[2]), strict=True):
+        np.testing.assert_allclose(np.asarray(axes.images[0].get_array()), view.permute(1, 2, 0))
+        assert {text.get_text() for text in axes.texts} == {"cat 0.80", "cup 0.60"}
+        colours = {patch.get_edgecolor() for patch in axes.patches}
+        assert len(colours) == 2  # the target's and another
+
+
+def test_views_may_be_smaller_than_the_photograph(scanpath, image):
+    figure = draw(plot_foveated_strip(scanpath, [image[:, ::2, ::2]] * 3))
+    assert tuple(figure.axes[0].images[0].get_extent()) == (0, 80, 60, 0)
+
+
+def test_labels_do_not_overlap(scanpath, image):
+    boxes = torch.tensor([[[10.0, 10, 30, 30], [11, 11, 31, 31], [12, 12, 32, 32], [9, 9, 29, 29]]])
+    crowd = Detections(boxes, torch.tensor([[[0.1, 0.8, 0.1]]]).expand(1, 4, 3), torch.ones(1, 4, dtype=torch.bool))
+    figure = draw(plot_foveated_strip(replace(scanpath, detections=(crowd,) * 3), [image] * 3))
+    for axes in figure.axes:
+        extents = [text.get_window_extent().padded(-0.5) for text in axes.texts]
+        assert len(extents) == 4
+        assert not any(a.overlaps(b) for n, a in enumerate(extents) for b in extents[n + 1 :])
+
+
+def test_fixation_is_scanpath_view_and_belief(scanpath, image):
+    path, seen, believed = draw(plot_fixation(scanpath, 1, image, image * 0.5)).axes
+    assert [text.get_text() for text in path.texts] == ["0", "1"]
+    np.testing.assert_allclose(np.asarray(seen.images[0].get_array()), (image * 0.5).permute(1, 2, 0))
+    belief = scanpath.beliefs[1]
+    shown = np.asarray(believed.images[-1].get_array()).ravel()
+    np.testing.assert_allclose(shown, belief[:, 2] / belief.sum(1), rtol=1e-6)
+    explored = draw(plot_fixation(replace(scanpath, target=None), 1, image, image))
+    assert explored.axes[2].get_title() == "what is where after fixation 1"
+
+
+def test_semantic_map_names_what_is_more_probable_than_background():
+    beliefs = torch.tensor([[[1.0, 50, 1], [1, 50, 1], [50, 9, 9], [1, 1, 1], [1, 1, 50], [50, 9, 9]]])
+    grid = Grid(3, 2, (30, 20))
+    nothing = Detections.empty(1, 2)
+    scanpath = Scanpath(
+        grid, ("background", "cat", "cup"), None, torch.tensor([0]), grid.centres[:1], (nothing,), beliefs,
+        torch.zeros(1, 6), False,
+    )  # fmt: skip
+    named, unsure, *_ = draw(plot_semantic_map(scanpath)).axes
+    texts = {text.get_text(): text.get_position() for text in named.texts}
+    assert set(texts) == {"cat", "cup"}
+    assert texts["cup"] == (15, 15)
+    p = beliefs[0] / beliefs[0].sum(-1, keepdim=True)
+    np.testing.assert_allclose(np.asarray(named.images[-1].get_array()).ravel(), p[:, 1:].amax(-1), rtol=1e-6)
+    bits = -(p * p.log2()).sum(-1)
+    np.testing.assert_allclose(entropy(scanpath)[0], bits, rtol=1e-5)
+    np.testing.assert_allclose(np.asarray(unsure.images[-1].get_array()).ravel(), bits, rtol=1e-5)
+
+
+def test_saliency_frames_the_most_salient_cell(image):
+    saliency = torch.rand(30, 40)
+    saliency[25, 33] = 2
+    grid = Grid(4, 3, (80, 60))
+    picture, whole, cells, *_ = draw(plot_saliency(saliency, image, grid=grid)).axes
+    np.testing.assert_allclose(np.asarray(picture.images[0].get_array()), image.permute(1, 2, 0))
+    np.testing.assert_allclose(np.asarray(whole.images[0].get_array()), saliency)
+    expected = cell_saliency(saliency[None], 4, 3, "max")[0]
+    np.testing.assert_allclose(np.asarray(cells.images[0].get_array()).ravel(), expected)
+    (frame,) = cells.patches
+    assert frame.get_bbox().bounds == (60, 40, 20, 20)
+    assert len(draw(plot_saliency(saliency, image)).axes) == 3  # photograph, map, its scale
+
+
+def test_figures_look_the_same_whatever_the_settings():
+    import matplotlib as mpl
+
+    curves = {"random": np.linspace(0, 1, 5)}
+    with mpl.rc_context({"font.size": 30, "xtick.labelsize": 40, "axes.titlesize": 50}):
+        axes = draw(plot_cumulative_performance(curves, title="t")).axes[0]
+        sizes = axes.title.get_size(), axes.xaxis.label.get_size(), axes.get_xticklabels()[0].get_size()
+    assert sizes == (9, 9, 8)
+
+
+def test_colours_differ_in_lightness_or_hue_for_dichromats():
+    """The least distance in CIELAB as people without red or green cones see it (Viénot et al. 1999)."""
+    from itertools import combinations
+
+    from skimage.color import rgb2lab
+
+    codes = [[int(code[n : n + 2], 16) / 255 for n in (1, 3, 5)] for code in COLOURS]
+    linear = np.array(codes) ** 2.2
+    to_lms = np.array([[17.8824, 43.5161, 4.11935], [3.45565, 27.1554, 3.86714], [0.0299566, 0.184309, 1.46709]])
+    protan = np.array([[0, 2.02344, -2.52581], [0, 1, 0], [0, 0, 1]])
+    deutan = np.array([[1, 0, 0], [0.494207, 0, 1.24827], [0, 0, 1]])
+    for lack in (np.eye(3), protan, deutan):
+        seen = np.clip(linear @ (np.linalg.inv(to_lms) @ lack @ to_lms).T, 0, 1) ** (1 / 2.2)
+        lab = rgb2lab(seen[None])[0]
+        assert min(np.linalg.norm(a - b) for a, b in combinations(lab, 2)) > 15
 
 
 def test_episode_has_one_scale_and_at_most_so_many_panels(scanpath, image):

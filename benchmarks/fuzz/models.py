@@ -70,7 +70,7 @@ def darknet_files(data: st.DataObject) -> str:
         lines = CFG.splitlines()
         damage = choose(data, ("none", "line", "bytes", "cut", "weights"), "damage")
         if damage == "line":
-            junk = ["filters=0", "filters=-3", "stride=0", "groups=5", "[rnn]", "mask=9", "anchors=", "="]
+            junk = ["filters=0", "size=99999", "filters=-3", "stride=0", "groups=5", "[rnn]", "mask=9", "anchors=", "="]
             lines[data.draw(st.integers(0, len(lines) - 1), label="line")] = choose(data, junk, "junk")
         text = "\n".join(lines).encode()
         cfg.write_bytes(changed(text, damage, rng) if damage in ("bytes", "cut") else text)

@@ -10,6 +10,9 @@ from semfov.detection.darknet_config import Section
 from semfov.detection.darknet_layers import ACTIVATIONS, Convolution, Head, MaxPool, Route, Shortcut, Upsample
 from semfov.errors import DataError
 
+# The largest of YOLOv3's convolutions has 5 million; a typing error should not fill the memory.
+_MOST_PARAMETERS = 10**9
+
 # Keys that would change what a layer computes, with the only value that is implemented.
 _NEUTRAL = {
     "convolutional": {"binary": "0", "xnor": "0", "dilation": "1", "antialiasing": "0"},
@@ -67,6 +70,8 @@ class Builder:
         if here.channels % groups or filters % groups:
             raise DataError(f"{section.where}: groups={groups} divides not both {here.channels} and {filters} channels")
         size, stride = section.integer("size", 1), section.integer("stride", 1)
+        if here.channels // groups * filters * size**2 > _MOST_PARAMETERS:
+            raise DataError(f"{section.where}: a convolution of more than {_MOST_PARAMETERS} parameters; check the cfg")
         same = section.integer("pad", 0, minimum=0)
         self._note(filters, here.step * stride)
         return Convolution(

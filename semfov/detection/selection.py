@@ -8,6 +8,7 @@ from torch import Tensor
 from semfov.detection.detections import Detections
 from semfov.detection.placement import Placement
 from semfov.detection.scores import BackgroundPolicy, Candidates, score_vectors
+from semfov.errors import check, check_finite, values_known
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,17 @@ def select(
     )
 
 
+def _check(image: int, confidence: Tensor, kept: Candidates) -> None:
+    """Raise `InputError` where a detector returns NaN, or for a box that is kept what is no score or no place."""
+    if not values_known():
+        return
+    check_finite(confidence.detach(), f"detector: confidence in image {image}")
+    check_finite(kept.boxes.detach(), f"detector: boxes in image {image}")
+    for name, scores in (("class scores", kept.classes), ("objectness", kept.objectness)):
+        inside = scores is None or bool(((scores.detach() >= 0) & (scores.detach() <= 1)).all())
+        check(inside, f"detector: {name} in image {image}", "numbers in [0, 1]", "some outside")
+
+
 def _select_one(
     candidates: Candidates,
     image: int,
@@ -46,8 +58,9 @@ def _select_one(
     selection: Selection,
     policy: BackgroundPolicy,
 ) -> Detections:
-    confident = candidates.confidence[image] >= selection.threshold
-    rows = candidates.take(image, confident.nonzero()[:, 0])
+    confidence = candidates.confidence[image]
+    rows = candidates.take(image, (confidence >= selection.threshold).nonzero()[:, 0])
+    _check(image, confidence, rows)
     boxes = rows.boxes if placement is None else placement.boxes_to_image(rows.boxes)
     keep = suppress(boxes, rows.confidence, rows.classes.argmax(-1), selection)
     scores = score_vectors(rows, policy)[keep]

@@ -5,7 +5,7 @@ from typing import get_args
 import torch
 from torch import Tensor, nn
 
-from semfov.errors import check, check_finite, check_shape, lookup
+from semfov.errors import check, check_finite, check_shape, lookup, values_known
 from semfov.sensor.pyramid import Bands, Convention, constant, laplacian_pyramid, places, pyrup
 
 
@@ -143,8 +143,10 @@ def _collapse(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Ten
             # All fixations share the coarsest level.
             result = torch.addcmul(expanded[:, None], window, band[:, None]).flatten(0, 1)
         else:
-            expanded.unflatten(0, (batch, many)).addcmul_(window, band[:, None])
-            result = expanded
+            views = expanded.unflatten(0, (batch, many))
+            # In place where nothing keeps a record of it, which saves memory that is fresh.
+            blend = views.addcmul_ if values_known() else views.addcmul
+            result = blend(window, band[:, None]).flatten(0, 1)
     return result.unflatten(0, (batch, many))
 
 
@@ -186,7 +188,7 @@ def _widths(sigma: float | Tensor, like: Tensor) -> Tensor:
 
 
 def _check_values(gaze: Tensor, sigma: float | Tensor, growth: float | Tensor) -> None:
-    if torch.compiler.is_compiling():
+    if not values_known():
         return
     check_finite(gaze, "gaze")
     for name, value in (("sigma", sigma), ("growth", growth)):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.errors import check, check_shape, lookup
+from semfov.errors import check, check_shape, lookup, values_known
 
 Convention = Literal["kornia", "opencv"]
 
@@ -151,7 +151,7 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
         smaller = pyrdown(image, convention)
         expanded = pyrup(smaller, (image.shape[-2], image.shape[-1]), convention)
         # Fresh memory costs more than the difference itself, so it is taken only where a gradient or a graph needs it.
-        fresh = expanded.requires_grad or torch.compiler.is_compiling()
+        fresh = expanded.requires_grad or not values_known()
         details.append(image - expanded if fresh else torch.sub(image, expanded, out=expanded))
         image = smaller
     return Bands(tuple(details), image, convention)
@@ -209,7 +209,7 @@ def _resize(image: Tensor, length: int) -> Tensor:
 def _convolves(image: Tensor) -> bool:
     """Whether `_convolve` is fast and precise here: oneDNN's convolutions are, for single precision on a CPU."""
     fast = _ONEDNN and image.device.type == "cpu" and image.dtype == torch.float32
-    return fast and image.shape[-2] >= 8 and not torch.compiler.is_compiling()
+    return fast and image.shape[-2] >= 8 and values_known()
 
 
 def _convolve(image: Tensor, length: int, convention: Convention) -> Tensor:

@@ -65,7 +65,7 @@ def loop(looks, *, tempering=1.0, footprint="overlap", memory="all", missed=None
         {"memory": "closest"},
         {"misses": misses},
     ],
-    ids=str,
+    ids=["published", "tempered", "soft", "centre", "closest", "misses"],
 )
 def test_belief_equals_the_loop(looks, options):
     belief = watch(SemanticObserver(4, **options), looks)

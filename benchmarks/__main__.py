@@ -1,0 +1,156 @@
+"""Everything measured, beside its peers, in one run: `python -m benchmarks`.
+
+Every figure is a ratio of times within one repetition of both programs, as median and quartiles over repetitions. With
+one thread, the default, times are the processor's, which other work on the machine changes little; with more, the
+clock's. Results go to `benchmarks/results/NAME.md` and `NAME.json`.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from benchmarks.beliefs import exploration, kaplan_update, predictive_search
+from benchmarks.fits import dirichlets
+from benchmarks.growth import grow
+from benchmarks.images import foveation, saliency, use_threads
+from benchmarks.limits import limits
+from benchmarks.machine import copy_bandwidth, describe
+from benchmarks.rollouts import rollouts
+from benchmarks.timing import Comparison, Measured, Spread, measure
+
+RESULTS = Path(__file__).parent / "results"
+
+COMPARISONS: tuple[Callable[[], Comparison], ...] = (
+    lambda: foveation("opencv", reuse=False),
+    lambda: foveation("opencv", reuse=True),
+    lambda: foveation("kornia", reuse=False),
+    lambda: foveation("kornia", reuse=True),
+    dirichlets,
+    kaplan_update,
+    predictive_search,
+    lambda: exploration("KL divergence"),
+    lambda: exploration("negative entropy"),
+    lambda: saliency("VOCUS2"),
+    lambda: saliency("Itti-Koch"),
+    rollouts,
+)
+
+
+def number(value: float) -> str:
+    """Three digits."""
+    return f"{value:.3g}" if value < 100 else f"{value:,.0f}"
+
+
+def spread(values: Spread) -> str:
+    """Median and quartiles."""
+    return f"{number(values.middle)} ({number(values.low)} to {number(values.high)})"
+
+
+def comparison_rows(measured: Measured) -> list[list[str]]:
+    """One row for each peer."""
+    times = measured.milliseconds
+    return [
+        [measured.name, peer, number(times["semfov"].middle), number(times[peer].middle), spread(ratio)]
+        for peer, ratio in measured.ratios.items()
+    ]
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    """Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+@torch.inference_mode()
+def main() -> None:
+    """Measure everything and write the tables."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.splitlines()[0])
+    parser.add_argument("--name", default="cpu", help="of the result files")
+    parser.add_argument("--seconds", type=float, default=4.0, help="for each comparison, at least")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    use_threads(options.threads)
+    clock = time.process_time if options.threads == 1 else time.perf_counter
+    about = describe() | {"times": "of the processor" if options.threads == 1 else "of the clock"}
+    bandwidth = copy_bandwidth(min(options.seconds, 1.0), clock)
+    measured = []
+    for make in COMPARISONS:
+        measured.append(measure(make(), options.seconds, clock))
+        for row in comparison_rows(measured[-1]):
+            print(" | ".join(row), flush=True)
+    grown, found = grow(options.seconds / 2, clock), limits(bandwidth, options.seconds / 2, clock)
+    text = report(about, bandwidth, measured, grown, found)
+    options.out.mkdir(parents=True, exist_ok=True)
+    figures = {
+        "machine": about,
+        "copy_bandwidth": bandwidth,
+        "comparisons": [asdict(each) for each in measured],
+        "growth": {
+            name: {"ms": {size: asdict(s) for size, s in sizes.items()}, "slope": slope}
+            for name, (sizes, slope) in grown.items()
+        },
+        "limits": {
+            name: {"bytes": path.bytes, "ms": asdict(ms), "share_of_bandwidth": share}
+            for name, (path, ms, share) in found.items()
+        },
+    }
+    (options.out / f"{options.name}.md").write_text(text, encoding="utf-8")
+    (options.out / f"{options.name}.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    print(f"written: {options.out / options.name}.md and .json")
+
+
+def report(
+    about: dict[str, str],
+    bandwidth: float,
+    measured: list[Measured],
+    grown: dict[str, tuple[dict[int, Spread], float]],
+    found: dict[str, tuple[object, Spread, float]],
+) -> str:
+    """All tables."""
+    rows = [row for each in measured for row in comparison_rows(each)]
+    growth = [
+        [name, ", ".join(f"{size:,}: {number(s.middle)}" for size, s in sizes.items()), f"{slope:.2f}"]
+        for name, (sizes, slope) in grown.items()
+    ]
+    hot = [
+        [name, f"{path.bytes / 1e6:.2f}", path.what, spread(ms), f"{100 * share:.1f}"]
+        for name, (path, ms, share) in found.items()
+    ]
+    return "\n".join(
+        [
+            "# Benchmarks",
+            "",
+            "Written by `python -m benchmarks`. Ratios are of times in the same repetition: median (quartiles); above",
+            "1 semfov is faster. Peers that do a part of the work, for the whole would take too long, are scaled up.",
+            "",
+            *(f"- {key}: {value}" for key, value in about.items()),
+            f"- copy bandwidth: {bandwidth / 1e9:.1f} GB/s, read and written",
+            "",
+            "## Beside peers",
+            "",
+            table(["work", "peer", "semfov, ms", "peer, ms", "peer / semfov"], rows),
+            "",
+            "## Growth",
+            "",
+            "Milliseconds by size, and the exponent of the growth between the first and the last.",
+            "",
+            table(["series", "size: ms", "exponent"], growth),
+            "",
+            "## Distance from the memory's limit",
+            "",
+            "Bytes that inputs and results have, each moved once, over the time, as a share of the copy bandwidth.",
+            "",
+            table(["path", "MB", "which are", "ms", "% of copy bandwidth"], hot),
+            "",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    main()

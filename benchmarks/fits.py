@@ -1,0 +1,35 @@
+"""Maximum-likelihood Dirichlets beside the PyPI package `dirichlet` and scipy's optimiser."""
+
+import dirichlet as pypi
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from scipy.special import digamma, gammaln
+
+from benchmarks.dirichlet_mle import draw
+from benchmarks.timing import Comparison
+from semfov.observation.dirichlet import mle
+
+
+def dirichlets(samples: int = 100) -> Comparison:
+    """81 × 8 Dirichlets of 81 dimensions from samples; the peers fit one of the 648."""
+    scores = draw(samples, seed=0)
+    logs = scores[0].log().mean(0).numpy()
+
+    def lost(log_alpha: np.ndarray) -> tuple[float, np.ndarray]:
+        alpha = np.exp(log_alpha)
+        value = gammaln(alpha.sum()) - gammaln(alpha).sum() + (alpha - 1) @ logs
+        return -value, -alpha * (digamma(alpha.sum()) - digamma(alpha) + logs)
+
+    def with_scipy() -> np.ndarray:
+        found = minimize(lost, np.zeros(len(logs)), jac=True, method="L-BFGS-B", options={"ftol": 1e-12, "gtol": 1e-8})
+        return np.exp(found.x)
+
+    def ours() -> torch.Tensor:
+        return mle(scores.log().mean(1))
+
+    def agree() -> None:
+        np.testing.assert_allclose(with_scipy(), ours()[0].numpy(), rtol=1e-3)
+
+    peers = {"PyPI dirichlet": lambda: pypi.mle(scores[0].numpy()), "scipy L-BFGS-B": with_scipy}
+    return Comparison("648 Dirichlets of 81 dimensions", ours, peers, dict.fromkeys(peers, 1 / len(scores)), agree)

@@ -1,0 +1,40 @@
+"""The protocol's searches as one batch of tensors, beside the same searches one after another."""
+
+import torch
+
+from benchmarks.timing import Comparison
+from eval.protocol import Episode, Searcher, run_episodes
+from semfov import Detections, Grid, search_policy
+from semfov.belief import SemanticObserver
+
+CLASSES, SHIFTS = 80, 30
+
+
+def episode(number: int) -> Episode:
+    """A search for one class after another."""
+    target = 1 + number % CLASSES
+    start = 1 + number % 99
+    return Episode(scene=0, target=target, cue=target, repetition=number, start=start, goal=(0,), commonest=False)
+
+
+def rollouts(episodes: int = 40) -> Comparison:
+    """Searches of 30 gaze shifts in one scene; alone, a quarter of them."""
+    generator = torch.Generator().manual_seed(0)
+    grid = Grid(10, 10, (640, 480))
+    corner = torch.rand(100, 12, 2, generator=generator) * torch.tensor([560.0, 400.0])
+    boxes = torch.cat([corner, corner + 20 + 60 * torch.rand(100, 12, 2, generator=generator)], -1)
+    scores = (3 * torch.randn(100, 12, CLASSES + 1, generator=generator)).softmax(-1)
+    seen = Detections(boxes, scores, torch.ones(100, 12, dtype=torch.bool))
+    searches = [episode(n) for n in range(episodes)]
+    noise = torch.rand(episodes, SHIFTS + 1, 100, generator=generator)
+    searcher = Searcher(SemanticObserver(CLASSES + 1), search_policy("non-predictive"))
+
+    def run(count: int, batch: int) -> object:
+        return run_episodes(searches[:count], searcher, seen, grid, noise[:count], shifts=SHIFTS, batch=batch)
+
+    def agree() -> None:
+        assert run(episodes, episodes) == run(episodes, 1)
+
+    peers = {"one at a time": lambda: run(episodes // 4, 1)}
+    name = f"{episodes} searches of {SHIFTS} shifts"
+    return Comparison(name, lambda: run(episodes, episodes), peers, {"one at a time": 1 / 4}, agree)

@@ -1,0 +1,247 @@
+"""See what the agent does: `python -m eval.demo PHOTO.jpg --target cup` searches a photograph and draws everything.
+
+    python -m eval.demo                                  # lists the classes that can be searched for
+    python -m eval.demo --target cup                     # an embedded scene, no photograph needed
+    python -m eval.demo PHOTO.jpg --target "wine glass"  # your own photograph; a folder or a video will do, too
+    python -m eval.demo PHOTO.jpg --explore              # no target: learn what is where
+    python -m eval.demo --camera 0 --target cup          # a picture from a camera
+    python -m eval.demo PHOTO.jpg --target cup --report cup.html
+
+It prints what was seen and believed at each fixation, and writes pictures and an animation to the folder `out`.
+Each picture of a folder, a video or a camera is looked at on its own.
+"""
+
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+import semfov
+from eval.animation import render, save_animation
+from eval.command import run_command
+from eval.html.episode import Pool, episode_data
+from eval.html.page import write_page
+from eval.pictures import Picture, embedded_picture, open_pictures
+from eval.report import save_figure
+from eval.stages import Stages
+from eval.views import foveated_views
+from semfov import ActivePerception, Scanpath, viz
+from semfov.errors import check, lookup
+
+PHOTO = "photograph, folder of photographs or video (none: an embedded scene)"
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Watch the agent search a photograph for a class, or explore it.
+
+    Args:
+        photo: photograph, folder of photographs or video (none: an embedded scene).
+        target: class to search for; none, and no --explore, lists the classes.
+        explore: look around without a target.
+        camera: take pictures from the camera of this number.
+        agent: `recommended` (learned models, where they are shipped for the detector), `published` (the paper's:
+            calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
+            no model: scores as they are, looks where the target is most probable).
+        detector: name or file, as for `semfov.load_detector`.
+        sigma: width of the fovea in pixels of an image whose longer side is 640.
+        start: first cell, numbered row by row (none: drawn at random).
+        shifts: most gaze shifts (none: 30 for a search, 20 for an exploration).
+        seed: of the start, of ties and of the embedded scene.
+        frames: how many frames of a video or camera to look at.
+        report: write a page to step through in a browser to this file.
+        out: folder for pictures and animations.
+    """
+
+    photo: Path | None = None
+    target: str | None = None
+    explore: bool = False
+    camera: int | None = None
+    agent: Literal["recommended", "published", "raw"] = "recommended"
+    detector: str = "yolov3-tiny"
+    sigma: float = 100.0
+    start: int | None = None
+    shifts: int | None = None
+    seed: int = 0
+    frames: int = 4
+    report: Path | None = None
+    out: Path = Path("runs/demo")
+
+
+def demo(config: DemoConfig) -> None:
+    """Look at every picture, print what was done, and draw it."""
+    check(config.frames >= 1, "frames", "at least 1", config.frames)
+    check(config.target is None or not config.explore, "target", "none with --explore", config.target)
+    agent = make_agent(config)
+    if config.target is None and not config.explore:
+        print(f"Choose a class with --target, or --explore. {agent.eye.detector.name} knows:\n")
+        print(columns(agent.classes[1:]))
+        return
+    if config.target is not None:
+        lookup(config.target, agent.classes[1:], "target class")
+    written, pool, episodes = [], Pool(), []
+    several = config.camera is not None or (config.photo is not None and is_many(config.photo))
+    for number, picture in enumerate(pictures(config, agent)):
+        scanpath, stages = look_at(agent, picture, config)
+        print(told(picture.name, scanpath, stages))
+        views = foveated_views(agent.eye, picture.image, scanpath.fixations)
+        folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
+        written += draw(folder, scanpath, picture, views)
+        if config.report is not None:
+            named = {"name": picture.name, "boxes": picture.boxes, "seconds": stages.looks}
+            episodes.append(episode_data(scanpath, picture.image, views, pool, **named))
+    if config.report is not None:
+        title = "exploration" if config.target is None else f"search for “{config.target}”"
+        written.append(write_page(config.report, f"semfov: {title}", episodes, pool))
+    print("written:")
+    for path in written:
+        print(f"  {path}")
+
+
+def make_agent(config: DemoConfig) -> ActivePerception:
+    """The agent that the settings name."""
+    if config.agent == "recommended":
+        return ActivePerception.from_pretrained(config.detector, sigma=config.sigma)
+    detector, model = semfov.load_detector(config.detector), None
+    if config.agent == "published":
+        model = semfov.FovealObservationModel.from_pretrained(f"{detector.name}-published", detector=detector)
+        model = model.requires_grad_(False)
+    calibrated = model is not None
+    return ActivePerception(
+        semfov.Foveation(config.sigma),
+        detector,
+        model,
+        (10, 10),
+        semfov.search_policy("predictive" if calibrated else "non-predictive", model, calibrated=calibrated),
+        exploration=semfov.exploration_policy("kl" if calibrated else "random", model, calibrated=calibrated),
+    ).eval()
+
+
+def is_many(photo: Path) -> bool:
+    """Whether this is a source of several pictures."""
+    from eval.pictures import VIDEOS
+
+    return photo.is_dir() or photo.suffix.lower() in VIDEOS
+
+
+def pictures(config: DemoConfig, agent: ActivePerception) -> Iterator[Picture]:
+    """The pictures that the settings name."""
+    if config.photo is None and config.camera is None:
+        yield embedded_picture(agent.classes[1:], config.target, config.seed)
+    else:
+        yield from open_pictures(config.photo, config.camera, config.frames)
+
+
+def look_at(agent: ActivePerception, picture: Picture, config: DemoConfig) -> tuple[Scanpath, Stages]:
+    """Search or explore a picture, and measure the stages."""
+    stages = Stages()
+    common: dict[str, Any] = {"start": start_cell(agent, picture, config), "seed": config.seed}
+    with torch.inference_mode(), stages.watch(agent):
+        if config.target is None:
+            shifts = 20 if config.shifts is None else config.shifts
+            return agent.explore(picture.image, shifts=shifts, **common), stages
+        shifts = 30 if config.shifts is None else config.shifts
+        return agent.search(picture.image, config.target, boxes=picture.boxes, shifts=shifts, **common), stages
+
+
+def start_cell(agent: ActivePerception, picture: Picture, config: DemoConfig) -> int | None:
+    """The first cell: off the target where that is known, else as the agent draws it."""
+    if config.start is not None or picture.boxes is None:
+        return config.start
+    grid = semfov.Grid(agent.columns, agent.rows, (picture.image.shape[-1], picture.image.shape[-2]))
+    free = (~grid.footprint(picture.boxes).any(0)).nonzero()[:, 0]
+    generator = torch.Generator().manual_seed(config.seed)
+    return int(free[torch.randint(len(free), (1,), generator=generator)]) if len(free) else None
+
+
+def told(name: str, scanpath: Scanpath, stages: Stages) -> str:
+    """What was done, fixation by fixation, as a table."""
+    wanted = scanpath.target is not None
+    values = viz.class_posterior(scanpath) if wanted else viz.entropy(scanpath)
+    what = f"p({scanpath.classes[scanpath.target]})" if wanted else "entropy (bits)"
+    rows = [["#", "at (column, row)", "seen from there", f"{what} there", "highest", "at", "ms"]]
+    for number, (cell, value) in enumerate(zip(scanpath.cells.tolist(), values, strict=True)):
+        best = int(value.argmax())
+        milliseconds = 1000 * sum(stages.looks[number].values())
+        figures = [f"{float(value[cell]):.3f}", f"{float(value[best]):.3f}", place(scanpath, best)]
+        rows.append([str(number), place(scanpath, cell), seen(scanpath, number), *figures, f"{milliseconds:.0f}"])
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join([f"{name}: {viz.describe(scanpath)}", *lines, ""])
+
+
+def seen(scanpath: Scanpath, fixation: int, most: int = 3) -> str:
+    """The most confident detections of a look, in words."""
+    detections = scanpath.detections[fixation]
+    pairs = zip(detections.labels[0].tolist(), detections.confidence[0].tolist(), strict=True)
+    sure = [f"{scanpath.classes[label]} {score:.2f}" for label, score in pairs if score >= viz.CONFIDENT]
+    more = f" and {len(sure) - most} more" if len(sure) > most else ""
+    return ", ".join(sure[:most]) + more or "nothing"
+
+
+def place(scanpath: Scanpath, cell: int) -> str:
+    """Column and row of a cell, from 0."""
+    row, column = divmod(cell, scanpath.grid.columns)
+    return f"({column}, {row})"
+
+
+def draw(folder: Path, scanpath: Scanpath, picture: Picture, views: list[Tensor]) -> list[Path]:
+    """Write the figures and the animation of an episode."""
+    image, boxes = small(picture.image), picture.boxes
+    figures = {
+        "scanpath": viz.plot_scanpath(scanpath, image, boxes=boxes),
+        "views": viz.plot_foveated_strip(scanpath, views),
+    }
+    if scanpath.target is None:
+        figures["map"] = viz.plot_semantic_map(scanpath, image=image)
+    else:
+        figures["belief"] = viz.plot_belief_strip(scanpath, image=image)
+        figures["belief_bars"] = viz.plot_belief_bars(scanpath)
+    written = [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items()]
+    steps = (viz.plot_fixation(scanpath, n, image, view, boxes=boxes) for n, view in enumerate(views))
+    return [*written, *save_animation(render(steps), folder / "animation.gif")]
+
+
+def small(image: Tensor, longest: int = 1280) -> Tensor:
+    """The picture at a size that figures can show."""
+    from semfov.detection.placement import resize
+
+    scale = longest / max(image.shape[-2:])
+    if scale >= 1:
+        return image
+    width, height = (max(1, round(n * scale)) for n in (image.shape[-1], image.shape[-2]))
+    return resize(image[None], (width, height))[0].clamp(0, 1)
+
+
+def columns(names: Sequence[str], width: int = 100) -> str:
+    """Names in columns, down first."""
+    wide = max(map(len, names)) + 2
+    across = max(1, width // wide)
+    down = -(-len(names) // across)
+    return "\n".join("".join(name.ljust(wide) for name in names[row::down]).rstrip() for row in range(down))
+
+
+def plain_name(name: str) -> str:
+    """A name that every file system takes.
+
+    >>> plain_name("my cup, frame 3")
+    'my-cup-frame-3'
+    """
+    return re.sub(r"[^\w.]+", "-", name).strip("-.") or "picture"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    given = sys.argv[1:] if arguments is None else arguments
+    # A flag needs no value.
+    given = ["--explore=true" if argument == "--explore" else argument for argument in given]
+    return run_command(demo, DemoConfig, __doc__, given, positional=("photo", PHOTO))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

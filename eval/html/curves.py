@@ -1,0 +1,101 @@
+"""Curves and tables as HTML that follows the page's colours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_WIDTH, _HEIGHT = 640, 380
+_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 12, 46
+_COLOURS = 7
+_DASHES = ("", "9 5", "3 4", "12 4 3 4")
+
+
+def curves_html(curves: Mapping[str, Array], errors: Mapping[str, Array], label: str) -> str:
+    """Shares after 0, 1, … gaze shifts as lines in percent, with bands of one standard error, and a legend.
+
+    Args:
+        curves: by name, in [0, 1].
+        errors: standard errors of some of them.
+        label: what the curves show.
+    """
+    last = max(len(curve) for curve in curves.values()) - 1
+    highest = max(float(np.nanmax(curve)) for curve in curves.values())
+    top = min(1.0, max(0.1, float(np.ceil(highest * 10) / 10)))
+
+    def point(shift: float, share: float) -> str:
+        x = _LEFT + shift / max(last, 1) * (_WIDTH - _LEFT - _RIGHT)
+        y = _HEIGHT - _BOTTOM - np.clip(share, 0, top) / top * (_HEIGHT - _TOP - _BOTTOM)
+        return f"{x:.1f},{y:.1f}"
+
+    parts = [_axes(last, top, label)]
+    for order, (name, curve) in enumerate(curves.items()):
+        band = errors.get(name)
+        if band is not None and np.isfinite(band).all():
+            around = [*enumerate(curve + band), *reversed(list(enumerate(curve - band)))]
+            parts.append(f'<polygon class="c{order % _COLOURS}" points="{" ".join(point(*p) for p in around)}"/>')
+    for order, curve in enumerate(curves.values()):
+        points = " ".join(point(*p) for p in enumerate(curve))
+        parts.append(f'<polyline {_line(order, len(curves))} points="{points}"/>')
+    samples = (f'<polyline {_line(order, len(curves))} points="0,6 38,6"/>' for order in range(len(curves)))
+    legend = "".join(
+        f'<li><svg viewBox="0 0 38 12" aria-hidden="true">{sample}</svg> {escape(name)}</li>'
+        for name, sample in zip(curves, samples, strict=True)
+    )
+    title = escape(f"{label} after 0 to {last} gaze shifts; the table below has the figures")
+    return (
+        f'<div class="curves"><div class="wide"><svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{title}">'
+        f'{"".join(parts)}</svg></div><ul class="legend">{legend}</ul></div>'
+    )
+
+
+def table_html(rows: Sequence[Sequence[str]], caption: str) -> str:
+    """A table whose first row is its head and whose first column names the rows."""
+    head = "".join(f'<th scope="col"{_number(n)}>{escape(cell)}</th>' for n, cell in enumerate(rows[0]))
+    body = "".join(
+        f'<tr><th scope="row">{escape(row[0])}</th>'
+        + "".join(f'<td class="number">{escape(cell)}</td>' for cell in row[1:])
+        + "</tr>"
+        for row in rows[1:]
+    )
+    label = escape(caption)
+    return (
+        f'<p>{label}</p><div class="wide" tabindex="0" role="region" aria-label="{label}">'
+        f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+    )
+
+
+def _number(column: int) -> str:
+    return ' class="number"' if column else ""
+
+
+def _line(order: int, count: int) -> str:
+    """Class and dashes of a line; no two are alike, as in `semfov.viz`."""
+    group = _COLOURS if count > _COLOURS else 2
+    dashes = _DASHES[order // group % len(_DASHES)]
+    return f'class="c{order % _COLOURS}"' + (f' stroke-dasharray="{dashes}"' if dashes else "")
+
+
+def _axes(last: int, top: float, label: str) -> str:
+    left, right, bottom = _LEFT, _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
+    parts = []
+    for step in range(6):
+        y = bottom - step / 5 * (bottom - _TOP)
+        parts.append(f'<line class="tick" x1="{left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        parts.append(f'<text x="{left - 7}" y="{y + 4:.1f}" text-anchor="end">{100 * top * step / 5:.0f}</text>')
+    every = next(step for step in (1, 2, 5, 10, 20, 50, 100, 10**6) if last / step <= 10)
+    for shift in range(0, last + 1, every):
+        x = left + shift / max(last, 1) * (right - left)
+        parts.append(f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle">{shift}</text>')
+    parts.append(f'<line class="axis" x1="{left}" x2="{right}" y1="{bottom}" y2="{bottom}"/>')
+    parts.append(f'<text x="{(left + right) / 2}" y="{_HEIGHT - 8}" text-anchor="middle">gaze shifts</text>')
+    middle = (bottom + _TOP) / 2
+    parts.append(
+        f'<text x="13" y="{middle}" text-anchor="middle" transform="rotate(-90 13 {middle})">{escape(label)}</text>'
+    )
+    return "".join(parts)

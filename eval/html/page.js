@@ -1,0 +1,248 @@
+"use strict";
+(() => {
+  const report = JSON.parse(document.getElementById("data").textContent);
+  const find = (id) => document.getElementById(id);
+  const GAZE = "#0072B2", TARGET = "#B84700", FOUND = "#00795A", OTHER = "#1F4E79", TRUTH = "#E69F00";
+  let episode, fixation = 0, chosenClass = 0, playing = null;
+
+  // Elements: names and texts are set as text, never as markup.
+  function make(namespace, tag, attributes = {}, children = []) {
+    const element = document.createElementNS(namespace, tag);
+    for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+    for (const child of [].concat(children)) element.append(child);
+    return element;
+  }
+  const svg = (tag, attributes, children) => make("http://www.w3.org/2000/svg", tag, attributes, children);
+  const html = (tag, attributes, children) => make("http://www.w3.org/1999/xhtml", tag, attributes, children);
+
+  // Data.
+  const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  function decode(map) {
+    if (!map.bytes) map.bytes = bytes(map.data);
+    return map;
+  }
+  const cells = () => episode.grid[0] * episode.grid[1];
+  function mapValues(map) {
+    const { bytes: steps, max } = decode(map);
+    return Array.from(steps.subarray(fixation * cells(), (fixation + 1) * cells()), (step) => step / 255 * max);
+  }
+  const short = (value) => value === null ? "none" : Number(value.toPrecision(3)).toString();
+  const place = (cell) => `column ${cell % episode.grid[0]}, row ${Math.floor(cell / episode.grid[0])}`;
+  function colour(scale, share) {
+    const steps = report.colours[scale];
+    const at = Math.min(Math.max(share, 0), 1) * (steps.length - 1);
+    const low = Math.floor(at), high = Math.min(low + 1, steps.length - 1);
+    return `rgb(${steps[low].map((value, n) => Math.round(value + (steps[high][n] - value) * (at - low))).join(" ")})`;
+  }
+
+  // Pictures. Coordinates are pixels of the photograph; one unit is a 640th of its width.
+  const unit = () => episode.size[0] / 640;
+  function frame(id, picture, label) {
+    const target = find(id);
+    target.setAttribute("viewBox", `0 0 ${episode.size[0]} ${episode.size[1]}`);
+    target.setAttribute("aria-label", label);
+    target.replaceChildren();
+    if (picture !== null) {
+      const source = { href: report.pictures[picture], width: episode.size[0], height: episode.size[1], preserveAspectRatio: "none" };
+      target.append(svg("image", source));
+    }
+    return target;
+  }
+  function box([x1, y1, x2, y2], attributes) {
+    return svg("rect", { x: x1, y: y1, width: Math.max(x2 - x1, 0), height: Math.max(y2 - y1, 0), fill: "none", ...attributes });
+  }
+  function cellBox(cell) {
+    const width = episode.size[0] / episode.grid[0], height = episode.size[1] / episode.grid[1];
+    const column = cell % episode.grid[0], row = Math.floor(cell / episode.grid[0]);
+    return [column * width, row * height, (column + 1) * width, (row + 1) * height];
+  }
+  function middle(cell) {
+    const [x1, y1, x2, y2] = cellBox(cell);
+    return [(x1 + x2) / 2, (y1 + y2) / 2];
+  }
+  function cross(cell) {
+    const [x, y] = middle(cell), r = 11 * unit();
+    const line = `M${x - r} ${y}H${x + r}M${x} ${y - r}V${y + r}`;
+    return [svg("path", { d: line, stroke: "white", "stroke-width": 6 * unit() }), svg("path", { d: line, stroke: GAZE, "stroke-width": 3 * unit() })];
+  }
+
+  function drawPath() {
+    const visited = episode.fixations.slice(0, fixation + 1).map((each) => each.cell);
+    const target = frame("path", episode.image, `Photograph with fixations 0 to ${fixation}, now at ${place(visited[fixation])}`);
+    for (const truth of episode.truth) target.append(box(truth, { stroke: TRUTH, "stroke-width": 3 * unit(), "stroke-dasharray": `${8 * unit()} ${5 * unit()}` }));
+    const points = visited.map((cell) => middle(cell).join(",")).join(" ");
+    target.append(svg("polyline", { points, fill: "none", stroke: "white", "stroke-width": 5 * unit() }));
+    target.append(svg("polyline", { points, fill: "none", stroke: GAZE, "stroke-width": 3 * unit() }));
+    visited.forEach((cell, number) => {
+      const [x, y] = middle(cell);
+      const end = episode.found && number === episode.fixations.length - 1;
+      target.append(svg("circle", { cx: x, cy: y, r: 15 * unit(), fill: end ? FOUND : GAZE, stroke: "white", "stroke-width": (number === fixation ? 4 : 1.5) * unit() }));
+      target.append(svg("text", { x, y, fill: "white", "font-size": 19 * unit(), "font-weight": "bold", "text-anchor": "middle", "dominant-baseline": "central" }, String(number)));
+    });
+  }
+
+  function drawView() {
+    const now = episode.fixations[fixation];
+    const target = frame("view", now.view, `Foveated view from ${place(now.cell)} with ${now.detections.length} detections`);
+    const tags = [];
+    now.detections.forEach((detection, number) => {
+      const shade = detection.label === episode.target ? TARGET : OTHER;
+      target.append(box(detection.box, { stroke: "white", "stroke-width": 4 * unit() }));
+      target.append(box(detection.box, { stroke: shade, "stroke-width": 2.5 * unit() }));
+      const [x1, y1, x2, y2] = detection.tag;
+      tags.push(box(detection.tag, { fill: shade }));
+      tags.push(svg("text", { x: x1 + 4 * unit(), y: (y1 + y2) / 2, fill: "white", "font-size": 19 * unit(), "dominant-baseline": "central", textLength: x2 - x1 - 8 * unit(), lengthAdjust: "spacingAndGlyphs" }, `${number + 1} ${detection.label}`));
+    });
+    target.append(...tags, ...cross(now.cell));
+  }
+
+  function drawMap(id, values, low, high, scale, label) {
+    const target = frame(id, episode.image, label);
+    const readout = drawScale(`${id}-scale`, low, high, scale);
+    values.forEach((value, cell) => {
+      const share = value === null ? 0 : (value - low) / (high - low || 1);
+      const square = box(cellBox(cell), { fill: value === null ? "#777777" : colour(scale, share), "fill-opacity": 0.82, stroke: "white", "stroke-width": 0.6 * unit(), "stroke-opacity": 0.5 });
+      const tell = () => { readout.textContent = `${place(cell)}: ${short(value)}`; };
+      square.addEventListener("pointerenter", tell);
+      square.addEventListener("pointerdown", tell);
+      target.append(square);
+    });
+    return target;
+  }
+  function drawScale(id, low, high, scale) {
+    const stops = report.colours[scale].map((rgb) => `rgb(${rgb.join(" ")})`).join(", ");
+    const bar = html("i");
+    bar.style.background = `linear-gradient(90deg, ${stops})`;
+    const readout = html("span");
+    find(id).replaceChildren(html("span", {}, short(low)), bar, html("span", {}, short(high)), readout);
+    return readout;
+  }
+  const bestOf = (values) => values.reduce((best, value, cell) => value !== null && (values[best] === null || value > values[best]) ? cell : best, 0);
+
+  function drawBelief() {
+    const map = episode.maps[chosenClass], values = mapValues(map), best = bestOf(values);
+    drawMap("belief", values, 0, map.max, "probability", `Probability of ${map.label}: highest ${short(values[best])} at ${place(best)}`)
+      .append(...cross(episode.fixations[fixation].cell));
+    return `Probability of ${map.label} is highest at ${place(best)}: ${short(values[best])}.`;
+  }
+  function drawEntropy() {
+    const values = mapValues(episode.entropy), best = bestOf(values);
+    const low = Math.min(...decode(episode.entropy).bytes) / 255 * episode.entropy.max;
+    drawMap("entropy", values, low, episode.entropy.max, "uncertainty", `Entropy: highest ${short(values[best])} bits at ${place(best)}`)
+      .append(...cross(episode.fixations[fixation].cell));
+  }
+  function drawValues() {
+    const now = episode.fixations[fixation], known = now.values.filter((value) => value !== null);
+    const low = Math.min(...known), high = Math.max(...known);
+    const chosen = now.next === null ? "no cell chosen" : `chosen: ${place(now.next)}`;
+    const target = drawMap("values", now.values, low, high, "probability", `Acquisition values, ${chosen}`);
+    for (const { cell } of episode.fixations.slice(0, fixation + 1)) {
+      const [x, y] = middle(cell), r = 9 * unit();
+      const line = `M${x - r} ${y - r}L${x + r} ${y + r}M${x + r} ${y - r}L${x - r} ${y + r}`;
+      target.append(svg("path", { d: line, stroke: "black", "stroke-width": 6 * unit() }), svg("path", { d: line, stroke: "white", "stroke-width": 3 * unit() }));
+    }
+    if (now.next !== null) {
+      target.append(box(cellBox(now.next), { stroke: "black", "stroke-width": 9 * unit() }), box(cellBox(now.next), { stroke: "#FF8F4D", "stroke-width": 5 * unit() }));
+    }
+  }
+
+  // Tables.
+  const row = (tag, values) => html("tr", {}, values.map((value) => html(tag, {}, String(value))));
+  function listDetections() {
+    const now = episode.fixations[fixation].detections, table = find("detections");
+    if (!now.length) return table.replaceChildren(row("td", ["nothing was detected"]));
+    const most = Math.max(...now.map((detection) => detection.scores.length));
+    const heads = Array.from({ length: most }, (_, number) => `class ${number + 1}`);
+    const rows = now.map((detection, number) => row("td", [number + 1, ...detection.scores.map(([name, score]) => `${name} ${(score ?? 0).toFixed(3)}`)]));
+    table.replaceChildren(html("thead", {}, row("th", ["#", ...heads])), html("tbody", {}, rows));
+  }
+  function listSeconds() {
+    const timed = episode.fixations.every((each) => each.seconds !== null);
+    find("timing").hidden = !timed;
+    if (!timed) return;
+    const stages = [...new Set(episode.fixations.flatMap((each) => Object.keys(each.seconds)))];
+    const mean = (stage) => episode.fixations.reduce((sum, each) => sum + (each.seconds[stage] ?? 0), 0) / episode.fixations.length;
+    const longest = Math.max(...stages.map((stage) => episode.fixations[fixation].seconds[stage] ?? 0)) || 1;
+    const rows = stages.map((stage) => {
+      const seconds = episode.fixations[fixation].seconds[stage] ?? 0, bar = html("i");
+      bar.style.width = `${100 * seconds / longest}%`;
+      const figure = (value) => html("td", { class: "number" }, `${(1000 * value).toFixed(2)} ms`);
+      return html("tr", {}, [html("th", { scope: "row" }, stage), figure(seconds), figure(mean(stage)), html("td", { class: "bar" }, bar)]);
+    });
+    const head = html("tr", {}, [html("th", {}, "stage"), html("th", { class: "number" }, "this fixation"), html("th", { class: "number" }, "mean"), html("td")]);
+    find("seconds").replaceChildren(html("thead", {}, head), html("tbody", {}, rows));
+  }
+
+  // What the reader does.
+  function show() {
+    const now = episode.fixations[fixation], last = episode.fixations.length - 1;
+    find("fixation").value = fixation;
+    find("fixation").setAttribute("aria-valuetext", `fixation ${fixation} of ${last}`);
+    find("number").textContent = `${fixation} of ${last}`;
+    find("back").disabled = fixation === 0;
+    find("forward").disabled = fixation === last;
+    drawPath();
+    drawView();
+    const believed = drawBelief();
+    drawEntropy();
+    drawValues();
+    listDetections();
+    listSeconds();
+    const seen = now.detections.slice(0, 3).map((detection) => detection.label).join(", ") || "nothing";
+    const end = fixation === last ? ` The end: ${episode.summary}.` : "";
+    find("status").textContent = `At ${place(now.cell)}, the eye saw: ${seen}. ${believed}${end}`;
+  }
+  function go(number) {
+    const wanted = Math.min(Math.max(number, 0), episode.fixations.length - 1);
+    if (wanted === fixation) return;
+    fixation = wanted;
+    show();
+  }
+  function open(number) {
+    const wanted = episode ? episode.maps[chosenClass].label : null;
+    episode = report.episodes[number];
+    fixation = 0;
+    chosenClass = Math.max(0, episode.maps.findIndex((map) => map.label === wanted));
+    find("fixation").max = episode.fixations.length - 1;
+    find("class").replaceChildren(...episode.maps.map((map, index) => html("option", { value: index }, map.label)));
+    find("class").value = chosenClass;
+    show();
+  }
+  function stop() {
+    clearInterval(playing);
+    playing = null;
+    find("play").textContent = "Play";
+  }
+  function play() {
+    if (playing !== null) return stop();
+    if (fixation === episode.fixations.length - 1) go(0);
+    find("play").textContent = "Pause";
+    playing = setInterval(() => {
+      go(fixation + 1);
+      if (fixation === episode.fixations.length - 1) stop();
+    }, 1000);
+  }
+
+  if (!report.episodes.length) {
+    find("viewer").hidden = true;
+    return;
+  }
+  find("episode-choice").hidden = report.episodes.length < 2;
+  find("episode").replaceChildren(...report.episodes.map((each, index) => html("option", { value: index }, `${each.name}: ${each.summary}`)));
+  find("episode").addEventListener("change", (event) => { stop(); open(Number(event.target.value)); });
+  find("class").addEventListener("change", (event) => { chosenClass = Number(event.target.value); show(); });
+  find("fixation").addEventListener("input", (event) => { stop(); go(Number(event.target.value)); });
+  find("back").addEventListener("click", () => { stop(); go(fixation - 1); });
+  find("forward").addEventListener("click", () => { stop(); go(fixation + 1); });
+  find("play").addEventListener("click", play);
+  document.addEventListener("keydown", (event) => {
+    // Lists and the slider have their own use for these keys.
+    if (event.target.closest("select, input, .wide") || event.altKey || event.ctrlKey || event.metaKey) return;
+    const moves = { ArrowLeft: fixation - 1, ArrowRight: fixation + 1, Home: 0, End: episode.fixations.length - 1 };
+    if (!(event.key in moves)) return;
+    event.preventDefault();
+    stop();
+    go(moves[event.key]);
+  });
+  open(0);
+})();

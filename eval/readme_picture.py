@@ -1,0 +1,42 @@
+"""Make the picture of the README from an embedded scene: `python -m eval.readme_picture`."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from eval.animation import Frame, in_palette, render
+from eval.views import foveated_views
+from semfov import ActivePerception, EmbeddedScenes
+from semfov.files import replacing
+from semfov.viz import plot_belief_strip, plot_foveated_strip
+
+PATH = Path(__file__).parents[1] / "docs" / "pictures" / "search.png"
+SCENE, TARGET, START = 5, "cup", 99
+
+
+def make_picture(path: Path = PATH) -> None:
+    """Search the scene, and draw what was seen above what was believed, in a small file."""
+    agent = ActivePerception.from_pretrained("yolov3-tiny")
+    scene = EmbeddedScenes(agent.classes[1:])[SCENE]
+    boxes = scene.boxes[scene.labels == agent.classes.index(TARGET)]
+    with torch.inference_mode():
+        scanpath = agent.search(scene.image, TARGET, start=START, boxes=boxes)
+    views = foveated_views(agent.eye, scene.image, scanpath.fixations)
+    seen = plot_foveated_strip(scanpath, views, most=3)
+    believed = plot_belief_strip(scanpath, image=scene.image, most=3)
+    with replacing(path) as temporary:
+        in_palette(stacked(render([seen, believed], dpi=105))).save(temporary, format="PNG", optimize=True)
+
+
+def stacked(frames: list[Frame]) -> Frame:
+    """Frames one below the other, on white."""
+    width = max(frame.shape[1] for frame in frames)
+    pads = [((0, 0), (0, width - frame.shape[1]), (0, 0)) for frame in frames]
+    padded = [np.pad(frame, pad, constant_values=255) for frame, pad in zip(frames, pads, strict=True)]
+    return np.concatenate(padded)
+
+
+if __name__ == "__main__":
+    make_picture()
+    print(PATH)

@@ -1,0 +1,77 @@
+"""Plug in a detector of your own as an ONNX file, and fit an observation model to what it sees off-centre.
+
+Run it from a checkout: python -m examples.own_onnx_detector MODEL.onnx --out model.safetensors
+Without a file it exports YOLOv3-tiny and takes that. For real use, fit on thousands of photographs: `train.fit_fom`.
+"""
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import torch
+
+import semfov
+from semfov.detection.export import export_onnx
+from semfov.observation.matching import match
+
+EDGES = [n * 50 / 640 for n in range(1, 8)]  # borders of the levels of distance, in longer sides of the image
+
+
+def look_around(eye: semfov.Eye, scenes: semfov.EmbeddedScenes, looks: int) -> list[torch.Tensor]:
+    """Score vectors, distances to the fovea and true classes of what is detected from random fixations."""
+    generator = torch.Generator().manual_seed(0)
+    scores, distances, labels = [], [], []
+    for index in range(len(scenes)):
+        scene = scenes[index]
+        grid = semfov.Grid(10, 10, scene.size)
+        for fixation in grid.centres[torch.randperm(len(grid), generator=generator)[:looks]]:
+            seen = eye(scene.image[None], fixation[None])[0]
+            scores.append(seen.scores)
+            distances.append(grid.box_distance(seen.boxes, fixation))
+            labels.append(match(seen.boxes, scene.boxes, scene.labels))
+    return [torch.cat(parts) for parts in (scores, distances, labels)]
+
+
+def main() -> None:
+    """Fit on some embedded scenes, judge on others, search with the result."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("model", nargs="?", help="ONNX detector (default: YOLOv3-tiny, exported)")
+    parser.add_argument("--scenes", type=int, default=8, help="scenes to fit on (default: 8)")
+    parser.add_argument("--looks", type=int, default=6, help="fixations in each scene (default: 6)")
+    parser.add_argument("--out", default="model.safetensors", help="where to write (default: model.safetensors)")
+    arguments = parser.parse_args()
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = arguments.model
+        if path is None:
+            path = Path(folder) / "own.onnx"
+            export_onnx(semfov.load_detector("yolov3-tiny", winograd=False), path)
+        detector = semfov.load_detector(path)
+    print(f"{detector.name} knows {len(detector.classes)} classes and takes pictures of {detector.input_size}")
+
+    eye = semfov.Eye(semfov.Foveation(sigma=100.0), detector).eval()
+    scenes = semfov.EmbeddedScenes(detector.classes, count=arguments.scenes, seed=1)
+    with torch.inference_mode():
+        scores, distances, labels = look_around(eye, scenes, arguments.looks)
+    model = semfov.FovealObservationModel.identity(detector.classes, EDGES)
+    statistics = semfov.DirichletStatistics(model.alpha.shape[:2], len(detector.classes) + 1)
+    statistics.update(scores, (labels, model.level(distances)))
+    model.fit(statistics, minimum=1, prior=True, tempering=0.1, **eye.settings()).eval().requires_grad_(False)
+    model.save(arguments.out)
+    print(f"fitted to {len(labels)} detections, written to {arguments.out}")
+
+    others = semfov.EmbeddedScenes(detector.classes, count=2, seed=2)
+    with torch.inference_mode():
+        scores, distances, labels = look_around(eye, others, arguments.looks)
+    for name, probabilities in (("raw scores", scores), ("fitted model", model.calibrate(scores, distances))):
+        loss = -probabilities.gather(-1, labels[:, None]).clamp(min=1e-6).log().mean()
+        print(f"{name}: {loss:.2f} nats lost per detection on other scenes")
+
+    policy = semfov.search_policy("predictive", model, calibrated=True)
+    agent = semfov.ActivePerception(eye.sensor, detector, model, (10, 10), policy).eval()
+    scanpath = agent.search(others[0].image, "person", start=0)
+    print(f"person {'found' if scanpath.found else 'not found'} after {scanpath.shifts} gaze shifts")
+
+
+if __name__ == "__main__":
+    main()

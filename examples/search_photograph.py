@@ -1,0 +1,34 @@
+"""Search a photograph for a class by moving a fovea, and draw where the gaze went.
+
+Run it from a checkout: python -m examples.search_photograph PHOTO.jpg cup --out scanpath.png
+"""
+
+import argparse
+
+import semfov
+from semfov import viz
+
+
+def main() -> None:
+    """Search a photograph, or an embedded scene where none is given."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("photo", nargs="?", help="image file (default: an embedded scene)")
+    parser.add_argument("target", nargs="?", default="cup", help="class to search for (default: cup)")
+    parser.add_argument("--out", default="scanpath.png", help="where to write (default: scanpath.png)")
+    arguments = parser.parse_args()
+
+    # An eye (a sensor before a detector), a belief about what is where, and a policy that chooses where to look next.
+    # `semfov.ActivePerception(...)` puts parts of your own together.
+    agent = semfov.ActivePerception.from_pretrained("yolov3-tiny")
+
+    image = semfov.read_image(arguments.photo) if arguments.photo else semfov.EmbeddedScenes(agent.classes[1:])[1].image
+    scanpath = agent.search(image, arguments.target, start=0)
+
+    for number, (x, y) in enumerate(scanpath.fixations.tolist()):
+        print(f"fixation {number} at ({x:.0f}, {y:.0f})")
+    print(viz.describe(scanpath))
+    viz.plot_scanpath(scanpath, image).savefig(arguments.out, dpi=150)
+
+
+if __name__ == "__main__":
+    main()

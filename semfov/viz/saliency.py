@@ -1,0 +1,53 @@
+"""Saliency maps."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.errors import check_shape
+from semfov.gaze.saliency.cells import Reduction, cell_saliency
+from semfov.viz.drawing import draw_boxes, draw_cells, draw_grid, draw_image
+from semfov.viz.style import PROBABILITY, TARGET, make_figure, styled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@styled
+def plot_saliency(
+    saliency: Tensor, image: Tensor, *, grid: Grid | None = None, reduction: Reduction = "max", title: str = "saliency"
+) -> Figure:
+    """A saliency map beside its photograph and, with a grid, the saliency of the cells with the greatest one framed.
+
+    Args:
+        saliency: `(H, W)` of any size.
+        image: `(3, H, W)`, RGB in [0, 1].
+        grid: the cells over the photograph.
+        reduction: how a cell's saliency comes from its pixels (`semfov.saliency.cell_saliency`).
+        title: what to call the map.
+    """
+    check_shape(saliency, "saliency", None, None)
+    height, width = image.shape[-2:]
+    panels = 2 if grid is None else 3
+    figure, axes = make_figure(
+        1, panels, width=3.4 * panels + 0.6, height=3.4 * height / width + 0.35, layout="compressed"
+    )
+    draw_image(axes[0], image, grid or Grid(1, 1, (width, height)))
+    axes[0].set_title("photograph")
+    values = saliency.detach().cpu()
+    shown = axes[1].imshow(values.numpy(), extent=(0, width, height, 0), cmap=PROBABILITY, vmin=0)
+    axes[1].set(xticks=[], yticks=[], title=title)
+    figure.colorbar(shown, ax=axes[1], shrink=0.85)
+    if grid is not None:
+        cells = cell_saliency(values[None], grid.columns, grid.rows, reduction)[0]
+        draw_cells(axes[2], grid, cells, cmap=PROBABILITY, vmin=0)
+        draw_grid(axes[2], grid)
+        row, column = divmod(int(cells.argmax()), grid.columns)
+        step = grid.extent / grid.extent.new_tensor([grid.columns, grid.rows])
+        corner = grid.extent.new_tensor([column, row]) * step
+        draw_boxes(axes[2], cells.new_tensor([[*corner.tolist(), *(corner + step).tolist()]]), TARGET, width=2.0)
+        axes[2].set_title(f"{reduction} in each cell")
+    return figure

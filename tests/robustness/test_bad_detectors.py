@@ -1,0 +1,56 @@
+"""A detector that returns what is no score is told of, and not passed over as one that sees nothing."""
+
+import pytest
+import torch
+
+from semfov.detection import Candidates, Detector
+from semfov.errors import DataError, InputError
+
+
+class Given(Detector):
+    """Returns the same for every canvas."""
+
+    def __init__(self, candidates):
+        super().__init__("given", ("cat", "cup"), (32, 32))
+        self.candidates = candidates
+
+    def propose(self, canvas):
+        return self.candidates
+
+
+def candidates(**changes):
+    made = {
+        "boxes": torch.tensor([[[1.0, 1, 9, 9], [10, 10, 20, 20]]]),
+        "classes": torch.tensor([[[0.9, 0.1], [0.2, 0.7]]]),
+        "objectness": torch.tensor([[0.8, 0.6]]),
+    }
+    for name, value in changes.items():
+        made[name][0, 1] = value
+    return Candidates(**made)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"classes": torch.nan}, "confidence.*finite"),
+        ({"objectness": torch.nan}, "confidence.*finite"),
+        ({"boxes": torch.nan}, "boxes.*finite"),
+        ({"boxes": torch.inf}, "boxes.*finite"),
+        ({"classes": 1.5}, r"class scores.*\[0, 1\]"),
+        ({"objectness": 2.0}, r"objectness.*\[0, 1\]"),
+    ],
+)
+def test_what_is_no_detection_is_refused(changes, message):
+    image = torch.rand(1, 3, 32, 32)
+    assert Given(candidates())(image).count.tolist() == [2]
+    with pytest.raises(InputError, match=message):
+        Given(candidates(**changes))(image)
+
+
+def test_a_kernel_that_fills_the_memory_is_refused():
+    from semfov.detection.darknet import Darknet
+    from semfov.detection.darknet_config import parse_cfg
+
+    text = "[net]\nwidth=32\nheight=32\n[convolutional]\nfilters=21\nsize=99999\n[yolo]\nmask=0\nanchors=4,6\nclasses=2"
+    with pytest.raises(DataError, match="parameters"):
+        Darknet(parse_cfg(text))

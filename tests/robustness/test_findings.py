@@ -1,0 +1,95 @@
+"""What fuzzing has found, each as its smallest case."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from eval.cached import read_tensors, write_tensors
+from semfov import FovealObservationModel, Grid, InputError, acquisition, fusion, read_image
+from semfov.belief import fuse
+from semfov.errors import DataError
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("oriented", [True, False])
+def test_grey_tiffs_are_turned_once(tmp_path, orientation, oriented):
+    """Pillow turns TIFFs while it loads them, and mixes up the rows of those that it maps into memory."""
+    pixels = np.arange(6, dtype=np.uint8).reshape(2, 3) * 40
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(pixels).save(tmp_path / "image.tiff", exif=exif)
+    Image.fromarray(pixels).convert("RGB").save(tmp_path / "image.png", exif=exif)
+    expected = read_image(tmp_path / "image.png", oriented=oriented)
+    torch.testing.assert_close(read_image(tmp_path / "image.tiff", oriented=oriented), expected)
+    if not oriented:
+        assert expected.shape == (3, 2, 3)
+
+
+@pytest.mark.parametrize("value", [1e30, math.inf])
+def test_points_far_outside_count_to_the_nearest_cell(value):
+    grid, far = Grid(3, 2, (30, 20)), torch.tensor([[value, 5.0], [-value, 5.0]])
+    if math.isinf(value):
+        with pytest.raises(InputError, match="points: expected finite numbers"):
+            grid.cell_of(far)
+    else:
+        assert grid.cell_of(far).tolist() == [2, 0]
+
+
+@pytest.mark.parametrize("rule", ["overlap", "centre", "box_centre", "soft"])
+def test_boxes_of_nan_cover_nothing_in_silence_no_more(rule):
+    grid = Grid(3, 2, (30, 20))
+    with pytest.raises(InputError, match="boxes: expected finite numbers"):
+        grid.footprint(torch.tensor([[0.0, 0.0, math.nan, 5.0]]), rule)
+    with pytest.raises(InputError, match="boxes"):
+        grid.box_distance(torch.tensor([[0.0, 0.0, math.nan, 5.0]]), torch.zeros(2))
+
+
+def test_windows_of_huge_boxes_are_flat():
+    weights = Grid(3, 2, (30, 20)).footprint(torch.tensor([[-1e30, -1e30, 1e30, 1e30]]), "soft")
+    torch.testing.assert_close(weights, torch.ones(1, 6))
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
+def test_parameters_that_are_none_are_refused(bad):
+    beta, likelihood = torch.tensor([0.5, bad]), torch.tensor([0.2, 0.8])
+    for rule in (fusion.kaplan, fusion.product, fusion.sum):
+        with pytest.raises(InputError, match="beta: expected positive, finite"):
+            rule(beta, likelihood)
+    with pytest.raises(InputError, match="beta"):
+        fuse(beta[None, None], likelihood[None, None], torch.ones(1, 1, 1, dtype=torch.bool))
+
+
+@pytest.mark.parametrize("distance", [math.nan, -0.1])
+def test_distances_that_are_none_are_refused(distance):
+    """NaN was the outermost level."""
+    model = FovealObservationModel.identity(["cup"], [0.2])
+    with pytest.raises(InputError, match="distance: expected numbers from 0 up"):
+        model.calibrate(torch.tensor([0.4, 0.6]), torch.tensor(distance))
+
+
+def test_a_changed_bit_in_a_model_is_noticed(tmp_path):
+    path = tmp_path / "model.safetensors"
+    FovealObservationModel.identity(["cup"], [0.2]).save(path)
+    content = bytearray(path.read_bytes())
+    content[-3] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="damaged"):
+        FovealObservationModel.from_pretrained(path)
+
+
+def test_tensors_of_another_file_are_not_taken(tmp_path):
+    first, second = tmp_path / "1.safetensors", tmp_path / "2.safetensors"
+    for number, path in enumerate((first, second)):
+        write_tensors(path, "key", {"a": torch.full((3,), float(number))})
+    assert read_tensors(first, "key")["a"].tolist() == [0, 0, 0]
+    first.write_bytes(second.read_bytes())
+    assert read_tensors(first, "key") is None
+
+
+def test_buffers_of_an_acquisition_are_leaves():
+    """Or it could not be copied."""
+    model = FovealObservationModel.identity(["cup"], [0.2], miss_rate=torch.full((2, 2), 0.5))
+    assert not any(b.requires_grad for b in acquisition.ExpectedAccuracy(model, Grid(2, 2, (4, 4))).buffers())

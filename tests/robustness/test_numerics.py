@@ -1,0 +1,151 @@
+"""Digits: single against double precision over long episodes, special functions against mpmath, bits of seeds."""
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+
+from semfov import EmbeddedScenes, FovealObservationModel, Grid, acquisition, dirichlet, fusion
+from semfov.belief import fuse
+from semfov.gaze import select_fixation
+
+mp = mpmath.mp.clone()
+mp.dps = 60
+
+
+def likelihoods(count: int, components: int, sharpness: float) -> torch.Tensor:
+    """Score vectors from flat (0.1) to nearly one-hot (5)."""
+    generator = torch.Generator().manual_seed(int(10 * sharpness))
+    return (sharpness * torch.randn(count, components, generator=generator, dtype=torch.float64)).softmax(-1)
+
+
+@pytest.mark.parametrize("sharpness", [0.1, 1.0, 5.0])
+@pytest.mark.parametrize("components", [2, 81])
+def test_300_updates_in_single_precision(components, sharpness):
+    """Kaplan's rule only multiplies and adds positive numbers: errors add up, and do not blow up."""
+    double = torch.full((components,), 0.5, dtype=torch.float64)
+    single = double.float()
+    for likelihood in likelihoods(300, components, sharpness):
+        double = fusion.kaplan(double, likelihood)
+        single = fusion.kaplan(single, likelihood.float())
+    error = float((single.double() / double - 1).abs().max())
+    assert error < 3e-5
+    assert single.argmax() == double.argmax()
+    assert float(double.sum()) > 0.5 * components
+
+
+@pytest.mark.parametrize("sharpness", [0.1, 5.0])
+def test_300_updates_in_double_precision(sharpness):
+    """Against sixty digits."""
+    double = torch.full((5,), 0.5, dtype=torch.float64)
+    exact = [mp.mpf(1) / 2] * 5
+    for likelihood in likelihoods(300, 5, sharpness):
+        double = fusion.kaplan(double, likelihood)
+        given = [mp.mpf(float(value)) for value in likelihood]
+        expected = mp.fsum(b * v for b, v in zip(exact, given, strict=True))
+        least = min(given) / expected
+        exact = [b * (1 + v / expected) / (1 + least) for b, v in zip(exact, given, strict=True)]
+    np.testing.assert_allclose(double.numpy(), [float(value) for value in exact], rtol=1e-13)
+
+
+TAILS = [1e-8, 1e-4, 0.02, 0.5, 1.0, 1.5, 37.0, 1e3, 1e5, 1e7]
+
+
+def rows() -> torch.Tensor:
+    """Parameters of every pair of magnitudes, with a third in the middle."""
+    return torch.tensor([[a, b, math.sqrt(a * b)] for a in TAILS for b in TAILS], dtype=torch.float64)
+
+
+def exact_normaliser(row: list[mpmath.mpf]) -> mpmath.mpf:
+    return mp.fsum(mp.loggamma(a) for a in row) - mp.loggamma(mp.fsum(row))
+
+
+def close(found: torch.Tensor, exact: list[mpmath.mpf], size: list[mpmath.mpf]) -> None:
+    """Rounding is that of the largest term of the sum, `size`; nothing else is lost."""
+    for value, wanted, largest in zip(found.tolist(), exact, size, strict=True):
+        assert abs(value - wanted) <= 1e-14 * max(abs(largest), 1), (value, float(wanted), float(largest))
+
+
+def test_log_normaliser_in_the_tails():
+    table = [[mp.mpf(a) for a in row] for row in rows().tolist()]
+    size = [mp.fsum(abs(mp.loggamma(a)) for a in row) + abs(mp.loggamma(mp.fsum(row))) for row in table]
+    close(dirichlet.log_normaliser(rows()), [exact_normaliser(row) for row in table], size)
+
+
+def test_entropy_in_the_tails():
+    exact, size = [], []
+    for row in [[mp.mpf(a) for a in row] for row in rows().tolist()]:
+        total = mp.fsum(row)
+        terms = [(a - 1) * (mp.digamma(a) - mp.digamma(total)) for a in row]
+        exact.append(exact_normaliser(row) - mp.fsum(terms))
+        largest = max(abs((a - 1) * mp.digamma(b)) for a in row for b in (a, total))
+        size.append(largest + abs(mp.loggamma(total)) + max(abs(mp.loggamma(a)) for a in row))
+    close(dirichlet.entropy(rows()), exact, [5 * value for value in size])
+
+
+def test_divergence_in_the_tails():
+    """Of neighbours in the table: never below zero by more than its terms round."""
+    alpha, other = rows(), rows().roll(1, 0)
+    exact, size = [], []
+    for a, b in zip(alpha.tolist(), other.tolist(), strict=True):
+        a, b = [mp.mpf(x) for x in a], [mp.mpf(x) for x in b]
+        total = mp.fsum(a)
+        terms = [(x - y) * (mp.digamma(x) - mp.digamma(total)) for x, y in zip(a, b, strict=True)]
+        exact.append(exact_normaliser(b) - exact_normaliser(a) + mp.fsum(terms))
+        largest = max(abs((x - y) * mp.digamma(z)) for x, y in zip(a, b, strict=True) for z in (x, total))
+        size.append(largest + sum(abs(mp.loggamma(z)) for z in (*a, *b, total, mp.fsum(b))))
+    assert min(exact) >= 0
+    close(dirichlet.kl_divergence(alpha, other), exact, [5 * value for value in size])
+
+
+def test_inverse_digamma_in_the_tails():
+    x = torch.logspace(-8, 8, 65, dtype=torch.float64)
+    level = torch.tensor([float(mp.digamma(mp.mpf(v))) for v in x.tolist()], dtype=torch.float64)
+    # A rounding of ψ(x) by one unit moves x by that over ψ'(x), relative to x.
+    slack = [
+        4e-16 * max(abs(y), 1) / float(mp.polygamma(1, v)) / v for v, y in zip(x.tolist(), level.tolist(), strict=True)
+    ]
+    found = dirichlet.inverse_digamma(level)
+    assert bool(((found / x - 1).abs() <= 4 * torch.tensor(slack) + 1e-14).all())
+
+
+def test_trigamma_in_the_tails():
+    """What Newton's steps divide by: torch's has ten digits, which sets how fast they arrive and not where."""
+    x = torch.logspace(-6, 8, 57, dtype=torch.float64)
+    exact = [float(mp.polygamma(1, mp.mpf(v))) for v in x.tolist()]
+    np.testing.assert_allclose(torch.polygamma(1, x).numpy(), exact, rtol=1e-9)
+
+
+def test_maps_do_not_depend_on_the_batch():
+    """Bits of fused beliefs, and choices of every acquisition, for all episodes at once and one by one."""
+    generator = torch.Generator().manual_seed(3)
+    beta = 0.5 + torch.rand(16, 30, 9, generator=generator)
+    likelihood = torch.rand(16, 12, 9, generator=generator).softmax(-1)
+    footprint = torch.rand(16, 12, 30, generator=generator) < 0.3
+    whole = fuse(beta, likelihood, footprint)
+    assert torch.equal(
+        whole, torch.cat([fuse(*(t[i : i + 1] for t in (beta, likelihood, footprint))) for i in range(16)])
+    )
+    alpha = 0.5 + 3 * torch.rand(9, 3, 9, generator=generator) + 2 * torch.eye(9)[:, None]
+    model = FovealObservationModel(alpha, [0.2, 0.4], [f"class {n}" for n in range(8)]).eval().requires_grad_(False)
+    grid, noise = Grid(6, 5, (60, 50)), torch.rand(16, 30, generator=generator)
+    visited = torch.zeros(16, 30, dtype=torch.bool)
+    for value in (
+        acquisition.TargetPosterior(4),
+        acquisition.PredictedTargetPosterior(4, model, calibrated=True),
+        acquisition.KLDivergence(model, grid, calibrated=True),
+        acquisition.NegativeEntropy(model, grid),
+        acquisition.TwoPeaks(model, grid),
+    ):
+        together = select_fixation(value(whole), visited, noise)
+        alone = [select_fixation(value(whole[i : i + 1]), visited[:1], noise[i : i + 1]) for i in range(16)]
+        assert torch.equal(together, torch.cat(alone))
+
+
+def test_scenes_of_a_seed_are_the_same_bits():
+    classes = ("person", "cat", "cup", "motorcycle")
+    first, again, other = (EmbeddedScenes(classes, count=2, seed=seed) for seed in (5, 5, 6))
+    assert first.digest(1) == again.digest(1) != other.digest(1)
+    assert torch.equal(first[1].image, again[1].image)

@@ -1,0 +1,247 @@
+"""Every public module as a part of somebody else's module: copied, moved, saved, compiled, exported, vectorised."""
+
+import copy
+import io
+import pickle
+from collections.abc import Callable
+from functools import partial
+from inspect import isabstract, isclass
+from types import ModuleType
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import semfov
+from semfov import FovealObservationModel, Foveation, Grid, SemanticMap, acquisition, fusion, saliency
+from semfov.belief import TargetEvidence
+from semfov.detection import Detections
+from semfov.gaze import select_fixation
+
+CLASSES = ("cat", "cup", "person")
+GRID = Grid(4, 3, (64, 48))
+
+
+class Host(nn.Module):
+    """Somebody else's module: it scales what the part returns by a parameter of its own."""
+
+    def __init__(self, part: nn.Module) -> None:
+        super().__init__()
+        self.part = part
+        self.gain = nn.Parameter(torch.tensor(2.0))
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return self.gain * self.part(*inputs)
+
+
+def rand(*shape: int) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(sum(shape)))
+
+
+def model() -> FovealObservationModel:
+    alpha = 0.5 + 4 * rand(4, 3, 4) + 3 * torch.eye(4)[:, None]
+    return FovealObservationModel(alpha, [0.2, 0.5], CLASSES, miss_rate=0.1 + 0.8 * rand(4, 3)).eval()
+
+
+def beliefs() -> Tensor:
+    return 0.5 + 3 * rand(2, len(GRID), 4)
+
+
+SEARCHERS: dict[str, Callable[[], nn.Module]] = {
+    "TargetPosterior": lambda: acquisition.TargetPosterior(2),
+    "PredictedTargetPosterior": lambda: acquisition.PredictedTargetPosterior(2, model(), calibrated=True),
+    "NeighbourhoodPosterior": lambda: acquisition.NeighbourhoodPosterior(2, GRID),
+    "FovealHit": lambda: acquisition.FovealHit(2, model(), GRID),
+    "PlaceInformation": lambda: acquisition.PlaceInformation(2, model(), GRID),
+    "Static": lambda: acquisition.Static(rand(len(GRID))),
+    "Uniform": acquisition.Uniform,
+}
+LOOKAHEADS = (
+    acquisition.KLDivergence,
+    acquisition.NegativeEntropy,
+    acquisition.TwoPeaks,
+    acquisition.UpperConfidenceBound,
+    acquisition.ProbabilityOfImprovement,
+)
+EXPLORERS: dict[str, Callable[[], nn.Module]] = {
+    make.__name__: partial(make, model(), GRID, calibrated=True) for make in LOOKAHEADS
+} | {"ExpectedAccuracy": lambda: acquisition.ExpectedAccuracy(model(), GRID)}
+ACQUISITIONS = SEARCHERS | EXPLORERS
+OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]]]] = {
+    "Foveation": (lambda: Foveation(9.0, learnable=True), lambda: (rand(2, 3, 48, 64), torch.tensor([20.0, 30.0]))),
+    "Foveation, opencv": (
+        lambda: Foveation(9.0, convention="opencv"),
+        lambda: (rand(1, 3, 33, 47), torch.tensor([[5.0, 6.0]])),
+    ),
+    "FovealObservationModel": (model, lambda: (rand(5, 6, 4).softmax(-1), rand(5, 6))),
+    "VOCUS2": (saliency.VOCUS2, lambda: (rand(1, 3, 40, 60),)),
+    "IttiKoch": (saliency.IttiKoch, lambda: (rand(1, 3, 64, 96),)),
+}
+PARTS = OTHERS | {name: (make, lambda: (beliefs(),)) for name, make in ACQUISITIONS.items()}
+
+# bfloat16 has 8 bits: a value is off by up to 2^-9, 0.2 %. Calibration multiplies logarithms of small scores by large
+# parameters, and exploration takes differences of what is nearly equal: digits that are not there then count.
+AUTOCAST = dict.fromkeys(("PlaceInformation", "PredictedTargetPosterior", "FovealObservationModel", "VOCUS2"), 0.05)
+AUTOCAST |= dict.fromkeys(EXPLORERS, 0.1)
+
+
+@pytest.fixture(params=PARTS)
+def part(request) -> tuple[str, nn.Module, tuple[Tensor, ...]]:
+    make, inputs = PARTS[request.param]
+    return request.param, make(), inputs()
+
+
+def test_all_modules_are_tested():
+    """A module that joins the public surface joins this file."""
+    spaces: list[ModuleType] = [semfov, semfov.acquisition, semfov.saliency]
+    things = {name: getattr(space, name) for space in spaces for name in space.__all__}
+    modules = {n for n, t in things.items() if isclass(t) and issubclass(t, nn.Module) and not isabstract(t)}
+    agents = {"ActivePerception", "Eye", "SemanticMap", "TargetEvidence"}
+    assert modules == {name.split(",")[0] for name in PARTS} | agents
+
+
+def test_state_dict(part):
+    name, module, inputs = part
+    host, other = Host(module), Host(PARTS[name][0]())
+    with torch.no_grad():
+        for parameter in host.parameters():
+            parameter.mul_(1.25)
+    file = io.BytesIO()
+    torch.save(host.state_dict(), file)
+    file.seek(0)
+    other.load_state_dict(torch.load(file, weights_only=True))
+    assert torch.equal(host(*inputs), other(*inputs))
+
+
+def test_copies_are_independent(part):
+    _, module, inputs = part
+    host = Host(module)
+    before = host(*inputs)
+    for twin in (copy.deepcopy(host), pickle.loads(pickle.dumps(host))):
+        assert torch.equal(twin(*inputs), before)
+        with torch.no_grad():
+            for tensor in (*twin.parameters(), *twin.buffers()):
+                if tensor.is_floating_point():
+                    tensor.zero_()
+        assert torch.equal(host(*inputs), before)
+
+
+def test_dtype_is_that_of_the_module(part, device):
+    _, module, inputs = part
+    expected = Host(module)(*inputs)
+    moved = Host(module).to(device, torch.float64)
+    result = moved(*(x.to(device, torch.float64) for x in inputs))
+    assert result.dtype == torch.float64
+    assert result.device.type == device.type
+    torch.testing.assert_close(result.cpu().float(), expected, rtol=1e-3, atol=1e-4)
+
+
+def test_compiles_to_one_graph(part):
+    _, module, inputs = part
+    host = Host(module)
+    torch.compiler.reset()
+    compiled = torch.compile(host, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(*inputs), host(*inputs), rtol=1e-4, atol=1e-5)
+
+
+def test_exports(part):
+    _, module, inputs = part
+    host = Host(module).requires_grad_(False)
+    program = torch.export.export(host, inputs)
+    torch.testing.assert_close(program.module()(*inputs), host(*inputs), rtol=1e-4, atol=1e-5)
+
+
+def test_autocast(part):
+    name, module, inputs = part
+    host = Host(module).requires_grad_(False)
+    expected = host(*inputs)
+    with torch.autocast("cpu", torch.bfloat16):
+        result = host(*inputs)
+    assert bool(torch.isfinite(result).all())
+    scale = float(expected.abs().max().clamp(min=1e-6))
+    assert float((result.float() - expected).abs().max()) <= AUTOCAST.get(name, 0.02) * scale
+
+
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_acquisitions_vectorise(name):
+    module = ACQUISITIONS[name]().requires_grad_(False)
+    many = 0.5 + 3 * rand(5, 2, len(GRID), 4)
+    torch.testing.assert_close(torch.func.vmap(module)(many), torch.stack([module(each) for each in many]))
+
+
+@pytest.mark.parametrize("rule", ["kaplan", "product", "sum"])
+def test_fusion_vectorises(rule):
+    update = getattr(fusion, rule)
+    beta, likelihood = 0.5 + rand(6, 4), 0.1 + rand(6, 4)
+    expected = torch.stack([update(*pair) for pair in zip(beta, likelihood, strict=True)])
+    torch.testing.assert_close(torch.func.vmap(update)(beta, likelihood), expected)
+
+
+def test_calibration_vectorises():
+    observation = model().requires_grad_(False)
+    scores, distance = rand(7, 5, 4).softmax(-1), rand(7, 5)
+    expected = torch.stack([observation(*pair) for pair in zip(scores, distance, strict=True)])
+    torch.testing.assert_close(torch.func.vmap(observation)(scores, distance), expected)
+
+
+def test_choice_vectorises():
+    values, noise = rand(5, 2, 12), rand(5, 2, 12).flip(-1)
+    visited = noise > 0.8
+    expected = torch.stack([select_fixation(*each) for each in zip(values, visited, noise, strict=True)])
+    assert torch.equal(torch.func.vmap(select_fixation)(values, visited, noise), expected)
+
+
+def test_gradients_of_each_sample():
+    """`vmap(grad(...))`, as for influence and per-sample clipping."""
+    observation = model().requires_grad_(False)
+    scores, distance = rand(7, 4).softmax(-1), rand(7)
+
+    def surprise(one: Tensor, there: Tensor) -> Tensor:
+        return -observation(one, there)[2].log()
+
+    every = torch.func.vmap(torch.func.grad(surprise))(scores, distance)
+    for one, there, gradient in zip(scores, distance, every, strict=True):
+        one = one.clone().requires_grad_()
+        torch.testing.assert_close(torch.autograd.grad(surprise(one, there), one)[0], gradient)
+
+
+def test_gradients_flow_from_the_choice_back_to_gaze_and_scores():
+    """Sensor, calibration, fusion and acquisition in one graph."""
+    gaze, width = torch.tensor([30.0, 20.0], requires_grad=True), torch.tensor(9.0, requires_grad=True)
+    view = semfov.foveate(rand(1, 3, 48, 64), gaze, sigma=width)
+    scores = view.mean((-1, -2)) @ rand(3, 4)
+    likelihood = model()(scores.softmax(-1), torch.tensor([0.1]))
+    beta = fusion.kaplan(beliefs()[:1], likelihood[:, None])
+    acquisition.TargetPosterior(2)(beta).sum().backward()
+    for leaf in (gaze, width):
+        assert bool(torch.isfinite(leaf.grad).all())
+        assert float(leaf.grad.abs().sum()) > 0
+
+
+def test_maps_and_evidence_are_modules_too():
+    """Modules that take detections: state, copies and dtype."""
+    boxes = torch.tensor([[[4.0, 4, 30, 30], [20, 10, 60, 40]]])
+    seen = Detections(boxes, rand(1, 2, 4).softmax(-1), torch.ones(1, 2, dtype=torch.bool))
+    fixation = torch.tensor([[20.0, 20.0]])
+    own = SemanticMap(GRID, CLASSES, observation=model())
+    twin = copy.deepcopy(own)
+    own(seen, fixation)
+    assert float(twin.beta.max()) == 0.5
+    twin.load_state_dict(own.state_dict())
+    assert torch.equal(twin.beta, own.beta)
+    evidence = TargetEvidence(4, 4).eval()
+    again = pickle.loads(pickle.dumps(evidence))
+    assert torch.equal(evidence(seen, fixation, GRID, 2), again(seen, fixation, GRID, 2))
+
+
+@pytest.mark.parametrize("size", [(48, 64), (200, 300)])
+@pytest.mark.parametrize("which", ["image", "gaze", "sigma"])
+def test_sensor_vectorises(size, which):
+    given = {"image": rand(1, 3, *size), "gaze": torch.tensor([20.0, 30.0]), "sigma": torch.tensor(9.0)}
+    many = {"image": rand(4, 1, 3, *size), "gaze": 40 * rand(5, 2), "sigma": 1 + 9 * rand(5)}[which]
+
+    def view(one: Tensor) -> Tensor:
+        options = given | {which: one}
+        return semfov.foveate(options["image"], options["gaze"], sigma=options["sigma"])
+
+    torch.testing.assert_close(torch.func.vmap(view)(many), torch.stack([view(one) for one in many]))

@@ -1,0 +1,145 @@
+"""Files from elsewhere are data: nothing in them is run, and nothing leads out of the folder they belong in."""
+
+import ast
+import io
+import pickle
+import tarfile
+from pathlib import Path
+
+import pytest
+import torch
+
+from semfov import load_detector
+from semfov.data.download import _ANNOTATIONS, SPLITS
+from semfov.detection.sources import Address, SourceDistribution
+from semfov.detection.weights import WEIGHTS
+from semfov.errors import DataError
+
+ROOT = Path(__file__).parents[2]
+SOURCES = [
+    file for folder in ("semfov", "eval", "train", "examples") for file in sorted((ROOT / folder).rglob("*.py"))
+] + [ROOT / "hubconf.py"]
+
+FORBIDDEN = {
+    "pickle.load", "pickle.loads", "pickle.Unpickler", "marshal.load", "marshal.loads", "shelve.open", "dill.load",
+    "joblib.load", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "os.system", "os.popen", "eval", "exec",
+    "compile", "torch.hub.load_state_dict_from_url", "torch.utils.model_zoo.load_url",
+}  # fmt: skip
+CLASSES = [f"class {n}" for n in range(1, 91)]
+EXTRACTING = ("extractall", "extract", "unpack_archive")
+
+
+def faults(source: str) -> list[str]:
+    """Calls that run, or may run, what a file says."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call):
+            continue
+        name = ast.unparse(node.func)
+        given = {word.arg: ast.unparse(word.value) for word in node.keywords}
+        bad = name in FORBIDDEN or name.split(".")[-1] in EXTRACTING
+        bad |= name == "torch.load" and given.get("weights_only") != "True"
+        bad |= name in ("np.load", "numpy.load") and given.get("allow_pickle", "False") != "False"
+        bad |= name.startswith("subprocess.") and given.get("shell", "False") != "False"
+        if bad:
+            found.append(f"line {node.lineno}: {ast.unparse(node)[:80]}")
+    return found
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "torch.load(path)", "torch.load(path, weights_only=False)", "pickle.loads(data)", "yaml.load(text, Loader)",
+        "tar.extractall(folder)", "np.load(path, allow_pickle=True)", "subprocess.run(command, shell=True)",
+        "eval(text)",
+    ],
+)  # fmt: skip
+def test_the_scan_finds(line):
+    assert faults(line)
+
+
+def test_sources_run_nothing_that_they_read():
+    assert len(SOURCES) > 100
+    assert {str(file): found for file in SOURCES if (found := faults(file.read_text(encoding="utf-8")))} == {}
+
+
+def test_every_download_is_pinned():
+    for name, entry in WEIGHTS.items():
+        assert len(bytes.fromhex(entry.sha256)) == 32, name
+        assert entry.size > 0
+        assert entry.licence
+        for source in entry.sources:
+            assert isinstance(source, Address | SourceDistribution)
+            if isinstance(source, Address):
+                assert source.url.startswith("https://")
+            else:
+                assert len(bytes.fromhex(source.sha256)) == 32
+    for archive in (*SPLITS.values(), _ANNOTATIONS):
+        assert len(bytes.fromhex(archive.sha256)) == 32
+
+
+class Evil:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_a_pickled_checkpoint_is_refused(tmp_path):
+    mark, weights = tmp_path / "run", tmp_path / "weights.pth"
+    torch.save({"weight": torch.zeros(1), "evil": Evil(mark)}, weights)
+    with pytest.raises(DataError, match=r"weights\.pth"):
+        load_detector("torchvision:ssdlite320_mobilenet_v3_large", weights=weights, classes=CLASSES)
+    assert not mark.exists()
+    pickle.loads(pickle.dumps(Evil(mark)))
+    assert mark.exists()
+
+
+def test_settings_that_would_run_code_are_refused(tmp_path, capsys):
+    from eval.search import main
+
+    mark, settings = tmp_path / "run", tmp_path / "settings.yaml"
+    settings.write_text(
+        f"out: !!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path ['{mark}']]"
+    )
+    with pytest.raises(SystemExit) as stopped:
+        main(["--config", str(settings)])
+    assert stopped.value.code == 2
+    assert "python/object" in capsys.readouterr().err
+    assert not mark.exists()
+
+
+def archive(path: Path, *members: tuple[str, bytes | None, str]) -> None:
+    """A tar file of (name, content, target of a link)."""
+    with tarfile.open(path, "w:gz") as tar:
+        for name, content, link in members:
+            entry = tarfile.TarInfo(name)
+            if content is None:
+                entry.type, entry.linkname = tarfile.SYMTYPE, link
+            else:
+                entry.size = len(content)
+            tar.addfile(entry, None if content is None else io.BytesIO(content))
+
+
+@pytest.mark.parametrize("target", ["../../../../etc/passwd", "/etc/passwd", "p-1/other"])
+def test_archives_give_their_one_member_and_nothing_else(tmp_path, monkeypatch, target):
+    """Names that lead out stay in the archive, and a link leads nowhere else."""
+    source = SourceDistribution("p", "1", "0" * 64, 100, "p-1/weights")
+
+    def download(self, folder: Path) -> None:
+        (folder / "archives").mkdir()
+        archive(
+            folder / "archives" / "p-1.tar.gz",
+            ("../../escaped", b"out", ""), ("/tmp/semfov-escaped", b"out", ""), ("p-1/weights", None, target),
+        )  # fmt: skip
+
+    monkeypatch.setattr(SourceDistribution, "_download", download)
+    destination = tmp_path / "weights"
+    with pytest.raises(DataError, match="lacks"):
+        source.fetch(destination)
+    assert not Path("/tmp/semfov-escaped").exists()
+    assert [file.name for file in tmp_path.iterdir()] in ([], ["weights"])
+    assert not destination.exists() or destination.read_bytes() == b""
