@@ -4,11 +4,12 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup search test lint types clean
+.PHONY: help setup search test test-all lint types clean
 
 help:
 	@echo "make search   set up, fetch the default detector, search the embedded scenes, write tables and pictures"
 	@echo "make test     set up, then lint, types and tests"
+	@echo "make test-all the same, with the tests that take minutes"
 	@echo "make clean    remove the environment and run outputs"
 
 setup: $(STAMP)
@@ -30,6 +31,9 @@ types: $(STAMP)
 
 test: lint types
 	$(BIN)/python -m pytest -n 2
+
+test-all: lint types
+	$(BIN)/python -m pytest -n 2 -m ""
 
 clean:
 	rm -rf $(VENV) runs

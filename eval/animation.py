@@ -30,12 +30,12 @@ def render(figures: Iterable[Any], dpi: int = 90) -> list[Frame]:
     return frames
 
 
-def in_palette(frame: Frame) -> Any:
-    """A frame as a Pillow image of 256 colours of its own, dithered."""
+def in_palette(frame: Frame, refine: int = 0) -> Any:
+    """A frame as a Pillow image of 256 colours of its own, dithered; refining the colours takes seconds a round."""
     from PIL import Image
 
     image = Image.fromarray(frame)
-    return image.quantize(palette=image.quantize(256, kmeans=3))
+    return image.quantize(palette=image.quantize(256, kmeans=refine))
 
 
 def save_animation(frames: Sequence[Frame], path: Path, *, seconds: float = 1.0, hold: float = 2.0) -> list[Path]:

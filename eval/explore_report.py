@@ -3,6 +3,7 @@
 from functools import partial
 from pathlib import Path
 
+from eval.html.run_report import replay_exploration, write_run_report
 from eval.metrics import success_rate
 from eval.report import (
     Array,
@@ -43,6 +44,18 @@ def report(run: ExploreRun, parts: Parts) -> None:
     tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("answers", "success_rate"))}
     written = write_files(run, "eval.explore", tables, records, seconds, decision)
     written += [draw_curves(run, curves[answer], answer) for answer in ANSWERS]
+    written.append(
+        write_run_report(
+            run,
+            records,
+            curves,
+            titles={name: title for name, (_, title) in ANSWERS.items()},
+            label="cells with the right class (%)",
+            shifts=SHIFTS,
+            decision=decision,
+            replay=replay_exploration,
+        )
+    )
     announce(summary, written)
 
 

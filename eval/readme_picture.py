@@ -26,7 +26,7 @@ def make_picture(path: Path = PATH) -> None:
     seen = plot_foveated_strip(scanpath, views, most=3)
     believed = plot_belief_strip(scanpath, image=scene.image, most=3)
     with replacing(path) as temporary:
-        in_palette(stacked(render([seen, believed], dpi=105))).save(temporary, format="PNG", optimize=True)
+        in_palette(stacked(render([seen, believed], dpi=105)), refine=3).save(temporary, format="PNG", optimize=True)
 
 
 def stacked(frames: list[Frame]) -> Frame:

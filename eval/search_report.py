@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from eval.html.run_report import write_run_report
 from eval.metrics import cumulative_performance, random_search
 from eval.protocol import Looks
 from eval.report import (
@@ -54,6 +55,19 @@ def report(run: SearchRun, parts: Parts) -> None:
     tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("average", "performance"))}
     written = write_files(run, "eval.search", tables, records, seconds, decision)
     written += [draw_curves(run, curves["all targets"], expected), *draw_scanpaths(run, records)]
+    written.append(
+        write_run_report(
+            run,
+            records,
+            curves,
+            titles=AVERAGES,
+            label="targets found (%)",
+            shifts=SHIFTS,
+            decision=decision,
+            replay=replay,
+            others={"random, by formula": expected},
+        )
+    )
     announce(summary, written)
 
 

@@ -23,7 +23,7 @@ class Scanpath:
         values: `(n, X·Y)`, acquisition values that the next fixation was chosen by.
         found: whether the search ended on its target.
         posterior: `(n, X·Y)`, probability of the target in each cell as the search believed it after each look; None
-            for exploration.
+            for exploration. Learned target evidence holds a fixated cell for empty: the search would have ended there.
     """
 
     grid: Grid

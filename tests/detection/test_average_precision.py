@@ -8,7 +8,7 @@ from benchmarks.detector_ap import SELECTIONS, average_precision
 from semfov.detection import Detector
 from semfov.detection.load import load_detector
 
-pytestmark = [pytest.mark.slow, pytest.mark.shared]
+pytestmark = [pytest.mark.long, pytest.mark.shared]
 
 
 def measured(detector: Detector, shared: Path) -> list[tuple[float, float]]:

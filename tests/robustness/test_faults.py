@@ -67,6 +67,7 @@ def whole(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", ["store", "evaluation", "fit"])
 def test_killed_runs_resume_to_the_same_bits(command, tmp_path):
     figures = tmp_path / "figures.json"
@@ -77,6 +78,7 @@ def test_killed_runs_resume_to_the_same_bits(command, tmp_path):
     assert came["killed"] >= 1
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
 def test_one_misfortune_after_another(whole, tmp_path):
     """A worker is killed, the next run meets a full disk, the next is interrupted, and the last one finishes."""
