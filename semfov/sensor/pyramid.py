@@ -14,13 +14,10 @@ from semfov.errors import check, check_shape, lookup, values_known
 Convention = Literal["kornia", "opencv"]
 
 _BLUR = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
-# Kornia blurs and resizes bilinearly, which between even sizes is one filter too: halving averages two blurred
-# pixels, doubling blurs pixels at 1/4 and 3/4 between two. The taps of `_DOUBLE` are for pixels with zeros between.
-_HALVE = {"kornia": tuple(t / 32 for t in (1, 5, 10, 10, 5, 1)), "opencv": _BLUR}
-_DOUBLE = {"kornia": tuple(t / 64 for t in (1, 7, 21, 35, 35, 21, 7, 1)), "opencv": tuple(2 * t for t in _BLUR)}
-
-_SMALL = 128
-_ONEDNN = torch.backends.mkldnn.is_available()
+# Up to this many pixels lines are filtered by one dense matrix, beyond it by one for every block of `_BLOCK`.
+_SMALL = 160
+_BLOCK = 8
+_REACH = 2
 
 Constant = TypeVar("Constant")
 Settings = TypeVarTuple("Settings")
@@ -99,7 +96,7 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     if max(height, width) <= _SMALL and not torch.compiler.is_compiling():
         down, across = (_matrix(n, None, convention, image.dtype, image.device) for n in (height, width))
         return down @ image @ across.mT
-    return _reduce(_reduce(image, convention).mT, convention).mT
+    return _reduce(_reduce(image.mT, convention).mT, convention)
 
 
 def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia") -> Tensor:
@@ -125,9 +122,7 @@ def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia
         lengths = zip(image.shape[-2:], size, strict=True)
         down, across = (_matrix(n, length, convention, image.dtype, image.device) for n, length in lengths)
         return down @ image @ across.mT
-    # Copies for the sake of speed: the transposed convolution is quick in one memory layout only.
-    across = _expand(image.mT.contiguous(), size[1], convention).mT.contiguous()
-    return _expand(across, size[0], convention)
+    return _expand(_expand(image.mT, size[1], convention).mT, size[0], convention)
 
 
 def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> Bands:
@@ -171,16 +166,16 @@ def _matrix(count: int, length: int | None, convention: Convention, dtype: torch
 def _reduce(image: Tensor, convention: Convention) -> Tensor:
     """`pyrdown` along the height."""
     count = image.shape[-2]
-    if _convolves(image) and (convention == "opencv" or count % 2 == 0):
-        return _convolve(image, (count + 1) // 2, convention)
+    if _blocks(count) and (convention == "opencv" or count % 2 == 0):
+        return _filter(image, (count + 1) // 2, convention)
     return _blur(image)[..., ::2, :] if convention == "opencv" else _resize(_blur(image), max(count // 2, 1))
 
 
 def _expand(image: Tensor, length: int, convention: Convention) -> Tensor:
     """`pyrup` along the height."""
     count = image.shape[-2]
-    if _convolves(image) and (convention == "opencv" or length == 2 * count):
-        return _convolve(image, length, convention)
+    if _blocks(count) and (convention == "opencv" or length == 2 * count):
+        return _filter(image, length, convention)
     if convention == "kornia":
         return _blur(_resize(image, length))
     before = torch.cat([image[..., min(1, count - 1), None, :], image[..., :-1, :]], -2)
@@ -206,53 +201,48 @@ def _resize(image: Tensor, length: int) -> Tensor:
     return F.interpolate(image, (length, image.shape[-1]), mode="bilinear", align_corners=False)
 
 
-def _convolves(image: Tensor) -> bool:
-    """Whether `_convolve` is fast and precise here: oneDNN's convolutions are, for single precision on a CPU."""
-    fast = _ONEDNN and image.device.type == "cpu" and image.dtype == torch.float32
-    return fast and image.shape[-2] >= 8 and values_known()
+def _blocks(count: int) -> bool:
+    """Whether `_filter` serves for a line of `count` pixels."""
+    return count >= 5 * _BLOCK and values_known()
 
 
-def _convolve(image: Tensor, length: int, convention: Convention) -> Tensor:
-    """Halve or double the height in one pass: a depthwise convolution whose channels are the columns."""
-    top, bottom = _borders(image.shape[-2], length, convention, image.dtype, image.device)
+def _filter(image: Tensor, length: int, convention: Convention) -> Tensor:
+    """Halve or double the height: matrix products of overlapping blocks of lines, all but the outermost alike.
+
+    A product reads a transposed image as quickly, so that two passes filter both axes without a copy.
+    """
     planes = image.flatten(0, -3)
-    result = _convolve_zeros(planes, length, convention)
-    count = planes.shape[0]
-    result[:, :3].baddbmm_(top.expand(count, 3, 3), planes[:, :3])
-    result[:, -3:].baddbmm_(bottom.expand(count, 3, 3), planes[:, -3:])
+    first, middle, last = _block_matrices(image.shape[-2], length, convention, image.dtype, image.device)
+    step, lines = middle.shape[-2], _BLOCK + 2 * _REACH
+    count = (image.shape[-2] - last.shape[-1] + _REACH) // _BLOCK - 1
+    matrices = middle.expand(count, -1, -1)
+    blocks = planes[:, _BLOCK - _REACH :].unfold(-2, lines, _BLOCK)[:, :count].mT
+    outermost = first @ planes[:, : first.shape[-1]], last @ planes[:, -last.shape[-1] :]
+    if planes.requires_grad and torch.is_grad_enabled():
+        inner = [torch.bmm(matrices, block).flatten(0, 1) for block in blocks]
+        return torch.cat([outermost[0], torch.stack(inner), outermost[1]], -2).unflatten(0, image.shape[:-2])
+    result = planes.new_empty(planes.shape[0], length, planes.shape[-1])
+    result[:, :step], result[:, step * (count + 1) :] = outermost
+    for block, out in zip(blocks, result[:, step : step * (count + 1)].unflatten(1, (count, step)), strict=True):
+        torch.bmm(matrices, block, out=out)
     return result.unflatten(0, image.shape[:-2])
 
 
-def _convolve_zeros(planes: Tensor, length: int, convention: Convention) -> Tensor:
-    """`_convolve` of planes `(N, height, width)`, with zeros beyond their borders."""
-    count, width = planes.shape[-2:]
-    columns = planes[:, None].permute(0, 3, 1, 2)
-    kernel = _kernel(length < count, width, convention, planes.dtype, planes.device)
-    taps = kernel.shape[-1]
-    padding = (0, (taps - 1) // 2)
-    if length < count:
-        result = F.conv2d(columns, kernel, None, (1, 2), padding, groups=width)
-    else:
-        rest = (0, length - 2 * count + taps % 2)
-        result = F.conv_transpose2d(columns, kernel, None, (1, 2), padding, rest, groups=width)
-    return result.permute(0, 2, 3, 1)[:, 0]
-
-
 @constant
-def _kernel(halve: bool, width: int, convention: Convention, dtype: torch.dtype, device: torch.device) -> Tensor:
-    taps = (_HALVE if halve else _DOUBLE)[convention]
-    return torch.tensor(taps, dtype=dtype, device=device).expand(width, 1, 1, -1).contiguous()
-
-
-@constant
-def _borders(
+def _block_matrices(
     count: int, length: int, convention: Convention, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """What zeros beyond the borders leave out: `(3, 3)`, of the first three pixels and of the last three."""
-    # A line of 8 or 9 pixels has the borders of a long one.
-    short = 8 + count % 2
-    length += (short - count) // 2 if length < count else 2 * (short - count)
-    lines = torch.eye(short, dtype=torch.float64)[None]
-    exact = _reduce(lines[None], convention) if length < short else _expand(lines[None], length, convention)
-    missing = (exact[0] - _convolve_zeros(lines, length, convention))[0].to(dtype=dtype, device=device)
-    return missing[:3, :3], missing[-3:, -3:]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Matrices that reduce or expand the first block of a line, one in the middle, and the last with what remains."""
+    # The blocks of a line of four, and what remains, are those of a long one.
+    short = 4 * _BLOCK + count % _BLOCK
+    halves = length < count
+    step = _BLOCK // 2 if halves else 2 * _BLOCK
+    pixels = torch.eye(short, dtype=torch.float64)[None, None]
+    lines = _reduce(pixels, convention) if halves else _expand(pixels, 2 * short - (2 * count - length), convention)
+    whole = lines[0, 0].to(dtype=dtype, device=device)
+    middle = whole[step : 2 * step, _BLOCK - _REACH : 2 * _BLOCK + _REACH]
+    return (
+        whole[:step, : _BLOCK + _REACH].contiguous(),
+        middle.contiguous(),
+        whole[3 * step :, 3 * _BLOCK - _REACH :].contiguous(),
+    )

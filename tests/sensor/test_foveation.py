@@ -42,7 +42,7 @@ def test_plain_loops(twin, convention, growth, size):
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("growth", [1.0, 2.0])
 def test_plain_loops_on_a_large_image(twin, convention, growth):
-    image = draw(1, 1, 132, 139)
+    image = draw(1, 1, 164, 171)
     gaze, sigma = (100.5, 20.0), (30.0, 30.0)
     result = foveate(image, torch.tensor(gaze), sigma=30.0, growth=growth, convention=convention)
     close(result[0], twin.foveate(image[0].numpy(), gaze, sigma, 5, growth, convention))
@@ -66,14 +66,14 @@ def test_wide_sigma_gives_a_large_image_back(convention, size, sigma, device):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
 def test_constant_image_stays_constant(convention, size):
     image = torch.full((1, 3, *size), 0.3, dtype=torch.float64)
     close(foveate(image, torch.tensor([5.0, 9.0]), sigma=2.0, convention=convention), image)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
 def test_many_fixations_are_the_loop_over_them(convention, size, device):
     image = draw(2, 3, *size, device=device)
     gaze = 30 * draw(2, 4, 2, device=device)
@@ -99,7 +99,7 @@ def test_no_fixations_and_no_levels():
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
 def test_sigma_of_each_image_and_axis(convention, size):
     image, gaze = draw(2, 1, *size), 20 * draw(2, 3, 2)
     sigma = torch.tensor([[4.0, 9.0], [7.0, 3.0]])
@@ -116,7 +116,7 @@ def test_sigma_of_each_image_and_axis(convention, size):
     close(equal[1:], foveate(image[1:], gaze[1:], sigma=9.0, convention=convention))
 
 
-@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
 def test_gaze_far_away_leaves_the_base(size):
     image = draw(1, 3, *size, dtype=torch.float32)
     far = foveate(image, torch.tensor([1e6, -1e6]), sigma=5.0)
@@ -146,7 +146,7 @@ def test_linear_in_the_image(convention, a, b, height, width):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
 def test_pyramid_can_be_reused(convention, size):
     image = draw(2, 3, *size)
     sensor = Foveation(8.0, levels=4, growth=1.5, convention=convention)
@@ -165,7 +165,7 @@ def test_pyramid_can_be_reused(convention, size):
 
 
 @pytest.mark.parametrize("levels", [0, 3])
-@pytest.mark.parametrize("size", [(20, 27), (150, 132), (131, 2)])
+@pytest.mark.parametrize("size", [(20, 27), (170, 164), (163, 2)])
 def test_nothing_of_the_callers_is_written(levels, size):
     image, gaze, sigma = draw(1, 3, *size), torch.tensor([[5.0, 6.0]]), torch.tensor([[4.0, 5.0]])
     before = [t.clone() for t in (image, gaze, sigma)]
@@ -176,7 +176,7 @@ def test_nothing_of_the_callers_is_written(levels, size):
         assert torch.equal(now, then)
 
 
-@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
 def test_writing_to_a_view_leaves_others_alone(size):
     bands = laplacian_pyramid(draw(1, 3, *size), 3)
     gaze = torch.tensor([[[3.0, 4.0], [9.0, 2.0]]])
@@ -189,7 +189,7 @@ def test_writing_to_a_view_leaves_others_alone(size):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(6, 5), (4, 130)])
+@pytest.mark.parametrize("size", [(6, 5), (4, 162)])
 def test_gradients(convention, size):
     image = draw(1, 1, *size).requires_grad_()
     gaze = (4 * draw(1, 2, 2)).requires_grad_()
@@ -203,7 +203,7 @@ def test_gradients(convention, size):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(20, 27), (150, 132), (141, 200)])
+@pytest.mark.parametrize("size", [(20, 27), (170, 164), (141, 200)])
 def test_same_with_and_without_gradient(convention, size):
     image, gaze = draw(2, 3, *size), 20 * draw(2, 3, 2)
     recorded = foveate(image.clone().requires_grad_(), gaze, sigma=8.0, convention=convention)
@@ -282,7 +282,7 @@ def test_learnable_sigma():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
 def test_dtype_and_device_follow_the_image(dtype, size, device):
     image = draw(1, 3, *size, device=device)
     expected = foveate(image, torch.tensor([9.0, 8.0], device=device), sigma=6.0)
@@ -293,7 +293,7 @@ def test_dtype_and_device_follow_the_image(dtype, size, device):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("size", [(20, 27), (150, 132)])
+@pytest.mark.parametrize("size", [(20, 27), (170, 164)])
 def test_compiles_to_one_graph(convention, size):
     image, gaze = draw(1, 2, *size), 20 * draw(1, 3, 2)
     torch.compiler.reset()
