@@ -45,6 +45,7 @@ class DetectorConfig:
         limit: most boxes kept in a view.
         stride: pad the view only to a multiple of this (None: to the detector's square input, as published; `auto`:
             what is fastest, 32 for Darknet's networks).
+        input_size: longer side in pixels at which it works, for Darknet's networks (None: its own, 416).
     """
 
     name: str = "yolov3-tiny"
@@ -54,6 +55,7 @@ class DetectorConfig:
     iou: float = 0.5
     limit: int = 100
     stride: int | Literal["auto"] | None = "auto"
+    input_size: int | None = None
 
 
 @dataclass(frozen=True)
@@ -155,7 +157,8 @@ class SearchConfig:
         policies: policies to compare: `target-evidence` (learned; recommended), `random`, `vocus2`, `itti-koch`, or
             `non-predictive`, `predictive`, `neighbourhood`, `foveal-hit` or `place-information` followed by `-raw`
             (scores are likelihoods) or `-calibrated` (scores go through the observation model). These may be followed
-            by `+tempered`, `+closest`, `+soft`, `+central` and `+misses`, which change `belief` for this policy alone.
+            by `+tempered` (τ = ¼), `+mild` (τ = ½), `+closest`, `+soft`, `+central` and `+misses`, which change
+            `belief` for this policy alone.
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what the detector saw from every cell, shared between runs (None: the user's cache).
         store: keep what the detector saw on disk; false recomputes it (the result is the same).
@@ -196,9 +199,9 @@ class ExploreConfig:
         saliency: the saliency baselines.
         protocol: the experiment.
         policies: policies to compare: `random`, `kl`, `negative-entropy`, `two-peaks`, `upper-confidence-bound`,
-            `probability-of-improvement`, `expected-accuracy`, `vocus2` or `itti-koch`, each followed by `-raw` (scores
-            are likelihoods) or `-calibrated` (scores go through the observation model), and `+` options as for
-            `eval.search`.
+            `probability-of-improvement`, `expected-accuracy`, `closer-look` (recommended), `vocus2` or `itti-koch`,
+            each followed by `-raw` (scores are likelihoods) or `-calibrated` (scores go through the observation
+            model), and `+` options as for `eval.search`.
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
         store: keep what was seen on disk; false recomputes it (the result is the same).
@@ -222,6 +225,7 @@ class ExploreConfig:
         "negative-entropy-calibrated",
         "two-peaks-calibrated",
         "vocus2-calibrated",
+        "closer-look-raw+mild",
     )
     out: Path = Path("runs/explore")
     cache: Path | None = None

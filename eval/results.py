@@ -61,8 +61,11 @@ EXPLORE = (
     "itti-koch-raw",
     "random-calibrated",
     "kl-calibrated",
+    "random-raw+mild",
     "expected-accuracy-raw+misses",
-    "expected-accuracy-calibrated+tempered+soft+misses",
+    "closer-look-raw",
+    "closer-look-raw+mild",
+    "closer-look-calibrated",
 )
 
 SENSITIVITY: dict[str, dict[str, dict[str, object]]] = {
@@ -88,6 +91,28 @@ SENSITIVITY: dict[str, dict[str, dict[str, object]]] = {
 }
 """Settings that change one thing each; of non-predictive search with raw scores."""
 
+SENSORS: dict[str, dict[str, dict[str, object]]] = {
+    **{
+        f"YOLOX-nano, fovea {sigma} px, growth {growth}": {"sensor": {"sigma": float(sigma), "growth": float(growth)}}
+        for sigma in (50, 100, 200)
+        for growth in (1, 2)
+    },
+    **{
+        f"YOLOv3-tiny at {size} px": {"detector": {"name": "yolov3-tiny", "weights": None, "input_size": size}}
+        for size in (320, 416, 608)
+    },
+}
+"""Sensors and working resolutions."""
+
+FIVE_LEVELS = "explore-five-levels-nano"
+"""The experiment that needs a model which is not shipped."""
+
+STUDIES = {
+    "sensitivity": (SENSITIVITY, ("non-predictive-raw",)),
+    "sensor": (SENSORS, ("random", "non-predictive-raw", "non-predictive-raw+tempered+central")),
+}
+"""Studies on fewer photographs: what changes, and the policies. A row of their tables is a setting and a policy."""
+
 
 @dataclass(frozen=True)
 class ResultsConfig:
@@ -98,7 +123,8 @@ class ResultsConfig:
         annotations: COCO-format instances file for them.
         yolox: ONNX file of YOLOX-nano (None: the published one).
         limit: only the first so many photographs, for a trial.
-        sensitivity: photographs for the study of sensitivity, which has to look anew for every sensor.
+        sensitivity: photographs for the studies of sensitivity and of sensors, which look anew for every setting.
+        five_levels: observation model of YOLOX-nano with five levels, the last of them empty (None: left out).
         only: experiments to run (None: all); the page says of the others what is there from before, or nothing.
         page: file to write.
         template: its text.
@@ -112,6 +138,7 @@ class ResultsConfig:
     yolox: Path | None = None
     limit: int | None = None
     sensitivity: int = 30
+    five_levels: Path | None = None
     only: tuple[str, ...] | None = None
     page: Path = Path("docs/results.md")
     template: Path = Path("docs/results.template.md")
@@ -141,19 +168,24 @@ def experiments(config: ResultsConfig) -> dict[str, RunConfig]:
         published = BeliefConfig(model=f"{'yolov3-tiny' if name == 'tiny' else 'yolox-nano'}-published")
         models = ("random-calibrated", "kl-calibrated", "negative-entropy-calibrated", "two-peaks-calibrated")
         runs[f"explore-published-{name}"] = tour(policies=models, belief=published)
-    some = replace(data, limit=config.sensitivity)
+    if config.five_levels is not None:
+        belief = BeliefConfig(model=str(config.five_levels))
+        policies = ("random-raw", "kl-raw", "random-calibrated", "kl-calibrated")
+        nano: dict[str, Any] = {"data": data, "detector": detectors["nano"], "cache": config.cache}
+        runs[FIVE_LEVELS] = ExploreConfig(**nano, workers=config.workers, policies=policies, belief=belief)
     base = SearchConfig(
-        some,
+        replace(data, limit=config.sensitivity),
         detectors["nano"],
-        policies=("non-predictive-raw",),
         cache=config.cache,
         workers=config.workers,
         scanpaths=0,
     )
-    for label, changes in SENSITIVITY.items():
-        parts = {part: replace(getattr(base, part), **values) for part, values in changes.items()}
-        runs[f"sensitivity {label}"] = replace(base, **parts)
-    return {name: replace(run, out=config.out / name.replace(" ", "-")) for name, run in runs.items()}
+    for study, (settings, policies) in STUDIES.items():
+        for label, changes in settings.items():
+            parts = {part: replace(getattr(base, part), **values) for part, values in changes.items()}
+            runs[f"{study} {label}"] = replace(base, **parts, policies=policies)
+    folder = str.maketrans({" ": "-", ",": None})
+    return {name: replace(run, out=config.out / name.translate(folder)) for name, run in runs.items()}
 
 
 def results(config: ResultsConfig) -> None:
@@ -182,30 +214,38 @@ def fill(template: str, runs: dict[str, RunConfig]) -> str:
         if not line.startswith("@@ "):
             lines.append(line)
             continue
-        if line == "@@ sensitivity":
-            lines += sensitivity_table(runs)
+        if line.removeprefix("@@ ") in STUDIES:
+            lines += study_table(line.removeprefix("@@ "), runs)
             continue
         name, kind = line.removeprefix("@@ ").split()
-        folder = runs[lookup(name, runs, "experiment")].out
         make = TABLES[lookup(kind, TABLES, "table")]
-        lines += make(folder) if (folder / "summary.md").exists() else ["*Not run yet.*"]
+        run = runs.get(lookup(name, [*runs, FIVE_LEVELS], "experiment"))
+        lines += make(run.out) if run and (run.out / "summary.md").exists() else ["*Not run yet.*"]
     return "\n".join(lines) + "\n"
 
 
-def sensitivity_table(runs: dict[str, RunConfig]) -> list[str]:
-    """One row for each setting, of the curves over all targets."""
+def study_table(study: str, runs: dict[str, RunConfig]) -> list[str]:
+    """One row for each setting and policy, of the curves over all targets."""
     shifts = (1, 5, 10, 15, 30)
-    rows = [["setting", *(f"CP@{n}" for n in shifts)]]
-    for label in SENSITIVITY:
-        folder = runs[f"sensitivity {label}"].out
-        if not (folder / "summary.md").exists():
-            rows.append([label, *("not run yet" for _ in shifts)])
-            continue
-        records = [json.loads(line) for line in (folder / "episodes.jsonl").read_text(encoding="utf-8").splitlines()]
-        curves = per_image(records, max(shifts))
-        mean, error = curves.mean(0), standard_error(curves)
-        rows.append([label, *(f"{100 * mean[n]:.1f} ± {100 * error[n]:.1f}" for n in shifts)])
+    settings, policies = STUDIES[study]
+    rows = [["setting", *(["policy"] if len(policies) > 1 else []), *(f"CP@{n}" for n in shifts)]]
+    for label in settings:
+        folder = runs[f"{study} {label}"].out
+        records = read_records(folder) if (folder / "summary.md").exists() else None
+        for policy in policies:
+            head = [label, *([policy] if len(policies) > 1 else [])]
+            if records is None:
+                rows.append([*head, *("not run yet" for _ in shifts)])
+                continue
+            curves = per_image([record for record in records if record["policy"] == policy], max(shifts))
+            mean, error = curves.mean(0), standard_error(curves)
+            rows.append([*head, *(f"{100 * mean[n]:.1f} ± {100 * error[n]:.1f}" for n in shifts)])
     return table(rows)
+
+
+def read_records(folder: Path) -> list[Record]:
+    """What a run wrote of every episode."""
+    return [json.loads(line) for line in (folder / "episodes.jsonl").read_text(encoding="utf-8").splitlines()]
 
 
 def summary(folder: Path, section: int | None = None) -> list[str]:
@@ -218,7 +258,7 @@ def summary(folder: Path, section: int | None = None) -> list[str]:
 
 def paired(folder: Path, baseline: str, shifts: Sequence[int]) -> list[str]:
     """Differences of every policy to `baseline` over the same images, in points, with standard errors."""
-    records = [json.loads(line) for line in (folder / "episodes.jsonl").read_text(encoding="utf-8").splitlines()]
+    records = read_records(folder)
     last = max(shifts)
     policies = list(dict.fromkeys(record["policy"] for record in records))
     curves = {policy: per_image([r for r in records if r["policy"] == policy], last) for policy in policies}

@@ -89,7 +89,8 @@ class Run(ABC):
             return Searcher(TargetObserver(self.target), search_policy("non-predictive"))
         saliency = self.saliency(base, index) if base in self.saliency_stores else None
         components = len(self.scenes.classes) + 1
-        return make_searcher(name, self.kind, self.config.belief, components, self.model, saliency)
+        fovea = self.config.sensor.sigma / self.config.sensor.reference
+        return make_searcher(name, self.kind, self.config.belief, components, self.model, saliency, fovea)
 
     def grid(self, index: int) -> Grid:
         """The grid over a scene."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,6 +58,16 @@ class Samples:
     def scene(self) -> Tensor:
         """Index of the scene of each detection, `(M,)`."""
         return self.scenes[self.look]
+
+    def seen(self, looks: slice) -> Detections:
+        """What successive looks saw, a batch of them."""
+        numbers = torch.arange(looks.start, looks.stop + 1)
+        bounds = torch.searchsorted(self.look, numbers).tolist()
+        return Detections.stack([self._view(slice(a, b)) for a, b in itertools.pairwise(bounds)])
+
+    def _view(self, rows: slice) -> Detections:
+        boxes, scores = self.boxes[rows], self.scores[rows]
+        return Detections(boxes[None], scores[None], torch.ones(1, len(boxes), dtype=torch.bool))
 
     @classmethod
     def join(cls, parts: list[Samples]) -> Samples:

@@ -27,6 +27,7 @@ TARGET_EVIDENCE = "target-evidence"
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "tempered": {"tempering": 0.25},
+    "mild": {"tempering": 0.5},
     "closest": {"memory": "closest"},
     "soft": {"footprint": "soft"},
     "central": {"footprint": "box_centre"},
@@ -73,6 +74,8 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
         options["weights"] = detector.weights
     if detector.stride != "auto":
         options["stride"] = detector.stride
+    if detector.input_size is not None:
+        options["input_size"] = detector.input_size
     model = semfov.load_detector(detector.name, **options)
     foveation = semfov.Foveation(sensor.sigma, levels=sensor.levels, growth=sensor.growth, convention=sensor.convention)
     return Eye(foveation, model, reference=sensor.reference).eval().requires_grad_(False)
@@ -120,7 +123,7 @@ def saliency_policies(policies: tuple[str, ...], kind: Kind) -> list[str]:
 def needs_model(policies: tuple[str, ...], kind: Kind) -> bool:
     """Whether a policy of the run needs an observation model: to predict, to calibrate, or for its miss rates."""
     check(len(policies) > 0, "policies", "at least one policy", "none")
-    without = (TARGET_EVIDENCE, "random", "non-predictive", "neighbourhood", *SALIENCY_MODELS)
+    without = (TARGET_EVIDENCE, "random", "non-predictive", "neighbourhood", "closer-look", *SALIENCY_MODELS)
     predicts = any(base not in without or calibrated for base, calibrated in _split(policies, kind))
     return predicts or any(belief_of(name, BeliefConfig()).misses for name in policies)
 
@@ -136,6 +139,7 @@ def make_searcher(
     components: int,
     model: semfov.FovealObservationModel | None,
     saliency: Tensor | None = None,
+    fovea: float = 100 / 640,
 ) -> Searcher:
     """How the policy of this name searches or explores.
 
@@ -146,6 +150,7 @@ def make_searcher(
         components: classes, background included.
         model: the observation model, where one is needed.
         saliency: of the scene, for the saliency policies.
+        fovea: width of the fovea in longer sides of the image.
     """
     base, calibrated = split_policy(name, kind)
     belief = belief_of(name, belief)
@@ -163,8 +168,9 @@ def make_searcher(
     )
     if base in SALIENCY_MODELS:
         return Searcher(observer, search_policy("random"), saliency)
-    make = search_policy if kind == "search" else exploration_policy
-    return Searcher(observer, make(base, model, calibrated=calibrated))
+    if kind == "search":
+        return Searcher(observer, search_policy(base, model, calibrated=calibrated))
+    return Searcher(observer, exploration_policy(base, model, calibrated=calibrated, fovea=fovea))
 
 
 def plain(settings: dict[str, Any]) -> Any:

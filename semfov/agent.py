@@ -48,7 +48,7 @@ def step(
     visited: Tensor,
     cell: Tensor,
     evidence: Any,
-    acquisition: Callable[[Tensor], Tensor],
+    acquisition: Callable[..., Tensor],
     noise: Tensor,
 ) -> Step:
     """One cycle of active perception for a batch of episodes; agent and evaluation both call it.
@@ -59,13 +59,21 @@ def step(
         visited: `(B, X·Y)` boolean, cells fixated before.
         cell: `(B,)`, the cell that is fixated now.
         evidence: what the look from there says (`Observer.weigh`).
-        acquisition: maps the new belief's parameters `(B, X·Y, C)` to values `(B, X·Y)`.
+        acquisition: maps the new belief to values `(B, X·Y)` (`acquisition_values`).
         noise: `(B, X·Y)`, random numbers that break ties.
     """
     belief = observer.update(belief, evidence)
     visited = visited.scatter(-1, cell[:, None], True)
-    values = acquisition(belief.beta)
+    values = acquisition_values(acquisition, belief, visited)
     return Step(belief, visited, values, select_fixation(values, visited, noise))
+
+
+def acquisition_values(acquisition: Callable[..., Tensor], belief: Belief, visited: Tensor) -> Tensor:
+    """Values `(B, X·Y)` of an acquisition function: of the belief's parameters `(B, X·Y, C)` alone, or, where it says
+    that it `reads_memory`, of the whole belief and the visited cells."""
+    if getattr(acquisition, "reads_memory", False):
+        return acquisition(belief, visited)
+    return acquisition(belief.beta)
 
 
 class ActivePerception(nn.Module):
@@ -128,7 +136,7 @@ class ActivePerception(nn.Module):
         grid: tuple[int, int] = (10, 10),
         **options: Any,
     ) -> Self:
-        """The recommended agent: learned target evidence for search, expected accuracy for exploration.
+        """The recommended agent: learned target evidence for search, the closer look for exploration.
 
         Args:
             name: a detector for which models are shipped, `yolov3-tiny` or `yolox-nano`.
@@ -150,9 +158,9 @@ class ActivePerception(nn.Module):
             observation,
             grid,
             search_policy("non-predictive"),
-            semantics=SemanticObserver(len(detector.classes) + 1, misses=observation.miss_likelihood),
+            semantics=SemanticObserver(len(detector.classes) + 1, tempering=0.5),
             observer=TargetObserver(evidence),
-            exploration=exploration_policy("expected-accuracy", observation),
+            exploration=exploration_policy("closer-look", fovea=sigma / 640),
         )
         evidence.check_compatible(agent.eye.settings())
         return agent.eval().requires_grad_(False)

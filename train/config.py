@@ -22,6 +22,7 @@ class FitConfig:
         levels: levels of distance, each `width` wide and the last one open.
         width: width of a level for a fovea of 100 pixels, in pixels of an image whose longer side is 640; it grows
             with the fovea.
+        minimum: objects that a level needs, or it takes the parameters of its inner neighbour (0: none does).
         holdout: every n-th photograph is kept out of the fit and used to judge it.
         iou: overlap from which a detection shows an object.
         seed: of the fixations.
@@ -39,6 +40,7 @@ class FitConfig:
     fixations: int = 8
     levels: int = 8
     width: float = 50.0
+    minimum: int = 100
     holdout: int = 10
     iou: float = 0.5
     seed: int = 0

@@ -69,6 +69,7 @@ def published_model(
         return model.fit(
             statistics_of(model, samples),
             method=method,
+            minimum=config.minimum,
             **options,
             **sampler.eye.settings(),
             samples=len(samples),

@@ -9,7 +9,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from eval.samples import Sampler, Samples
-from semfov import Detections, Grid
+from semfov import Grid
 from semfov.belief.look_features import look_features
 from semfov.data.scene import legal_targets
 
@@ -46,8 +46,6 @@ def make_examples(
     sampler: Sampler, samples: Samples, columns: int, rows: int, min_objects: int, max_area: float
 ) -> Examples:
     """Examples from labelled detections and the annotations of their photographs."""
-    counts = torch.bincount(samples.look, minlength=len(samples.scenes)).tolist()
-    boxes, scores = samples.boxes.split(counts), samples.scores.split(counts)
     looks = sampler.settings.fixations
     parts = []
     for index in tqdm(range(len(sampler.scenes)), desc="describing looks", unit="scene", dynamic_ncols=True):
@@ -55,9 +53,8 @@ def make_examples(
         targets = legal_targets(annotation, max_area) if len(annotation.labels) >= min_objects else []
         if not targets:
             continue
-        rows_of = range(index * looks, (index + 1) * looks)
-        seen = Detections.stack([_detections(boxes[row], scores[row]) for row in rows_of])
-        fixations = samples.fixations[rows_of.start : rows_of.stop]
+        here = slice(index * looks, (index + 1) * looks)
+        seen, fixations = samples.seen(here), samples.fixations[here]
         grid = Grid(columns, rows, annotation.size)
         offset = grid.centres - fixations[:, None]
         distance = torch.linalg.vector_norm(offset, dim=-1) / grid.extent.amax()
@@ -68,7 +65,3 @@ def make_examples(
                 features = look_features(seen, fixations, grid, target)
                 parts.append((features, distance, grid.cell_of(fixations), goal, torch.tensor(index)))
     return Examples(*(torch.stack(column) for column in zip(*parts, strict=True)))
-
-
-def _detections(boxes: Tensor, scores: Tensor) -> Detections:
-    return Detections(boxes[None], scores[None], torch.ones(1, len(boxes), dtype=torch.bool))

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from semfov.belief.grid import Grid
 from semfov.errors import InputError, lookup
 from semfov.gaze.acquisition.accuracy import ExpectedAccuracy, SightedModel
+from semfov.gaze.acquisition.closer_look import CloserLook
 from semfov.gaze.acquisition.exploration import (
     KLDivergence,
     NegativeEntropy,
@@ -45,7 +46,7 @@ _LOOKAHEADS: dict[str, type[Lookahead]] = {
     "probability-of-improvement": ProbabilityOfImprovement,
 }
 
-EXPLORATION_POLICIES = ("random", *_LOOKAHEADS, "expected-accuracy")
+EXPLORATION_POLICIES = ("random", *_LOOKAHEADS, "expected-accuracy", "closer-look")
 
 
 class SearchModel(FovealModel, MissModel, Protocol):
@@ -87,15 +88,19 @@ def search_policy(name: str, model: SearchModel | None = None, *, calibrated: bo
     return lambda target, grid: PredictedTargetPosterior(_known(target, name), expecting, calibrated=calibrated)
 
 
-def exploration_policy(name: str, model: ExplorationModel | None = None, *, calibrated: bool = False) -> Policy:
+def exploration_policy(
+    name: str, model: ExplorationModel | None = None, *, calibrated: bool = False, fovea: float = 100 / 640
+) -> Policy:
     """An exploration policy by its name; it has no use for a target.
 
     Args:
         name: `random`, `kl` (`KLDivergence`), `negative-entropy` (`NegativeEntropy`), `two-peaks` (`TwoPeaks`),
             `upper-confidence-bound` (`UpperConfidenceBound`), `probability-of-improvement`
-            (`ProbabilityOfImprovement`) or `expected-accuracy` (`ExpectedAccuracy`).
-        model: the observation model; every policy but `random` needs one, the last with miss rates.
+            (`ProbabilityOfImprovement`), `expected-accuracy` (`ExpectedAccuracy`) or `closer-look` (`CloserLook`).
+        model: the observation model; every policy but `random` and `closer-look` needs one, `expected-accuracy` with
+            miss rates.
         calibrated: whether expected scores are calibrated, as an agent does that calibrates what it sees.
+        fovea: width σ of the fovea in longer sides of the image, for `closer-look`.
 
     Raises:
         InputError: the name is unknown, or the model is missing.
@@ -108,6 +113,8 @@ def exploration_policy(name: str, model: ExplorationModel | None = None, *, cali
     lookup(name, EXPLORATION_POLICIES, "exploration policy")
     if name == "random":
         return lambda target, grid: Uniform()
+    if name == "closer-look":
+        return lambda target, grid: CloserLook(grid, fovea)
     expecting = _needed(model, name)
     if name == "expected-accuracy":
         return lambda target, grid: ExpectedAccuracy(expecting, grid)

@@ -39,7 +39,9 @@ def test_lines_become_tables(runs):
     text = fill("before\n@@ search-tiny second\nafter\n", runs[0])
     assert text == "before\n**two** (2)\n\n| b |\nafter\n"
     assert fill("@@ explore-nano all\n", runs[0]) == "*Not run yet.*\n"
+    assert fill("@@ explore-five-levels-nano first\n", runs[0]) == "*Not run yet.*\n"
     assert fill("@@ sensitivity\n", runs[0]).count("not run yet") > 50
+    assert fill("@@ sensor\n", runs[0]).count("not run yet") == 9 * 3 * 5
     assert summary(runs[0]["search-tiny"].out, 0)[0] == "**one** (1)"
     with pytest.raises(InputError, match="did you mean 'search-tiny'"):
         fill("@@ search-tin first\n", runs[0])

@@ -1,6 +1,7 @@
 """Acquisition functions: the value of fixating each cell, given the belief."""
 
 from semfov.gaze.acquisition.accuracy import ExpectedAccuracy
+from semfov.gaze.acquisition.closer_look import CloserLook
 from semfov.gaze.acquisition.exploration import (
     KLDivergence,
     NegativeEntropy,
@@ -13,6 +14,7 @@ from semfov.gaze.acquisition.search import PredictedTargetPosterior, TargetPoste
 from semfov.gaze.acquisition.static import Static, Uniform
 
 __all__ = [
+    "CloserLook",
     "ExpectedAccuracy",
     "FovealHit",
     "KLDivergence",

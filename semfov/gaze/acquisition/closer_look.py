@@ -1,0 +1,55 @@
+"""Exploration that brings the fovea closer to what it has not named yet."""
+
+from torch import Tensor, nn
+
+from semfov.belief.grid import Grid
+from semfov.belief.state import Belief
+from semfov.errors import check
+
+
+class CloserLook(nn.Module):
+    r"""How much better than ever before the cells would be seen whose class is not known yet.
+
+    Successive looks from one distance see, and miss, the same objects; only a closer look shows more. So a cell counts
+    by the acuity that a fixation adds to that of its closest look :math:`d^*`:
+
+    .. math:: a(f) = \sum_x \bigl(1 - \max_k q_k(x)\bigr) \bigl[v(d(x, f)) - v(d^*(x))\bigr]_+, \qquad
+              v(d) = e^{-\max(d / r - 1,\, 0)}
+
+    q are the probabilities of the classes other than background, r is the width of the fovea: within it all is seen
+    equally well. Once the fovea has been near every cell nothing is gained anywhere, and ties are broken at random.
+
+    Args:
+        grid: the cells of one image.
+        fovea: r in longer sides of the image (100 px of 640 by default, the paper's wide fovea).
+
+    >>> import torch
+    >>> grid = Grid(3, 1, (90, 30))
+    >>> belief = Belief(torch.ones(1, 3, 4), torch.tensor([[0.0, 1 / 3, 2 / 3]]))
+    >>> CloserLook(grid, 0.2)(belief, torch.tensor([[True, False, False]])).argmax().item()
+    1
+    """
+
+    reads_memory = True
+    seen: Tensor
+
+    def __init__(self, grid: Grid, fovea: float = 100 / 640) -> None:
+        super().__init__()
+        check(fovea > 0, "fovea", "a positive number", fovea)
+        self.fovea = fovea
+        self.register_buffer("seen", self.acuity(grid.cell_distance))
+
+    def acuity(self, distance: Tensor) -> Tensor:
+        """v, of distances in longer sides."""
+        return (1 - distance / self.fovea).clamp(max=0).exp()
+
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
+        """Values `(B, X·Y)` for a belief `(B, X·Y, K+1)`; where the fovea was is in `belief.closest`."""
+        objects = belief.beta[..., 1:]
+        unknown = 1 - objects.amax(-1) / objects.sum(-1)
+        gain = (self.seen.to(belief.beta) - self.acuity(belief.closest)[..., None]).clamp(min=0)
+        return (gain * unknown[..., None]).sum(-2)
+
+    def extra_repr(self) -> str:
+        """Settings, for `repr`."""
+        return f"fovea={self.fovea:g}"

@@ -1,0 +1,70 @@
+"""The closer look against a loop over fixations and cells."""
+
+import math
+
+import pytest
+import torch
+
+from semfov.belief import Belief, Grid
+from semfov.errors import InputError
+from semfov.gaze import exploration_policy
+from semfov.gaze.acquisition import CloserLook
+
+GRID = Grid(4, 3, (80, 60))
+FOVEA = 0.2
+
+
+@pytest.fixture(params=[torch.float32, torch.float64])
+def belief(request):
+    torch.manual_seed(0)
+    beta = torch.rand(2, 12, 5, dtype=request.param) ** 2 + 0.02
+    closest = torch.stack([GRID.cell_distance[3], GRID.cell_distance[[0, 10]].amin(0)]).to(beta)
+    return Belief(beta, closest)
+
+
+def test_value_equals_the_loop(belief):
+    got = CloserLook(GRID, FOVEA)(belief, torch.zeros(2, 12, dtype=torch.bool))
+    assert got.dtype == belief.beta.dtype
+
+    def acuity(distance):
+        return 1.0 if distance <= FOVEA else math.exp(1 - distance / FOVEA)
+
+    for episode in range(2):
+        for f in range(12):
+            total = 0.0
+            for x in range(12):
+                classes = belief.beta[episode, x, 1:].tolist()
+                unknown = 1 - max(classes) / sum(classes)
+                now = acuity(float(belief.closest[episode, x]))
+                total += unknown * max(0.0, acuity(float(GRID.cell_distance[f, x])) - now)
+            assert float(got[episode, f]) == pytest.approx(total, rel=1e-5, abs=1e-6)
+
+
+def test_before_the_first_look_any_look_is_closer():
+    belief = Belief.uniform(1, 12, 5, 0.5, torch.ones(1))
+    values = CloserLook(GRID, FOVEA)(belief, torch.zeros(1, 12, dtype=torch.bool))
+    # All unknown, nothing seen: from the centre of the image most is seen.
+    assert values.argmax().item() in (5, 6)
+    torch.testing.assert_close(values, values.flip(-1))
+
+
+def test_nothing_is_gained_where_the_fovea_was():
+    belief = Belief(torch.ones(1, 12, 5), torch.full((1, 12), 0.99 * FOVEA))
+    assert not CloserLook(GRID, FOVEA)(belief, torch.zeros(1, 12, dtype=torch.bool)).any()
+
+
+def test_nothing_is_gained_where_all_is_known():
+    beta = torch.full((1, 12, 5), 1e-9)
+    beta[..., 2] = 1.0
+    values = CloserLook(GRID, FOVEA)(Belief(beta, torch.full((1, 12), 9.0)), torch.zeros(1, 12, dtype=torch.bool))
+    assert values.abs().max() < 1e-6
+
+
+def test_policy_by_name(belief):
+    acquisition = exploration_policy("closer-look", fovea=FOVEA)(None, GRID)
+    visited = torch.zeros(2, 12, dtype=torch.bool)
+    assert torch.equal(acquisition(belief, visited), CloserLook(GRID, FOVEA)(belief, visited))
+    compiled = torch.compile(acquisition, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(belief, visited), acquisition(belief, visited))
+    with pytest.raises(InputError, match="fovea"):
+        CloserLook(GRID, 0.0)
