@@ -18,6 +18,8 @@ from benchmarks.beliefs import exploration, kaplan_update, predictive_search
 from benchmarks.fits import dirichlets
 from benchmarks.growth import grow
 from benchmarks.images import foveation, saliency, use_threads
+from benchmarks.interleave import in_turn
+from benchmarks.limits import Path as HotPath
 from benchmarks.limits import limits
 from benchmarks.machine import copy_bandwidth, describe
 from benchmarks.rollouts import rollouts
@@ -37,6 +39,7 @@ COMPARISONS: tuple[Callable[[], Comparison], ...] = (
     lambda: exploration("negative entropy"),
     lambda: saliency("VOCUS2"),
     lambda: saliency("Itti-Koch"),
+    in_turn,
     rollouts,
 )
 
@@ -110,7 +113,7 @@ def report(
     bandwidth: float,
     measured: list[Measured],
     grown: dict[str, tuple[dict[int, Spread], float]],
-    found: dict[str, tuple[object, Spread, float]],
+    found: dict[str, tuple[HotPath, Spread, float]],
 ) -> str:
     """All tables."""
     rows = [row for each in measured for row in comparison_rows(each)]
@@ -122,6 +125,7 @@ def report(
         [name, f"{path.bytes / 1e6:.2f}", path.what, spread(ms), f"{100 * share:.1f}"]
         for name, (path, ms, share) in found.items()
     ]
+    slowest = min(found, key=lambda name: found[name][2])
     return "\n".join(
         [
             "# Benchmarks",
@@ -147,6 +151,13 @@ def report(
             "Bytes that inputs and results have, each moved once, over the time, as a share of the copy bandwidth.",
             "",
             table(["path", "MB", "which are", "ms", "% of copy bandwidth"], hot),
+            "",
+            "What stops them:",
+            "",
+            *(
+                f"- {name}{' (the slowest)' if name == slowest else ''}: {path.stops}"
+                for name, (path, *_) in found.items()
+            ),
             "",
         ]
     )

@@ -1,15 +1,16 @@
 """Runs that are killed at a random moment and started again: is the result the same to the last bit?
 
-Each repetition starts a command on the embedded scenes, kills it (SIGKILL) after a random share of the time that a
-whole run takes, starts it again, and compares what it leaves with what a run leaves that nobody disturbs:
+A command is started on the embedded scenes, killed (SIGKILL) after a random share of the time that a whole run takes,
+and started again; what it leaves is compared with what a run leaves that nobody disturbs:
 
-- `store`: `eval.search` while it looks from every cell and keeps what it saw;
-- `evaluation`: `eval.search` with that store there, while it runs policies and writes its report;
+- `store`: `eval.search` from the first look: what is seen from every cell is kept in a store;
+- `evaluation`: `eval.explore` with its store there, while it runs policies and writes its report;
 - `fit`: `train.fit_fom` from the first look to the fitted model.
 
-Runs are forked from one process that has imported everything, so that kills hit work and not the start of Python.
+Runs are forked from one process that has imported everything, so that kills hit work and not the start of Python. A run
+that was faster than its kill does not count; the next is given another moment.
 
-python -m benchmarks.faults --repetitions 50
+python -m benchmarks.faults --kills 50
 """
 
 import argparse
@@ -19,6 +20,7 @@ import multiprocessing
 import os
 import random
 import shutil
+import signal
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -30,17 +32,21 @@ import torch
 from safetensors import safe_open
 
 from eval.cached import checksum
+from eval.explore import main as explore
 from eval.search import main as search
 from train.fit_fom import main as fit
 
 Main = Callable[[Sequence[str]], int]
 
-_SCENES = ["--data.limit", "3", "--workers", "1"]
-_SEARCH = [
-    *_SCENES, "--belief.columns", "3", "--belief.rows", "2", "--protocol.starts", "3", "--protocol.shifts", "5",
-    "--scanpaths", "0", "--policies", '["random", "non-predictive-raw", "predictive-calibrated"]',
+_SMALL = [
+    "--workers", "1", "--data.limit", "2", "--belief.columns", "3", "--belief.rows", "2",
+    "--protocol.starts", "2", "--protocol.shifts", "4",
 ]  # fmt: skip
-_FIT = [*_SCENES, "--data.limit", "6", "--fixations", "2", "--holdout", "3", "--shard", "1", "--method", "newton"]
+_SEARCH = [*_SMALL, "--scanpaths", "0", "--policies", '["random", "non-predictive-raw"]']
+_EXPLORE = [*_SMALL, "--policies", '["random-raw", "kl-calibrated"]']
+_FIT = [
+    "--workers", "1", "--data.limit", "4", "--fixations", "1", "--holdout", "3", "--shard", "1", "--method", "newton",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -82,39 +88,40 @@ class Command:
         return digest.hexdigest()
 
 
+_RECORDS = ("episodes.jsonl", "summary.csv")
 COMMANDS = (
-    Command("store", search, (*_SEARCH[:-1], '["random"]'), ("episodes.jsonl", "summary.csv")),
-    Command("evaluation", search, tuple(_SEARCH), ("episodes.jsonl", "summary.csv"), stored=True),
+    Command("store", search, tuple(_SEARCH), (*_RECORDS, "cumulative_performance.png")),
+    Command("evaluation", explore, tuple(_EXPLORE), (*_RECORDS, "success_rate_objects.png"), stored=True),
     Command("fit", fit, tuple(_FIT), ("yolov3-tiny.safetensors", "report.md", "counts.csv")),
 )
 
 
 @dataclass(frozen=True)
 class Survived:
-    """What came of the repetitions of a command.
+    """What came of the kills of a command.
 
     Attributes:
         seconds: of an undisturbed run.
-        killed: repetitions in which the kill came before the end.
-        progress: for each of them, files that were there, finished, when it was killed.
-        remains: for each of them, unfinished files that were left behind.
-        identical: repetitions whose result is that of the undisturbed run.
+        spared: runs that ended before their kill.
+        progress: for each kill, files that were there, finished.
+        remains: for each kill, unfinished files that were left behind.
+        identical: kills after which the result is that of the undisturbed run.
     """
 
     seconds: float
-    killed: int
+    spared: int
     progress: list[int]
     remains: list[int]
     identical: int
 
 
-def survive(command: Command, repetitions: int, seed: int = 0) -> Survived:
+def survive(command: Command, kills: int, seed: int = 0) -> Survived:
     """Kill and resume a command so often."""
     fork = multiprocessing.get_context("fork")
     chance = random.Random(seed)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        whole, cache = folder / "whole", folder / "looks"
+        whole, cache, here = folder / "whole", folder / "looks", folder / "killed"
         cache.mkdir()
         if command.stored:
             finish(fork.Process(target=command.run, args=(whole,)))
@@ -123,25 +130,25 @@ def survive(command: Command, repetitions: int, seed: int = 0) -> Survived:
         shutil.copytree(cache, whole)
         seconds = finish(fork.Process(target=command.run, args=(whole,)))
         expected = command.digest(whole)
-        killed, identical, progress, remains = 0, 0, [], []
-        for repetition in range(repetitions):
-            here = folder / str(repetition)
+        spared, identical, progress, remains = 0, 0, [], []
+        while len(progress) < kills:
             shutil.copytree(cache, here)
             process = fork.Process(target=command.run, args=(here,))
             process.start()
             process.join(chance.random() * seconds)
-            if process.is_alive():
-                process.kill()
-                killed += 1
+            process.kill()
             process.join()
-            files = [file for file in here.rglob("*") if file.is_file()]
-            parts = sum(file.suffix == ".part" for file in files)
-            progress.append(len(files) - parts)
-            remains.append(parts)
-            finish(fork.Process(target=command.run, args=(here,)))
-            identical += command.digest(here) == expected
+            if process.exitcode == -signal.SIGKILL:
+                files = [file for file in here.rglob("*") if file.is_file()]
+                parts = sum(file.suffix == ".part" for file in files)
+                progress.append(len(files) - parts)
+                remains.append(parts)
+                finish(fork.Process(target=command.run, args=(here,)))
+                identical += command.digest(here) == expected
+            else:
+                spared += 1
             shutil.rmtree(here)
-    return Survived(seconds, killed, progress, remains, identical)
+    return Survived(seconds, spared, progress, remains, identical)
 
 
 def finish(process: "multiprocessing.context.ForkProcess") -> float:
@@ -157,19 +164,19 @@ def finish(process: "multiprocessing.context.ForkProcess") -> float:
 def main() -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repetitions", type=int, default=50, help="of each command")
+    parser.add_argument("--kills", type=int, default=50, help="of each command")
     parser.add_argument("--only", nargs="+", choices=[c.name for c in COMMANDS], help="these commands; default: all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the figures here too")
     options = parser.parse_args()
-    print("| run | s | repetitions | killed before the end | finished files then | unfinished | same bits |")
-    print("|---|---|---|---|---|---|---|", flush=True)
+    print("| run | s | kills | finished files then | unfinished | same bits after |")
+    print("|---|---|---|---|---|---|", flush=True)
     figures = {}
     for command in [c for c in COMMANDS if options.only is None or c.name in options.only]:
-        came = survive(command, options.repetitions, options.seed)
+        came = survive(command, options.kills, options.seed)
         figures[command.name] = came.__dict__
         files = f"{min(came.progress)} to {max(came.progress)}"
-        cells = [f"{came.seconds:.1f}", options.repetitions, came.killed, files, sum(came.remains), came.identical]
+        cells = [f"{came.seconds:.1f}", options.kills, files, sum(came.remains), came.identical]
         print(f"| {command.name} | {' | '.join(map(str, cells))} |", flush=True)
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + "\n")

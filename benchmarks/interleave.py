@@ -32,7 +32,9 @@ from torch import Tensor
 
 import semfov
 from benchmarks.detector_speed import photograph
+from benchmarks.timing import Comparison
 from semfov.belief.observer import SemanticObserver
+from semfov.detection import Detections
 from semfov.detection.export import export_onnx
 from semfov.detection.load import load_yolo
 from semfov.detection.onnx import OnnxDetector, load_onnx
@@ -80,6 +82,34 @@ def taking_turns(eye: Eye, view: View, fixations: Tensor, repetitions: int, cloc
             if repetition >= 0:
                 times[name].append(1e3 * (clock() - start) / len(gazes))
     return times
+
+
+def in_turn(fixations: int = 10) -> Comparison:
+    """Fixations in which sensor and detector take turns, beside all of the one and then all of the other."""
+    image = photograph(640, 480)
+    grid = semfov.Grid(COLUMNS, ROWS, (640, 480))
+    order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(0))
+    gazes = grid.centres[order[:fixations]].split(1)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "yolov3-tiny.onnx"
+        with torch.inference_mode(False), torch.no_grad():
+            export_onnx(load_yolo("yolov3-tiny", winograd=False), path)
+        eye = Eye(semfov.Foveation(100.0), load(path, torch.get_num_threads(), spinning=False))
+    view = eye.open(image)
+
+    def apart() -> list[Detections]:
+        canvases = [eye.foveated(view, gaze) for gaze in gazes]
+        return [eye.detector.detect(canvas, view.placement) for canvas in canvases]
+
+    def ours() -> list[Detections]:
+        return [eye.look(view, gaze) for gaze in gazes]
+
+    def agree() -> None:
+        for one, other in zip(ours(), apart(), strict=True):
+            torch.testing.assert_close(one.boxes, other.boxes)
+            torch.testing.assert_close(one.scores, other.scores)
+
+    return Comparison(f"{fixations} fixations, sensor and detector in turn", ours, {"each alone": apart}, {}, agree)
 
 
 def policies(classes: Sequence[str], grid: semfov.Grid) -> dict[str, Policy]:

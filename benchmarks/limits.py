@@ -5,11 +5,14 @@ from dataclasses import dataclass
 import torch
 
 from benchmarks.beliefs import DETECTIONS, make_belief, make_look, make_model
+from benchmarks.dirichlet_mle import draw
 from benchmarks.images import GAZE, SIGMA, photograph
+from benchmarks.rollouts import SHIFTS, searches
 from benchmarks.timing import Clock, Run, Spread, interleaved
 from semfov import Grid, acquisition, foveate
 from semfov.belief import fuse
 from semfov.gaze.saliency import VOCUS2
+from semfov.observation.dirichlet import mle
 from semfov.sensor import laplacian_pyramid
 
 
@@ -21,11 +24,13 @@ class Path:
         run: the program.
         bytes: of its inputs and results, each read or written once.
         what: they are.
+        stops: what keeps it from moving them at the bandwidth.
     """
 
     run: Run
     bytes: int
     what: str
+    stops: str
 
 
 def paths() -> dict[str, Path]:
@@ -38,24 +43,48 @@ def paths() -> dict[str, Path]:
     model, grid = make_model(), Grid(10, 10, (640, 480))
     value, belief = acquisition.KLDivergence(model, grid), make_belief(100, batch=batch)
     vocus = VOCUS2()
+    logs = draw(100, seed=0).log().mean(1)
+    episodes = 40
+    seen, run = searches(episodes)
+    scene = sum(t.numel() * t.element_size() for t in (seen.boxes, seen.scores, seen.mask))
+    # Every look reads and writes an episode's map and reads what is seen from one of the scene's cells.
+    looks = episodes * (SHIFTS + 1)
+    moved = looks * (4 * 2 * beta[0].numel() + scene // len(seen.boxes))
+    blurs = "bands of the pyramid are written and read again, in memory that is fresh each time"
+    newton = "Newton's steps, each with digamma and trigamma of every parameter in double precision: it computes"
+    small = "each look is some dozens of operations on small tensors: calls cost more than what they move"
     return {
         "foveation, pyramid included": Path(
-            lambda: foveate(image, gaze, sigma=SIGMA), 4 * 2 * image.numel(), "image in, view out"
+            lambda: foveate(image, gaze, sigma=SIGMA), 4 * 2 * image.numel(), "image in, view out", blurs
         ),
         "foveation, pyramid reused": Path(
-            lambda: foveate(bands, gaze, sigma=SIGMA), 4 * (details + image.numel()), "bands in, view out"
+            lambda: foveate(bands, gaze, sigma=SIGMA), 4 * (details + image.numel()), "bands in, view out", blurs
         ),
         f"fusion, {DETECTIONS} detections, {batch} maps": Path(
             lambda: fuse(beta, likelihood, footprint),
             4 * (2 * beta.numel() + likelihood.numel()) + footprint.numel(),
             "maps in and out, likelihoods, footprints",
+            "detections are fused one after another: the maps go through the processor once for each of them",
         ),
         f"exploration, KL divergence, {batch} maps": Path(
             lambda: value(belief),
             4 * (belief.numel() + belief.shape[0] * belief.shape[1] + model.alpha.numel()),
             "maps and expected scores in, values out",
+            "every cell is updated as seen at each level and its divergence taken, "
+            f"{model.alpha.shape[1] * belief.numel() / 1e6:.1f} million logarithms: it computes",
         ),
-        "saliency, VOCUS2": Path(lambda: vocus(image), 4 * (image.numel() + image.numel() // 3), "image in, map out"),
+        "saliency, VOCUS2": Path(
+            lambda: vocus(image),
+            4 * (image.numel() + image.numel() // 3),
+            "image in, map out",
+            "some 20 Gaussian blurs of up to 65 taps, matrix products at most of the processor's rate: it computes",
+        ),
+        f"{len(logs)} Dirichlets of {logs.shape[-1]} dimensions": Path(
+            lambda: mle(logs), 2 * logs.numel() * logs.element_size(), "mean logarithms in, parameters out", newton
+        ),
+        f"{episodes} searches of {SHIFTS} shifts": Path(
+            lambda: run(episodes, episodes), moved, "every look: map in and out, detections in", small
+        ),
     }
 
 

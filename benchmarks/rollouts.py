@@ -1,5 +1,7 @@
 """The protocol's searches as one batch of tensors, beside the same searches one after another."""
 
+from collections.abc import Callable
+
 import torch
 
 from benchmarks.timing import Comparison
@@ -17,20 +19,27 @@ def episode(number: int) -> Episode:
     return Episode(scene=0, target=target, cue=target, repetition=number, start=start, goal=(0,), commonest=False)
 
 
-def rollouts(episodes: int = 40) -> Comparison:
-    """Searches of 30 gaze shifts in one scene; alone, a quarter of them."""
+def searches(episodes: int) -> tuple[Detections, Callable[[int, int], object]]:
+    """What is seen from each cell of a scene, and a program that does so many searches in it, so many at once."""
     generator = torch.Generator().manual_seed(0)
     grid = Grid(10, 10, (640, 480))
     corner = torch.rand(100, 12, 2, generator=generator) * torch.tensor([560.0, 400.0])
     boxes = torch.cat([corner, corner + 20 + 60 * torch.rand(100, 12, 2, generator=generator)], -1)
     scores = (3 * torch.randn(100, 12, CLASSES + 1, generator=generator)).softmax(-1)
     seen = Detections(boxes, scores, torch.ones(100, 12, dtype=torch.bool))
-    searches = [episode(n) for n in range(episodes)]
+    todo = [episode(n) for n in range(episodes)]
     noise = torch.rand(episodes, SHIFTS + 1, 100, generator=generator)
     searcher = Searcher(SemanticObserver(CLASSES + 1), search_policy("non-predictive"))
 
     def run(count: int, batch: int) -> object:
-        return run_episodes(searches[:count], searcher, seen, grid, noise[:count], shifts=SHIFTS, batch=batch)
+        return run_episodes(todo[:count], searcher, seen, grid, noise[:count], shifts=SHIFTS, batch=batch)
+
+    return seen, run
+
+
+def rollouts(episodes: int = 40) -> Comparison:
+    """Searches of 30 gaze shifts in one scene; alone, a quarter of them."""
+    run = searches(episodes)[1]
 
     def agree() -> None:
         assert run(episodes, episodes) == run(episodes, 1)

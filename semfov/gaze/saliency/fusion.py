@@ -34,7 +34,8 @@ def fuse(maps: Sequence[Tensor], size: tuple[int, int], fusion: Fusion = "mean")
         check_shape(layer, "maps", maps[0].shape[0], maps[0].shape[1], None, None)
     if fusion == "mean":
         # Interpolation is linear: of each size only the mean is enlarged.
-        return torch.stack([enlarge(layer.mean(1), size) for layer in maps]).mean(0)
+        enlarged = (enlarge(layer.mean(1), size) for layer in maps)
+        return sum(enlarged, next(enlarged)) / len(maps)
     return torch.stack([enlarge(layer, size).amax(1) for layer in maps]).amax(0)
 
 

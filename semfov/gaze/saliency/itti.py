@@ -114,9 +114,10 @@ def local_maxima(maps: Tensor) -> Tensor:
     """
     height, width = maps.shape[-2:]
     padded = F.pad(maps, (1, 1, 1, 1), value=-torch.inf)
-    shifted = [padded[..., y : y + height, x : x + width] for y in range(3) for x in range(3)]
-    earlier = torch.stack(shifted[:4]).amax(0)
-    later = torch.stack(shifted[5:]).amax(0)
+    left, right = padded[..., :width], padded[..., 2:]
+    rows = torch.maximum(torch.maximum(left, right), padded[..., 1:-1])
+    earlier = torch.maximum(rows[..., :height, :], left[..., 1:-1, :])
+    later = torch.maximum(rows[..., 2:, :], right[..., 1:-1, :])
     return (maps > earlier) & (maps >= later)
 
 

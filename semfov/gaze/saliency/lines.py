@@ -3,16 +3,39 @@
 On a CPU this is several times faster than a convolution of few channels, above all for wide kernels.
 """
 
-from functools import lru_cache
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
-from semfov.errors import check, check_shape
+from semfov.errors import check, check_shape, values_known
+from semfov.sensor.pyramid import constant
 
-# Pixels that one product makes at once: more of them multiply more zeros, fewer copy more pixels twice.
-_TILE = 32
+# Pixels that one product makes at once: more of them multiply more zeros, fewer make the products slow.
+_TILE = 24
+# Up to this many pixels lines are made by one dense matrix, beyond it by one for every tile.
+_SMALL = 160
+
+
+class Lines(NamedTuple):
+    """A matrix that makes lines of other lengths out of lines, and is zero far from its diagonal.
+
+    Attributes:
+        first: what makes the first pixels of a line, `(a, n)`; without `middle`, all of them.
+        middle: what makes each of the tiles that follow, `(tile, window)`.
+        last: what makes the pixels that remain, `(b, m)`.
+        tiles: how many follow.
+        start: where on the line the window of the first of them begins.
+        shift: how far apart the windows of two in succession lie.
+    """
+
+    first: Tensor
+    middle: Tensor | None = None
+    last: Tensor | None = None
+    tiles: int = 0
+    start: int = 0
+    shift: int = 0
 
 
 def gaussian_kernel(sigma: float) -> Tensor:
@@ -44,8 +67,9 @@ def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor
     """
     check_shape(image, "image", None, None, None, None)
     check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
-    step = 2 if halve else 1
-    return _blur(_blur(image, -1, sigma, step), -2, sigma, step)
+    check(sigma > 0, "sigma", "a positive number of pixels", sigma)
+    height, width = (_blurring(n, sigma, 2 if halve else 1, image.dtype, image.device) for n in image.shape[-2:])
+    return separable(image, height, width)
 
 
 def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
@@ -55,49 +79,127 @@ def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
     torch.Size([1, 4, 5])
     """
     check_shape(image, "image", None, None)
-    height, width = size
-    # A compiler traces the matrices into its graph; a cache would be a side effect.
-    matrix = _cubic_matrix if torch.compiler.is_compiling() else _cached_cubic_matrix
-    if image.shape[-1] != width:
-        image = image @ matrix(image.shape[-1], width, image.dtype, image.device).mT
-    if image.shape[-2] != height:
-        image = matrix(image.shape[-2], height, image.dtype, image.device) @ image
-    return image
+    if tuple(image.shape[-2:]) == tuple(size):
+        return image
+    lengths = zip(image.shape[-2:], size, strict=True)
+    return separable(image, *(_enlarging(count, length, image.dtype, image.device) for count, length in lengths))
 
 
-def _blur(image: Tensor, axis: int, sigma: float, step: int) -> Tensor:
-    """Blur along one axis and keep the first of every `step` pixels."""
-    batch, channels, height, width = image.shape
-    count = image.shape[axis]
-    length = max(count // step, 1)
-    tile = min(_TILE, length)
-    tiles = -(-length // tile)
-    blocks = _block if torch.compiler.is_compiling() else _cached_block
-    block = blocks(sigma, tile, step, image.dtype, image.device)
-    # Every tile is the same product with a window of the line that reaches as far as its outermost taps.
-    window = block.shape[1]
-    radius = (window - (tile - 1) * step) // 2
-    after = max((tiles - 1) * tile * step + window - radius - count, 0)
-    padding = (radius, after, 0, 0) if axis == -1 else (0, 0, radius, after)
-    windows = F.pad(image, padding, mode="replicate").unfold(axis, window, tile * step)
-    if axis == -1:
-        # One product for all lines: `matmul` would make one of each.
-        blurred = windows.reshape(-1, window) @ block.mT
-        return blurred.reshape(batch, channels, height, tiles * tile)[..., :length]
-    windows = windows.mT.reshape(-1, window, width)
-    blurred = torch.bmm(block.expand(len(windows), -1, -1), windows)
-    return blurred.reshape(batch, channels, tiles * tile, width)[..., :length, :]
+def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
+    """Columns of an image `(..., h, w)` made into others by `down`, its rows by `across`.
+
+    A product reads a transposed image as quickly, so that two make both axes without a copy.
+    """
+    if not values_known() or (image.requires_grad and torch.is_grad_enabled()):
+        return _product(_product(image.mT, across).mT, down)
+    if down.middle is None and across.middle is None:
+        return down.first @ (image @ across.first.mT)
+    planes = image.reshape(image.shape[:-2].numel(), *image.shape[-2:])
+    # Fresh memory costs as much as a product: what lies between both is one plane, used again.
+    between = image.new_empty(_length(across), image.shape[-2])
+    result = image.new_empty(len(planes), _length(down), len(between))
+    for plane, made in zip(planes, result, strict=True):
+        _write(plane.mT, across, between)
+        _write(between.mT, down, made)
+    return result.reshape(*image.shape[:-2], *result.shape[-2:])
 
 
-def _block(sigma: float, tile: int, step: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`(tile, window)`: the kernel in every row, each `step` pixels further than the one before."""
+def _product(image: Tensor, lines: Lines) -> Tensor:
+    """Columns made into others."""
+    if lines.middle is None or lines.last is None:
+        return lines.first @ image
+    top, bottom = (
+        lines.first @ image[..., : lines.first.shape[1], :],
+        lines.last @ image[..., -lines.last.shape[1] :, :],
+    )
+    return torch.cat([top, (lines.middle @ _windows(image, lines)).flatten(-3, -2), bottom], -2)
+
+
+def _write(image: Tensor, lines: Lines, out: Tensor) -> None:
+    """The same of one plane, into memory that is there."""
+    top = len(lines.first)
+    torch.mm(lines.first, image[: lines.first.shape[1]], out=out[:top])
+    if lines.middle is not None and lines.last is not None:
+        bottom = len(out) - len(lines.last)
+        matrices, inner = lines.middle.expand(lines.tiles, -1, -1), out[top:bottom].unflatten(0, (lines.tiles, -1))
+        torch.bmm(matrices, _windows(image, lines), out=inner)
+        torch.mm(lines.last, image[-lines.last.shape[1] :], out=out[bottom:])
+
+
+def _windows(image: Tensor, lines: Lines) -> Tensor:
+    """What the tiles are made of, overlapping: `(..., tiles, window, w)`."""
+    assert lines.middle is not None
+    window = lines.middle.shape[1]
+    stop = lines.start + (lines.tiles - 1) * lines.shift + window
+    return image[..., lines.start : stop, :].unfold(-2, window, lines.shift).mT
+
+
+def _length(lines: Lines) -> int:
+    """Pixels of the lines that are made."""
+    inner = 0 if lines.middle is None else lines.tiles * len(lines.middle)
+    return len(lines.first) + inner + (0 if lines.last is None else len(lines.last))
+
+
+@constant
+def _blurring(count: int, sigma: float, step: int, dtype: torch.dtype, device: torch.device) -> Lines:
+    """Blur of lines of `count` pixels, of which one of `step` is kept."""
     kernel = gaussian_kernel(sigma)
-    index = torch.arange(tile)[:, None] * step + torch.arange(len(kernel))
-    block = torch.zeros(tile, (tile - 1) * step + len(kernel), dtype=torch.float64)
-    return block.scatter(1, index, kernel.expand(tile, -1)).to(device, dtype)
+
+    def matrix(count: int) -> Tensor:
+        length = max(count // step, 1)
+        index = torch.arange(length)[:, None] * step + torch.arange(len(kernel)) - len(kernel) // 2
+        weights = kernel.expand(length, -1)
+        return torch.zeros(length, count, dtype=torch.float64).scatter_add(1, index.clamp(0, count - 1), weights)
+
+    return _cut(matrix, count, _TILE, _TILE * step, len(kernel) // 2, dtype, device)
 
 
-def _cubic_matrix(count: int, length: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+@constant
+def _enlarging(count: int, length: int, dtype: torch.dtype, device: torch.device) -> Lines:
+    """Cubic interpolation of lines of `count` pixels at `length`."""
+    ratio, rest = divmod(length, count)
+    if rest:
+        return Lines(_cubic_matrix(count, length).to(device, dtype))
+    shift = max(_TILE // ratio, 1)
+    return _cut(lambda count: _cubic_matrix(count, ratio * count), count, shift * ratio, shift, 2, dtype, device)
+
+
+def _cut(
+    matrix: Callable[[int], Tensor],
+    count: int,
+    tile: int,
+    shift: int,
+    reach: int,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Lines:
+    """The matrix for lines of `count` pixels, of which all tiles but the outermost are alike.
+
+    Args:
+        matrix: makes it for lines of so many pixels.
+        count: pixels of a line.
+        tile: pixels made at once.
+        shift: pixels of the lines that lie under a tile.
+        reach: pixels before and behind that it needs too.
+    """
+    before = -(-reach // shift)
+    tiles = (count - reach) // shift - before
+    if count * max(tile, shift) <= _SMALL * shift or tiles < 2:
+        return Lines(matrix(count).to(device, dtype))
+    # The outermost tiles, and what remains, are those of a line with one tile in between.
+    short = matrix(count - (tiles - 1) * shift).to(device, dtype)
+    top, start, window = before * tile, before * shift - reach, shift + 2 * reach
+    return Lines(
+        short[:top, : start + 2 * reach].contiguous(),
+        short[top : top + tile, start : start + window].contiguous(),
+        short[top + tile :, start + shift :].contiguous(),
+        tiles,
+        start,
+        shift,
+    )
+
+
+def _cubic_matrix(count: int, length: int) -> Tensor:
     """`(length, count)`: Keys' cubic convolution with a = -0.75, pixels as areas, borders continued."""
     place = (torch.arange(length).double() + 0.5) * (count / length) - 0.5
     index = place.floor().long()[:, None] + torch.arange(-1, 3)
@@ -106,18 +208,4 @@ def _cubic_matrix(count: int, length: int, dtype: torch.dtype, device: torch.dev
     near = ((a + 2) * distance - (a + 3)) * distance**2 + 1
     far = a * (((distance - 5) * distance + 8) * distance - 4)
     matrix = torch.zeros(length, count, dtype=torch.float64)
-    matrix = matrix.scatter_add(1, index.clamp(0, count - 1), torch.where(distance <= 1, near, far))
-    return matrix.to(device, dtype)
-
-
-@lru_cache(maxsize=64)
-def _cached_block(sigma: float, tile: int, step: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    # Tensors born in inference mode could not take part in a later backward pass.
-    with torch.inference_mode(False), torch.no_grad():
-        return _block(sigma, tile, step, dtype, device)
-
-
-@lru_cache(maxsize=64)
-def _cached_cubic_matrix(count: int, length: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    with torch.inference_mode(False), torch.no_grad():
-        return _cubic_matrix(count, length, dtype, device)
+    return matrix.scatter_add(1, index.clamp(0, count - 1), torch.where(distance <= 1, near, far))

@@ -113,11 +113,13 @@ def vocus2_saliency(
     True
     """
     lookup(fusion, ("mean", "max"), "fusion")
-    pyramids = twin_pyramids(
-        anchor(opponent_colours(image)), centre_sigma, surround_sigma, layers=layers, scales=scales
-    )
-    maps = [torch.cat([_contrasts(twin, fusion) for twin in twins], 1) for twins in pyramids]
-    saliency = fuse(maps, (image.shape[-2], image.shape[-1]), fusion)
+    # Products of single precision: contrasts are small differences.
+    with torch.autocast(image.device.type, enabled=False):
+        pyramids = twin_pyramids(
+            anchor(opponent_colours(image)), centre_sigma, surround_sigma, layers=layers, scales=scales
+        )
+        maps = [torch.cat([_contrasts(twin, fusion) for twin in twins], 1) for twins in pyramids]
+        saliency = fuse(maps, (image.shape[-2], image.shape[-1]), fusion)
     return rescale(saliency) if normalise else saliency
 
 
@@ -170,8 +172,7 @@ def _contrasts(twin: Twin, fusion: Fusion) -> Tensor:
     """Contrasts to be fused `(B, N, h, w)`."""
     if fusion == "mean":
         # One of both contrasts is zero, so their mean is half the difference; the channels' mean is taken on the way.
-        differences = (twin.centre - twin.surround).abs().unbind(1)
-        return sum(differences[1:], differences[0])[:, None] / (2 * len(differences))
+        return (twin.centre - twin.surround).abs_().mean(1, keepdim=True) / 2
     return torch.cat(on_off_contrasts(*twin), 1)
 
 

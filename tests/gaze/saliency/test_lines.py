@@ -50,6 +50,44 @@ def test_enlargement_is_opencvs(height: int, width: int, taller: int, wider: int
     np.testing.assert_allclose(enlarge(torch.from_numpy(image), size).numpy(), expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("size", [(200, 333), (481, 170), (24, 640)])
+@pytest.mark.parametrize("halve", [False, True])
+def test_blur_in_tiles_is_opencvs(size: tuple[int, int], halve: bool, dtype: torch.dtype) -> None:
+    image = torch.rand(2, 3, *size, dtype=dtype)
+    blurred = gaussian_blur(image, 5.5, halve=halve)
+    for plane, made in zip(image.flatten(0, 1), blurred.flatten(0, 1), strict=True):
+        expected = cv2.GaussianBlur(plane.double().numpy(), (0, 0), 5.5, borderType=cv2.BORDER_REPLICATE)
+        if halve:
+            expected = cv2.resize(expected, made.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        np.testing.assert_allclose(made.numpy(), expected, atol=2e-6)
+    graded = gaussian_blur(image.clone().requires_grad_(), 5.5, halve=halve).detach()
+    torch.testing.assert_close(graded, blurred)
+
+
+def test_blur_in_tiles_compiles_and_vectorises() -> None:
+    image = torch.rand(2, 3, 200, 333)
+
+    def run(images: torch.Tensor) -> torch.Tensor:
+        return gaussian_blur(images, 5.5, halve=True)
+
+    torch.compiler.reset()
+    compiled = torch.compile(run, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(image), run(image))
+    torch.testing.assert_close(torch.func.vmap(run)(image[:, None])[:, 0], run(image))
+
+
+@pytest.mark.parametrize(
+    ("size", "factors"), [((60, 90), (2, 4)), ((30, 21), (16, 8)), ((100, 61), (3, 7)), ((80, 170), (3, 1))]
+)
+def test_enlargement_in_tiles_is_opencvs(size: tuple[int, int], factors: tuple[int, int], dtype: torch.dtype) -> None:
+    image = torch.rand(size, dtype=dtype)
+    height, width = size[0] * factors[0], size[1] * factors[1]
+    expected = cv2.resize(image.double().numpy(), (width, height), interpolation=cv2.INTER_CUBIC)
+    np.testing.assert_allclose(enlarge(image, (height, width)).numpy(), expected, atol=1e-5)
+    graded = enlarge(image.clone().requires_grad_(), (height, width)).detach()
+    np.testing.assert_allclose(graded.numpy(), expected, atol=1e-5)
+
+
 def test_matrices_made_in_inference_mode_carry_gradients() -> None:
     image = torch.rand(1, 1, 21, 23)
     with torch.inference_mode():
