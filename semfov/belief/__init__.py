@@ -1,6 +1,8 @@
 """Beliefs about the scene: a grid of Dirichlet distributions and the rules that update it."""
 
 from semfov.belief import fusion
+from semfov.belief.context import ContextPrior
+from semfov.belief.context_observer import ContextObserver
 from semfov.belief.evidence import Evidence, Observation, weigh
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.observer import Memory, Observer, SemanticObserver
@@ -12,6 +14,8 @@ from semfov.belief.update import fuse
 
 __all__ = [
     "Belief",
+    "ContextObserver",
+    "ContextPrior",
     "Evidence",
     "Footprint",
     "Grid",

@@ -38,6 +38,15 @@ class Evidence:
         """Evidence of some of the looks."""
         return Evidence(self.likelihood[index], self.footprint[index], self.distance[index])
 
+    @classmethod
+    def join(cls, looks: list["Evidence"]) -> "Evidence":
+        """All looks of several batches with equally many detections."""
+        return cls(
+            torch.cat([look.likelihood for look in looks]),
+            torch.cat([look.footprint for look in looks]),
+            torch.cat([look.distance for look in looks]),
+        )
+
 
 def weigh(
     detections: Detections,

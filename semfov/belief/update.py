@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from semfov.belief.fusion import RULES, check_parameters, scale_likelihood
-from semfov.errors import check, check_shape, lookup
+from semfov.belief.fusion import RULES, Rule, check_parameters, scale_likelihood
+from semfov.errors import check, check_shape, lookup, values_known
 
 
 def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kaplan") -> Tensor:
@@ -12,6 +12,8 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
 
     Cells are independent, so the r-th detection of every cell of every map is fused in the same step: there are as
     many steps as detections pile up on one cell, not as there are detections, and only covered cells are touched.
+    Where a graph is traced, and inside `torch.func.vmap`, every detection is a step and meets every cell: the shape of
+    the graph may not depend on what was seen.
 
     Args:
         beta: `(B, X·Y, K+1)`, Dirichlet parameters.
@@ -36,6 +38,8 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     soft = footprint.is_floating_point()
     check(soft or footprint.dtype == torch.bool, "footprint", "a boolean or floating-point tensor", footprint.dtype)
     covered = footprint > 0 if soft else footprint
+    if not values_known():
+        return _fuse_one_by_one(beta, _scaled(likelihood, covered), footprint, update)
     image, detection, cell = covered.nonzero(as_tuple=True)
     if len(image) == 0:
         return beta.clone()
@@ -45,12 +49,25 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     sources = (image * likelihood.shape[1] + detection)[order]
     steps = torch.bincount(rank)[1:].tolist()
     flat = beta.reshape(-1, components).clone()
-    # Padding may hold zeros, which no rule accepts; nothing reads it.
-    used = covered.any(-1, keepdim=True)
-    evidence = scale_likelihood(torch.where(used, likelihood, 1.0)).reshape(-1, components)
+    evidence = _scaled(likelihood, covered).reshape(-1, components)
     weights = footprint[image, detection, cell][order, None].to(evidence).split(steps) if soft else None
     for i, (row, source) in enumerate(zip(rows.split(steps), sources.split(steps), strict=True)):
         said = evidence.index_select(0, source)
         said = said if weights is None else said.pow(weights[i])
         flat.index_copy_(0, row, update(flat.index_select(0, row), said))
     return flat.view(batch, cells, components)
+
+
+def _scaled(likelihood: Tensor, covered: Tensor) -> Tensor:
+    """Scaled likelihoods. Padding may hold zeros, which no rule accepts; nothing reads it."""
+    return scale_likelihood(torch.where(covered.any(-1, keepdim=True), likelihood, 1.0))
+
+
+def _fuse_one_by_one(beta: Tensor, evidence: Tensor, footprint: Tensor, update: Rule) -> Tensor:
+    """`fuse` as one graph, from scaled likelihoods."""
+    for number in range(evidence.shape[1]):
+        said, covers = evidence[:, number, None], footprint[:, number, :, None]
+        if covers.is_floating_point():
+            said = said.pow(covers.to(evidence))
+        beta = torch.where(covers > 0, update(beta, said), beta)
+    return beta.clone()

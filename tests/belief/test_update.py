@@ -51,6 +51,35 @@ def test_fuse_without_coverage_changes_nothing():
     assert got.data_ptr() != beta.data_ptr()
 
 
+@pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
+@pytest.mark.parametrize("soft", [False, True])
+def test_fuse_vectorises(name, soft):
+    beta, likelihood, footprint = piled(soft)
+    expected = torch.stack([fuse(b, l, f, name) for b, l, f in zip(beta, likelihood, footprint, strict=True)])
+    together = torch.func.vmap(lambda b, l, f: fuse(b, l, f, name))(beta, likelihood, footprint)
+    torch.testing.assert_close(together, expected)
+
+
+def test_fuse_compiles_whole():
+    """For any number of detections."""
+    beta, likelihood, footprint = (tensor[0] for tensor in piled(soft=True))
+    torch.compiler.reset()
+    compiled = torch.compile(fuse, fullgraph=True, backend="eager")
+    for looks in (4, 3):
+        given = beta, likelihood[:, :looks], footprint[:, :looks]
+        torch.testing.assert_close(compiled(*given), fuse(*given))
+
+
+def piled(soft):
+    """Three batches of two maps, four detections each, the last of which is padding."""
+    torch.manual_seed(2)
+    beta, likelihood = torch.rand(3, 2, 6, 5) + 0.2, torch.rand(3, 2, 4, 5)
+    footprint = torch.rand(3, 2, 4, 6) * (torch.rand(3, 2, 4, 6) < 0.5)
+    footprint[:, :, 3] = 0
+    likelihood[:, :, 3] = 0
+    return beta, likelihood, footprint if soft else footprint > 0
+
+
 def test_fuse_gradients():
     torch.manual_seed(1)
     beta = (torch.rand(1, 3, 3, dtype=torch.float64) + 0.2).requires_grad_()

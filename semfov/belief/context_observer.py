@@ -1,0 +1,112 @@
+"""An observer that adds context to what another one believes of the target."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from semfov.belief.context import ContextPrior, presence_of
+from semfov.belief.grid import Grid
+from semfov.belief.observer import Observer
+from semfov.belief.state import Belief
+from semfov.detection.detections import Detections
+from semfov.errors import InputError
+
+_CERTAIN = 1e-6  # log odds stay finite
+
+
+@dataclass(frozen=True)
+class ContextLook:
+    """What looks say of the target, and which classes they show where.
+
+    Attributes:
+        inner: what the other observer takes the looks to say.
+        presence: `(B, X·Y, K+1)`, of `presence_of`.
+        target: `(B,)`, class that is searched for.
+        grid: the cells.
+    """
+
+    inner: Any
+    presence: Tensor
+    target: Tensor
+    grid: Grid
+
+    def __getitem__(self, index: Tensor | slice) -> "ContextLook":
+        """Some of the looks."""
+        return replace(self, inner=self.inner[index], presence=self.presence[index], target=self.target[index])
+
+    @classmethod
+    def join(cls, looks: list["ContextLook"]) -> "ContextLook":
+        """All looks of several batches."""
+        inner = [look.inner for look in looks]
+        presence = torch.cat([look.presence for look in looks])
+        return cls(type(inner[0]).join(inner), presence, torch.cat([look.target for look in looks]), looks[0].grid)
+
+
+@dataclass(frozen=True)
+class ContextBelief(Belief):
+    """Belief about the target alone: `beta` holds the probabilities of its absence and its presence, `(B, X·Y, 2)`.
+
+    Attributes:
+        inner: belief of the other observer.
+        presence: `(B, X·Y, K+1)`, highest score of each class in each cell in any look.
+    """
+
+    inner: Any
+    presence: Tensor
+
+    def __getitem__(self, index: Tensor | slice) -> "ContextBelief":
+        """Beliefs of some of the episodes."""
+        return ContextBelief(self.beta[index], self.closest[index], self.inner[index], self.presence[index])
+
+
+class ContextObserver:
+    r"""Adds context to the log odds of the target that another observer arrives at.
+
+    .. math:: \operatorname{logit} P(t \in x) = \operatorname{logit} p_t(x) + c_t(x)
+
+    with c of `ContextPrior`, from the strongest sight of every class so far. It suits policies that go by the
+    probability of the target alone (`TargetPosterior`, `NeighbourhoodPosterior`).
+
+    Args:
+        observer: what it adds to.
+        prior: the context.
+        weights: of place and co-occurrence; None takes those fitted for the kind of observer.
+    """
+
+    by_target = True
+
+    def __init__(self, observer: Observer, prior: ContextPrior, weights: tuple[float, float] | None = None) -> None:
+        self.observer = observer
+        self.prior = prior
+        self.weights = weights or prior.weights_for("evidence" if observer.by_target else "map")
+
+    def start(self, batch: int, grid: Grid, like: Tensor) -> ContextBelief:
+        """Even odds in every cell, nothing seen."""
+        even = Belief.uniform(batch, len(grid), 2, 0.5, like)
+        nothing = like.new_zeros(batch, len(grid), len(self.prior.classes) + 1)
+        return ContextBelief(even.beta, even.closest, self.observer.start(batch, grid, like), nothing)
+
+    def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> ContextLook:
+        """What looks from `fixation` `(B, 2)` say of the target, and what they show around it."""
+        if target is None:
+            raise InputError("target: expected a class to search for, got None")
+        inner = self.observer.weigh(detections, fixation, grid, target)
+        wanted = torch.full((len(fixation),), target, device=fixation.device)
+        return ContextLook(inner, presence_of(detections, grid), wanted, grid)
+
+    def update(self, belief: ContextBelief, evidence: ContextLook) -> ContextBelief:
+        """Belief after a look in each episode."""
+        inner = self.observer.update(belief.inner, evidence.inner)
+        presence = torch.maximum(belief.presence, evidence.presence)
+        component = torch.as_tensor(self.observer.component(evidence.target))
+        chosen = component[:, None, None].expand(*inner.beta.shape[:-1], 1)
+        probability = inner.beta.gather(-1, chosen)[..., 0] / inner.beta.sum(-1)
+        context = self.prior(presence, evidence.grid, evidence.target, self.weights)
+        present = (probability.logit(eps=_CERTAIN) + context).sigmoid()
+        return ContextBelief(torch.stack([1 - present, present], -1), inner.closest, inner, presence)
+
+    def component(self, target: int | Tensor) -> int | Tensor:
+        """Presence, whatever the target."""
+        return 1 if isinstance(target, int) else torch.ones_like(target)

@@ -1,0 +1,195 @@
+"""Context: places and company against loops over cells, and what it adds to other observers."""
+
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+
+from semfov import Detections, Grid
+from semfov.belief import ContextObserver, ContextPrior, SemanticObserver, TargetEvidence, TargetObserver
+from semfov.belief.context import presence_of, reaches
+from semfov.errors import DataError, InputError
+from semfov.gaze.acquisition import TargetPosterior
+
+GRID = Grid(5, 4, (100, 60))
+EDGES = [0.0, 0.2, 0.45]
+FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]
+
+
+@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+def presence(request):
+    generator = torch.Generator().manual_seed(0)
+    sparse = torch.rand(2, 20, 4, generator=generator, dtype=request.param)
+    return sparse * (torch.rand(2, 20, 4, generator=generator) < 0.2)
+
+
+@pytest.fixture
+def prior():
+    generator = torch.Generator().manual_seed(1)
+    place, pairs = torch.randn(4, 4, 4, generator=generator), torch.randn(4, 4, 4, generator=generator)
+    pairs.diagonal().zero_()
+    weights = {"evidence": (0.5, 0.25), "map": (1.0, 2.0)}
+    return ContextPrior(["cup", "cat", "car"], place, pairs, EDGES, weights=weights, metadata={"data": "toy"})
+
+
+@pytest.fixture
+def looks():
+    generator = torch.Generator().manual_seed(2)
+    corner = torch.rand(3, 4, 2, generator=generator) * 40
+    boxes = torch.cat([corner, corner + 5 + torch.rand(3, 4, 2, generator=generator) * 15], -1)
+    mask = torch.tensor([[True, True, True, False], [True, True, False, False], [False] * 4])
+    return Detections(boxes, torch.rand(3, 4, 4, generator=generator).softmax(-1), mask)
+
+
+def reach(presence, cell, component, edge):
+    """Highest presence of a class within a distance of a cell, in scalars."""
+    best = 0.0
+    for other in range(20):
+        offset = (GRID.centres[cell] - GRID.centres[other]).abs().amax() / 100
+        if offset <= edge + 1e-6:
+            best = max(best, float(presence[other, component]))
+    return best
+
+
+def test_company_equals_the_loop(prior, presence):
+    got = prior(presence, GRID, torch.tensor([1, 3]), (0.0, 1.0))
+    assert got.dtype == presence.dtype
+    for row, target in enumerate([1, 3]):
+        for cell in range(20):
+            expected = 0.0
+            for component in range(4):
+                nearer = 0.0
+                for band, edge in enumerate([*EDGES, math.inf]):
+                    within = reach(presence[row], cell, component, edge)
+                    expected += (within - nearer) * float(prior.cooccurrence[target, component, band])
+                    nearer = within
+            assert float(got[row, cell]) == pytest.approx(expected, abs=1e-5)
+
+
+def test_reaches_grow_and_end_at_the_whole_image(presence):
+    steps = list(reaches(presence, GRID, EDGES))
+    assert len(steps) == len(EDGES) + 1
+    torch.testing.assert_close(steps[0], presence)
+    for near, far in pairwise(steps):
+        assert bool((far >= near).all())
+    torch.testing.assert_close(steps[-1], presence.amax(1, keepdim=True).expand_as(presence))
+
+
+def test_places_are_read_between_the_cells_of_the_map(prior):
+    same = prior.place_at(Grid(4, 4, (30, 20)))
+    torch.testing.assert_close(same, prior.place.flatten(1))
+    grid = Grid(3, 7, (30, 20))
+    got = prior.place_at(grid)
+    for cell in range(21):
+        # Centre of the cell on the scale of the map, whose first centre is at 0; beyond the outermost it stays.
+        x = min(max((cell % 3 + 0.5) / 3 * 4 - 0.5, 0), 3)
+        y = min(max((cell // 3 + 0.5) / 7 * 4 - 0.5, 0), 3)
+        left, top = min(int(x), 2), min(int(y), 2)
+        u, v = x - left, y - top
+        corner = prior.place[:, top : top + 2, left : left + 2]
+        expected = (
+            corner[:, 0, 0] * (1 - u) * (1 - v)
+            + corner[:, 0, 1] * u * (1 - v)
+            + corner[:, 1, 0] * (1 - u) * v
+            + corner[:, 1, 1] * u * v
+        )
+        torch.testing.assert_close(got[:, cell], expected)
+
+
+def test_weights_scale_the_two_parts(prior, presence):
+    place, company = (prior(presence, GRID, 2, weights) for weights in ((1.0, 0.0), (0.0, 1.0)))
+    torch.testing.assert_close(prior(presence, GRID, 2, (0.3, 0.7)), 0.3 * place + 0.7 * company)
+    torch.testing.assert_close(place[0].float(), prior.place_at(GRID)[2])
+    assert torch.equal(prior(presence, GRID, 2, (0.0, 0.0)), torch.zeros_like(place))
+
+
+def test_presence_equals_a_loop(looks):
+    got = presence_of(looks, GRID)
+    expected = torch.zeros(3, 20, 4)
+    for look, detection in looks.mask.nonzero().tolist():
+        for cell in GRID.footprint(looks.boxes[look, detection][None])[0].nonzero()[:, 0].tolist():
+            expected[look, cell] = torch.maximum(expected[look, cell], looks.scores[look, detection])
+    assert torch.equal(got, expected)
+    assert torch.equal(presence_of(Detections.empty(2, 3), GRID), torch.zeros(2, 20, 4))
+
+
+def observers():
+    torch.manual_seed(3)
+    evidence = TargetObserver(TargetEvidence(8, 6).eval().requires_grad_(False))
+    return [evidence, SemanticObserver(4, tempering=0.25, footprint="box_centre")]
+
+
+@pytest.mark.parametrize("kind", [0, 1], ids=["evidence", "map"])
+def test_observer_adds_context_to_the_log_odds(prior, looks, kind):
+    inner = observers()[kind]
+    observer = ContextObserver(inner, prior)
+    assert observer.weights == ((0.5, 0.25), (1.0, 2.0))[kind]
+    belief, plain = observer.start(1, GRID, looks.scores), inner.start(1, GRID, looks.scores)
+    for look in range(3):
+        part = slice(look, look + 1)
+        belief = observer.update(belief, observer.weigh(looks[part], FIXATIONS[part], GRID, 2))
+        plain = inner.update(plain, inner.weigh(looks[part], FIXATIONS[part], GRID, 2))
+    present = TargetPosterior(inner.component(2))(plain.beta)
+    context = prior(presence_of(looks, GRID).amax(0, keepdim=True), GRID, 2, observer.weights)
+    expected = (present.log() - torch.log1p(-present) + context).sigmoid()
+    torch.testing.assert_close(TargetPosterior(observer.component(2))(belief.beta), expected, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(belief.closest, plain.closest)
+    assert observer.component(torch.tensor([3, 2])).tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("kind", [0, 1], ids=["evidence", "map"])
+def test_looks_joined_over_targets_are_those_of_each(prior, looks, kind):
+    observer = ContextObserver(observers()[kind], prior)
+    said = [observer.weigh(looks, FIXATIONS, GRID, target) for target in (1, 3)]
+    joined = type(said[0]).join(said)
+    start = observer.start(2, GRID, looks.scores)
+    both = observer.update(start, joined[torch.tensor([1, 4])])
+    for row in range(2):
+        alone = observer.update(start[row : row + 1], said[row][1:2])
+        torch.testing.assert_close(both[row : row + 1].beta, alone.beta)
+
+
+def test_without_weight_nothing_changes(prior, looks):
+    inner = observers()[1]
+    observer = ContextObserver(inner, prior, (0.0, 0.0))
+    after = observer.update(observer.start(3, GRID, looks.scores), observer.weigh(looks, FIXATIONS, GRID, 1))
+    plain = inner.update(inner.start(3, GRID, looks.scores), inner.weigh(looks, FIXATIONS, GRID, 1))
+    torch.testing.assert_close(after.beta[..., 1], TargetPosterior(1)(plain.beta))
+
+
+def test_gradients_reach_the_presence(prior):
+    generator = torch.Generator().manual_seed(4)
+    presence = torch.rand(1, 20, 4, generator=generator, dtype=torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(lambda p: prior.double()(p, GRID, 1), presence)
+
+
+def test_saved_and_loaded_is_the_same_to_half_precision(tmp_path, prior):
+    prior.save(tmp_path / "toy.safetensors")
+    loaded = ContextPrior.from_pretrained(tmp_path / "toy.safetensors")
+    assert torch.equal(loaded.place, prior.place.half().float())
+    assert torch.equal(loaded.cooccurrence, prior.cooccurrence.half().float())
+    assert (loaded.edges, loaded.weights, loaded.metadata) == (prior.edges, prior.weights, prior.metadata)
+    loaded.save(tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "toy.safetensors").read_bytes()
+    assert loaded.digest() == ContextPrior.from_pretrained(tmp_path / "again.safetensors").digest() != prior.digest()
+    with pytest.raises(DataError):
+        ContextPrior.from_pretrained(tmp_path / "none.safetensors")
+
+
+def test_bad_input(prior, looks):
+    nothing = torch.zeros(1, 20, 4)
+    with pytest.raises(InputError, match="target"):
+        prior(nothing, GRID, 4)
+    with pytest.raises(InputError, match="presence"):
+        prior(nothing[:, :5], GRID, 1)
+    with pytest.raises(InputError, match="size of one image"):
+        prior(nothing, Grid(5, 4, torch.tensor([[100.0, 60.0]])), 1)
+    with pytest.raises(InputError, match="target"):
+        ContextObserver(observers()[0], prior).weigh(looks, FIXATIONS, GRID)
+    with pytest.raises(InputError, match="evidence"):
+        prior.weights_for("evidnce")
+    with pytest.raises(InputError, match="class 2"):
+        prior.check_compatible(["cup", "dog", "car"])
+    with pytest.raises(InputError, match="edges"):
+        ContextPrior(["cup"], torch.zeros(2, 3, 3), torch.zeros(2, 2, 3), [0.3, 0.1])

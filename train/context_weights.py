@@ -1,0 +1,148 @@
+"""How much context should count beside a belief: two weights, fitted on series of looks at photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from eval.protocol import generator_for
+from eval.samples import Sampler, Samples
+from semfov import Detections
+from semfov.belief import ContextPrior, Observer, SemanticObserver, TargetEvidence, TargetObserver
+from semfov.belief.context import presence_of
+
+if TYPE_CHECKING:
+    from train.fit_context import FitContextConfig, Places
+
+
+@dataclass(frozen=True)
+class Cases:
+    """Beliefs after some looks, one for each photograph and class.
+
+    Attributes:
+        log_odds: `(E, X·Y)`, of the target without context.
+        place: `(E, X·Y)`, what place would add.
+        company: `(E, X·Y)`, what co-occurrence would add.
+        goal: `(E, X·Y)` boolean, cells with the target.
+        visited: `(E, X·Y)` boolean.
+    """
+
+    log_odds: Tensor
+    place: Tensor
+    company: Tensor
+    goal: Tensor
+    visited: Tensor
+
+
+def make_cases(
+    kind: str,
+    sampler: Sampler,
+    samples: Samples,
+    folds: Sequence[tuple[ContextPrior, Sequence[int]]],
+    places: Sequence[Places],
+    config: FitContextConfig,
+) -> Cases:
+    """Beliefs of one kind, `evidence` or `map`, after a random number of random looks off the target.
+
+    Args:
+        kind: of the belief.
+        sampler: what looked.
+        samples: what it saw.
+        folds: priors, each with the photographs to use it on.
+        places: where the objects are.
+        config: of the fit.
+    """
+    observer: Observer = SemanticObserver(len(sampler.scenes.classes) + 1, tempering=0.25, footprint="box_centre")
+    if kind == "evidence":
+        observer = TargetObserver(TargetEvidence.from_pretrained(sampler.eye.detector.name).requires_grad_(False))
+    counts = torch.bincount(samples.look, minlength=len(samples.scenes)).tolist()
+    boxes, scores = samples.boxes.split(counts), samples.scores.split(counts)
+    work = [(prior, index) for prior, part in folds for index in part]
+    parts = []
+    for prior, index in tqdm(work, desc=f"context beside {kind}", unit="scene", dynamic_ncols=True):
+        place = places[index]
+        rows = range(index * config.fixations, (index + 1) * config.fixations)
+        seen = Detections.stack([_detections(boxes[row], scores[row]) for row in rows])
+        fixations = samples.fixations[rows.start : rows.stop]
+        presence, cells = presence_of(seen, place.grid), place.grid.cell_of(fixations)
+        for target in place.targets:
+            goal = place.occupied[:, target]
+            free = (~goal[cells]).nonzero()[:, 0]
+            if not len(free):
+                continue
+            generator = generator_for("looks", config.seed, sampler.scenes.ids[index], target)
+            number = int(torch.randint(1, len(free) + 1, (1,), generator=generator))
+            used = free[torch.randperm(len(free), generator=generator)[:number]]
+            belief = observer.start(1, place.grid, presence)
+            said = observer.weigh(seen, fixations, place.grid, target)
+            for look in used.split(1):
+                belief = observer.update(belief, said[look])
+            component = int(observer.component(target))
+            probability = belief.beta[0, :, component] / belief.beta[0].sum(-1)
+            shown = presence[used].amax(0, keepdim=True)
+            alone = [prior(shown, place.grid, target, weights)[0] for weights in ((1.0, 0.0), (0.0, 1.0))]
+            visited = torch.zeros(len(place.grid), dtype=torch.bool).scatter(0, cells[used], True)
+            parts.append((probability.logit(eps=1e-6), *alone, goal, visited))
+    return Cases(*(torch.stack(column) for column in zip(*parts, strict=True)))
+
+
+SIZES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
+"""Shares of the likeliest weights that are tried; the smallest do little but break ties."""
+
+
+def fit_weights(cases: Cases) -> tuple[float, float]:
+    """Weights of place and co-occurrence: as the likelihood has them to each other, as large as serves the gaze.
+
+    A belief that is not calibrated, such as a fused map, asks for large weights to be likely, under which the most
+    probable cell holds the target less often; of `SIZES` the one is taken that lands on the target most often.
+    """
+    place, company = likeliest_weights(cases)
+    size = max(SIZES, key=lambda size: landed(cases, size * place, size * company))
+    return size * place, size * company
+
+
+def likeliest_weights(cases: Cases) -> tuple[float, float]:
+    r"""Weights of place and co-occurrence that make a soft next fixation land on the target most likely.
+
+    .. math:: \max_{\gamma, w} \sum \ln \sum_{x \in \text{goal}}
+              \mathrm{softmax}\bigl(\gamma (\ell + w_1 a + w_2 r)\bigr)(x)
+
+    γ makes up for beliefs that are not calibrated; the next fixation does not depend on it.
+    """
+    parameters = torch.tensor([1.0, 0.0, 0.0], requires_grad=True)
+    optimiser = torch.optim.LBFGS([parameters], max_iter=100, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        value = -hit(cases, *parameters)
+        value.backward()
+        return value
+
+    optimiser.step(loss)
+    gamma, place, company = parameters.tolist()
+    return place / gamma, company / gamma
+
+
+def landed(cases: Cases, place: float, company: float) -> float:
+    """How often the most probable cell not visited holds the target, ties broken at random (`select_fixation`)."""
+    value = cases.log_odds + place * cases.place + company * cases.company
+    value = value.masked_fill(cases.visited, -torch.inf)
+    best = value.amax(-1, keepdim=True)
+    tied = value >= best - 1e-6 * best.abs()
+    return float(((tied & cases.goal).sum(-1) / tied.sum(-1)).mean())
+
+
+def hit(cases: Cases, gamma: Tensor, place: Tensor, company: Tensor) -> Tensor:
+    """Mean log probability of landing on the target."""
+    value = gamma * cases.log_odds + place * cases.place + company * cases.company
+    value = value.masked_fill(cases.visited, -torch.inf)
+    return (value.masked_fill(~cases.goal, -torch.inf).logsumexp(-1) - value.logsumexp(-1)).mean()
+
+
+def _detections(boxes: Tensor, scores: Tensor) -> Detections:
+    return Detections(boxes[None], scores[None], torch.ones(1, len(boxes), dtype=torch.bool))
