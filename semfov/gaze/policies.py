@@ -1,6 +1,7 @@
 """The named policies: which acquisition function looks for a target, and which explores a scene."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 from torch import Tensor, nn
@@ -74,18 +75,9 @@ def search_policy(name: str, model: SearchModel | None = None, *, calibrated: bo
     TargetPosterior()
     """
     lookup(name, SEARCH_POLICIES, "search policy")
-    if name == "random":
-        return lambda target, grid: Uniform()
-    if name == "non-predictive":
-        return lambda target, grid: TargetPosterior(_known(target, name))
-    if name == "neighbourhood":
-        return lambda target, grid: NeighbourhoodPosterior(_known(target, name), grid)
-    expecting = _needed(model, name)
-    if name == "foveal-hit":
-        return lambda target, grid: FovealHit(_known(target, name), expecting, grid)
-    if name == "place-information":
-        return lambda target, grid: PlaceInformation(_known(target, name), expecting, grid)
-    return lambda target, grid: PredictedTargetPosterior(_known(target, name), expecting, calibrated=calibrated)
+    if name in ("predictive", "foveal-hit", "place-information"):
+        _needed(model, name)
+    return _SearchPolicy(name, model, calibrated)
 
 
 def exploration_policy(
@@ -111,15 +103,53 @@ def exploration_policy(
     'KLDivergence'
     """
     lookup(name, EXPLORATION_POLICIES, "exploration policy")
-    if name == "random":
-        return lambda target, grid: Uniform()
-    if name == "closer-look":
-        return lambda target, grid: CloserLook(grid, fovea)
-    expecting = _needed(model, name)
-    if name == "expected-accuracy":
-        return lambda target, grid: ExpectedAccuracy(expecting, grid)
-    acquisition = _LOOKAHEADS[name]
-    return lambda target, grid: acquisition(expecting, grid, calibrated=calibrated)
+    if name not in ("random", "closer-look"):
+        _needed(model, name)
+    return _ExplorationPolicy(name, model, calibrated, fovea)
+
+
+@dataclass(frozen=True)
+class _SearchPolicy:
+    """What `search_policy` returns: it can be pickled, and a copy of it has a copy of the model."""
+
+    name: str
+    model: SearchModel | None
+    calibrated: bool
+
+    def __call__(self, target: int | Tensor | None, grid: Grid) -> nn.Module:
+        if self.name == "random":
+            return Uniform()
+        wanted = _known(target, self.name)
+        if self.name == "non-predictive":
+            return TargetPosterior(wanted)
+        if self.name == "neighbourhood":
+            return NeighbourhoodPosterior(wanted, grid)
+        model = _needed(self.model, self.name)
+        if self.name == "foveal-hit":
+            return FovealHit(wanted, model, grid)
+        if self.name == "place-information":
+            return PlaceInformation(wanted, model, grid)
+        return PredictedTargetPosterior(wanted, model, calibrated=self.calibrated)
+
+
+@dataclass(frozen=True)
+class _ExplorationPolicy:
+    """What `exploration_policy` returns."""
+
+    name: str
+    model: ExplorationModel | None
+    calibrated: bool
+    fovea: float
+
+    def __call__(self, target: int | Tensor | None, grid: Grid) -> nn.Module:
+        if self.name == "random":
+            return Uniform()
+        if self.name == "closer-look":
+            return CloserLook(grid, self.fovea)
+        model = _needed(self.model, self.name)
+        if self.name == "expected-accuracy":
+            return ExpectedAccuracy(model, grid)
+        return _LOOKAHEADS[self.name](model, grid, calibrated=self.calibrated)
 
 
 def _needed(model: Model | None, name: str) -> Model:

@@ -61,8 +61,8 @@ def test_estimators_agree(fitted):
     assert figures[0] == figures[1] == figures[2]
 
 
-def test_two_workers_give_the_same_bits(fitted, tmp_path):
-    assert main([*SMALL, "2", "--out", str(tmp_path)]) == 0
+def test_two_workers_and_larger_shards_give_the_same_bits(fitted, tmp_path):
+    assert main([*SMALL, "2", "--shard", "3", "--out", str(tmp_path)]) == 0
     assert bits(tmp_path) == bits(fitted)
 
 

@@ -76,17 +76,39 @@ def test_objective_equals_its_formula():
     torch.testing.assert_close(objective(log_odds, goal, visited), expected)
 
 
+SMALL = [
+    "--data.limit", "6", "--fixations", "3", "--holdout", "3", "--min_objects", "1", "--shard", "2", "--steps", "40",
+    "--batch", "8", "--workers",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A model trained on three looks at each of 6 embedded scenes."""
+    out = tmp_path_factory.mktemp("fit_search")
+    threads = torch.get_num_threads()
+    assert main([*SMALL, "1", "--out", str(out)]) == 0
+    torch.set_num_threads(threads)
+    return out
+
+
 @pytest.mark.weights
 @pytest.mark.slow
-def test_training_leaves_a_model_that_hits_more_often(tmp_path):
-    threads = torch.get_num_threads()
-    small = ["--data.limit", "6", "--fixations", "3", "--holdout", "3", "--min_objects", "1", "--shard", "2"]
-    call = [*small, "--steps", "40", "--batch", "8", "--workers", "1", "--out", str(tmp_path)]
-    assert main(call) == 0
-    torch.set_num_threads(threads)
-    model = TargetEvidence.from_pretrained(tmp_path / "yolov3-tiny.safetensors")
+def test_training_leaves_a_model_that_hits_more_often(trained):
+    model = TargetEvidence.from_pretrained(trained / "yolov3-tiny.safetensors")
     assert model.metadata["detector"]["name"] == "yolov3-tiny"
     assert model.metadata["training"]["steps"] == 40
-    judged = json.loads((tmp_path / "judged.json").read_text())
+    judged = json.loads((trained / "judged.json").read_text())
     assert judged[-1]["cross_entropy"] < judged[0]["cross_entropy"] / 2
-    assert "next fixation hits" in (tmp_path / "report.md").read_text()
+    assert "next fixation hits" in (trained / "report.md").read_text()
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_two_workers_give_the_same_bits(trained, tmp_path):
+    threads = torch.get_num_threads()
+    torch.manual_seed(1)  # what the caller draws elsewhere changes nothing
+    assert main([*SMALL, "2", "--out", str(tmp_path)]) == 0
+    torch.set_num_threads(threads)
+    for name in ("yolov3-tiny.safetensors", "judged.json", "report.md"):
+        assert (tmp_path / name).read_bytes() == (trained / name).read_bytes(), name

@@ -53,7 +53,31 @@ class NeighbourhoodPosterior(nn.Module):
         return (pick(beta, self.target) / beta.sum(-1)) @ self.kernel.to(beta)
 
 
-class FovealHit(nn.Module):
+class TargetVisibility(nn.Module):
+    """Base of the acquisition functions that know from where the target can be seen.
+
+    Args:
+        target: class 1..K, or a tensor `(B,)` with one for each episode.
+        model: the observation model, with miss rates.
+        grid: the cells of one image.
+
+    Attributes:
+        visibility: `(..., f, x)`, probability that a target in cell x is detected from f, for each target.
+    """
+
+    target: Tensor
+    visibility: Tensor
+
+    def __init__(self, target: int | Tensor, model: MissModel, grid: Grid) -> None:
+        super().__init__()
+        if model.miss_rate is None:
+            raise InputError("model: expected an observation model with miss rates, got one without")
+        self.register_buffer("target", torch.as_tensor(target))
+        level = model.level(grid.cell_distance)
+        self.register_buffer("visibility", 1 - model.miss_rate[self.target][..., level])
+
+
+class FovealHit(TargetVisibility):
     r"""Probability that the target is detected anywhere from the next fixation, if cells are independent.
 
     .. math:: a(f) = 1 - \prod_x \bigl(1 - p_t(x) \, v_t(d(x, f))\bigr), \qquad v_t = 1 - m_t
@@ -66,21 +90,13 @@ class FovealHit(nn.Module):
         grid: the cells of one image.
     """
 
-    target: Tensor
-    visibility: Tensor
-
-    def __init__(self, target: int | Tensor, model: MissModel, grid: Grid) -> None:
-        super().__init__()
-        self.register_buffer("target", torch.as_tensor(target))
-        self.register_buffer("visibility", visibility(model, grid, self.target))
-
     def forward(self, beta: Tensor) -> Tensor:
         """Values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
         present = pick(beta, self.target) / beta.sum(-1)
         return -torch.expm1(torch.log1p(-present[..., None, :] * self.visibility.to(beta)).sum(-1))
 
 
-class PlaceInformation(nn.Module):
+class PlaceInformation(TargetVisibility):
     r"""How much the next look is expected to tell of the target's place.
 
     With the place distributed as :math:`q(x) \propto p_t(x)`, a look from f detects the target with probability
@@ -98,14 +114,6 @@ class PlaceInformation(nn.Module):
         grid: the cells of one image.
     """
 
-    target: Tensor
-    visibility: Tensor
-
-    def __init__(self, target: int | Tensor, model: MissModel, grid: Grid) -> None:
-        super().__init__()
-        self.register_buffer("target", torch.as_tensor(target))
-        self.register_buffer("visibility", visibility(model, grid, self.target))
-
     def forward(self, beta: Tensor) -> Tensor:
         """Values `(..., X·Y)` in nats for a belief `(..., X·Y, K+1)`."""
         present = pick(beta, self.target) / beta.sum(-1)
@@ -115,11 +123,3 @@ class PlaceInformation(nn.Module):
         # P(nothing) H(q') = -Σ m ln m + P ln P with m = q (1 - v)
         left = torch.xlogy(nothing, nothing) - torch.xlogy(missed, missed).sum(-1)
         return -torch.xlogy(place, place).sum(-1, keepdim=True) - left
-
-
-def visibility(model: MissModel, grid: Grid, target: Tensor) -> Tensor:
-    """Probability that a target in cell x is detected from f, `(..., f, x)` with the dimensions of `target` leading."""
-    if model.miss_rate is None:
-        raise InputError("model: expected an observation model with miss rates, got one without")
-    level = model.level(grid.cell_distance)
-    return 1 - model.miss_rate[target][..., level]
