@@ -92,6 +92,9 @@ class BeliefConfig:
         misses: take account of cells in which nothing was detected, by the observation model's miss rates.
         model: fitted observation model, by name or file (None: the one shipped for the detector).
         target_model: learned target evidence, by name or file (None: the one shipped for the detector).
+        context: what is added to the log odds of a target: `none`, its usual `place`, its `cooccurrence` with what was
+            seen, or `both`; for `target-evidence`, `non-predictive` and `neighbourhood`.
+        context_model: fitted context, by name or file.
     """
 
     columns: int = 10
@@ -104,6 +107,8 @@ class BeliefConfig:
     misses: bool = False
     model: str | None = None
     target_model: str | None = None
+    context: Literal["none", "place", "cooccurrence", "both"] = "none"
+    context_model: str = "coco"
 
 
 @dataclass(frozen=True)
@@ -154,11 +159,14 @@ class SearchConfig:
         belief: the grid of beliefs.
         saliency: the saliency baselines.
         protocol: the experiment.
-        policies: policies to compare: `target-evidence` (learned; recommended), `random`, `vocus2`, `itti-koch`, or
+        policies: policies to compare: `target-evidence` (learned; recommended), `learned-raw` (a gaze policy learned
+            end to end, with the belief that it was trained behind), `random`, `vocus2`, `itti-koch`, or
             `non-predictive`, `predictive`, `neighbourhood`, `foveal-hit` or `place-information` followed by `-raw`
             (scores are likelihoods) or `-calibrated` (scores go through the observation model). These may be followed
             by `+tempered` (τ = ¼), `+mild` (τ = ½), `+closest`, `+soft`, `+central` and `+misses`, which change
-            `belief` for this policy alone.
+            `belief` for this policy alone; `target-evidence`, `non-predictive` and `neighbourhood` also by `+context`,
+            or one part of it, `+place` or `+cooccurrence`.
+        gaze_model: learned gaze policy of `learned-raw`, by name or file (None: the one shipped for the detector).
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what the detector saw from every cell, shared between runs (None: the user's cache).
         store: keep what the detector saw on disk; false recomputes it (the result is the same).
@@ -180,6 +188,7 @@ class SearchConfig:
         "predictive-calibrated",
         "target-evidence",
     )
+    gaze_model: str | None = None
     out: Path = Path("runs/search")
     cache: Path | None = None
     store: bool = True

@@ -24,8 +24,10 @@ from eval.metrics import standard_error
 from eval.protocol import Searcher
 from eval.run import Parts, Run
 from eval.saliency import milliseconds_per_map
-from eval.setup import TARGET_EVIDENCE, plain, split_policy
+from eval.setup import plain, split_policy
 from semfov import Detections, Grid
+from semfov.agent import acquisition_values
+from semfov.belief import Belief
 from semfov.errors import DataError
 from semfov.files import replacing, write_text
 from semfov.gaze import select_fixation
@@ -136,10 +138,10 @@ def _milliseconds(run: Run, name: str, repetitions: int) -> float:
         return milliseconds_per_map(base, run.config.saliency, run.eye, run.scenes[0].image, run.grid(0))
     searcher, grid = run.searcher(name, 0), run.grid(0)
     generator = torch.Generator().manual_seed(0)
-    if base == TARGET_EVIDENCE:
+    if searcher.observer.by_target:
         return _milliseconds_to_weigh(searcher, grid, len(run.scenes.classes), repetitions)
     start = searcher.observer.start(1, grid, torch.empty(0)).beta
-    beta = start + torch.rand(start.shape, generator=generator)
+    belief = Belief(start + torch.rand(start.shape, generator=generator), torch.rand(1, len(grid), generator=generator))
     visited, noise = torch.zeros(1, len(grid), dtype=torch.bool), torch.rand(1, len(grid), generator=generator)
     component = searcher.observer.component(torch.tensor([1])) if run.kind == "search" else None
     acquisition = searcher.policy(component, grid)
@@ -147,7 +149,7 @@ def _milliseconds(run: Run, name: str, repetitions: int) -> float:
     with torch.inference_mode():
         for _ in range(repetitions):
             began = time.perf_counter()
-            select_fixation(acquisition(beta), visited, noise)
+            select_fixation(acquisition_values(acquisition, belief, visited), visited, noise)
             times.append(time.perf_counter() - began)
     return 1000 * float(np.median(times))
 
@@ -156,12 +158,13 @@ def _milliseconds_to_weigh(searcher: Searcher, grid: Grid, classes: int, repetit
     """As above, where the update of the belief is what decides and takes the time."""
     observer, nothing = searcher.observer, Detections.empty(1, classes)
     acquisition, times = searcher.policy(1, grid), []
+    visited = torch.zeros(1, len(grid), dtype=torch.bool)
     with torch.inference_mode():
         belief, look = observer.start(1, grid, torch.empty(0)), observer.weigh(nothing, grid.centres[:1], grid, 1)
         for _ in range(repetitions):
             began = time.perf_counter()
             belief = observer.update(belief, look)
-            select_fixation(acquisition(belief.beta), belief.visited, torch.zeros(1, len(grid)))
+            select_fixation(acquisition(belief.beta), visited, torch.zeros(1, len(grid)))
             times.append(time.perf_counter() - began)
     return 1000 * float(np.median(times))
 

@@ -104,12 +104,19 @@ SENSORS: dict[str, dict[str, dict[str, object]]] = {
 }
 """Sensors and working resolutions."""
 
+VIEWS: dict[str, dict[str, dict[str, object]]] = {
+    "whole photograph, once": {"saliency": {"view": "picture"}},
+    "foveated view, as published": {"saliency": {"view": "foveated"}},
+}
+"""What the saliency models see."""
+
 FIVE_LEVELS = "explore-five-levels-nano"
 """The experiment that needs a model which is not shipped."""
 
 STUDIES = {
     "sensitivity": (SENSITIVITY, ("non-predictive-raw",)),
-    "sensor": (SENSORS, ("random", "non-predictive-raw", "non-predictive-raw+tempered+central")),
+    "saliency": (VIEWS, ("vocus2", "itti-koch")),
+    "sensor": (SENSORS, ("non-predictive-raw", "non-predictive-raw+tempered+central")),
 }
 """Studies on fewer photographs: what changes, and the policies. A row of their tables is a setting and a policy."""
 
@@ -123,7 +130,7 @@ class ResultsConfig:
         annotations: COCO-format instances file for them.
         yolox: ONNX file of YOLOX-nano (None: the published one).
         limit: only the first so many photographs, for a trial.
-        sensitivity: photographs for the studies of sensitivity and of sensors, which look anew for every setting.
+        sensitivity: photographs for the studies of settings, which look anew for every one.
         five_levels: observation model of YOLOX-nano with five levels, the last of them empty (None: left out).
         only: experiments to run (None: all); the page says of the others what is there from before, or nothing.
         page: file to write.
@@ -160,9 +167,9 @@ def experiments(config: ResultsConfig) -> dict[str, RunConfig]:
         for control in ("wrong-class", "permuted"):
             protocol = ProtocolConfig(control=control)
             runs[f"{control}-{name}"] = seek(policies=("random", "target-evidence"), protocol=protocol, scanpaths=0)
-        if name == "nano":
-            first = ProtocolConfig(ties="first")
-            runs[f"first-index-{name}"] = seek(policies=PUBLISHED, protocol=first, scanpaths=0)
+        if name == "tiny":
+            policies = ("non-predictive-raw+tempered+central", "learned-raw")
+            runs[f"learned-{name}"] = seek(policies=policies, scanpaths=0)
         tour = partial(ExploreConfig, **common, saliency=picture)
         runs[f"explore-{name}"] = tour(policies=EXPLORE)
         published = BeliefConfig(model=f"{'yolov3-tiny' if name == 'tiny' else 'yolox-nano'}-published")
@@ -286,11 +293,27 @@ def per_image(records: list[Record], last: int) -> Array:
     return np.stack([np.mean(images[scene], axis=0) for scene in sorted(images)])
 
 
+def agreement(folder: Path) -> list[str]:
+    """How often predictive and non-predictive search choose the same cell, first and all the way."""
+    episodes: dict[str, list[Record]] = {}
+    for record in read_records(folder):
+        episodes.setdefault(record["policy"], []).append(record)
+    rows = [["scores", "same first gaze shift", "found after as many shifts"]]
+    for mode in ("raw", "calibrated"):
+        pairs = list(zip(episodes[f"non-predictive-{mode}"], episodes[f"predictive-{mode}"], strict=True))
+        first = [a["cells"][1] == b["cells"][1] for a, b in pairs]
+        found = [a["found_at"] == b["found_at"] for a, b in pairs]
+        rows.append([mode, *(f"{100 * np.mean(same):.1f} %" for same in (first, found))])
+    return table(rows)
+
+
 TABLES: dict[str, Callable[[Path], list[str]]] = {
     "all": summary,
     "first": partial(summary, section=0),
     "second": partial(summary, section=1),
+    "agreement": agreement,
     "paired-search": partial(paired, baseline="random", shifts=(1, 5, 15, 30)),
+    "paired-learned": partial(paired, baseline="non-predictive-raw+tempered+central", shifts=(1, 5, 10, 15, 30)),
     "paired-explore": partial(paired, baseline="random-raw", shifts=(1, 2, 3, 4, 10, 20)),
 }
 

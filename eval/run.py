@@ -7,7 +7,7 @@ import json
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,20 @@ from eval.parallel import available_cores, mine, run_tasks, wait_for_all
 from eval.protocol import Searcher
 from eval.saliency import SaliencyStore, saliency_table
 from eval.setup import (
+    LEARNED,
     TARGET_EVIDENCE,
     Kind,
+    in_context,
+    make_context,
     make_eye,
+    make_learned_gaze,
     make_observation,
     make_scenes,
     make_searcher,
     make_target_evidence,
+    needs_context,
     needs_model,
+    needs_target,
     prepare_worker,
     saliency_policies,
     split_policy,
@@ -56,7 +62,9 @@ class Run(ABC):
         if not len(self.scenes):
             raise DataError("data: no scene passes the selection; lower data.min_instances or raise data.limit")
         self.model = make_observation(config, self.eye) if needs_model(config.policies, self.kind) else None
-        self.target = make_target_evidence(config, self.eye) if TARGET_EVIDENCE in config.policies else None
+        self.target = make_target_evidence(config, self.eye) if needs_target(config.policies, self.kind) else None
+        self.context = make_context(config, self.eye) if needs_context(config.policies, config.belief) else None
+        self.gaze = make_learned_gaze(config, self.eye) if LEARNED in config.policies else None
         belief, settings, cache = config.belief, self.eye.settings(), cache_folder(config)
         size = belief.columns, belief.rows
         self.store = DetectionStore(cache / "looks", settings, *size)
@@ -72,7 +80,13 @@ class Run(ABC):
             name: None if model is None else checksum(model.state_dict())
             for name, model in (("model", self.model), ("target_model", self.target))
         }
+        if self.gaze is not None:
+            models["gaze_model"] = checksum(self.gaze.state_dict())
         belief = {**asdict(config.belief), **models}
+        if self.context is None:
+            del belief["context"], belief["context_model"]
+        else:
+            belief["context_model"] = self.context.digest()
         protocol = {name: value for name, value in asdict(config.protocol).items() if name != "batch"}
         saliency = {name: store.key for name, store in self.saliency_stores.items()}
         what = [self.kind, self.store.key, self.scenes.fingerprint, belief, protocol, list(config.policies), saliency]
@@ -83,12 +97,19 @@ class Run(ABC):
         """Records of all episodes of a scene under all policies, and the seconds that they took."""
 
     def searcher(self, name: str, index: int) -> Searcher:
-        """How the policy of this name searches or explores a scene, with this run's observation model."""
+        """How the policy of this name searches or explores a scene, with this run's models."""
+        searcher = self._without_context(name, index)
+        observer = in_context(name, self.kind, searcher.observer, self.config.belief, self.context)
+        return replace(searcher, observer=observer)
+
+    def _without_context(self, name: str, index: int) -> Searcher:
         base, _ = split_policy(name, self.kind)
         if self.target is not None and base == TARGET_EVIDENCE:
             return Searcher(TargetObserver(self.target), search_policy("non-predictive"))
-        saliency = self.saliency(base, index) if base in self.saliency_stores else None
         components = len(self.scenes.classes) + 1
+        if self.gaze is not None and base == LEARNED:
+            return Searcher(self.gaze.observer(components), self.gaze.policy)
+        saliency = self.saliency(base, index) if base in self.saliency_stores else None
         fovea = self.config.sensor.sigma / self.config.sensor.reference
         return make_searcher(name, self.kind, self.config.belief, components, self.model, saliency, fovea)
 

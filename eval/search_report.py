@@ -28,7 +28,7 @@ from eval.report import (
 from eval.run import Parts
 from eval.saliency import foveated
 from eval.tasks import SearchRun
-from semfov.agent import probability
+from semfov.agent import acquisition_values, probability
 from semfov.belief import SemanticObserver
 from semfov.errors import DataError
 from semfov.scanpath import Scanpath
@@ -156,12 +156,15 @@ def replay(run: SearchRun, index: int, record: Record) -> Scanpath:
     seen, known = Looks(semantics, detections, grid, [target]), semantics.start(1, grid, detections.scores)
     cells, wanted = torch.tensor(record["cells"]), torch.tensor([target])
     beliefs, present, values = [], [], []
+    visited = torch.zeros(1, len(grid), dtype=torch.bool)
     with torch.no_grad():
         for cell in cells.split(1):
             belief, known = observer.update(belief, looks(wanted, cell)), semantics.update(known, seen(wanted, cell))
             beliefs.append(known.beta[0])
             present.append(probability(belief.beta[0], int(observer.component(target))))
-            values.append(searcher.acquisition(observer.component(target), grid, cell)(belief.beta)[0])
+            visited[0, cell] = True
+            acquisition = searcher.acquisition(observer.component(target), grid, cell)
+            values.append(acquisition_values(acquisition, belief, visited)[0])
     return Scanpath(
         grid=grid,
         classes=("background", *run.scenes.classes),

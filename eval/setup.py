@@ -15,15 +15,16 @@ import semfov
 from eval.config import BeliefConfig, DataConfig, DetectorConfig, RunConfig, SearchConfig, SensorConfig
 from eval.protocol import Searcher
 from eval.saliency import SALIENCY_MODELS
-from semfov.belief import SemanticObserver, TargetEvidence
+from semfov.belief import ContextObserver, ContextPrior, Observer, SemanticObserver, TargetEvidence
 from semfov.data.scene import Scenes
 from semfov.errors import InputError, check, lookup
 from semfov.eye import Eye
-from semfov.gaze import EXPLORATION_POLICIES, SEARCH_POLICIES, exploration_policy, search_policy
+from semfov.gaze import EXPLORATION_POLICIES, SEARCH_POLICIES, LearnedGaze, exploration_policy, search_policy
 
 Kind = Literal["search", "exploration"]
 
 TARGET_EVIDENCE = "target-evidence"
+LEARNED = "learned-raw"
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "tempered": {"tempering": 0.25},
@@ -32,11 +33,14 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "soft": {"footprint": "soft"},
     "central": {"footprint": "box_centre"},
     "misses": {"misses": True},
+    "context": {"context": "both"},
+    "place": {"context": "place"},
+    "cooccurrence": {"context": "cooccurrence"},
 }
 """Settings of the belief that a policy may be followed by, `+tempered` and so on."""
 
 _POLICIES: dict[Kind, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "search": (SEARCH_POLICIES[1:], (TARGET_EVIDENCE, "random", *SALIENCY_MODELS)),
+    "search": (SEARCH_POLICIES[1:], (TARGET_EVIDENCE, LEARNED, "random", *SALIENCY_MODELS)),
     "exploration": ((*EXPLORATION_POLICIES, *SALIENCY_MODELS), ()),
 }
 """Names of policies that come with `-raw` or `-calibrated`, and of those that come alone."""
@@ -95,6 +99,20 @@ def make_target_evidence(config: SearchConfig, eye: Eye) -> TargetEvidence:
     return model.requires_grad_(False)
 
 
+def make_learned_gaze(config: SearchConfig, eye: Eye) -> LearnedGaze:
+    """The gaze policy that was learned end to end, checked to belong to this detector."""
+    gaze = LearnedGaze.from_pretrained(config.gaze_model or eye.detector.name)
+    gaze.check_compatible(eye.settings())
+    return gaze.requires_grad_(False)
+
+
+def make_context(config: RunConfig, eye: Eye) -> ContextPrior:
+    """The context of searches, checked to know the detector's classes."""
+    prior = ContextPrior.from_pretrained(config.belief.context_model)
+    prior.check_compatible(eye.detector.classes)
+    return prior.requires_grad_(False)
+
+
 def split_policy(name: str, kind: Kind) -> tuple[str, bool]:
     """The policy and whether scores are calibrated: `predictive-calibrated+soft` -> (`predictive`, True).
 
@@ -123,9 +141,33 @@ def saliency_policies(policies: tuple[str, ...], kind: Kind) -> list[str]:
 def needs_model(policies: tuple[str, ...], kind: Kind) -> bool:
     """Whether a policy of the run needs an observation model: to predict, to calibrate, or for its miss rates."""
     check(len(policies) > 0, "policies", "at least one policy", "none")
-    without = (TARGET_EVIDENCE, "random", "non-predictive", "neighbourhood", "closer-look", *SALIENCY_MODELS)
+    without = (TARGET_EVIDENCE, LEARNED, "random", "non-predictive", "neighbourhood", "closer-look", *SALIENCY_MODELS)
     predicts = any(base not in without or calibrated for base, calibrated in _split(policies, kind))
     return predicts or any(belief_of(name, BeliefConfig()).misses for name in policies)
+
+
+def needs_target(policies: tuple[str, ...], kind: Kind) -> bool:
+    """Whether a policy of the run needs learned target evidence."""
+    return any(base == TARGET_EVIDENCE for base, _ in _split(policies, kind))
+
+
+def needs_context(policies: tuple[str, ...], belief: BeliefConfig) -> bool:
+    """Whether a policy of the run adds context."""
+    return any(belief_of(name, belief).context != "none" for name in policies)
+
+
+def in_context(name: str, kind: Kind, observer: Observer, belief: BeliefConfig, prior: ContextPrior | None) -> Observer:
+    """The observer of a policy, with context where the policy or the run asks for it."""
+    part = belief_of(name, belief).context
+    if part == "none":
+        return observer
+    base, _ = split_policy(name, kind)
+    if kind != "search" or base not in (TARGET_EVIDENCE, "non-predictive", "neighbourhood"):
+        raise InputError(f"belief.context: expected a search by the probability of the target, got policy {name!r}")
+    if prior is None:
+        raise InputError("belief.context: expected a fitted context, got none")
+    place, company = prior.weights_for("evidence" if observer.by_target else "map")
+    return ContextObserver(observer, prior, (place * (part != "cooccurrence"), company * (part != "place")))
 
 
 def _split(policies: tuple[str, ...], kind: Kind) -> list[tuple[str, bool]]:

@@ -1,12 +1,14 @@
 """The chain: look, weigh what was seen, update the belief, choose where to look next."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
+from semfov.belief.context import ContextPrior
+from semfov.belief.context_observer import ContextObserver
 from semfov.belief.evidence import Observation
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.observer import Observer, SemanticObserver
@@ -125,6 +127,10 @@ class ActivePerception(nn.Module):
             len(self.classes), observation, prior=prior, fusion=fusion, footprint=footprint
         )
         self.observer: Observer = observer or self.semantics
+        # Observers are no modules; what they learned moves with the agent.
+        learned = dict.fromkeys([*models_of(self.semantics), *models_of(self.observer)])
+        known = set(self.modules())
+        self.learned = nn.ModuleList(model for model in learned if model not in known)
 
     @classmethod
     def from_pretrained(
@@ -134,6 +140,7 @@ class ActivePerception(nn.Module):
         sigma: float = 100.0,
         growth: float = 2.0,
         grid: tuple[int, int] = (10, 10),
+        context: bool = False,
         **options: Any,
     ) -> Self:
         """The recommended agent: learned target evidence for search, the closer look for exploration.
@@ -143,6 +150,7 @@ class ActivePerception(nn.Module):
             sigma: width of the fovea in pixels of an image of 640; the models are fitted for 100.
             growth: see `Foveation`; the models are fitted for 2.
             grid: `(columns, rows)` of the belief.
+            context: whether search also goes by the usual places and company of the target (`ContextPrior`).
             options: of `semfov.load_detector`.
 
         Raises:
@@ -152,6 +160,11 @@ class ActivePerception(nn.Module):
         detector = load_detector(name, **options)
         observation = FovealObservationModel.from_pretrained(detector.name, detector=detector).requires_grad_(False)
         evidence = TargetEvidence.from_pretrained(detector.name).requires_grad_(False)
+        observer: Observer = TargetObserver(evidence)
+        if context:
+            prior = ContextPrior.from_pretrained().requires_grad_(False)
+            prior.check_compatible(detector.classes)
+            observer = ContextObserver(observer, prior)
         agent = cls(
             Foveation(sigma, growth=growth),
             detector,
@@ -159,7 +172,7 @@ class ActivePerception(nn.Module):
             grid,
             search_policy("non-predictive"),
             semantics=SemanticObserver(len(detector.classes) + 1, tempering=0.5),
-            observer=TargetObserver(evidence),
+            observer=observer,
             exploration=exploration_policy("closer-look", fovea=sigma / 640),
         )
         evidence.check_compatible(agent.eye.settings())
@@ -293,6 +306,16 @@ class ActivePerception(nn.Module):
             return self.classes.index(lookup(target, self.classes[1:], "target class"))
         check(1 <= target < len(self.classes), "target", f"a class from 1 to {len(self.classes) - 1}", target)
         return target
+
+
+def models_of(observer: object) -> Iterator[nn.Module]:
+    """Modules that an observer holds: its own, those of an observer inside it, and those whose methods it calls."""
+    for value in vars(observer).values():
+        owner = getattr(value, "__self__", value)
+        if isinstance(owner, nn.Module):
+            yield owner
+        elif hasattr(owner, "weigh"):
+            yield from models_of(owner)
 
 
 def probability(beta: Tensor, component: int) -> Tensor:

@@ -1,11 +1,13 @@
 """The agent as a whole, with a detector that sees coloured squares."""
 
+import copy
+
 import pytest
 import torch
 
 from semfov import ActivePerception, FovealObservationModel, Foveation, Grid, SemanticMap, search_policy
 from semfov.agent import confirms, step
-from semfov.belief import SemanticObserver
+from semfov.belief import SemanticObserver, TargetEvidence, TargetObserver
 from semfov.detection import Candidates, Detections, Detector
 from semfov.errors import InputError
 from semfov.eye import Eye
@@ -79,6 +81,24 @@ def test_beliefs_are_those_of_a_semantic_map(agent, image):
         torch.testing.assert_close(detections.boxes, seen.boxes)
         own.update(detections, fixation[None])
         torch.testing.assert_close(own.beta[0], belief)
+
+
+def test_what_observers_learned_moves_with_the_agent(image):
+    misses = FovealObservationModel.identity(["red", "green"], [0.2], miss_rate=torch.full((3, 2), 0.5))
+    agent = ActivePerception(
+        Foveation(40.0), Squares(), None, (8, 6), search_policy("non-predictive"), reference=160.0,
+        semantics=SemanticObserver(3, misses=misses.miss_likelihood), observer=TargetObserver(TargetEvidence(4, 4)),
+    )  # fmt: skip
+    assert set(agent.learned) == {misses, agent.observer.model}
+    agent.double().requires_grad_(False)
+    scanpath = agent.search(image.double(), "green", start=0, shifts=2)
+    assert scanpath.posterior.dtype == scanpath.beliefs.dtype == misses.edges.dtype == torch.float64
+    other = copy.deepcopy(agent)
+    assert other.observer.model is not agent.observer.model
+    assert other.observer.model in set(other.learned)
+    assert not ActivePerception(
+        Foveation(40.0), Squares(), misses, (8, 6), search_policy("non-predictive"), reference=160.0
+    ).learned
 
 
 def test_same_seed_same_scanpath(agent, image):

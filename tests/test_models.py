@@ -7,11 +7,13 @@ import pytest
 import torch
 
 import semfov
-from semfov.belief import target_evidence
+from semfov.belief import Belief, ContextPrior, context, target_evidence
+from semfov.gaze import learned
 from semfov.observation import foveal
 
 OBSERVATION = sorted(foveal.SHIPPED.glob("*.safetensors"))
 TARGET = sorted(target_evidence.SHIPPED.glob("*.safetensors"))
+GAZE = sorted(learned.SHIPPED.glob("*.safetensors"))
 
 
 @pytest.mark.parametrize("path", OBSERVATION, ids=lambda path: path.stem)
@@ -46,6 +48,40 @@ def test_target_evidence(path):
     middle = int(grid.cell_of(torch.tensor([330.0, 230.0])))
     assert odds.argmax() == middle
     assert odds[middle] > max(0.0, float(other[middle]) + 1)
+
+
+@pytest.mark.parametrize("path", sorted(context.SHIPPED.glob("*.safetensors")), ids=lambda path: path.stem)
+def test_context(path):
+    prior = ContextPrior.from_pretrained(path.stem)
+    assert path.stat().st_size < 100_000
+    assert set(prior.weights) == {"evidence", "map"}
+    assert all(weight > 0 for pair in prior.weights.values() for weight in pair)
+    index = {name: place for place, name in enumerate(prior.classes, 1)}
+    # Kites fly, and ties are on people.
+    kite = prior.place[index["kite"]]
+    assert kite[:5].mean() > kite[5:].mean()
+    tie = prior.cooccurrence[index["tie"], index["person"]]
+    assert tie[0] > 0 > tie[-1]
+    assert bool((prior.cooccurrence.diagonal() == 0).all())
+    text = json.dumps(prior.metadata)
+    assert "/" not in text.replace("://", "")
+
+
+def test_learned_gaze():
+    assert [path.stem for path in GAZE] == ["yolov3-tiny"]
+    gaze = semfov.gaze.LearnedGaze.from_pretrained("yolov3-tiny")
+    assert GAZE[0].stat().st_size < 20_000
+    assert gaze.metadata["detector"]["name"] == "yolov3-tiny"
+    assert "/" not in json.dumps(gaze.metadata)
+    # It goes where the target is seen, wherever that is, and not where it has been.
+    start = gaze.observer(81).start(1, semfov.Grid(10, 10, (640, 480)), torch.empty(0))
+    for cell in (0, 37, 99):
+        beta, visited = start.beta.clone(), torch.zeros(1, 100, dtype=torch.bool)
+        beta[0, cell, 7] += 1
+        visited[0, 50] = True
+        closest = (torch.arange(100) - 50.0).abs()[None] / 100
+        with torch.no_grad():
+            assert gaze(Belief(beta, closest), visited, 7, 10).argmax() == cell
 
 
 def test_both_kinds_exist_for_every_detector():

@@ -23,6 +23,7 @@ class FitConfig:
         width: width of a level for a fovea of 100 pixels, in pixels of an image whose longer side is 640; it grows
             with the fovea.
         minimum: objects that a level needs, or it takes the parameters of its inner neighbour (0: none does).
+        shrinkage: detections of a class's other levels that a level is given, so that few do not decide.
         holdout: every n-th photograph is kept out of the fit and used to judge it.
         iou: overlap from which a detection shows an object.
         seed: of the fixations.
@@ -41,6 +42,7 @@ class FitConfig:
     levels: int = 8
     width: float = 50.0
     minimum: int = 100
+    shrinkage: float = 10.0
     holdout: int = 10
     iou: float = 0.5
     seed: int = 0

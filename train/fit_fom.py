@@ -70,6 +70,7 @@ def published_model(
             statistics_of(model, samples),
             method=method,
             minimum=config.minimum,
+            shrinkage=config.shrinkage,
             **options,
             **sampler.eye.settings(),
             samples=len(samples),

@@ -20,6 +20,7 @@ from eval.run import Run
 from eval.setup import plain
 from eval.views import foveated_views
 from semfov import Scanpath
+from semfov.agent import acquisition_values
 
 LIMIT = 4_500_000
 """No further episode is added to a page that is as large as this, in bytes."""
@@ -97,13 +98,15 @@ def replay_exploration(run: Run, index: int, record: Record) -> Scanpath:
     explorer = run.searcher(record["policy"], index)
     cells = torch.tensor(record["cells"])
     beliefs, values = [], []
+    visited = torch.zeros(1, len(grid), dtype=torch.bool)
     with torch.inference_mode():
         evidence = explorer.observer.weigh(detections, grid.centres, grid)
         belief = explorer.observer.start(1, grid, detections.scores)
         for cell in cells.split(1):
             belief = explorer.observer.update(belief, evidence[cell])
             beliefs.append(belief.beta[0])
-            values.append(explorer.acquisition(None, grid, cell)(belief.beta)[0])
+            visited[0, cell] = True
+            values.append(acquisition_values(explorer.acquisition(None, grid, cell), belief, visited)[0])
     return Scanpath(
         grid=grid,
         classes=("background", *run.scenes.classes),

@@ -1,15 +1,23 @@
-"""An episode that needs no detector, with names that try to be markup."""
+"""An episode and a run that need no detector, with names that try to be markup."""
 
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import torch
 
+from eval.config import DataConfig, SearchConfig
+from eval.html import run_report
+from eval.report import Curve
 from semfov import Detections, Grid, Scanpath
 
 
 @pytest.fixture
 def hostile() -> str:
-    """A class name that would run if it were taken for markup."""
-    return "<script>document.title='taken'</script>"
+    """A name that would run if it were taken for markup: in an attribute, a text, the title or a script."""
+    attack = "<img src=x onerror=\"alert('taken')\"><script>alert('taken')</script>"
+    return f"\"'>{attack}</title></script>{attack}<!--<script>"
 
 
 @pytest.fixture
@@ -40,3 +48,29 @@ def image() -> torch.Tensor:
     """A picture in the frame of the episode."""
     across, down = torch.linspace(0, 1, 80).expand(60, 80), torch.linspace(0, 1, 60)[:, None].expand(60, 80)
     return torch.stack([across, down, 1 - across])
+
+
+@pytest.fixture
+def run_page(scanpath: Scanpath, image: torch.Tensor, hostile: str, tmp_path: Path, monkeypatch) -> Path:
+    """The page of a run of which everything is called that."""
+    scene = SimpleNamespace(name=hostile, image=image, boxes=torch.ones(1, 4), labels=torch.tensor([2]))
+    run = SimpleNamespace(
+        kind=hostile,
+        config=SearchConfig(data=DataConfig(annotations=Path(hostile)), policies=(hostile,), out=tmp_path / "run"),
+        eye=SimpleNamespace(detector=SimpleNamespace(name=hostile)),
+        scenes=type("Scenes", (list,), {"ids": [7]})([scene]),
+    )
+    run.config.out.mkdir()
+    monkeypatch.setattr(run_report, "foveated_views", lambda eye, image, fixations: [image] * len(fixations))
+    share = np.array([0.0, 0.5, 1.0])
+    return run_report.write_run_report(
+        run,
+        [{"policy": hostile, "scene": 7, "repetition": 0}],
+        {"average": {hostile: Curve(share, share / 10, share / 10, 1, 1)}},
+        titles={"average": hostile},
+        label=hostile,
+        shifts=(0, 2),
+        decision={hostile: 0.1},
+        replay=lambda run, index, record: scanpath,
+        others={hostile + "2": share},
+    )

@@ -39,17 +39,27 @@ def path(scanpath, image, hostile, tmp_path):
 
 @pytest.fixture
 def opened(chromium, path):
-    """The page, and what the browser complained of and asked for."""
-    page = chromium.new_page(viewport={"width": 1200, "height": 900})
-    problems, requests = [], []
-    page.on("console", lambda message: problems.append(message.text))
-    page.on("pageerror", lambda error: problems.append(str(error)))
-    page.on("request", lambda request: requests.append(request.url))
+    """The page; nothing may be complained of, asked for or run that is not its own."""
+    page, told = watched(chromium)
     page.goto(path.as_uri())
     yield page
-    assert problems == []
-    assert [url for url in requests if not url.startswith(("file:", "data:"))] == []
+    assert told == []
     page.close()
+
+
+def watched(chromium):
+    """A new page, and what it says: complaints, dialogs, and what it asks of the network."""
+    page, told = chromium.new_page(viewport={"width": 1200, "height": 900}), []
+
+    def dismiss(dialog):
+        told.append(f"dialog: {dialog.message}")
+        dialog.dismiss()
+
+    page.on("dialog", dismiss)
+    page.on("console", lambda message: told.append(message.text))
+    page.on("pageerror", lambda error: told.append(str(error)))
+    page.on("request", lambda request: request.url.startswith(("file:", "data:")) or told.append(request.url))
+    return page, told
 
 
 PICTURES = ("path", "view", "belief", "entropy", "values")
@@ -111,6 +121,28 @@ def test_names_are_shown_and_not_run(opened, hostile):
     assert hostile in opened.locator("#class option").all_inner_texts()
     assert opened.locator("script").count() == 2
     assert hostile in opened.locator("#detections").inner_text()
+
+
+def test_names_of_a_run_are_shown_and_not_run(chromium, run_page, hostile):
+    page, told = watched(chromium)
+    page.goto(run_page.as_uri())
+    assert page.title() == f"semfov: {hostile} with {hostile}"
+    for label in page.locator("#class option").all_inner_texts():
+        page.locator("#class").select_option(label=label)
+    page.keyboard.press("End")
+    page.locator("summary").click()
+    assert page.locator("script").count() == 2
+    assert page.locator("main img").count() == 0
+    assert told == []
+    page.close()
+
+
+def test_names_would_run_if_they_were_not_escaped(chromium, hostile, tmp_path):
+    """Or the tests that they do not would show nothing."""
+    page, told = watched(chromium)
+    page.goto(write_page(tmp_path / "page.html", "t", [], Pool(), sections=hostile).as_uri())
+    assert told.count("dialog: taken") >= 2
+    page.close()
 
 
 def test_another_episode(opened):

@@ -1,5 +1,8 @@
 """The demonstration as a user runs it, with a detector that sees coloured squares."""
 
+import json
+import re
+
 import pytest
 import torch
 from PIL import Image
@@ -75,6 +78,16 @@ def test_explore_a_folder(run, photo, tmp_path):
     for folder in ("000-my-photo.png", "001-other.png"):
         assert {file.suffix for file in (tmp_path / "out" / folder).iterdir()} >= {".png", ".gif"}
         assert (tmp_path / "out" / folder / "map.png").is_file()
+
+
+def test_file_names_are_not_taken_for_markup(run, photo, tmp_path):
+    photo = photo.rename(photo.with_name("<img src=x onerror=alert(1)>'\"&$x$.png"))
+    code, _ = run(photo, "--target", "red", "--start", 47, "--report", tmp_path / "page.html")
+    assert code == 0
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "<img" not in page
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])
+    assert data["episodes"][0]["name"] == photo.name
 
 
 def test_no_target_lists_the_classes(run, photo, tmp_path):

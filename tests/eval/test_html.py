@@ -51,12 +51,24 @@ def decoded(data, *shape):
     return steps / 255 * data["max"]
 
 
-def test_names_are_never_markup(page, hostile):
+@pytest.mark.parametrize("kind", ["episode", "run"])
+def test_names_are_never_markup(kind, hostile, request):
+    if kind == "run":
+        page = request.getfixturevalue("run_page").read_text(encoding="utf-8")
+    else:
+        page = request.getfixturevalue("page")
     assert hostile not in page
     elements = Elements(page)
-    assert [tag for tag, _ in elements.found].count("script") == 2
-    assert hostile in "".join(elements.texts)
-    assert data_of(page)["episodes"][0]["name"] == hostile
+    tags = [tag for tag, _ in elements.found]
+    assert tags.count("script") == 2
+    assert "img" not in tags
+    assert not [name for _, attributes in elements.found for name in attributes if name.startswith("on")]
+    assert elements.texts.count(hostile) >= 3
+    assert any(hostile in (attributes.get("aria-label") or "") for _, attributes in elements.found)
+    (episode,) = data_of(page)["episodes"]
+    assert episode["name"].startswith(hostile)
+    assert hostile in {each["label"] for each in episode["maps"]}
+    assert "<" not in re.search(r'id="data">(.*?)</script>', page, re.S)[1]
 
 
 def test_a_name_cannot_fill_in_a_place_of_the_template(scanpath, image, tmp_path):

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from eval.results import ResultsConfig, experiments, fill, paired, summary
+from eval.results import ResultsConfig, agreement, experiments, fill, paired, summary
 from eval.setup import split_policy
 from semfov.errors import InputError
 
@@ -41,7 +41,7 @@ def test_lines_become_tables(runs):
     assert fill("@@ explore-nano all\n", runs[0]) == "*Not run yet.*\n"
     assert fill("@@ explore-five-levels-nano first\n", runs[0]) == "*Not run yet.*\n"
     assert fill("@@ sensitivity\n", runs[0]).count("not run yet") > 50
-    assert fill("@@ sensor\n", runs[0]).count("not run yet") == 9 * 3 * 5
+    assert fill("@@ sensor\n", runs[0]).count("not run yet") == 9 * 2 * 5
     assert summary(runs[0]["search-tiny"].out, 0)[0] == "**one** (1)"
     with pytest.raises(InputError, match="did you mean 'search-tiny'"):
         fill("@@ search-tin first\n", runs[0])
@@ -62,3 +62,20 @@ def test_differences_are_paired_over_images(runs):
     expected = f"{100 * np.mean(differences):+.1f} ± {100 * np.std(differences, ddof=1) / np.sqrt(6):.1f}"
     assert len(rows) == 3
     assert expected in rows[2]
+
+
+def test_agreement_compares_the_same_episodes(tmp_path):
+    records = [
+        {
+            "policy": f"{policy}-{mode}",
+            "cells": [0, 1 + (policy == "predictive" and mode == "raw" and n == 0)],
+            "found_at": n,
+        }
+        for policy in ("non-predictive", "predictive")
+        for mode in ("raw", "calibrated")
+        for n in range(4)
+    ]
+    (tmp_path / "episodes.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    rows = agreement(tmp_path)
+    assert [cell.strip() for cell in rows[2].split("|")[1:-1]] == ["raw", "75.0 %", "100.0 %"]
+    assert [cell.strip() for cell in rows[3].split("|")[1:-1]] == ["calibrated", "100.0 %", "100.0 %"]

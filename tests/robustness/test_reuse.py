@@ -1,22 +1,26 @@
 """Every public module as a part of somebody else's module: copied, moved, saved, compiled, exported, vectorised."""
 
 import copy
+import importlib
 import io
 import pickle
+import re
 from collections.abc import Callable
 from functools import partial
 from inspect import isabstract, isclass
-from types import ModuleType
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor, nn
 
 import semfov
-from semfov import FovealObservationModel, Foveation, Grid, SemanticMap, acquisition, fusion, saliency
-from semfov.belief import TargetEvidence
-from semfov.detection import Detections
-from semfov.gaze import select_fixation
+from semfov import Eye, FovealObservationModel, Foveation, Grid, SemanticMap, acquisition, fusion, saliency
+from semfov.agent import ActivePerception
+from semfov.belief import Belief, ContextPrior, TargetEvidence
+from semfov.detection import Candidates, Detections, Detector, Selection
+from semfov.gaze import LearnedGaze, select_fixation
+from semfov.observation import FoldedObservationModel
 
 CLASSES = ("cat", "cup", "person")
 GRID = Grid(4, 3, (64, 48))
@@ -32,6 +36,109 @@ class Host(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         return self.gain * self.part(*inputs)
+
+
+class Blobs(Detector):
+    """As many detections as there are quarters of the canvas, scored by a linear layer from their mean colour."""
+
+    def __init__(self) -> None:
+        super().__init__("blobs", CLASSES, (64, 48), selection=Selection(threshold=0.0, iou=1.0))
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            self.score = nn.Linear(3, len(CLASSES))
+
+    def propose(self, canvas: Tensor) -> Candidates:
+        corners = canvas.new_tensor([[0, 0], [32, 0], [0, 24], [32, 24]])
+        boxes = torch.cat([corners, corners + canvas.new_tensor([32, 24])], -1)
+        colours = nn.functional.avg_pool2d(canvas, (24, 32)).flatten(2).mT
+        return Candidates(boxes.expand(len(canvas), 4, 4), self.score(colours).sigmoid().to(canvas))
+
+
+class Looking(nn.Module):
+    """A look as tensors: scores `(B, L, K+1)`, boxes and fixations."""
+
+    def __init__(self, part: nn.Module, *arguments: object) -> None:
+        super().__init__()
+        self.part = part
+        self.arguments = arguments
+
+    def forward(self, scores: Tensor, boxes: Tensor, fixation: Tensor) -> Tensor:
+        seen = Detections(boxes, scores, torch.ones(scores.shape[:2], dtype=torch.bool, device=scores.device))
+        return self.part(seen, fixation, *self.arguments)
+
+
+class FirstLook(Looking):
+    """The same on a map that knows nothing yet."""
+
+    def forward(self, scores: Tensor, boxes: Tensor, fixation: Tensor) -> Tensor:
+        self.part.beta = torch.full_like(self.part.beta, 0.5)
+        self.part.closest = torch.full_like(self.part.closest, torch.inf)
+        return super().forward(scores, boxes, fixation)
+
+
+class Given(nn.Module):
+    """A part with arguments that are no tensors."""
+
+    def __init__(self, part: nn.Module, *arguments: object) -> None:
+        super().__init__()
+        self.part = part
+        self.arguments = arguments
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return self.part(*inputs, *self.arguments)
+
+
+class Remembering(nn.Module):
+    """A part that takes the whole belief and the visited cells."""
+
+    def __init__(self, part: nn.Module) -> None:
+        super().__init__()
+        self.part = part
+
+    def forward(self, beta: Tensor, closest: Tensor) -> Tensor:
+        return self.part(Belief(beta, closest), closest == 0)
+
+
+class Scores(nn.Module):
+    """The scores that an eye sees."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.eye = Eye(Foveation(9.0), Blobs(), reference=64.0)
+
+    def forward(self, image: Tensor, fixations: Tensor) -> Tensor:
+        return self.eye(image, fixations).scores
+
+
+def in_order(target: int | Tensor | None, grid: Grid) -> nn.Module:
+    """A policy whose choices do not hang on digits."""
+    return acquisition.Static(rand(len(grid)))
+
+
+class Exploring(nn.Module):
+    """What an agent believes after it has looked at three given cells."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        parts = Foveation(9.0), Blobs(), model().requires_grad_(False), (GRID.columns, GRID.rows), in_order
+        self.agent = ActivePerception(*parts, reference=64.0)
+
+    def forward(self, image: Tensor) -> Tensor:
+        return self.agent.explore(image, start=5, shifts=2).beliefs
+
+
+def memory() -> tuple[Tensor, Tensor]:
+    closest = torch.minimum(*GRID.cell_distance[[2, 7]]).expand(2, -1).clone()
+    return beliefs(), closest
+
+
+def context() -> nn.Module:
+    return ContextPrior(CLASSES, rand(4, 3, 3), rand(4, 4, 3), [0.2, 0.4], weights={"map": (0.5, 0.2)})
+
+
+def look() -> tuple[Tensor, Tensor, Tensor]:
+    boxes = torch.tensor([[[4.0, 4, 30, 30], [20, 10, 60, 40]]])
+    return rand(1, 2, 4).softmax(-1), boxes, torch.tensor([[20.0, 20.0]])
 
 
 def rand(*shape: int) -> Tensor:
@@ -74,35 +181,64 @@ OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]
         lambda: (rand(1, 3, 33, 47), torch.tensor([[5.0, 6.0]])),
     ),
     "FovealObservationModel": (model, lambda: (rand(5, 6, 4).softmax(-1), rand(5, 6))),
+    "FoldedObservationModel": (
+        lambda: FoldedObservationModel(model()),
+        lambda: (rand(5, 6, 4).softmax(-1), rand(5, 6)),
+    ),
+    "TargetEvidence": (lambda: Looking(TargetEvidence(4, 4).eval(), GRID, 2), look),
+    "SemanticMap": (lambda: FirstLook(SemanticMap(GRID, CLASSES, observation=model().requires_grad_(False))), look),
+    "LearnedGaze": (lambda: Remembering(LearnedGaze().policy(2, GRID)), memory),
+    "CloserLook": (lambda: Remembering(acquisition.CloserLook(GRID)), memory),
     "VOCUS2": (saliency.VOCUS2, lambda: (rand(1, 3, 40, 60),)),
     "IttiKoch": (saliency.IttiKoch, lambda: (rand(1, 3, 64, 96),)),
 }
-PARTS = OTHERS | {name: (make, lambda: (beliefs(),)) for name, make in ACQUISITIONS.items()}
+# How many boxes are kept, when an episode ends, how far context reaches depends on values: these are no single graph.
+BRANCHING = {
+    "ContextPrior": (lambda: Given(context(), GRID, 2), lambda: (rand(2, len(GRID), 4),)),
+    "Eye": (Scores, lambda: (rand(1, 3, 48, 64), torch.tensor([[20.0, 30.0], [5.0, 6.0]]))),
+    "ActivePerception": (Exploring, lambda: (rand(1, 3, 48, 64),)),
+}
+TENSORS = OTHERS | {name: (make, lambda: (beliefs(),)) for name, make in ACQUISITIONS.items()}
+PARTS = TENSORS | BRANCHING
 
 # bfloat16 has 8 bits: a value is off by up to 2^-9, 0.2 %. Calibration multiplies logarithms of small scores by large
 # parameters, and exploration takes differences of what is nearly equal: digits that are not there then count.
 AUTOCAST = dict.fromkeys(("PlaceInformation", "PredictedTargetPosterior", "FovealObservationModel", "VOCUS2"), 0.05)
+AUTOCAST["FoldedObservationModel"] = 0.05
 AUTOCAST |= dict.fromkeys(EXPLORERS, 0.1)
+
+
+def make(name: str) -> tuple[str, nn.Module, tuple[Tensor, ...]]:
+    module, inputs = PARTS[name]
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return name, module(), inputs()
 
 
 @pytest.fixture(params=PARTS)
 def part(request) -> tuple[str, nn.Module, tuple[Tensor, ...]]:
-    make, inputs = PARTS[request.param]
-    return request.param, make(), inputs()
+    return make(request.param)
+
+
+@pytest.fixture(params=TENSORS)
+def graph(request) -> tuple[str, nn.Module, tuple[Tensor, ...]]:
+    return make(request.param)
 
 
 def test_all_modules_are_tested():
-    """A module that joins the public surface joins this file."""
-    spaces: list[ModuleType] = [semfov, semfov.acquisition, semfov.saliency]
-    things = {name: getattr(space, name) for space in spaces for name in space.__all__}
-    modules = {n for n, t in things.items() if isclass(t) and issubclass(t, nn.Module) and not isabstract(t)}
-    agents = {"ActivePerception", "Eye", "SemanticMap", "TargetEvidence"}
-    assert modules == {name.split(",")[0] for name in PARTS} | agents
+    """A module that joins the API reference joins this file."""
+    reference = Path(__file__).parents[2] / "docs" / "api.md"
+    modules = set()
+    for home, name in re.findall(r"^### (\S+)\.(\w+)$", reference.read_text(encoding="utf-8"), re.MULTILINE):
+        thing = getattr(importlib.import_module(home), name)
+        if isclass(thing) and issubclass(thing, nn.Module) and not isabstract(thing):
+            modules.add(name)
+    assert modules <= {name.split(",")[0] for name in PARTS}
 
 
 def test_state_dict(part):
     name, module, inputs = part
-    host, other = Host(module), Host(PARTS[name][0]())
+    host, other = Host(module), Host(make(name)[1])
     with torch.no_grad():
         for parameter in host.parameters():
             parameter.mul_(1.25)
@@ -136,16 +272,16 @@ def test_dtype_is_that_of_the_module(part, device):
     torch.testing.assert_close(result.cpu().float(), expected, rtol=1e-3, atol=1e-4)
 
 
-def test_compiles_to_one_graph(part):
-    _, module, inputs = part
+def test_compiles_to_one_graph(graph):
+    _, module, inputs = graph
     host = Host(module)
     torch.compiler.reset()
     compiled = torch.compile(host, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(*inputs), host(*inputs), rtol=1e-4, atol=1e-5)
 
 
-def test_exports(part):
-    _, module, inputs = part
+def test_exports(graph):
+    _, module, inputs = graph
     host = Host(module).requires_grad_(False)
     program = torch.export.export(host, inputs)
     torch.testing.assert_close(program.module()(*inputs), host(*inputs), rtol=1e-4, atol=1e-5)
@@ -162,11 +298,15 @@ def test_autocast(part):
     assert float((result.float() - expected).abs().max()) <= AUTOCAST.get(name, 0.02) * scale
 
 
-@pytest.mark.parametrize("name", ACQUISITIONS)
-def test_acquisitions_vectorise(name):
-    module = ACQUISITIONS[name]().requires_grad_(False)
-    many = 0.5 + 3 * rand(5, 2, len(GRID), 4)
-    torch.testing.assert_close(torch.func.vmap(module)(many), torch.stack([module(each) for each in many]))
+@pytest.mark.parametrize("name", [name for name in TENSORS if name != "SemanticMap"])
+def test_vectorises(name):
+    """Over the first input: images, beliefs or scores. (A map keeps what it is shown; `fuse` vectorises.)"""
+    _, module, (first, *others) = make(name)
+    module.requires_grad_(False)
+    many = torch.stack([first, first.flip(-1), first.flip(0)])
+    expected = torch.stack([module(each, *others) for each in many])
+    together = torch.func.vmap(lambda each: module(each, *others))(many)
+    torch.testing.assert_close(together, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("rule", ["kaplan", "product", "sum"])
