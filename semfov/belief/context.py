@@ -187,7 +187,7 @@ def reaches(presence: Tensor, grid: Grid, edges: Sequence[float]) -> Iterator[Te
     """
     check(grid.extent.ndim == 1, "grid", "the size of one image", grid.size)
     planes = presence.transpose(1, 2).unflatten(-1, (grid.rows, grid.columns))
-    width, height = (grid.extent / grid.extent.amax()).tolist()
+    width, height = (float(side) / max(map(float, grid.size)) for side in grid.size)
     for edge in edges:
         # Rounding must not take cells out that lie just at the edge.
         across = min(int(edge * grid.columns / width + 1e-6), grid.columns - 1)

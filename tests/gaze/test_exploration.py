@@ -14,6 +14,7 @@ from semfov.gaze.acquisition import (
     ProbabilityOfImprovement,
     TwoPeaks,
     UpperConfidenceBound,
+    lookahead,
 )
 
 ACQUISITIONS = {
@@ -142,6 +143,17 @@ def test_batches_are_rows(name, model):
     assert together.shape == (4, 10)
     torch.testing.assert_close(torch.stack([acquisition(row) for row in beta]), together)
     torch.testing.assert_close(acquisition(beta.view(2, 2, 10, 5)), together.view(2, 2, 10))
+
+
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_large_batches_are_taken_in_parts(name, model, monkeypatch):
+    acquisition = ACQUISITIONS[name](model, GRIDS["wide"])
+    beta = 0.5 + 3 * torch.rand(2, 3, 8, 5, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    whole = acquisition(beta)
+    for cached in (1, 1000):
+        monkeypatch.setattr(lookahead, "_CACHED", cached)
+        torch.testing.assert_close(acquisition(beta), whole, rtol=1e-12, atol=1e-12)
+    assert acquisition(beta[:0]).shape == (0, 3, 8)
 
 
 @pytest.mark.parametrize("name", ACQUISITIONS)

@@ -175,6 +175,7 @@ EXPLORERS: dict[str, Callable[[], nn.Module]] = {
 } | {"ExpectedAccuracy": lambda: acquisition.ExpectedAccuracy(model(), GRID)}
 ACQUISITIONS = SEARCHERS | EXPLORERS
 OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]]]] = {
+    "ContextPrior": (lambda: Given(context(), GRID, 2), lambda: (rand(2, len(GRID), 4),)),
     "Foveation": (lambda: Foveation(9.0, learnable=True), lambda: (rand(2, 3, 48, 64), torch.tensor([20.0, 30.0]))),
     "Foveation, opencv": (
         lambda: Foveation(9.0, convention="opencv"),
@@ -194,7 +195,6 @@ OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]
 }
 # How many boxes are kept, when an episode ends, how far context reaches depends on values: these are no single graph.
 BRANCHING = {
-    "ContextPrior": (lambda: Given(context(), GRID, 2), lambda: (rand(2, len(GRID), 4),)),
     "Eye": (Scores, lambda: (rand(1, 3, 48, 64), torch.tensor([[20.0, 30.0], [5.0, 6.0]]))),
     "ActivePerception": (Exploring, lambda: (rand(1, 3, 48, 64),)),
 }
