@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 import torch
-import yaml
 from torch import Tensor
 
 from eval.command import run_command
@@ -31,8 +30,8 @@ from semfov.belief.context import reaches
 from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.errors import DataError, check
-from semfov.files import write_text
 from train.context_weights import fit_weights, make_cases
+from train.outputs import write_outputs
 
 
 @dataclass(frozen=True)
@@ -137,13 +136,7 @@ def fit_context(config: FitContextConfig) -> None:
     path = config.out / f"{config.name}.safetensors"
     model.save(path)
     text = report(judged, weights, len(known), config)
-    print(text)
-    write_text(config.out / "report.md", text)
-    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
-    write_text(config.out / "judged.json", json.dumps(judged, indent=2) + "\n")
-    print(
-        "written:", *(f"  {config.out / n}" for n in (path.name, "report.md", "config.yaml", "judged.json")), sep="\n"
-    )
+    write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
 
 
 def read_places(scenes: Scenes, config: FitContextConfig) -> list[Places]:

@@ -26,7 +26,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
-import yaml
 from torch import Tensor
 from tqdm import tqdm
 
@@ -38,10 +37,10 @@ from eval.setup import make_eye, make_scenes, plain, prepare_worker
 from semfov import Eye
 from semfov.data.scene import Scenes
 from semfov.errors import DataError, check
-from semfov.files import write_text
 from semfov.gaze.learned import LearnedGaze
 from semfov.observation import storage
 from train.gaze_episodes import Relaxation, backpropagate, draw_searches, found_at
+from train.outputs import write_outputs
 
 _CHECKPOINT = "gaze-checkpoint"
 
@@ -131,14 +130,8 @@ def fit_gaze(config: FitGazeConfig) -> None:
     path = config.out / f"{config.name or eye.detector.name}.safetensors"
     gaze.save(path)
     text = report(config, judged, losses, len(trained_on), len(held_out), (width, float(eye.sensor.sigma)))
-    print(text)
-    write_text(config.out / "report.md", text)
-    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
     found = {name: found.tolist() for name, found in judged.items()}
-    write_text(config.out / "judged.json", json.dumps({"found_at": found, "losses": losses}) + "\n")
-    print(
-        "written:", *(f"  {config.out / n}" for n in (path.name, "report.md", "config.yaml", "judged.json")), sep="\n"
-    )
+    write_outputs(config, text, ("judged.json", json.dumps({"found_at": found, "losses": losses}) + "\n"), path)
 
 
 def first_model(config: FitGazeConfig, metadata: dict[str, object]) -> LearnedGaze:

@@ -18,7 +18,6 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 import torch
-import yaml
 from torch import Tensor
 from torch.nn import functional as F
 from tqdm import tqdm
@@ -31,7 +30,7 @@ from eval.samples import SampleSettings, collect
 from eval.setup import plain
 from semfov.belief import TargetEvidence
 from semfov.errors import DataError, check
-from semfov.files import write_text
+from train.outputs import write_outputs
 from train.search_examples import Examples, make_examples
 
 
@@ -100,13 +99,7 @@ def fit_search(config: FitSearchConfig) -> None:
     path = config.out / f"{config.name or sampler.eye.detector.name}.safetensors"
     model.save(path)
     text = report(judged, int((~held_out).sum()), int(held_out.sum()))
-    print(text)
-    write_text(config.out / "report.md", text)
-    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
-    write_text(config.out / "judged.json", json.dumps(judged, indent=2) + "\n")
-    print(
-        "written:", *(f"  {config.out / n}" for n in (path.name, "report.md", "config.yaml", "judged.json")), sep="\n"
-    )
+    write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
 
 
 def train(

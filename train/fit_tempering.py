@@ -14,11 +14,10 @@ Use it with `--belief.tempering τ`, or a policy's ending `+tempered`, which is 
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import torch
-import yaml
 from torch import Tensor
 from tqdm import tqdm
 
@@ -27,13 +26,12 @@ from eval.config import DataConfig, DetectorConfig, SensorConfig
 from eval.parallel import rank
 from eval.report import table
 from eval.samples import Sampler, Samples, SampleSettings, collect
-from eval.setup import plain
 from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief import SemanticObserver
 from semfov.belief.grid import Footprint
 from semfov.data.scene import legal_targets
 from semfov.errors import DataError, check
-from semfov.files import write_text
+from train.outputs import write_outputs
 
 
 @dataclass(frozen=True)
@@ -98,11 +96,7 @@ def fit_tempering(config: FitTemperingConfig) -> None:
         model.requires_grad_(False)
     hits = {tempering: measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
     text = report(hits)
-    print(text)
-    write_text(config.out / "report.md", text)
-    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
-    write_text(config.out / "hits.json", json.dumps(hits, indent=2) + "\n")
-    print("written:", *(f"  {config.out / name}" for name in ("report.md", "config.yaml", "hits.json")), sep="\n")
+    write_outputs(config, text, ("hits.json", json.dumps(hits, indent=2) + "\n"))
 
 
 def measure(

@@ -1,0 +1,31 @@
+"""What every fit leaves besides its model: a report, the settings, and the figures of the report."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from eval.setup import plain
+from semfov.files import write_text
+
+
+def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Path | None = None) -> None:
+    """Print the report, write it, the settings and the figures to `config.out`, and name all that was written.
+
+    Args:
+        config: dataclass of the settings.
+        report: Markdown.
+        figures: name of a JSON file, and its text.
+        model: file that was written before, to be named too.
+    """
+    files = {
+        "report.md": report,
+        "config.yaml": yaml.safe_dump(plain(asdict(config)), sort_keys=False),
+        figures[0]: figures[1],
+    }
+    print(report)
+    for name, text in files.items():
+        write_text(config.out / name, text)
+    written = [*([] if model is None else [model]), *(config.out / name for name in files)]
+    print("written:", *(f"  {path}" for path in written), sep="\n")
