@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from semfov.errors import check, check_finite, check_shape, lookup, values_known
-from semfov.sensor.pyramid import Bands, Convention, constant, laplacian_pyramid, places, pyrup
+from semfov.sensor.lines import constant
+from semfov.sensor.pyramid import Bands, Convention, laplacian_pyramid, places, pyrup
 
 
 def foveate(

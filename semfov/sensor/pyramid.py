@@ -1,45 +1,19 @@
 """Gaussian and Laplacian pyramids in Kornia's and in OpenCV's convention, for images of any size."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, wraps
-from typing import Any, Literal, TypeVar, TypeVarTuple, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from semfov.errors import check, check_shape, lookup, values_known
+from semfov.sensor.lines import Lines, Taps, banded, constant, separable
 
 Convention = Literal["kornia", "opencv"]
 
 _BLUR = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
-# Up to this many pixels lines are filtered by one dense matrix, beyond it by one for every block of `_BLOCK`.
-_SMALL = 160
-_BLOCK = 8
-_REACH = 2
-
-Constant = TypeVar("Constant")
-Settings = TypeVarTuple("Settings")
-
-
-def constant(function: Callable[[*Settings], Constant]) -> Callable[[*Settings], Constant]:
-    """Remember the tensors that a function makes of sizes and settings alone; a compiled graph makes its own."""
-
-    @lru_cache(maxsize=256)
-    def remember(*settings: Any) -> Any:
-        # What is made during inference must serve a later gradient too.
-        with torch.inference_mode(False), torch.no_grad():
-            return function(*settings)
-
-    @wraps(function)
-    def call(*settings: *Settings) -> Constant:
-        if torch.compiler.is_compiling():
-            return function(*settings)
-        result: Constant = remember(*settings)
-        return result
-
-    return call
+# Pixels read that lie under a tile of those made: fewer make the products slow, more multiply more zeros.
+_SHIFT = 8
 
 
 @dataclass(frozen=True)
@@ -92,11 +66,8 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     """
     check_shape(image, "image", None, None, None, None)
     lookup(convention, get_args(Convention), "pyramid convention")
-    height, width = image.shape[-2:]
-    if max(height, width) <= _SMALL and not torch.compiler.is_compiling():
-        down, across = (_matrix(n, None, convention, image.dtype, image.device) for n in (height, width))
-        return down @ image @ across.mT
-    return _reduce(_reduce(image.mT, convention).mT, convention)
+    down, across = (_reducing(count, convention, image.dtype, image.device) for count in image.shape[-2:])
+    return separable(image, down, across)
 
 
 def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia") -> Tensor:
@@ -118,11 +89,9 @@ def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia
     if convention == "opencv":
         for count, length in zip(image.shape[-2:], size, strict=True):
             check(0 <= 2 * count - length <= 1, "size", f"{2 * count} or {2 * count - 1} for {count} pixels", length)
-    if max(size) <= _SMALL and not torch.compiler.is_compiling():
-        lengths = zip(image.shape[-2:], size, strict=True)
-        down, across = (_matrix(n, length, convention, image.dtype, image.device) for n, length in lengths)
-        return down @ image @ across.mT
-    return _expand(_expand(image.mT, size[1], convention).mT, size[0], convention)
+    lengths = zip(image.shape[-2:], size, strict=True)
+    down, across = (_expanding(count, length, convention, image.dtype, image.device) for count, length in lengths)
+    return separable(image, down, across)
 
 
 def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> Bands:
@@ -153,96 +122,52 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
 
 
 @constant
-def _matrix(count: int, length: int | None, convention: Convention, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Matrix that reduces a line of `count` pixels, or expands it to `length`.
-
-    Levels of a few thousand pixels cost less as two matrix products than as many short passes.
-    """
-    lines = torch.eye(count, dtype=torch.float64)[None, None]
-    lines = _reduce(lines, convention) if length is None else _expand(lines, length, convention)
-    return lines[0, 0].to(dtype=dtype, device=device)
-
-
-def _reduce(image: Tensor, convention: Convention) -> Tensor:
-    """`pyrdown` along the height."""
-    count = image.shape[-2]
-    if _blocks(count) and (convention == "opencv" or count % 2 == 0):
-        return _filter(image, (count + 1) // 2, convention)
-    return _blur(image)[..., ::2, :] if convention == "opencv" else _resize(_blur(image), max(count // 2, 1))
-
-
-def _expand(image: Tensor, length: int, convention: Convention) -> Tensor:
-    """`pyrup` along the height."""
-    count = image.shape[-2]
-    if _blocks(count) and (convention == "opencv" or length == 2 * count):
-        return _filter(image, length, convention)
-    if convention == "kornia":
-        return _blur(_resize(image, length))
-    before = torch.cat([image[..., min(1, count - 1), None, :], image[..., :-1, :]], -2)
-    after = torch.cat([image[..., 1:, :], image[..., -1:, :]], -2)
-    pairs = torch.stack([(before + 6 * image + after) / 8, (image + after) / 2], -2)
-    return pairs.flatten(-3, -2)[..., :length, :]
-
-
-def _blur(image: Tensor) -> Tensor:
-    """Five taps along the height, the image mirrored at its outermost pixels."""
-    count = image.shape[-2]
-    # A line of one or two pixels is mirrored to and fro, as `BORDER_REFLECT_101` of OpenCV does.
-    place = torch.arange(-2, count + 2, device=image.device).abs() % max(2 * count - 2, 1)
-    extended = image.index_select(-2, torch.minimum(place, 2 * count - 2 - place))
-    result = extended[..., :count, :] * _BLUR[0]
-    for i in range(1, 5):
-        result.add_(extended[..., i : i + count, :], alpha=_BLUR[i])
-    return result
-
-
-def _resize(image: Tensor, length: int) -> Tensor:
-    """Bilinear resizing along the height, without antialiasing."""
-    return F.interpolate(image, (length, image.shape[-1]), mode="bilinear", align_corners=False)
-
-
-def _blocks(count: int) -> bool:
-    """Whether `_filter` serves for a line of `count` pixels."""
-    return count >= 5 * _BLOCK and values_known()
-
-
-def _filter(image: Tensor, length: int, convention: Convention) -> Tensor:
-    """Halve or double the height: matrix products of overlapping blocks of lines, all but the outermost alike.
-
-    A product reads a transposed image as quickly, so that two passes filter both axes without a copy.
-    """
-    planes = image.flatten(0, -3)
-    first, middle, last = _block_matrices(image.shape[-2], length, convention, image.dtype, image.device)
-    step, lines = middle.shape[-2], _BLOCK + 2 * _REACH
-    count = (image.shape[-2] - last.shape[-1] + _REACH) // _BLOCK - 1
-    matrices = middle.expand(count, -1, -1)
-    blocks = planes[:, _BLOCK - _REACH :].unfold(-2, lines, _BLOCK)[:, :count].mT
-    outermost = first @ planes[:, : first.shape[-1]], last @ planes[:, -last.shape[-1] :]
-    if planes.requires_grad and torch.is_grad_enabled():
-        inner = [torch.bmm(matrices, block).flatten(0, 1) for block in blocks]
-        return torch.cat([outermost[0], torch.stack(inner), outermost[1]], -2).unflatten(0, image.shape[:-2])
-    result = planes.new_empty(planes.shape[0], length, planes.shape[-1])
-    result[:, :step], result[:, step * (count + 1) :] = outermost
-    for block, out in zip(blocks, result[:, step : step * (count + 1)].unflatten(1, (count, step)), strict=True):
-        torch.bmm(matrices, block, out=out)
-    return result.unflatten(0, image.shape[:-2])
+def _reducing(count: int, convention: Convention, dtype: torch.dtype, device: torch.device) -> Lines:
+    """`pyrdown` of lines of `count` pixels."""
+    if convention == "opencv":
+        taps = _blur(torch.arange(0, count, 2), count)
+    else:
+        taps = _compose(_resize(count, max(count // 2, 1), dtype), _blur(torch.arange(count), count))
+    # Halves of an odd number drift by a pixel from one end of the line to the other.
+    return banded(taps, count, _SHIFT // 2, _SHIFT, 2 + count % 2, dtype, device)
 
 
 @constant
-def _block_matrices(
-    count: int, length: int, convention: Convention, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Matrices that reduce or expand the first block of a line, one in the middle, and the last with what remains."""
-    # The blocks of a line of four, and what remains, are those of a long one.
-    short = 4 * _BLOCK + count % _BLOCK
-    halves = length < count
-    step = _BLOCK // 2 if halves else 2 * _BLOCK
-    pixels = torch.eye(short, dtype=torch.float64)[None, None]
-    lines = _reduce(pixels, convention) if halves else _expand(pixels, 2 * short - (2 * count - length), convention)
-    whole = lines[0, 0].to(dtype=dtype, device=device)
-    middle = whole[step : 2 * step, _BLOCK - _REACH : 2 * _BLOCK + _REACH]
-    return (
-        whole[:step, : _BLOCK + _REACH].contiguous(),
-        middle.contiguous(),
-        whole[3 * step :, 3 * _BLOCK - _REACH :].contiguous(),
+def _expanding(count: int, length: int, convention: Convention, dtype: torch.dtype, device: torch.device) -> Lines:
+    """`pyrup` of lines of `count` pixels to `length`."""
+    if convention == "opencv":
+        # The blur of lines with zeros in between, mirrored before their first pixel and continued after their last.
+        place = torch.arange(length)[:, None]
+        half = place.div(2, rounding_mode="floor")
+        index = torch.where(place % 2 == 0, half + torch.tensor([-1, 0, 1]), half + torch.tensor([0, 1, 1]))
+        weight = torch.where(place % 2 == 0, torch.tensor([1 / 8, 6 / 8, 1 / 8]), torch.tensor([1 / 2, 1 / 2, 0]))
+        taps = Taps(torch.where(index < 0, min(1, count - 1), index.clamp(max=count - 1)), weight.double())
+    else:
+        taps = _compose(_blur(torch.arange(length), length), _resize(count, length, dtype))
+    drift = abs(length - 2 * count)
+    return banded(taps, count, 2 * _SHIFT, _SHIFT if drift <= 1 else count, 2 + drift, dtype, device)
+
+
+def _blur(place: Tensor, count: int) -> Taps:
+    """Five taps at some pixels of a line of `count`, which is mirrored at its outermost pixels."""
+    # A line of one or two pixels is mirrored to and fro, as `BORDER_REFLECT_101` of OpenCV does.
+    index = (place[:, None] + torch.arange(-2, 3)).abs() % max(2 * count - 2, 1)
+    return Taps(
+        torch.minimum(index, 2 * count - 2 - index), torch.tensor(_BLUR, dtype=torch.float64).expand(len(place), 5)
     )
+
+
+def _resize(count: int, length: int, dtype: torch.dtype) -> Taps:
+    """Bilinear interpolation of a line of `count` pixels at `length`, pixels as areas, without antialiasing."""
+    # Places are rounded as those of `torch.nn.functional.interpolate` are.
+    place = torch.arange(length, dtype=torch.promote_types(dtype, torch.float32)) + 0.5
+    place = (place * (torch.tensor(count).to(place) / length) - 0.5).clamp(0, count - 1).double()
+    before = place.floor()
+    index = before.long()[:, None] + torch.arange(2)
+    return Taps(index.clamp(max=count - 1), torch.stack([1 - place + before, place - before], -1))
+
+
+def _compose(outer: Taps, inner: Taps) -> Taps:
+    """Taps of `outer` on what `inner` makes."""
+    index, weight = inner.index[outer.index], outer.weight[..., None] * inner.weight[outer.index]
+    return Taps(index.flatten(1), weight.flatten(1))

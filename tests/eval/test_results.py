@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from eval.results import ResultsConfig, agreement, experiments, fill, paired, summary
+from eval.experiments import ResultsConfig, experiments
+from eval.results import agreement, fill, paired, summary
 from eval.setup import split_policy
 from semfov.errors import InputError
 
@@ -42,6 +43,7 @@ def test_lines_become_tables(runs):
     assert fill("@@ explore-five-levels-nano first\n", runs[0]) == "*Not run yet.*\n"
     assert fill("@@ sensitivity\n", runs[0]).count("not run yet") > 50
     assert fill("@@ sensor\n", runs[0]).count("not run yet") == 9 * 2 * 5
+    assert fill("@@ explore-sensor\n", runs[0]).count("not run yet") == 6 * 3 * 7
     assert summary(runs[0]["search-tiny"].out, 0)[0] == "**one** (1)"
     with pytest.raises(InputError, match="did you mean 'search-tiny'"):
         fill("@@ search-tin first\n", runs[0])
@@ -79,3 +81,23 @@ def test_agreement_compares_the_same_episodes(tmp_path):
     rows = agreement(tmp_path)
     assert [cell.strip() for cell in rows[2].split("|")[1:-1]] == ["raw", "75.0 %", "100.0 %"]
     assert [cell.strip() for cell in rows[3].split("|")[1:-1]] == ["calibrated", "100.0 %", "100.0 %"]
+
+
+def test_a_study_has_a_row_for_each_setting_and_policy(runs):
+    folder = runs[0]["explore-sensor YOLOX-nano, fovea 50 px, growth 1"].out
+    folder.mkdir()
+    (folder / "summary.md").write_text("**one**\n")
+    right = {"random-raw": (1, 2), "kl-raw": (2, 2), "closer-look-raw+mild": (3, 4)}
+    records = [
+        {"policy": policy, "scene": scene, "right": [counts[scene]] * 21, "object_cells": 4}
+        for policy, counts in right.items()
+        for scene in (0, 1)
+    ]
+    (folder / "episodes.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    rows = [
+        [cell.strip() for cell in row.split("|")[1:-1]] for row in fill("@@ explore-sensor\n", runs[0]).splitlines()
+    ]
+    assert rows[0] == ["setting", "policy", "0", "1", "2", "3", "4", "10", "20"]
+    assert rows[2][:3] == ["YOLOX-nano, fovea 50 px, growth 1", "random-raw", "37.5 ± 12.5"]
+    assert [row[2] for row in rows[3:5]] == ["50.0 ± 0.0", "87.5 ± 12.5"]
+    assert len(rows) == 2 + 6 * 3

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape, lookup
-from semfov.gaze.saliency.lines import enlarge
+from semfov.gaze.saliency.blur import enlarge
 
 Fusion = Literal["mean", "max"]
 

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.errors import check, check_shape, lookup
+from semfov.gaze.saliency.blur import gaussian_blur
 from semfov.gaze.saliency.fusion import Fusion, fuse, rescale
-from semfov.gaze.saliency.lines import gaussian_blur
 from semfov.gaze.saliency.opponent import anchor, opponent_colours
 
 

@@ -89,7 +89,9 @@ def test_saliency_is_opencvs(photograph: np.ndarray, dtype: torch.dtype) -> None
     image = torch.from_numpy(photograph).permute(2, 0, 1)[None].to(dtype)
     saliency = IttiKoch()(image)
     assert saliency.dtype == dtype
-    np.testing.assert_allclose(saliency[0].numpy(), opencv_itti_koch(photograph), atol=2e-5)
+    # Which pixels are peaks hangs on the last digits of single precision.
+    atol = 2e-5 if dtype == torch.float64 else 5e-4
+    np.testing.assert_allclose(saliency[0].numpy(), opencv_itti_koch(photograph), atol=atol)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (48, 64), (97, 131)])

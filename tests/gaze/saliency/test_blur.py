@@ -10,7 +10,7 @@ from kornia.filters import gaussian_blur2d
 from scipy import ndimage
 
 from semfov.errors import InputError
-from semfov.gaze.saliency.lines import enlarge, gaussian_blur, gaussian_kernel
+from semfov.gaze.saliency.blur import enlarge, gaussian_blur, gaussian_kernel
 
 
 @given(st.integers(1, 150), st.integers(1, 150), st.floats(0.3, 9.0), st.sampled_from([torch.float32, torch.float64]))

@@ -1,0 +1,83 @@
+"""Blur and enlargement of images as OpenCV does them."""
+
+import torch
+from torch import Tensor
+
+from semfov.errors import check, check_shape
+from semfov.sensor.lines import Lines, Taps, banded, constant, separable
+
+# Pixels that one product makes at once: more of them multiply more zeros, fewer make the products slow.
+_TILE = 24
+
+
+def gaussian_kernel(sigma: float) -> Tensor:
+    r"""Weights of a Gaussian, `(2r+1,)` in float64.
+
+    .. math:: w_i \propto \exp(-i^2 / 2\sigma^2), \quad |i| \le r, \quad 2r + 1 = \mathrm{round}(8\sigma + 1)
+
+    the number of taps made odd by rounding up: OpenCV's kernel for floats where no size is given.
+
+    >>> gaussian_kernel(0.25)
+    tensor([3.3524e-04, 9.9933e-01, 3.3524e-04], dtype=torch.float64)
+    """
+    check(sigma > 0, "sigma", "a positive number of pixels", sigma)
+    radius = (round(8 * sigma + 1) | 1) // 2
+    weight = torch.exp(-(torch.arange(-radius, radius + 1).double() ** 2) / (2 * sigma**2))
+    return weight / weight.sum()
+
+
+def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor:
+    """Blur with a Gaussian, borders continued: `cv2.GaussianBlur` of floats with `BORDER_REPLICATE`.
+
+    Args:
+        image: `(B, C, H, W)`.
+        sigma: standard deviation in pixels, see `gaussian_kernel`.
+        halve: keep only the first of every two pixels, `floor(n / 2)` of n (at least 1) along each axis.
+
+    >>> gaussian_blur(torch.ones(1, 3, 5, 7), 2.0, halve=True).shape
+    torch.Size([1, 3, 2, 3])
+    """
+    check_shape(image, "image", None, None, None, None)
+    check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
+    check(sigma > 0, "sigma", "a positive number of pixels", sigma)
+    height, width = (_blurring(n, sigma, 2 if halve else 1, image.dtype, image.device) for n in image.shape[-2:])
+    return separable(image, height, width)
+
+
+def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Enlarge an image `(..., h, w)` to `(height, width)` by cubic interpolation (a = -0.75): `cv2.INTER_CUBIC`.
+
+    >>> enlarge(torch.rand(1, 2, 3), (4, 5)).shape
+    torch.Size([1, 4, 5])
+    """
+    check_shape(image, "image", None, None)
+    if tuple(image.shape[-2:]) == tuple(size):
+        return image
+    lengths = zip(image.shape[-2:], size, strict=True)
+    return separable(image, *(_enlarging(count, length, image.dtype, image.device) for count, length in lengths))
+
+
+@constant
+def _blurring(count: int, sigma: float, step: int, dtype: torch.dtype, device: torch.device) -> Lines:
+    """Blur of lines of `count` pixels, of which one of `step` is kept; borders continued."""
+    kernel = gaussian_kernel(sigma)
+    length, reach = max(count // step, 1), len(kernel) // 2
+    index = torch.arange(length)[:, None] * step + torch.arange(len(kernel)) - reach
+    taps = Taps(index.clamp(0, count - 1), kernel.expand(length, -1))
+    return banded(taps, count, _TILE, _TILE * step, reach, dtype, device)
+
+
+@constant
+def _enlarging(count: int, length: int, dtype: torch.dtype, device: torch.device) -> Lines:
+    """Keys' cubic interpolation (a = -0.75), pixels as areas, borders continued."""
+    place = (torch.arange(length).double() + 0.5) * (count / length) - 0.5
+    index = place.floor().long()[:, None] + torch.arange(-1, 3)
+    distance = (place[:, None] - index).abs()
+    a = -0.75
+    near = ((a + 2) * distance - (a + 3)) * distance**2 + 1
+    far = a * (((distance - 5) * distance + 8) * distance - 4)
+    taps = Taps(index.clamp(0, count - 1), torch.where(distance <= 1, near, far))
+    ratio, rest = divmod(length, count)
+    # Where the ratio is no whole number the tiles would not be evenly spaced.
+    shift = count if rest else max(_TILE // ratio, 1)
+    return banded(taps, count, shift * ratio, shift, 2, dtype, device)

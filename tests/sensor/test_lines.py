@@ -1,0 +1,57 @@
+"""Matrices cut into tiles against the whole matrix."""
+
+import numpy as np
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.sensor.lines import Taps, banded, separable
+
+
+@given(
+    tiles=st.integers(1, 30),
+    tile=st.integers(1, 16),
+    shift=st.integers(1, 16),
+    reach=st.integers(0, 20),
+    rest=st.integers(0, 15),
+    fewer=st.integers(0, 15),
+    alike=st.booleans(),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_tiles_are_the_whole_matrix(tiles, tile, shift, reach, rest, fewer, alike, seed):
+    generator = np.random.default_rng(seed)
+    count, taps = 161 + tiles * shift + 2 * reach + rest, 3
+    length = -(-count // shift) * tile - min(fewer, tile - 1)
+    under = np.arange(length)[:, None] // tile
+    offsets = generator.integers(-reach, shift + reach, (1 if alike else length // tile + 1, tile, taps))
+    weights = generator.normal(size=offsets.shape)
+    pick = (0 if alike else under[:, 0], np.arange(length) % tile)
+    index = np.clip(under * shift + offsets[pick], 0, count - 1)
+    whole = np.zeros((length, count))
+    np.add.at(whole, (np.arange(length)[:, None], index), weights[pick])
+
+    lines = banded(
+        Taps(torch.from_numpy(index), torch.from_numpy(weights[pick])),
+        count,
+        tile,
+        shift,
+        reach,
+        torch.float64,
+        torch.device("cpu"),
+    )
+    assert lines.length == length
+    image = torch.from_numpy(generator.random((2, count, count)))
+    expected = torch.from_numpy(whole) @ image @ torch.from_numpy(whole).T
+    torch.testing.assert_close(separable(image, lines, lines), expected)
+    recorded = separable(image.clone().requires_grad_(), lines, lines)
+    torch.testing.assert_close(recorded.detach(), expected)
+
+
+def test_long_lines_are_cut():
+    index = torch.arange(400)[:, None]
+    taps = Taps(index, torch.ones(400, 1, dtype=torch.float64))
+    lines = banded(taps, 400, 8, 8, 1, torch.float32, torch.device("cpu"))
+    assert lines.middle is not None
+    assert lines.middle.shape == (48, 8, 10)
+    assert lines.middle.stride(0) == 0, "tiles that are alike share their matrix"
+    assert banded(Taps(index[:100], taps.weight[:100]), 100, 8, 8, 1, torch.float32, torch.device("cpu")).middle is None
