@@ -7,13 +7,11 @@ import pytest
 import torch
 
 import semfov
-from semfov.belief import Belief, ContextPrior, context, target_evidence
-from semfov.gaze import learned
-from semfov.observation import foveal
+from semfov.belief import Belief, ContextPrior
 
-OBSERVATION = sorted(foveal.SHIPPED.glob("*.safetensors"))
-TARGET = sorted(target_evidence.SHIPPED.glob("*.safetensors"))
-GAZE = sorted(learned.SHIPPED.glob("*.safetensors"))
+OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
+TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
+GAZE = sorted(semfov.gaze.LearnedGaze.shipped.glob("*.safetensors"))
 
 
 @pytest.mark.parametrize("path", OBSERVATION, ids=lambda path: path.stem)
@@ -50,7 +48,7 @@ def test_target_evidence(path):
     assert odds[middle] > max(0.0, float(other[middle]) + 1)
 
 
-@pytest.mark.parametrize("path", sorted(context.SHIPPED.glob("*.safetensors")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(ContextPrior.shipped.glob("*.safetensors")), ids=lambda path: path.stem)
 def test_context(path):
     prior = ContextPrior.from_pretrained(path.stem)
     assert path.stat().st_size < 100_000

@@ -5,23 +5,20 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
-from semfov.errors import DataError, InputError, check, check_shape, lookup, values_known
+from semfov.errors import check, check_shape, lookup, values_known
 from semfov.observation import compatibility
-from semfov.observation.storage import find, read, write
-
-SHIPPED = Path(__file__).parent / "models" / "context"
-_KIND = "context-prior"
+from semfov.observation.pretrained import Pretrained
 
 
-class ContextPrior(nn.Module):
+class ContextPrior(Pretrained):
     r"""Log odds that context adds to those of a target t in each cell x, from annotations alone.
 
     .. math:: c_t(x) = w_1 \, a_t(x) + w_2 \sum_{j \ne t} \sum_n q_{jn}(x) \, r_{tjn}
@@ -51,6 +48,9 @@ class ContextPrior(nn.Module):
     tensor([[0., 0., 1., 1.]])
     """
 
+    kind: ClassVar[str] = "context-prior"
+    title: ClassVar[str] = "context prior"
+    shipped: ClassVar[Path] = Path(__file__).parent / "models" / "context"
     place: Tensor
     cooccurrence: Tensor
 
@@ -116,7 +116,7 @@ class ContextPrior(nn.Module):
 
     def check_compatible(self, classes: Sequence[str]) -> None:
         """Raise `InputError` unless a detector with these classes can be used."""
-        compatibility.check_classes(self.classes, classes)
+        compatibility.check_classes(self.classes, classes, self.title)
 
     def digest(self) -> str:
         """sha256 of all that `forward` and `weights_for` depend on."""
@@ -124,42 +124,30 @@ class ContextPrior(nn.Module):
         tensors = [tensor.cpu().contiguous().view(torch.uint8).numpy().tobytes() for tensor in self.buffers()]
         return hashlib.sha256(b"".join([what, *tensors])).hexdigest()
 
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the model to a safetensors file, its tensors in half precision, whole or not at all."""
-        from semfov import __version__
+    def record(self) -> dict[str, Any]:
+        """Classes, bands and weights."""
+        return {"classes": self.classes, "edges": self.edges, "weights": self.weights}
 
-        record = {
-            "kind": _KIND,
-            "version": __version__,
-            "classes": self.classes,
-            "edges": self.edges,
-            "weights": self.weights,
-            "metadata": self.metadata,
-        }
-        write(path, {name: tensor.half() for name, tensor in self.state_dict().items()}, record)
+    def tensors(self) -> dict[str, Tensor]:
+        """Both tables in half precision."""
+        return {name: tensor.half() for name, tensor in self.state_dict().items()}
+
+    @classmethod
+    def restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """The prior from what was kept."""
+        tables = tensors["place"].float(), tensors["cooccurrence"].float()
+        settings = {"weights": record["weights"], "metadata": record["metadata"]}
+        return cls(record["classes"], *tables, record["edges"], **settings)
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str] = "coco") -> Self:
-        """A model that is shipped with the package, by name, or one that `save` wrote, by path; in `eval` mode.
+        """A prior that is shipped with the package, by name, or one that `save` wrote, by path; in `eval` mode.
 
         Raises:
-            InputError: no model of that name is shipped.
-            DataError: the file is missing, damaged or not such a model.
+            InputError: no prior of that name is shipped.
+            DataError: the file is missing, damaged or not such a prior.
         """
-        path = find(name_or_path, SHIPPED, "context prior")
-        tensors, record = read(path, _KIND)
-        try:
-            model = cls(
-                record["classes"],
-                tensors["place"].float(),
-                tensors["cooccurrence"].float(),
-                record["edges"],
-                weights=record["weights"],
-                metadata=record["metadata"],
-            )
-        except (KeyError, TypeError, ValueError, AttributeError, InputError) as error:
-            raise DataError(f"{path}: not a complete context prior ({error})") from None
-        return model.eval()
+        return super().from_pretrained(name_or_path)
 
 
 def presence_of(detections: Detections, grid: Grid) -> Tensor:

@@ -1,9 +1,8 @@
 """Learned evidence for a target: what one look says of a cell, and what all looks so far say together."""
 
 from collections.abc import Mapping
-from os import PathLike
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -12,16 +11,14 @@ from torch.nn import functional as F
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import FEATURES, look_features
 from semfov.detection.detections import Detections
-from semfov.errors import DataError, check_shape
+from semfov.errors import check_shape
 from semfov.observation import compatibility
-from semfov.observation.storage import find, read, write
+from semfov.observation.pretrained import Pretrained
 
-SHIPPED = Path(__file__).parent / "models"
-_KIND = "target-evidence"
 _READOUT = 11
 
 
-class TargetEvidence(nn.Module):
+class TargetEvidence(Pretrained):
     r"""Log odds that a cell holds the target, learned from looks at photographs with boxes.
 
     Kaplan's rule multiplies looks as if they were independent. Looks at a static scene are not: a blurred, wrong
@@ -42,6 +39,10 @@ class TargetEvidence(nn.Module):
         readout_width: hidden units of h.
         metadata: JSON values kept with the model: `detector` and `sensor` (settings it was trained for).
     """
+
+    kind: ClassVar[str] = "target-evidence"
+    title: ClassVar[str] = "model of target evidence"
+    shipped: ClassVar[Path] = Path(__file__).parent / "models"
 
     def __init__(
         self, look_width: int = 48, readout_width: int = 16, *, metadata: Mapping[str, Any] | None = None
@@ -99,32 +100,19 @@ class TargetEvidence(nn.Module):
         Args:
             settings: `Eye.settings()`.
         """
-        compatibility.check_detector(self.metadata.get("detector", {}), settings["detector"])
-        compatibility.check_sensor(self.metadata.get("sensor", {}), settings["sensor"])
+        compatibility.check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
+        compatibility.check_sensor(self.metadata.get("sensor", {}), settings["sensor"], self.title)
 
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the model to a safetensors file with its metadata, whole or not at all."""
-        from semfov import __version__
-
-        record = {"kind": _KIND, "version": __version__, "widths": self.widths, "metadata": self.metadata}
-        write(path, self.state_dict(), record)
+    def record(self) -> dict[str, Any]:
+        """Widths of both networks."""
+        return {"widths": self.widths}
 
     @classmethod
-    def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:
-        """A model that is shipped with the package, by name, or one that `save` wrote, by path; in `eval` mode.
-
-        Raises:
-            InputError: no model of that name is shipped.
-            DataError: the file is missing, damaged or not such a model.
-        """
-        path = find(name_or_path, SHIPPED, "model of target evidence")
-        tensors, record = read(path, _KIND)
-        try:
-            model = cls(*record["widths"], metadata=record["metadata"])
-            model.load_state_dict(tensors)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise DataError(f"{path}: not a complete model of target evidence ({error})") from None
-        return model.eval()
+    def restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """The networks from what was kept."""
+        model = cls(*record["widths"], metadata=record["metadata"])
+        model.load_state_dict(tensors)
+        return model
 
 
 def _network(inputs: int, width: int) -> nn.Sequential:

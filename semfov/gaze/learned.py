@@ -2,9 +2,8 @@
 
 import math
 from collections.abc import Mapping
-from os import PathLike
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -12,17 +11,15 @@ from torch import Tensor, nn
 from semfov.belief.grid import Grid
 from semfov.belief.observer import SemanticObserver
 from semfov.belief.state import Belief
-from semfov.errors import DataError, InputError
+from semfov.errors import InputError
 from semfov.gaze.acquisition.search import pick
 from semfov.observation import compatibility
-from semfov.observation.storage import find, read, write
+from semfov.observation.pretrained import Pretrained
 
-SHIPPED = Path(__file__).parent / "models"
 FEATURES = 12
-_KIND = "learned-gaze"
 
 
-class LearnedGaze(nn.Module):
+class LearnedGaze(Pretrained):
     r"""Where to look next for a target, learned by backpropagation through whole searches (`train.fit_gaze`).
 
     .. math:: \ell(x) = s \ln p_t(x) + h(\psi)(x), \qquad f = \arg\max_{x \notin \mathcal V} \ell(x)
@@ -41,6 +38,10 @@ class LearnedGaze(nn.Module):
     >>> sum(p.numel() for p in gaze.parameters())
     1466
     """
+
+    kind: ClassVar[str] = "learned-gaze"
+    title: ClassVar[str] = "learned gaze policy"
+    shipped: ClassVar[Path] = Path(__file__).parent / "models"
 
     def __init__(
         self, width: int = 8, *, belief: Mapping[str, Any] | None = None, metadata: Mapping[str, Any] | None = None
@@ -84,32 +85,19 @@ class LearnedGaze(nn.Module):
         Args:
             settings: `Eye.settings()`.
         """
-        compatibility.check_detector(self.metadata.get("detector", {}), settings["detector"])
-        compatibility.check_sensor(self.metadata.get("sensor", {}), settings["sensor"])
+        compatibility.check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
+        compatibility.check_sensor(self.metadata.get("sensor", {}), settings["sensor"], self.title)
 
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the model to a safetensors file with its metadata, whole or not at all."""
-        from semfov import __version__
-
-        settings = {"width": self.width, "belief": self.belief, "metadata": self.metadata}
-        write(path, self.state_dict(), {"kind": _KIND, "version": __version__, **settings})
+    def record(self) -> dict[str, Any]:
+        """Width of the network, and the belief that it reads."""
+        return {"width": self.width, "belief": self.belief}
 
     @classmethod
-    def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:
-        """A model that is shipped with the package, by name, or one that `save` wrote, by path; in `eval` mode.
-
-        Raises:
-            InputError: no model of that name is shipped.
-            DataError: the file is missing, damaged or not such a model.
-        """
-        path = find(name_or_path, SHIPPED, "learned gaze")
-        tensors, record = read(path, _KIND)
-        try:
-            model = cls(record["width"], belief=record["belief"], metadata=record["metadata"])
-            model.load_state_dict(tensors)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise DataError(f"{path}: not a complete model of learned gaze ({error})") from None
-        return model.eval()
+    def restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """The network from what was kept."""
+        model = cls(record["width"], belief=record["belief"], metadata=record["metadata"])
+        model.load_state_dict(tensors)
+        return model
 
 
 class LearnedAcquisition(nn.Module):

@@ -1,4 +1,4 @@
-"""Whether an observation model may stand beside a detector and a sensor."""
+"""Whether a fitted model may stand beside a detector and a sensor."""
 
 import json
 import warnings
@@ -18,29 +18,29 @@ CONVERSIONS = (
 """sha256 of files that are conversions of one checkpoint: here YOLOX-nano's, by Kazuhito00 and by its authors."""
 
 
-def check_classes(fitted: Sequence[str], classes: Sequence[str] | None) -> None:
+def check_classes(fitted: Sequence[str], classes: Sequence[str] | None, what: str) -> None:
     """Raise `InputError` unless the class lists are the same."""
     if classes is None or tuple(classes) == tuple(fitted):
         return
     if len(classes) != len(fitted):
-        raise InputError(f"classes: the observation model was fitted for {len(fitted)} classes, got {len(classes)}")
+        raise InputError(f"classes: the {what} was fitted for {len(fitted)} classes, got {len(classes)}")
     place, (mine, theirs) = next(
         (i, pair) for i, pair in enumerate(zip(fitted, classes, strict=True), 1) if pair[0] != pair[1]
     )
-    raise InputError(f"classes: the observation model was fitted with {mine!r} as class {place}, got {theirs!r}")
+    raise InputError(f"classes: the {what} was fitted with {mine!r} as class {place}, got {theirs!r}")
 
 
-def check_background(fitted: Mapping[str, Any], background: str | None) -> None:
+def check_background(fitted: Mapping[str, Any], background: str | None, what: str) -> None:
     """Raise `InputError` where the background policy is another one."""
     known = fitted.get("background")
     if background is not None and known is not None and background != known:
         raise InputError(
-            f"background: the observation model was fitted on scores with background policy {known!r}, got "
+            f"background: the {what} was fitted on scores with background policy {known!r}, got "
             f"{background!r}; make the detector with background={known!r}, or fit a model for it"
         )
 
 
-def check_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any]) -> None:
+def check_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], what: str) -> None:
     """Raise `InputError` where the weights or the background policy differ, warn where another setting does."""
     if not detector or not fitted:
         return
@@ -50,27 +50,27 @@ def check_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any]) -> No
         same = mine == theirs or any({mine, theirs} <= files for files in CONVERSIONS)
     if not same:
         raise InputError(
-            f"detector: the observation model was fitted for {_describe(fitted)}, got {_describe(detector)}; fit a "
+            f"detector: the {what} was fitted for {_describe(fitted)}, got {_describe(detector)}; fit a "
             f"model for this detector, or take the one it was fitted for"
         )
-    check_background(fitted, detector.get("background"))
-    _warn_of_others("detector", fitted, detector, {"name", "digest", "background", "winograd", "dtype"})
+    check_background(fitted, detector.get("background"), what)
+    _warn_of_others("detector", fitted, detector, {"name", "digest", "background", "winograd", "dtype"}, what)
 
 
-def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any]) -> None:
+def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str) -> None:
     """Warn where the sensor has other settings."""
     if sensor and fitted:
-        _warn_of_others("sensor", fitted, sensor, set())
+        _warn_of_others("sensor", fitted, sensor, set(), what)
 
 
-def _warn_of_others(what: str, fitted: Mapping[str, Any], used: Mapping[str, Any], known: set[str]) -> None:
+def _warn_of_others(part: str, fitted: Mapping[str, Any], used: Mapping[str, Any], known: set[str], what: str) -> None:
     other = [
         f"{key} is {used.get(key)}, fitted with {fitted.get(key)}"
         for key in sorted((fitted.keys() | used.keys()) - known)
         if _plain(fitted.get(key)) != _plain(used.get(key))
     ]
     if other:
-        warnings.warn(f"the observation model was fitted for another {what}: {'; '.join(other)}", stacklevel=4)
+        warnings.warn(f"the {what} was fitted for another {part}: {'; '.join(other)}", stacklevel=4)
 
 
 def _plain(value: Any) -> str:

@@ -4,25 +4,22 @@ import warnings
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.errors import DataError, InputError, check, check_finite, check_shape, lookup, values_known
+from semfov.errors import InputError, check, check_finite, check_shape, lookup, values_known
 from semfov.observation import compatibility
 from semfov.observation.dirichlet import floor, log_normaliser
 from semfov.observation.fitting import estimate_prior, expected_table, fit_table
 from semfov.observation.mle import Method
+from semfov.observation.pretrained import Pretrained
 from semfov.observation.statistics import DirichletStatistics
-from semfov.observation.storage import find, read, write
-
-SHIPPED = Path(__file__).parent / "models"
-_KIND = "foveal-observation-model"
 
 
-class FovealObservationModel(nn.Module):
+class FovealObservationModel(Pretrained):
     r"""Dirichlet likelihoods of score vectors, one for each class k and level of distance d to the fovea.
 
     .. math:: p(S \mid C = k, d) = \mathrm{Dir}(S \mid \alpha_{k,d})
@@ -62,6 +59,9 @@ class FovealObservationModel(nn.Module):
     tensor([0.2000, 0.7000, 0.1000])
     """
 
+    kind: ClassVar[str] = "foveal-observation-model"
+    title: ClassVar[str] = "observation model"
+    shipped: ClassVar[Path] = Path(__file__).parent / "models"
     edges: Tensor
     log_prior: Tensor
     tempering: Tensor
@@ -260,23 +260,29 @@ class FovealObservationModel(nn.Module):
         settings = settings or {}
         eye = settings if "detector" in settings else {"detector": settings}
         fitted = self.metadata.get("detector", {})
-        compatibility.check_classes(self.classes, classes)
-        compatibility.check_background(fitted, background)
-        compatibility.check_detector(fitted, eye["detector"])
-        compatibility.check_sensor(self.metadata.get("sensor", {}), eye.get("sensor", {}))
+        compatibility.check_classes(self.classes, classes, self.title)
+        compatibility.check_background(fitted, background, self.title)
+        compatibility.check_detector(fitted, eye["detector"], self.title)
+        compatibility.check_sensor(self.metadata.get("sensor", {}), eye.get("sensor", {}), self.title)
 
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the model to a safetensors file with its metadata as JSON in the header, whole or not at all."""
-        from semfov import __version__
+    def record(self) -> dict[str, Any]:
+        """Classes and ε."""
+        return {"classes": self.classes, "epsilon": self.epsilon}
 
-        record = {
-            "kind": _KIND,
-            "version": __version__,
-            "classes": self.classes,
-            "epsilon": self.epsilon,
-            "metadata": self.metadata,
-        }
-        write(path, self.state_dict(), record)
+    @classmethod
+    def restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """The model from what was kept."""
+        model = cls(
+            tensors["log_alpha"].exp(),
+            tensors["edges"],
+            record["classes"],
+            epsilon=record["epsilon"],
+            expected=tensors.get("expected"),
+            miss_rate=tensors.get("miss_rate"),
+            metadata=record["metadata"],
+        )
+        model.load_state_dict(tensors)
+        return model
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str], *, detector: Any = None) -> Self:
@@ -290,25 +296,10 @@ class FovealObservationModel(nn.Module):
             InputError: no model of that name is shipped, or it was not fitted for `detector`.
             DataError: the file is missing, damaged or not a model.
         """
-        path = find(name_or_path, SHIPPED, "observation model")
-        tensors, record = read(path, _KIND)
-        try:
-            alpha = tensors.pop("log_alpha")
-            model = cls(
-                alpha.exp(),
-                tensors["edges"],
-                record["classes"],
-                epsilon=record["epsilon"],
-                expected=tensors.get("expected"),
-                miss_rate=tensors.get("miss_rate"),
-                metadata=record["metadata"],
-            )
-            model.load_state_dict({"log_alpha": alpha, **tensors})
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise DataError(f"{path}: not a complete observation model ({error})") from None
+        model = super().from_pretrained(name_or_path)
         if detector is not None:
             model.check_compatible(detector.settings(), detector.classes)
-        return model.eval()
+        return model
 
     def train(self, mode: bool = True) -> Self:
         """As for every module; also forgets what `eval` mode keeps between calls."""

@@ -10,7 +10,7 @@ import scipy.stats
 import torch
 
 from semfov.errors import DataError, InputError
-from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet, foveal
+from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
 from semfov.observation.compatibility import CONVERSIONS, check_detector
 from semfov.observation.fitting import estimate_prior, expected_table, fit_table
 
@@ -338,7 +338,7 @@ def test_header_is_readable_json(tmp_path):
 
 
 def test_shipped_models_are_found_by_name(tmp_path, monkeypatch):
-    monkeypatch.setattr(foveal, "SHIPPED", tmp_path)
+    monkeypatch.setattr(FovealObservationModel, "shipped", tmp_path)
     FovealObservationModel(table(), EDGES, CLASSES).save(tmp_path / "toy-tiny.safetensors")
     assert FovealObservationModel.from_pretrained("toy-tiny").classes == tuple(CLASSES)
     with pytest.raises(InputError, match="did you mean 'toy-tiny'"):
@@ -428,6 +428,6 @@ def test_bad_arguments_are_named(call):
 
 def test_conversions_of_one_checkpoint_are_one_detector():
     pair = sorted(CONVERSIONS[0])
-    check_detector({"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": pair[1]})
-    with pytest.raises(InputError, match="fitted for"):
-        check_detector({"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": "0" * 64})
+    check_detector({"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": pair[1]}, "model")
+    with pytest.raises(InputError, match="the model was fitted for"):
+        check_detector({"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": "0" * 64}, "model")

@@ -168,10 +168,10 @@ def run_here(folder: Path) -> int:
 @pytest.mark.parametrize("damage", ["cut", "flipped", "of another kind"])
 def test_damaged_models_are_refused(whole, tmp_path, capsys, damage):
     from eval.search import main
-    from semfov.observation.foveal import SHIPPED, FovealObservationModel
+    from semfov import FovealObservationModel
 
     model = tmp_path / "model.safetensors"
-    FovealObservationModel.from_pretrained(SHIPPED / "yolov3-tiny.safetensors").save(model)
+    FovealObservationModel.from_pretrained("yolov3-tiny").save(model)
     content = bytearray(model.read_bytes())
     if damage == "cut":
         content = content[: len(content) // 2]

@@ -1,0 +1,64 @@
+"""Fitted modules that are kept in files, some of which are shipped with the package."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from torch import Tensor, nn
+
+from semfov.errors import DataError, InputError
+from semfov.observation.storage import find, read, write
+
+
+class Pretrained(nn.Module):
+    """A module with a form of its own on disk: tensors, and JSON values that say what they are.
+
+    Attributes:
+        kind: of file, as its record says.
+        title: what messages call it.
+        shipped: folder of the models that come with the package.
+        metadata: JSON values kept with the model.
+    """
+
+    kind: ClassVar[str]
+    title: ClassVar[str]
+    shipped: ClassVar[Path]
+    metadata: dict[str, Any]
+
+    @abstractmethod
+    def record(self) -> dict[str, Any]:
+        """JSON values that `restore` needs beside tensors and metadata."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Tensors that are kept."""
+        return self.state_dict()
+
+    @classmethod
+    @abstractmethod
+    def restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """The module from what was kept; an error of any kind where something is missing or does not fit."""
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the model to a safetensors file with its metadata as JSON in the header, whole or not at all."""
+        from semfov import __version__
+
+        record = {"kind": self.kind, "version": __version__, **self.record(), "metadata": self.metadata}
+        write(path, self.tensors(), record)
+
+    @classmethod
+    def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:
+        """A model that is shipped with the package, by name, or one that `save` wrote, by path; in `eval` mode.
+
+        Raises:
+            InputError: no model of that name is shipped.
+            DataError: the file is missing, damaged or not such a model.
+        """
+        path = find(name_or_path, cls.shipped, cls.title)
+        tensors, record = read(path, cls.kind)
+        try:
+            model = cls.restore(record, tensors)
+        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, InputError) as error:
+            raise DataError(f"{path}: not a complete {cls.title} ({error})") from None
+        return model.eval()
