@@ -71,7 +71,9 @@ def methods(thing: Any) -> list[str]:
     if not inspect.isclass(thing):
         return []
     lines = []
-    for name, member in vars(thing).items():
+    ours = [parent for parent in thing.__mro__ if parent.__module__.startswith("semfov")]
+    inherited = {name: member for parent in reversed(ours) for name, member in vars(parent).items()}
+    for name, member in ({**vars(thing)} | inherited).items():
         target = member.__func__ if isinstance(member, classmethod | staticmethod) else member
         target = target.fget if isinstance(target, property) else target
         if name.startswith("_") or not inspect.isfunction(target) or not target.__doc__:

@@ -24,6 +24,7 @@ from eval.report import save_figure, table
 from eval.samples import Sampler, Samples, SampleSettings, collect
 from eval.setup import plain
 from semfov.files import write_text
+from semfov.observation.compatibility import recommended
 from semfov.viz import plot_reliability
 
 
@@ -78,7 +79,8 @@ def judge(config: CalibrationConfig) -> None:
 
 def load_model(config: CalibrationConfig, sampler: Sampler) -> semfov.FovealObservationModel:
     """The observation model, checked against the detector and the sensor."""
-    model = semfov.FovealObservationModel.from_pretrained(config.model or sampler.eye.detector.name)
+    name = config.model or recommended(sampler.eye.detector.name, config.sensor.growth)
+    model = semfov.FovealObservationModel.from_pretrained(name)
     model.check_compatible(sampler.eye.settings(), sampler.eye.detector.classes)
     return model
 

@@ -90,7 +90,7 @@ class BeliefConfig:
         tempering: exponent of the likelihoods (published: 1).
         memory: fuse `all` looks (published), or keep what the `closest` look at each cell says.
         misses: take account of cells in which nothing was detected, by the observation model's miss rates.
-        model: fitted observation model, by name or file (None: the one shipped for the detector).
+        model: fitted observation model, by name or file (None: the one shipped for the detector and growth).
         target_model: learned target evidence, by name or file (None: the one shipped for the detector).
         context: what is added to the log odds of a target: `none`, its usual `place`, its `cooccurrence` with what was
             seen, or `both`; for `target-evidence`, `non-predictive` and `neighbourhood`.

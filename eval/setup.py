@@ -20,6 +20,7 @@ from semfov.data.scene import Scenes
 from semfov.errors import InputError, check, lookup
 from semfov.eye import Eye
 from semfov.gaze import EXPLORATION_POLICIES, SEARCH_POLICIES, LearnedGaze, exploration_policy, search_policy
+from semfov.observation.compatibility import recommended
 
 Kind = Literal["search", "exploration"]
 
@@ -87,7 +88,8 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
 
 def make_observation(config: RunConfig, eye: Eye) -> semfov.FovealObservationModel:
     """The observation model, checked to belong to this detector, background policy and class list."""
-    model = semfov.FovealObservationModel.from_pretrained(config.belief.model or eye.detector.name)
+    name = config.belief.model or recommended(eye.detector.name, config.sensor.growth)
+    model = semfov.FovealObservationModel.from_pretrained(name)
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)
 

@@ -22,6 +22,7 @@ from semfov.errors import check, check_shape, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Policy, exploration_policy, search_policy
 from semfov.gaze.selection import select_fixation
+from semfov.observation.compatibility import recommended
 from semfov.observation.foveal import FovealObservationModel
 from semfov.scanpath import Scanpath
 from semfov.sensor.foveation import Foveation
@@ -148,7 +149,7 @@ class ActivePerception(nn.Module):
         Args:
             name: a detector for which models are shipped, `yolov3-tiny` or `yolox-nano`.
             sigma: width of the fovea in pixels of an image of 640; the models are fitted for 100.
-            growth: see `Foveation`; the models are fitted for 2.
+            growth: see `Foveation`; the models are fitted for 2, the observation model for 1 too.
             grid: `(columns, rows)` of the belief.
             context: whether search also goes by the usual places and company of the target (`ContextPrior`).
             options: of `semfov.load_detector`.
@@ -158,7 +159,8 @@ class ActivePerception(nn.Module):
             DataError: the weights cannot be had, or are damaged.
         """
         detector = load_detector(name, **options)
-        observation = FovealObservationModel.from_pretrained(detector.name, detector=detector).requires_grad_(False)
+        fitted = recommended(detector.name, growth)
+        observation = FovealObservationModel.from_pretrained(fitted, detector=detector).requires_grad_(False)
         evidence = TargetEvidence.from_pretrained(detector.name).requires_grad_(False)
         observer: Observer = TargetObserver(evidence)
         if context:

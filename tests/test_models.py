@@ -8,6 +8,7 @@ import torch
 
 import semfov
 from semfov.belief import Belief, ContextPrior
+from semfov.observation.compatibility import recommended
 
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
 TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
@@ -85,7 +86,17 @@ def test_learned_gaze():
 def test_both_kinds_exist_for_every_detector():
     names = {path.stem for path in TARGET}
     assert names == {"yolov3-tiny", "yolox-nano"}
-    assert {path.stem for path in OBSERVATION} == names | {f"{name}-published" for name in names}
+    kinds = ("", "-published", "-sharp", "-sharp-published")
+    assert {path.stem for path in OBSERVATION} == {name + kind for name in names for kind in kinds}
+
+
+@pytest.mark.parametrize("growth", [1.0, 2.0])
+@pytest.mark.parametrize("detector", ["yolov3-tiny", "yolox-nano"])
+def test_recommended_model_is_fitted_for_the_sensor(detector, growth):
+    model = semfov.FovealObservationModel.from_pretrained(recommended(detector, growth))
+    assert model.metadata["sensor"]["growth"] == growth
+    assert model.metadata["detector"]["name"] == detector
+    assert model.metadata["method"] == "discriminative"
 
 
 @pytest.mark.weights

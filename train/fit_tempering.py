@@ -31,6 +31,7 @@ from semfov.belief import SemanticObserver
 from semfov.belief.grid import Footprint
 from semfov.data.scene import legal_targets
 from semfov.errors import DataError, check
+from semfov.observation.compatibility import recommended
 from train.outputs import write_outputs
 
 
@@ -91,7 +92,8 @@ def fit_tempering(config: FitTemperingConfig) -> None:
         return
     model = None
     if config.calibrated:
-        model = FovealObservationModel.from_pretrained(sampler.eye.detector.name)
+        name = recommended(sampler.eye.detector.name, config.sensor.growth)
+        model = FovealObservationModel.from_pretrained(name)
         model.check_compatible(sampler.eye.settings(), sampler.eye.detector.classes)
         model.requires_grad_(False)
     hits = {tempering: measure(config, sampler, samples, model, tempering) for tempering in config.exponents}

@@ -124,16 +124,16 @@ class ContextPrior(Pretrained):
         tensors = [tensor.cpu().contiguous().view(torch.uint8).numpy().tobytes() for tensor in self.buffers()]
         return hashlib.sha256(b"".join([what, *tensors])).hexdigest()
 
-    def record(self) -> dict[str, Any]:
+    def _record(self) -> dict[str, Any]:
         """Classes, bands and weights."""
         return {"classes": self.classes, "edges": self.edges, "weights": self.weights}
 
-    def tensors(self) -> dict[str, Tensor]:
+    def _tensors(self) -> dict[str, Tensor]:
         """Both tables in half precision."""
         return {name: tensor.half() for name, tensor in self.state_dict().items()}
 
     @classmethod
-    def restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """The prior from what was kept."""
         tables = tensors["place"].float(), tensors["cooccurrence"].float()
         settings = {"weights": record["weights"], "metadata": record["metadata"]}

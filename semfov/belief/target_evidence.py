@@ -103,12 +103,12 @@ class TargetEvidence(Pretrained):
         compatibility.check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
         compatibility.check_sensor(self.metadata.get("sensor", {}), settings["sensor"], self.title)
 
-    def record(self) -> dict[str, Any]:
+    def _record(self) -> dict[str, Any]:
         """Widths of both networks."""
         return {"widths": self.widths}
 
     @classmethod
-    def restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """The networks from what was kept."""
         model = cls(*record["widths"], metadata=record["metadata"])
         model.load_state_dict(tensors)

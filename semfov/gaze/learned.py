@@ -88,12 +88,12 @@ class LearnedGaze(Pretrained):
         compatibility.check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
         compatibility.check_sensor(self.metadata.get("sensor", {}), settings["sensor"], self.title)
 
-    def record(self) -> dict[str, Any]:
+    def _record(self) -> dict[str, Any]:
         """Width of the network, and the belief that it reads."""
         return {"width": self.width, "belief": self.belief}
 
     @classmethod
-    def restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """The network from what was kept."""
         model = cls(record["width"], belief=record["belief"], metadata=record["metadata"])
         model.load_state_dict(tensors)

@@ -18,6 +18,15 @@ CONVERSIONS = (
 """sha256 of files that are conversions of one checkpoint: here YOLOX-nano's, by Kazuhito00 and by its authors."""
 
 
+def recommended(detector: str, growth: float) -> str:
+    """Name of the observation model for a detector behind a sensor of this growth.
+
+    >>> recommended("yolov3-tiny", 2.0), recommended("yolov3-tiny", 1.0)
+    ('yolov3-tiny', 'yolov3-tiny-sharp')
+    """
+    return f"{detector}-sharp" if growth == 1 else detector
+
+
 def check_classes(fitted: Sequence[str], classes: Sequence[str] | None, what: str) -> None:
     """Raise `InputError` unless the class lists are the same."""
     if classes is None or tuple(classes) == tuple(fitted):

@@ -265,12 +265,12 @@ class FovealObservationModel(Pretrained):
         compatibility.check_detector(fitted, eye["detector"], self.title)
         compatibility.check_sensor(self.metadata.get("sensor", {}), eye.get("sensor", {}), self.title)
 
-    def record(self) -> dict[str, Any]:
+    def _record(self) -> dict[str, Any]:
         """Classes and ε."""
         return {"classes": self.classes, "epsilon": self.epsilon}
 
     @classmethod
-    def restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """The model from what was kept."""
         model = cls(
             tensors["log_alpha"].exp(),

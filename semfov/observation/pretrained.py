@@ -28,24 +28,24 @@ class Pretrained(nn.Module):
     metadata: dict[str, Any]
 
     @abstractmethod
-    def record(self) -> dict[str, Any]:
-        """JSON values that `restore` needs beside tensors and metadata."""
+    def _record(self) -> dict[str, Any]:
+        """JSON values that `_restore` needs beside tensors and metadata."""
 
-    def tensors(self) -> dict[str, Tensor]:
+    def _tensors(self) -> dict[str, Tensor]:
         """Tensors that are kept."""
         return self.state_dict()
 
     @classmethod
     @abstractmethod
-    def restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """The module from what was kept; an error of any kind where something is missing or does not fit."""
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the model to a safetensors file with its metadata as JSON in the header, whole or not at all."""
         from semfov import __version__
 
-        record = {"kind": self.kind, "version": __version__, **self.record(), "metadata": self.metadata}
-        write(path, self.tensors(), record)
+        record = {"kind": self.kind, "version": __version__, **self._record(), "metadata": self.metadata}
+        write(path, self._tensors(), record)
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:
@@ -58,7 +58,7 @@ class Pretrained(nn.Module):
         path = find(name_or_path, cls.shipped, cls.title)
         tensors, record = read(path, cls.kind)
         try:
-            model = cls.restore(record, tensors)
+            model = cls._restore(record, tensors)
         except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, InputError) as error:
             raise DataError(f"{path}: not a complete {cls.title} ({error})") from None
         return model.eval()

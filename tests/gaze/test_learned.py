@@ -130,7 +130,7 @@ def test_save_and_load(tmp_path, belief, visited):
     assert again.metadata == gaze.metadata
     assert again.observer(3).tempering == 0.5
     assert torch.equal(again.double()(belief, visited, 1, COLUMNS), gaze.double()(belief, visited, 1, COLUMNS))
-    with pytest.raises(InputError, match="learned gaze policy was fitted for .d."):
+    with pytest.raises(InputError, match="learned gaze policy was fitted for 'd'"):
         again.check_compatible({"detector": {"name": "d", "digest": "y"}, "sensor": {}})
     (tmp_path / "g.safetensors").write_bytes(b"no")
     with pytest.raises(DataError, match="readable"):
