@@ -16,6 +16,7 @@ from eval.report import (
     curves_csv,
     milliseconds_per_decision,
     save_figure,
+    sensing,
     table,
     write_files,
 )
@@ -94,6 +95,6 @@ def draw_curves(run: ExploreRun, curves: dict[str, Curve], answer: str) -> Path:
     figure = plot_success_rate(
         {name: curve.mean for name, curve in curves.items()},
         {name: curve.over_images for name, curve in curves.items()},
-        title=f"Exploration, {run.eye.detector.name}, fovea {run.config.sensor.sigma:g} px, background {background}",
+        title=f"Exploration, {sensing(run)}, background {background}",
     )
     return save_figure(figure, run.config.out / f"success_rate_{answer}.png")

@@ -249,6 +249,12 @@ def commit() -> str | None:
         return None
 
 
+def sensing(run: Run) -> str:
+    """Detector and sensor of a run, for titles."""
+    sensor = run.config.sensor
+    return f"{run.eye.detector.name}, fovea {sensor.sigma:g} px, growth {sensor.growth:g}"
+
+
 def save_figure(figure: Any, path: Path) -> Path:
     """Save a matplotlib figure atomically."""
     with replacing(path) as temporary:

@@ -22,6 +22,7 @@ from eval.report import (
     curves_csv,
     milliseconds_per_decision,
     save_figure,
+    sensing,
     table,
     write_files,
 )
@@ -119,7 +120,7 @@ def draw_curves(run: SearchRun, curves: dict[str, Curve], expected: Array) -> Pa
     figure = plot_cumulative_performance(
         {**{name: curve.mean for name, curve in curves.items()}, "random, by formula": expected},
         {name: curve.over_images for name, curve in curves.items()},
-        title=f"Visual search, {run.eye.detector.name}, fovea {run.config.sensor.sigma:g} px",
+        title=f"Visual search, {sensing(run)}",
     )
     return save_figure(figure, run.config.out / "cumulative_performance.png")
 
