@@ -64,7 +64,7 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     >>> pyrdown(torch.rand(1, 3, 48, 65)).shape, pyrdown(torch.rand(1, 3, 48, 65), "opencv").shape
     (torch.Size([1, 3, 24, 32]), torch.Size([1, 3, 24, 33]))
     """
-    check_shape(image, "image", None, None, None, None)
+    _check_image(image)
     lookup(convention, get_args(Convention), "pyramid convention")
     down, across = (_reducing(count, convention, image.dtype, image.device) for count in image.shape[-2:])
     return separable(image, down, across)
@@ -84,7 +84,7 @@ def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia
     Returns:
         `(B, C, *size)`.
     """
-    check_shape(image, "image", None, None, None, None)
+    _check_image(image)
     lookup(convention, get_args(Convention), "pyramid convention")
     if convention == "opencv":
         for count, length in zip(image.shape[-2:], size, strict=True):
@@ -108,7 +108,7 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
     ([(64, 48), (32, 24), (16, 12)], (8, 6))
     """
     check(levels >= 0, "levels", "0 or more", levels)
-    check_shape(image, "image", None, None, None, None)
+    _check_image(image)
     check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
     details = []
     for _ in range(levels):
@@ -119,6 +119,12 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
         details.append(image - expanded if fresh else torch.sub(image, expanded, out=expanded))
         image = smaller
     return Bands(tuple(details), image, convention)
+
+
+def _check_image(image: Tensor) -> None:
+    """Raise `InputError` unless `image` is `(B, C, H, W)` of floating-point numbers."""
+    check_shape(image, "image", None, None, None, None)
+    check(image.is_floating_point(), "image", "floating-point numbers", image.dtype)
 
 
 @constant

@@ -179,6 +179,9 @@ def test_bad_input():
         pyrdown(torch.rand(4, 4))
     with pytest.raises(InputError, match="image"):
         pyrup(torch.rand(3, 4, 4), (8, 8))
+    for call in (pyrdown, lambda image: pyrup(image, (8, 8)), lambda image: laplacian_pyramid(image, 1)):
+        with pytest.raises(InputError, match="image: expected floating-point numbers, got"):
+            call(torch.zeros(1, 3, 4, 4, dtype=torch.uint8))
     with pytest.raises(InputError, match="convention 'openvc'; did you mean 'opencv'"):
         pyrdown(torch.rand(1, 1, 4, 4), "openvc")
     with pytest.raises(InputError, match="convention"):

@@ -80,4 +80,4 @@ def _enlarging(count: int, length: int, dtype: torch.dtype, device: torch.device
     ratio, rest = divmod(length, count)
     # Where the ratio is no whole number the tiles would not be evenly spaced.
     shift = count if rest else max(_TILE // ratio, 1)
-    return banded(taps, count, shift * ratio, shift, 2, dtype, device)
+    return banded(taps, count, length if rest else shift * ratio, shift, 2, dtype, device)

@@ -76,6 +76,14 @@ def test_blur_in_tiles_compiles_and_vectorises() -> None:
     torch.testing.assert_close(torch.func.vmap(run)(image[:, None])[:, 0], run(image))
 
 
+@pytest.mark.parametrize(("size", "length"), [((200, 170), (90, 61)), ((190, 40), (63, 41)), ((300, 200), (450, 199))])
+def test_other_sizes_are_opencvs(size: tuple[int, int], length: tuple[int, int], dtype: torch.dtype) -> None:
+    image = torch.rand(size, dtype=dtype)
+    expected = cv2.resize(image.double().numpy(), length[::-1], interpolation=cv2.INTER_CUBIC)
+    # OpenCV's weights are in single precision.
+    np.testing.assert_allclose(enlarge(image, length).numpy(), expected, atol=2e-5)
+
+
 @pytest.mark.parametrize(
     ("size", "factors"), [((60, 90), (2, 4)), ((30, 21), (16, 8)), ((100, 61), (3, 7)), ((80, 170), (3, 1))]
 )
