@@ -36,6 +36,7 @@ def test_target_evidence(path):
     model = semfov.TargetEvidence.from_pretrained(path.stem)
     assert path.stat().st_size < 100_000
     assert model.metadata["detector"]["name"] == path.stem
+    assert "/" not in json.dumps(model.metadata)
     grid = semfov.Grid(10, 10, (640, 480))
     box = torch.tensor([[[300.0, 200.0, 360.0, 260.0]]])
     scores = torch.full((1, 1, 81), 0.001)

@@ -120,7 +120,7 @@ def fit_context(config: FitContextConfig) -> None:
     judged = judge(prior, [place for place, out in zip(places, held_out, strict=True) if out], config.min_objects)
     weights = dict.fromkeys(("evidence", "map"), (1.0, 1.0))
     metadata: dict[str, object] = {"data": scenes.fingerprint, "training": plain(asdict(config))}
-    for part in ("out", "cache", "workers", "data", *(() if config.weigh else ("detector", "sensor"))):
+    for part in ("out", "cache", "workers", "data", "detector", "sensor"):
         metadata["training"].pop(part)
     if sampler is not None and samples is not None:
         usable = [index for index, out in enumerate(held_out) if not out]
@@ -128,8 +128,6 @@ def fit_context(config: FitContextConfig) -> None:
         for kind in weights:
             weights[kind] = fit_weights(make_cases(kind, sampler, samples, folds, places, config))
         metadata |= {"detector": sampler.eye.settings()["detector"], "sensor": sampler.eye.settings()["sensor"]}
-    for part in ("weights", "cfg"):
-        metadata["training"].get("detector", {}).pop(part, None)
     model = ContextPrior(
         scenes.classes, prior.place, prior.cooccurrence, config.edges, weights=weights, metadata=metadata
     )

@@ -118,7 +118,8 @@ def fit_gaze(config: FitGazeConfig) -> None:
     if not trained_on:
         raise DataError(f"data: too few photographs to train and to judge by ({len(scenes)})")
     metadata = {**eye.settings(), "data": scenes.fingerprint, "training": plain(asdict(config))}
-    for place in ("out", "data", "save_every", "judged"):
+    # Detector and sensor are told by what they are, not by where their files lie.
+    for place in ("out", "data", "save_every", "judged", "detector", "sensor"):
         metadata["training"].pop(place)
     start, width = first_model(config, metadata), float(eye.sensor.sigma)
     judged = {"start": judge(config, start, eye, scenes, held_out, "judging the start")}

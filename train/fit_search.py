@@ -93,7 +93,8 @@ def fit_search(config: FitSearchConfig) -> None:
     if held_out.all() or not held_out.any():
         raise DataError(f"data: too few examples to train and to judge by ({len(examples)}); give more photographs")
     metadata = {**sampler.eye.settings(), "data": sampler.scenes.fingerprint, "training": plain(asdict(config))}
-    for place in ("out", "cache", "workers", "data"):
+    # Detector and sensor are told by what they are, not by where their files lie.
+    for place in ("out", "cache", "workers", "data", "detector", "sensor"):
         metadata["training"].pop(place)
     model, judged = train(config, examples[~held_out], examples[held_out], metadata)
     path = config.out / f"{config.name or sampler.eye.detector.name}.safetensors"
