@@ -21,10 +21,9 @@ from eval.command import run_command
 from eval.config import DataConfig, DetectorConfig, SensorConfig
 from eval.parallel import rank
 from eval.report import save_figure, table
-from eval.samples import Sampler, Samples, SampleSettings, collect
-from eval.setup import plain
+from eval.samples import Samples, SampleSettings, collect
+from eval.setup import make_observation, plain
 from semfov.files import write_text
-from semfov.observation.compatibility import recommended
 from semfov.viz import plot_reliability
 
 
@@ -36,7 +35,7 @@ class CalibrationConfig:
         data: photographs to judge on, all of them by default.
         detector: which detector looks through the fovea.
         sensor: the foveal sensor.
-        model: fitted observation model, by name or file (None: the one shipped for the detector).
+        model: fitted observation model, by name or file (None: the one shipped for the detector and growth).
         fixations: random fixations in each photograph.
         iou: overlap from which a detection shows an object.
         seed: of the fixations.
@@ -63,7 +62,7 @@ def judge(config: CalibrationConfig) -> None:
     sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
     if rank() > 0:
         return
-    model = load_model(config, sampler)
+    model = make_observation(config.model, sampler.eye)
     with torch.inference_mode():
         calibrated = model.calibrate(samples.scores, samples.distance)
     predictions = {"raw": samples.scores, "calibrated": calibrated}
@@ -75,14 +74,6 @@ def judge(config: CalibrationConfig) -> None:
     written = [config.out / "calibration.md", config.out / "config.yaml"]
     written.append(save_figure(figure, config.out / "reliability.png"))
     print("written:", *(f"  {path}" for path in written), sep="\n")
-
-
-def load_model(config: CalibrationConfig, sampler: Sampler) -> semfov.FovealObservationModel:
-    """The observation model, checked against the detector and the sensor."""
-    name = config.model or recommended(sampler.eye.detector.name, config.sensor.growth)
-    model = semfov.FovealObservationModel.from_pretrained(name)
-    model.check_compatible(sampler.eye.settings(), sampler.eye.detector.classes)
-    return model
 
 
 def calibration_table(

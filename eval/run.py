@@ -61,7 +61,8 @@ class Run(ABC):
         self.scenes: Scenes = make_scenes(config.data, self.eye.detector.classes)
         if not len(self.scenes):
             raise DataError("data: no scene passes the selection; lower data.min_instances or raise data.limit")
-        self.model = make_observation(config, self.eye) if needs_model(config.policies, self.kind) else None
+        needed = needs_model(config.policies, self.kind)
+        self.model = make_observation(config.belief.model, self.eye) if needed else None
         self.target = make_target_evidence(config, self.eye) if needs_target(config.policies, self.kind) else None
         self.context = make_context(config, self.eye) if needs_context(config.policies, config.belief) else None
         self.gaze = make_learned_gaze(config, self.eye) if LEARNED in config.policies else None

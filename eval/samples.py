@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -103,6 +104,11 @@ class SampleSettings:
     iou: float
     seed: int
     shard: int = 32
+
+    @classmethod
+    def of(cls, config: Any) -> SampleSettings:
+        """Those of a command, whose settings have the same names."""
+        return cls(**{field.name: getattr(config, field.name) for field in fields(cls)})
 
 
 class Sampler:

@@ -86,10 +86,9 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
     return Eye(foveation, model, reference=sensor.reference).eval().requires_grad_(False)
 
 
-def make_observation(config: RunConfig, eye: Eye) -> semfov.FovealObservationModel:
-    """The observation model, checked to belong to this detector, background policy and class list."""
-    name = config.belief.model or recommended(eye.detector.name, config.sensor.growth)
-    model = semfov.FovealObservationModel.from_pretrained(name)
+def make_observation(name: str | None, eye: Eye) -> semfov.FovealObservationModel:
+    """The observation model of that name, or the one for this eye; checked to belong to detector and class list."""
+    model = semfov.FovealObservationModel.from_pretrained(name or recommended(eye.detector.name, eye.sensor.growth))
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)
 

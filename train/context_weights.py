@@ -12,9 +12,11 @@ from tqdm import tqdm
 
 from eval.protocol import generator_for
 from eval.samples import Sampler, Samples
-from semfov import Detections
+from semfov.agent import probability
 from semfov.belief import ContextPrior, Observer, SemanticObserver, TargetEvidence, TargetObserver
 from semfov.belief.context import presence_of
+from semfov.belief.context_observer import log_odds
+from semfov.gaze.selection import best_cells
 
 if TYPE_CHECKING:
     from train.fit_context import FitContextConfig, Places
@@ -60,15 +62,12 @@ def make_cases(
     observer: Observer = SemanticObserver(len(sampler.scenes.classes) + 1, tempering=0.25, footprint="box_centre")
     if kind == "evidence":
         observer = TargetObserver(TargetEvidence.from_pretrained(sampler.eye.detector.name).requires_grad_(False))
-    counts = torch.bincount(samples.look, minlength=len(samples.scenes)).tolist()
-    boxes, scores = samples.boxes.split(counts), samples.scores.split(counts)
     work = [(prior, index) for prior, part in folds for index in part]
     parts = []
     for prior, index in tqdm(work, desc=f"context beside {kind}", unit="scene", dynamic_ncols=True):
         place = places[index]
-        rows = range(index * config.fixations, (index + 1) * config.fixations)
-        seen = Detections.stack([_detections(boxes[row], scores[row]) for row in rows])
-        fixations = samples.fixations[rows.start : rows.stop]
+        looks = slice(index * config.fixations, (index + 1) * config.fixations)
+        seen, fixations = samples.seen(looks), samples.fixations[looks]
         presence, cells = presence_of(seen, place.grid), place.grid.cell_of(fixations)
         for target in place.targets:
             goal = place.occupied[:, target]
@@ -82,12 +81,11 @@ def make_cases(
             said = observer.weigh(seen, fixations, place.grid, target)
             for look in used.split(1):
                 belief = observer.update(belief, said[look])
-            component = int(observer.component(target))
-            probability = belief.beta[0, :, component] / belief.beta[0].sum(-1)
+            present = probability(belief.beta[0], int(observer.component(target)))
             shown = presence[used].amax(0, keepdim=True)
             alone = [prior(shown, place.grid, target, weights)[0] for weights in ((1.0, 0.0), (0.0, 1.0))]
             visited = torch.zeros(len(place.grid), dtype=torch.bool).scatter(0, cells[used], True)
-            parts.append((probability.logit(eps=1e-6), *alone, goal, visited))
+            parts.append((log_odds(present), *alone, goal, visited))
     return Cases(*(torch.stack(column) for column in zip(*parts, strict=True)))
 
 
@@ -130,10 +128,7 @@ def likeliest_weights(cases: Cases) -> tuple[float, float]:
 
 def landed(cases: Cases, place: float, company: float) -> float:
     """How often the most probable cell not visited holds the target, ties broken at random (`select_fixation`)."""
-    value = cases.log_odds + place * cases.place + company * cases.company
-    value = value.masked_fill(cases.visited, -torch.inf)
-    best = value.amax(-1, keepdim=True)
-    tied = value >= best - 1e-6 * best.abs()
+    tied = best_cells(cases.log_odds + place * cases.place + company * cases.company, cases.visited)
     return float(((tied & cases.goal).sum(-1) / tied.sum(-1)).mean())
 
 
@@ -142,7 +137,3 @@ def hit(cases: Cases, gamma: Tensor, place: Tensor, company: Tensor) -> Tensor:
     value = gamma * cases.log_odds + place * cases.place + company * cases.company
     value = value.masked_fill(cases.visited, -torch.inf)
     return (value.masked_fill(~cases.goal, -torch.inf).logsumexp(-1) - value.logsumexp(-1)).mean()
-
-
-def _detections(boxes: Tensor, scores: Tensor) -> Detections:
-    return Detections(boxes[None], scores[None], torch.ones(1, len(boxes), dtype=torch.bool))

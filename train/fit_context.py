@@ -12,7 +12,7 @@ Use it with `--policies target-evidence+context --belief.context_model runs/fit_
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -23,7 +23,7 @@ from eval.config import DataConfig, DetectorConfig, SensorConfig
 from eval.parallel import rank
 from eval.report import table
 from eval.samples import SampleSettings, collect
-from eval.setup import make_scenes, plain
+from eval.setup import make_scenes
 from semfov import Grid
 from semfov.belief import ContextPrior
 from semfov.belief.context import reaches
@@ -31,7 +31,7 @@ from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.errors import DataError, check
 from train.context_weights import fit_weights, make_cases
-from train.outputs import write_outputs
+from train.outputs import training_of, write_outputs
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def fit_context(config: FitContextConfig) -> None:
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     sampler, samples, scenes = None, None, None
     if config.weigh:
-        settings = SampleSettings(**{f.name: getattr(config, f.name) for f in fields(SampleSettings)})
+        settings = SampleSettings.of(config)
         sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
         scenes = sampler.scenes
     if rank() > 0:
@@ -119,15 +119,13 @@ def fit_context(config: FitContextConfig) -> None:
     prior = fit(known, scenes.classes, config)
     judged = judge(prior, [place for place, out in zip(places, held_out, strict=True) if out], config.min_objects)
     weights = dict.fromkeys(("evidence", "map"), (1.0, 1.0))
-    metadata: dict[str, object] = {"data": scenes.fingerprint, "training": plain(asdict(config))}
-    for part in ("out", "cache", "workers", "data", "detector", "sensor"):
-        metadata["training"].pop(part)
+    metadata = training_of(config, scenes)
     if sampler is not None and samples is not None:
         usable = [index for index, out in enumerate(held_out) if not out]
         folds = cross_fit(places, usable, scenes.classes, config)
         for kind in weights:
             weights[kind] = fit_weights(make_cases(kind, sampler, samples, folds, places, config))
-        metadata |= {"detector": sampler.eye.settings()["detector"], "sensor": sampler.eye.settings()["sensor"]}
+        metadata |= sampler.eye.settings()
     model = ContextPrior(
         scenes.classes, prior.place, prior.cooccurrence, config.edges, weights=weights, metadata=metadata
     )

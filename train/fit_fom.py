@@ -13,7 +13,6 @@ more machines share the work under `torchrun`. Use the model with `--belief.mode
 import sys
 import warnings
 from collections.abc import Sequence
-from dataclasses import fields
 
 import semfov
 from eval.command import run_command
@@ -29,10 +28,8 @@ from train.report import write_report
 def fit_fom(config: FitConfig) -> None:
     """Collect labelled detections, fit the model, judge it on held-out photographs, and write everything."""
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
-    names = [field.name for field in fields(SampleSettings)]
-    settings = SampleSettings(**{name: getattr(config, name) for name in names})
-    folder = (config.cache or config.out) / "samples"
-    sampler, samples = collect(settings, folder, config.workers, "looking")
+    settings = SampleSettings.of(config)
+    sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
     if rank() > 0:
         return
     held_out = samples.scene % config.holdout == 0

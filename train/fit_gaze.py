@@ -22,7 +22,7 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -33,14 +33,14 @@ from eval.command import run_command
 from eval.config import DataConfig, DetectorConfig, SensorConfig
 from eval.protocol import generator_for
 from eval.report import table
-from eval.setup import make_eye, make_scenes, plain, prepare_worker
+from eval.setup import make_eye, make_scenes, prepare_worker
 from semfov import Eye
 from semfov.data.scene import Scenes
 from semfov.errors import DataError, check
 from semfov.gaze.learned import LearnedGaze
 from semfov.observation import storage
 from train.gaze_episodes import Relaxation, backpropagate, draw_searches, found_at
-from train.outputs import write_outputs
+from train.outputs import training_of, write_outputs
 
 _CHECKPOINT = "gaze-checkpoint"
 
@@ -117,10 +117,7 @@ def fit_gaze(config: FitGazeConfig) -> None:
     trained_on = [index for index in range(len(scenes)) if index % config.holdout]
     if not trained_on:
         raise DataError(f"data: too few photographs to train and to judge by ({len(scenes)})")
-    metadata = {**eye.settings(), "data": scenes.fingerprint, "training": plain(asdict(config))}
-    # Detector and sensor are told by what they are, not by where their files lie.
-    for place in ("out", "data", "save_every", "judged", "detector", "sensor"):
-        metadata["training"].pop(place)
+    metadata = {**eye.settings(), **training_of(config, scenes, "save_every", "judged")}
     start, width = first_model(config, metadata), float(eye.sensor.sigma)
     judged = {"start": judge(config, start, eye, scenes, held_out, "judging the start")}
     eye.sensor.log_sigma.requires_grad_(config.learn_sigma)

@@ -14,7 +14,7 @@ Use it with `--policies target-evidence --belief.target_model runs/fit_search/<n
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -27,10 +27,9 @@ from eval.config import DataConfig, DetectorConfig, SensorConfig
 from eval.parallel import rank
 from eval.report import table
 from eval.samples import SampleSettings, collect
-from eval.setup import plain
 from semfov.belief import TargetEvidence
 from semfov.errors import DataError, check
-from train.outputs import write_outputs
+from train.outputs import training_of, write_outputs
 from train.search_examples import Examples, make_examples
 
 
@@ -84,7 +83,7 @@ class FitSearchConfig:
 def fit_search(config: FitSearchConfig) -> None:
     """Collect looks, train, judge on held-out photographs, and write everything."""
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
-    settings = SampleSettings(**{f.name: getattr(config, f.name) for f in fields(SampleSettings)})
+    settings = SampleSettings.of(config)
     sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
     if rank() > 0:
         return
@@ -92,10 +91,7 @@ def fit_search(config: FitSearchConfig) -> None:
     held_out = examples.scene % config.holdout == 0
     if held_out.all() or not held_out.any():
         raise DataError(f"data: too few examples to train and to judge by ({len(examples)}); give more photographs")
-    metadata = {**sampler.eye.settings(), "data": sampler.scenes.fingerprint, "training": plain(asdict(config))}
-    # Detector and sensor are told by what they are, not by where their files lie.
-    for place in ("out", "cache", "workers", "data", "detector", "sensor"):
-        metadata["training"].pop(place)
+    metadata = {**sampler.eye.settings(), **training_of(config, sampler.scenes)}
     model, judged = train(config, examples[~held_out], examples[held_out], metadata)
     path = config.out / f"{config.name or sampler.eye.detector.name}.safetensors"
     model.save(path)

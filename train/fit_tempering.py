@@ -14,7 +14,7 @@ Use it with `--belief.tempering τ`, or a policy's ending `+tempered`, which is 
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -26,12 +26,12 @@ from eval.config import DataConfig, DetectorConfig, SensorConfig
 from eval.parallel import rank
 from eval.report import table
 from eval.samples import Sampler, Samples, SampleSettings, collect
+from eval.setup import make_observation
 from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief import SemanticObserver
 from semfov.belief.grid import Footprint
 from semfov.data.scene import legal_targets
 from semfov.errors import DataError, check
-from semfov.observation.compatibility import recommended
 from train.outputs import write_outputs
 
 
@@ -86,16 +86,11 @@ def fit_tempering(config: FitTemperingConfig) -> None:
     """Collect looks, try every exponent, and write the report."""
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     check(len(config.exponents) > 0, "exponents", "at least one value", "none")
-    settings = SampleSettings(**{f.name: getattr(config, f.name) for f in fields(SampleSettings)})
+    settings = SampleSettings.of(config)
     sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
     if rank() > 0:
         return
-    model = None
-    if config.calibrated:
-        name = recommended(sampler.eye.detector.name, config.sensor.growth)
-        model = FovealObservationModel.from_pretrained(name)
-        model.check_compatible(sampler.eye.settings(), sampler.eye.detector.classes)
-        model.requires_grad_(False)
+    model = make_observation(None, sampler.eye) if config.calibrated else None
     hits = {tempering: measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
     text = report(hits)
     write_outputs(config, text, ("hits.json", json.dumps(hits, indent=2) + "\n"))

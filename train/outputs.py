@@ -1,4 +1,4 @@
-"""What every fit leaves besides its model: a report, the settings, and the figures of the report."""
+"""What every fit leaves: what the model says of its training, a report, the settings, and the report's figures."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -7,7 +7,23 @@ from typing import Any
 import yaml
 
 from eval.setup import plain
+from semfov.data.scene import Scenes
 from semfov.files import write_text
+
+
+def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
+    """What a model keeps of its training: the photographs, and the settings that it depends on.
+
+    Detector and sensor are not among them, nor where files lie: they are told by `Eye.settings()`.
+
+    Args:
+        config: dataclass of the settings.
+        scenes: the photographs.
+        besides: further settings that the model does not depend on.
+    """
+    left_out = {"out", "cache", "workers", "data", "detector", "sensor", *besides}
+    settings = {name: value for name, value in plain(asdict(config)).items() if name not in left_out}
+    return {"data": scenes.fingerprint, "training": settings}
 
 
 def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Path | None = None) -> None:

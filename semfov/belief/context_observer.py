@@ -13,8 +13,6 @@ from semfov.belief.state import Belief
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
 
-_CERTAIN = 1e-6  # log odds stay finite
-
 
 @dataclass(frozen=True)
 class ContextLook:
@@ -104,9 +102,14 @@ class ContextObserver:
         chosen = component[:, None, None].expand(*inner.beta.shape[:-1], 1)
         probability = inner.beta.gather(-1, chosen)[..., 0] / inner.beta.sum(-1)
         context = self.prior(presence, evidence.grid, evidence.target, self.weights)
-        present = (probability.logit(eps=_CERTAIN) + context).sigmoid()
+        present = (log_odds(probability) + context).sigmoid()
         return ContextBelief(torch.stack([1 - present, present], -1), inner.closest, inner, presence)
 
     def component(self, target: int | Tensor) -> int | Tensor:
         """Presence, whatever the target."""
         return 1 if isinstance(target, int) else torch.ones_like(target)
+
+
+def log_odds(probability: Tensor) -> Tensor:
+    """What context is added to: the logit, kept finite."""
+    return probability.logit(eps=1e-6)

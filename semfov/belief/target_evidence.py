@@ -12,13 +12,12 @@ from semfov.belief.grid import Grid
 from semfov.belief.look_features import FEATURES, look_features
 from semfov.detection.detections import Detections
 from semfov.errors import check_shape
-from semfov.observation import compatibility
-from semfov.observation.pretrained import Pretrained
+from semfov.observation.pretrained import PretrainedForEye
 
 _READOUT = 11
 
 
-class TargetEvidence(Pretrained):
+class TargetEvidence(PretrainedForEye):
     r"""Log odds that a cell holds the target, learned from looks at photographs with boxes.
 
     Kaplan's rule multiplies looks as if they were independent. Looks at a static scene are not: a blurred, wrong
@@ -93,15 +92,6 @@ class TargetEvidence(Pretrained):
         ]
         value: Tensor = self.read(torch.stack(inputs, -1))
         return nearest + value[..., 0]
-
-    def check_compatible(self, settings: Mapping[str, Any]) -> None:
-        """Raise `InputError` beside another detector than it was trained for, warn of other settings.
-
-        Args:
-            settings: `Eye.settings()`.
-        """
-        compatibility.check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
-        compatibility.check_sensor(self.metadata.get("sensor", {}), settings["sensor"], self.title)
 
     def _record(self) -> dict[str, Any]:
         """Widths of both networks."""

@@ -13,13 +13,12 @@ from semfov.belief.observer import SemanticObserver
 from semfov.belief.state import Belief
 from semfov.errors import InputError
 from semfov.gaze.acquisition.search import pick
-from semfov.observation import compatibility
-from semfov.observation.pretrained import Pretrained
+from semfov.observation.pretrained import PretrainedForEye
 
 FEATURES = 12
 
 
-class LearnedGaze(Pretrained):
+class LearnedGaze(PretrainedForEye):
     r"""Where to look next for a target, learned by backpropagation through whole searches (`train.fit_gaze`).
 
     .. math:: \ell(x) = s \ln p_t(x) + h(\psi)(x), \qquad f = \arg\max_{x \notin \mathcal V} \ell(x)
@@ -78,15 +77,6 @@ class LearnedGaze(Pretrained):
     def observer(self, components: int) -> SemanticObserver:
         """The belief that it was trained behind, for so many classes, background included."""
         return SemanticObserver(components, **self.belief)
-
-    def check_compatible(self, settings: Mapping[str, Any]) -> None:
-        """Raise `InputError` beside another detector than it was trained for, warn of other settings.
-
-        Args:
-            settings: `Eye.settings()`.
-        """
-        compatibility.check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
-        compatibility.check_sensor(self.metadata.get("sensor", {}), settings["sensor"], self.title)
 
     def _record(self) -> dict[str, Any]:
         """Width of the network, and the belief that it reads."""

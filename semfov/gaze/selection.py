@@ -32,8 +32,12 @@ def select_fixation(values: Tensor, visited: Tensor, noise: Tensor, *, tolerance
     if values_known():
         unusable = torch.isnan(values) & ~visited
         check(not bool(unusable.any()), "values", "numbers", "NaN for a cell that is not visited")
+    choice = torch.where(best_cells(values, visited, tolerance), noise, -1.0).argmax(-1)
+    return torch.where(visited.all(-1), -1, choice)
+
+
+def best_cells(values: Tensor, visited: Tensor, tolerance: float = 1e-6) -> Tensor:
+    """The cells that are tied for the highest value among those not visited, `(B, X·Y)`; see `select_fixation`."""
     open_values = values.masked_fill(visited, -torch.inf)
     best = open_values.amax(-1, keepdim=True)
-    tied = (open_values >= best - tolerance * best.abs()) & ~visited
-    choice = torch.where(tied, noise, -1.0).argmax(-1)
-    return torch.where(visited.all(-1), -1, choice)
+    return (open_values >= best - tolerance * best.abs()) & ~visited

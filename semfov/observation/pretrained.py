@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 from torch import Tensor, nn
 
 from semfov.errors import DataError, InputError
+from semfov.observation.compatibility import check_detector, check_sensor
 from semfov.observation.storage import find, read, write
 
 
@@ -62,3 +63,16 @@ class Pretrained(nn.Module):
         except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, InputError) as error:
             raise DataError(f"{path}: not a complete {cls.title} ({error})") from None
         return model.eval()
+
+
+class PretrainedForEye(Pretrained):
+    """Base of the models that are trained behind one eye, whose `metadata` tells `detector` and `sensor`."""
+
+    def check_compatible(self, settings: Mapping[str, Any]) -> None:
+        """Raise `InputError` beside another detector than it was trained for, warn of other settings.
+
+        Args:
+            settings: `Eye.settings()`.
+        """
+        check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
+        check_sensor(self.metadata.get("sensor", {}), settings["sensor"], self.title)
