@@ -46,7 +46,7 @@ class Eye(nn.Module):
     Args:
         sensor: the foveal sensor; its σ is in pixels of an image whose longer side is `reference`.
         detector: any detector.
-        reference: longer side, in pixels, that σ is meant for (the paper's σ = 100 and 50 are for 640).
+        reference: longer side, in pixels, that σ is meant for (those of `semfov.sensor.SENSORS` are meant for 640).
     """
 
     def __init__(self, sensor: Foveation, detector: Detector, *, reference: float = 640.0) -> None:

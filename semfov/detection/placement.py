@@ -99,18 +99,4 @@ def resize(image: Tensor, size: tuple[int, int]) -> Tensor:
         return image.clone()
     if 2 * height < image.shape[-2] or 2 * width < image.shape[-1]:
         return F.interpolate(image, (height, width), mode="bilinear", align_corners=False, antialias=True)
-    return _interpolate(_interpolate(image, -2, height), -1, width)
-
-
-def _interpolate(image: Tensor, axis: int, length: int) -> Tensor:
-    """Linear interpolation along one axis.
-
-    `F.interpolate` without antialiasing gives other bits for another number of threads; this does not.
-    """
-    there = (torch.arange(length, dtype=torch.float64) + 0.5) * (image.shape[axis] / length) - 0.5
-    there = there.clamp(0, image.shape[axis] - 1)
-    left = there.floor()
-    right = (left + 1).clamp(max=image.shape[axis] - 1)
-    share = (there - left).to(image)
-    before, after = (image.index_select(axis, index.long().to(image.device)) for index in (left, right))
-    return torch.lerp(before, after, share[:, None] if axis == -2 else share)
+    return F.interpolate(image, (height, width), mode="bilinear", align_corners=False)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from semfov.errors import InputError, check_shape, lookup
 
-BackgroundPolicy = Literal["residual", "uniform", "none", "own"]
+BackgroundPolicy = Literal["residual", "normalised", "uniform", "none", "own"]
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,8 @@ def score_vectors(candidates: Candidates, policy: BackgroundPolicy = "residual")
     With class scores `c`, objectness `o` (or `o = max c` where the head has none) and `s_k = (1 - s_0) c_k / Σ c`:
 
     - `residual`: `s_0 = 1 - o`
+    - `normalised`: `1 - o` and `o c_k` (`c_k` where the head has no objectness), all divided by their sum, as Luzio,
+      Bernardino and Moreno (2024) have it in a footnote for scores that do not sum to 1
     - `uniform`: `s_0 = 1 / (K+1)`
     - `none`: `s_0 = 0`
     - `own`: `s_0` is the background probability that the head itself gives (heads with a softmax)
@@ -66,6 +68,11 @@ def score_vectors(candidates: Candidates, policy: BackgroundPolicy = "residual")
         background = candidates.background
     elif policy == "residual":
         background = 1 - (classes.amax(-1) if candidates.objectness is None else candidates.objectness)
+    elif policy == "normalised":
+        seen = classes.amax(-1) if candidates.objectness is None else candidates.objectness
+        sure = 1 if candidates.objectness is None else seen
+        # (1 - o) / (1 - o + o Σ c): the other scores then share what is left as those of every policy do.
+        background = (1 - seen) / (1 - seen + sure * classes.sum(-1)).clamp(min=torch.finfo(classes.dtype).tiny)
     elif policy == "uniform":
         background = torch.full_like(classes[..., 0], 1 / (classes.shape[-1] + 1))
     else:

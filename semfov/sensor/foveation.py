@@ -40,8 +40,8 @@ def foveate(
         sigma: width σ of the fovea in image pixels: a number, `()`, `(B,)`, or `(B, 2)` for widths along x and y.
             Infinity gives the image back.
         levels: number of bands, K.
-        growth: factor g by which the window of each coarser band is wider; 2 is the published sensor, 1 a sharp
-            disc.
+        growth: factor g by which the window of each coarser band is wider: with 1 all share one, with 2 acuity falls
+            off gradually (`semfov.sensor.SENSORS` names settings).
         convention: `kornia` or `opencv` (`semfov.sensor.pyramid`).
 
     Returns:
