@@ -7,8 +7,10 @@ import pytest
 import torch
 
 import semfov
-from semfov.belief import Belief, ContextPrior
+from semfov.agent import PUBLISHED_SENSORS
+from semfov.belief import ContextPrior, DirichletBelief
 from semfov.observation.compatibility import recommended
+from semfov.sensor import SENSORS
 
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
 TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
@@ -81,13 +83,13 @@ def test_learned_gaze():
         visited[0, 50] = True
         closest = (torch.arange(100) - 50.0).abs()[None] / 100
         with torch.no_grad():
-            assert gaze(Belief(beta, closest), visited, 7, 10).argmax() == cell
+            assert gaze(DirichletBelief(beta, closest), visited, 7, 10).argmax() == cell
 
 
 def test_both_kinds_exist_for_every_detector():
     names = {path.stem for path in TARGET}
     assert names == {"yolov3-tiny", "yolox-nano"}
-    kinds = ("", "-published", "-sharp", "-sharp-published")
+    kinds = ("", "-sharp", "-published", "-published-narrow")
     assert {path.stem for path in OBSERVATION} == {name + kind for name in names for kind in kinds}
 
 
@@ -98,6 +100,31 @@ def test_recommended_model_is_fitted_for_the_sensor(detector, growth):
     assert model.metadata["sensor"]["growth"] == growth
     assert model.metadata["detector"]["name"] == detector
     assert model.metadata["method"] == "discriminative"
+
+
+@pytest.mark.parametrize("sensor", PUBLISHED_SENSORS)
+@pytest.mark.parametrize("detector", ["yolov3-tiny", "yolox-nano"])
+def test_published_model_is_of_maximum_likelihood_for_the_named_sensor(detector, sensor):
+    model = semfov.FovealObservationModel.from_pretrained(f"{detector}-{sensor}")
+    fitted = model.metadata["sensor"]
+    assert (fitted["sigma"], fitted["growth"]) == pytest.approx((SENSORS[sensor]["sigma"], SENSORS[sensor]["growth"]))
+    assert model.metadata["method"] == "newton"
+    assert not model.log_prior.any()
+    assert float(model.tempering) == 1
+    torch.testing.assert_close(model.expected_scores(), model.alpha / model.alpha.sum(-1, keepdim=True))
+
+
+@pytest.mark.weights
+@pytest.mark.parametrize("sensor", PUBLISHED_SENSORS)
+def test_published_agent_searches_and_explores(sensor):
+    agent = semfov.ActivePerception.published("yolov3-tiny", sensor=sensor, search="non-predictive")
+    assert float(agent.eye.sensor.sigma) == pytest.approx(SENSORS[sensor]["sigma"])
+    assert agent.eye.sensor.growth == 1
+    scene = semfov.EmbeddedScenes(agent.eye.detector.classes, count=1)[0]
+    assert len(agent.search(scene.image, "person", start=0, shifts=2)) <= 3
+    assert len(agent.explore(scene.image, start=0, shifts=2)) == 3
+    with pytest.raises(semfov.InputError, match="published sensor 'gradual'"):
+        semfov.ActivePerception.published("yolov3-tiny", sensor="gradual")
 
 
 @pytest.mark.weights

@@ -16,7 +16,8 @@ class FitConfig:
         detector: which detector looks through the fovea.
         sensor: the foveal sensor.
         name: name of the model (None: the detector's).
-        method: `newton`, `fixed_point` (Minka) and `gradient` maximise the likelihood, as published;
+        method: `newton`, `fixed_point` (both Minka's; the paper does not say which) and `gradient` maximise the
+            likelihood, where `enough` lets them;
             `discriminative` trains the posterior of the class itself, which is what calibration needs.
         fixations: random fixations in each photograph.
         levels: levels of distance, each `width` wide and the last one open.
@@ -24,6 +25,8 @@ class FitConfig:
             with the fovea.
         minimum: objects that a level needs, or it takes the parameters of its inner neighbour (0: none does).
         shrinkage: detections of a class's other levels that a level is given, so that few do not decide.
+        enough: detections of a class at a level from which that cell is not shrunk, but fitted by maximum likelihood
+            alone, as published (None: all are shrunk).
         holdout: every n-th photograph is kept out of the fit and used to judge it.
         iou: overlap from which a detection shows an object.
         seed: of the fixations.
@@ -43,6 +46,7 @@ class FitConfig:
     width: float = 50.0
     minimum: int = 100
     shrinkage: float = 10.0
+    enough: int | None = None
     holdout: int = 10
     iou: float = 0.5
     seed: int = 0
@@ -54,5 +58,5 @@ class FitConfig:
     @property
     def edges(self) -> list[float]:
         """Borders between the levels, in longer sides of the image."""
-        step = self.width / 640.0 * self.sensor.sigma / 100.0 * 640.0 / self.sensor.reference
+        step = self.width / 100.0 * self.sensor.fovea
         return [step * n for n in range(1, self.levels)]

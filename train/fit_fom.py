@@ -57,7 +57,7 @@ def fit_model(config: FitConfig, sampler: Sampler, samples: Samples) -> semfov.F
 def published_model(
     config: FitConfig, sampler: Sampler, samples: Samples, method: str, **options: object
 ) -> semfov.FovealObservationModel:
-    """Dirichlets of maximum likelihood, as in the paper."""
+    """Dirichlets of maximum likelihood where a cell has enough detections, as published; others are shrunk."""
     classes = sampler.eye.detector.classes
     model = semfov.FovealObservationModel.identity(classes, config.edges)
     with warnings.catch_warnings():
@@ -68,6 +68,7 @@ def published_model(
             method=method,
             minimum=config.minimum,
             shrinkage=config.shrinkage,
+            enough=config.enough,
             **options,
             **sampler.eye.settings(),
             samples=len(samples),

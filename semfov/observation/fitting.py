@@ -14,7 +14,12 @@ UNIFORM = 1.0
 
 
 def fit_table(
-    statistics: DirichletStatistics, *, method: Method = "newton", shrinkage: float = 10.0, minimum: int = 100
+    statistics: DirichletStatistics,
+    *,
+    method: Method = "newton",
+    shrinkage: float = 10.0,
+    minimum: int = 100,
+    enough: int | None = None,
 ) -> tuple[Tensor, dict[int, int]]:
     r"""Maximum a posteriori α for every class and level, `(K+1, N, K+1)` in float64.
 
@@ -27,11 +32,15 @@ def fit_table(
     so that a class without samples gets the uniform density, and a cell without samples that of its class. A level
     with fewer than `minimum` objects in all takes the parameters of its inner neighbour.
 
+    Luzio, Bernardino and Moreno (2024, section III-C) maximise the likelihood alone, and do not say what becomes of
+    cells with few samples or none. Cells with `enough` get that maximum; how the others are filled is our choice.
+
     Args:
         statistics: of shape `(K+1, N)`, background first.
         method: of `semfov.dirichlet.mle`.
         shrinkage: pseudo-counts w.
         minimum: objects, background not counted, that a level needs.
+        enough: detections from which a cell is not shrunk, but fitted by maximum likelihood; None shrinks all.
 
     Returns:
         α, and the levels that fell back: level -> the level that its parameters are of. Level 0 has no inner
@@ -42,6 +51,9 @@ def fit_table(
     uniform = vacuous(statistics.components).to(statistics.count.device)
     parent = shrink(classes.mean_log, classes.count, uniform, UNIFORM)
     mean_log = shrink(statistics.mean_log, statistics.count, parent[:, None], shrinkage)
+    if enough is not None:
+        check(enough >= 2, "enough", "2 or more", enough)
+        mean_log = torch.where((statistics.count >= enough)[..., None], statistics.mean_log, mean_log)
     alpha = mle(mean_log, method=method, max_precision=MAX_PRECISION)
     fallback: dict[int, int] = {}
     for level, objects in enumerate(statistics.count[1:].sum(0).tolist()):

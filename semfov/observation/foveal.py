@@ -24,14 +24,16 @@ class FovealObservationModel(Pretrained):
 
     .. math:: p(S \mid C = k, d) = \mathrm{Dir}(S \mid \alpha_{k,d})
 
-    (Luzio, Bernardino and Moreno, 2024). The posterior that `calibrate` gives is
+    (Luzio, Bernardino and Moreno, 2024, section III-D, after Dias, Simões, Moreno and Bernardino, 2022.) The posterior
+    that `calibrate` gives is
 
     .. math:: P(C = k \mid S, d) \propto \mathrm{Dir}(S \mid \alpha_{k,d})^\tau \, \pi_{k,d}
 
-    With `τ = 1` and a uniform π, as `fit` leaves them, this is the published model. It is overconfident: the density
-    multiplies K+1 dimensions as if each were evidence of its own, though most scores are near zero together. A class
-    prior and τ < 1 help; `semfov.observation.fit_discriminative` trains α and π for the posterior itself, and is what
-    the recommended models use.
+    With `τ = 1` and a uniform π, as `fit` leaves them, these are the published calibrated scores (equation 11). They
+    are overconfident: the density multiplies K+1 dimensions as if each were evidence of its own, though most scores
+    are near zero together. A class prior and τ < 1 help; `semfov.observation.fit_discriminative` trains α and π for
+    the posterior itself, and is what the recommended models use. The paper prints neither the number of levels nor
+    their borders, nor what is done with scores of 0: `edges` and `epsilon` are our choice.
 
     The logit of a class is linear in the log scores, with weights `τ (α - 1)`. So `α_k = 1 + e_k` with all else
     uniform (`identity`) gives back the scores as they are.
@@ -132,7 +134,7 @@ class FovealObservationModel(Pretrained):
         return torch.bucketize(distance.to(self.edges).contiguous(), self.edges)
 
     def log_likelihood(self, scores: Tensor, distance: Tensor) -> Tensor:
-        """`ln Dir(S | α_{k,d})` for every class k, `(..., K+1)`.
+        """`ln Dir(S | α_{k,d})` for every class k, `(..., K+1)` (Luzio, Bernardino and Moreno, 2024, equation 9).
 
         Args:
             scores: `(..., K+1)`, points of the simplex; floored at `epsilon`.
@@ -154,22 +156,18 @@ class FovealObservationModel(Pretrained):
         return every.gather(-2, index).squeeze(-2).to(scores.dtype)
 
     def calibrate(self, scores: Tensor, distance: Tensor) -> Tensor:
-        """Calibrated scores, the posterior of the classes, `(..., K+1)`; arguments and errors as `log_likelihood`."""
+        """Calibrated scores, the posterior of the classes, `(..., K+1)`; arguments and errors as `log_likelihood`.
+
+        With a uniform prior they are proportional to the likelihoods, which is all that fusion needs.
+        """
         logits = self.log_likelihood(scores, distance) * self.tempering
         return (logits + F.embedding(self.level(distance), self.log_prior.t())).softmax(-1).to(scores.dtype)
 
-    def calibrate_levels(self, scores: Tensor) -> Tensor:
-        """`calibrate` for scores `(..., N, K+1)` whose row n is seen at level n, in N products instead of N²."""
-        components, levels = self.log_alpha.shape[:2]
-        check_shape(scores, "scores", levels, components)
-        weight, constant = self._linear()
-        log_scores = floor(scores, self.epsilon).log().to(weight.dtype)
-        every = torch.einsum("...nj,nkj->...nk", log_scores, weight.unflatten(0, (levels, components)))
-        offset = constant.unflatten(0, (levels, components)) * self.tempering + self.log_prior.t()
-        return (every * self.tempering + offset).softmax(-1).to(scores.dtype)
-
     def expected_scores(self) -> Tensor:
-        """Scores to expect of an object, `E[S | C = k, d]`, `(K+1, N, K+1)`."""
+        """Scores to expect of an object, `E[S | C = k, d]`, `(K+1, N, K+1)`.
+
+        Published is the mean of the Dirichlet, `α_kd / Σ_j α_kdj` (Luzio, Bernardino and Moreno, 2024, equation 16).
+        """
         return self.log_alpha.softmax(-1) if self.expected is None else self.expected
 
     def miss_likelihood(self, distance: Tensor) -> Tensor:
@@ -194,6 +192,7 @@ class FovealObservationModel(Pretrained):
         method: Method = "newton",
         shrinkage: float = 10.0,
         minimum: int = 100,
+        enough: int | None = None,
         prior: bool = False,
         tempering: float = 1.0,
         expected: Literal["dirichlet", "empirical"] = "dirichlet",
@@ -201,14 +200,16 @@ class FovealObservationModel(Pretrained):
     ) -> Self:
         """Set α to the maximum a posteriori under the statistics of a training set, and return the model itself.
 
-        See `semfov.observation.fitting.fit_table` for the estimate. A level with fewer than `minimum` objects takes
-        the parameters of its inner neighbour; a warning and `metadata["fallback"]` say so.
+        See `semfov.observation.fitting.fit_table` for the estimate, and for how it differs from the paper's. A level
+        with fewer than `minimum` objects takes the parameters of its inner neighbour; a warning and
+        `metadata["fallback"]` say so.
 
         Args:
             statistics: sums of the scores by class and level, of shape `(K+1, N)`.
             method: `newton`, `fixed_point` or `gradient` (`semfov.dirichlet.mle`).
             shrinkage: pseudo-counts that draw a cell to its class.
             minimum: objects, background not counted, that a level needs.
+            enough: detections from which a cell is fitted by maximum likelihood alone; None shrinks all cells.
             prior: take the frequencies of the classes as prior; False leaves it uniform, as published.
             tempering: exponent τ of the likelihood.
             expected: what `expected_scores` returns: the means of the fitted Dirichlets, as published, or those of
@@ -220,7 +221,7 @@ class FovealObservationModel(Pretrained):
         check(got == wanted, "statistics", f"shape and epsilon {wanted}", got)
         check(tempering > 0, "tempering", "a positive number", tempering)
         lookup(expected, ["dirichlet", "empirical"], "kind of expected scores")
-        alpha, fallback = fit_table(statistics, method=method, shrinkage=shrinkage, minimum=minimum)
+        alpha, fallback = fit_table(statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough)
         if fallback:
             told = ", ".join(f"level {n} as level {source}" for n, source in fallback.items() if n > 0)
             told += "; level 0 has no inner neighbour and rests on the classes' other levels" * (0 in fallback)
@@ -236,6 +237,7 @@ class FovealObservationModel(Pretrained):
             "method": method,
             "shrinkage": shrinkage,
             "minimum": minimum,
+            "enough": enough,
             "expected": expected,
             **metadata,
         }

@@ -1,14 +1,20 @@
-"""The observation model: likelihoods, calibration and fit against explicit Dirichlets; files; compatibility."""
+"""The observation model: likelihoods, calibration and fit against explicit Dirichlets; files; compatibility.
+
+Equations are those of Luzio, Bernardino and Moreno (2024), with the labels of the paper's source.
+"""
 
 import json
+import math
 import struct
 import warnings
 
 import numpy as np
 import pytest
+import scipy.optimize
 import scipy.stats
 import torch
 
+from semfov.belief.fusion import kaplan
 from semfov.errors import DataError, InputError
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
 from semfov.observation.compatibility import CONVERSIONS, check_detector
@@ -74,7 +80,34 @@ def test_large_parameters_keep_their_digits_in_single_precision():
     torch.testing.assert_close(got.double(), exact, rtol=0, atol=0.02)
 
 
-def test_calibration_is_bayes():
+def density_by_the_formula(scores, alpha):
+    """Equation 9 (eq:dirichlet) in scalars."""
+    powers = math.prod(s ** (a - 1) for s, a in zip(scores, alpha, strict=True))
+    return math.gamma(sum(alpha)) / math.prod(math.gamma(a) for a in alpha) * powers
+
+
+def test_calibrated_scores_are_those_of_equation_11():
+    """eq:corrected_scores: the densities of all classes at the box's distance, divided by their sum D."""
+    model, (scores, distance) = FovealObservationModel(table(), EDGES, CLASSES), looks()
+    got = model.calibrate(scores, distance).detach()
+    for i, j in np.ndindex(5, 7):
+        level = sum(float(distance[i, j]) > edge for edge in EDGES)
+        densities = [density_by_the_formula(scores[i, j].tolist(), table()[k, level].tolist()) for k in range(4)]
+        expected = [density / sum(densities) for density in densities]
+        np.testing.assert_allclose(got[i, j], expected, rtol=1e-9, atol=0)
+
+
+def test_kaplans_rule_does_not_need_the_sum_of_equation_11():
+    """Section III-D: "the normalization of the likelihoods is not ultimately relevant"."""
+    model, (scores, distance) = FovealObservationModel(table(), EDGES, CLASSES), looks()
+    beta = torch.full((4,), 0.5, dtype=torch.float64)
+    with torch.no_grad():
+        densities = model.log_likelihood(scores, distance).exp()
+        torch.testing.assert_close(kaplan(beta, model.calibrate(scores, distance)), kaplan(beta, densities))
+
+
+def test_calibration_with_a_prior_and_tempering_is_bayes():
+    """Beyond the paper, in which the prior is uniform and τ is 1."""
     alpha, scores, distance = table(), *looks()
     log_prior = torch.randn(4, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     model = FovealObservationModel(alpha, EDGES, CLASSES, log_prior=log_prior, tempering=0.3)
@@ -83,17 +116,6 @@ def test_calibration_is_bayes():
     joint = (0.3 * density + log_prior[:, level].movedim(0, -1)).exp()
     torch.testing.assert_close(model.calibrate(scores, distance), joint / joint.sum(-1, keepdim=True))
     torch.testing.assert_close(model(scores, distance), model.calibrate(scores, distance))
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_calibration_of_all_levels_at_once(dtype):
-    prior = torch.randn(4, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64).to(dtype)
-    model = FovealObservationModel(table(dtype), EDGES, CLASSES, log_prior=prior, tempering=0.6)
-    scores, _ = looks((2, 5, 3), dtype)
-    distance = torch.tensor([0.05, 0.2, 0.9], dtype=dtype).expand(2, 5, 3)
-    torch.testing.assert_close(model.calibrate_levels(scores), model.calibrate(scores, distance))
-    with pytest.raises(InputError, match="scores"):
-        model.calibrate_levels(scores[..., :2, :])
 
 
 def test_no_detections_are_calibrated_to_none():
@@ -125,9 +147,11 @@ def test_levels_are_those_of_the_edges():
     assert model.level(distance).tolist() == [0, 0, 1, 1, 2, 2]
 
 
-def test_expected_scores_are_the_means():
-    model = FovealObservationModel(table(), EDGES, CLASSES)
-    torch.testing.assert_close(model.expected_scores(), torch.distributions.Dirichlet(table()).mean)
+def test_expected_scores_are_the_means_of_equation_16():
+    """eq:expected_operator, its first factor: α_kd / Σ_j α_kdj."""
+    model, alpha = FovealObservationModel(table(), EDGES, CLASSES), table().tolist()
+    means = [[[a / sum(row) for a in row] for row in levels] for levels in alpha]
+    torch.testing.assert_close(model.expected_scores(), torch.tensor(means, dtype=torch.float64))
     given = torch.full((4, 3, 4), 0.25, dtype=torch.float64)
     fixed = FovealObservationModel(table(), EDGES, CLASSES, expected=given)
     assert torch.equal(fixed.expected_scores(), given)
@@ -232,6 +256,21 @@ def test_fit_recovers_the_dirichlets_of_much_data(method):
     assert float(model.log_prior.abs().max()) == 0
     reference = FovealObservationModel.identity(CLASSES, EDGES).fit(statistics)
     torch.testing.assert_close(model.alpha, reference.alpha, rtol=2e-6, atol=0)
+
+
+def test_without_shrinking_a_fit_is_the_maximum_of_the_likelihood():
+    """Section III-C, what the paper fits, against scipy's search for the maximum of equation 9's logarithm."""
+    rows = np.random.default_rng(6).dirichlet([2.0, 0.7, 4.0, 1.5], 60)
+    statistics = DirichletStatistics((4, 3), 4)
+    here = torch.ones(60, dtype=torch.int64)
+    statistics.update(torch.from_numpy(rows), (here * 2, here))
+    alpha, _ = fit_table(statistics, shrinkage=1e-9, minimum=0)
+
+    def loss(x):
+        return -scipy.stats.dirichlet(np.exp(x)).logpdf(rows.T).mean()
+
+    best = scipy.optimize.minimize(loss, np.zeros(4), options={"gtol": 1e-9})
+    np.testing.assert_allclose(alpha[2, 1], np.exp(best.x), rtol=1e-4)
 
 
 def test_cells_with_little_data_lean_on_their_class():
