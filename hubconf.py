@@ -45,5 +45,5 @@ def yolov3_tiny_agent(
         yolov3_tiny_detector(),
         model if calibrated else None,
         (columns, rows),
-        _semfov.search_policy(policy, model, calibrated=calibrated),
+        _semfov.search_policy(policy, model),
     ).eval()

@@ -41,7 +41,7 @@ def chance_of_hit(model: semfov.FovealObservationModel, look: dict[str, object],
     here = torch.nn.functional.one_hot(cells, len(grid)).bool()
     hits = []
     for target, goal in look["goals"].items():
-        values = semfov.acquisition.TargetPosterior(target)(beta).clamp(min=1e-9).log()
+        values = semfov.DirichletBelief(beta).probability(target).clamp(min=1e-9).log()
         choice = (sharpness * values).masked_fill(here, -torch.inf).softmax(-1)
         hits.append(choice[:, goal].sum(-1)[~goal[cells]])
     return torch.cat(hits)

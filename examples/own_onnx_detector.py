@@ -67,7 +67,7 @@ def main() -> None:
         loss = -probabilities.gather(-1, labels[:, None]).clamp(min=1e-6).log().mean()
         print(f"{name}: {loss:.2f} nats lost per detection on other scenes")
 
-    policy = semfov.search_policy("predictive", model, calibrated=True)
+    policy = semfov.search_policy("predictive", model)
     agent = semfov.ActivePerception(eye.sensor, detector, model, (10, 10), policy).eval()
     scanpath = agent.search(others[0].image, "person", start=0)
     print(f"person {'found' if scanpath.found else 'not found'} after {scanpath.shifts} gaze shifts")

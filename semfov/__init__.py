@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from semfov.agent import ActivePerception
-from semfov.belief import Evidence, Grid, SemanticMap, TargetEvidence, fusion, weigh
+from semfov.belief import DirichletBelief, Evidence, Grid, SemanticMap, TargetEvidence, fusion, weigh
 from semfov.data import EmbeddedScenes, read_image
 from semfov.detection import Detections, Detector, Selection
 from semfov.detection.load import load_detector
@@ -25,6 +25,7 @@ __all__ = [
     "DataError",
     "Detections",
     "Detector",
+    "DirichletBelief",
     "DirichletStatistics",
     "EmbeddedScenes",
     "Evidence",

@@ -7,12 +7,12 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from semfov.belief.belief import Belief, dirichlet_belief
 from semfov.belief.context import ContextPrior
 from semfov.belief.context_observer import ContextObserver
 from semfov.belief.evidence import Observation
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.observer import Observer, SemanticObserver
-from semfov.belief.state import Belief
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.belief.target_observer import TargetObserver
 from semfov.detection.detections import Detections
@@ -20,12 +20,17 @@ from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_shape, lookup
 from semfov.eye import Eye
+from semfov.gaze.acquisition import AcquisitionFunction
 from semfov.gaze.policies import Policy, exploration_policy, search_policy
 from semfov.gaze.selection import select_fixation
 from semfov.observation.compatibility import recommended
 from semfov.observation.foveal import FovealObservationModel
 from semfov.scanpath import Scanpath
 from semfov.sensor.foveation import Foveation
+from semfov.sensor.named import named_sensor
+
+PUBLISHED_SENSORS = ("published", "published-narrow")
+"""Named sensors of the paper, for which observation models of maximum likelihood are shipped."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ def step(
     visited: Tensor,
     cell: Tensor,
     evidence: Any,
-    acquisition: Callable[..., Tensor],
+    acquisition: AcquisitionFunction,
     noise: Tensor,
 ) -> Step:
     """One cycle of active perception for a batch of episodes; agent and evaluation both call it.
@@ -62,21 +67,13 @@ def step(
         visited: `(B, X·Y)` boolean, cells fixated before.
         cell: `(B,)`, the cell that is fixated now.
         evidence: what the look from there says (`Observer.weigh`).
-        acquisition: maps the new belief to values `(B, X·Y)` (`acquisition_values`).
+        acquisition: values the cells by the new belief.
         noise: `(B, X·Y)`, random numbers that break ties.
     """
     belief = observer.update(belief, evidence)
     visited = visited.scatter(-1, cell[:, None], True)
-    values = acquisition_values(acquisition, belief, visited)
+    values = acquisition(belief, visited)
     return Step(belief, visited, values, select_fixation(values, visited, noise))
-
-
-def acquisition_values(acquisition: Callable[..., Tensor], belief: Belief, visited: Tensor) -> Tensor:
-    """Values `(B, X·Y)` of an acquisition function: of the belief's parameters `(B, X·Y, C)` alone, or, where it says
-    that it `reads_memory`, of the whole belief and the visited cells."""
-    if getattr(acquisition, "reads_memory", False):
-        return acquisition(belief, visited)
-    return acquisition(belief.beta)
 
 
 class ActivePerception(nn.Module):
@@ -180,6 +177,50 @@ class ActivePerception(nn.Module):
         evidence.check_compatible(agent.eye.settings())
         return agent.eval().requires_grad_(False)
 
+    @classmethod
+    def published(
+        cls,
+        name: str = "yolov3-tiny",
+        *,
+        sensor: str = "published",
+        search: str = "predictive",
+        calibrated: bool = True,
+        **options: Any,
+    ) -> Self:
+        """The agent of Luzio, Bernardino and Moreno (2024), with the small detectors that models are shipped for.
+
+        10 x 10 cells with a uniform prior of 0.5, every cell that a box overlaps updated by Kaplan's rule, scores
+        calibrated by Dirichlets of maximum likelihood; exploration maximises the Kullback-Leibler divergence. The paper
+        prints no width of its wide and its narrow fovea: ours are 100 and 50 pixels of 640. The detectors are smaller
+        than its YOLOv3.
+
+        Args:
+            name: a detector for which models are shipped, `yolov3-tiny` or `yolox-nano`.
+            sensor: `published`, the wide fovea, or `published-narrow`.
+            search: `predictive` or `non-predictive`.
+            calibrated: whether scores go through the observation model before they are fused ("Modified Kaplan").
+            options: of `semfov.load_detector`.
+
+        Raises:
+            InputError: no models are shipped for a detector or a sensor of this name.
+            DataError: the weights cannot be had, or are damaged.
+        """
+        lookup(sensor, PUBLISHED_SENSORS, "published sensor")
+        lookup(search, ["predictive", "non-predictive"], "published search policy")
+        detector = load_detector(name, **options)
+        fitted = f"{detector.name}-{sensor}"
+        observation = FovealObservationModel.from_pretrained(fitted, detector=detector).requires_grad_(False)
+        agent = cls(
+            named_sensor(sensor),
+            detector,
+            observation if calibrated else None,
+            (10, 10),
+            search_policy(search, observation),
+            exploration=exploration_policy("kl", observation),
+        )
+        observation.check_compatible(agent.eye.settings())
+        return agent.eval().requires_grad_(False)
+
     @property
     def classes(self) -> tuple[str, ...]:
         """Names of the belief's components, background first."""
@@ -222,7 +263,7 @@ class ActivePerception(nn.Module):
         def ends(cell: int, detections: Detections) -> bool:
             return bool(goal[cell]) if goal is not None else confirms(detections, grid, cell, index, confirm)
 
-        policy = self.policy(self.observer.component(index), grid)
+        policy = self.policy(index, grid)
         return self._gaze(image, grid, self.observer, policy, index, start, shifts, seed, ends)
 
     def explore(self, image: Tensor, *, start: int | None = None, shifts: int = 20, seed: int = 0) -> Scanpath:
@@ -251,7 +292,7 @@ class ActivePerception(nn.Module):
         image: Tensor,
         grid: Grid,
         observer: Observer,
-        acquisition: nn.Module,
+        acquisition: AcquisitionFunction,
         target: int | None,
         start: int | None,
         shifts: int,
@@ -276,14 +317,14 @@ class ActivePerception(nn.Module):
             after = step(observer, belief, visited, here, evidence, acquisition, noise)
             belief, visited = after.belief, after.visited
             if observer is self.semantics:
-                semantics = belief
+                semantics = dirichlet_belief(belief)
             else:
                 semantics = self.semantics.update(semantics, self.semantics.weigh(detections, fixation, grid))
             cells.append(cell)
             seen.append(detections)
             beliefs.append(semantics.beta[0])
             if target is not None:
-                present.append(probability(belief.beta[0], int(observer.component(target))))
+                present.append(belief.probability(target)[0])
             values.append(after.values[0])
             found = ends(cell, detections)
             cell = int(after.cell)
@@ -318,11 +359,6 @@ def models_of(observer: object) -> Iterator[nn.Module]:
             yield owner
         elif hasattr(owner, "weigh"):
             yield from models_of(owner)
-
-
-def probability(beta: Tensor, component: int) -> Tensor:
-    """Mean of a component of Dirichlet beliefs `(..., C)`, `(...)`."""
-    return beta[..., component] / beta.sum(-1)
 
 
 def confirms(detections: Detections, grid: Grid, cell: int, target: int, score: float) -> bool:

@@ -121,7 +121,7 @@ def explorer():
     clarity = torch.tensor([4.0, 1.0, 0.2])
     alpha = 1 + torch.eye(3)[:, None] * clarity[:, None]
     model = FovealObservationModel(alpha, [0.2, 0.4], ["red", "green"]).requires_grad_(False).eval()
-    policy = exploration_policy("kl", model, calibrated=True)
+    policy = exploration_policy("kl", model)
     return ActivePerception(Foveation(40.0), Squares(), model, (8, 6), policy, reference=160.0)
 
 

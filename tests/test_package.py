@@ -17,6 +17,7 @@ SURFACE = {
     "DataError",
     "Detections",
     "Detector",
+    "DirichletBelief",
     "DirichletStatistics",
     "EmbeddedScenes",
     "Evidence",

@@ -1,27 +1,106 @@
 """What a batch of episodes believes."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Self
 
+import torch
 from torch import Tensor
 
+from semfov.errors import InputError, check, values_known
+from semfov.observation import dirichlet
 
-@dataclass(frozen=True)
-class Belief:
-    """Beliefs about the cells of a batch of episodes.
+
+class Belief(ABC):
+    """Base of all beliefs about the cells of a batch of episodes.
 
     Attributes:
-        beta: `(B, X·Y, C)`, Dirichlet parameters of every cell's class.
         closest: `(B, X·Y)`, distance to the closest fixation so far, in longer sides; infinite before the first look.
     """
 
-    beta: Tensor
     closest: Tensor
 
-    def __getitem__(self, index: Tensor | slice) -> "Belief":
+    @abstractmethod
+    def probability(self, target: int | Tensor) -> Tensor:
+        """Probability that each cell holds the target, `(B, X·Y)`.
+
+        Args:
+            target: class 1..K, or a tensor `(B,)` with one for each episode. A belief about one target alone answers
+                for that target, whatever is asked.
+        """
+
+    @abstractmethod
+    def __getitem__(self, index: Tensor | slice) -> Self:
         """Beliefs of some of the episodes."""
-        return Belief(self.beta[index], self.closest[index])
+
+
+@dataclass(frozen=True)
+class DirichletBelief(Belief):
+    r"""A Dirichlet belief about the class of every cell, :math:`P(C^x) \sim \mathrm{Dir}(\beta^x)`.
+
+    (Luzio, Bernardino and Moreno, 2024, the equation of the map B.)
+
+    Attributes:
+        beta: `(B, X·Y, K+1)`, Dirichlet parameters, background first.
+        closest: `(B, X·Y)`, see `Belief`; left out, there was no look yet.
+
+    >>> belief = DirichletBelief(torch.tensor([[[1.0, 3.0], [1.0, 1.0]]]))
+    >>> belief.probability(1)
+    tensor([[0.7500, 0.5000]])
+    """
+
+    beta: Tensor
+    closest: Tensor = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.closest is None:
+            object.__setattr__(self, "closest", torch.full_like(self.beta[..., 0], torch.inf))
+
+    def __getitem__(self, index: Tensor | slice) -> "DirichletBelief":
+        """Beliefs of some of the episodes."""
+        return DirichletBelief(self.beta[index], self.closest[index])
 
     @classmethod
-    def uniform(cls, batch: int, cells: int, components: int, prior: float, like: Tensor) -> "Belief":
+    def uniform(cls, batch: int, cells: int, components: int, prior: float, like: Tensor) -> "DirichletBelief":
         """The same parameter for every class, before any look; dtype and device as `like`."""
-        return cls(like.new_full((batch, cells, components), prior), like.new_full((batch, cells), float("inf")))
+        return cls(like.new_full((batch, cells, components), prior))
+
+    @property
+    def probabilities(self) -> Tensor:
+        r"""Posterior of every class, :math:`p_k = \beta_k / \sum_j \beta_j`, `(B, X·Y, K+1)`."""
+        return dirichlet.mean(self.beta)
+
+    def probability(self, target: int | Tensor) -> Tensor:
+        """Posterior of the target class in each cell, `(B, X·Y)`."""
+        return pick(self.beta, torch.as_tensor(target)) / self.beta.sum(-1)
+
+
+def dirichlet_belief(belief: Belief) -> DirichletBelief:
+    """The belief, as one about all classes.
+
+    Raises:
+        InputError: it is about a target alone.
+    """
+    if not isinstance(belief, DirichletBelief):
+        raise InputError(f"belief: expected a belief about all classes (DirichletBelief), got {type(belief).__name__}")
+    return belief
+
+
+def pick(values: Tensor, target: Tensor) -> Tensor:
+    """Component `target` (a scalar, or `(B,)`) of `values` `(B, ..., K+1)`, `(B, ...)`.
+
+    Raises:
+        InputError: there is no such component.
+
+    >>> pick(torch.tensor([[[0.1, 0.9]], [[0.3, 0.7]]]), torch.tensor([1, 0]))
+    tensor([[0.9000],
+            [0.3000]])
+    """
+    components = values.shape[-1]
+    if values_known():
+        inside = bool(((target >= 0) & (target < components)).all())
+        check(inside, "target", f"a class index from 0 to {components - 1}", target.tolist())
+    if target.ndim == 0:
+        return values[..., target]
+    index = target.reshape(*target.shape, *[1] * (values.ndim - target.ndim))
+    return values.take_along_dim(index.expand(*values.shape[:-1], 1), -1)[..., 0]

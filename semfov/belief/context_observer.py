@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from semfov.belief.belief import Belief
 from semfov.belief.context import ContextPrior, presence_of
 from semfov.belief.grid import Grid
 from semfov.belief.observer import Observer
-from semfov.belief.state import Belief
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
 
@@ -44,19 +44,27 @@ class ContextLook:
 
 @dataclass(frozen=True)
 class ContextBelief(Belief):
-    """Belief about the target alone: `beta` holds the probabilities of its absence and its presence, `(B, X·Y, 2)`.
+    """Belief about one target alone.
 
     Attributes:
+        present: `(B, X·Y)`, probability that a cell holds the target.
+        closest: `(B, X·Y)`, see `Belief`.
         inner: belief of the other observer.
         presence: `(B, X·Y, K+1)`, highest score of each class in each cell in any look.
     """
 
+    present: Tensor
+    closest: Tensor
     inner: Any
     presence: Tensor
 
+    def probability(self, target: int | Tensor) -> Tensor:
+        """Probability of the target that was searched for, `(B, X·Y)`, whatever `target` is."""
+        return self.present
+
     def __getitem__(self, index: Tensor | slice) -> "ContextBelief":
         """Beliefs of some of the episodes."""
-        return ContextBelief(self.beta[index], self.closest[index], self.inner[index], self.presence[index])
+        return ContextBelief(self.present[index], self.closest[index], self.inner[index], self.presence[index])
 
 
 class ContextObserver:
@@ -65,7 +73,7 @@ class ContextObserver:
     .. math:: \operatorname{logit} P(t \in x) = \operatorname{logit} p_t(x) + c_t(x)
 
     with c of `ContextPrior`, from the strongest sight of every class so far. It suits policies that go by the
-    probability of the target alone (`TargetPosterior`, `NeighbourhoodPosterior`).
+    probability of the target alone (`TargetPosterior`).
 
     Args:
         observer: what it adds to.
@@ -82,9 +90,10 @@ class ContextObserver:
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> ContextBelief:
         """Even odds in every cell, nothing seen."""
-        even = Belief.uniform(batch, len(grid), 2, 0.5, like)
+        inner = self.observer.start(batch, grid, like)
+        even = like.new_full((batch, len(grid)), 0.5)
         nothing = like.new_zeros(batch, len(grid), len(self.prior.classes) + 1)
-        return ContextBelief(even.beta, even.closest, self.observer.start(batch, grid, like), nothing)
+        return ContextBelief(even, inner.closest, inner, nothing)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> ContextLook:
         """What looks from `fixation` `(B, 2)` say of the target, and what they show around it."""
@@ -98,16 +107,10 @@ class ContextObserver:
         """Belief after a look in each episode."""
         inner = self.observer.update(belief.inner, evidence.inner)
         presence = torch.maximum(belief.presence, evidence.presence)
-        component = torch.as_tensor(self.observer.component(evidence.target))
-        chosen = component[:, None, None].expand(*inner.beta.shape[:-1], 1)
-        probability = inner.beta.gather(-1, chosen)[..., 0] / inner.beta.sum(-1)
+        probability = inner.probability(evidence.target)
         context = self.prior(presence, evidence.grid, evidence.target, self.weights)
         present = (log_odds(probability) + context).sigmoid()
-        return ContextBelief(torch.stack([1 - present, present], -1), inner.closest, inner, presence)
-
-    def component(self, target: int | Tensor) -> int | Tensor:
-        """Presence, whatever the target."""
-        return 1 if isinstance(target, int) else torch.ones_like(target)
+        return ContextBelief(present, inner.closest, inner, presence)
 
 
 def log_odds(probability: Tensor) -> Tensor:

@@ -59,9 +59,15 @@ def weigh(
 ) -> Evidence:
     r"""Evidence of the detections seen from `fixation`.
 
-    Successive looks at a static scene are not independent. With `tempering` τ < 1 a likelihood counts as
+    The likelihoods are the scores as they are, or what the observation model calibrates them to
+    (Luzio, Bernardino and Moreno, 2024, section III-B and equation 11):
 
-    .. math:: \lambda_k^\tau, \quad \lambda_k \propto P(C = k \mid S, d)
+    .. math:: \lambda_k = s_k \quad \text{or} \quad \lambda_k \propto p(S \mid C = k, d)
+
+    With a class prior in the model λ is the posterior, and the prior counts anew with every detection.
+
+    Successive looks at a static scene are not independent. With `tempering` τ < 1 a likelihood counts as
+    :math:`\lambda_k^\tau`, which is not in the paper.
 
     Args:
         detections: boxes in pixels of the grid's image, batch `(B, L)`.

@@ -16,12 +16,16 @@ def kaplan(beta: Tensor, likelihood: Tensor) -> Tensor:
     .. math:: \beta'_k = \beta_k \frac{1 + \lambda_k / D}{1 + \min_j \lambda_j / D}, \quad
               D = \sum_j \beta_j \lambda_j
 
-    (Kaplan, Chakraborty and Ulukus, 2018; the whole numerator stands over the whole denominator.) It is computed as
-    `β + β (λ − min λ) / (D + min λ)`, which is the same and adds only terms that are not negative.
+    (Luzio, Bernardino and Moreno, 2024, equation 7, after Kaplan, Chakraborty and Bisdikian, "Fusion of classifiers: A
+    subjective logic perspective", IEEE Aerospace Conference 2012.) The whole numerator stands over the whole
+    denominator. The exact posterior is a mixture of the Dirichlets Dir(β + e_k) with weights β_k λ_k / D, and its mean
+    is that of Dir(β'). It is computed as `β + β (λ − min λ) / (D + min λ)`, which is the same and adds only terms that
+    are not negative.
 
     Args:
         beta: `(..., K+1)`, Dirichlet parameters, positive.
-        likelihood: `(..., K+1)`, λ_k up to a common factor, not negative, not all zero; broadcasts with `beta`.
+        likelihood: `(..., K+1)`, λ_k = P(S | C = k) of the scores S that were seen, up to a common factor; not
+            negative, not all zero; broadcasts with `beta`.
 
     Returns:
         New parameters, `(..., K+1)`, nowhere smaller than `beta`.
@@ -41,7 +45,9 @@ def product(beta: Tensor, likelihood: Tensor) -> Tensor:
 
     .. math:: \beta'_k = (1 + \sum_j \beta_j) \, \beta_k \lambda_k / \sum_j \beta_j \lambda_j
 
-    The mean is the categorical posterior `p_k λ_k / Σ p λ`. Arguments and errors as for `kaplan`.
+    The mean is the categorical posterior `p_k λ_k / Σ p λ`. Luzio, Bernardino and Moreno (2024, section III-B) name the
+    product and the sum rule, with which Kaplan et al. (2012) compare theirs, and print neither. That a look adds 1 to
+    the sum of the parameters is our choice. Arguments and errors as for `kaplan`.
 
     >>> product(torch.ones(2), torch.tensor([3.0, 1.0]))
     tensor([2.2500, 0.7500])
@@ -55,7 +61,8 @@ def sum(beta: Tensor, likelihood: Tensor) -> Tensor:
 
     .. math:: \beta'_k = \beta_k + \lambda_k / \sum_j \lambda_j
 
-    Arguments and errors as for `kaplan`.
+    After n looks the mean is the average of the n normalised likelihoods and of the prior's mean, which counts Σβ
+    times. As with `product`, the form for Dirichlet parameters is our choice. Arguments and errors as for `kaplan`.
 
     >>> sum(torch.ones(2), torch.tensor([3.0, 1.0]))
     tensor([1.7500, 1.2500])

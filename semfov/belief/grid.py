@@ -79,7 +79,8 @@ class Grid:
     def footprint(self, boxes: Tensor, rule: Footprint = "overlap") -> Tensor:
         r"""Which cells each box covers, `(..., L, X·Y)`, for boxes `(..., L, 4)`; boolean, or weights if `soft`.
 
-        - `overlap`: cells that share a positive area with the box (the published rule).
+        - `overlap`: cells that share a positive area with the box. Luzio, Bernardino and Moreno (2024, section IV-A)
+          update the cells that a detection overlaps; the other rules are not theirs.
         - `centre`: cells whose centre lies in the box, or the cell of the box's centre where there is none.
         - `box_centre`: only the cell in which the centre of the box lies.
         - `soft`: cells that share an area with the box, with weights that fall off towards its borders, for objects
@@ -118,7 +119,8 @@ class Grid:
     def box_distance(self, boxes: Tensor, fixation: Tensor) -> Tensor:
         """Distance from the centre of each box `(..., L, 4)` to the fixation `(..., 2)`, `(..., L)`.
 
-        In units of the image's longer side, so that one observation model serves every resolution.
+        It is the d = ‖(u, v)‖ of Luzio, Bernardino and Moreno (2024, section III-D), here in units of the image's
+        longer side, so that one observation model serves every resolution.
         """
         check_shape(boxes, "boxes", None, 4)
         check_shape(fixation, "fixation", 2)
@@ -138,7 +140,10 @@ class Grid:
 
     @property
     def cell_distance(self) -> Tensor:
-        """Distance between the centres of every two cells, `(X·Y, X·Y)` or `(B, X·Y, X·Y)`, in longer sides."""
+        """Distance between the centres of every two cells, `(X·Y, X·Y)` or `(B, X·Y, X·Y)`, in longer sides.
+
+        It is the d' = ‖x − f'‖ with which Luzio, Bernardino and Moreno (2024, equation 16) predict scores.
+        """
         centres = self.centres
         offset = centres[..., :, None, :] - centres[..., None, :, :]
         return torch.linalg.vector_norm(offset, dim=-1) / self.extent.amax(-1)[..., None, None]

@@ -6,10 +6,10 @@ from typing import Any, Literal, Protocol, get_args
 import torch
 from torch import Tensor
 
+from semfov.belief.belief import DirichletBelief
 from semfov.belief.evidence import Evidence, Observation, weigh
 from semfov.belief.fusion import RULES
 from semfov.belief.grid import Footprint, Grid
-from semfov.belief.state import Belief
 from semfov.belief.update import fuse
 from semfov.detection.detections import Detections
 from semfov.errors import check, lookup
@@ -27,7 +27,7 @@ class Observer(Protocol):
     by_target: bool
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> Any:
-        """The belief (`Belief`) of `batch` episodes before the first look; dtype and device as `like`."""
+        """The belief (`semfov.belief.Belief`) of `batch` episodes before the first look; dtype and device as `like`."""
         ...
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> Any:
@@ -36,10 +36,6 @@ class Observer(Protocol):
 
     def update(self, belief: Any, evidence: Any) -> Any:
         """The belief after a look in each episode."""
-        ...
-
-    def component(self, target: int | Tensor) -> int | Tensor:
-        """Which component of the belief stands for a target class."""
         ...
 
 
@@ -95,26 +91,22 @@ class SemanticObserver:
         self.memory: Memory = memory
         self.misses = misses
 
-    def start(self, batch: int, grid: Grid, like: Tensor) -> Belief:
+    def start(self, batch: int, grid: Grid, like: Tensor) -> DirichletBelief:
         """The prior in every cell."""
-        return Belief.uniform(batch, len(grid), self.components, self.prior, like)
+        return DirichletBelief.uniform(batch, len(grid), self.components, self.prior, like)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> Evidence:
         """Likelihoods of the detections (`semfov.weigh`), the same for every target."""
         return weigh(detections, fixation, grid, self.observation, self.footprint, tempering=self.tempering)
 
-    def update(self, belief: Belief, evidence: Evidence) -> Belief:
+    def update(self, belief: DirichletBelief, evidence: Evidence) -> DirichletBelief:
         """Fuse a look in each episode."""
         closest = torch.minimum(belief.closest, evidence.distance)
         if self.memory == "all":
-            return Belief(self._fuse(belief.beta, evidence), closest)
+            return DirichletBelief(self._fuse(belief.beta, evidence), closest)
         fresh = self._fuse(torch.full_like(belief.beta, self.prior), evidence)
         closer = evidence.distance < belief.closest
-        return Belief(torch.where(closer[..., None], fresh, belief.beta), closest)
-
-    def component(self, target: int | Tensor) -> int | Tensor:
-        """The target class itself."""
-        return target
+        return DirichletBelief(torch.where(closer[..., None], fresh, belief.beta), closest)
 
     def _fuse(self, beta: Tensor, evidence: Evidence) -> Tensor:
         fused = fuse(beta, evidence.likelihood.to(beta.dtype), evidence.footprint, self.fusion)

@@ -5,11 +5,12 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from semfov.belief.belief import DirichletBelief
 from semfov.belief.evidence import Observation
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.observer import Memory, SemanticObserver
-from semfov.belief.state import Belief
 from semfov.detection.detections import Detections
+from semfov.observation import dirichlet
 
 
 class SemanticMap(nn.Module):
@@ -72,20 +73,15 @@ class SemanticMap(nn.Module):
     @property
     def probabilities(self) -> Tensor:
         """Mean of every belief, `p_k = β_k / Σ β`, `(B, X·Y, K+1)`."""
-        return mean(self.beta)
+        return dirichlet.mean(self.beta)
 
     def update(self, detections: Detections, fixation: Tensor) -> "SemanticMap":
         """Fuse the detections of one look from `fixation` `(B, 2)` and return the map itself."""
         evidence = self._observer.weigh(detections, fixation, self.grid)
-        belief = self._observer.update(Belief(self.beta, self.closest), evidence)
+        belief = self._observer.update(DirichletBelief(self.beta, self.closest), evidence)
         self.beta, self.closest = belief.beta, belief.closest
         return self
 
     def forward(self, detections: Detections, fixation: Tensor) -> Tensor:
         """As `update`; returns the new parameters."""
         return self.update(detections, fixation).beta
-
-
-def mean(beta: Tensor) -> Tensor:
-    """Mean of Dirichlet beliefs `(..., K+1)`: `p_k = β_k / Σ β`."""
-    return beta / beta.sum(-1, keepdim=True)

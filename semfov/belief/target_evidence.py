@@ -20,7 +20,7 @@ _READOUT = 11
 class TargetEvidence(PretrainedForEye):
     r"""Log odds that a cell holds the target, learned from looks at photographs with boxes.
 
-    Kaplan's rule multiplies looks as if they were independent. Looks at a static scene are not: a blurred, wrong
+    Kaplan's rule takes looks for independent. Looks at a static scene are not: a blurred, wrong
     detection repeats itself and buries the target for good. Here a cell keeps the evidence of its closest look, and a
     small network, trained on whole series of looks, weighs it together with the strongest evidence of any look and with
     the neighbouring cells. A look that shows nothing is evidence too: much at the fovea, little far out.

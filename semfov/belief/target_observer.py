@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
-from semfov.belief.state import Belief
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
@@ -45,22 +45,30 @@ class TargetLook:
 
 @dataclass(frozen=True)
 class TargetBelief(Belief):
-    """Belief about the target alone: `beta` holds the probabilities of its absence and its presence, `(B, X·Y, 2)`.
+    """Belief about one target alone.
 
     Attributes:
+        present: `(B, X·Y)`, probability that a cell holds the target.
+        closest: `(B, X·Y)`, see `Belief`.
         nearest: `(B, X·Y)`, evidence of the closest look at each cell.
         best: `(B, X·Y)`, strongest evidence of any look.
         visited: `(B, X·Y)` boolean, cells that were fixated.
     """
 
+    present: Tensor
+    closest: Tensor
     nearest: Tensor
     best: Tensor
     visited: Tensor
 
+    def probability(self, target: int | Tensor) -> Tensor:
+        """Probability of the target that was searched for, `(B, X·Y)`, whatever `target` is."""
+        return self.present
+
     def __getitem__(self, index: Tensor | slice) -> "TargetBelief":
         """Beliefs of some of the episodes."""
         return TargetBelief(
-            self.beta[index], self.closest[index], self.nearest[index], self.best[index], self.visited[index]
+            self.present[index], self.closest[index], self.nearest[index], self.best[index], self.visited[index]
         )
 
 
@@ -78,9 +86,8 @@ class TargetObserver:
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> TargetBelief:
         """Even odds in every cell."""
-        even = Belief.uniform(batch, len(grid), 2, 0.5, like)
-        zeros = torch.zeros_like(even.closest)
-        return TargetBelief(even.beta, even.closest, zeros, zeros - torch.inf, zeros.bool())
+        zeros = like.new_zeros(batch, len(grid))
+        return TargetBelief(zeros + 0.5, zeros + torch.inf, zeros, zeros - torch.inf, zeros.bool())
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> TargetLook:
         """What looks from `fixation` `(B, 2)` say about the target."""
@@ -99,9 +106,4 @@ class TargetObserver:
         closest = torch.minimum(evidence.distance, belief.closest)
         visited = belief.visited | evidence.fixated
         present = self.model.log_odds(nearest, best, closest, visited, evidence.columns).sigmoid()
-        beta = torch.stack([1 - present, present], -1)
-        return TargetBelief(beta, closest, nearest, best, visited)
-
-    def component(self, target: int | Tensor) -> int | Tensor:
-        """Presence, whatever the target."""
-        return 1 if isinstance(target, int) else torch.ones_like(target)
+        return TargetBelief(present, closest, nearest, best, visited)

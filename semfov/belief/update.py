@@ -10,6 +10,9 @@ from semfov.errors import check, check_shape, lookup, values_known
 def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kaplan") -> Tensor:
     """Update every cell with the detections that cover it, one after another.
 
+    Kaplan's rule depends on their order. Luzio, Bernardino and Moreno (2024, section IV-A) fuse them "in no particular
+    order"; here it is the order of the rows, and our detectors give the most confident first.
+
     Cells are independent, so the r-th detection of every cell of every map is fused in the same step: there are as
     many steps as detections pile up on one cell, not as there are detections, and only covered cells are touched.
     Where a graph is traced, and inside `torch.func.vmap`, every detection is a step and meets every cell: the shape of

@@ -7,7 +7,7 @@ import hashlib
 import json
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 class CocoScenes:
-    """Photographs with COCO annotations, as many as the published selection keeps.
+    """Photographs with COCO annotations, those that meet the conditions of the published selection.
 
     An image is kept that has at least `min_instances` boxes (of any category) and at least one class whose boxes
     cover at most `max_target_area` of it: such classes are its legal targets. Categories are matched to `classes`
@@ -41,6 +41,7 @@ class CocoScenes:
         min_instances: boxes that an image needs, at least.
         max_target_area: share of the image that a target may cover; None allows any, and images without targets.
         limit: keep only so many images, those with the lowest ids.
+        ids: ids of the images to choose among, before any other selection; None takes all.
         coverage: how the share is measured (`semfov.data.scene.box_coverage`): the sum of the boxes' areas, or the
             area of their union, which is smaller where they overlap. On the 300 photographs of the results tables
             the sum admits 1,079 image-target pairs, the union 1,090.
@@ -66,6 +67,7 @@ class CocoScenes:
         min_instances: int = 8,
         max_target_area: float | None = 0.2,
         limit: int | None = None,
+        ids: Collection[int | str] | None = None,
         coverage: Coverage = "sum",
         crowd: Literal["keep", "drop"] = "keep",
     ) -> None:
@@ -84,8 +86,11 @@ class CocoScenes:
         self._packed = packed
         self._rows: list[int] = []
         self._targets: list[list[int]] = []
+        wanted = None if ids is None else _known_ids(ids, packed.ids, annotations)
         for row, instances in enumerate(packed.instances):
             if instances < min_instances or len(self._rows) == limit:
+                continue
+            if wanted is not None and str(packed.ids[row]) not in wanted:
                 continue
             targets = legal_targets(packed.annotation(row), max_target_area, coverage)
             if targets or max_target_area is None:
@@ -136,6 +141,16 @@ class CocoScenes:
         except OSError as error:
             raise DataError(f"image {path}: cannot be read ({error.strerror}); check data.root") from None
         return _sha256(hashlib.sha256(content).hexdigest(), self._packed.sizes[self._rows[index]])
+
+
+def _known_ids(ids: Collection[int | str], known: Sequence[Any], annotations: str | PathLike[str]) -> set[str]:
+    """Ids as text, all of which the annotations have."""
+    wanted = {str(i) for i in ids}
+    missing = sorted(wanted - {str(i) for i in known})
+    if missing:
+        some = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
+        raise DataError(f"annotations {annotations}: {len(missing)} of {len(wanted)} ids are not in it: {some}")
+    return wanted
 
 
 class _Packed:

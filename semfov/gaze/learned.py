@@ -8,11 +8,11 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
+from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief, pick
 from semfov.belief.grid import Grid
 from semfov.belief.observer import SemanticObserver
-from semfov.belief.state import Belief
 from semfov.errors import InputError
-from semfov.gaze.acquisition.search import pick
+from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.observation.pretrained import PretrainedForEye
 
 FEATURES = 12
@@ -61,9 +61,9 @@ class LearnedGaze(PretrainedForEye):
             last,
         )
 
-    def forward(self, belief: Belief, visited: Tensor, target: int | Tensor, columns: int) -> Tensor:
+    def forward(self, belief: DirichletBelief, visited: Tensor, target: int | Tensor, columns: int) -> Tensor:
         """Values ℓ of all cells, `(B, X·Y)`; arguments as for `gaze_features`."""
-        present = (pick(belief.beta, torch.as_tensor(target)) / belief.beta.sum(-1)).log()
+        present = belief.probability(target).log()
         features = gaze_features(belief, visited, target, columns)
         correction: Tensor = self.network(features.mT.unflatten(-1, (-1, columns)))
         return self.log_scale.exp() * present + correction[:, 0].flatten(1)
@@ -90,8 +90,8 @@ class LearnedGaze(PretrainedForEye):
         return model
 
 
-class LearnedAcquisition(nn.Module):
-    """`LearnedGaze` for one search; it looks at all that is remembered, not at the belief's parameters alone.
+class LearnedAcquisition(AcquisitionFunction):
+    """`LearnedGaze` for one search.
 
     Args:
         gaze: the policy.
@@ -99,7 +99,6 @@ class LearnedAcquisition(nn.Module):
         grid: the cells.
     """
 
-    reads_memory = True
     target: Tensor
 
     def __init__(self, gaze: LearnedGaze, target: int | Tensor, grid: Grid) -> None:
@@ -110,11 +109,11 @@ class LearnedAcquisition(nn.Module):
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(B, X·Y)` for a belief and the cells `(B, X·Y)` fixated so far."""
-        value: Tensor = self.gaze(belief, visited, self.target, self.columns)
+        value: Tensor = self.gaze(dirichlet_belief(belief), visited, self.target, self.columns)
         return value
 
 
-def gaze_features(belief: Belief, visited: Tensor, target: int | Tensor, columns: int) -> Tensor:
+def gaze_features(belief: DirichletBelief, visited: Tensor, target: int | Tensor, columns: int) -> Tensor:
     r"""What a searcher remembers of every cell, `(B, X·Y, 12)`, the same for every class.
 
     With :math:`p = \beta / T`, :math:`T = \sum_k \beta_k` and C classes they are, each scaled to about unit size:

@@ -4,13 +4,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.errors import InputError, lookup
 from semfov.gaze.acquisition.accuracy import ExpectedAccuracy, SightedModel
+from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.closer_look import CloserLook
 from semfov.gaze.acquisition.exploration import (
+    BayesianSurprise,
     KLDivergence,
     NegativeEntropy,
     ProbabilityOfImprovement,
@@ -18,16 +20,16 @@ from semfov.gaze.acquisition.exploration import (
     UpperConfidenceBound,
 )
 from semfov.gaze.acquisition.lookahead import LevelledModel, Lookahead
-from semfov.gaze.acquisition.place import FovealHit, MissModel, NeighbourhoodPosterior, PlaceInformation
-from semfov.gaze.acquisition.search import FovealModel, PredictedTargetPosterior, TargetPosterior
+from semfov.gaze.acquisition.place import FovealHit, MissModel, PlaceInformation
+from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
 from semfov.gaze.acquisition.static import Uniform
 
 Model = TypeVar("Model")
 
-Policy = Callable[[int | Tensor | None, Grid], nn.Module]
-"""Makes the acquisition function for a component of the belief (an index, or one for each episode) on a grid.
+Policy = Callable[[int | Tensor | None, Grid], AcquisitionFunction]
+"""Makes the acquisition function for a target (a class, or one for each episode) on a grid.
 
-The component is None where a scene is explored and nothing is searched for.
+The target is None where a scene is explored and nothing is searched for.
 """
 
 SEARCH_POLICIES = (
@@ -41,6 +43,7 @@ SEARCH_POLICIES = (
 
 _LOOKAHEADS: dict[str, type[Lookahead]] = {
     "kl": KLDivergence,
+    "surprise": BayesianSurprise,
     "negative-entropy": NegativeEntropy,
     "two-peaks": TwoPeaks,
     "upper-confidence-bound": UpperConfidenceBound,
@@ -50,7 +53,7 @@ _LOOKAHEADS: dict[str, type[Lookahead]] = {
 EXPLORATION_POLICIES = ("random", *_LOOKAHEADS, "expected-accuracy", "closer-look")
 
 
-class SearchModel(FovealModel, MissModel, Protocol):
+class SearchModel(LevelledModel, MissModel, Protocol):
     """What all search policies together need of an observation model (`semfov.FovealObservationModel`)."""
 
 
@@ -58,15 +61,14 @@ class ExplorationModel(LevelledModel, SightedModel, Protocol):
     """What all exploration policies together need of an observation model (`semfov.FovealObservationModel`)."""
 
 
-def search_policy(name: str, model: SearchModel | None = None, *, calibrated: bool = False) -> Policy:
-    """A search policy by its name in the literature.
+def search_policy(name: str, model: SearchModel | None = None) -> Policy:
+    """A search policy by its name; `random`, `non-predictive` and `predictive` are published, the others are ours.
 
     Args:
         name: `random`, `non-predictive` (`TargetPosterior`), `predictive` (`PredictedTargetPosterior`),
             `neighbourhood` (`NeighbourhoodPosterior`), `foveal-hit` (`FovealHit`) or `place-information`
             (`PlaceInformation`).
-        model: the observation model; `predictive` needs one, the last two need one with miss rates.
-        calibrated: whether predicted scores are calibrated, as an agent does that calibrates what it sees.
+        model: the observation model; `predictive` and `neighbourhood` need one, the last two one with miss rates.
 
     Raises:
         InputError: the name is unknown, or the model is missing.
@@ -75,24 +77,25 @@ def search_policy(name: str, model: SearchModel | None = None, *, calibrated: bo
     TargetPosterior()
     """
     lookup(name, SEARCH_POLICIES, "search policy")
-    if name in ("predictive", "foveal-hit", "place-information"):
+    if name not in ("random", "non-predictive"):
         _needed(model, name)
-    return _SearchPolicy(name, model, calibrated)
+    return _SearchPolicy(name, model)
 
 
 def exploration_policy(
-    name: str, model: ExplorationModel | None = None, *, calibrated: bool = False, fovea: float = 100 / 640
+    name: str, model: ExplorationModel | None = None, *, fovea: float = 100 / 640, prior: float = 0.5
 ) -> Policy:
     """An exploration policy by its name; it has no use for a target.
 
     Args:
         name: `random`, `kl` (`KLDivergence`), `negative-entropy` (`NegativeEntropy`), `two-peaks` (`TwoPeaks`),
-            `upper-confidence-bound` (`UpperConfidenceBound`), `probability-of-improvement`
-            (`ProbabilityOfImprovement`), `expected-accuracy` (`ExpectedAccuracy`) or `closer-look` (`CloserLook`).
+            `surprise` (`BayesianSurprise`), `upper-confidence-bound` (`UpperConfidenceBound`),
+            `probability-of-improvement` (`ProbabilityOfImprovement`), `expected-accuracy` (`ExpectedAccuracy`) or
+            `closer-look` (`CloserLook`).
         model: the observation model; every policy but `random` and `closer-look` needs one, `expected-accuracy` with
             miss rates.
-        calibrated: whether expected scores are calibrated, as an agent does that calibrates what it sees.
         fovea: width σ of the fovea in longer sides of the image, for `closer-look`.
+        prior: Dirichlet parameter of every class before the first look, for `kl`.
 
     Raises:
         InputError: the name is unknown, or the model is missing.
@@ -105,7 +108,7 @@ def exploration_policy(
     lookup(name, EXPLORATION_POLICIES, "exploration policy")
     if name not in ("random", "closer-look"):
         _needed(model, name)
-    return _ExplorationPolicy(name, model, calibrated, fovea)
+    return _ExplorationPolicy(name, model, fovea, prior)
 
 
 @dataclass(frozen=True)
@@ -114,22 +117,21 @@ class _SearchPolicy:
 
     name: str
     model: SearchModel | None
-    calibrated: bool
 
-    def __call__(self, target: int | Tensor | None, grid: Grid) -> nn.Module:
+    def __call__(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         if self.name == "random":
             return Uniform()
         wanted = _known(target, self.name)
         if self.name == "non-predictive":
             return TargetPosterior(wanted)
-        if self.name == "neighbourhood":
-            return NeighbourhoodPosterior(wanted, grid)
         model = _needed(self.model, self.name)
+        if self.name == "neighbourhood":
+            return NeighbourhoodPosterior(wanted, model, grid)
         if self.name == "foveal-hit":
             return FovealHit(wanted, model, grid)
         if self.name == "place-information":
             return PlaceInformation(wanted, model, grid)
-        return PredictedTargetPosterior(wanted, model, calibrated=self.calibrated)
+        return PredictedTargetPosterior(wanted, model)
 
 
 @dataclass(frozen=True)
@@ -138,10 +140,10 @@ class _ExplorationPolicy:
 
     name: str
     model: ExplorationModel | None
-    calibrated: bool
     fovea: float
+    prior: float
 
-    def __call__(self, target: int | Tensor | None, grid: Grid) -> nn.Module:
+    def __call__(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         if self.name == "random":
             return Uniform()
         if self.name == "closer-look":
@@ -149,7 +151,9 @@ class _ExplorationPolicy:
         model = _needed(self.model, self.name)
         if self.name == "expected-accuracy":
             return ExpectedAccuracy(model, grid)
-        return _LOOKAHEADS[self.name](model, grid, calibrated=self.calibrated)
+        if self.name == "kl":
+            return KLDivergence(model, grid, prior=self.prior)
+        return _LOOKAHEADS[self.name](model, grid)
 
 
 def _needed(model: Model | None, name: str) -> Model:

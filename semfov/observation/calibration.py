@@ -39,7 +39,8 @@ def fit_discriminative(
     each score, has the weaker prior of c. The maximum a posteriori is found by L-BFGS on all samples from a fixed
     start, so that the result depends on nothing random.
 
-    Trained so, Dir(α) no longer describes the scores: the expected scores are kept from `model`.
+    Trained so, Dir(α) no longer describes the scores: the expected scores are kept from `model`. The paper of Luzio,
+    Bernardino and Moreno (2024) has nothing of the kind: its Dirichlets are fitted to the scores.
 
     Args:
         model: gives edges, classes, epsilon, metadata, and the expected scores; fitted by `fit`.

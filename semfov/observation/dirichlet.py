@@ -1,10 +1,13 @@
 """The Dirichlet distribution: density, moments, entropy, divergence, and its maximum-likelihood fit."""
 
+import math
+
 import torch
 from torch import Tensor
 
 from semfov.errors import check, check_finite, check_shape, values_known
 from semfov.observation.mle import inverse_digamma, mle, shrink, vacuous
+from semfov.observation.special import digamma
 
 __all__ = [
     "categorical_covariance",
@@ -13,6 +16,7 @@ __all__ = [
     "floor",
     "inverse_digamma",
     "kl_divergence",
+    "kl_from_symmetric",
     "log_normaliser",
     "log_prob",
     "mean",
@@ -37,6 +41,8 @@ def log_prob(alpha: Tensor, log_scores: Tensor) -> Tensor:
 
     .. math:: \ln p(s | \alpha) = \ln\Gamma(A) - \sum_k \ln\Gamma(\alpha_k) + \sum_k (\alpha_k - 1) \ln s_k
 
+    (The logarithm of equation 9 of Luzio, Bernardino and Moreno, 2024.)
+
     Args:
         alpha: `(..., K)`, parameters, positive.
         log_scores: `(..., K)`, logarithms of scores that sum to 1; broadcasts with `alpha`.
@@ -54,6 +60,9 @@ def log_prob(alpha: Tensor, log_scores: Tensor) -> Tensor:
 def mean(alpha: Tensor) -> Tensor:
     """Expected scores, `(..., K)`: `α_k / A`.
 
+    Of a belief Dir(β) this is the probability of each class: one draw of the Dirichlet-compound multinomial
+    (Luzio, Bernardino and Moreno, 2024, equations 4 and 5).
+
     >>> mean(torch.tensor([1.0, 3.0]))
     tensor([0.2500, 0.7500])
     """
@@ -62,7 +71,9 @@ def mean(alpha: Tensor) -> Tensor:
 
 
 def covariance(alpha: Tensor) -> Tensor:
-    r"""Covariance of the scores, `(..., K, K)`: `p_i (δ_ij - p_j) / (A + 1)`, with `p = α / A`.
+    r"""Covariance of the scores under Dir(α), `(..., K, K)`: `p_i (δ_ij - p_j) / (A + 1)`, with `p = α / A`.
+
+    It shrinks as evidence grows; `categorical_covariance` does not.
 
     >>> covariance(torch.tensor([1.0, 1.0]))
     tensor([[ 0.0833, -0.0833],
@@ -72,10 +83,10 @@ def covariance(alpha: Tensor) -> Tensor:
 
 
 def categorical_covariance(alpha: Tensor) -> Tensor:
-    r"""Covariance of one draw of a class (one-hot) from the mean, `(..., K, K)`: `p_i (δ_ij - p_j)`.
+    r"""Covariance of the class as a one-hot vector, drawn once from the mean, `(..., K, K)`: `p_i (δ_ij - p_j)`.
 
-    Off the diagonal this is the `-p_i p_j` that is printed as the Dirichlet's in Luzio, Bernardino and Moreno (2024);
-    it does not shrink as evidence grows.
+    Off the diagonal this is the `σ_ij = -p_i p_j` of Luzio, Bernardino and Moreno (2024, equation 6), "co-variances of
+    the class distribution". It is not the covariance of the probabilities under the Dirichlet (`covariance`).
 
     >>> categorical_covariance(torch.tensor([1.0, 1.0]))
     tensor([[ 0.2500, -0.2500],
@@ -90,6 +101,8 @@ def entropy(alpha: Tensor) -> Tensor:
 
     .. math:: H = \ln B(\alpha) + (A - K) \psi(A) - \sum_k (\alpha_k - 1) \psi(\alpha_k)
 
+    It is that of the density. The negentropy of Luzio, Bernardino and Moreno (2024, equation 20) is that of the mean.
+
     >>> entropy(torch.tensor([1.0, 1.0]))
     tensor(0.)
     """
@@ -98,10 +111,13 @@ def entropy(alpha: Tensor) -> Tensor:
 
 
 def kl_divergence(alpha: Tensor, other: Tensor) -> Tensor:
-    r"""Kullback-Leibler divergence from Dir(other) to Dir(alpha), in nats, `(...)`.
+    r"""Kullback-Leibler divergence :math:`D_{KL}(\mathrm{Dir}(\alpha) \| \mathrm{Dir}(\beta))`, in nats, `(...)`.
 
     .. math:: KL(\alpha \| \beta) = \ln B(\beta) - \ln B(\alpha)
               + \sum_k (\alpha_k - \beta_k) (\psi(\alpha_k) - \psi(A))
+
+    Exploration by Luzio, Bernardino and Moreno (2024, equation 19) takes it from a cell's belief, as `alpha`, to the
+    prior, `other` with 0.5 for every class.
 
     Args:
         alpha: `(..., K)`, the distribution that the expectation is over.
@@ -113,6 +129,31 @@ def kl_divergence(alpha: Tensor, other: Tensor) -> Tensor:
     check_shape(other, "other", alpha.shape[-1])
     expected = alpha.digamma() - alpha.sum(-1, keepdim=True).digamma()
     return log_normaliser(other) - log_normaliser(alpha) + ((alpha - other) * expected).sum(-1)
+
+
+def kl_from_symmetric(alpha: Tensor, parameter: float) -> Tensor:
+    r"""`kl_divergence` to a symmetric Dirichlet, whose parameters are all c, in nats, `(...)`.
+
+    .. math:: \mathrm{KL} = \ln\frac{\Gamma(A)}{\Gamma(K c)} - (A - K c) \, \psi(A) + \sum_k h(\alpha_k), \qquad
+              h(x) = (x - c) \, \psi(x) - \ln\frac{\Gamma(x)}{\Gamma(c)}
+
+    h is 0 at c and nowhere negative, so what differs little from c does not come from large terms that cancel. The
+    special functions are computed once for each parameter.
+
+    Args:
+        alpha: `(..., K)`, parameters, positive.
+        parameter: c, positive.
+
+    >>> kl_from_symmetric(torch.tensor([2.0, 1.0]), 1.0)
+    tensor(0.1931)
+    """
+    check(parameter > 0, "parameter", "a positive number", parameter)
+    base = alpha.shape[-1] * parameter
+    # Sums are few, and their terms large: double precision costs nothing here.
+    total = alpha.sum(-1, dtype=torch.float64)
+    whole = total.lgamma() - math.lgamma(base) - (total - base) * total.digamma()
+    each = torch.addcmul(math.lgamma(parameter) - alpha.lgamma(), alpha - parameter, digamma(alpha))
+    return whole.to(alpha) + each.sum(-1)
 
 
 def floor(scores: Tensor, epsilon: float) -> Tensor:

@@ -28,6 +28,9 @@ def match(boxes: Tensor, truth: Tensor, labels: Tensor, *, iou: float = 0.5) -> 
     Detections choose in their order (most confident first) the object that they overlap most among those not taken,
     if the overlap is at least `iou`; no object is matched twice. The detected class plays no part.
 
+    This is our choice: Luzio, Bernardino and Moreno (2024, section IV-A) fit scores "according to the corresponding
+    ground truth object" and do not say how it is found, nor which detections are background.
+
     Args:
         boxes: `(L, 4)`, detections, most confident first.
         truth: `(M, 4)`, annotated boxes.

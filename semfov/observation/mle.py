@@ -37,6 +37,9 @@ def mle(mean_log: Tensor, *, method: Method = "newton", max_precision: float = 1
       error, nearly all where A is large; as that share is known, A is moved all the way at once.
     - `gradient`: L-BFGS on `ln α`, in coordinates in which the Fisher information is the identity.
 
+    Luzio, Bernardino and Moreno (2024) take "a simple and efficient iterative method, proposed by Minka", and do not
+    say which of his two.
+
     Identical samples have `Σ exp(g) = 1` and a likelihood without bound. The precision A is kept to at most
     `max_precision`; the result is then the maximum among Dirichlets of that precision.
 

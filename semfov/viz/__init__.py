@@ -11,7 +11,7 @@ from semfov.viz.belief import (
     plot_belief_strip,
     plot_semantic_map,
 )
-from semfov.viz.curves import plot_cumulative_performance, plot_success_rate
+from semfov.viz.curves import plot_cumulative_performance, plot_curve_panels, plot_success_rate
 from semfov.viz.drawing import CONFIDENT
 from semfov.viz.reliability import plot_reliability
 from semfov.viz.saliency import plot_saliency
@@ -28,6 +28,7 @@ __all__ = [
     "plot_belief_bars",
     "plot_belief_strip",
     "plot_cumulative_performance",
+    "plot_curve_panels",
     "plot_episode",
     "plot_fixation",
     "plot_foveated_strip",

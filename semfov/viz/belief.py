@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.belief.semantic_map import mean
 from semfov.errors import InputError, check
+from semfov.observation.dirichlet import mean
 from semfov.scanpath import Scanpath
 from semfov.viz.drawing import check_fixation, choose_fixations, draw_cells, draw_gaze, draw_grid, draw_image
 from semfov.viz.style import PROBABILITY, UNCERTAINTY, make_figure, styled

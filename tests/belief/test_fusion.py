@@ -1,4 +1,7 @@
-"""Fusion rules against the exact posterior, a scalar twin and the properties that define them."""
+"""Fusion rules against the exact posterior, the paper's formula and the properties that define them.
+
+Equations are those of Luzio, Bernardino and Moreno (2024), with the labels of the paper's source.
+"""
 
 import itertools
 
@@ -15,13 +18,16 @@ likelihoods = st.lists(st.floats(0.0, 1.0), min_size=2, max_size=6).filter(lambd
 
 
 def exact_posterior_mean(beta: list[float], likelihood: list[float]) -> list[float]:
-    """Mean of the exact posterior, a mixture of Dirichlets Dir(β + e_k) weighted by β_k λ_k."""
+    """Mean of the exact posterior, which section III-B says the rule matches.
+
+    By Bayes it is Dir(p | β) Σ_k p_k λ_k, a mixture of the Dirichlets Dir(β + e_k) with weights β_k λ_k.
+    """
     total, weights = sum(beta), [b * l for b, l in zip(beta, likelihood, strict=True)]
     return [(b + w / sum(weights)) / (total + 1) for b, w in zip(beta, weights, strict=True)]
 
 
 def scalar_kaplan(beta: list[float], likelihood: list[float]) -> list[float]:
-    """The published formula, letter by letter."""
+    """Equation 7 (eq:kaplanrule), letter by letter."""
     expected = sum(b * l for b, l in zip(beta, likelihood, strict=True))
     return [b * (1 + l / expected) / (1 + min(likelihood) / expected) for b, l in zip(beta, likelihood, strict=True)]
 
@@ -49,6 +55,21 @@ def test_kaplan_mean_is_that_of_the_integrated_posterior():
     torch.testing.assert_close(after / after.sum(), posterior, atol=2e-3, rtol=0)
 
 
+def test_raw_scores_update_a_cell_as_in_equation_7():
+    """Three classes at the prior of 0.5 see s = (0.2, 0.7, 0.1), so that D = 0.5: every step by hand."""
+    beta, scores = torch.full((3,), 0.5, dtype=torch.float64), torch.tensor([0.2, 0.7, 0.1], dtype=torch.float64)
+    expected = torch.tensor([0.5 * (1 + s / 0.5) / (1 + 0.1 / 0.5) for s in (0.2, 0.7, 0.1)], dtype=torch.float64)
+    torch.testing.assert_close(fusion.kaplan(beta, scores), expected, rtol=1e-14, atol=0)
+
+
+def test_kaplan_depends_on_the_order_of_detections():
+    """Section IV-A applies it "in no particular order": whoever fuses has to choose one."""
+    beta = torch.full((3,), 0.5, dtype=torch.float64)
+    first, second = torch.tensor([[0.7, 0.2, 0.1], [0.1, 0.1, 0.8]], dtype=torch.float64)
+    one, other = fusion.kaplan(fusion.kaplan(beta, first), second), fusion.kaplan(fusion.kaplan(beta, second), first)
+    assert (one - other).abs().max() > 0.01
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_kaplan_special_cases(dtype):
     beta = torch.tensor([0.5, 1.5, 3.0], dtype=dtype)
@@ -66,6 +87,23 @@ def test_rules_ignore_scale_and_order_of_classes(rule):
     torch.testing.assert_close(rule(beta, likelihood * 1e-30), after)
     for order in itertools.permutations(range(4)):
         torch.testing.assert_close(rule(beta[:, order], likelihood[:, order]), after[:, order])
+
+
+@given(st.lists(likelihoods.filter(lambda values: min(values) > 1e-3), min_size=1, max_size=5), st.data())
+def test_product_is_bayes_and_sum_is_an_average(looks, data):
+    """Over several looks: p_k Π λ, normalised, and the mean of the normalised λ with the prior counting Σβ times."""
+    classes = min(len(look) for look in looks)
+    looks = [look[:classes] for look in looks]
+    beta = data.draw(st.lists(positive, min_size=classes, max_size=classes))
+    multiplied = added = start = torch.tensor(beta, dtype=torch.float64)
+    joint, shares = list(beta), list(beta)
+    for look in looks:
+        likelihood = torch.tensor(look, dtype=torch.float64)
+        multiplied, added = fusion.product(multiplied, likelihood), fusion.sum(added, likelihood)
+        joint = [j * l for j, l in zip(joint, look, strict=True)]
+        shares = [s + l / sum(look) for s, l in zip(shares, look, strict=True)]
+    torch.testing.assert_close(multiplied / multiplied.sum(), start.new_tensor(joint) / sum(joint))
+    torch.testing.assert_close(added / added.sum(), start.new_tensor(shares) / (sum(beta) + len(looks)))
 
 
 def test_product_and_sum_by_hand():

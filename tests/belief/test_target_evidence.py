@@ -5,11 +5,12 @@ import pytest
 import scipy.ndimage
 import torch
 
-from semfov import Detections, Grid
+from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief import TargetEvidence, TargetObserver
 from semfov.belief.look_features import FEATURES, look_features
 from semfov.belief.target_evidence import _blur, _peak
 from semfov.errors import DataError, InputError
+from semfov.gaze.acquisition import KLDivergence
 
 GRID = Grid(6, 4, (90, 60))
 
@@ -104,10 +105,16 @@ def test_belief_keeps_the_closest_look_and_the_strongest(looks, model):
         torch.testing.assert_close(belief.best[0], said.amax(0))
         assert belief.visited[0].nonzero()[:, 0].tolist() == [0, 9, 20]
         odds = model.log_odds(belief.nearest, belief.best, offset.amin(1)[None] / 90, belief.visited, 6)
-    torch.testing.assert_close(belief.beta[..., 1], odds.sigmoid())
-    torch.testing.assert_close(belief.beta.sum(-1), torch.ones(1, 24))
-    assert observer.component(7) == 1
-    assert observer.component(torch.tensor([7, 2])).tolist() == [1, 1]
+    torch.testing.assert_close(belief.present, odds.sigmoid())
+    # It is about the target that was searched for, whatever is asked.
+    assert belief.probability(7) is belief.probability(torch.tensor([2])) is belief.present
+
+
+def test_an_acquisition_about_all_classes_refuses_a_belief_about_one_target(model):
+    belief = TargetObserver(model).start(1, GRID, torch.empty(0))
+    observation = FovealObservationModel.identity(["cup", "cat"], [0.2])
+    with pytest.raises(InputError, match="belief: expected a belief about all classes"):
+        KLDivergence(observation, GRID)(belief, belief.visited)
 
 
 def test_gradients_reach_every_parameter(looks):

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from semfov.belief import Belief, Grid
+from semfov.belief import DirichletBelief, Grid
 from semfov.errors import InputError
 from semfov.gaze import exploration_policy
 from semfov.gaze.acquisition import CloserLook
@@ -19,7 +19,7 @@ def belief(request):
     torch.manual_seed(0)
     beta = torch.rand(2, 12, 5, dtype=request.param) ** 2 + 0.02
     closest = torch.stack([GRID.cell_distance[3], GRID.cell_distance[[0, 10]].amin(0)]).to(beta)
-    return Belief(beta, closest)
+    return DirichletBelief(beta, closest)
 
 
 def test_value_equals_the_loop(belief):
@@ -41,7 +41,7 @@ def test_value_equals_the_loop(belief):
 
 
 def test_before_the_first_look_any_look_is_closer():
-    belief = Belief.uniform(1, 12, 5, 0.5, torch.ones(1))
+    belief = DirichletBelief.uniform(1, 12, 5, 0.5, torch.ones(1))
     values = CloserLook(GRID, FOVEA)(belief, torch.zeros(1, 12, dtype=torch.bool))
     # All unknown, nothing seen: from the centre of the image most is seen.
     assert values.argmax().item() in (5, 6)
@@ -49,14 +49,16 @@ def test_before_the_first_look_any_look_is_closer():
 
 
 def test_nothing_is_gained_where_the_fovea_was():
-    belief = Belief(torch.ones(1, 12, 5), torch.full((1, 12), 0.99 * FOVEA))
+    belief = DirichletBelief(torch.ones(1, 12, 5), torch.full((1, 12), 0.99 * FOVEA))
     assert not CloserLook(GRID, FOVEA)(belief, torch.zeros(1, 12, dtype=torch.bool)).any()
 
 
 def test_nothing_is_gained_where_all_is_known():
     beta = torch.full((1, 12, 5), 1e-9)
     beta[..., 2] = 1.0
-    values = CloserLook(GRID, FOVEA)(Belief(beta, torch.full((1, 12), 9.0)), torch.zeros(1, 12, dtype=torch.bool))
+    values = CloserLook(GRID, FOVEA)(
+        DirichletBelief(beta, torch.full((1, 12), 9.0)), torch.zeros(1, 12, dtype=torch.bool)
+    )
     assert values.abs().max() < 1e-6
 
 

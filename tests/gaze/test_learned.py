@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov import DataError, Grid, InputError
-from semfov.belief import Belief
+from semfov.belief import DirichletBelief
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.learned import LearnedGaze, gaze_features
 from semfov.gaze.relaxation import soft_fixation
@@ -17,7 +17,7 @@ CELLS, CLASSES, COLUMNS = 12, 5, 4
 @pytest.fixture
 def belief():
     torch.manual_seed(0)
-    return Belief(torch.rand(3, CELLS, CLASSES, dtype=torch.float64) * 2 + 0.1, torch.rand(3, CELLS).double())
+    return DirichletBelief(torch.rand(3, CELLS, CLASSES, dtype=torch.float64) * 2 + 0.1, torch.rand(3, CELLS).double())
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ def test_it_starts_as_non_predictive_search(belief, visited):
     target = torch.tensor([1, 4, 2])
     values = gaze.policy(target, Grid(COLUMNS, 3, (64, 48)))(belief, visited)
     assert values.shape == (3, CELLS)
-    assert torch.equal(values.argsort(), TargetPosterior(target)(belief.beta).argsort())
+    assert torch.equal(values.argsort(), TargetPosterior(target)(belief, visited).argsort())
 
 
 def test_it_knows_no_class_by_its_number(belief, visited):
@@ -111,13 +111,13 @@ def test_it_knows_no_class_by_its_number(belief, visited):
     gaze = LearnedGaze().double()
     torch.nn.init.normal_(gaze.network[-1].weight)
     order = torch.tensor([0, 3, 1, 4, 2])
-    renamed = Belief(belief.beta[..., order], belief.closest)
+    renamed = DirichletBelief(belief.beta[..., order], belief.closest)
     torch.testing.assert_close(gaze(renamed, visited, 1, COLUMNS), gaze(belief, visited, 3, COLUMNS))
     assert not torch.allclose(gaze(belief, visited, 1, COLUMNS), gaze(belief, visited, 3, COLUMNS))
 
 
 def test_all_cells_visited_gives_numbers(belief):
-    single = Belief(belief.beta.float(), belief.closest.float())
+    single = DirichletBelief(belief.beta.float(), belief.closest.float())
     assert LearnedGaze()(single, torch.ones(3, CELLS, dtype=torch.bool), 1, COLUMNS).isfinite().all()
 
 

@@ -1,8 +1,14 @@
-"""Densities, moments, entropy and divergence against scipy, torch.distributions, mpmath and closed forms."""
+"""Densities, moments, entropy and divergence against scipy, torch.distributions, mpmath and closed forms.
+
+Equations are those of Luzio, Bernardino and Moreno (2024), with the labels of the paper's source.
+"""
+
+import math
 
 import mpmath
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.stats
 import torch
 from hypothesis import given
@@ -117,16 +123,55 @@ def test_moments_are_those_of_scipy():
     np.testing.assert_allclose(dirichlet.covariance(alpha), reference.cov(), rtol=1e-12)
 
 
-def test_categorical_covariance_is_that_of_one_draw():
+def test_density_is_that_of_equation_9():
+    """eq:dirichlet, written with the gamma function."""
+    alpha, scores = [0.7, 3.5, 1.2, 2.0], [0.1, 0.55, 0.05, 0.3]
+    density = math.gamma(sum(alpha)) / math.prod(math.gamma(a) for a in alpha)
+    density *= math.prod(s ** (a - 1) for a, s in zip(alpha, scores, strict=True))
+    got = dirichlet.log_prob(*(torch.tensor(v, dtype=torch.float64) for v in (alpha, np.log(scores))))
+    assert float(got.exp()) == pytest.approx(density, rel=1e-13)
+
+
+def test_mean_is_the_compound_multinomial_of_equation_4():
+    """eq:finalsemanticmap, as printed, for one draw of class k: n_k = 1 and all other n_i = 0."""
+    beta = [0.5, 2.0, 7.5, 1.1]
+    for k, got in enumerate(dirichlet.mean(torch.tensor(beta, dtype=torch.float64)).tolist()):
+        drawn = [int(i == k) for i in range(4)]
+        n = sum(drawn)
+        printed = math.factorial(n) / sum(beta) ** n
+        printed *= math.prod(b**m / math.factorial(m) for b, m in zip(beta, drawn, strict=True))
+        assert got == pytest.approx(printed, rel=1e-14)
+
+
+def test_covariance_of_the_class_is_that_of_equation_6():
+    """eq:confscores, σ_ij = -p_i p_j off the diagonal, which is what one draw of a class has."""
     alpha = torch.tensor([[0.4, 2.0, 7.5], [1.0, 1.0, 2.0]], dtype=torch.float64)
-    p = alpha / alpha.sum(-1, keepdim=True)
-    draws = torch.eye(3, dtype=torch.float64)
-    expected = torch.zeros(2, 3, 3, dtype=torch.float64)
+    got = dirichlet.categorical_covariance(alpha)
     for row in range(2):
-        for k in range(3):
-            offset = draws[k] - p[row]
-            expected[row] += p[row, k] * torch.outer(offset, offset)
-    torch.testing.assert_close(dirichlet.categorical_covariance(alpha), expected, rtol=1e-13, atol=1e-15)
+        p = [float(a / alpha[row].sum()) for a in alpha[row]]
+        for i in range(3):
+            for j in range(3):
+                drawn = sum(p[k] * ((k == i) - p[i]) * ((k == j) - p[j]) for k in range(3))
+                assert float(got[row, i, j]) == pytest.approx(drawn, rel=1e-13)
+                if i != j:
+                    assert float(got[row, i, j]) == pytest.approx(-p[i] * p[j], rel=1e-13)
+    # That of the probabilities under the Dirichlet is smaller: it shrinks as evidence grows.
+    torch.testing.assert_close(dirichlet.covariance(alpha), got / (alpha.sum(-1) + 1)[:, None, None])
+
+
+@pytest.mark.parametrize("beta", [[0.5, 0.5], [0.5, 3.0], [6.0, 1.5]])
+def test_divergence_from_the_prior_is_the_integral_of_equation_19(beta):
+    """eq:kldivergence, between the Dirichlets themselves, β⁰ = 0.5: ∫ Dir(p | β) ln(Dir(p | β) / Dir(p | β⁰)) dp."""
+    belief, prior = scipy.stats.beta(*beta), scipy.stats.beta(0.5, 0.5)
+
+    def integrand(angle):
+        """With p = sin², which takes the poles of the densities out of the integral."""
+        p = math.sin(angle) ** 2
+        return belief.pdf(p) * (belief.logpdf(p) - prior.logpdf(p)) * math.sin(2 * angle)
+
+    expected, _ = scipy.integrate.quad(integrand, 0, math.pi / 2, epsabs=1e-11, epsrel=1e-11)
+    one, other = torch.tensor(beta, dtype=torch.float64), torch.full((2,), 0.5, dtype=torch.float64)
+    assert float(dirichlet.kl_divergence(one, other)) == pytest.approx(expected, abs=1e-9)
 
 
 def test_everything_has_gradients():

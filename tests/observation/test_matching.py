@@ -1,4 +1,4 @@
-"""Matching against torchvision's IoU and a loop."""
+"""Matching against torchvision's IoU and a loop; how detections are matched is our choice, not the paper's."""
 
 import torch
 from torchvision.ops import box_iou as torchvision_iou

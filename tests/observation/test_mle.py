@@ -5,6 +5,7 @@ import mpmath
 import numpy as np
 import pytest
 import scipy.optimize
+import scipy.special
 import scipy.stats
 import torch
 from hypothesis import given, settings
@@ -175,6 +176,19 @@ def test_derivative_is_that_of_the_optimum():
     assert torch.autograd.gradcheck(mle, (mean_log,), rtol=1e-4)
     bounded = torch.tensor([[0.7, 0.2, 0.1]], dtype=torch.float64).log().requires_grad_()
     assert torch.autograd.gradcheck(lambda g: mle(g - 1e-3, max_precision=50.0), (bounded,), rtol=1e-4)
+
+
+def test_fixed_point_is_where_minkas_iteration_ends():
+    """ψ(α_k) = ψ(Σ α_old) + mean ln s_k (Minka, 2000, equation 9), round by round with scipy's ψ and a root finder."""
+
+    def inverse(y):
+        return scipy.optimize.brentq(lambda x: scipy.special.digamma(x) - y, 1e-6, 1e3)
+
+    mean_log = np.log(np.random.default_rng(7).dirichlet([1.5, 0.6, 2.5], 80)).mean(0)
+    alpha = np.ones(3)
+    for _ in range(400):
+        alpha = np.array([inverse(y) for y in scipy.special.digamma(alpha.sum()) + mean_log])
+    np.testing.assert_allclose(mle(torch.from_numpy(mean_log), method="fixed_point"), alpha, rtol=1e-7)
 
 
 def test_inverse_digamma_inverts():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from semfov import EmbeddedScenes, FovealObservationModel, Grid, acquisition, dirichlet, fusion
+from semfov import DirichletBelief, EmbeddedScenes, FovealObservationModel, Grid, acquisition, dirichlet, fusion
 from semfov.belief import fuse
 from semfov.gaze import select_fixation
 
@@ -134,13 +134,16 @@ def test_maps_do_not_depend_on_the_batch():
     visited = torch.zeros(16, 30, dtype=torch.bool)
     for value in (
         acquisition.TargetPosterior(4),
-        acquisition.PredictedTargetPosterior(4, model, calibrated=True),
-        acquisition.KLDivergence(model, grid, calibrated=True),
+        acquisition.PredictedTargetPosterior(4, model),
+        acquisition.KLDivergence(model, grid),
         acquisition.NegativeEntropy(model, grid),
         acquisition.TwoPeaks(model, grid),
     ):
-        together = select_fixation(value(whole), visited, noise)
-        alone = [select_fixation(value(whole[i : i + 1]), visited[:1], noise[i : i + 1]) for i in range(16)]
+        together = select_fixation(value(DirichletBelief(whole), visited), visited, noise)
+        alone = [
+            select_fixation(value(DirichletBelief(whole[i : i + 1]), visited[:1]), visited[:1], noise[i : i + 1])
+            for i in range(16)
+        ]
         assert torch.equal(together, torch.cat(alone))
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from semfov import FovealObservationModel, Foveation, Grid, acquisition, fusion
+from semfov import DirichletBelief, FovealObservationModel, Foveation, Grid, acquisition, fusion
 from semfov.gaze import select_fixation
 from semfov.observation import FoldedObservationModel
 
@@ -41,7 +41,7 @@ class SearchStep(nn.Module):
         for number in range(likelihood.shape[1]):
             fused = fusion.kaplan(beta, likelihood[:, number, None])
             beta = torch.where(footprint[:, number, :, None], fused, beta)
-        values = self.value(beta)
+        values = self.value(DirichletBelief(beta), visited)
         return beta, values, select_fixation(values, visited, noise)
 
 
@@ -75,9 +75,9 @@ def test_step(name, tmp_path):
 
     def step_with(source: FovealObservationModel) -> SearchStep:
         if name == "predictive":
-            value: nn.Module = acquisition.PredictedTargetPosterior(2, source, calibrated=True)
+            value: nn.Module = acquisition.PredictedTargetPosterior(2, source)
         else:
-            value = acquisition.NegativeEntropy(source, GRID, calibrated=True)
+            value = acquisition.NegativeEntropy(source, GRID)
         return SearchStep(source, value).eval()
 
     cells, looks = len(GRID), 3

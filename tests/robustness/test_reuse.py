@@ -17,7 +17,7 @@ from torch import Tensor, nn
 import semfov
 from semfov import Eye, FovealObservationModel, Foveation, Grid, SemanticMap, acquisition, fusion, saliency
 from semfov.agent import ActivePerception
-from semfov.belief import Belief, ContextPrior, TargetEvidence
+from semfov.belief import ContextPrior, DirichletBelief, TargetEvidence
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.gaze import LearnedGaze, select_fixation
 from semfov.observation import FoldedObservationModel
@@ -88,15 +88,15 @@ class Given(nn.Module):
         return self.part(*inputs, *self.arguments)
 
 
-class Remembering(nn.Module):
-    """A part that takes the whole belief and the visited cells."""
+class Valuing(nn.Module):
+    """An acquisition function, given the parameters of a belief and how close the fovea was to each cell."""
 
     def __init__(self, part: nn.Module) -> None:
         super().__init__()
         self.part = part
 
     def forward(self, beta: Tensor, closest: Tensor) -> Tensor:
-        return self.part(Belief(beta, closest), closest == 0)
+        return self.part(DirichletBelief(beta, closest), closest == 0)
 
 
 class Scores(nn.Module):
@@ -132,6 +132,10 @@ def memory() -> tuple[Tensor, Tensor]:
     return beliefs(), closest
 
 
+def valuing(make: Callable[[], nn.Module]) -> nn.Module:
+    return Valuing(make())
+
+
 def context() -> nn.Module:
     return ContextPrior(CLASSES, rand(4, 3, 3), rand(4, 4, 3), [0.2, 0.4], weights={"map": (0.5, 0.2)})
 
@@ -156,23 +160,27 @@ def beliefs() -> Tensor:
 
 SEARCHERS: dict[str, Callable[[], nn.Module]] = {
     "TargetPosterior": lambda: acquisition.TargetPosterior(2),
-    "PredictedTargetPosterior": lambda: acquisition.PredictedTargetPosterior(2, model(), calibrated=True),
-    "NeighbourhoodPosterior": lambda: acquisition.NeighbourhoodPosterior(2, GRID),
+    "PredictedTargetPosterior": lambda: acquisition.PredictedTargetPosterior(2, model()),
+    "NeighbourhoodPosterior": lambda: acquisition.NeighbourhoodPosterior(2, model(), GRID),
     "FovealHit": lambda: acquisition.FovealHit(2, model(), GRID),
     "PlaceInformation": lambda: acquisition.PlaceInformation(2, model(), GRID),
+    "SaliencyPrior": lambda: acquisition.SaliencyPrior(acquisition.TargetPosterior(2), rand(len(GRID)), weight=0.5),
+    "LearnedGaze": lambda: LearnedGaze().policy(2, GRID),
+    "CloserLook": lambda: acquisition.CloserLook(GRID),
     "Static": lambda: acquisition.Static(rand(len(GRID))),
     "Uniform": acquisition.Uniform,
 }
 LOOKAHEADS = (
     acquisition.KLDivergence,
+    acquisition.BayesianSurprise,
     acquisition.NegativeEntropy,
     acquisition.TwoPeaks,
     acquisition.UpperConfidenceBound,
     acquisition.ProbabilityOfImprovement,
 )
-EXPLORERS: dict[str, Callable[[], nn.Module]] = {
-    make.__name__: partial(make, model(), GRID, calibrated=True) for make in LOOKAHEADS
-} | {"ExpectedAccuracy": lambda: acquisition.ExpectedAccuracy(model(), GRID)}
+EXPLORERS: dict[str, Callable[[], nn.Module]] = {make.__name__: partial(make, model(), GRID) for make in LOOKAHEADS} | {
+    "ExpectedAccuracy": lambda: acquisition.ExpectedAccuracy(model(), GRID)
+}
 ACQUISITIONS = SEARCHERS | EXPLORERS
 OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]]]] = {
     "ContextPrior": (lambda: Given(context(), GRID, 2), lambda: (rand(2, len(GRID), 4),)),
@@ -188,8 +196,6 @@ OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]
     ),
     "TargetEvidence": (lambda: Looking(TargetEvidence(4, 4).eval(), GRID, 2), look),
     "SemanticMap": (lambda: FirstLook(SemanticMap(GRID, CLASSES, observation=model().requires_grad_(False))), look),
-    "LearnedGaze": (lambda: Remembering(LearnedGaze().policy(2, GRID)), memory),
-    "CloserLook": (lambda: Remembering(acquisition.CloserLook(GRID)), memory),
     "VOCUS2": (saliency.VOCUS2, lambda: (rand(1, 3, 40, 60),)),
     "IttiKoch": (saliency.IttiKoch, lambda: (rand(1, 3, 64, 96),)),
 }
@@ -198,7 +204,7 @@ BRANCHING = {
     "Eye": (Scores, lambda: (rand(1, 3, 48, 64), torch.tensor([[20.0, 30.0], [5.0, 6.0]]))),
     "ActivePerception": (Exploring, lambda: (rand(1, 3, 48, 64),)),
 }
-TENSORS = OTHERS | {name: (make, lambda: (beliefs(),)) for name, make in ACQUISITIONS.items()}
+TENSORS = OTHERS | {name: (partial(valuing, make), memory) for name, make in ACQUISITIONS.items()}
 PARTS = TENSORS | BRANCHING
 
 # bfloat16 has 8 bits: a value is off by up to 2^-9, 0.2 %. Calibration multiplies logarithms of small scores by large
@@ -352,7 +358,8 @@ def test_gradients_flow_from_the_choice_back_to_gaze_and_scores():
     scores = view.mean((-1, -2)) @ rand(3, 4)
     likelihood = model()(scores.softmax(-1), torch.tensor([0.1]))
     beta = fusion.kaplan(beliefs()[:1], likelihood[:, None])
-    acquisition.TargetPosterior(2)(beta).sum().backward()
+    belief = DirichletBelief(beta)
+    acquisition.TargetPosterior(2)(belief, belief.closest == 0).sum().backward()
     for leaf in (gaze, width):
         assert bool(torch.isfinite(leaf.grad).all())
         assert float(leaf.grad.abs().sum()) > 0

@@ -1,19 +1,24 @@
 """Acquisition functions: the value of fixating each cell, given the belief."""
 
 from semfov.gaze.acquisition.accuracy import ExpectedAccuracy
+from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.closer_look import CloserLook
 from semfov.gaze.acquisition.exploration import (
+    BayesianSurprise,
     KLDivergence,
     NegativeEntropy,
     ProbabilityOfImprovement,
     TwoPeaks,
     UpperConfidenceBound,
 )
-from semfov.gaze.acquisition.place import FovealHit, NeighbourhoodPosterior, PlaceInformation
-from semfov.gaze.acquisition.search import PredictedTargetPosterior, TargetPosterior
+from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
+from semfov.gaze.acquisition.saliency_prior import SaliencyPrior
+from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
 from semfov.gaze.acquisition.static import Static, Uniform
 
 __all__ = [
+    "AcquisitionFunction",
+    "BayesianSurprise",
     "CloserLook",
     "ExpectedAccuracy",
     "FovealHit",
@@ -23,6 +28,7 @@ __all__ = [
     "PlaceInformation",
     "PredictedTargetPosterior",
     "ProbabilityOfImprovement",
+    "SaliencyPrior",
     "Static",
     "TargetPosterior",
     "TwoPeaks",

@@ -2,10 +2,13 @@
 
 from typing import Protocol
 
-from torch import Tensor, nn
+from torch import Tensor
 
+from semfov.belief.belief import Belief, dirichlet_belief
 from semfov.belief.grid import Grid
 from semfov.errors import InputError, check_shape
+from semfov.gaze.acquisition.base import AcquisitionFunction
+from semfov.gaze.acquisition.lookahead import seen_from
 
 
 class SightedModel(Protocol):
@@ -22,7 +25,7 @@ class SightedModel(Protocol):
         ...
 
 
-class ExpectedAccuracy(nn.Module):
+class ExpectedAccuracy(AcquisitionFunction):
     r"""How many cells with objects one more look is expected to name right that are not yet.
 
     A cell is right with probability :math:`\max_{k \ge 1} p_k`. From level n an object of class k is detected with
@@ -54,12 +57,12 @@ class ExpectedAccuracy(nn.Module):
         self.register_buffer("miss", model.miss_rate[1:])
         self.register_buffer("named", (1 - model.miss_rate[1:]) * right[1:])
 
-    def forward(self, beta: Tensor) -> Tensor:
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
-        check_shape(beta, "beta", self.levels.shape[-1], None)
-        objects = (beta / beta.sum(-1, keepdim=True))[..., 1:]
-        seen = objects @ self.named.to(beta)
-        missed = (objects[..., None] * self.miss.to(beta)).amax(-2)
+        known = dirichlet_belief(belief)
+        check_shape(known.beta, "beta", self.levels.shape[-1], None)
+        objects = known.probabilities[..., 1:]
+        seen = objects @ self.named.to(objects)
+        missed = (objects[..., None] * self.miss.to(objects)).amax(-2)
         gain = (seen + missed - objects.amax(-1, keepdim=True)).clamp(min=0)
-        # (..., seen cell, level) -> (..., seen cell, fixation) -> (..., fixation)
-        return gain.gather(-1, self.levels.expand(*gain.shape[:-1], -1)).sum(-2)
+        return seen_from(gain, self.levels).sum(-2)

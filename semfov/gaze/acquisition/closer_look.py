@@ -1,13 +1,14 @@
 """Exploration that brings the fovea closer to what it has not named yet."""
 
-from torch import Tensor, nn
+from torch import Tensor
 
+from semfov.belief.belief import Belief, dirichlet_belief
 from semfov.belief.grid import Grid
-from semfov.belief.state import Belief
 from semfov.errors import check
+from semfov.gaze.acquisition.base import AcquisitionFunction
 
 
-class CloserLook(nn.Module):
+class CloserLook(AcquisitionFunction):
     r"""How much better than ever before the cells would be seen whose class is not known yet.
 
     Successive looks from one distance see, and miss, the same objects; only a closer look shows more. So a cell counts
@@ -21,16 +22,16 @@ class CloserLook(nn.Module):
 
     Args:
         grid: the cells of one image.
-        fovea: r in longer sides of the image (100 px of 640 by default, the paper's wide fovea).
+        fovea: r in longer sides of the image (100 px of 640 by default).
 
     >>> import torch
     >>> grid = Grid(3, 1, (90, 30))
-    >>> belief = Belief(torch.ones(1, 3, 4), torch.tensor([[0.0, 1 / 3, 2 / 3]]))
+    >>> from semfov import DirichletBelief
+    >>> belief = DirichletBelief(torch.ones(1, 3, 4), torch.tensor([[0.0, 1 / 3, 2 / 3]]))
     >>> CloserLook(grid, 0.2)(belief, torch.tensor([[True, False, False]])).argmax().item()
     1
     """
 
-    reads_memory = True
     seen: Tensor
 
     def __init__(self, grid: Grid, fovea: float = 100 / 640) -> None:
@@ -45,9 +46,10 @@ class CloserLook(nn.Module):
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(B, X·Y)` for a belief `(B, X·Y, K+1)`; where the fovea was is in `belief.closest`."""
-        objects = belief.beta[..., 1:]
+        beta = dirichlet_belief(belief).beta
+        objects = beta[..., 1:]
         unknown = 1 - objects.amax(-1) / objects.sum(-1)
-        gain = (self.seen.to(belief.beta) - self.acuity(belief.closest)[..., None]).clamp(min=0)
+        gain = (self.seen.to(beta) - self.acuity(belief.closest)[..., None]).clamp(min=0)
         return (gain * unknown[..., None]).sum(-2)
 
     def extra_repr(self) -> str:

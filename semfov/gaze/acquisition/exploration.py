@@ -4,62 +4,77 @@ All simulate one look from every cell (`semfov.gaze.acquisition.lookahead`) and 
 cell x; p and T are mean and sum of a cell's Dirichlet parameters, primed after the simulated update.
 """
 
-from typing import Literal, get_args
-
 import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.errors import check, lookup
+from semfov.errors import check
 from semfov.gaze.acquisition.lookahead import LevelledModel, Lookahead, Outlook
-from semfov.observation.dirichlet import kl_divergence
-
-Divergent = Literal["mean", "dirichlet"]
+from semfov.observation.dirichlet import kl_from_symmetric
 
 
 class KLDivergence(Lookahead):
-    r"""How much a look is expected to teach: divergence of the predicted map from the present one.
+    r"""How far a look is expected to take the map from knowing nothing.
 
-    .. math:: a(f) = \sum_x \mathrm{KL}\bigl(p'(x \mid f) \,\|\, p(x)\bigr)
+    .. math:: a(f) = \sum_x F(\bar\beta(x \mid f)) - F(\beta(x)), \qquad
+              F(\beta) = \mathrm{KL}\bigl(\mathrm{Dir}(\beta) \,\|\, \mathrm{Dir}(\beta^0)\bigr)
 
-    (Luzio, Bernardino and Moreno, 2024.)
+    with β⁰ the uniform prior, 0.5 for every class (Luzio, Bernardino and Moreno, 2024, Scene Exploration: F and the
+    sum over the map that the next fixation maximises). The published value is :math:`\sum_x F(\bar\beta)`. The present
+    map's is the same for every fixation; without it, small differences are lost in a large sum.
 
     Args:
         model: the observation model.
         grid: the cells.
-        calibrated: calibrate the expected scores.
-        of: divergence between the `mean` class distributions, or between the `dirichlet` beliefs themselves, whose
-            gamma functions cost several times as much.
+        prior: β⁰.
 
     An eye that sees well up to 0.4 image widths takes in all of three cells from the central one:
 
-    >>> from semfov import FovealObservationModel
+    >>> from semfov import DirichletBelief, FovealObservationModel
     >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])
     >>> model = FovealObservationModel(alpha, [0.4], ["cup"])
-    >>> KLDivergence(model, Grid(3, 1, (30, 10)))(torch.tensor([[1.0, 2.0]]).repeat(3, 1)).argmax()
+    >>> belief = DirichletBelief(torch.tensor([[1.0, 2.0]]).repeat(3, 1))
+    >>> KLDivergence(model, Grid(3, 1, (30, 10)))(belief, torch.zeros(3, dtype=torch.bool)).argmax()
     tensor(1)
     """
 
-    def __init__(self, model: LevelledModel, grid: Grid, *, calibrated: bool = False, of: Divergent = "mean") -> None:
-        super().__init__(model, grid, calibrated=calibrated)
-        lookup(of, get_args(Divergent), "divergence")
-        self.of: Divergent = of
+    def __init__(self, model: LevelledModel, grid: Grid, *, prior: float = 0.5) -> None:
+        super().__init__(model, grid)
+        check(prior > 0, "prior", "a positive number", prior)
+        self.prior = prior
 
     def worth(self, outlook: Outlook) -> Tensor:
-        """Divergence of the predicted from the present belief."""
-        if self.of == "mean":
-            return divergence(outlook)
-        before = outlook.mean * outlook.total[..., None]
-        return kl_divergence(outlook.next_mean * outlook.next_total[..., None], before[..., None, :])
+        """Divergence gained."""
+        now = kl_from_symmetric(outlook.mean * outlook.total[..., None], self.prior)
+        return kl_from_symmetric(outlook.next_beta, self.prior) - now[..., None]
+
+
+class BayesianSurprise(Lookahead):
+    r"""How much a look is expected to change the map: divergence of the predicted from the present posterior.
+
+    .. math:: a(f) = \sum_x \mathrm{KL}\bigl(\bar p(x \mid f) \,\|\, p(x)\bigr)
+
+    (The surprise of Itti and Baldi, 2009, of the expected look. `KLDivergence` measures from the prior instead, and
+    between the Dirichlets.)
+
+    Args:
+        model: the observation model.
+        grid: the cells.
+    """
+
+    def worth(self, outlook: Outlook) -> Tensor:
+        """Divergence of the predicted from the present posterior."""
+        return divergence(outlook)
 
 
 class NegativeEntropy(Lookahead):
     r"""How certain a look is expected to leave the map.
 
-    .. math:: a(f) = \sum_x H(p(x)) - H(p'(x \mid f)), \qquad H(p) = -\sum_k p_k \ln p_k
+    .. math:: a(f) = \sum_x H(p(x)) - H(\bar p(x \mid f)), \qquad H(p) = -\sum_k p_k \ln p_k
 
-    The published value is :math:`-\sum_x H(p')`. The entropy of the present map is the same for every fixation; with
-    it, small differences are not lost in a large sum.
+    (Luzio, Bernardino and Moreno, 2024, Scene Exploration, the classification negentropy.) The published value is
+    :math:`-\sum_x H(\bar p)`. The entropy of the present map is the same for every fixation; with it, small differences
+    are not lost in a large sum.
     """
 
     def worth(self, outlook: Outlook) -> Tensor:
@@ -74,7 +89,7 @@ class TwoPeaks(Lookahead):
 
     .. math:: a(f) = \max_x |\Delta(p'(x \mid f)) - \Delta(p(x))|, \qquad \Delta(p) = p_{(1)} - p_{(2)}
 
-    (Luzio, Bernardino and Moreno, 2024.)
+    (Luzio, Bernardino and Moreno, 2024, Scene Exploration, the expected improvement of the two-peak difference.)
     """
 
     def worth(self, outlook: Outlook) -> Tensor:
@@ -97,12 +112,11 @@ class UpperConfidenceBound(Lookahead):
     Args:
         model: the observation model.
         grid: the cells.
-        calibrated: calibrate the expected scores.
         kappa: κ, standard deviations above the mean.
     """
 
-    def __init__(self, model: LevelledModel, grid: Grid, *, calibrated: bool = False, kappa: float = 2.0) -> None:
-        super().__init__(model, grid, calibrated=calibrated)
+    def __init__(self, model: LevelledModel, grid: Grid, *, kappa: float = 2.0) -> None:
+        super().__init__(model, grid)
         check(kappa >= 0, "kappa", "0 or more", kappa)
         self.kappa = kappa
 
@@ -121,17 +135,17 @@ class ProbabilityOfImprovement(Lookahead):
     .. math:: a(f) = \sum_x \Phi\left(\frac{p'_{(1)}(x \mid f) - p_{(1)}(x) - \xi}{\sigma'(x \mid f)}\right), \qquad
               \sigma'^2 = p'_{(1)} (1 - p'_{(1)}) / (T' + 1)
 
-    with the predicted Dirichlet's marginal taken for normal. (Kushner, 1964, on the predicted map.)
+    with the predicted Dirichlet's marginal taken for normal. (Kushner, 1964, on the predicted map. What a
+    caption of Luzio, Bernardino and Moreno, 2024, calls the probability of improving is the sum of `KLDivergence`.)
 
     Args:
         model: the observation model.
         grid: the cells.
-        calibrated: calibrate the expected scores.
         margin: ξ, probability by which to improve.
     """
 
-    def __init__(self, model: LevelledModel, grid: Grid, *, calibrated: bool = False, margin: float = 0.0) -> None:
-        super().__init__(model, grid, calibrated=calibrated)
+    def __init__(self, model: LevelledModel, grid: Grid, *, margin: float = 0.0) -> None:
+        super().__init__(model, grid)
         check(0 <= margin < 1, "margin", "at least 0 and less than 1", margin)
         self.margin = margin
 

@@ -1,13 +1,16 @@
 """One look ahead: what a fixation is expected to make of the belief about the whole map."""
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from semfov.belief.belief import Belief, dirichlet_belief
 from semfov.belief.grid import Grid
 from semfov.errors import check, check_shape, values_known
+from semfov.gaze.acquisition.base import AcquisitionFunction
 
 # A batch is looked ahead from a few maps at a time: what lies in between, a number for every cell, level and class,
 # then stays in the processor's cache, and the batch costs a quarter.
@@ -23,10 +26,6 @@ class LevelledModel(Protocol):
 
     def expected_scores(self) -> Tensor:
         """Expected scores `E[S | class k, level n]`, `(K+1, N, K+1)`."""
-        ...
-
-    def calibrate_levels(self, scores: Tensor) -> Tensor:
-        """Likelihoods `(..., N, K+1)` for scores `(..., N, K+1)` whose row n is seen at level n."""
         ...
 
 
@@ -60,32 +59,38 @@ class Outlook:
         total = self.total[..., None]
         return (total + 1) / (1 + self.evidence.amin(-1) / total)
 
+    @property
+    def next_beta(self) -> Tensor:
+        """Parameters after Kaplan's update, `β' = T' p'`, `(..., X·Y, N, K+1)`."""
+        return self.next_mean * self.next_total[..., None]
 
-def look_ahead(beta: Tensor, model: LevelledModel, *, calibrated: bool = False) -> Outlook:
+
+def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
     r"""Simulate Kaplan's update of every cell with the scores expected at every level of distance.
 
     .. math:: \bar S_n = \sum_k p_k \, E[S \mid k, n], \qquad p'_k = \frac{T p_k + p_k r_k}{T + 1}, \quad
-              r_k = \frac{\lambda_k}{\sum_j p_j \lambda_j}
+              r_k = \frac{\bar S_{n,k}}{\sum_j p_j \bar S_{n,j}}
 
-    where λ is :math:`\bar S_n`, or what it is calibrated to at level n.
+    The expected scores stand in Kaplan's rule as they are (Luzio, Bernardino and Moreno, 2024, the equation of
+    :math:`\bar S^x`, "which can then be applied with Kaplan's rule").
 
     Args:
         beta: `(..., X·Y, K+1)`, Dirichlet parameters.
-        model: the observation model.
-        calibrated: pass the expected scores through the model's calibration, as an agent does that calibrates what it
-            sees.
+        expected: `(K+1, N, K+1)`, scores to expect of each class at each level
+            (`FovealObservationModel.expected_scores`).
+
+    Raises:
+        InputError: belief and expected scores are of different numbers of classes.
     """
-    expected = model.expected_scores().to(beta)
     components = beta.shape[-1]
     check(expected.shape[0] == components, "model", f"{components} classes", expected.shape[0])
     total = beta.sum(-1)
     mean = beta / total[..., None]
-    scores = (mean @ expected.flatten(1)).unflatten(-1, expected.shape[1:])
-    likelihood = model.calibrate_levels(scores) if calibrated else scores
-    return Outlook(total, mean, likelihood / (likelihood * mean[..., None, :]).sum(-1, keepdim=True))
+    scores = (mean @ expected.to(beta).flatten(1)).unflatten(-1, expected.shape[1:])
+    return Outlook(total, mean, scores / (scores * mean[..., None, :]).sum(-1, keepdim=True))
 
 
-class Lookahead(nn.Module):
+class Lookahead(AcquisitionFunction):
     """Base of the acquisition functions of exploration.
 
     A cell's update depends on the fixation only through the level of the distance between them. So every cell is
@@ -94,19 +99,18 @@ class Lookahead(nn.Module):
     Args:
         model: the observation model (`semfov.FovealObservationModel`).
         grid: the cells, of one image or of a batch.
-        calibrated: see `look_ahead`.
     """
 
     levels: Tensor
 
-    def __init__(self, model: LevelledModel, grid: Grid, *, calibrated: bool = False) -> None:
+    def __init__(self, model: LevelledModel, grid: Grid) -> None:
         super().__init__()
         self.model = model
-        self.calibrated = calibrated
         self.register_buffer("levels", model.level(grid.cell_distance))
 
-    def forward(self, beta: Tensor) -> Tensor:
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Value of fixating each cell, `(..., X·Y)`, for a belief `(..., X·Y, K+1)`."""
+        beta = dirichlet_belief(belief).beta
         check_shape(beta, "beta", self.levels.shape[-1], None)
         maps = beta.ndim - 2
         if maps == 0 or self.levels.ndim > 2 or not values_known():
@@ -118,19 +122,22 @@ class Lookahead(nn.Module):
         return torch.cat([self._values(part) for part in parts]).unflatten(0, beta.shape[:-2])
 
     def _values(self, beta: Tensor) -> Tensor:
-        worth = self.worth(look_ahead(beta, self.model, calibrated=self.calibrated))
-        cells = self.levels.shape[-1]
-        # (..., X·Y, N) -> (..., seen cell, fixation)
-        return self.pool(worth.gather(-1, self.levels.expand(*worth.shape[:-1], cells)))
+        return self.pool(seen_from(self.worth(look_ahead(beta, self.model.expected_scores())), self.levels))
 
+    @abstractmethod
     def worth(self, outlook: Outlook) -> Tensor:
         """What seeing a cell from each level is worth, `(..., X·Y, N)`."""
-        raise NotImplementedError
 
     def pool(self, worth: Tensor) -> Tensor:
         """One value for each fixation `(..., X·Y)` from what it is worth at every cell `(..., X·Y, X·Y)`: the sum."""
         return worth.sum(-2)
 
-    def extra_repr(self) -> str:
-        """Settings, for `repr`."""
-        return f"calibrated={self.calibrated}"
+
+def seen_from(values: Tensor, levels: Tensor) -> Tensor:
+    """What is so for each level `(..., X·Y, N)`, for each fixation: `(..., seen cell, fixation)`.
+
+    Args:
+        values: for every cell and level.
+        levels: `(X·Y, X·Y)` or `(B, X·Y, X·Y)`, level of the distance between every two cells.
+    """
+    return values.gather(-1, levels.expand(*values.shape[:-1], levels.shape[-1]))

@@ -3,11 +3,12 @@
 from typing import Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
-from semfov.errors import InputError, check
-from semfov.gaze.acquisition.search import pick
+from semfov.errors import InputError
+from semfov.gaze.acquisition.base import AcquisitionFunction
 
 
 class MissModel(Protocol):
@@ -20,40 +21,7 @@ class MissModel(Protocol):
         ...
 
 
-class NeighbourhoodPosterior(nn.Module):
-    r"""Probability of the target in a cell and, with less weight, around it.
-
-    .. math:: a(f) = \sum_x \exp\left(-\frac{\|x - f\|^2}{2 \sigma^2}\right) p_t(x)
-
-    The paper names it as future work: boxes and beliefs are a cell or so off, and targets are larger than a cell.
-
-    Args:
-        target: component of the belief that stands for the target, or a tensor `(B,)` with one for each episode.
-        grid: the cells.
-        sigma: σ in cells.
-
-    >>> beta = torch.tensor([[[1.0, 1.0], [1.0, 1.2], [1.0, 1.0]]])
-    >>> NeighbourhoodPosterior(1, Grid(3, 1, (3, 1)), sigma=0.5)(beta)
-    tensor([[0.5740, 0.6808, 0.5740]])
-    """
-
-    target: Tensor
-    kernel: Tensor
-
-    def __init__(self, target: int | Tensor, grid: Grid, *, sigma: float = 0.7) -> None:
-        super().__init__()
-        check(sigma > 0, "sigma", "a positive number of cells", sigma)
-        self.register_buffer("target", torch.as_tensor(target))
-        cell = torch.arange(len(grid))
-        place = torch.stack([cell % grid.columns, cell // grid.columns], -1).to(torch.get_default_dtype())
-        self.register_buffer("kernel", (-torch.cdist(place, place).square() / (2 * sigma**2)).exp())
-
-    def forward(self, beta: Tensor) -> Tensor:
-        """Values `(..., X·Y)` for a belief `(..., X·Y, C)`."""
-        return (pick(beta, self.target) / beta.sum(-1)) @ self.kernel.to(beta)
-
-
-class TargetVisibility(nn.Module):
+class TargetVisibility(AcquisitionFunction):
     """Base of the acquisition functions that know from where the target can be seen.
 
     Args:
@@ -90,10 +58,10 @@ class FovealHit(TargetVisibility):
         grid: the cells of one image.
     """
 
-    def forward(self, beta: Tensor) -> Tensor:
-        """Values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
-        present = pick(beta, self.target) / beta.sum(-1)
-        return -torch.expm1(torch.log1p(-present[..., None, :] * self.visibility.to(beta)).sum(-1))
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
+        """Values `(..., X·Y)`."""
+        present = belief.probability(self.target)
+        return -torch.expm1(torch.log1p(-present[..., None, :] * self.visibility.to(present)).sum(-1))
 
 
 class PlaceInformation(TargetVisibility):
@@ -105,8 +73,8 @@ class PlaceInformation(TargetVisibility):
 
     .. math:: a(f) = H(q) - \Bigl(\sum_x q(x) (1 - v_t(d(x, f)))\Bigr) H(q')
 
-    (The expected information gain of an ideal searcher, after Najemnik and Geisler, 2005, with a detector that either
-    sees or misses.)
+    (The expected information gain of a searcher, as in Butko and Movellan, 2010, with a detector that either sees or
+    misses.)
 
     Args:
         target: class 1..K, or a tensor `(B,)` with one for each episode.
@@ -114,11 +82,11 @@ class PlaceInformation(TargetVisibility):
         grid: the cells of one image.
     """
 
-    def forward(self, beta: Tensor) -> Tensor:
-        """Values `(..., X·Y)` in nats for a belief `(..., X·Y, K+1)`."""
-        present = pick(beta, self.target) / beta.sum(-1)
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
+        """Values `(..., X·Y)` in nats."""
+        present = belief.probability(self.target)
         place = present / present.sum(-1, keepdim=True)
-        missed = place[..., None, :] * (1 - self.visibility.to(beta))
+        missed = place[..., None, :] * (1 - self.visibility.to(present))
         nothing = missed.sum(-1)
         # P(nothing) H(q') = -Σ m ln m + P ln P with m = q (1 - v)
         left = torch.xlogy(nothing, nothing) - torch.xlogy(missed, missed).sum(-1)

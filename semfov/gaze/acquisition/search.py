@@ -3,33 +3,37 @@
 from typing import Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from semfov.belief.fusion import scale_likelihood
-from semfov.errors import check, values_known
+from semfov.belief.belief import Belief, dirichlet_belief, pick
+from semfov.belief.grid import Grid
+from semfov.errors import check, check_shape
+from semfov.gaze.acquisition.base import AcquisitionFunction
+from semfov.gaze.acquisition.lookahead import LevelledModel, look_ahead, seen_from
 
 
-class FovealModel(Protocol):
+class ExpectingModel(Protocol):
     """What prediction needs of an observation model (`semfov.FovealObservationModel`)."""
 
     def expected_scores(self) -> Tensor:
         """Expected scores `E[S | class k, level n]`, `(K+1, N, K+1)`, level 0 at the fovea."""
         ...
 
-    def calibrate(self, scores: Tensor, distance: Tensor) -> Tensor:
-        """Likelihoods `(..., K+1)` for scores `(..., K+1)` at distances `(...)`."""
-        ...
 
-
-class TargetPosterior(nn.Module):
+class TargetPosterior(AcquisitionFunction):
     r"""Probability that a cell holds the target class: non-predictive search.
 
-    .. math:: a(x) = p_t(x) = \beta_t(x) / \sum_j \beta_j(x)
+    .. math:: a(x) = P(C^x = t) = \beta_t(x) / \sum_j \beta_j(x)
+
+    for a Dirichlet belief (Luzio, Bernardino and Moreno, 2024, Non-Predictive Visual Search); any other belief says
+    itself what the probability is.
 
     Args:
         target: index of the target class, 1..K, or a tensor `(B,)` with one for each episode.
 
-    >>> TargetPosterior(1)(torch.tensor([[[1.0, 3.0], [1.0, 1.0]]]))
+    >>> from semfov import DirichletBelief
+    >>> belief = DirichletBelief(torch.tensor([[[1.0, 3.0], [1.0, 1.0]]]))
+    >>> TargetPosterior(1)(belief, torch.zeros(1, 2, dtype=torch.bool))
     tensor([[0.7500, 0.5000]])
     """
 
@@ -39,56 +43,75 @@ class TargetPosterior(nn.Module):
         super().__init__()
         self.register_buffer("target", torch.as_tensor(target))
 
-    def forward(self, beta: Tensor) -> Tensor:
-        """Values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
-        return pick(beta, self.target) / beta.sum(-1)
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
+        """Values `(B, X·Y)`."""
+        return belief.probability(self.target)
 
 
-class PredictedTargetPosterior(nn.Module):
+class PredictedTargetPosterior(AcquisitionFunction):
     r"""Probability of the target that one more, foveal look at a cell is expected to leave: predictive search.
 
-    With the scores expected of such a look and one simulated step of Kaplan's rule, of which the mean is known,
+    With the scores expected of such a look and one simulated update by Kaplan's rule,
 
-    .. math:: \bar S = \sum_k p_k \, E[S \mid k, d = 0], \qquad
-              a(x) = \frac{\beta_t (1 + \lambda_t / D)}{1 + \sum_j \beta_j}, \quad D = \sum_j \beta_j \lambda_j
+    .. math:: \bar S_0 = \sum_k p_k \, \frac{\alpha_{k,0}}{\sum_j \alpha_{k,0,j}}, \qquad
+              a(x) = \frac{\bar\beta_t}{\sum_k \bar\beta_k} = p_t \frac{T + r_t}{T + 1}, \quad
+              r_t = \frac{\bar S_{0,t}}{\sum_j p_j \bar S_{0,j}}, \quad T = \sum_j \beta_j
 
-    where λ is `S̄` itself, or `S̄` calibrated at the fovea (Luzio, Bernardino and Moreno, 2024).
+    (Luzio, Bernardino and Moreno, 2024, Predictive Visual Search). The expected scores are not calibrated again.
 
     Args:
         target: index of the target class, 1..K, or a tensor `(B,)` with one for each episode.
         model: the observation model, for the expected scores.
-        calibrated: pass `S̄` through the model's calibration, as an agent does that calibrates what it sees.
     """
 
     target: Tensor
 
-    def __init__(self, target: int | Tensor, model: FovealModel, *, calibrated: bool = False) -> None:
+    def __init__(self, target: int | Tensor, model: ExpectingModel) -> None:
         super().__init__()
         self.model = model
-        self.calibrated = calibrated
         self.register_buffer("target", torch.as_tensor(target))
 
-    def forward(self, beta: Tensor) -> Tensor:
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
-        expected = self.model.expected_scores()[:, 0].to(beta)
-        components = beta.shape[-1]
-        check(expected.shape[0] == components, "model", f"{components} classes", expected.shape[0])
-        total = beta.sum(-1)
-        scores = (beta / total[..., None]) @ expected
-        if self.calibrated:
-            scores = self.model.calibrate(scores, torch.zeros_like(total))
-        likelihood = scale_likelihood(scores)
-        share = pick(likelihood, self.target) / (beta * likelihood).sum(-1)
-        return pick(beta, self.target) * (1 + share) / (1 + total)
+        outlook = look_ahead(dirichlet_belief(belief).beta, self.model.expected_scores()[:, :1])
+        return pick(outlook.next_mean[..., 0, :], self.target)
 
 
-def pick(values: Tensor, target: Tensor) -> Tensor:
-    """Component `target` (a scalar, or `(B,)`) of `values` `(B, X·Y, K+1)`, `(B, X·Y)`."""
-    components = values.shape[-1]
-    if values_known():
-        inside = bool(((target >= 0) & (target < components)).all())
-        check(inside, "target", f"a class index from 0 to {components - 1}", target.tolist())
-    if target.ndim == 0:
-        return values[..., target]
-    index = target.reshape(*target.shape, *[1] * (values.ndim - target.ndim))
-    return values.take_along_dim(index.expand(*values.shape[:-1], 1), -1)[..., 0]
+class NeighbourhoodPosterior(AcquisitionFunction):
+    r"""Probability of the target around a cell in the map that a fixation of it is expected to leave.
+
+    .. math:: a(f) = \sum_x \exp\left(-\frac{\|x - f\|^2}{2 \varsigma^2}\right) \bar p_t(x \mid f)
+
+    with :math:`\bar p` the predicted map, every cell seen from the level of its distance to f. The outlook of Luzio,
+    Bernardino and Moreno (2024) proposes it: "the semantic information available in the cells surrounding a potential
+    fixation point, which can be extracted from" the predicted map, weighted "according to their distance to the focal
+    point". The paper gives no weights; the Gaussian is our choice.
+
+    Args:
+        target: index of the target class, 1..K, or a tensor `(B,)` with one for each episode.
+        model: the observation model, for the expected scores.
+        grid: the cells of one image.
+        sigma: ς in cells.
+    """
+
+    target: Tensor
+    levels: Tensor
+    kernel: Tensor
+
+    def __init__(self, target: int | Tensor, model: LevelledModel, grid: Grid, *, sigma: float = 0.7) -> None:
+        super().__init__()
+        check(sigma > 0, "sigma", "a positive number of cells", sigma)
+        self.model = model
+        self.register_buffer("target", torch.as_tensor(target))
+        self.register_buffer("levels", model.level(grid.cell_distance))
+        cell = torch.arange(len(grid))
+        place = torch.stack([cell % grid.columns, cell // grid.columns], -1).to(torch.get_default_dtype())
+        self.register_buffer("kernel", (-torch.cdist(place, place).square() / (2 * sigma**2)).exp())
+
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
+        """Values `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
+        beta = dirichlet_belief(belief).beta
+        check_shape(beta, "beta", self.levels.shape[-1], None)
+        outlook = look_ahead(beta, self.model.expected_scores())
+        predicted = seen_from(pick(outlook.next_mean, self.target), self.levels)
+        return (predicted * self.kernel.to(predicted)).sum(-2)

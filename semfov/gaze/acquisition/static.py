@@ -1,24 +1,27 @@
 """Acquisition functions that do not look at the belief."""
 
-from torch import Tensor, nn
+from torch import Tensor
 
+from semfov.belief.belief import Belief
 from semfov.errors import check_shape
+from semfov.gaze.acquisition.base import AcquisitionFunction
 
 
-class Uniform(nn.Module):
+class Uniform(AcquisitionFunction):
     """Every cell is worth the same: with ties broken at random this is uniform random gaze.
 
     >>> import torch
-    >>> Uniform()(torch.ones(1, 3, 2))
+    >>> from semfov import DirichletBelief
+    >>> Uniform()(DirichletBelief(torch.ones(1, 3, 2)), torch.zeros(1, 3, dtype=torch.bool))
     tensor([[0., 0., 0.]])
     """
 
-    def forward(self, beta: Tensor) -> Tensor:
-        """Zeros `(..., X·Y)` for a belief `(..., X·Y, K+1)`."""
-        return beta.new_zeros(beta.shape[:-1])
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
+        """Zeros `(..., X·Y)`."""
+        return belief.closest.new_zeros(belief.closest.shape)
 
 
-class Static(nn.Module):
+class Static(AcquisitionFunction):
     """Given values, such as a saliency map's, whatever the belief.
 
     Args:
@@ -31,7 +34,7 @@ class Static(nn.Module):
         super().__init__()
         self.register_buffer("values", values)
 
-    def forward(self, beta: Tensor) -> Tensor:
-        """The values `(..., X·Y)`, for a belief `(..., X·Y, K+1)` of as many cells."""
-        check_shape(self.values, "values", beta.shape[-2])
-        return self.values.expand(beta.shape[:-1])
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
+        """The values `(..., X·Y)`, for a belief about as many cells."""
+        check_shape(self.values, "values", belief.closest.shape[-1])
+        return self.values.expand(belief.closest.shape)

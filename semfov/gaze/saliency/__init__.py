@@ -1,4 +1,8 @@
-"""Bottom-up saliency: where an image draws the gaze, whatever is looked for. Baselines to compare with."""
+"""Bottom-up saliency: where an image draws the gaze, whatever is looked for. Baselines to compare with.
+
+VOCUS2 is the baseline of Luzio, Bernardino and Moreno (2024, section IV-B), computed anew on the foveated view of every
+fixation. The model of Itti, Koch and Niebur is the one that VOCUS2 reforms; the paper has no figures for it.
+"""
 
 from semfov.gaze.saliency.cells import cell_saliency
 from semfov.gaze.saliency.itti import IttiKoch, itti_koch_saliency

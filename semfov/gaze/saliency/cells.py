@@ -18,7 +18,9 @@ def cell_saliency(saliency: Tensor, columns: int, rows: int, reduction: Reductio
         columns: number of cells in a row, X.
         rows: number of cells in a column, Y.
         reduction: `mean` over the cell's area (a pixel on the border counts with the share inside), or `max` over
-            the pixels that share a positive area with it.
+            the pixels that share a positive area with it. With `max` the best cell not yet visited is that of the most
+            salient pixel once the pixels of visited cells are nullified, as Luzio, Bernardino and Moreno (2024, section
+            IV-B) describe inhibition of return.
 
     Returns:
         `(B, Y·X)`.

@@ -16,7 +16,8 @@ CENTRES = (2, 3, 4)
 DELTAS = (3, 4)
 ORIENTATIONS = (0.0, 45.0, 90.0, 135.0)
 
-# The paper names no Gabor filter; these are the SaliencyToolbox's (Walther and Koch, 2006).
+# Itti, Koch and Niebur (1998) print no sizes of their Gabor filters; these are the SaliencyToolbox's (Walther and
+# Koch, 2006).
 _TAPS, _PERIOD, _SIGMA = 9, 7.0, 7 / 3
 
 # Lower maxima of a map do not count (Walther and Koch, 2006).
@@ -83,7 +84,7 @@ def across_scales(centre: Tensor, surround: Tensor) -> Tensor:
 
 
 def promote(maps: Tensor) -> Tensor:
-    r"""Itti's map normalisation: promote maps with one strong peak, suppress those with many.
+    r"""Map normalisation of Itti, Koch and Niebur (1998): promote maps with one strong peak, suppress those with many.
 
     .. math:: N(M) = M \, (1 - \bar m)^2
 
@@ -130,8 +131,9 @@ def conspicuity(image: Tensor) -> Tensor:
 
     over centres c = 2, 3, 4 and surrounds s = c + 3, c + 4 of the Gaussian pyramid.
 
-    The opponency's contrast is that of R - G at the centre to R - G in the surround. The paper's equation 2 has G - R
-    in the surround, which taken literally answers most to a uniform colour; its text means the contrast.
+    The opponency's contrast is that of R - G at the centre to R - G in the surround. Equation 2 of Itti, Koch and
+    Niebur has G - R in the surround, which taken literally answers most to a uniform colour; their text means the
+    contrast. So it is with B - Y and their equation 3.
 
     Args:
         image: `(B, 3, H, W)`, RGB in [0, 1].

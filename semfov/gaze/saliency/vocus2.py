@@ -94,6 +94,10 @@ def vocus2_saliency(
 
     On-off and off-on contrasts of intensity, red-green and blue-yellow over all layers and scales, fused.
 
+    The saliency baseline of Luzio, Bernardino and Moreno (2024, section IV-B), who print no settings. The authors of
+    VOCUS2 ship two sets with their program: the defaults here are those for cluttered scenes (`coffee_cfg.xml`), and
+    σ of 3 and 13 are the program's own defaults, for salient single objects.
+
     Args:
         image: `(B, 3, H, W)`, RGB in [0, 1].
         centre_sigma: blur of the centre; 2 for cluttered scenes, 3 for salient single objects.

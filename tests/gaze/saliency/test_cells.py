@@ -32,6 +32,19 @@ def test_cells_are_the_grids() -> None:
         assert cell_saliency(saliency, 7, 5, reduction).argmax() == expected
 
 
+def test_the_most_salient_open_cell_holds_the_most_salient_pixel_left() -> None:
+    """Luzio, Bernardino and Moreno (2024, section IV-B): after each fixation the pixels of its cell are nullified."""
+    saliency = torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(0)) + 0.1
+    left, visited = saliency[0].clone(), torch.zeros(20, dtype=torch.bool)
+    for _ in range(20):
+        y, x = divmod(int(left.argmax()), 40)
+        row, column = y // 6, x // 10
+        values = cell_saliency(saliency, 4, 5, "max")[0].masked_fill(visited, -torch.inf)
+        assert int(values.argmax()) == row * 4 + column
+        visited[row * 4 + column] = True
+        left[row * 6 : row * 6 + 6, column * 10 : column * 10 + 10] = 0
+
+
 def test_mean_keeps_the_mass(device: torch.device) -> None:
     saliency = torch.rand(3, 31, 50, dtype=torch.float64, device=device)
     torch.testing.assert_close(cell_saliency(saliency, 8, 7).mean(-1), saliency.mean((-2, -1)))
@@ -42,7 +55,7 @@ def test_gradients_and_compilation() -> None:
     for reduction in ("mean", "max"):
         assert torch.autograd.gradcheck(lambda x, how=reduction: cell_saliency(x, 3, 2, how), saliency)
         compiled = torch.compile(cell_saliency, fullgraph=True, backend="eager")
-        assert torch.equal(compiled(saliency, 3, 2, reduction), cell_saliency(saliency, 3, 2, reduction))
+        torch.testing.assert_close(compiled(saliency, 3, 2, reduction), cell_saliency(saliency, 3, 2, reduction))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Itti, Koch and Niebur's model against its steps written with OpenCV and loops."""
+"""The model of Itti, Koch and Niebur (1998) against its steps written with OpenCV and loops."""
 
 import cv2
 import numpy as np
@@ -86,12 +86,13 @@ def opencv_itti_koch(image: np.ndarray) -> np.ndarray:
 
 
 def test_saliency_is_opencvs(photograph: np.ndarray, dtype: torch.dtype) -> None:
-    image = torch.from_numpy(photograph).permute(2, 0, 1)[None].to(dtype)
-    saliency = IttiKoch()(image)
+    # Noise breaks up even areas: which of their pixels is a peak hangs on how a processor rounds.
+    picture = 0.2 + 0.5 * photograph + 0.3 * np.random.default_rng(0).random(photograph.shape)
+    saliency = IttiKoch()(torch.from_numpy(picture).permute(2, 0, 1)[None].to(dtype))
     assert saliency.dtype == dtype
-    # Which pixels are peaks hangs on the last digits of single precision.
-    atol = 2e-5 if dtype == torch.float64 else 5e-4
-    np.testing.assert_allclose(saliency[0].numpy(), opencv_itti_koch(photograph), atol=atol)
+    # In single precision a peak may still come or go.
+    atol = 1e-6 if dtype == torch.float64 else 5e-4
+    np.testing.assert_allclose(saliency[0].numpy(), opencv_itti_koch(picture), atol=atol)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (48, 64), (97, 131)])
@@ -170,7 +171,9 @@ def test_batch_is_a_loop(dtype: torch.dtype, device: torch.device) -> None:
     images = torch.rand(3, 3, 80, 101, dtype=dtype, device=device)
     images[1] *= 0.2
     loop = torch.cat([itti_koch_saliency(image[None]) for image in images])
-    torch.testing.assert_close(itti_koch_saliency(images), loop, atol=2e-5, rtol=0)
+    # In single precision a peak may come or go.
+    atol = 1e-6 if dtype == torch.float64 else 5e-4
+    torch.testing.assert_close(itti_koch_saliency(images), loop, atol=atol, rtol=0)
 
 
 def test_red_pops_out(pop_out: torch.Tensor) -> None:

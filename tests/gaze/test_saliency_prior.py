@@ -1,0 +1,122 @@
+"""Saliency as a prior over the cells: against a loop, and where it should make no difference."""
+
+import math
+
+import pytest
+import torch
+
+from semfov import DirichletBelief, FovealObservationModel, Grid, InputError
+from semfov.gaze import select_fixation
+from semfov.gaze.acquisition import BayesianSurprise, SaliencyPrior, Static, TargetPosterior, TwoPeaks
+
+GRID = Grid(4, 3, (80, 60))
+
+
+def rand(*shape, seed=0):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+BELIEF = DirichletBelief(0.3 + 4 * rand(3, 12, 5) ** 2)
+NOWHERE = torch.zeros(3, 12, dtype=torch.bool)
+SALIENCY = rand(3, 12, seed=1) ** 3
+
+
+def values(acquisition):
+    return acquisition(BELIEF, NOWHERE)
+
+
+def surprise():
+    alpha = 0.5 + 3 * rand(5, 2, 5) + 2 * torch.eye(5, dtype=torch.float64)[:, None]
+    model = FovealObservationModel(alpha, [0.3], ("cat", "cup", "dog", "hat")).requires_grad_(False)
+    return BayesianSurprise(model, GRID)
+
+
+def two_peaks():
+    return TwoPeaks(surprise().model, GRID)
+
+
+ACQUISITIONS = {"target": lambda: TargetPosterior(2), "surprise": surprise, "two peaks": two_peaks}
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.3, 2.0])
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_value_equals_the_loop(name, weight):
+    plain, got = values(ACQUISITIONS[name]()), values(SaliencyPrior(ACQUISITIONS[name](), SALIENCY, weight=weight))
+    for row in range(3):
+        epsilon = 1e-3 * max(SALIENCY[row].tolist())
+        total = sum(s + epsilon for s in SALIENCY[row].tolist())
+        for cell in range(12):
+            prior = math.log((float(SALIENCY[row, cell]) + epsilon) / total)
+            expected = math.log(float(plain[row, cell])) + weight * prior
+            assert float(got[row, cell]) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_without_weight_the_order_is_that_of_the_acquisition(name):
+    plain, guided = values(ACQUISITIONS[name]()), values(SaliencyPrior(ACQUISITIONS[name](), SALIENCY, weight=0.0))
+    torch.testing.assert_close(guided.exp(), plain)
+    assert torch.equal(guided.argsort(-1, stable=True), plain.argsort(-1, stable=True))
+
+
+@pytest.mark.parametrize("level", [0.0, 1e-12, 0.4, 1e6])
+@pytest.mark.parametrize("name", ACQUISITIONS)
+def test_saliency_that_is_the_same_everywhere_changes_nothing(name, level):
+    """Not even where there is none at all, as in a picture without contrast."""
+    flat = torch.full((12,), level, dtype=torch.float64)
+    plain, guided = values(ACQUISITIONS[name]()), values(SaliencyPrior(ACQUISITIONS[name](), flat, weight=0.7))
+    torch.testing.assert_close(guided - guided.mean(-1, keepdim=True), plain.log() - plain.log().mean(-1, keepdim=True))
+
+
+def test_a_large_weight_leaves_the_order_to_saliency():
+    guided = values(SaliencyPrior(TargetPosterior(2), SALIENCY, weight=1e6))
+    assert torch.equal(guided.argsort(-1), SALIENCY.argsort(-1))
+
+
+def test_a_cell_without_saliency_is_not_out():
+    """Its prior is about a thousandth of the most salient cell's."""
+    saliency = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    belief = DirichletBelief(torch.tensor([[[1.0, 1e-6], [1e-6, 1.0]]], dtype=torch.float64))
+    guided = SaliencyPrior(TargetPosterior(1), saliency, weight=1.0)(belief, torch.zeros(1, 2, dtype=torch.bool))
+    assert guided.argmax() == 1
+    ratio = SaliencyPrior(Static(torch.ones(2)), saliency, weight=1.0)(belief, torch.zeros(1, 2, dtype=torch.bool))[0]
+    assert float((ratio[1] - ratio[0]).exp()) == pytest.approx(1e-3 / 1.001, rel=1e-6)
+
+
+def test_the_unit_of_saliency_does_not_matter():
+    one, other = (values(SaliencyPrior(TargetPosterior(2), SALIENCY * unit, weight=0.3)) for unit in (1.0, 255.0))
+    torch.testing.assert_close(one, other)
+
+
+def test_one_map_serves_all_episodes():
+    one = values(SaliencyPrior(TargetPosterior(2), SALIENCY[1], weight=0.3))
+    each = values(SaliencyPrior(TargetPosterior(2), SALIENCY[1].expand(3, 12), weight=0.3))
+    assert torch.equal(one, each)
+
+
+def test_worthless_cells_come_last():
+    """A value that is not positive has no logarithm: it counts as next to nothing, and never as NaN."""
+    worth = torch.tensor([0.5, 0.0, -3.0, 1e-9])
+    guided = SaliencyPrior(Static(worth), torch.tensor([0.0, 1.0, 1.0, 1.0]), weight=0.3)
+    got = guided(DirichletBelief(torch.ones(1, 4, 2)), torch.zeros(1, 4, dtype=torch.bool))
+    assert bool(got.isfinite().all())
+    assert got.argsort(-1, descending=True)[0, :2].tolist() == [0, 3]
+    assert got[0, 1] == got[0, 2]
+
+
+def test_choices_are_still_those_of_a_product():
+    """The cell with the largest v s^w, as Torralba and others (2006) multiply them."""
+    noise = torch.rand(3, 12, generator=torch.Generator().manual_seed(2))
+    chosen = select_fixation(values(SaliencyPrior(TargetPosterior(2), SALIENCY, weight=0.5)), NOWHERE, noise)
+    raised = SALIENCY + 1e-3 * SALIENCY.amax(-1, keepdim=True)
+    assert torch.equal(chosen, (values(TargetPosterior(2)) * raised**0.5).argmax(-1))
+
+
+def test_bad_arguments():
+    with pytest.raises(InputError, match="weight"):
+        SaliencyPrior(TargetPosterior(2), SALIENCY, weight=-0.1)
+    with pytest.raises(InputError, match="saliency: expected no negative"):
+        SaliencyPrior(TargetPosterior(2), -SALIENCY, weight=0.3)
+    with pytest.raises(InputError, match="saliency: expected no negative"):
+        SaliencyPrior(TargetPosterior(2), SALIENCY * math.nan, weight=0.3)
+    with pytest.raises(InputError, match="saliency"):
+        values(SaliencyPrior(TargetPosterior(2), SALIENCY[:, :7], weight=0.3))
