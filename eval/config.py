@@ -7,6 +7,7 @@ from typing import Literal
 from semfov.belief import Footprint, Memory
 from semfov.detection.scores import BackgroundPolicy
 from semfov.gaze.saliency.cells import Reduction
+from semfov.sensor import SENSORS, Foveation, named_sensor
 
 
 @dataclass(frozen=True)
@@ -18,14 +19,16 @@ class DataConfig:
         annotations: COCO-format instances file for the photographs.
         limit: use only the first so many scenes (None: all of the photographs, 8 embedded scenes).
         min_instances: leave out photographs with fewer objects (published: 8).
-        max_target_area: a class that covers a larger share of the image is not searched for (published: 0.2), unless
-            this is null.
+        ids: text file with the ids of the photographs to take, one a line, before any other selection (None: all).
+        max_target_area: a class whose boxes cover a larger share of the image is not searched for, unless this is null
+            (published: 0.2 for a target object).
         scene_seed: seed that the embedded scenes are composed by.
     """
 
     root: Path | None = None
     annotations: Path | None = None
     limit: int | None = None
+    ids: Path | None = None
     min_instances: int = 8
     max_target_area: float | None = 0.2
     scene_seed: int = 0
@@ -43,8 +46,8 @@ class DetectorConfig:
         threshold: boxes with a lower confidence are dropped.
         iou: class-agnostic non-maximum suppression drops boxes that overlap a better one by more.
         limit: most boxes kept in a view.
-        stride: pad the view only to a multiple of this (None: to the detector's square input, as published; `auto`:
-            what is fastest, 32 for Darknet's networks).
+        stride: pad the view only to a multiple of this (None: to the detector's square input, as Darknet pads it;
+            `auto`: what is fastest, 32 for Darknet's networks).
         input_size: longer side in pixels at which it works, for Darknet's networks (None: its own, 416).
     """
 
@@ -63,18 +66,32 @@ class SensorConfig:
     """The foveal sensor.
 
     Args:
-        sigma: width of the fovea in pixels of an image whose longer side is `reference` (published: 100 and 50).
-        growth: how much wider the window of each coarser band is (2: published sensor, 1: a sharp disc).
+        name: `published` or `published-narrow`, for the wide and the narrow fovea of the paper, or `gradual`, the
+            agent's (`semfov.sensor.SENSORS`).
+        sigma: width of the fovea in pixels of an image whose longer side is `reference` (None: that of the name).
+        growth: how much wider the window of each coarser band is (None: that of the name).
         levels: number of bands of the Laplacian pyramid.
         convention: `kornia` or `opencv` pyramid.
         reference: longer side in pixels that sigma is meant for.
     """
 
-    sigma: float = 100.0
-    growth: float = 2.0
+    name: Literal["published", "published-narrow", "gradual"] = "gradual"
+    sigma: float | None = None
+    growth: float | None = None
     levels: int = 5
     convention: Literal["kornia", "opencv"] = "kornia"
     reference: float = 640.0
+
+    def make(self) -> Foveation:
+        """The sensor."""
+        given = {"sigma": self.sigma, "growth": self.growth}
+        changes = {name: value for name, value in given.items() if value is not None}
+        return named_sensor(self.name, levels=self.levels, convention=self.convention, **changes)
+
+    @property
+    def fovea(self) -> float:
+        """Width of the fovea in longer sides of the image."""
+        return (SENSORS[self.name]["sigma"] if self.sigma is None else self.sigma) / self.reference
 
 
 @dataclass(frozen=True)
@@ -90,10 +107,11 @@ class BeliefConfig:
         tempering: exponent of the likelihoods (published: 1).
         memory: fuse `all` looks (published), or keep what the `closest` look at each cell says.
         misses: take account of cells in which nothing was detected, by the observation model's miss rates.
-        model: fitted observation model, by name or file (None: the one shipped for the detector and growth).
+        model: fitted observation model, by name or file (None: our own for the detector and growth; published: the
+            detector's name and `-published` or `-published-narrow`).
         target_model: learned target evidence, by name or file (None: the one shipped for the detector).
         context: what is added to the log odds of a target: `none`, its usual `place`, its `cooccurrence` with what was
-            seen, or `both`; for `target-evidence`, `non-predictive` and `neighbourhood`.
+            seen, or `both`; for `target-evidence` and `non-predictive`.
         context_model: fitted context, by name or file.
     """
 
@@ -116,13 +134,15 @@ class SaliencyConfig:
     """The saliency baselines, `vocus2` and `itti-koch`.
 
     Args:
-        view: `foveated`, the saliency of what the eye sees from each fixation (published), or `picture`, that of the
-            whole photograph, once.
+        view: `foveated`, the saliency of what the sensor shows from each fixation (published), or `picture`, that of
+            the whole photograph, once. Neither depends on the detector.
         reduction: a cell is as salient as its most salient pixel (`max`) or as the `mean` of its pixels.
+        weight: of a saliency map as a prior over the cells, for policies with `+vocus2` or `+itti-koch`.
     """
 
     view: Literal["foveated", "picture"] = "foveated"
     reduction: Reduction = "max"
+    weight: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -136,7 +156,7 @@ class ProtocolConfig:
         ties: equal cells are chosen at `random`, or the `first` by number.
         control: `none`; `wrong-class`, the searcher is told another class than the one that counts, drawn at random; or
             `permuted`, the cells that count are drawn at random, as many as hold the target.
-        seed: seed of starts and tie-breaking; the same seed gives the same result to the last bit.
+        seed: seed of starts and tie-breaking (what it promises: docs/guides/evaluation.md).
         batch: episodes that are run as one tensor (no influence on the result).
     """
 
@@ -164,8 +184,9 @@ class SearchConfig:
             `non-predictive`, `predictive`, `neighbourhood`, `foveal-hit` or `place-information` followed by `-raw`
             (scores are likelihoods) or `-calibrated` (scores go through the observation model). These may be followed
             by `+tempered` (τ = ¼), `+mild` (τ = ½), `+closest`, `+soft`, `+central` and `+misses`, which change
-            `belief` for this policy alone; `target-evidence`, `non-predictive` and `neighbourhood` also by `+context`,
-            or one part of it, `+place` or `+cooccurrence`.
+            `belief` for this policy alone; all but `random` and the saliency models by `+vocus2` or `+itti-koch`
+            (saliency as a prior over the cells); `target-evidence` and `non-predictive` also by `+context`, or one part
+            of it, `+place` or `+cooccurrence`.
         gaze_model: learned gaze policy of `learned-raw`, by name or file (None: the one shipped for the detector).
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what the detector saw from every cell, shared between runs (None: the user's cache).
@@ -207,10 +228,10 @@ class ExploreConfig:
         belief: the grid of beliefs.
         saliency: the saliency baselines.
         protocol: the experiment.
-        policies: policies to compare: `random`, `kl`, `negative-entropy`, `two-peaks`, `upper-confidence-bound`,
-            `probability-of-improvement`, `expected-accuracy`, `closer-look` (recommended), `vocus2` or `itti-koch`,
-            each followed by `-raw` (scores are likelihoods) or `-calibrated` (scores go through the observation
-            model), and `+` options as for `eval.search`.
+        policies: policies to compare: `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
+            `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look` (recommended),
+            `vocus2` or `itti-koch`, each followed by `-raw` (scores are likelihoods) or `-calibrated` (scores go
+            through the observation model), and `+` options as for `eval.search`.
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
         store: keep what was seen on disk; false recomputes it (the result is the same).

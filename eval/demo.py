@@ -32,6 +32,7 @@ from eval.stages import Stages
 from eval.views import foveated_views
 from semfov import ActivePerception, Scanpath, viz
 from semfov.errors import check, lookup
+from semfov.sensor import SENSORS, named_sensor
 
 PHOTO = "photograph, folder of photographs or video (none: an embedded scene)"
 
@@ -49,7 +50,8 @@ class DemoConfig:
             calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
             no model: scores as they are, looks where the target is most probable).
         detector: name or file, as for `semfov.load_detector`.
-        sigma: width of the fovea in pixels of an image whose longer side is 640.
+        sensor: `gradual` (the recommended agent's), `published` or `published-narrow` (`semfov.sensor.SENSORS`); none
+            takes the agent's own.
         start: first cell, numbered row by row (none: drawn at random).
         shifts: most gaze shifts (none: 30 for a search, 20 for an exploration).
         seed: of the start, of ties and of the embedded scene.
@@ -64,7 +66,7 @@ class DemoConfig:
     camera: int | None = None
     agent: Literal["recommended", "published", "raw"] = "recommended"
     detector: str = "yolov3-tiny"
-    sigma: float = 100.0
+    sensor: Literal["gradual", "published", "published-narrow"] | None = None
     start: int | None = None
     shifts: int | None = None
     seed: int = 0
@@ -106,19 +108,17 @@ def demo(config: DemoConfig) -> None:
 def make_agent(config: DemoConfig) -> ActivePerception:
     """The agent that the settings name."""
     if config.agent == "recommended":
-        return ActivePerception.from_pretrained(config.detector, sigma=config.sigma)
-    detector, model = semfov.load_detector(config.detector), None
+        return ActivePerception.from_pretrained(config.detector, **SENSORS[config.sensor or "gradual"])
+    sensor = config.sensor or "published"
     if config.agent == "published":
-        model = semfov.FovealObservationModel.from_pretrained(f"{detector.name}-published", detector=detector)
-        model = model.requires_grad_(False)
-    calibrated = model is not None
+        return ActivePerception.published(config.detector, sensor=sensor)
     return ActivePerception(
-        semfov.Foveation(config.sigma),
-        detector,
-        model,
+        named_sensor(sensor),
+        semfov.load_detector(config.detector),
+        None,
         (10, 10),
-        semfov.search_policy("predictive" if calibrated else "non-predictive", model, calibrated=calibrated),
-        exploration=semfov.exploration_policy("kl" if calibrated else "random", model, calibrated=calibrated),
+        semfov.search_policy("non-predictive"),
+        exploration=semfov.exploration_policy("random"),
     ).eval()
 
 

@@ -1,5 +1,6 @@
-"""The experiments of the results page: which policies, detectors and settings."""
+"""The experiments of the results page: which policies, detectors, sensors and settings."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,65 +13,78 @@ from eval.config import (
     ExploreConfig,
     ProtocolConfig,
     RunConfig,
-    SaliencyConfig,
     SearchConfig,
     SensorConfig,
 )
 
-PUBLISHED = ("random", "non-predictive-raw", "predictive-raw", "non-predictive-calibrated", "predictive-calibrated")
-BEYOND = (
-    *PUBLISHED,
+DETECTORS = {"nano": "YOLOX-nano", "tiny": "YOLOv3-tiny"}
+"""Detectors of the page, by the names that experiments have."""
+
+FOVEAE = {"published": "wide", "published-narrow": "narrow"}
+"""Published sensors, in the paper's words."""
+
+PUBLISHED = (
+    "random",
+    "non-predictive-raw",
+    "predictive-raw",
+    "non-predictive-calibrated",
+    "predictive-calibrated",
+    "vocus2",
+)
+"""Searches of the paper."""
+
+PUBLISHED_EXPLORATION = (
+    "random-raw",
+    "kl-raw",
+    "random-calibrated",
+    "kl-calibrated",
+    "negative-entropy-calibrated",
+    "two-peaks-calibrated",
+    "vocus2-calibrated",
+)
+"""Explorations of the paper."""
+
+PROPOSED = (
+    "random",
+    "non-predictive-calibrated",
+    "neighbourhood-calibrated",
+    "non-predictive-calibrated+vocus2",
+    "predictive-calibrated+vocus2",
     "vocus2",
     "itti-koch",
+)
+"""What the paper proposes to try next, with its own sensor and observation model."""
+
+BEYOND = (
+    "random",
+    "non-predictive-raw",
+    "non-predictive-calibrated",
     "non-predictive-raw+tempered",
     "non-predictive-raw+tempered+central",
     "non-predictive-calibrated+tempered+soft",
     "target-evidence",
 )
-ABLATIONS = (
-    "non-predictive-raw+central",
-    "non-predictive-raw+closest",
-    "non-predictive-calibrated+tempered+soft+misses",
-    "neighbourhood-calibrated+tempered+soft",
-    "foveal-hit-calibrated+tempered+soft+misses",
-    "place-information-calibrated+tempered+soft+misses",
-)
-EXPLORE = (
-    "random-raw",
-    "kl-raw",
-    "negative-entropy-raw",
-    "two-peaks-raw",
-    "vocus2-raw",
-    "itti-koch-raw",
-    "random-calibrated",
-    "kl-calibrated",
-    "random-raw+mild",
-    "expected-accuracy-raw+misses",
-    "closer-look-raw",
-    "closer-look-raw+mild",
-    "closer-look-calibrated",
-)
+"""Searches with our own sensor and models."""
 
-SHARP = (
+BEYOND_EXPLORATION = (
     "random-raw",
     "kl-raw",
-    "negative-entropy-raw",
-    "two-peaks-raw",
-    "random-calibrated",
-    "kl-calibrated",
-    "expected-accuracy-raw+misses",
+    "surprise-raw",
     "closer-look-raw",
     "closer-look-raw+mild",
+    "random-calibrated",
+    "kl-calibrated",
     "closer-look-calibrated",
 )
+"""Explorations with our own models."""
 
 Changes = dict[str, dict[str, object]]
 
 SENSITIVITY: dict[str, Changes] = {
     "as published": {},
-    "fovea 50 px": {"sensor": {"sigma": 50.0}},
-    "fovea 200 px": {"sensor": {"sigma": 200.0}},
-    "growth 1": {"sensor": {"growth": 1.0}},
+    "OpenCV's pyramid": {"sensor": {"convention": "opencv"}},
+    "growth 2": {"sensor": {"growth": 2.0}},
+    "background policy normalised": {"detector": {"background": "normalised"}},
     "background policy uniform": {"detector": {"background": "uniform"}},
     "background policy none": {"detector": {"background": "none"}},
     "score threshold 0.1": {"detector": {"threshold": 0.1}},
@@ -82,61 +96,55 @@ SENSITIVITY: dict[str, Changes] = {
     "ties by first index": {"protocol": {"ties": "first"}},
     "fusion product": {"belief": {"fusion": "product"}},
     "fusion sum": {"belief": {"fusion": "sum"}},
-    "tempering 0.1": {"belief": {"tempering": 0.1}},
     "tempering 0.25": {"belief": {"tempering": 0.25}},
-    "tempering 0.5": {"belief": {"tempering": 0.5}},
     "closest look": {"belief": {"memory": "closest"}},
 }
 """Settings that change one thing each; of non-predictive search with raw scores."""
 
-FOVEAE: dict[str, Changes] = {
-    f"YOLOX-nano, fovea {sigma} px, growth {growth}": {"sensor": {"sigma": float(sigma), "growth": float(growth)}}
+SENSORS: dict[str, Changes] = {
+    f"fovea {sigma} px, growth {growth}": {"sensor": {"sigma": float(sigma), "growth": float(growth)}}
     for sigma in (50, 100, 200)
     for growth in (1, 2)
 }
 """Sensors."""
 
-SENSORS: dict[str, Changes] = {
-    **FOVEAE,
-    **{
-        f"YOLOv3-tiny at {size} px": {"detector": {"name": "yolov3-tiny", "weights": None, "input_size": size}}
-        for size in (320, 416, 608)
-    },
+WEIGHTS: dict[str, Changes] = {
+    f"weight {weight:g}": {"saliency": {"weight": weight}} for weight in (0.0, 0.1, 0.3, 1.0)
 }
-"""Sensors and working resolutions."""
+"""Weights of a saliency map as a prior."""
 
 VIEWS: dict[str, Changes] = {
-    "whole photograph, once": {"saliency": {"view": "picture"}},
     "foveated view, as published": {"saliency": {"view": "foveated"}},
+    "whole photograph, once": {"saliency": {"view": "picture"}},
 }
 """What the saliency models see."""
-
-FIVE_LEVELS = "explore-five-levels-nano"
-"""The experiment that needs a model which is not shipped."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """Runs on fewer photographs that differ in their settings; a row of its table is a setting and a policy.
+    """Runs on photographs of the fit set that differ in their settings; a row of its table is a setting and a policy.
 
     Attributes:
         settings: by name, what changes.
         policies: that are compared.
         explores: whether scenes are explored, or targets searched for.
         shifts: that the table shows.
+        model: ending of the observation model's name, where one is named.
     """
 
     settings: dict[str, Changes]
     policies: tuple[str, ...]
     explores: bool = False
     shifts: tuple[int, ...] = (1, 5, 10, 15, 30)
+    model: str | None = None
 
 
 STUDIES = {
     "sensitivity": Study(SENSITIVITY, ("non-predictive-raw",)),
-    "saliency": Study(VIEWS, ("vocus2", "itti-koch")),
-    "sensor": Study(SENSORS, ("non-predictive-raw", "non-predictive-raw+tempered+central")),
-    "explore-sensor": Study(FOVEAE, ("random-raw", "closer-look-raw+mild"), True, (0, 1, 2, 3, 4, 10, 20)),
+    "sensor": Study(SENSORS, ("random", "non-predictive-raw", "non-predictive-raw+tempered+central")),
+    "explore-sensor": Study(SENSORS, ("random-raw", "closer-look-raw+mild"), True, (0, 1, 2, 3, 4, 10, 20)),
+    "saliency": Study(VIEWS, ("random", "vocus2", "itti-koch")),
+    "weights": Study(WEIGHTS, ("non-predictive-calibrated+vocus2", "predictive-calibrated+vocus2"), model="published"),
 }
 
 
@@ -145,15 +153,18 @@ class ResultsConfig:
     """Which photographs, and where the page goes.
 
     Args:
-        root: folder of the photographs.
+        root: folder of the photographs of COCO val2017.
         annotations: COCO-format instances file for them.
+        ids: text file with the ids of the photographs that results are measured on.
+        fit_root: folder of photographs that the models were fitted on, for the studies of settings (None: no studies).
+        fit_annotations: COCO-format instances file for them.
         yolox: ONNX file of YOLOX-nano (None: the published one).
         limit: only the first so many photographs, for a trial.
-        sensitivity: photographs for the studies of settings, which look anew for every one.
-        five_levels: observation model of YOLOX-nano with five levels, the last of them empty (None: left out).
+        study: photographs for the studies of settings, which look anew for every sensor and detector setting.
         only: experiments to run (None: all); the page says of the others what is there from before, or nothing.
         page: file to write.
         template: its text.
+        pictures: folder for the page's figures.
         out: folder for the runs.
         cache: folder for what the detectors saw (None: the user's cache).
         workers: processes (None: one for each CPU core).
@@ -161,13 +172,16 @@ class ResultsConfig:
 
     root: Path
     annotations: Path
+    ids: Path = Path("configs/results_photographs.txt")
+    fit_root: Path | None = None
+    fit_annotations: Path | None = None
     yolox: Path | None = None
     limit: int | None = None
-    sensitivity: int = 30
-    five_levels: Path | None = None
+    study: int = 30
     only: tuple[str, ...] | None = None
     page: Path = Path("docs/results.md")
     template: Path = Path("docs/results.template.md")
+    pictures: Path = Path("docs/pictures")
     out: Path = Path("runs/results")
     cache: Path | None = None
     workers: int | None = None
@@ -175,38 +189,51 @@ class ResultsConfig:
 
 def experiments(config: ResultsConfig) -> dict[str, RunConfig]:
     """The experiments of the page, by name."""
-    data = DataConfig(root=config.root, annotations=config.annotations, limit=config.limit)
-    detectors = {"nano": DetectorConfig(name="yolox-nano", weights=config.yolox), "tiny": DetectorConfig()}
-    picture = SaliencyConfig(view="picture")
-    runs: dict[str, RunConfig] = {}
-    for name, detector in detectors.items():
-        common: dict[str, Any] = {"data": data, "detector": detector, "cache": config.cache, "workers": config.workers}
-        seek = partial(SearchConfig, **common, saliency=picture)
-        runs[f"search-{name}"] = seek(policies=(*ABLATIONS, *BEYOND) if name == "nano" else BEYOND)
+    runs = dict(_measured(config))
+    if config.fit_root is not None:
+        runs |= dict(_studies(config))
+    folder = str.maketrans({" ": "-", ",": None, "'": None})
+    return {name: replace(run, out=config.out / name.translate(folder)) for name, run in runs.items()}
+
+
+def detector(name: str, config: ResultsConfig) -> DetectorConfig:
+    """Settings of a detector of the page."""
+    return DetectorConfig(name="yolox-nano", weights=config.yolox) if name == "nano" else DetectorConfig()
+
+
+def _measured(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:
+    """Experiments on the photographs that results are measured on, those of the paper first."""
+    data = DataConfig(root=config.root, annotations=config.annotations, ids=config.ids, limit=config.limit)
+    for name in DETECTORS:
+        settings = detector(name, config)
+        common: dict[str, Any] = {"data": data, "detector": settings, "cache": config.cache, "workers": config.workers}
+        seek, tour = partial(SearchConfig, **common, scanpaths=0), partial(ExploreConfig, **common)
+        for fovea in FOVEAE:
+            sensor, belief = SensorConfig(name=fovea), BeliefConfig(model=f"{settings.name}-{fovea}")
+            yield f"search-{fovea}-{name}", seek(sensor=sensor, belief=belief, policies=PUBLISHED)
+            yield f"explore-{fovea}-{name}", tour(sensor=sensor, belief=belief, policies=PUBLISHED_EXPLORATION)
+        sensor, belief = SensorConfig(name="published"), BeliefConfig(model=f"{settings.name}-published")
+        yield f"proposed-{name}", seek(sensor=sensor, belief=belief, policies=PROPOSED)
+        yield f"beyond-search-{name}", seek(policies=BEYOND)
         for control in ("wrong-class", "permuted"):
             protocol = ProtocolConfig(control=control)
-            runs[f"{control}-{name}"] = seek(policies=("random", "target-evidence"), protocol=protocol, scanpaths=0)
+            yield f"{control}-{name}", seek(policies=("random", "target-evidence"), protocol=protocol)
+        yield f"beyond-explore-{name}", tour(policies=BEYOND_EXPLORATION)
+        yield f"beyond-explore-published-{name}", tour(policies=BEYOND_EXPLORATION, sensor=sensor)
         if name == "tiny":
-            policies = ("non-predictive-raw+tempered+central", "learned-raw")
-            runs[f"learned-{name}"] = seek(policies=policies, scanpaths=0)
-        tour = partial(ExploreConfig, **common, saliency=picture)
-        runs[f"explore-{name}"] = tour(policies=EXPLORE)
-        # The window of the authors' code, with which one look leaves more to explore.
-        runs[f"explore-sharp-{name}"] = tour(policies=SHARP, sensor=SensorConfig(growth=1.0))
-        published = BeliefConfig(model=f"{'yolov3-tiny' if name == 'tiny' else 'yolox-nano'}-published")
-        models = ("random-calibrated", "kl-calibrated", "negative-entropy-calibrated", "two-peaks-calibrated")
-        runs[f"explore-published-{name}"] = tour(policies=models, belief=published)
-    if config.five_levels is not None:
-        belief = BeliefConfig(model=str(config.five_levels))
-        policies = ("random-raw", "kl-raw", "random-calibrated", "kl-calibrated")
-        nano: dict[str, Any] = {"data": data, "detector": detectors["nano"], "cache": config.cache}
-        runs[FIVE_LEVELS] = ExploreConfig(**nano, workers=config.workers, policies=policies, belief=belief)
-    few: dict[str, Any] = {"data": replace(data, limit=config.sensitivity), "detector": detectors["nano"]}
-    few |= {"cache": config.cache, "workers": config.workers}
+            yield "learned-tiny", seek(policies=("non-predictive-raw+tempered+central", "learned-raw"))
+
+
+def _studies(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:
+    """Experiments on photographs of the fit set, by which settings are chosen."""
+    data = DataConfig(root=config.fit_root, annotations=config.fit_annotations, limit=config.study)
+    nano = detector("nano", config)
+    few: dict[str, Any] = {"data": data, "detector": nano, "cache": config.cache, "workers": config.workers}
+    few["sensor"] = SensorConfig(name="published")
     for title, study in STUDIES.items():
         base = ExploreConfig(**few) if study.explores else SearchConfig(**few, scanpaths=0)
+        if study.model is not None:
+            base = replace(base, belief=BeliefConfig(model=f"{nano.name}-{study.model}"))
         for label, changes in study.settings.items():
             parts = {part: replace(getattr(base, part), **values) for part, values in changes.items()}
-            runs[f"{title} {label}"] = replace(base, **parts, policies=study.policies)
-    folder = str.maketrans({" ": "-", ",": None})
-    return {name: replace(run, out=config.out / name.translate(folder)) for name, run in runs.items()}
+            yield f"{title} {label}", replace(base, **parts, policies=study.policies)

@@ -11,6 +11,7 @@ from eval.config import ProtocolConfig
 from eval.protocol import Searcher, generator_for, noise_for
 from semfov import Detections, Grid
 from semfov.agent import step
+from semfov.belief.belief import dirichlet_belief
 from semfov.data.scene import Annotation, Scenes
 
 
@@ -35,14 +36,14 @@ class Progress:
 
     Attributes:
         cells: fixated cells in order.
-        right: after 0, 1, … gaze shifts, how many of the cells with objects are given the class of one of them, where
-            the most probable class but background is the answer.
-        right_with_background: the same, where background is an answer too (and a wrong one).
+        right: after 0, 1, … gaze shifts, how many of the cells with objects are given the class of one of them: the
+            published measure, where the most probable of all classes is the answer, background among them.
+        right_without_background: the same, where the most probable class but background is the answer.
     """
 
     cells: tuple[int, ...]
     right: tuple[int, ...]
-    right_with_background: tuple[int, ...]
+    right_without_background: tuple[int, ...]
 
 
 def explorations_of(scenes: Scenes, index: int, cells: int, protocol: ProtocolConfig) -> list[Exploration]:
@@ -111,19 +112,20 @@ def run_explorations(
     for cell, random in zip(starts.split(batch), noise.split(batch), strict=True):
         belief = explorer.observer.start(len(cell), grid, detections.scores)
         visited = torch.zeros(len(cell), len(grid), dtype=torch.bool)
-        visits, right, with_background = [], [], []
+        visits, right, without = [], [], []
         for shift in range(shifts + 1):
             # All episodes have made as many shifts, and so all run out of cells at once.
             if not (cell >= 0).all():
                 right.append(right[-1])
-                with_background.append(with_background[-1])
+                without.append(without[-1])
                 continue
             visits.append(cell)
             acquisition = explorer.acquisition(None, grid, cell)
             after = step(explorer.observer, belief, visited, cell, evidence[cell], acquisition, random[:, shift])
             belief, visited, cell = after.belief, after.visited, after.cell
-            right.append(count_right(belief.beta[..., 1:], answers[:, 1:]))
-            with_background.append(count_right(belief.beta, answers))
-        tables = [torch.stack(columns, 1).tolist() for columns in (visits, right, with_background)]
+            beta = dirichlet_belief(belief).beta
+            right.append(count_right(beta, answers))
+            without.append(count_right(beta[..., 1:], answers[:, 1:]))
+        tables = [torch.stack(columns, 1).tolist() for columns in (visits, right, without)]
         progress += [Progress(tuple(a), tuple(b), tuple(c)) for a, b, c in zip(*tables, strict=True)]
     return progress

@@ -6,6 +6,7 @@ from pathlib import Path
 from eval.html.run_report import replay_exploration, write_run_report
 from eval.metrics import success_rate
 from eval.report import (
+    LAST_COLUMN,
     Array,
     Curve,
     Record,
@@ -14,7 +15,6 @@ from eval.report import (
     curve_of,
     curve_rows,
     curves_csv,
-    milliseconds_per_decision,
     save_figure,
     sensing,
     table,
@@ -28,8 +28,8 @@ SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
 """Gaze shifts at which tables show the success rate."""
 
 ANSWERS = {
-    "objects": ("right", "the answer is the most probable class but background"),
-    "background": ("right_with_background", "background is an answer too, and a wrong one"),
+    "all classes": ("right", "as published: the answer is the most probable of all classes, background among them"),
+    "without background": ("right_without_background", "the answer is the most probable class but background"),
 }
 """What counts as an answer: the records' field, and in words."""
 
@@ -40,10 +40,9 @@ def report(run: ExploreRun, parts: Parts) -> None:
     if not records:
         raise DataError("data: no scene has an object; lower data.min_instances or raise data.limit")
     curves = {answer: success(records, run.config.policies, answer) for answer in ANSWERS}
-    decision = milliseconds_per_decision(run)
-    summary = summary_markdown(curves, run.config.protocol.shifts, decision)
+    summary = summary_markdown(curves, run.config.protocol.shifts, sensing(run))
     tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("answers", "success_rate"))}
-    written = write_files(run, "eval.explore", tables, records, seconds, decision)
+    written = write_files(run, "eval.explore", tables, records, seconds)
     written += [draw_curves(run, curves[answer], answer) for answer in ANSWERS]
     written.append(
         write_run_report(
@@ -53,7 +52,6 @@ def report(run: ExploreRun, parts: Parts) -> None:
             titles={name: title for name, (_, title) in ANSWERS.items()},
             label="cells with the right class (%)",
             shifts=SHIFTS,
-            decision=decision,
             replay=replay_exploration,
         )
     )
@@ -70,18 +68,19 @@ def _rate(record: Record, field: str) -> Array:
     return success_rate(record[field], record["object_cells"])
 
 
-def summary_markdown(curves: dict[str, dict[str, Curve]], last: int, decision: dict[str, float]) -> str:
+def summary_markdown(curves: dict[str, dict[str, Curve]], last: int, sensing: str) -> str:
     """The tables that the run prints: success rates with standard errors over images."""
     shifts = [n for n in SHIFTS if n <= last]
-    head = ["policy", *(str(n) for n in shifts), "ms / decision"]
+    head = ["policy", *(str(n) for n in shifts), LAST_COLUMN]
     lines = []
     for answer, policies in curves.items():
         first = next(iter(policies.values()))
         lines += [
-            f"**{ANSWERS[answer][1]}** ({first.images} images, {first.episodes} explorations per policy; % of the "
-            "cells with objects that are given the class of one, after n gaze shifts ± standard error over images)",
+            f"**{ANSWERS[answer][1]}** ({sensing}; {first.images} images, {first.episodes} explorations per policy; "
+            "% of the cells with objects that are given the class of one after n gaze shifts, ± standard error over "
+            "images)",
             "",
-            *table([head, *curve_rows(policies, shifts, decision)]),
+            *table([head, *curve_rows(policies, shifts)]),
             "",
         ]
     return "\n".join(lines)
@@ -91,10 +90,9 @@ def draw_curves(run: ExploreRun, curves: dict[str, Curve], answer: str) -> Path:
     """The success-rate figure."""
     from semfov.viz import plot_success_rate
 
-    background = "wrong" if answer == "background" else "not counted"
     figure = plot_success_rate(
         {name: curve.mean for name, curve in curves.items()},
         {name: curve.over_images for name, curve in curves.items()},
-        title=f"Exploration, {sensing(run)}, background {background}",
+        title=f"Exploration, {sensing(run)}\n{answer}",
     )
-    return save_figure(figure, run.config.out / f"success_rate_{answer}.png")
+    return save_figure(figure, run.config.out / f"success_rate_{answer.replace(' ', '_')}.png")

@@ -1,7 +1,7 @@
 """The search protocol: which episodes there are, and running them as tensors."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ from semfov.agent import step
 from semfov.belief import Observer
 from semfov.data.scene import Scenes
 from semfov.gaze import Policy
-from semfov.gaze.acquisition import Static
+from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static
 
 
 @dataclass(frozen=True)
@@ -47,18 +47,25 @@ class Searcher:
     Attributes:
         observer: turns looks into belief.
         policy: makes the acquisition function for a target.
-        saliency: `(X·Y, X·Y)`, values of all cells seen from each cell, or `(1, X·Y)`; they take the policy's place.
+        saliency: `(X·Y, X·Y)`, saliency of all cells seen from each cell, or `(1, X·Y)`.
+        weight: of the saliency as a prior over the cells (`SaliencyPrior`); None: saliency takes the policy's place.
     """
 
     observer: Observer
     policy: Policy
     saliency: Tensor | None = None
+    weight: float | None = None
 
-    def acquisition(self, component: int | Tensor | None, grid: Grid, cell: Tensor) -> Callable[[Tensor], Tensor]:
+    def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
         """The acquisition function of episodes that fixate `cell` `(B,)`."""
         if self.saliency is None:
-            return self.policy(component, grid)
-        return Static(self.saliency[cell if len(self.saliency) > 1 else torch.zeros_like(cell)])
+            return self.policy(target, grid)
+        salient = self.saliency[cell if len(self.saliency) > 1 else torch.zeros_like(cell)]
+        return (
+            Static(salient)
+            if self.weight is None
+            else SaliencyPrior(self.policy(target, grid), salient, weight=self.weight)
+        )
 
 
 @dataclass(frozen=True)
@@ -204,7 +211,7 @@ def _run_batch(
             break
         active, cell, belief, visited = active[go_on], cell[go_on], belief[go_on], visited[go_on]
         wanted = cues[active]
-        acquisition = searcher.acquisition(observer.component(wanted), looks.grid, cell)
+        acquisition = searcher.acquisition(wanted, looks.grid, cell)
         after = step(observer, belief, visited, cell, looks(wanted, cell), acquisition, noise[active, shift])
         left = after.cell >= 0
         active, cell, belief, visited = active[left], after.cell[left], after.belief[left], after.visited[left]

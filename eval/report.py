@@ -6,7 +6,6 @@ import json
 import platform
 import subprocess
 import sys
-import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -21,16 +20,11 @@ from numpy.typing import NDArray
 import semfov
 from eval.cached import checksum
 from eval.metrics import standard_error
-from eval.protocol import Searcher
 from eval.run import Parts, Run
-from eval.saliency import milliseconds_per_map
-from eval.setup import plain, split_policy
-from semfov import Detections, Grid
-from semfov.agent import acquisition_values
-from semfov.belief import Belief
+from eval.setup import plain
 from semfov.errors import DataError
 from semfov.files import replacing, write_text
-from semfov.gaze import select_fixation
+from semfov.observation.compatibility import recommended
 
 Array = NDArray[np.float64]
 Record = dict[str, Any]
@@ -96,14 +90,13 @@ def write_files(
     tables: dict[str, str],
     records: list[Record],
     seconds: dict[str, float],
-    decision: dict[str, float],
 ) -> list[Path]:
     """Write tables (text by file name), records, settings and manifest; returns their paths."""
     files = {
         **tables,
         "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records),
         "config.yaml": yaml.safe_dump(plain(asdict(run.config)), sort_keys=False),
-        "manifest.json": json.dumps(manifest(run, program, seconds, decision), indent=2) + "\n",
+        "manifest.json": json.dumps(manifest(run, program, seconds), indent=2) + "\n",
     }
     for name, text in files.items():
         write_text(run.config.out / name, text)
@@ -116,57 +109,6 @@ def announce(summary: str, written: Iterable[Path]) -> None:
     print("written:")
     for path in written:
         print(f"  {path}")
-
-
-def milliseconds_per_decision(run: Run, repetitions: int = 50) -> dict[str, float]:
-    """For each policy the median time to the next fixation, one episode on one thread.
-
-    From a belief, where the policy looks at it; from a picture, where it looks at that: a foveated view, or the
-    photograph.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        return {name: _milliseconds(run, name, repetitions) for name in run.config.policies}
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _milliseconds(run: Run, name: str, repetitions: int) -> float:
-    base, _ = split_policy(name, run.kind)
-    if base in run.saliency_stores:
-        return milliseconds_per_map(base, run.config.saliency, run.eye, run.scenes[0].image, run.grid(0))
-    searcher, grid = run.searcher(name, 0), run.grid(0)
-    generator = torch.Generator().manual_seed(0)
-    if searcher.observer.by_target:
-        return _milliseconds_to_weigh(searcher, grid, len(run.scenes.classes), repetitions)
-    start = searcher.observer.start(1, grid, torch.empty(0)).beta
-    belief = Belief(start + torch.rand(start.shape, generator=generator), torch.rand(1, len(grid), generator=generator))
-    visited, noise = torch.zeros(1, len(grid), dtype=torch.bool), torch.rand(1, len(grid), generator=generator)
-    component = searcher.observer.component(torch.tensor([1])) if run.kind == "search" else None
-    acquisition = searcher.policy(component, grid)
-    times = []
-    with torch.inference_mode():
-        for _ in range(repetitions):
-            began = time.perf_counter()
-            select_fixation(acquisition_values(acquisition, belief, visited), visited, noise)
-            times.append(time.perf_counter() - began)
-    return 1000 * float(np.median(times))
-
-
-def _milliseconds_to_weigh(searcher: Searcher, grid: Grid, classes: int, repetitions: int) -> float:
-    """As above, where the update of the belief is what decides and takes the time."""
-    observer, nothing = searcher.observer, Detections.empty(1, classes)
-    acquisition, times = searcher.policy(1, grid), []
-    visited = torch.zeros(1, len(grid), dtype=torch.bool)
-    with torch.inference_mode():
-        belief, look = observer.start(1, grid, torch.empty(0)), observer.weigh(nothing, grid.centres[:1], grid, 1)
-        for _ in range(repetitions):
-            began = time.perf_counter()
-            belief = observer.update(belief, look)
-            select_fixation(acquisition(belief.beta), visited, torch.zeros(1, len(grid)))
-            times.append(time.perf_counter() - began)
-    return 1000 * float(np.median(times))
 
 
 def curves_csv(curves: dict[str, dict[str, Curve]], head: tuple[str, str]) -> str:
@@ -189,12 +131,20 @@ def curves_csv(curves: dict[str, dict[str, Curve]], head: tuple[str, str]) -> st
     return text.getvalue()
 
 
-def curve_rows(curves: dict[str, Curve], shifts: Iterable[int], decision: dict[str, float]) -> list[list[str]]:
-    """A row of a table for each policy: its curve at these gaze shifts, in percent, and its cost."""
+def curve_rows(curves: dict[str, Curve], shifts: Iterable[int]) -> list[list[str]]:
+    """A row of a table for each policy: its curve at these gaze shifts, in percent, with both standard errors."""
     return [
-        [name, *(percent(curve.mean[n], curve.over_images[n]) for n in shifts), f"{decision[name]:.2f}"]
+        [
+            name,
+            *(percent(curve.mean[n], curve.over_images[n]) for n in shifts),
+            f"{100 * curve.over_repetitions.max():.2f}",
+        ]
         for name, curve in curves.items()
     ]
+
+
+LAST_COLUMN = "max. SEM over repetitions"
+"""Head of the last column of `curve_rows`: the largest standard error of the mean over the starts (published)."""
 
 
 def percent(value: float, error: float) -> str:
@@ -211,7 +161,7 @@ def table(rows: list[list[str]]) -> list[str]:
     return [lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]]
 
 
-def manifest(run: Run, program: str, seconds: dict[str, float], decision: dict[str, float]) -> dict[str, object]:
+def manifest(run: Run, program: str, seconds: dict[str, float]) -> dict[str, object]:
     """Where the figures come from: versions, commit, checksums, seed, and where the time went."""
     return {
         "command": ["python", "-m", program, *sys.argv[1:]],
@@ -231,7 +181,6 @@ def manifest(run: Run, program: str, seconds: dict[str, float], decision: dict[s
         "model_sha256": None if run.model is None else checksum(run.model.state_dict()),
         "seed": run.config.protocol.seed,
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
-        "milliseconds_per_decision": {name: round(value, 4) for name, value in decision.items()},
     }
 
 
@@ -250,9 +199,14 @@ def commit() -> str | None:
 
 
 def sensing(run: Run) -> str:
-    """Detector and sensor of a run, for titles."""
-    sensor = run.config.sensor
-    return f"{run.eye.detector.name}, fovea {sensor.sigma:g} px, growth {sensor.growth:g}"
+    """Detector, sensor and observation model of a run, for titles."""
+    sensor, model = run.config.sensor, run.config.belief.model
+    spread = run.eye.sensor
+    what = f"{run.eye.detector.name}, {sensor.name} fovea (σ {float(spread.sigma):g} px, growth {spread.growth:g})"
+    if run.model is None:
+        return what
+    own = model or recommended(run.eye.detector.name, float(spread.growth))
+    return f"{what}, observation model {Path(own).stem}"
 
 
 def save_figure(figure: Any, path: Path) -> Path:

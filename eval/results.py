@@ -1,28 +1,44 @@
 """Regenerate docs/results.md: `python -m eval.results` runs its experiments and fills in the page.
 
     python -m eval.results --root val2017 --annotations instances_val2017.json --yolox yolox_nano.onnx
+        --fit_root fit --fit_annotations instances_fit.json
 
-The page's text is docs/results.template.md, in which a line `@@ experiment table` stands for a table of an experiment.
-What a detector sees is computed once and shared; a run that was stopped goes on where it was.
+Results are measured on the photographs that configs/results_photographs.txt names; settings are chosen on those of the
+fit set. The page's text is docs/results.template.md, in which a line `@@ table` or `@@ experiment table` stands for a
+table. What a detector sees is computed once and shared; a run that was stopped goes on where it was.
 """
 
-import json
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
+from eval import paper
 from eval.command import run_command
-from eval.config import RunConfig, SearchConfig
-from eval.experiments import FIVE_LEVELS, STUDIES, ResultsConfig, experiments
+from eval.config import SearchConfig
+from eval.experiments import STUDIES, ResultsConfig, experiments
 from eval.explore import explore
-from eval.metrics import cumulative_performance, standard_error, success_rate
-from eval.report import Array, Record, table
+from eval.findings import findings
+from eval.page_figures import draw_figures
+from eval.page_tables import (
+    Runs,
+    agreement,
+    beside_paper,
+    decisions,
+    finished,
+    first_fixations,
+    paired,
+    paired_objects,
+    photographs,
+    readings,
+    study_table,
+    summary,
+)
 from eval.search import search
 from semfov.errors import DataError, lookup
 from semfov.files import write_text
+
+NOT_RUN = ["*Not run yet.*"]
 
 
 def results(config: ResultsConfig) -> None:
@@ -41,112 +57,55 @@ def results(config: ResultsConfig) -> None:
     except OSError as error:
         raise DataError(f"{config.template}: cannot be read ({error.strerror})") from None
     write_text(config.page, fill(template, runs))
-    print(f"written: {config.page}")
+    for path in [config.page, *draw_figures(config.pictures, runs)]:
+        print(f"written: {path}")
 
 
-def fill(template: str, runs: dict[str, RunConfig]) -> str:
-    """The template with every line `@@ experiment table` replaced by that table."""
+def fill(template: str, runs: Runs) -> str:
+    """The template with every line `@@ …` replaced by the table that it names."""
     lines: list[str] = []
     for line in template.splitlines():
-        if not line.startswith("@@ "):
-            lines.append(line)
-            continue
-        if line.removeprefix("@@ ") in STUDIES:
-            lines += study_table(line.removeprefix("@@ "), runs)
-            continue
-        name, kind = line.removeprefix("@@ ").split()
-        make = TABLES[lookup(kind, TABLES, "table")]
-        run = runs.get(lookup(name, [*runs, FIVE_LEVELS], "experiment"))
-        lines += make(run.out) if run and (run.out / "summary.md").exists() else ["*Not run yet.*"]
+        lines += fill_line(line.removeprefix("@@ "), runs) if line.startswith("@@ ") else [line]
     return "\n".join(lines) + "\n"
 
 
-def study_table(title: str, runs: dict[str, RunConfig]) -> list[str]:
-    """One row for each setting and policy: of the curves over all targets, or of cells named but as background."""
-    study = STUDIES[title]
-    several = len(study.policies) > 1
-    shifts = [str(n) if study.explores else f"CP@{n}" for n in study.shifts]
-    rows = [["setting", *(["policy"] if several else []), *shifts]]
-    for label in study.settings:
-        folder = runs[f"{title} {label}"].out
-        records = read_records(folder) if (folder / "summary.md").exists() else None
-        for policy in study.policies:
-            head = [label, *([policy] if several else [])]
-            if records is None:
-                rows.append([*head, *("not run yet" for _ in shifts)])
-                continue
-            curves = per_image([record for record in records if record["policy"] == policy], max(study.shifts))
-            mean, error = curves.mean(0), standard_error(curves)
-            rows.append([*head, *(f"{100 * mean[n]:.1f} ± {100 * error[n]:.1f}" for n in study.shifts)])
-    return table(rows)
+def fill_line(line: str, runs: Runs) -> list[str]:
+    """The table that a line names: one of the whole page, of a study, or `experiment table`."""
+    if line in STUDIES:
+        return study_table(line, runs)
+    if line in WHOLE:
+        return WHOLE[line](runs)
+    name, _, kind = line.partition(" ")
+    run = runs.get(lookup(name, [*runs, *STUDIES, *WHOLE], "experiment"))
+    make = TABLES[lookup(kind, TABLES, "table")]
+    return make(run.out) if run is not None and finished(run) else NOT_RUN
 
 
-def read_records(folder: Path) -> list[Record]:
-    """What a run wrote of every episode."""
-    return [json.loads(line) for line in (folder / "episodes.jsonl").read_text(encoding="utf-8").splitlines()]
+WHOLE: dict[str, Callable[[Runs], list[str]]] = {
+    "table-1": partial(beside_paper, paper.TABLE_I),
+    "table-2": partial(beside_paper, paper.TABLE_II),
+    "decisions": lambda runs: decisions(),
+    "findings": findings,
+    "photographs": photographs,
+    "readings": readings,
+}
+"""Tables that draw on several experiments, or on none."""
 
-
-def summary(folder: Path, section: int | None = None) -> list[str]:
-    """The tables that a run printed, or one of them."""
-    text = (folder / "summary.md").read_text(encoding="utf-8").strip()
-    parts = ["**" + part.strip() for part in text.split("\n**")]
-    parts[0] = parts[0].removeprefix("**")
-    return text.splitlines() if section is None else parts[section].splitlines()
-
-
-def paired(folder: Path, baseline: str, shifts: Sequence[int]) -> list[str]:
-    """Differences of every policy to `baseline` over the same images, in points, with standard errors."""
-    records = read_records(folder)
-    last = max(shifts)
-    policies = list(dict.fromkeys(record["policy"] for record in records))
-    curves = {policy: per_image([r for r in records if r["policy"] == policy], last) for policy in policies}
-    rows = [[f"difference to {baseline}", *(str(n) for n in shifts), "behind at"]]
-    for policy in policies:
-        if policy == baseline:
-            continue
-        difference = curves[policy] - curves[baseline]
-        mean, error = difference.mean(0), standard_error(difference)
-        cells = [f"{100 * mean[n]:+.1f} ± {100 * error[n]:.1f}" for n in shifts]
-        behind = [n for n in range(1, last + 1) if mean[n] < 0]
-        rows.append([policy, *cells, f"{behind[0]} to {behind[-1]}" if behind else "no shift"])
-    return table(rows)
-
-
-def per_image(records: list[Record], last: int) -> Array:
-    """Figure of merit of each image after 0..`last` gaze shifts, in order of the images, `(images, last+1)`."""
-    images: dict[str, list[Array]] = {}
-    for record in records:
-        if "found_at" in record:
-            curve = cumulative_performance(np.array([record["found_at"]]), last)
-        else:
-            curve = success_rate(record["right"], record["object_cells"])[: last + 1]
-        images.setdefault(str(record["scene"]), []).append(curve)
-    return np.stack([np.mean(images[scene], axis=0) for scene in sorted(images)])
-
-
-def agreement(folder: Path) -> list[str]:
-    """How often predictive and non-predictive search choose the same cell, first and all the way."""
-    episodes: dict[str, list[Record]] = {}
-    for record in read_records(folder):
-        episodes.setdefault(record["policy"], []).append(record)
-    rows = [["scores", "same first gaze shift", "found after as many shifts"]]
-    for mode in ("raw", "calibrated"):
-        pairs = list(zip(episodes[f"non-predictive-{mode}"], episodes[f"predictive-{mode}"], strict=True))
-        first = [a["cells"][1] == b["cells"][1] for a, b in pairs]
-        found = [a["found_at"] == b["found_at"] for a, b in pairs]
-        rows.append([mode, *(f"{100 * np.mean(same):.1f} %" for same in (first, found))])
-    return table(rows)
-
+EXPLORED = (1, 2, 3, 4, 10, 20)
 
 TABLES: dict[str, Callable[[Path], list[str]]] = {
     "all": summary,
     "first": partial(summary, section=0),
     "second": partial(summary, section=1),
     "agreement": agreement,
+    "first-fixations": first_fixations,
     "paired-search": partial(paired, baseline="random", shifts=(1, 5, 15, 30)),
     "paired-learned": partial(paired, baseline="non-predictive-raw+tempered+central", shifts=(1, 5, 10, 15, 30)),
-    "paired-explore": partial(paired, baseline="random-raw", shifts=(1, 2, 3, 4, 10, 20)),
+    "paired-explore": partial(paired, baseline="random-raw", shifts=EXPLORED),
+    "paired-explore-calibrated": partial(paired, baseline="random-calibrated", shifts=EXPLORED),
+    "paired-explore-objects": paired_objects,
 }
+"""Tables of one experiment."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -34,6 +34,7 @@ from eval.setup import (
     needs_model,
     needs_target,
     prepare_worker,
+    saliency_of,
     saliency_policies,
     split_policy,
 )
@@ -70,7 +71,7 @@ class Run(ABC):
         size = belief.columns, belief.rows
         self.store = DetectionStore(cache / "looks", settings, *size)
         self.saliency_stores = {
-            name: SaliencyStore(cache / "saliency", name, config.saliency, settings, size)
+            name: SaliencyStore(cache / "saliency", name, config.saliency, settings["sensor"], size)
             for name in saliency_policies(config.policies, self.kind)
         }
         self.key = self._key()
@@ -89,7 +90,7 @@ class Run(ABC):
         else:
             belief["context_model"] = self.context.digest()
         protocol = {name: value for name, value in asdict(config.protocol).items() if name != "batch"}
-        saliency = {name: store.key for name, store in self.saliency_stores.items()}
+        saliency = {name: [store.key, config.saliency.weight] for name, store in self.saliency_stores.items()}
         what = [self.kind, self.store.key, self.scenes.fingerprint, belief, protocol, list(config.policies), saliency]
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
@@ -99,20 +100,24 @@ class Run(ABC):
 
     def searcher(self, name: str, index: int) -> Searcher:
         """How the policy of this name searches or explores a scene, with this run's models."""
-        searcher = self._without_context(name, index)
+        searcher = self._by_belief(name)
         observer = in_context(name, self.kind, searcher.observer, self.config.belief, self.context)
-        return replace(searcher, observer=observer)
+        salient = saliency_of(name, self.kind)
+        if salient is None:
+            return replace(searcher, observer=observer)
+        alone = split_policy(name, self.kind)[0] == salient
+        weight = None if alone else self.config.saliency.weight
+        return replace(searcher, observer=observer, saliency=self.saliency(salient, index), weight=weight)
 
-    def _without_context(self, name: str, index: int) -> Searcher:
+    def _by_belief(self, name: str) -> Searcher:
         base, _ = split_policy(name, self.kind)
         if self.target is not None and base == TARGET_EVIDENCE:
             return Searcher(TargetObserver(self.target), search_policy("non-predictive"))
         components = len(self.scenes.classes) + 1
         if self.gaze is not None and base == LEARNED:
             return Searcher(self.gaze.observer(components), self.gaze.policy)
-        saliency = self.saliency(base, index) if base in self.saliency_stores else None
-        fovea = self.config.sensor.sigma / self.config.sensor.reference
-        return make_searcher(name, self.kind, self.config.belief, components, self.model, saliency, fovea)
+        fovea = self.config.sensor.fovea
+        return make_searcher(name, self.kind, self.config.belief, components, self.model, fovea)
 
     def grid(self, index: int) -> Grid:
         """The grid over a scene."""
@@ -134,7 +139,8 @@ class Run(ABC):
         saliency = store.load(digest) if self.config.store else None
         if saliency is None:
             image = self.scenes[index].image
-            saliency = saliency_table(name, self.config.saliency, self.eye, image, self.grid(index))
+            sensor, reference = self.eye.sensor, self.config.sensor.reference
+            saliency = saliency_table(name, self.config.saliency, sensor, reference, image, self.grid(index))
             if self.config.store:
                 store.save(digest, saliency)
         return saliency

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,10 @@ from torch import Tensor
 from eval.config import SaliencyConfig
 from eval.store import SceneStore, code_digest
 from semfov import Grid
-from semfov.detection.placement import Placement
+from semfov.detection.placement import Placement, resize
 from semfov.eye import Eye, View
 from semfov.gaze.saliency import VOCUS2, IttiKoch, cell_saliency
+from semfov.sensor import Bands, Foveation
 
 Model = Callable[[Tensor], Tensor]
 
@@ -29,18 +29,18 @@ class SaliencyStore(SceneStore):
         folder: where the store lies.
         name: of the model.
         saliency: settings of the baselines.
-        settings: `Eye.settings()`; what the whole photograph shows does not depend on them.
+        sensor: settings of the sensor; what the whole photograph shows does not depend on them.
         grid: `(columns, rows)`.
     """
 
     def __init__(
-        self, folder: Path, name: str, saliency: SaliencyConfig, settings: Mapping[str, Any], grid: tuple[int, int]
+        self, folder: Path, name: str, saliency: SaliencyConfig, sensor: Mapping[str, Any], grid: tuple[int, int]
     ) -> None:
         what = {
             "model": name,
             "view": saliency.view,
             "reduction": saliency.reduction,
-            "eye": settings if saliency.view == "foveated" else None,
+            "sensor": sensor if saliency.view == "foveated" else None,
             "grid": list(grid),
         }
         super().__init__(folder, what, code_digest("gaze/saliency/*.py"))
@@ -55,13 +55,18 @@ class SaliencyStore(SceneStore):
         self.write(digest, {"saliency": saliency})
 
 
-def saliency_table(name: str, saliency: SaliencyConfig, eye: Eye, image: Tensor, grid: Grid) -> Tensor:
+def saliency_table(
+    name: str, saliency: SaliencyConfig, sensor: Foveation, reference: float, image: Tensor, grid: Grid
+) -> Tensor:
     """Saliency of every cell: seen from the centre of every cell `(X·Y, X·Y)`, or of the photograph `(1, X·Y)`.
+
+    No detector has a part in it: the sensor is shown the photograph at the size that its σ is meant for.
 
     Args:
         name: of the model.
         saliency: settings of the baselines.
-        eye: what the scene is seen through.
+        sensor: what the photograph is seen through.
+        reference: longer side in pixels that the sensor's σ is meant for.
         image: `(3, H, W)`.
         grid: the grid over it.
     """
@@ -69,10 +74,17 @@ def saliency_table(name: str, saliency: SaliencyConfig, eye: Eye, image: Tensor,
     with torch.inference_mode():
         if saliency.view == "picture":
             return cells_of(model, image[None], grid, saliency)
-        view = eye.open(image[None])
-        # One view at a time: the bits then do not depend on which views share a batch.
-        rows = [cells_of(model, foveated(eye, view, fixation[None]), grid, saliency) for fixation in grid.centres]
-        return torch.cat(rows)
+        bands, fixations = seen_by(sensor, reference, image, grid.centres)
+        # One view at a time: rounding then does not depend on which views share a batch.
+        return torch.cat([cells_of(model, sensor(bands, fixation), grid, saliency) for fixation in fixations])
+
+
+def seen_by(sensor: Foveation, reference: float, image: Tensor, points: Tensor) -> tuple[Bands, Tensor]:
+    """Pyramid of a photograph `(3, H, W)` whose longer side is made `reference`, and `points` `(F, 2)` of it there."""
+    scale = reference / max(image.shape[-2:])
+    size = round(image.shape[-1] * scale), round(image.shape[-2] * scale)
+    ratio = points.new_tensor(size) / points.new_tensor((image.shape[-1], image.shape[-2]))
+    return sensor.pyramid(resize(image[None], size)), (points + 0.5) * ratio - 0.5
 
 
 def cells_of(model: Model, pictures: Tensor, grid: Grid, saliency: SaliencyConfig) -> Tensor:
@@ -90,19 +102,3 @@ def cut(canvases: Tensor, placement: Placement) -> Tensor:
     left, top = placement.offset
     width, height = (round(n * s) for n, s in zip(placement.size, placement.scale, strict=True))
     return canvases[..., top : top + height, left : left + width]
-
-
-def milliseconds_per_map(
-    name: str, saliency: SaliencyConfig, eye: Eye, image: Tensor, grid: Grid, repetitions: int = 7
-) -> float:
-    """Median time for the saliency of the cells of one picture, that is seen from the first cell or whole."""
-    model, times = SALIENCY_MODELS[name](), []
-    with torch.inference_mode():
-        picture = image[None]
-        if saliency.view == "foveated":
-            picture = foveated(eye, eye.open(picture), grid.centres[:1])
-        for _ in range(repetitions):
-            began = time.perf_counter()
-            cells_of(model, picture, grid, saliency)
-            times.append(time.perf_counter() - began)
-    return 1000 * sorted(times)[len(times) // 2]

@@ -12,6 +12,7 @@ from eval.html.run_report import write_run_report
 from eval.metrics import cumulative_performance, random_search
 from eval.protocol import Looks
 from eval.report import (
+    LAST_COLUMN,
     Array,
     Curve,
     Record,
@@ -20,16 +21,14 @@ from eval.report import (
     curve_of,
     curve_rows,
     curves_csv,
-    milliseconds_per_decision,
     save_figure,
     sensing,
     table,
     write_files,
 )
 from eval.run import Parts
-from eval.saliency import foveated
 from eval.tasks import SearchRun
-from semfov.agent import acquisition_values, probability
+from eval.views import foveated_views
 from semfov.belief import SemanticObserver
 from semfov.errors import DataError
 from semfov.scanpath import Scanpath
@@ -51,10 +50,9 @@ def report(run: SearchRun, parts: Parts) -> None:
     shifts = run.config.protocol.shifts
     curves = {average: performance(records, run.config.policies, shifts, average) for average in AVERAGES}
     expected = expected_random(records, shifts, run.config.belief.columns * run.config.belief.rows)
-    decision = milliseconds_per_decision(run)
-    summary = summary_markdown(curves, expected, decision)
+    summary = summary_markdown(curves, expected, sensing(run))
     tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("average", "performance"))}
-    written = write_files(run, "eval.search", tables, records, seconds, decision)
+    written = write_files(run, "eval.search", tables, records, seconds)
     written += [draw_curves(run, curves["all targets"], expected), *draw_scanpaths(run, records)]
     written.append(
         write_run_report(
@@ -64,7 +62,6 @@ def report(run: SearchRun, parts: Parts) -> None:
             titles=AVERAGES,
             label="targets found (%)",
             shifts=SHIFTS,
-            decision=decision,
             replay=replay,
             others={"random, by formula": expected},
         )
@@ -94,19 +91,19 @@ def expected_random(records: list[Record], shifts: int, cells: int) -> Array:
     return np.asarray(np.mean(curves, axis=0), dtype=np.float64)
 
 
-def summary_markdown(curves: dict[str, dict[str, Curve]], expected: Array, decision: dict[str, float]) -> str:
+def summary_markdown(curves: dict[str, dict[str, Curve]], expected: Array, sensing: str) -> str:
     """The tables that the run prints: cumulative performance with standard errors over images."""
     shifts = [n for n in SHIFTS if n < len(expected)]
-    head = ["policy", *(f"CP@{n}" for n in shifts), "ms / decision"]
+    head = ["policy", *(f"CP@{n}" for n in shifts), LAST_COLUMN]
     lines = []
     for average, policies in curves.items():
         first = next(iter(policies.values()))
         lines += [
-            f"**{AVERAGES[average]}** ({first.images} images, {first.episodes} searches per policy; "
-            "% found after n gaze shifts ± standard error over images)",
+            f"**{AVERAGES[average]}** ({sensing}; {first.images} images, {first.episodes} searches per policy; "
+            "% found after n gaze shifts, the first fixation not counted, ± standard error over images)",
             "",
         ]
-        rows = curve_rows(policies, shifts, decision)
+        rows = curve_rows(policies, shifts)
         if average == "all targets":
             rows.append(["random, by formula", *(f"{100 * expected[n]:.1f}" for n in shifts), ""])
         lines += [*table([head, *rows]), ""]
@@ -138,7 +135,7 @@ def draw_scanpaths(run: SearchRun, records: list[Record]) -> list[Path]:
         index = run.scenes.ids.index(record["scene"])
         scene = run.scenes[index]
         scanpath = replay(run, index, record)
-        views = foveated_views(run, index, scanpath)
+        views = foveated_views(run.eye, scene.image, scanpath.fixations)
         boxes = scene.boxes[scene.labels == record["target"]]
         name = f"scanpath_{record['scene']}_{record['target_name'].replace(' ', '-')}.png"
         paths.append(save_figure(plot_episode(scanpath, scene.image, views, boxes=boxes), run.config.out / name))
@@ -162,10 +159,9 @@ def replay(run: SearchRun, index: int, record: Record) -> Scanpath:
         for cell in cells.split(1):
             belief, known = observer.update(belief, looks(wanted, cell)), semantics.update(known, seen(wanted, cell))
             beliefs.append(known.beta[0])
-            present.append(probability(belief.beta[0], int(observer.component(target))))
+            present.append(belief.probability(target)[0])
             visited[0, cell] = True
-            acquisition = searcher.acquisition(observer.component(target), grid, cell)
-            values.append(acquisition_values(acquisition, belief, visited)[0])
+            values.append(searcher.acquisition(target, grid, cell)(belief, visited)[0])
     return Scanpath(
         grid=grid,
         classes=("background", *run.scenes.classes),
@@ -178,13 +174,3 @@ def replay(run: SearchRun, index: int, record: Record) -> Scanpath:
         found=record["found_at"] >= 0,
         posterior=torch.stack(present),
     )
-
-
-def foveated_views(run: SearchRun, index: int, scanpath: Scanpath) -> list[torch.Tensor]:
-    """What the detector was shown at each fixation, without its canvas and at the size of the image."""
-    from semfov.detection.placement import resize
-
-    image = run.scenes[index].image
-    with torch.no_grad():
-        view = run.eye.open(image[None])
-        return list(resize(foveated(run.eye, view, scanpath.fixations), view.placement.size))

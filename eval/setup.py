@@ -6,10 +6,10 @@ import json
 import logging
 import multiprocessing
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 import semfov
 from eval.config import BeliefConfig, DataConfig, DetectorConfig, RunConfig, SearchConfig, SensorConfig
@@ -17,7 +17,7 @@ from eval.protocol import Searcher
 from eval.saliency import SALIENCY_MODELS
 from semfov.belief import ContextObserver, ContextPrior, Observer, SemanticObserver, TargetEvidence
 from semfov.data.scene import Scenes
-from semfov.errors import InputError, check, lookup
+from semfov.errors import DataError, InputError, check, lookup
 from semfov.eye import Eye
 from semfov.gaze import EXPLORATION_POLICIES, SEARCH_POLICIES, LearnedGaze, exploration_policy, search_policy
 from semfov.observation.compatibility import recommended
@@ -62,9 +62,18 @@ def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
         data.annotations,
         classes,
         min_instances=data.min_instances,
+        ids=None if data.ids is None else read_ids(data.ids),
         max_target_area=data.max_target_area,
         limit=data.limit,
     )
+
+
+def read_ids(path: Path) -> list[str]:
+    """Ids of photographs, one a line."""
+    try:
+        return path.read_text(encoding="utf-8").split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read as a list of ids ({error})") from None
 
 
 def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
@@ -82,8 +91,7 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
     if detector.input_size is not None:
         options["input_size"] = detector.input_size
     model = semfov.load_detector(detector.name, **options)
-    foveation = semfov.Foveation(sensor.sigma, levels=sensor.levels, growth=sensor.growth, convention=sensor.convention)
-    return Eye(foveation, model, reference=sensor.reference).eval().requires_grad_(False)
+    return Eye(sensor.make(), model, reference=sensor.reference).eval().requires_grad_(False)
 
 
 def make_observation(name: str | None, eye: Eye) -> semfov.FovealObservationModel:
@@ -130,19 +138,28 @@ def split_policy(name: str, kind: Kind) -> tuple[str, bool]:
 def belief_of(name: str, belief: BeliefConfig) -> BeliefConfig:
     """Settings of the belief for a policy: those of the run, changed as the `+` endings of its name say."""
     for variant in name.split("+")[1:]:
-        belief = replace(belief, **VARIANTS[lookup(variant, VARIANTS, "belief setting")])
+        if variant not in SALIENCY_MODELS:
+            belief = replace(belief, **VARIANTS[lookup(variant, [*VARIANTS, *SALIENCY_MODELS], "policy setting")])
     return belief
+
+
+def saliency_of(name: str, kind: Kind) -> str | None:
+    """The saliency model that a policy goes by (`vocus2-raw`), or has as a prior (`non-predictive-raw+vocus2`)."""
+    base, _ = split_policy(name, kind)
+    if base in SALIENCY_MODELS:
+        return base
+    return next((variant for variant in name.split("+")[1:] if variant in SALIENCY_MODELS), None)
 
 
 def saliency_policies(policies: tuple[str, ...], kind: Kind) -> list[str]:
     """Saliency models that a run needs, each once."""
-    return list(dict.fromkeys(base for base, _ in _split(policies, kind) if base in SALIENCY_MODELS))
+    return list(dict.fromkeys(model for name in policies if (model := saliency_of(name, kind)) is not None))
 
 
 def needs_model(policies: tuple[str, ...], kind: Kind) -> bool:
     """Whether a policy of the run needs an observation model: to predict, to calibrate, or for its miss rates."""
     check(len(policies) > 0, "policies", "at least one policy", "none")
-    without = (TARGET_EVIDENCE, LEARNED, "random", "non-predictive", "neighbourhood", "closer-look", *SALIENCY_MODELS)
+    without = (TARGET_EVIDENCE, LEARNED, "random", "non-predictive", "closer-look", *SALIENCY_MODELS)
     predicts = any(base not in without or calibrated for base, calibrated in _split(policies, kind))
     return predicts or any(belief_of(name, BeliefConfig()).misses for name in policies)
 
@@ -163,7 +180,7 @@ def in_context(name: str, kind: Kind, observer: Observer, belief: BeliefConfig, 
     if part == "none":
         return observer
     base, _ = split_policy(name, kind)
-    if kind != "search" or base not in (TARGET_EVIDENCE, "non-predictive", "neighbourhood"):
+    if kind != "search" or base not in (TARGET_EVIDENCE, "non-predictive"):
         raise InputError(f"belief.context: expected a search by the probability of the target, got policy {name!r}")
     if prior is None:
         raise InputError("belief.context: expected a fitted context, got none")
@@ -181,7 +198,6 @@ def make_searcher(
     belief: BeliefConfig,
     components: int,
     model: semfov.FovealObservationModel | None,
-    saliency: Tensor | None = None,
     fovea: float = 100 / 640,
 ) -> Searcher:
     """How the policy of this name searches or explores.
@@ -192,7 +208,6 @@ def make_searcher(
         belief: the grid of beliefs.
         components: classes, background included.
         model: the observation model, where one is needed.
-        saliency: of the scene, for the saliency policies.
         fovea: width of the fovea in longer sides of the image.
     """
     base, calibrated = split_policy(name, kind)
@@ -210,10 +225,10 @@ def make_searcher(
         misses=model.miss_likelihood if belief.misses and model is not None else None,
     )
     if base in SALIENCY_MODELS:
-        return Searcher(observer, search_policy("random"), saliency)
+        return Searcher(observer, search_policy("random"))
     if kind == "search":
-        return Searcher(observer, search_policy(base, model, calibrated=calibrated))
-    return Searcher(observer, exploration_policy(base, model, calibrated=calibrated, fovea=fovea))
+        return Searcher(observer, search_policy(base, model))
+    return Searcher(observer, exploration_policy(base, model, fovea=fovea, prior=belief.prior))
 
 
 def plain(settings: dict[str, Any]) -> Any:

@@ -93,5 +93,5 @@ class ExploreRun(Run):
             "cells": list(progress.cells),
             "object_cells": objects,
             "right": list(progress.right),
-            "right_with_background": list(progress.right_with_background),
+            "right_without_background": list(progress.right_without_background),
         }

@@ -12,7 +12,6 @@ from tqdm import tqdm
 
 from eval.protocol import generator_for
 from eval.samples import Sampler, Samples
-from semfov.agent import probability
 from semfov.belief import ContextPrior, Observer, SemanticObserver, TargetEvidence, TargetObserver
 from semfov.belief.context import presence_of
 from semfov.belief.context_observer import log_odds
@@ -81,7 +80,7 @@ def make_cases(
             said = observer.weigh(seen, fixations, place.grid, target)
             for look in used.split(1):
                 belief = observer.update(belief, said[look])
-            present = probability(belief.beta[0], int(observer.component(target)))
+            present = belief.probability(target)[0]
             shown = presence[used].amax(0, keepdim=True)
             alone = [prior(shown, place.grid, target, weights)[0] for weights in ((1.0, 0.0), (0.0, 1.0))]
             visited = torch.zeros(len(place.grid), dtype=torch.bool).scatter(0, cells[used], True)

@@ -11,9 +11,9 @@ differentiated through belief, detector and foveation, back to the choices that 
 network learns (and the width of the fovea, with `--learn_sigma true`); detector and belief stay as they are. It starts
 as the hand-made policy `non-predictive-raw+tempered+central`, so it can be compared with what it started from.
 
-A run that was stopped goes on where it was when the same command is given again, to the same bits. The folder `out`
-gets the model (`<name>.safetensors`), a checkpoint, and a report that judges the model and its start on photographs
-that it was not trained on. Expect a few seconds a step on one CPU core.
+A run that was stopped goes on where it was when the same command is given again, and on the same machine ends as if it
+had not been. The folder `out` gets the model (`<name>.safetensors`), a checkpoint, and a report that judges the model
+and its start on photographs that it was not trained on. Expect a few seconds a step on one CPU core.
 Use it with `--policies [learned-raw] --gaze_model runs/fit_gaze/<name>.safetensors`.
 """
 
@@ -144,7 +144,7 @@ def train(
 ) -> tuple[LearnedGaze, list[float]]:
     """The trained policy, and the loss of every step; goes on from the checkpoint in `out` where there is one.
 
-    Random numbers are seeded step by step, so that a run that was stopped ends with the same bits.
+    Random numbers are seeded step by step, so that a run that was stopped ends as if it had not been.
     """
     gaze = first_model(config, metadata)
     parameters = dict(gaze.named_parameters())

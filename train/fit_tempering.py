@@ -154,10 +154,7 @@ def hit_rate(
         updated = observer.update(belief[going], evidence[torch.full_like(going, look)])
         belief.beta[going], belief.closest[going] = updated.beta, updated.closest
         visited[going, cell] = True
-        posterior = (updated.beta / updated.beta.sum(-1, keepdim=True)).gather(
-            -1, targets[going, None, None].expand(-1, len(grid), 1)
-        )[..., 0]
-        posterior = posterior.masked_fill(visited[going], -1)
+        posterior = updated.probability(targets[going]).masked_fill(visited[going], -1)
         best = posterior == posterior.amax(-1, keepdim=True)
         hits.append((best & goal[going]).sum(-1) / best.sum(-1))
     share = torch.cat(hits)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from semfov import Eye, Grid
 from semfov.agent import step
-from semfov.belief import Belief, SemanticObserver
+from semfov.belief import DirichletBelief, SemanticObserver
 from semfov.data.scene import Scenes
 from semfov.eye import View
 from semfov.gaze.learned import LearnedGaze
@@ -143,7 +143,7 @@ def unroll(
         visited = visited.scatter(-1, cell[:, None], True)
         logits = gaze(belief, visited, target, grid.columns)
         hit = log_share(logits.masked_fill(visited, -torch.inf), goal)
-        present = belief.beta.take_along_dim(target[:, None, None], -1)[..., 0] / belief.beta.sum(-1)
+        present = belief.probability(target)
         weight = how.discount**shift / count
         loss = loss - weight * (hit + how.posterior * log_share(present.log(), goal)).sum()
         if how.others > 0:
@@ -158,18 +158,20 @@ def unroll(
         if last or (shift + 1) % how.window == 0:
             finish(loss)
             loss, fixation = like.new_zeros(()), fixation.detach()
-            belief = Belief(belief.beta.detach(), belief.closest.detach())
+            belief = DirichletBelief(belief.beta.detach(), belief.closest.detach())
         if last:
             return
 
 
-def others_loss(gaze: LearnedGaze, searches: Searches, belief: Belief, visited: Tensor, target: Tensor) -> Tensor:
+def others_loss(
+    gaze: LearnedGaze, searches: Searches, belief: DirichletBelief, visited: Tensor, target: Tensor
+) -> Tensor:
     """Sum over searches of the mean first term of the loss for classes other than `target`, not yet found."""
     found = (searches.goals & visited[:, None]).any(-1)
     row, other = (~found & (searches.classes != target[:, None])).nonzero(as_tuple=True)
     if not len(row):
         return belief.beta.new_zeros(())
-    constant = Belief(belief.beta.detach()[row], belief.closest.detach()[row])
+    constant = DirichletBelief(belief.beta.detach()[row], belief.closest.detach()[row])
     logits = gaze(constant, visited[row], searches.classes[other], searches.grid.columns)
     hit = log_share(logits.masked_fill(visited[row], -torch.inf), searches.goals[other])
     return -(hit / torch.bincount(row)[row]).sum()
@@ -206,7 +208,9 @@ def found_at(gaze: LearnedGaze, eye: Eye, searches: Searches, noise: Tensor) -> 
     return found
 
 
-def _look(observer: SemanticObserver, eye: Eye, searches: Searches, belief: Belief, fixation: Tensor) -> Belief:
+def _look(
+    observer: SemanticObserver, eye: Eye, searches: Searches, belief: DirichletBelief, fixation: Tensor
+) -> DirichletBelief:
     """The belief after a look of every search from `fixation` `(F, 2)`."""
     detections = eye.look(searches.view, fixation)
     return observer.update(belief, observer.weigh(detections, fixation, searches.grid))

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from semfov import Scanpath, viz
-from semfov.belief.semantic_map import mean
 from semfov.detection.placement import resize
+from semfov.observation.dirichlet import mean
 from semfov.viz.labels import place_labels
 
 Data = dict[str, Any]

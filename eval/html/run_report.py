@@ -15,12 +15,12 @@ import yaml
 from eval.html.curves import curves_html, table_html
 from eval.html.episode import Data, Pool, episode_data
 from eval.html.page import write_page
-from eval.report import Array, Curve, Record, curve_rows
+from eval.report import LAST_COLUMN, Array, Curve, Record, curve_rows
 from eval.run import Run
 from eval.setup import plain
 from eval.views import foveated_views
 from semfov import Scanpath
-from semfov.agent import acquisition_values
+from semfov.belief.belief import dirichlet_belief
 
 LIMIT = 4_500_000
 """No further episode is added to a page that is as large as this, in bytes."""
@@ -34,7 +34,6 @@ def write_run_report(
     titles: Mapping[str, str],
     label: str,
     shifts: Sequence[int],
-    decision: Mapping[str, float],
     replay: Callable[[Any, int, Record], Scanpath],
     others: Mapping[str, Array] | None = None,
     episodes: int = 18,
@@ -48,7 +47,6 @@ def write_run_report(
         titles: of the averages, in words.
         label: what the curves show, in percent.
         shifts: gaze shifts at which the tables show them.
-        decision: milliseconds per decision of each policy.
         replay: the scanpath of a record.
         others: curves of the first average that no policy made.
         episodes: at least this many to step through, where the page does not grow too large.
@@ -60,7 +58,7 @@ def write_run_report(
         means = {**{name: curve.mean for name, curve in policies.items()}, **added}
         errors = {name: curve.over_images for name, curve in policies.items()}
         at = [n for n in shifts if n < len(first.mean)]
-        rows = [["policy", *(str(n) for n in at), "ms / decision"], *curve_rows(policies, at, dict(decision))]
+        rows = [["policy", *(str(n) for n in at), LAST_COLUMN], *curve_rows(policies, at)]
         rows += [[name, *(f"{100 * curve[n]:.1f}" for n in at), ""] for name, curve in added.items()]
         caption = f"{label} after n gaze shifts ± standard error over {first.images} images, {first.episodes} episodes"
         title = escape(titles[average])
@@ -104,9 +102,9 @@ def replay_exploration(run: Run, index: int, record: Record) -> Scanpath:
         belief = explorer.observer.start(1, grid, detections.scores)
         for cell in cells.split(1):
             belief = explorer.observer.update(belief, evidence[cell])
-            beliefs.append(belief.beta[0])
+            beliefs.append(dirichlet_belief(belief).beta[0])
             visited[0, cell] = True
-            values.append(acquisition_values(explorer.acquisition(None, grid, cell), belief, visited)[0])
+            values.append(explorer.acquisition(None, grid, cell)(belief, visited)[0])
     return Scanpath(
         grid=grid,
         classes=("background", *run.scenes.classes),

@@ -70,7 +70,6 @@ def run_page(scanpath: Scanpath, image: torch.Tensor, hostile: str, tmp_path: Pa
         titles={"average": hostile},
         label=hostile,
         shifts=(0, 2),
-        decision={hostile: 0.1},
         replay=lambda run, index, record: scanpath,
         others={hostile + "2": share},
     )

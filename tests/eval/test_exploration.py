@@ -14,7 +14,7 @@ from eval.exploration import (
     run_explorations,
 )
 from eval.protocol import Searcher
-from semfov import Detections, Evidence, FovealObservationModel, Grid, fusion
+from semfov import Detections, Evidence, FovealObservationModel, Grid
 from semfov.belief import SemanticObserver
 from semfov.data.scene import Annotation
 from semfov.gaze import exploration_policy, search_policy
@@ -61,23 +61,35 @@ def model():
     return FovealObservationModel(alpha, [0.3], ["cat", "cup", "dog"]).requires_grad_(False).eval()
 
 
+def kaplan(beta, likelihood):
+    """Equation 7 of Luzio, Bernardino and Moreno (2024)."""
+    expected = (beta * likelihood).sum()
+    return beta * (1 + likelihood / expected) / (1 + likelihood.min() / expected)
+
+
+def from_prior(beta):
+    """Their equation 19."""
+    base = torch.distributions.Dirichlet(torch.full((len(beta),), 0.5, dtype=torch.float64))
+    return float(torch.distributions.kl_divergence(torch.distributions.Dirichlet(torch.from_numpy(beta)), base))
+
+
 def explore_by_loop(episode, evidence, model, answers, noise, shifts):
     """KL exploration of one episode, cell by cell, from the description in the paper."""
     beta = np.full((12, 4), 0.5)
-    cell, cells, right, with_background = episode.start, [], [], []
+    cell, cells, right, without = episode.start, [], [], []
     for shift in range(shifts + 1):
         cells.append(cell)
         for likelihood, footprint in zip(evidence.likelihood[cell], evidence.footprint[cell], strict=True):
             for covered in footprint.nonzero()[:, 0].tolist():
-                beta[covered] = fusion.kaplan(torch.from_numpy(beta[covered]), likelihood.double()).numpy()
+                beta[covered] = kaplan(beta[covered], likelihood.double().numpy())
         counts = [0, 0]
         for place in range(12):
-            for number, offered in enumerate(([1, 2, 3], [0, 1, 2, 3])):
+            for number, offered in enumerate(([0, 1, 2, 3], [1, 2, 3])):
                 best = max(beta[place, k] for k in offered)
                 winners = [k for k in offered if beta[place, k] > best * (1 - 1e-6)]
                 counts[number] += len(winners) == 1 and winners[0] in answers[place]
         right.append(counts[0])
-        with_background.append(counts[1])
+        without.append(counts[1])
         values = []
         for fixation in range(12):
             total = 0.0
@@ -85,19 +97,18 @@ def explore_by_loop(episode, evidence, model, answers, noise, shifts):
                 distance = float((GRID.centres[place] - GRID.centres[fixation]).norm()) / 80
                 p = beta[place] / beta[place].sum()
                 scores = p @ model.expected_scores()[:, int(distance > 0.3)].double().numpy()
-                after = fusion.kaplan(torch.from_numpy(beta[place]), torch.from_numpy(scores)).numpy()
-                after = after / after.sum()
-                total += float((after * np.log(after / p)).sum())
+                after = kaplan(beta[place], scores)
+                total += from_prior(after) - from_prior(beta[place])
             values.append(total)
         free = [c for c in range(12) if c not in cells]
         if not free:
             right += [right[-1]] * (shifts - shift)
-            with_background += [with_background[-1]] * (shifts - shift)
+            without += [without[-1]] * (shifts - shift)
             break
         best = max(values[c] for c in free)
         tied = [c for c in free if values[c] > best * (1 - 1e-6)]
         cell = max(tied, key=lambda c: float(noise[shift, c]))
-    return tuple(cells), tuple(right), tuple(with_background)
+    return tuple(cells), tuple(right), tuple(without)
 
 
 @pytest.mark.parametrize("batch", [2, 100])
@@ -115,7 +126,7 @@ def test_exploration_equals_a_scalar_twin(evidence, model, shifts, batch):
     right_classes = [set(row.nonzero()[:, 0].tolist()) for row in answers]
     for episode, random, outcome in zip(episodes, noise, progress, strict=True):
         expected = explore_by_loop(episode, evidence, model, right_classes, random, shifts)
-        assert (outcome.cells, outcome.right, outcome.right_with_background) == expected
+        assert (outcome.cells, outcome.right, outcome.right_without_background) == expected
 
 
 def test_answers_are_the_classes_of_overlapping_objects():

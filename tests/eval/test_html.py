@@ -15,7 +15,7 @@ from PIL import Image
 from eval.html.curves import curves_html, table_html
 from eval.html.episode import Pool, episode_data
 from eval.html.page import write_page
-from semfov.belief.semantic_map import mean
+from semfov.observation.dirichlet import mean
 
 
 class Elements(HTMLParser):

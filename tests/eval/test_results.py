@@ -1,59 +1,124 @@
 """The results page: tables come from what runs wrote, and differences are paired."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from eval import paper
+from eval.curves import behind
 from eval.experiments import ResultsConfig, experiments
-from eval.results import agreement, fill, paired, summary
+from eval.findings import FINDINGS, gain, overtaken
+from eval.page_figures import FIGURES, draw_figures
+from eval.page_tables import agreement, central, first_fixations, paired, summary
+from eval.results import TABLES, WHOLE, fill
 from eval.setup import split_policy
 from semfov.errors import InputError
+
+ROOT = Path(__file__).parents[2]
+
+
+def write_records(folder, records):
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "summary.md").write_text("**one** (1)\n\n| a |\n|---|\n| 1 |\n\n**two** (2)\n\n| b |\n")
+    (folder / "episodes.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+
+
+def searches(policies, found_at):
+    """Searches of six scenes, four starts each; `found_at` tells for (policy, scene, repetition)."""
+    return [
+        {
+            "policy": policy,
+            "scene": scene,
+            "repetition": repetition,
+            "commonest": scene % 2 == 0,
+            "goal": [1, 2],
+            "cells": [0, scene, 5],
+            "found_at": found_at(policy, scene, repetition),
+        }
+        for policy in policies
+        for scene in range(6)
+        for repetition in range(4)
+    ]
+
+
+def cells_of(row):
+    return [cell.strip() for cell in row.split("|")[1:-1]]
 
 
 @pytest.fixture
 def runs(tmp_path):
-    config = ResultsConfig(root=tmp_path, annotations=tmp_path / "a.json", out=tmp_path)
-    made = experiments(config)
-    folder = made["search-tiny"].out
-    folder.mkdir()
-    (folder / "summary.md").write_text("**one** (1)\n\n| a |\n|---|\n| 1 |\n\n**two** (2)\n\n| b |\n")
+    config = ResultsConfig(
+        root=tmp_path,
+        annotations=tmp_path / "a.json",
+        fit_root=tmp_path,
+        fit_annotations=tmp_path,
+        out=tmp_path / "out",
+    )
+    return experiments(config)
+
+
+@pytest.fixture
+def searched(runs):
     rng = np.random.default_rng(0)
-    records = [
-        {"policy": policy, "scene": scene, "found_at": int(rng.integers(-1, 12))}
-        for policy in ("random", "clever")
-        for scene in range(6)
-        for _ in range(4)
-    ]
-    (folder / "episodes.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
-    return made, records
+    records = searches(("random", "clever"), lambda *_: int(rng.integers(-1, 12)))
+    write_records(runs["beyond-search-tiny"].out, records)
+    return runs, records
 
 
 def test_every_policy_of_the_page_is_known(runs):
-    for run in runs[0].values():
+    for run in runs.values():
         kind = "search" if hasattr(run, "scanpaths") else "exploration"
         for policy in run.policies:
             split_policy(policy, kind)
 
 
-def test_lines_become_tables(runs):
-    text = fill("before\n@@ search-tiny second\nafter\n", runs[0])
+def test_settings_are_studied_on_the_fit_set_and_results_on_the_named_photographs(tmp_path):
+    config = ResultsConfig(root=tmp_path / "val", annotations=tmp_path / "v.json", fit_root=tmp_path / "fit")
+    for name, run in experiments(config).items():
+        study = " " in name
+        assert run.data.root == (config.fit_root if study else config.root)
+        assert run.data.ids == (None if study else config.ids)
+    ids = (ROOT / config.ids).read_text().split()
+    assert len(set(ids)) == len(ids) == 300
+
+
+def test_published_experiments_have_the_published_sensor_and_model(runs):
+    for kind in ("search", "explore"):
+        for fovea in ("published", "published-narrow"):
+            for name, detector in (("nano", "yolox-nano"), ("tiny", "yolov3-tiny")):
+                run = runs[f"{kind}-{fovea}-{name}"]
+                assert run.sensor.name == fovea
+                assert run.belief.model == f"{detector}-{fovea}"
+                assert run.saliency.view == "foveated"
+
+
+def test_lines_become_tables(searched):
+    runs, _ = searched
+    text = fill("before\n@@ beyond-search-tiny second\nafter\n", runs)
     assert text == "before\n**two** (2)\n\n| b |\nafter\n"
-    assert fill("@@ explore-nano all\n", runs[0]) == "*Not run yet.*\n"
-    assert fill("@@ explore-five-levels-nano first\n", runs[0]) == "*Not run yet.*\n"
-    assert fill("@@ sensitivity\n", runs[0]).count("not run yet") > 50
-    assert fill("@@ sensor\n", runs[0]).count("not run yet") == 9 * 2 * 5
-    assert fill("@@ explore-sensor\n", runs[0]).count("not run yet") == 6 * 2 * 7
-    assert summary(runs[0]["search-tiny"].out, 0)[0] == "**one** (1)"
-    with pytest.raises(InputError, match="did you mean 'search-tiny'"):
-        fill("@@ search-tin first\n", runs[0])
+    assert fill("@@ beyond-explore-nano all\n", runs) == "*Not run yet.*\n"
+    assert fill("@@ sensitivity\n", runs).count("not run yet") > 50
+    assert fill("@@ explore-sensor\n", runs).count("not run yet") == 6 * 2 * 7
+    assert fill("@@ table-1\n", runs).count("not run yet") == 4 * 4 * 4
+    assert summary(runs["beyond-search-tiny"].out, 0)[0] == "**one** (1)"
+    with pytest.raises(InputError, match="did you mean 'beyond-search-tiny'"):
+        fill("@@ beyond-search-tin first\n", runs)
     with pytest.raises(InputError, match="table"):
-        fill("@@ search-tiny third\n", runs[0])
+        fill("@@ beyond-search-tiny third\n", runs)
 
 
-def test_differences_are_paired_over_images(runs):
-    made, records = runs
-    rows = paired(made["search-tiny"].out, "random", (1, 5))
+def test_every_line_of_the_template_is_known(runs):
+    for line in (ROOT / "docs/results.template.md").read_text(encoding="utf-8").splitlines():
+        if line.startswith("@@ "):
+            name, _, kind = line.removeprefix("@@ ").partition(" ")
+            assert name in WHOLE or not kind or (name in runs and kind in TABLES), line
+
+
+def test_differences_are_paired_over_images(searched):
+    runs, records = searched
+    rows = paired(runs["beyond-search-tiny"].out, "random", (1, 5))
     differences = []
     for scene in range(6):
         rate = {
@@ -64,6 +129,35 @@ def test_differences_are_paired_over_images(runs):
     expected = f"{100 * np.mean(differences):+.1f} ± {100 * np.std(differences, ddof=1) / np.sqrt(6):.1f}"
     assert len(rows) == 3
     assert expected in rows[2]
+
+
+def test_behind_is_behind_by_two_standard_errors():
+    mean, error = np.array([0.0, -0.1, -0.3, -0.2, 0.4]), np.array([0.0, 0.06, 0.1, 0.1, 0.1])
+    assert behind(mean, error) == [2]
+
+
+def test_a_table_of_the_paper_counts_the_commonest_target_and_both_errors(runs):
+    found = {("random", 0): 3, ("random", 2): 20, ("random", 4): -1}
+    records = searches(tuple(paper.TABLE_II), lambda policy, scene, _: found.get((policy, scene), 1))
+    write_records(runs["search-published-nano"].out, records)
+    rows = [cells_of(row) for row in fill("@@ table-2\n", runs).splitlines()]
+    assert rows[0][:4] == ["policy", "", "paper", "YOLOX-nano, wide"]
+    # One of the three even scenes within 5 and 15 shifts, two within 30.
+    assert rows[2][:4] == ["random", "CP@5", "45.20", "33.3 ± 33.3"]
+    assert rows[4][1:4] == ["CP@30", "97.13", "66.7 ± 33.3"]
+    assert rows[5][1:4] == ["max. SEM", "1.059", "0.000"]
+
+
+def test_findings_have_verdicts(runs):
+    folder = runs["search-published-nano"].out
+    found = {"random": 9, "vocus2": 20}
+    write_records(folder, searches(("random", "vocus2"), lambda policy, scene, _: found[policy] + scene % 2))
+    answer = gain("random", "vocus2", (5, 15, 30), "search")(folder)
+    assert answer == "+0.0 / +100.0 / +0.0: holds in part"
+    assert gain("random", "vocus2", (5, 30), "search", expected=0)(folder).endswith("holds")
+    told = overtaken("random", "vocus2", "search")(folder)
+    assert told == "ahead at 9 to 20, behind at no shift: leads, not overtaken"
+    assert len({finding.text for finding in FINDINGS}) == len(FINDINGS)
 
 
 def test_agreement_compares_the_same_episodes(tmp_path):
@@ -77,27 +171,41 @@ def test_agreement_compares_the_same_episodes(tmp_path):
         for mode in ("raw", "calibrated")
         for n in range(4)
     ]
-    (tmp_path / "episodes.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    write_records(tmp_path, records)
     rows = agreement(tmp_path)
-    assert [cell.strip() for cell in rows[2].split("|")[1:-1]] == ["raw", "75.0 %", "100.0 %"]
-    assert [cell.strip() for cell in rows[3].split("|")[1:-1]] == ["calibrated", "100.0 %", "100.0 %"]
+    assert cells_of(rows[2]) == ["raw", "75.0 %", "100.0 %"]
+    assert cells_of(rows[3]) == ["calibrated", "100.0 %", "100.0 %"]
+
+
+def test_first_fixations_are_central_or_at_the_border(tmp_path):
+    middle, border = central(np.arange(100))
+    assert middle.nonzero()[0].tolist() == [10 * row + column for row in (3, 4, 5, 6) for column in (3, 4, 5, 6)]
+    assert border.sum() == 36
+    write_records(tmp_path, [{"policy": "kl-raw", "cells": [50, cell]} for cell in (44, 45, 9, 21)])
+    assert cells_of(first_fixations(tmp_path)[2]) == ["kl-raw", "50.0 %", "25.0 %"]
 
 
 def test_a_study_has_a_row_for_each_setting_and_policy(runs):
-    folder = runs[0]["explore-sensor YOLOX-nano, fovea 50 px, growth 1"].out
-    folder.mkdir()
-    (folder / "summary.md").write_text("**one**\n")
     right = {"random-raw": (1, 2), "closer-look-raw+mild": (3, 4)}
     records = [
         {"policy": policy, "scene": scene, "right": [counts[scene]] * 21, "object_cells": 4}
         for policy, counts in right.items()
         for scene in (0, 1)
     ]
-    (folder / "episodes.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
-    rows = [
-        [cell.strip() for cell in row.split("|")[1:-1]] for row in fill("@@ explore-sensor\n", runs[0]).splitlines()
-    ]
+    write_records(runs["explore-sensor fovea 50 px, growth 1"].out, records)
+    rows = [cells_of(row) for row in fill("@@ explore-sensor\n", runs).splitlines()]
     assert rows[0] == ["setting", "policy", "0", "1", "2", "3", "4", "10", "20"]
-    assert rows[2][:3] == ["YOLOX-nano, fovea 50 px, growth 1", "random-raw", "37.5 ± 12.5"]
+    assert rows[2][:3] == ["fovea 50 px, growth 1", "random-raw", "37.5 ± 12.5"]
     assert rows[3][1:3] == ["closer-look-raw+mild", "87.5 ± 12.5"]
     assert len(rows) == 2 + 6 * 2
+
+
+def test_figures_are_drawn_once_their_experiments_have_run(runs, tmp_path):
+    assert draw_figures(tmp_path, runs) == []
+    for name in ("nano", "tiny"):
+        for fovea in ("published", "published-narrow"):
+            run = runs[f"search-{fovea}-{name}"]
+            write_records(run.out, searches(run.policies, lambda policy, scene, repetition: scene + repetition))
+    drawn = draw_figures(tmp_path, runs)
+    assert {path.stem for path in drawn} == {name for name, figure in FIGURES.items() if figure.kind == "search"}
+    assert all(path.stat().st_size > 10_000 for path in drawn)

@@ -44,7 +44,6 @@ def write_search(run, records, **options):
         titles=search_report.AVERAGES,
         label="targets found (%)",
         shifts=search_report.SHIFTS,
-        decision=dict.fromkeys(policies, 0.5),
         replay=search_report.replay,
         others={"random, by formula": search_report.expected_random(records, 5, 12)},
         **options,
@@ -81,15 +80,14 @@ def test_no_more_than_the_limit(searched, monkeypatch):
 def test_exploration(settings):
     run = ExploreRun(ExploreConfig(**settings, policies=("random-raw", "kl-calibrated")))
     records = run.outcomes(0)[0]
-    curves = {"objects": explore_report.success(records, run.config.policies, "objects")}
+    curves = {"all classes": explore_report.success(records, run.config.policies, "all classes")}
     path = write_run_report(
         run,
         records,
         curves,
-        titles={"objects": "objects"},
+        titles={"all classes": "all classes"},
         label="cells with the right class (%)",
         shifts=explore_report.SHIFTS,
-        decision=dict.fromkeys(run.config.policies, 1.0),
         replay=replay_exploration,
     )
     data = json.loads(re.search(r'id="data">(.*?)</script>', path.read_text(encoding="utf-8"), re.S)[1])

@@ -92,6 +92,7 @@ def test_same_bits(finished, change, tmp_path):
     assert records_of(again) == records_of(finished)
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_store_equals_looking_and_refuses_damage(finished):
     run = SearchRun(finished)
     digest = run.scenes.digest(0)

@@ -56,9 +56,11 @@ def test_fit_leaves_a_model_and_a_report(fitted):
 
 def test_estimators_agree(fitted):
     rows = [line for line in (fitted / "report.md").read_text().splitlines() if line.startswith("| Dirichlet, ")]
-    figures = [row.split("|")[2:] for row in rows]
+    figures = [[float(cell) for cell in row.split("|")[2:-1]] for row in rows]
     assert len(figures) == 3
-    assert figures[0] == figures[1] == figures[2]
+    # The last digit may be rounded either way.
+    assert figures[1] == pytest.approx(figures[0], rel=1e-4, abs=1.1e-3)
+    assert figures[2] == pytest.approx(figures[0], rel=1e-4, abs=1.1e-3)
 
 
 def test_two_workers_and_larger_shards_give_the_same_bits(fitted, tmp_path):

@@ -216,6 +216,7 @@ def test_training_finds_more(config, eye):
     assert found[learned] < 0.8 * found[start]
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_a_stopped_run_ends_with_the_same_bits(config, eye):
     scenes = Pictures(6)
     whole, losses = train(replace(config, steps=6, out=config.out / "whole"), eye, scenes, range(6), {})
