@@ -124,12 +124,15 @@ def test_a_batch_equals_its_images_one_by_one(tiny):
 
 @pytest.mark.weights
 @pytest.mark.parametrize("winograd", [True, False])
-def test_bits_do_not_depend_on_threads(tiny_weights, threads, winograd):
+def test_one_thread_repeats_itself_and_two_agree_with_it(tiny_weights, threads, winograd):
+    """To the bit, and up to rounding: matrix products are cut otherwise for other numbers of threads."""
     detector = load_detector("yolov3-tiny", weights=tiny_weights, winograd=winograd)
     image = torch.rand(1, 3, 240, 320, generator=torch.Generator().manual_seed(1))
-    one, two = (detector.propose(detector.fit(image)[0]) for _ in threads())
-    assert torch.equal(one.boxes, two.boxes)
-    assert torch.equal(one.classes, two.classes)
+    (one, again), (two, _) = [[detector.propose(detector.fit(image)[0]) for _ in range(2)] for _ in threads()]
+    assert torch.equal(one.boxes, again.boxes)
+    assert torch.equal(one.classes, again.classes)
+    torch.testing.assert_close(two.boxes, one.boxes, atol=1e-3, rtol=1e-5)
+    torch.testing.assert_close(two.classes, one.classes, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.weights

@@ -108,6 +108,7 @@ def test_gradient_from_scores_to_image(detector):
     assert int((image.grad != 0).sum()) > 1000
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_twice_is_the_same_bits(detector):
     image = torch.rand(1, 3, 32, 64)
     first, second = detector(image), detector(image)
