@@ -1,6 +1,7 @@
 """What a batch of episodes believes."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -104,3 +105,18 @@ def pick(values: Tensor, target: Tensor) -> Tensor:
         return values[..., target]
     index = target.reshape(*target.shape, *[1] * (values.ndim - target.ndim))
     return values.take_along_dim(index.expand(*values.shape[:-1], 1), -1)[..., 0]
+
+
+def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
+    """`function` of the rows of tensors `(B, ...)`, each row alone, joined again.
+
+    Matrix products of other sizes may round otherwise, and so may exponentials and logarithms, of which the last few of
+    a tensor are not computed in vectors. Taken alone, an episode's figures do not depend on how many others are run
+    with it. Where a graph is traced, and inside `torch.func.vmap`, all rows are taken at once.
+
+    >>> one_by_one(lambda row: row @ torch.ones(3, 1), torch.ones(2, 1, 3)).shape
+    torch.Size([2, 1, 1])
+    """
+    if not values_known() or len(rows[0]) <= 1:
+        return function(*rows)
+    return torch.cat([function(*(row[index : index + 1] for row in rows)) for index in range(len(rows[0]))])

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import Belief
+from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.context import ContextPrior, presence_of
 from semfov.belief.grid import Grid
 from semfov.belief.observer import Observer
@@ -107,9 +107,11 @@ class ContextObserver:
         """Belief after a look in each episode."""
         inner = self.observer.update(belief.inner, evidence.inner)
         presence = torch.maximum(belief.presence, evidence.presence)
-        probability = inner.probability(evidence.target)
-        context = self.prior(presence, evidence.grid, evidence.target, self.weights)
-        present = (log_odds(probability) + context).sigmoid()
+
+        def in_context(alone: Tensor, shown: Tensor, target: Tensor) -> Tensor:
+            return (log_odds(alone) + self.prior(shown, evidence.grid, target, self.weights)).sigmoid()
+
+        present = one_by_one(in_context, inner.probability(evidence.target), presence, evidence.target)
         return ContextBelief(present, inner.closest, inner, presence)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import Belief
+from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.detection.detections import Detections
@@ -105,5 +105,9 @@ class TargetObserver:
         best = torch.maximum(evidence.evidence, belief.best)
         closest = torch.minimum(evidence.distance, belief.closest)
         visited = belief.visited | evidence.fixated
-        present = self.model.log_odds(nearest, best, closest, visited, evidence.columns).sigmoid()
+
+        def probability(nearest: Tensor, best: Tensor, closest: Tensor, visited: Tensor) -> Tensor:
+            return self.model.log_odds(nearest, best, closest, visited, evidence.columns).sigmoid()
+
+        present = one_by_one(probability, nearest, best, closest, visited)
         return TargetBelief(present, closest, nearest, best, visited)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief, pick
+from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief, one_by_one, pick
 from semfov.belief.grid import Grid
 from semfov.belief.observer import SemanticObserver
 from semfov.errors import InputError
@@ -109,8 +109,13 @@ class LearnedAcquisition(AcquisitionFunction):
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(B, X·Y)` for a belief and the cells `(B, X·Y)` fixated so far."""
-        value: Tensor = self.gaze(dirichlet_belief(belief), visited, self.target, self.columns)
-        return value
+        known, target = dirichlet_belief(belief), self.target.expand(len(visited))
+
+        def values(beta: Tensor, closest: Tensor, visited: Tensor, target: Tensor) -> Tensor:
+            value: Tensor = self.gaze(DirichletBelief(beta, closest), visited, target, self.columns)
+            return value
+
+        return one_by_one(values, known.beta, known.closest, visited, target)
 
 
 def gaze_features(belief: DirichletBelief, visited: Tensor, target: int | Tensor, columns: int) -> Tensor:

@@ -55,7 +55,7 @@ def test_value_equals_the_loop(name, weight):
 def test_without_weight_the_order_is_that_of_the_acquisition(name):
     plain, guided = values(ACQUISITIONS[name]()), values(SaliencyPrior(ACQUISITIONS[name](), SALIENCY, weight=0.0))
     torch.testing.assert_close(guided.exp(), plain)
-    assert torch.equal(guided.argsort(-1, stable=True), plain.argsort(-1, stable=True))
+    assert torch.equal(guided.argsort(dim=-1, stable=True), plain.argsort(dim=-1, stable=True))
 
 
 @pytest.mark.parametrize("level", [0.0, 1e-12, 0.4, 1e6])

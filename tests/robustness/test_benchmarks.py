@@ -1,15 +1,26 @@
 """What is timed side by side computes the same; and the figures come out of times as they should."""
 
+import json
+import platform
 import time
 
 import pytest
 import torch
 
-from benchmarks.__main__ import COMPARISONS, comparison_rows
+from benchmarks import decisions
+from benchmarks.__main__ import COMPARISONS
 from benchmarks.limits import paths
+from benchmarks.tables import comparison_rows
 from benchmarks.timing import Comparison, Spread, interleaved, measure
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def same_threads():
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("number", range(len(COMPARISONS)))
@@ -41,6 +52,27 @@ def test_runs_take_turns_at_being_first():
     interleaved({name: lambda name=name: order.append(name) for name in "abc"}, 0.0, time.perf_counter, least=3)
     rounds = ["".join(order[i : i + 3]) for i in range(0, len(order), 3)]
     assert rounds == ["abc", "bca", "cab", "abc"]
+
+
+def test_a_turn_of_many_runs_counts_as_their_mean():
+    clock = iter(range(10**6))
+    found = interleaved({"a": lambda: next(clock)}, 0.0, lambda: float(next(clock)), least=1, times=4)
+    assert found == {"a": [1e3 * 5 / 4]}
+
+
+def test_decisions_have_a_row_for_every_published_cost(tmp_path, monkeypatch, same_threads):
+    arguments = ["decisions", "--threads", "1", "--seconds", "0", "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", arguments)
+    decisions.main()
+    text, figures = (tmp_path / "decisions.md").read_text(), json.loads((tmp_path / "decisions.json").read_text())
+    for costs in decisions.PUBLISHED.values():
+        for name in costs:
+            assert f"| {name} |" in text
+            times = figures["milliseconds"][name]
+            assert 0 < times["low"] <= times["middle"] <= times["high"]
+    assert set(figures["peers"]["ratios"]) == {"loop over fixations and cells", "all pairs at once"}
+    assert figures["published_milliseconds"]["exploration"]["KL divergence, raw"] == 9851
+    assert platform.node() not in json.dumps(figures["machine"]).split('"')
 
 
 def test_bytes_of_the_sensor_are_those_of_its_tensors():

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from semfov.belief.belief import Belief, dirichlet_belief
+from semfov.belief.belief import Belief, dirichlet_belief, one_by_one
 from semfov.belief.grid import Grid
 from semfov.errors import check
 from semfov.gaze.acquisition.base import AcquisitionFunction
@@ -46,10 +46,12 @@ class CloserLook(AcquisitionFunction):
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(B, X·Y)` for a belief `(B, X·Y, K+1)`; where the fovea was is in `belief.closest`."""
-        beta = dirichlet_belief(belief).beta
+        return one_by_one(self._values, dirichlet_belief(belief).beta, belief.closest)
+
+    def _values(self, beta: Tensor, closest: Tensor) -> Tensor:
         objects = beta[..., 1:]
         unknown = 1 - objects.amax(-1) / objects.sum(-1)
-        gain = (self.seen.to(beta) - self.acuity(belief.closest)[..., None]).clamp(min=0)
+        gain = (self.seen.to(beta) - self.acuity(closest)[..., None]).clamp(min=0)
         return (gain * unknown[..., None]).sum(-2)
 
     def extra_repr(self) -> str:

@@ -7,14 +7,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import Belief, dirichlet_belief
+from semfov.belief.belief import Belief, dirichlet_belief, one_by_one
 from semfov.belief.grid import Grid
-from semfov.errors import check, check_shape, values_known
+from semfov.errors import check, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
-
-# A batch is looked ahead from a few maps at a time: what lies in between, a number for every cell, level and class,
-# then stays in the processor's cache, and the batch costs a quarter.
-_CACHED = 2**18
 
 
 class LevelledModel(Protocol):
@@ -86,7 +82,9 @@ def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
     check(expected.shape[0] == components, "model", f"{components} classes", expected.shape[0])
     total = beta.sum(-1)
     mean = beta / total[..., None]
-    scores = (mean @ expected.to(beta).flatten(1)).unflatten(-1, expected.shape[1:])
+    table = expected.to(beta).flatten(1)
+    scores = mean @ table if mean.ndim == 2 else one_by_one(lambda maps: maps @ table, mean.flatten(0, -3))
+    scores = scores.view(*mean.shape[:-1], *expected.shape[1:])
     return Outlook(total, mean, scores / (scores * mean[..., None, :]).sum(-1, keepdim=True))
 
 
@@ -112,14 +110,10 @@ class Lookahead(AcquisitionFunction):
         """Value of fixating each cell, `(..., X·Y)`, for a belief `(..., X·Y, K+1)`."""
         beta = dirichlet_belief(belief).beta
         check_shape(beta, "beta", self.levels.shape[-1], None)
-        maps = beta.ndim - 2
-        if maps == 0 or self.levels.ndim > 2 or not values_known():
+        if beta.ndim == 2 or self.levels.ndim > 2:
             return self._values(beta)
-        if beta.numel() == 0:
-            return beta.new_zeros(beta.shape[:-1])
-        size = beta[(0,) * maps].numel() * len(self.model.expected_scores()[0])
-        parts = beta.flatten(0, -3).split(max(_CACHED // size, 1))
-        return torch.cat([self._values(part) for part in parts]).unflatten(0, beta.shape[:-2])
+        # A map alone stays in the processor's cache: a batch at once costs four times as much.
+        return one_by_one(self._values, beta.flatten(0, -3)).view(beta.shape[:-1])
 
     def _values(self, beta: Tensor) -> Tensor:
         return self.pool(seen_from(self.worth(look_ahead(beta, self.model.expected_scores())), self.levels))

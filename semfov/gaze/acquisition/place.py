@@ -1,11 +1,12 @@
 """Acquisition functions of visual search that look beyond the fixated cell: what a fovea takes in."""
 
+from abc import abstractmethod
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import Belief
+from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.grid import Grid
 from semfov.errors import InputError
 from semfov.gaze.acquisition.base import AcquisitionFunction
@@ -44,6 +45,16 @@ class TargetVisibility(AcquisitionFunction):
         level = model.level(grid.cell_distance)
         self.register_buffer("visibility", 1 - model.miss_rate[self.target][..., level])
 
+    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
+        """Values `(B, X·Y)`."""
+        present = belief.probability(self.target)
+        visibility = self.visibility.to(present).expand(len(present), -1, -1)
+        return one_by_one(self.values, present, visibility)
+
+    @abstractmethod
+    def values(self, present: Tensor, visibility: Tensor) -> Tensor:
+        """Values `(B, X·Y)` for the target's probability `(B, X·Y)` and its visibility `(B, f, x)`."""
+
 
 class FovealHit(TargetVisibility):
     r"""Probability that the target is detected anywhere from the next fixation, if cells are independent.
@@ -58,10 +69,9 @@ class FovealHit(TargetVisibility):
         grid: the cells of one image.
     """
 
-    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(..., X·Y)`."""
-        present = belief.probability(self.target)
-        return -torch.expm1(torch.log1p(-present[..., None, :] * self.visibility.to(present)).sum(-1))
+    def values(self, present: Tensor, visibility: Tensor) -> Tensor:
+        """Probability of a hit."""
+        return -torch.expm1(torch.log1p(-present[..., None, :] * visibility).sum(-1))
 
 
 class PlaceInformation(TargetVisibility):
@@ -82,11 +92,10 @@ class PlaceInformation(TargetVisibility):
         grid: the cells of one image.
     """
 
-    def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(..., X·Y)` in nats."""
-        present = belief.probability(self.target)
+    def values(self, present: Tensor, visibility: Tensor) -> Tensor:
+        """Entropy of the place that is expected to be lost, in nats."""
         place = present / present.sum(-1, keepdim=True)
-        missed = place[..., None, :] * (1 - self.visibility.to(present))
+        missed = place[..., None, :] * (1 - visibility)
         nothing = missed.sum(-1)
         # P(nothing) H(q') = -Σ m ln m + P ln P with m = q (1 - v)
         left = torch.xlogy(nothing, nothing) - torch.xlogy(missed, missed).sum(-1)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import Belief
+from semfov.belief.belief import Belief, one_by_one
 from semfov.errors import check, check_shape
 from semfov.gaze.acquisition.base import AcquisitionFunction
 
@@ -49,7 +49,8 @@ class SaliencyPrior(AcquisitionFunction):
         """Values `(B, X·Y)`."""
         value: Tensor = self.acquisition(belief, visited)
         check_shape(self.log_prior, "saliency", value.shape[-1])
-        return value.clamp(min=torch.finfo(value.dtype).tiny).log() + self.weight * self.log_prior.to(value)
+        least = torch.finfo(value.dtype).tiny
+        return one_by_one(lambda row: row.clamp(min=least).log(), value) + self.weight * self.log_prior.to(value)
 
     def extra_repr(self) -> str:
         """Settings, for `repr`."""
