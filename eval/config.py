@@ -142,7 +142,7 @@ class SaliencyConfig:
 
     view: Literal["foveated", "picture"] = "foveated"
     reduction: Reduction = "max"
-    weight: float = 0.3
+    weight: float = 1.0
 
 
 @dataclass(frozen=True)

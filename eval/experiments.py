@@ -109,7 +109,7 @@ SENSORS: dict[str, Changes] = {
 """Sensors."""
 
 WEIGHTS: dict[str, Changes] = {
-    f"weight {weight:g}": {"saliency": {"weight": weight}} for weight in (0.0, 0.1, 0.3, 1.0)
+    f"weight {weight:g}": {"saliency": {"weight": weight}} for weight in (0.0, 0.1, 0.3, 1.0, 3.0)
 }
 """Weights of a saliency map as a prior."""
 

@@ -51,18 +51,20 @@ def gain(one: str, other: str, shifts: tuple[int, ...], kind: str, *, expected: 
 def verdict(signs: set[int], expected: int) -> str:
     """In words, for the signs of differences that are more than two standard errors from nothing.
 
-    >>> verdict({1}, 1), verdict({1, 0}, 1), verdict({0}, 1), verdict({1, -1}, 1), verdict({-1}, 1), verdict({0}, 0)
-    ('holds', 'holds in part', 'level', 'mixed', 'reversed', 'holds')
+    >>> verdict({1}, 1), verdict({1, 0}, 1), verdict({0}, 1), verdict({-1}, 1), verdict({-1, 0}, 1), verdict({0}, 0)
+    ('holds', 'holds in part', 'level', 'reversed', 'reversed in part', 'holds')
     """
     if signs == {expected}:
         return "holds"
     if expected == 0:
         return "does not hold"
-    if signs == {0}:
-        return "level"
-    if signs == {-expected}:
-        return "reversed"
-    return "holds in part" if signs == {expected, 0} else "mixed"
+    words = {
+        frozenset({0}): "level",
+        frozenset({-expected}): "reversed",
+        frozenset({expected, 0}): "holds in part",
+        frozenset({-expected, 0}): "reversed in part",
+    }
+    return words.get(frozenset(signs), "mixed")
 
 
 def overtaken(policy: str, baseline: str, kind: str) -> Answer:

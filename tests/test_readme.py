@@ -1,6 +1,17 @@
-"""What the README says works: its code runs, its links lead somewhere, its picture is small."""
+"""What the README says works: commands and code run as printed, links lead somewhere, pictures are small.
 
+Commands run in a folder of their own that holds what they name: PHOTO.jpg, and a small data set in COCO's format. Only
+`make` is asked what it would do: it sets up an environment and takes minutes.
+"""
+
+import importlib.util
+import json
+import os
 import re
+import shlex
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,9 +19,15 @@ import torch
 from PIL import Image
 
 import semfov
+from semfov.detection.weights import fetch
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+LINES = [line for block in re.findall(r"```sh\n(.*?)```", README, re.S) for line in block.splitlines() if line.strip()]
+COMMANDS = {line: shlex.split(line, comments=True) for line in LINES}
+PYTHON = [line for line, words in COMMANDS.items() if words[:2] == ["python", "-m"]]
+MAKE = [line for line, words in COMMANDS.items() if words[0] == "make"]
+DEMO = next(line for line in PYTHON if "eval.demo" in line)
 
 
 def test_links_lead_somewhere():
@@ -26,15 +43,140 @@ def test_pictures_are_small():
             assert max(picture.size) <= 1000
 
 
+def test_every_command_is_run_or_asked_below():
+    assert set(PYTHON) | set(MAKE) == set(LINES)
+    assert len(PYTHON) >= 3
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+@pytest.mark.parametrize("line", MAKE)
+def test_make_knows_what_to_do(line):
+    dry = subprocess.run([*COMMANDS[line], "--dry-run"], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert {"search": "-m eval.search", "test": "-m pytest"}[COMMANDS[line][1]] in dry.stdout
+
+
+def test_programs_named_in_the_text_are_there():
+    named = set(re.findall(r"python -m ([\w.]+)", README))
+    assert len(named) > 5
+    assert [name for name in named if importlib.util.find_spec(name) is None] == []
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A cache that has the default detector's weights and nothing else."""
+    try:
+        kept = fetch("yolov3-tiny")
+    except semfov.DataError as error:
+        pytest.skip(f"the default detector's weights are missing: {error}")
+    cache = tmp_path_factory.mktemp("cache")
+    (cache / kept.name).symlink_to(kept)
+    return cache
+
+
+def save(image, path):
+    pixels = (image * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Where a reader may be: photographs, and two of them as a data set in COCO's format, where the text has them."""
+    scenes = semfov.EmbeddedScenes(["cup"], count=2)
+    for name in ("PHOTO.jpg", "kitchen.jpg", "photographs/PHOTO.jpg"):
+        save(scenes[0].image, tmp_path / name)
+    images, annotations = [], []
+    for number in range(2):
+        scene, name = scenes[number], f"{number:012d}.jpg"
+        save(scene.image, tmp_path / "coco/val2017" / name)
+        height, width = scene.image.shape[-2:]
+        images.append({"id": number, "file_name": name, "width": width, "height": height})
+        # As many boxes as the published selection asks for.
+        boxes = scene.boxes.tolist() + [[20.0 * n, 0.0, 20.0 * n + 15, 15.0] for n in range(8)]
+        annotations += [
+            {"id": 100 * number + n, "image_id": number, "category_id": 47, "bbox": [x, y, right - x, bottom - y]}
+            for n, (x, y, right, bottom) in enumerate(boxes)
+        ]
+    content = {"images": images, "annotations": annotations, "categories": [{"id": 47, "name": "cup"}]}
+    (tmp_path / "coco/annotations").mkdir()
+    (tmp_path / "coco/annotations/instances_val2017.json").write_text(json.dumps(content))
+    return tmp_path
+
+
+def run(words, folder, cache):
+    """What a command prints, run where it would be by a reader with `.venv/bin` on the path."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "SEMFOV_CACHE": str(cache), "PYTHONWARNINGS": "error"}
+    call = [sys.executable, *words[1:]]
+    done = subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def written(printed, folder):
+    """The files that a command says it wrote."""
+    names = [line.strip() for line in printed.partition("written:\n")[2].splitlines()]
+    assert names
+    assert [name for name in names if not (folder / name).is_file()] == []
+    return names
+
+
 @pytest.mark.weights
 @pytest.mark.slow
-def test_code_runs(tmp_path, monkeypatch):
+@pytest.mark.parametrize("line", PYTHON, ids=lambda line: COMMANDS[line][2])
+def test_command_runs_as_printed(line, folder, weights):
+    words = COMMANDS[line]
+    names = written(run(words, folder, weights), folder)
+    for option in ("--report", "--out"):
+        if option in words:
+            asked = words[words.index(option) + 1]
+            assert [name for name in names if name.startswith(asked)]
+
+
+# What the comment behind the demonstration's command says it takes, too; a camera cannot be counted on.
+ALSO = {
+    "folder": lambda words: [word.replace("PHOTO.jpg", "photographs") for word in words],
+    "video": lambda words: [word.replace("PHOTO.jpg", "video.avi") for word in words],
+    "explore": lambda words: [*words[: words.index("--target")], "--explore", *words[words.index("--target") + 2 :]],
+}
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+@pytest.mark.parametrize("other", ALSO)
+def test_demonstration_also_takes(other, folder, weights):
+    for word in ("folder", "video", "--camera 0", "--explore"):
+        assert word in DEMO.partition("#")[2]
+    if other == "video":
+        film(folder)
+    words = ALSO[other](COMMANDS[DEMO])
+    printed = run([*words, "--shifts", "2"], folder, weights)
+    assert "cup.html" in written(printed, folder)
+    assert ("explored with 2 gaze shifts" in printed) == (other == "explore")
+
+
+def film(folder):
+    """A video of one frame."""
+    cv2 = pytest.importorskip("cv2")
+    frame = cv2.imread(str(folder / "PHOTO.jpg"))
+    writer = cv2.VideoWriter(str(folder / "video.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, frame.shape[1::-1])
+    writer.write(frame)
+    writer.release()
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_help_of_the_fit_that_is_named(folder, weights):
+    (line,) = re.findall(r"`(python -m [\w.]+ --help)`", README)
+    assert "usage" in run(shlex.split(line), folder, weights)
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_code_runs(folder, weights, monkeypatch):
     (code,) = re.findall(r"```python\n(.*?)```", README, re.S)
     assert len([line for line in code.splitlines() if line]) <= 10
-    monkeypatch.chdir(tmp_path)
-    image = semfov.EmbeddedScenes(["cup"])[0].image
-    pixels = (image * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
-    Image.fromarray(pixels).save("kitchen.jpg")
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("SEMFOV_CACHE", str(weights))
     names = {}
     exec(compile(code, "README.md", "exec"), names)
     assert names["scanpath"].classes[names["scanpath"].target] == "cup"

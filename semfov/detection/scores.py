@@ -49,8 +49,8 @@ def score_vectors(candidates: Candidates, policy: BackgroundPolicy = "residual")
     With class scores `c`, objectness `o` (or `o = max c` where the head has none) and `s_k = (1 - s_0) c_k / Σ c`:
 
     - `residual`: `s_0 = 1 - o`
-    - `normalised`: `1 - o` and `o c_k` (`c_k` where the head has no objectness), all divided by their sum, as Luzio,
-      Bernardino and Moreno (2024) have it in a footnote for scores that do not sum to 1
+    - `normalised`: `1 - o` and `o c_k` (`c_k` where the head has no objectness), all divided by their sum. Luzio,
+      Bernardino and Moreno (2024) divide by the sum in a footnote; `1 - o` for background is ours
     - `uniform`: `s_0 = 1 / (K+1)`
     - `none`: `s_0 = 0`
     - `own`: `s_0` is the background probability that the head itself gives (heads with a softmax)

@@ -28,7 +28,8 @@ def foveate(
               w_k(x, y) = \exp\left(-\frac{(x-x_0)^2 + (y-y_0)^2}{2 \sigma_k^2}\right), \quad
               \sigma_k = \sigma \cdot g^k
 
-    which is `expand^K(G_K) + Σ_k expand^k(w_k L_k)`. A window is evaluated at the places in the image where the
+    which is `expand^K(G_K) + Σ_k expand^k(w_k L_k)`. (The factor g is ours: their code has one window for all bands,
+    g = 1.) A window is evaluated at the places in the image where the
     pixels of its band lie: pixel i of band k at `(i + ½) · W / W_k − ½` with Kornia's pyramid, at `2^k i` with
     OpenCV's.
 

@@ -12,9 +12,9 @@ SENSORS: dict[str, dict[str, float]] = {
 }
 """Settings of the named sensors; σ is in pixels of an image whose longer side is 640.
 
-- `published`: the wide fovea of Luzio, Bernardino and Moreno (2024). They print no growth; 1, one window for all bands,
-  is what the authors' code computes.
-- `published-narrow`: their narrow fovea.
+- `published`: the wide fovea of Luzio, Bernardino and Moreno (2024). They print neither σ nor growth nor levels. The
+  width is our choice; one window for all bands, growth 1, is what the code of the foveal system they cite computes.
+- `published-narrow`: their narrow fovea, half as wide.
 - `gradual`: every coarser band's window is twice as wide, so that acuity falls off slowly. The recommended agent's.
 """
 

@@ -312,7 +312,7 @@ def test_settings_are_json_and_tell_detectors_apart(detector):
     assert detector.settings() != settings
 
 
-@pytest.mark.parametrize("policy", ["residual", "uniform", "none"])
+@pytest.mark.parametrize("policy", ["residual", "normalised", "uniform", "none"])
 def test_every_background_policy(detector, policy):
     detector.background = policy
     images = photographs(1, 45, 64)

@@ -19,6 +19,8 @@ def candidates(classes, objectness=None, background=None) -> Candidates:
     [
         ("residual", [0.6, 0.2], [0.5], None, [0.5, 0.375, 0.125]),
         ("residual", [0.6, 0.2], None, None, [0.4, 0.45, 0.15]),
+        ("normalised", [0.6, 0.2], [0.5], None, [5 / 9, 3 / 9, 1 / 9]),
+        ("normalised", [0.6, 0.2], None, None, [2 / 6, 3 / 6, 1 / 6]),
         ("uniform", [0.6, 0.2], [0.5], None, [1 / 3, 1 / 2, 1 / 6]),
         ("none", [0.6, 0.2], [0.5], None, [0.0, 0.75, 0.25]),
         ("own", [0.6, 0.2], None, [0.1], [0.1, 0.675, 0.225]),
@@ -30,7 +32,9 @@ def test_policies_by_hand(policy, classes, objectness, background, expected):
 
 
 @given(
-    st.lists(st.floats(0, 1), min_size=1, max_size=6), st.floats(0, 1), st.sampled_from(["residual", "uniform", "none"])
+    st.lists(st.floats(0, 1), min_size=1, max_size=6),
+    st.floats(0, 1),
+    st.sampled_from(["residual", "normalised", "uniform", "none"]),
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_points_of_the_simplex(dtype, classes, objectness, policy):
@@ -41,7 +45,7 @@ def test_points_of_the_simplex(dtype, classes, objectness, policy):
     assert scores.dtype == dtype
     assert bool((scores >= 0).all())
     torch.testing.assert_close(scores.sum(-1), torch.ones(1, dtype=dtype), atol=1e-6, rtol=0)
-    if max(classes) > 1e-3 and (objectness > 1e-3 or policy != "residual"):
+    if max(classes) > 1e-3 and (objectness > 1e-3 or policy in ("uniform", "none")):
         assert scores[0, 1:].argmax() == torch.tensor(classes, dtype=dtype).argmax()
 
 
@@ -56,7 +60,7 @@ def test_confidence():
     assert candidates([0.6, 0.2]).confidence.item() == pytest.approx(0.6)
 
 
-@pytest.mark.parametrize("policy", ["residual", "uniform", "none"])
+@pytest.mark.parametrize("policy", ["residual", "normalised", "uniform", "none"])
 def test_gradients(policy):
     classes = torch.rand(2, 3, dtype=torch.float64, requires_grad=True)
     objectness = torch.rand(2, dtype=torch.float64, requires_grad=True)

@@ -1,4 +1,4 @@
-"""The demonstration as a user runs it, with a detector that sees coloured squares."""
+"""The demonstration as a user runs it: with a detector that sees coloured squares, and with the agent that comes."""
 
 import json
 import re
@@ -8,9 +8,11 @@ import torch
 from PIL import Image
 
 import eval.demo as program
+from eval.pictures import Picture, embedded_picture
 from eval.stages import STAGES, Stages
-from semfov import ActivePerception, Foveation, search_policy
+from semfov import ActivePerception, Foveation, exploration_policy, search_policy
 from semfov.detection import Candidates, Detector
+from semfov.gaze import EXPLORATION_POLICIES, SEARCH_POLICIES, LearnedGaze
 
 
 class Squares(Detector):
@@ -134,3 +136,96 @@ def test_stages_measure_and_change_nothing(agent, photo):
     assert len(stages.looks) == len(watched)
     assert all(set(look) == set(STAGES) and min(look.values()) > 0 for look in stages.looks)
     assert (dict(vars(agent.eye)), dict(vars(agent.observer)), agent.policy) == before
+
+
+@pytest.fixture(scope="module")
+def usual():
+    """The agent that a user gets."""
+    return program.make_agent(program.DemoConfig())
+
+
+@pytest.fixture(scope="module")
+def cup(usual) -> Picture:
+    return embedded_picture(usual.classes[1:], "cup", seed=0)
+
+
+def watched_and_plain(agent, picture, **how):
+    """The scanpaths of the demonstration, which measures each stage, and of the agent alone."""
+    config = program.DemoConfig(start=0, shifts=2, **how)
+    watched, stages = program.look_at(agent, picture, config)
+    assert len(stages.looks) == len(watched)
+    assert all(set(look) == set(STAGES) for look in stages.looks)
+    with torch.inference_mode():
+        if config.target is None:
+            return watched, agent.explore(picture.image, start=0, shifts=2)
+        return watched, agent.search(picture.image, config.target, start=0, shifts=2, boxes=picture.boxes)
+
+
+def policy_of(name, agent, make=search_policy):
+    if name == "learned":
+        return LearnedGaze.from_pretrained(agent.eye.detector.name).requires_grad_(False).policy
+    return make(name, agent.observation)
+
+
+@pytest.mark.weights
+@pytest.mark.parametrize("name", [*SEARCH_POLICIES, "learned"])
+def test_every_search_can_be_watched(name, usual, cup, monkeypatch):
+    """By the map of all classes where a policy needs one, else by the belief that comes with the agent."""
+    monkeypatch.setattr(usual, "policy", policy_of(name, usual))
+    if name in ("predictive", "neighbourhood", "learned"):
+        monkeypatch.setattr(usual, "observer", usual.semantics)
+    watched, plain = watched_and_plain(usual, cup, target="cup")
+    assert torch.equal(watched.cells, plain.cells)
+    assert torch.equal(watched.values, plain.values)
+
+
+@pytest.mark.weights
+@pytest.mark.parametrize("name", EXPLORATION_POLICIES)
+def test_every_exploration_can_be_watched(name, usual, cup, monkeypatch):
+    monkeypatch.setattr(usual, "exploration", policy_of(name, usual, exploration_policy))
+    watched, plain = watched_and_plain(usual, cup, explore=True)
+    assert torch.equal(watched.cells, plain.cells)
+    assert torch.equal(watched.values, plain.values)
+    assert watched.shifts == 2
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+@pytest.mark.parametrize("task", [("--target", "cup"), ("--explore",)], ids=["search", "exploration"])
+@pytest.mark.parametrize(
+    "agent",
+    [
+        (),
+        ("--agent", "published"),
+        ("--agent", "published", "--sensor", "published-narrow"),
+        ("--agent", "raw"),
+        ("--agent", "raw", "--sensor", "gradual"),
+    ],
+    ids=" ".join,
+)
+def test_agents_that_come_with_it(agent, task, cup, tmp_path, capsys):
+    photo = tmp_path / "photo.png"
+    pixels = (cup.image * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
+    Image.fromarray(pixels).save(photo)
+    short = ["--shifts", "1", "--start", "0", "--out", str(tmp_path / "out"), "--report", str(tmp_path / "page.html")]
+    assert program.main([str(photo), *task, *agent, *short]) == 0
+    printed = capsys.readouterr().out
+    assert "photo.png: " in printed
+    assert [line.split()[0] for line in printed.splitlines() if line[:1] in "01"] == ["0", "1"]
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"scanpath.png", "views.png", "animation.gif", "map.png" if len(task) == 1 else "belief.png"} <= written
+    assert "<!DOCTYPE html>" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.weights
+def test_sensors_by_name(usual):
+    """The recommended agent's sensor is `gradual`, the published agent's the wide fovea."""
+    expected = {
+        ("recommended", None): (100, 2),
+        ("published", None): (100, 1),
+        ("published", "published-narrow"): (50, 1),
+        ("raw", "gradual"): (100, 2),
+    }
+    for (kind, sensor), (sigma, growth) in expected.items():
+        eye = program.make_agent(program.DemoConfig(agent=kind, sensor=sensor)).eye
+        assert (float(eye.sensor.sigma), eye.sensor.growth) == (sigma, growth)

@@ -1,5 +1,7 @@
 """The exploration protocol against a scalar twin."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -133,6 +135,49 @@ def test_answers_are_the_classes_of_overlapping_objects():
     answers = answers_of(ANNOTATION, GRID, 4)
     found = {cell: set(row.nonzero()[:, 0].tolist()) for cell, row in enumerate(answers) if row.any()}
     assert found == {0: {1, 2}, 1: {2}, 2: {2}, 11: {3}}
+
+
+def test_success_is_the_most_probable_of_all_classes():
+    """Section IV-A: the "highest categorical score" must fit an overlapping object, and background has a score, too."""
+    answers = torch.tensor([[False, True, False]] * 4)
+    beta = torch.tensor([[[0.2, 0.7, 0.1], [0.6, 0.3, 0.1], [0.1, 0.3, 0.6], [0.4, 0.35, 0.25]]])
+    assert count_right(beta, answers).tolist() == [1]
+    # Without background as an answer the class is right where background was a little more probable.
+    assert count_right(beta[..., 1:], answers[:, 1:]).tolist() == [3]
+
+
+def test_both_answers_are_recorded(evidence):
+    """What `right` counts is among what is right when background is no answer, as no cell's answer is background."""
+    protocol = ProtocolConfig(starts=6, shifts=5)
+    episodes = explorations_of(Scenes(), 0, 12, protocol)
+    noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
+    answers = answers_of(ANNOTATION, GRID, 4)
+    assert not answers[:, 0].any()
+    explorer = Searcher(Told(evidence), exploration_policy("random"))
+    progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=5, batch=100)
+    for outcome in progress:
+        counts = zip(outcome.right, outcome.right_without_background, strict=True)
+        assert all(right <= without for right, without in counts)
+    assert any(outcome.right != outcome.right_without_background for outcome in progress)
+
+
+def test_saliency_as_a_prior_follows_the_gaze(evidence, model):
+    """From every cell the next fixation is that of the policy's value times what is salient as seen from there."""
+    protocol = ProtocolConfig(starts=4, shifts=6)
+    episodes = explorations_of(Scenes(), 0, 12, protocol)
+    noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
+    table = torch.rand(12, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64) + 0.1
+    observer, policy = Told(evidence), exploration_policy("surprise", model)
+    explorer, answers = Searcher(observer, policy, table, 0.5), answers_of(ANNOTATION, GRID, 4)
+    progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=6, batch=3)
+    for outcome in progress:
+        belief, visited = observer.start(1, GRID, evidence.likelihood), torch.zeros(1, 12, dtype=torch.bool)
+        for here, there in pairwise(outcome.cells):
+            belief = observer.update(belief, evidence[torch.tensor([here])])
+            visited[0, here] = True
+            raised = table[here] + 1e-3 * table[here].max()
+            values = policy(None, GRID)(belief, visited)[0].double() * (raised / raised.sum()) ** 0.5
+            assert values[there] >= values.masked_fill(visited[0], 0).max() * (1 - 1e-5)
 
 
 def test_what_is_not_known_is_not_right():

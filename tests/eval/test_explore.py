@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from eval.config import BeliefConfig, DataConfig, ExploreConfig, ProtocolConfig, SaliencyConfig
+from eval.config import BeliefConfig, DataConfig, DetectorConfig, ExploreConfig, ProtocolConfig, SaliencyConfig
 from eval.explore import explore, main
 from eval.saliency import SaliencyStore, saliency_table
 from eval.tasks import ExploreRun
@@ -135,6 +135,15 @@ def test_saliency_is_that_of_what_the_sensor_shows(finished):
     assert picture.shape == (1, 12)
     expected = VOCUS2()(image[None]).unflatten(-1, (4, -1)).unflatten(1, (3, -1)).mean((2, 4)).flatten(1)
     torch.testing.assert_close(picture, expected)
+
+
+def test_saliency_does_not_depend_on_the_detector(finished, tmp_path):
+    """Whatever size it works at and keeps of what it sees: the sensor shows the same."""
+    small = replace(finished, detector=DetectorConfig(input_size=224, threshold=0.2), cache=tmp_path, out=tmp_path)
+    run, other = ExploreRun(finished), ExploreRun(small)
+    assert other.store.key != run.store.key
+    assert other.saliency_stores["vocus2"].key == run.saliency_stores["vocus2"].key
+    assert torch.equal(other.saliency("vocus2", 0), run.saliency("vocus2", 0))
 
 
 def test_saliency_store_knows_what_it_depends_on(finished):

@@ -24,10 +24,9 @@ class SaliencyPrior(AcquisitionFunction):
         saliency: s, `(..., X·Y)`, not negative (`semfov.saliency.cell_saliency`).
         weight: w, 0 or more.
 
-    >>> from semfov import DirichletBelief
-    >>> from semfov.acquisition import TargetPosterior
+    >>> from semfov import DirichletBelief, acquisition
     >>> belief = DirichletBelief(torch.tensor([[[1.0, 1.0], [1.0, 1.1]]]))
-    >>> guided = SaliencyPrior(TargetPosterior(1), torch.tensor([0.9, 0.1]), weight=0.3)
+    >>> guided = SaliencyPrior(acquisition.TargetPosterior(1), torch.tensor([0.9, 0.1]), weight=0.3)
     >>> guided(belief, torch.zeros(1, 2, dtype=torch.bool)).argmax().item()
     0
     """
