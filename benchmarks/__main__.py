@@ -6,8 +6,6 @@ clock's. Results go to `benchmarks/results/NAME.md` and `NAME.json`.
 """
 
 import argparse
-import json
-import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -23,9 +21,8 @@ from benchmarks.limits import Path as HotPath
 from benchmarks.limits import limits
 from benchmarks.machine import copy_bandwidth, describe
 from benchmarks.rollouts import rollouts
-from benchmarks.timing import Comparison, Measured, Spread, measure
-
-RESULTS = Path(__file__).parent / "results"
+from benchmarks.tables import RESULTS, comparison_rows, number, spread, table, write
+from benchmarks.timing import Comparison, Measured, Spread, clock_for, measure
 
 COMPARISONS: tuple[Callable[[], Comparison], ...] = (
     lambda: foveation("opencv", reuse=False),
@@ -44,31 +41,6 @@ COMPARISONS: tuple[Callable[[], Comparison], ...] = (
 )
 
 
-def number(value: float) -> str:
-    """Three digits."""
-    return f"{value:.3g}" if value < 100 else f"{value:,.0f}"
-
-
-def spread(values: Spread) -> str:
-    """Median and quartiles."""
-    return f"{number(values.middle)} ({number(values.low)} to {number(values.high)})"
-
-
-def comparison_rows(measured: Measured) -> list[list[str]]:
-    """One row for each peer."""
-    times = measured.milliseconds
-    return [
-        [measured.name, peer, number(times["semfov"].middle), number(times[peer].middle), spread(ratio)]
-        for peer, ratio in measured.ratios.items()
-    ]
-
-
-def table(head: list[str], rows: list[list[str]]) -> str:
-    """Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 @torch.inference_mode()
 def main() -> None:
     """Measure everything and write the tables."""
@@ -79,8 +51,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     use_threads(options.threads)
-    clock = time.process_time if options.threads == 1 else time.perf_counter
-    about = describe() | {"times": "of the processor" if options.threads == 1 else "of the clock"}
+    clock, times = clock_for(options.threads)
+    about = describe() | {"times": times}
     bandwidth = copy_bandwidth(min(options.seconds, 1.0), clock)
     measured = []
     for make in COMPARISONS:
@@ -89,7 +61,6 @@ def main() -> None:
             print(" | ".join(row), flush=True)
     grown, found = grow(options.seconds / 2, clock), limits(bandwidth, options.seconds / 2, clock)
     text = report(about, bandwidth, measured, grown, found)
-    options.out.mkdir(parents=True, exist_ok=True)
     figures = {
         "machine": about,
         "copy_bandwidth": bandwidth,
@@ -103,9 +74,7 @@ def main() -> None:
             for name, (path, ms, share) in found.items()
         },
     }
-    (options.out / f"{options.name}.md").write_text(text, encoding="utf-8")
-    (options.out / f"{options.name}.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
-    print(f"written: {options.out / options.name}.md and .json")
+    write(options.out, options.name, text, figures)
 
 
 def report(

@@ -3,23 +3,60 @@
 The published costs of exploration (9.85 s a decision) are those of loops like these.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import digamma, gammaln
 from torch import Tensor
+from torch.distributions import Dirichlet, kl_divergence
 
-from benchmarks.timing import Comparison
-from semfov import FovealObservationModel, Grid, acquisition, fusion
+from benchmarks.timing import Comparison, Run
+from semfov import DirichletBelief, FovealObservationModel, Grid, acquisition, fusion
 from semfov.belief import fuse
 
 Array = NDArray[np.float64]
-CLASSES, LEVELS, DETECTIONS = 80, 8, 30
+CLASSES, LEVELS, DETECTIONS, PRIOR = 80, 8, 30, 0.5
 
 
 def kaplan(beta: Array, likelihood: Array) -> Array:
     """The published rule for one cell."""
     expected = beta @ likelihood
     return beta * (1 + likelihood / expected) / (1 + likelihood.min() / expected)
+
+
+def divergence(beta: Array) -> float:
+    """Kullback-Leibler divergence of Dir(β) from the prior."""
+    total, base = beta.sum(), PRIOR * len(beta)
+    constant = gammaln(base) - len(beta) * gammaln(PRIOR)
+    expected = digamma(beta) - digamma(total)
+    return float(gammaln(total) - gammaln(beta).sum() - constant + ((beta - PRIOR) * expected).sum())
+
+
+def divergences(beta: Tensor) -> Tensor:
+    """The same of many cells, by torch's own formula."""
+    prior = Dirichlet(torch.full_like(beta, PRIOR), validate_args=False)
+    return kl_divergence(Dirichlet(beta, validate_args=False), prior)
+
+
+def certainty(beta: Array) -> float:
+    """Negative entropy of the mean."""
+    p = beta / beta.sum()
+    return float((p * np.log(p)).sum())
+
+
+def certainties(beta: Tensor) -> Tensor:
+    """The same of many cells."""
+    p = beta / beta.sum(-1, keepdim=True)
+    return (p * p.log()).sum(-1)
+
+
+# What the next fixation maximises, summed over the map: of one cell, and of many.
+WORTH: dict[str, tuple[Callable[[Array], float], Callable[[Tensor], Tensor]]] = {
+    "KL divergence": (divergence, divergences),
+    "negative entropy": (certainty, certainties),
+}
 
 
 def make_model(classes: int = CLASSES, levels: int = LEVELS) -> FovealObservationModel:
@@ -31,10 +68,15 @@ def make_model(classes: int = CLASSES, levels: int = LEVELS) -> FovealObservatio
     )
 
 
-def make_belief(cells: int, classes: int = CLASSES, batch: int = 1) -> Tensor:
+def make_belief(cells: int, classes: int = CLASSES, batch: int = 1) -> DirichletBelief:
     """Beliefs after some looks."""
     generator = torch.Generator().manual_seed(0)
-    return 0.5 + torch.rand(batch, cells, classes + 1, generator=generator).pow(8) * 6
+    return DirichletBelief(PRIOR + torch.rand(batch, cells, classes + 1, generator=generator).pow(8) * 6)
+
+
+def unvisited(belief: DirichletBelief) -> Tensor:
+    """No cell was fixated yet."""
+    return torch.zeros_like(belief.closest, dtype=torch.bool)
 
 
 def make_look(cells: int, classes: int = CLASSES, batch: int = 1) -> tuple[Tensor, Tensor]:
@@ -46,7 +88,7 @@ def make_look(cells: int, classes: int = CLASSES, batch: int = 1) -> tuple[Tenso
 
 def kaplan_update() -> Comparison:
     """30 detections into a map of 10 × 10 cells and 81 classes."""
-    beta, (likelihood, footprint) = make_belief(100), make_look(100)
+    beta, (likelihood, footprint) = make_belief(100).beta, make_look(100)
     cells, scores, covered = beta[0].double().numpy(), likelihood[0].double().numpy(), footprint[0].numpy()
 
     def loop() -> Array:
@@ -77,8 +119,9 @@ def kaplan_update() -> Comparison:
 
 def predictive_search() -> Comparison:
     """Expected posterior of a target in every cell."""
-    beta, model = make_belief(100), make_model()
-    expected, cells = model.expected_scores()[:, 0].double().numpy(), beta[0].double().numpy()
+    belief, model = make_belief(100), make_model()
+    expected, cells = model.expected_scores()[:, 0].double().numpy(), belief.beta[0].double().numpy()
+    visited = unvisited(belief)
     value = acquisition.PredictedTargetPosterior(5, model)
 
     def loop() -> Array:
@@ -89,7 +132,7 @@ def predictive_search() -> Comparison:
         return result
 
     def ours() -> Tensor:
-        return value(beta)
+        return value(belief, visited)
 
     def agree() -> None:
         np.testing.assert_allclose(ours()[0].numpy(), loop(), rtol=1e-4)
@@ -97,45 +140,42 @@ def predictive_search() -> Comparison:
     return Comparison("predictive search, one decision", ours, {"loop over cells": loop}, {}, agree)
 
 
-def exploration(name: str) -> Comparison:
-    """Value of every next fixation; the loop does one fixation of the hundred."""
-    grid, model, beta = Grid(10, 10, (640, 480)), make_model(), make_belief(100)
-    value = {"KL divergence": acquisition.KLDivergence, "negative entropy": acquisition.NegativeEntropy}[name](
-        model, grid
-    )
-    levels = model.level(grid.cell_distance)
-    table, cells = model.expected_scores().double().numpy(), beta[0].double().numpy()
+def exploration(name: str, belief: DirichletBelief | None = None) -> Comparison:
+    """Value of every next fixation; the loop does one fixation of the hundred.
 
-    def gain(before: Array, after: Array) -> float:
-        p, q = before / before.sum(), after / after.sum()
-        if name == "KL divergence":
-            return float((q * np.log(q / p)).sum())
-        return float((q * np.log(q)).sum() - (p * np.log(p)).sum())
+    The peers give the published values, which are semfov's and those of the present map together.
+    """
+    grid, model = Grid(10, 10, (640, 480)), make_model()
+    belief = belief or make_belief(len(grid))
+    visited, wide = unvisited(belief), belief.beta[0].double()
+    kinds = {"KL divergence": acquisition.KLDivergence, "negative entropy": acquisition.NegativeEntropy}
+    value, (worth, worths) = kinds[name](model, grid), WORTH[name]
+    levels = model.level(grid.cell_distance)
+    table, cells = model.expected_scores().double().numpy(), wide.numpy()
 
     def loop(fixations: int = 1) -> list[float]:
         return [
-            sum(gain(row, kaplan(row, (row / row.sum()) @ table[:, levels[cell, f]])) for cell, row in enumerate(cells))
+            sum(worth(kaplan(row, (row / row.sum()) @ table[:, levels[cell, f]])) for cell, row in enumerate(cells))
             for f in range(fixations)
         ]
 
     def brute() -> Tensor:
-        wide = beta[0].double()
         mean = wide / wide.sum(-1, keepdim=True)
         scores = torch.einsum("xk,knj->xnj", mean, model.expected_scores().double())
         every = scores[torch.arange(len(wide))[:, None], levels]
-        after = fusion.kaplan(wide[:, None].expand_as(every), every)
-        after = after / after.sum(-1, keepdim=True)
-        if name == "KL divergence":
-            return (after * (after / mean[:, None]).log()).sum((-1, 0))
-        return (after * after.log()).sum((-1, 0)) - (mean * mean.log()).sum()
+        return worths(fusion.kaplan(wide[:, None].expand_as(every), every)).sum(0)
 
     def ours() -> Tensor:
-        return value(beta)
+        return value(belief, visited)
 
     def agree() -> None:
-        torch.testing.assert_close(ours()[0].double(), brute(), rtol=1e-3, atol=1e-4)
-        np.testing.assert_allclose(brute()[:1].numpy(), loop(), rtol=1e-6)
+        published = brute()
+        gained = published - worths(wide).sum()
+        precise = value(DirichletBelief(wide[None]), visited)[0]
+        torch.testing.assert_close(precise, gained, rtol=0, atol=1e-6)
+        torch.testing.assert_close(ours()[0].double(), gained, rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(published[:1].numpy(), loop(), rtol=1e-9)
 
-    peers = {"loop over fixations and cells": loop, "all pairs at once": brute}
+    peers: dict[str, Run] = {"loop over fixations and cells": loop, "all pairs at once": brute}
     share = {"loop over fixations and cells": 1 / len(grid)}
     return Comparison(f"exploration, {name}, one decision", ours, peers, share, agree)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import torch
 
-from benchmarks.beliefs import make_belief, make_look, make_model
+from benchmarks.beliefs import make_belief, make_look, make_model, unvisited
 from benchmarks.timing import Clock, Run, Spread, interleaved
 from semfov import Grid, acquisition, foveate
 from semfov.belief import fuse
@@ -13,15 +13,16 @@ from semfov.belief import fuse
 
 def fusing(cells: int = 100, classes: int = 80, batch: int = 1) -> Run:
     """30 detections into each map."""
-    beta, look = make_belief(cells, classes, batch), make_look(cells, classes, batch)
+    beta, look = make_belief(cells, classes, batch).beta, make_look(cells, classes, batch)
     return lambda: fuse(beta, *look)
 
 
 def exploring(side: int = 10, classes: int = 80, levels: int = 8) -> Run:
     """One decision by KL divergence."""
     value = acquisition.KLDivergence(make_model(classes, levels), Grid(side, side, (640, 480)))
-    beta = make_belief(side * side, classes)
-    return lambda: value(beta)
+    belief = make_belief(side * side, classes)
+    visited = unvisited(belief)
+    return lambda: value(belief, visited)
 
 
 def foveating(side: int = 256, levels: int = 5) -> Run:

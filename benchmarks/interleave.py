@@ -52,7 +52,7 @@ PARTS = ("sensor", "detector", "belief", "policy")
 class Policy:
     """How a fixation is chosen, and whether scores are calibrated before."""
 
-    acquisition: Callable[[Tensor], Tensor]
+    acquisition: semfov.acquisition.AcquisitionFunction
     observation: semfov.FovealObservationModel | None
 
 
@@ -117,10 +117,10 @@ def policies(classes: Sequence[str], grid: semfov.Grid) -> dict[str, Policy]:
     model = semfov.FovealObservationModel.identity(classes, EDGES).eval()
     search = {
         "search, non-predictive, raw": (semfov.search_policy("non-predictive"), None),
-        "search, predictive, calibrated": (semfov.search_policy("predictive", model, calibrated=True), model),
+        "search, predictive, calibrated": (semfov.search_policy("predictive", model), model),
     }
     made = {name: Policy(policy(TARGET, grid), observation) for name, (policy, observation) in search.items()}
-    explore = semfov.acquisition.KLDivergence(model, grid, calibrated=True)
+    explore = semfov.acquisition.KLDivergence(model, grid)
     return made | {"exploration, KL divergence, calibrated": Policy(explore, model)}
 
 
@@ -145,7 +145,7 @@ def scanpath(
         stamps.append(clock())
         visited = visited.scatter(-1, cell[:, None], True)
         noise = torch.rand(1, len(grid), generator=generator)
-        cell = select_fixation(policy.acquisition(belief.beta), visited, noise)
+        cell = select_fixation(policy.acquisition(belief, visited), visited, noise)
         stamps.append(clock())
         totals += torch.tensor(stamps, dtype=torch.float64).diff()
     return (1e3 * totals / fixations).tolist()

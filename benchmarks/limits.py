@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from benchmarks.beliefs import DETECTIONS, make_belief, make_look, make_model
+from benchmarks.beliefs import DETECTIONS, make_belief, make_look, make_model, unvisited
 from benchmarks.dirichlet_mle import draw
 from benchmarks.images import GAZE, SIGMA, photograph
 from benchmarks.rollouts import SHIFTS, searches
@@ -39,9 +39,10 @@ def paths() -> dict[str, Path]:
     bands = laplacian_pyramid(image, 5)
     details = sum(band.numel() for band in (*bands.details, bands.base))
     batch = 256
-    beta, (likelihood, footprint) = make_belief(100, batch=batch), make_look(100, batch=batch)
+    belief, (likelihood, footprint) = make_belief(100, batch=batch), make_look(100, batch=batch)
+    beta, visited = belief.beta, unvisited(belief)
     model, grid = make_model(), Grid(10, 10, (640, 480))
-    value, belief = acquisition.KLDivergence(model, grid), make_belief(100, batch=batch)
+    value = acquisition.KLDivergence(model, grid)
     vocus = VOCUS2()
     logs = draw(100, seed=0).log().mean(1)
     episodes = 40
@@ -67,11 +68,11 @@ def paths() -> dict[str, Path]:
             "detections are fused one after another: the maps go through the processor once for each of them",
         ),
         f"exploration, KL divergence, {batch} maps": Path(
-            lambda: value(belief),
-            4 * (belief.numel() + belief.shape[0] * belief.shape[1] + model.alpha.numel()),
+            lambda: value(belief, visited),
+            4 * (beta.numel() + visited.numel() + model.alpha.numel()),
             "maps and expected scores in, values out",
-            "every cell is updated as seen at each level and its divergence taken, "
-            f"{model.alpha.shape[1] * belief.numel() / 1e6:.1f} million logarithms: it computes",
+            "every cell is updated as seen at each level and its divergence from the prior taken, "
+            f"ln Γ and ψ of {model.alpha.shape[1] * beta.numel() / 1e6:.1f} million numbers: it computes",
         ),
         "saliency, VOCUS2": Path(
             lambda: vocus(image),

@@ -1,5 +1,6 @@
 """What figures were measured on."""
 
+import os
 import platform
 import subprocess
 from importlib.metadata import version
@@ -13,14 +14,16 @@ PACKAGES = ("torch", "kornia", "numpy", "opencv-python-headless", "scipy", "diri
 
 
 def describe() -> dict[str, str]:
-    """Processor, threads, versions and commit."""
+    """Processor, threads, other work, versions and commit; no name of the machine."""
     root = Path(__file__).parents[1]
     commit = subprocess.run(
         ["git", "describe", "--always", "--dirty"], cwd=root, capture_output=True, text=True, check=False
     )
     return {
         "processor": processor(),
+        "cores": str(os.cpu_count()),
         "threads": str(torch.get_num_threads()),
+        "load": f"{os.getloadavg()[0]:.1f} programs wanted a core in the minute before",
         "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
         **{name: version(name) for name in PACKAGES},
         "commit": commit.stdout.strip() or "unknown",

@@ -11,6 +11,11 @@ Clock = Callable[[], float]
 """Seconds: `time.perf_counter`, or `time.process_time` for programs of one thread, which other work disturbs less."""
 
 
+def clock_for(threads: int) -> tuple[Clock, str]:
+    """The clock for programs of so many threads, and what it shows."""
+    return (time.process_time, "of the processor") if threads == 1 else (time.perf_counter, "of the clock")
+
+
 @dataclass(frozen=True)
 class Comparison:
     """semfov beside other programs for the same work.
@@ -60,35 +65,37 @@ class Measured:
 
 
 def interleaved(
-    runs: Mapping[str, Run], seconds: float, clock: Clock = time.perf_counter, least: int = 5
+    runs: Mapping[str, Run], seconds: float, clock: Clock = time.perf_counter, least: int = 5, times: int = 1
 ) -> dict[str, list[float]]:
     """Milliseconds of every run in every repetition, for about so many seconds; the first, warm-up, is not counted.
 
     A repetition runs all of them one after another, starting with another each time: what else the machine does falls
-    on all alike.
+    on all alike. A run that takes microseconds is slower after another one than after itself: with `times`, each turn
+    is so many runs, and their mean counts.
     """
-    times: dict[str, list[float]] = {name: [] for name in runs}
+    found: dict[str, list[float]] = {name: [] for name in runs}
     names, began, repetition = list(runs), time.perf_counter(), 0
     while repetition <= least or time.perf_counter() - began < seconds:
         first = repetition % len(names)
         for name in names[first:] + names[:first]:
             start = clock()
-            runs[name]()
+            for _ in range(times):
+                runs[name]()
             if repetition:
-                times[name].append(1e3 * (clock() - start))
+                found[name].append(1e3 * (clock() - start) / times)
         repetition += 1
-    return times
+    return found
 
 
-def measure(comparison: Comparison, seconds: float, clock: Clock) -> Measured:
-    """Check that the programs agree, and time them."""
+def measure(comparison: Comparison, seconds: float, clock: Clock, times: int = 1) -> Measured:
+    """Check that the programs agree, and time them (`interleaved`)."""
     comparison.agree()
-    times = interleaved({"semfov": comparison.ours, **comparison.peers}, seconds, clock)
+    found = interleaved({"semfov": comparison.ours, **comparison.peers}, seconds, clock, times=times)
     for name, share in comparison.share.items():
-        times[name] = [value / share for value in times[name]]
-    ours = times["semfov"]
+        found[name] = [value / share for value in found[name]]
+    ours = found["semfov"]
     ratios = {
-        name: Spread.of([theirs / mine for theirs, mine in zip(times[name], ours, strict=True)])
+        name: Spread.of([theirs / mine for theirs, mine in zip(found[name], ours, strict=True)])
         for name in comparison.peers
     }
-    return Measured(comparison.name, {name: Spread.of(values) for name, values in times.items()}, ratios)
+    return Measured(comparison.name, {name: Spread.of(values) for name, values in found.items()}, ratios)

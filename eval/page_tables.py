@@ -189,4 +189,4 @@ def decisions(path: Path = Path("benchmarks/results/decisions.md")) -> list[str]
     if not path.exists():
         return ["*Not run yet.*"]
     lines = path.read_text(encoding="utf-8").splitlines()
-    return [line for line in lines if not line.startswith("# ")]
+    return [f"#{line}" if line.startswith("## ") else line for line in lines if not line.startswith("# ")]

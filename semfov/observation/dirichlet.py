@@ -150,7 +150,7 @@ def kl_from_symmetric(alpha: Tensor, parameter: float) -> Tensor:
     check(parameter > 0, "parameter", "a positive number", parameter)
     base = alpha.shape[-1] * parameter
     # Sums are few, and their terms large: double precision costs nothing here.
-    total = alpha.sum(-1, dtype=torch.float64)
+    total = alpha.sum(-1).double()
     whole = total.lgamma() - math.lgamma(base) - (total - base) * total.digamma()
     each = torch.addcmul(math.lgamma(parameter) - alpha.lgamma(), alpha - parameter, digamma(alpha))
     return whole.to(alpha) + each.sum(-1)

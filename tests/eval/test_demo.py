@@ -62,7 +62,7 @@ def test_search(run, photo, tmp_path):
     code, printed = run(photo, "--target", "red", "--start", 47, "--report", tmp_path / "page.html")
     assert code == 0
     assert "my photo.png: “red” found after 1 gaze shift" in printed.out
-    rows = [line.split() for line in printed.out.splitlines() if line[:1] in "01"]
+    rows = [line.split() for line in printed.out.splitlines() if line[:1] in ("0", "1")]
     assert rows[0][:3] == ["0", "(7,", "5)"]
     for name in ("scanpath.png", "views.png", "belief.png", "belief_bars.png", "animation.gif"):
         with Image.open(tmp_path / "out" / name) as picture:
@@ -211,7 +211,7 @@ def test_agents_that_come_with_it(agent, task, cup, tmp_path, capsys):
     assert program.main([str(photo), *task, *agent, *short]) == 0
     printed = capsys.readouterr().out
     assert "photo.png: " in printed
-    assert [line.split()[0] for line in printed.splitlines() if line[:1] in "01"] == ["0", "1"]
+    assert [line.split()[0] for line in printed.splitlines() if line[:1] in ("0", "1")] == ["0", "1"]
     written = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"scanpath.png", "views.png", "animation.gif", "map.png" if len(task) == 1 else "belief.png"} <= written
     assert "<!DOCTYPE html>" in (tmp_path / "page.html").read_text(encoding="utf-8")
@@ -228,4 +228,4 @@ def test_sensors_by_name(usual):
     }
     for (kind, sensor), (sigma, growth) in expected.items():
         eye = program.make_agent(program.DemoConfig(agent=kind, sensor=sensor)).eye
-        assert (float(eye.sensor.sigma), eye.sensor.growth) == (sigma, growth)
+        assert (float(eye.sensor.sigma), eye.sensor.growth) == pytest.approx((sigma, growth))

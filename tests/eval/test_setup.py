@@ -173,7 +173,7 @@ def test_divergence_is_from_the_prior_of_the_run(model):
 def test_a_sensor_is_known_by_name_and_may_be_changed(settings, sigma, growth, fovea):
     config = SensorConfig(**settings)
     sensor = config.make()
-    assert (float(sensor.sigma), sensor.growth, sensor.levels) == (sigma, growth, 5)
+    assert (float(sensor.sigma), sensor.growth, sensor.levels) == pytest.approx((sigma, growth, 5))
     assert config.fovea == pytest.approx(fovea)
     assert SensorConfig(levels=3, convention="opencv").make().convention == "opencv"
 

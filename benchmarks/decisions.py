@@ -1,0 +1,228 @@
+"""Milliseconds of one decision where to look next, beside the published ones: `python -m benchmarks.decisions`.
+
+A decision is for one episode, on a map of 10 x 10 cells and 81 classes, with 8 levels of distance. It begins with a
+belief that is there. It values every cell, draws the random numbers that break ties, and takes the best cell that was
+not visited. Looking, detecting and updating the belief are no part of it; the update has rows of its own. A decision by
+saliency has no belief: it foveates the photograph, models the saliency of the view, and averages that over the cells.
+"""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from functools import reduce
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from benchmarks.beliefs import CLASSES, DETECTIONS, LEVELS, exploration, make_model, unvisited
+from benchmarks.images import GAZE, photograph, use_threads
+from benchmarks.machine import describe
+from benchmarks.tables import RESULTS, comparison_rows, number, spread, table, write
+from benchmarks.timing import Clock, Measured, Run, Spread, clock_for, interleaved, measure
+from semfov import (
+    Detections,
+    DirichletBelief,
+    FovealObservationModel,
+    Grid,
+    acquisition,
+    exploration_policy,
+    saliency,
+    search_policy,
+)
+from semfov.belief import SemanticObserver
+from semfov.gaze import select_fixation
+from semfov.sensor import named_sensor
+
+TARGET, LOOKS, TIMES = 5, 3, 10
+KL = "KL divergence, raw"
+
+# Luzio, Bernardino and Moreno (2024), the tables of search and of exploration: computational cost in ms, on another
+# machine. They call raw Kaplan and calibrated modified Kaplan. Their saliency is VOCUS2.
+PUBLISHED: dict[str, dict[str, float | None]] = {
+    "search": {
+        "random": 0.015,
+        "VOCUS2": 762.3,
+        "Itti-Koch": None,
+        "non-predictive, raw": 0.144,
+        "non-predictive, calibrated": 0.133,
+        "predictive, raw": 77.81,
+        "predictive, calibrated": 83.76,
+    },
+    "exploration": {
+        "random": 0.017,
+        "VOCUS2": 462.0,
+        "Itti-Koch": None,
+        KL: 9851.0,
+        "KL divergence, calibrated": 9907.0,
+        "negative entropy, raw": 9770.0,
+        "negative entropy, calibrated": 9833.0,
+        "two peaks, raw": 8971.0,
+        "two peaks, calibrated": 8981.0,
+    },
+}
+
+
+def make_seen(grid: Grid, seed: int) -> Detections:
+    """What one look might detect: boxes of up to a tenth of the photograph."""
+    generator = torch.Generator().manual_seed(seed)
+    size = torch.tensor(photograph().shape[:1:-1])
+    corner, extent = torch.rand(2, 1, DETECTIONS, 2, generator=generator) * size
+    boxes = torch.cat([corner, corner + 0.3 * extent], -1)
+    scores = (3 * torch.randn(1, DETECTIONS, CLASSES + 1, generator=generator)).softmax(-1)
+    return Detections(boxes, scores, torch.ones(1, DETECTIONS, dtype=torch.bool))
+
+
+def believe(observer: SemanticObserver, grid: Grid) -> DirichletBelief:
+    """The belief after some looks."""
+
+    def look(belief: DirichletBelief, seed: int) -> DirichletBelief:
+        return observer.update(belief, observer.weigh(make_seen(grid, seed), grid.centres[seed : seed + 1], grid))
+
+    return reduce(look, range(LOOKS), observer.start(1, grid, torch.zeros(())))
+
+
+def decide(value: acquisition.AcquisitionFunction, belief: DirichletBelief) -> Run:
+    """One decision."""
+    visited, generator = unvisited(belief), torch.Generator().manual_seed(0)
+    visited[:, :LOOKS] = True
+
+    def run() -> Tensor:
+        noise = torch.rand(visited.shape, generator=generator)
+        return select_fixation(value(belief, visited), visited, noise)
+
+    return run
+
+
+def on_the_map(model: FovealObservationModel, maps: dict[str, DirichletBelief], grid: Grid) -> dict[str, Run]:
+    """Decisions that go by a belief."""
+    policies = {
+        "non-predictive": search_policy("non-predictive"),
+        "predictive": search_policy("predictive", model),
+        "KL divergence": exploration_policy("kl", model),
+        "negative entropy": exploration_policy("negative-entropy", model),
+        "two peaks": exploration_policy("two-peaks", model),
+    }
+    runs = {"random": decide(search_policy("random")(None, grid), maps["raw"])}
+    for name, policy in policies.items():
+        runs |= {f"{name}, {kind}": decide(policy(TARGET, grid), belief) for kind, belief in maps.items()}
+    return runs
+
+
+def updates(model: FovealObservationModel, belief: DirichletBelief, grid: Grid) -> dict[str, Run]:
+    """What one look of 30 detections does to a belief."""
+    observer, seen, fixation = SemanticObserver(CLASSES + 1), make_seen(grid, LOOKS), torch.tensor([GAZE])
+    evidence, distance = observer.weigh(seen, fixation, grid), grid.box_distance(seen.boxes, fixation)
+    return {
+        f"cells and distances of {DETECTIONS} detections": lambda: observer.weigh(seen, fixation, grid),
+        f"calibration of {DETECTIONS} detections": lambda: model.calibrate(seen.scores, distance),
+        f"Kaplan's rule for {DETECTIONS} detections": lambda: observer.update(belief, evidence),
+    }
+
+
+def on_the_view(grid: Grid) -> tuple[dict[str, Run], dict[str, Run]]:
+    """Decisions that go by the saliency of a foveated view; and what is to be done for them first."""
+    image, gaze, sensor = photograph(), torch.tensor(GAZE), named_sensor("published")
+    bands, visited = sensor.pyramid(image), torch.zeros(1, len(grid), dtype=torch.bool)
+    generator = torch.Generator().manual_seed(0)
+
+    def decide_by(model: Callable[[Tensor], Tensor]) -> Run:
+        def run() -> Tensor:
+            values = saliency.cell_saliency(model(sensor(bands, gaze)), grid.columns, grid.rows)
+            return select_fixation(values, visited, torch.rand(visited.shape, generator=generator))
+
+        return run
+
+    parts = {
+        "pyramid of the photograph, once for all decisions": lambda: sensor.pyramid(image),
+        "foveated view, in every decision by saliency": lambda: sensor(bands, gaze),
+    }
+    return {"VOCUS2": decide_by(saliency.VOCUS2()), "Itti-Koch": decide_by(saliency.IttiKoch())}, parts
+
+
+def main() -> None:
+    """Measure all rows and write the tables."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.decisions", description=__doc__.splitlines()[0])
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--seconds", type=float, default=30.0, help="for all rows together, at least")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    use_threads(options.threads)
+    clock, times = clock_for(options.threads)
+    about = describe() | {"times": times}
+    # Made outside of inference mode, as a model that is loaded: it keeps its tables then.
+    model = make_model()
+    with torch.inference_mode():
+        spreads, others, peers = measure_all(model, options.seconds / 3, clock)
+    text = report(about, spreads, others, peers)
+    print(text)
+    figures = {
+        "machine": about,
+        "milliseconds": {name: asdict(values) for name, values in spreads.items()},
+        "published_milliseconds": PUBLISHED,
+        "peers": asdict(peers),
+    }
+    write(options.out, "decisions", text, figures)
+
+
+def measure_all(
+    model: FovealObservationModel, seconds: float, clock: Clock
+) -> tuple[dict[str, Spread], list[str], Measured]:
+    """Milliseconds of all rows, the names of those that are no decisions, and brute force."""
+    grid = Grid(10, 10, (640, 480))
+    maps = {
+        "raw": believe(SemanticObserver(CLASSES + 1), grid),
+        "calibrated": believe(SemanticObserver(CLASSES + 1, model), grid),
+    }
+    decisions, changes = on_the_map(model, maps, grid), updates(model, maps["raw"], grid)
+    views, parts = on_the_view(grid)
+    found = interleaved(decisions | changes, seconds, clock, times=TIMES)
+    found |= interleaved(views | parts, seconds, clock)
+    brute = replace(exploration("KL divergence", maps["raw"]), name=KL, ours=decisions[KL])
+    spreads = {name: Spread.of(values) for name, values in found.items()}
+    return spreads, [*changes, *parts], measure(brute, seconds, clock, TIMES)
+
+
+def report(about: dict[str, str], spreads: dict[str, Spread], others: list[str], peers: Measured) -> str:
+    """All tables."""
+    sections = []
+    for experiment, published in PUBLISHED.items():
+        rows = [[name, spread(spreads[name]), number(cost) if cost else ""] for name, cost in published.items()]
+        head = ["decision", "semfov, ms", "published, ms"]
+        sections += [f"## One decision of {experiment}", "", table(head, rows), ""]
+    return "\n".join(
+        [
+            "# Decisions",
+            "",
+            "Written by `python -m benchmarks.decisions`. Medians (quartiles) of one run. What goes by a belief is run",
+            f"{TIMES} times in a row, and the mean is one value.",
+            "",
+            f"A decision is for one episode, {CLASSES + 1} classes on 10 x 10 cells, {LEVELS} levels of distance. It",
+            "begins with a belief that is there. It values every cell, draws the random numbers that break ties, and",
+            "takes the best cell that was not visited. Looking, detecting and updating the belief are no part of it.",
+            "By saliency, it foveates a photograph of 640 x 480 whose pyramid is there, models the saliency of the",
+            "view, and averages it over the cells. Raw is the map by Kaplan's rule, calibrated that by the modified",
+            "rule. Published figures are of another machine: only the peers below were timed beside semfov.",
+            "",
+            *(f"- {key}: {value}" for key, value in about.items()),
+            "",
+            *sections,
+            "## What decisions need and do not include",
+            "",
+            table(["work", "semfov, ms"], [[name, spread(spreads[name])] for name in others]),
+            "",
+            "The foveated view is the exception: it is part of decisions by saliency.",
+            "",
+            "## Brute force",
+            "",
+            "The published sum over the map, of every fixation, by the formula. The loop does one fixation of the",
+            "hundred, and its time is scaled up. It leaves the choice out. Ratios are of times in one repetition.",
+            "",
+            table(["decision", "peer", "semfov, ms", "peer, ms", "peer / semfov"], comparison_rows(peers)),
+            "",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    main()
