@@ -7,7 +7,7 @@ from torch import Tensor
 
 from semfov.errors import check, check_finite, check_shape, values_known
 from semfov.observation.mle import inverse_digamma, mle, shrink, vacuous
-from semfov.observation.special import digamma
+from semfov.observation.special import log_gamma_divergence
 
 __all__ = [
     "categorical_covariance",
@@ -134,11 +134,11 @@ def kl_divergence(alpha: Tensor, other: Tensor) -> Tensor:
 def kl_from_symmetric(alpha: Tensor, parameter: float) -> Tensor:
     r"""`kl_divergence` to a symmetric Dirichlet, whose parameters are all c, in nats, `(...)`.
 
-    .. math:: \mathrm{KL} = \ln\frac{\Gamma(A)}{\Gamma(K c)} - (A - K c) \, \psi(A) + \sum_k h(\alpha_k), \qquad
-              h(x) = (x - c) \, \psi(x) - \ln\frac{\Gamma(x)}{\Gamma(c)}
+    .. math:: \mathrm{KL} = \sum_k h(\alpha_k; c) - h(A; K c), \qquad
+              h(x; c) = (x - c) \, \psi(x) - \ln\frac{\Gamma(x)}{\Gamma(c)}
 
-    h is 0 at c and nowhere negative, so what differs little from c does not come from large terms that cancel. The
-    special functions are computed once for each parameter.
+    h is 0 at c and nowhere negative (`semfov.observation.special.log_gamma_divergence`), so what differs little from c
+    does not come from large terms that cancel.
 
     Args:
         alpha: `(..., K)`, parameters, positive.
@@ -151,9 +151,8 @@ def kl_from_symmetric(alpha: Tensor, parameter: float) -> Tensor:
     base = alpha.shape[-1] * parameter
     # Sums are few, and their terms large: double precision costs nothing here.
     total = alpha.sum(-1).double()
-    whole = total.lgamma() - math.lgamma(base) - (total - base) * total.digamma()
-    each = torch.addcmul(math.lgamma(parameter) - alpha.lgamma(), alpha - parameter, digamma(alpha))
-    return whole.to(alpha) + each.sum(-1)
+    whole = (total - base) * total.digamma() - total.lgamma() + math.lgamma(base)
+    return log_gamma_divergence(alpha, parameter).sum(-1) - whole.to(alpha)
 
 
 def floor(scores: Tensor, epsilon: float) -> Tensor:

@@ -1,31 +1,71 @@
-"""Special functions that torch computes one number at a time."""
+"""Special functions that torch has not."""
+
+from functools import lru_cache
+from math import prod
 
 import torch
+from numpy.polynomial import Polynomial
 from torch import Tensor
 
-# B_2k / 2k for k = 1, 2, … From 8 on, the first term left out is below 1e-16, with half of them below 1e-8.
-_SERIES = (1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12, -3617 / 8160)
+# B_2k / 2k for k = 1, 2, … What is left out after three terms is below 3e-8 from 4 on, after eight 1e-15 from 8 on.
+_STIRLING = (1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12, -3617 / 8160)
 
 
-def digamma(x: Tensor) -> Tensor:
-    r"""Digamma function ψ of positive numbers, twice as fast on a CPU as torch's, which has no vector instructions.
+def log_gamma_divergence(x: Tensor, c: float) -> Tensor:
+    r"""How far ln Γ is at c above its tangent at x, for positive numbers: the Bregman divergence of ln Γ.
 
-    .. math:: \psi(x) = \ln y - \frac{1}{2 y} - \sum_k \frac{B_{2k}}{2 k \, y^{2k}} - \sum_{i=0}^{7} \frac{1}{x + i},
-              \qquad y = x + 8
+    .. math:: h(x) = \ln\Gamma(c) - \ln\Gamma(x) - (c - x) \, \psi(x)
 
-    (Abramowitz and Stegun, 1964, 6.3.6 and 6.3.18.) Differentiable; dtype and device as `x`.
+    It is 0 at c and nowhere negative. The recurrences of Γ and ψ lead from x up to x + n, and from there Stirling's
+    series (Abramowitz and Stegun, 1964, 6.1.40, 6.3.6 and 6.3.18). In terms of g, which is 0 at c, all but two terms
+    are one logarithm and three polynomials, and nothing large cancels:
 
-    >>> digamma(torch.tensor([1.0, 0.5], dtype=torch.float64))
-    tensor([-0.5772, -1.9635], dtype=torch.float64)
+    .. math::
+
+        h(x) &= \ln\Bigl(\bigl(1 + \tfrac{n}{c} g\bigr) P(g)\Bigr) + g \Bigl(Q(g) - \frac{(1 - g) P'(g)}{P(g)}\Bigr)
+        + (x - c) \Bigl(1 - \frac{1}{x}\Bigr) + \Bigl(\frac{1}{2} - c\Bigr) \ln\frac{x + n}{c + n} \\
+        g &= \frac{x - c}{x + n}, \qquad P(g) = \prod_{i=1}^{n-1} \Bigl(1 + \frac{n - i}{c + i} \, g\Bigr)
+
+    g Q(g) is Stirling's series less its value at c, less (n - 1/2) g. Differentiable; dtype and device as `x`.
+
+    >>> log_gamma_divergence(torch.tensor([1.0, 2.0]), 1.0)
+    tensor([0.0000, 0.4228])
     """
-    terms = _SERIES if x.dtype == torch.float64 else _SERIES[:4]
-    inverse = (x + 8).reciprocal()
-    square = inverse * inverse
-    series = terms[-1] * square
-    for coefficient in reversed(terms[:-1]):
-        series = (series + coefficient) * square
-    # 1/(x + i) + 1/(x + 7 - i) = (2x + 7) / (u + i (7 - i)) with u = x (x + 7): four pairs, in two fractions.
-    u = x * (x + 7)
-    outer = u * (u + 12)
-    pairs = (u + 6) / outer + (u + 8) / (outer + 4 * u + 60)
-    return -(inverse.log() + 0.5 * inverse + series + (4 * x + 14) * pairs)
+    shift, terms = (8, 8) if x.dtype == torch.float64 else (4, 3)
+    rise, slope, series = _polynomials(c, shift, terms)
+    above = x - c
+    lift = above / (x + shift)
+    rest = _evaluate(rise, lift).mul_(lift)
+    product = 1 + rest
+    # Near x = 0, where c/x is all, rounding would make it the logarithm of 0.
+    whole = torch.addcmul(rest, product, lift, value=shift / c).clamp(min=torch.finfo(x.dtype).eps - 1).log1p()
+    slopes = torch.addcdiv(_evaluate(series, lift), _evaluate(slope, lift), product, value=-1)
+    value = torch.addcdiv(torch.addcmul(whole, slopes, lift), above, x, value=-1).add_(above)
+    return value if c == 0.5 else value.add_((above / (c + shift)).log1p(), alpha=0.5 - c)
+
+
+def _evaluate(coefficients: tuple[float, ...], x: Tensor) -> Tensor:
+    """A polynomial, constant first. In place, for fresh memory costs more than the sums do."""
+    value = x * coefficients[-1]
+    for coefficient in coefficients[-2:0:-1]:
+        value = value.add_(coefficient).mul_(x)
+    return value.add_(coefficients[0])
+
+
+@torch.compiler.assume_constant_result
+def _polynomials(c: float, shift: int, terms: int) -> tuple[tuple[float, ...], ...]:
+    """Coefficients of (P - 1) / g, (1 - g) P' and Q."""
+    return _expand(c, shift, terms)
+
+
+@lru_cache
+def _expand(c: float, shift: int, terms: int) -> tuple[tuple[float, ...], ...]:
+    fall, none = Polynomial([1.0, -1.0]), Polynomial([0.0])
+    product = prod((Polynomial([1.0, (shift - i) / (c + i)]) for i in range(1, shift)), start=none + 1)
+    inverse = fall / (c + shift)
+    series = sum(
+        (_STIRLING[k] * inverse ** (2 * k + 1) * Polynomial([1 / (2 * k + 1), 1.0]) for k in range(terms)), start=none
+    )
+    rest = -series.coef[1:]
+    rest[0] -= shift - 0.5
+    return tuple(product.coef[1:].tolist()), tuple((fall * product.deriv()).coef.tolist()), tuple(rest.tolist())

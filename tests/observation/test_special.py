@@ -1,4 +1,4 @@
-"""Digamma, and the divergence from a symmetric Dirichlet, against mpmath, scipy and torch.distributions."""
+"""The divergence of ln Γ, and that from a symmetric Dirichlet, against mpmath, scipy and torch.distributions."""
 
 import math
 
@@ -9,54 +9,64 @@ import scipy.special
 import torch
 
 from semfov import InputError, dirichlet
-from semfov.observation.special import digamma
+from semfov.observation.special import log_gamma_divergence
 
 mp = mpmath.mp.clone()
 mp.dps = 40
 
-# From next to the pole at 0 to where ψ is the logarithm, and on both sides of its zero at 1.4616.
-POINTS = [*np.logspace(-6, 6, 241).tolist(), 0.5, 1.0, 1.4616321449683623, 1.46, 2.0, 8.0]
+# From next to the pole at 0 to where h is linear, and closely around c.
+POINTS = [*np.logspace(-8, 8, 97).tolist(), 0.5, 1.0, 2.0, 8.0]
+NEAR = [1 + step for step in (-0.1, -1e-2, -1e-3, 1e-3, 1e-2, 0.1, 0.5)]
 
 
-@pytest.mark.parametrize(("dtype", "digits"), [(torch.float64, 2e-15), (torch.float32, 4e-7)], ids=str)
-def test_digamma_is_that_of_mpmath(dtype, digits):
-    """To a few roundings of ψ, or of the logarithm of which the sum is taken where ψ is near 0."""
-    x = torch.tensor(POINTS, dtype=dtype)
-    got = digamma(x)
+def exact(x, c):
+    x, c = mp.mpf(x), mp.mpf(c)
+    return float((x - c) * mp.digamma(x) - mp.loggamma(x) + mp.loggamma(c))
+
+
+@pytest.mark.parametrize("c", [0.25, 0.5, 1.0, 5.0, 100.0])
+@pytest.mark.parametrize(("dtype", "digits"), [(torch.float64, 5e-14), (torch.float32, 1e-6)], ids=str)
+def test_divergence_of_log_gamma_is_that_of_mpmath(dtype, digits, c):
+    """To some roundings of it, or of the distance from c, of which it is the small part near c."""
+    x = torch.tensor([*POINTS, *(c * step for step in NEAR)], dtype=dtype)
+    got = log_gamma_divergence(x, c)
     assert got.dtype == dtype
     for value, at in zip(got.tolist(), x.tolist(), strict=True):
-        exact = float(mp.digamma(mp.mpf(at)))
-        assert abs(value - exact) <= digits * max(abs(exact), math.log(at + 8)), at
+        assert abs(value - exact(at, c)) <= digits * (exact(at, c) + abs(at - c)), at
 
 
-@pytest.mark.parametrize(("dtype", "digits"), [(torch.float64, 1e-13), (torch.float32, 2e-5)], ids=str)
-def test_digamma_is_that_of_scipy(dtype, digits):
-    x = torch.tensor(POINTS[:241], dtype=dtype)
-    np.testing.assert_allclose(digamma(x).double(), scipy.special.digamma(x.double().numpy()), rtol=digits, atol=digits)
-
-
-def test_digamma_of_one_is_eulers_constant():
-    torch.testing.assert_close(digamma(torch.ones(3)), torch.full((3,), -0.5772156649015329))
-
-
-def test_digamma_steps_by_the_inverse():
-    """ψ(x + 1) = ψ(x) + 1/x."""
-    x = torch.logspace(-3, 3, 61, dtype=torch.float64)
-    torch.testing.assert_close(digamma(x + 1), digamma(x) + 1 / x, rtol=1e-12, atol=1e-12)
-
-
-def test_derivative_of_digamma_is_trigamma():
-    x = torch.logspace(-3, 4, 57, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(digamma, x[10:40])
-    (slope,) = torch.autograd.grad(digamma(x).sum(), x)
-    np.testing.assert_allclose(slope, scipy.special.polygamma(1, x.detach().numpy()), rtol=1e-10)
+def test_divergence_of_log_gamma_from_itself_is_nothing():
+    for c in (0.5, 1.0, 7.0):
+        x = torch.full((3,), c, dtype=torch.float64)
+        assert log_gamma_divergence(x, c).abs().max() < 1e-15
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_digamma_compiles_whole(dtype):
+def test_divergence_of_log_gamma_at_the_ends_of_the_number_line(dtype):
+    """(c - x) ψ(x) is c / x near 0, and it is x where x is large."""
+    x = torch.tensor([1e-38, 1e-30, 1e30, 1e38], dtype=dtype)
+    expected = torch.tensor([5e37, 5e29, 1e30, 1e38], dtype=dtype)
+    torch.testing.assert_close(log_gamma_divergence(x, 0.5), expected)
+
+
+def test_derivative_of_the_divergence_of_log_gamma():
+    """(x - c) times trigamma."""
+    x = torch.logspace(-3, 4, 57, dtype=torch.float64, requires_grad=True)
+    for c in (0.5, 2.0):
+        assert torch.autograd.gradcheck(lambda y, c=c: log_gamma_divergence(y, c), x[10:40])
+        (slope,) = torch.autograd.grad(log_gamma_divergence(x, c).sum(), x)
+        trigamma = scipy.special.polygamma(1, x.detach().numpy())
+        np.testing.assert_allclose(slope.numpy(), (x.detach().numpy() - c) * trigamma, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_divergence_of_log_gamma_compiles_whole_and_maps(dtype):
     x = torch.rand(3, 7, dtype=dtype) + 0.1
+    whole = log_gamma_divergence(x, 0.5)
     torch.compiler.reset()
-    assert torch.equal(torch.compile(digamma, fullgraph=True, backend="eager")(x), digamma(x))
+    compiled = torch.compile(log_gamma_divergence, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(x, 0.5), whole)
+    torch.testing.assert_close(torch.func.vmap(lambda row: log_gamma_divergence(row, 0.5))(x), whole)
 
 
 def beliefs(classes, dtype=torch.float64):

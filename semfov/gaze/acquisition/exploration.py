@@ -45,8 +45,10 @@ class KLDivergence(Lookahead):
 
     def worth(self, outlook: Outlook) -> Tensor:
         """Divergence gained."""
-        now = kl_from_symmetric(outlook.mean * outlook.total[..., None], self.prior)
-        return kl_from_symmetric(outlook.next_beta, self.prior) - now[..., None]
+        # The present map goes through the special functions with the predicted ones, as one level more.
+        every = torch.cat([outlook.next_beta, outlook.beta[..., None, :]], -2)
+        divergence = kl_from_symmetric(every, self.prior)
+        return divergence[..., :-1] - divergence[..., -1:]
 
 
 class BayesianSurprise(Lookahead):

@@ -30,11 +30,13 @@ class Outlook:
     """The belief now, and what one more look from each level of distance is expected to leave of it.
 
     Attributes:
+        beta: β, `(..., X·Y, K+1)`.
         total: T = Σ β, `(..., X·Y)`.
         mean: p = β / T, `(..., X·Y, K+1)`.
         evidence: r = λ / Σ p λ, the expected look's likelihoods as factors on the mean, `(..., X·Y, N, K+1)`.
     """
 
+    beta: Tensor
     total: Tensor
     mean: Tensor
     evidence: Tensor
@@ -57,8 +59,9 @@ class Outlook:
 
     @property
     def next_beta(self) -> Tensor:
-        """Parameters after Kaplan's update, `β' = T' p'`, `(..., X·Y, N, K+1)`."""
-        return self.next_mean * self.next_total[..., None]
+        """Parameters after Kaplan's update, `β' = β + β (r - min r) / (T + min r)`, `(..., X·Y, N, K+1)`."""
+        beta, least = self.beta[..., None, :], self.evidence.amin(-1, keepdim=True)
+        return torch.addcdiv(beta, beta * (self.evidence - least), self.total[..., None, None] + least)
 
 
 def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
@@ -85,7 +88,7 @@ def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
     table = expected.to(beta).flatten(1)
     scores = mean @ table if mean.ndim == 2 else one_by_one(lambda maps: maps @ table, mean.flatten(0, -3))
     scores = scores.view(*mean.shape[:-1], *expected.shape[1:])
-    return Outlook(total, mean, scores / (scores * mean[..., None, :]).sum(-1, keepdim=True))
+    return Outlook(beta, total, mean, scores / (scores * mean[..., None, :]).sum(-1, keepdim=True))
 
 
 class Lookahead(AcquisitionFunction):
@@ -110,13 +113,15 @@ class Lookahead(AcquisitionFunction):
         """Value of fixating each cell, `(..., X·Y)`, for a belief `(..., X·Y, K+1)`."""
         beta = dirichlet_belief(belief).beta
         check_shape(beta, "beta", self.levels.shape[-1], None)
-        if beta.ndim == 2 or self.levels.ndim > 2:
-            return self._values(beta)
-        # A map alone stays in the processor's cache: a batch at once costs four times as much.
-        return one_by_one(self._values, beta.flatten(0, -3)).view(beta.shape[:-1])
+        expected = self.model.expected_scores()
 
-    def _values(self, beta: Tensor) -> Tensor:
-        return self.pool(seen_from(self.worth(look_ahead(beta, self.model.expected_scores())), self.levels))
+        def values(maps: Tensor) -> Tensor:
+            return self.pool(seen_from(self.worth(look_ahead(maps, expected)), self.levels))
+
+        if beta.ndim == 2 or self.levels.ndim > 2:
+            return values(beta)
+        # A map alone stays in the processor's cache: a batch at once costs four times as much.
+        return one_by_one(values, beta.flatten(0, -3)).view(beta.shape[:-1])
 
     @abstractmethod
     def worth(self, outlook: Outlook) -> Tensor:
