@@ -1,8 +1,8 @@
-"""Time of the Laplacian pyramid and of the sensor, by matrices and by Kornia, with gradients and without, in one run.
+"""Time of the pyramid, the sensor and the blur of saliency by matrices and by Kornia, with gradients and without.
 
 `semfov.sensor.pyramid` takes Kornia's functions on devices where this does not show its own matrices ahead. Both are
-run here whatever it takes. A figure is the ratio of Kornia's time to that of the matrices in the same repetition, as
-median and quartiles: above 1 the matrices are faster. With one thread times are the processor's.
+run here, in one run, whatever it takes. A figure is the ratio of Kornia's time to that of the matrices in the same
+repetition, as median and quartiles: above 1 the matrices are faster. With one thread times are the processor's.
 
 python -m benchmarks.pyramid
 """
@@ -12,14 +12,18 @@ from collections.abc import Callable, Collection
 from unittest import mock
 
 import torch
+from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from benchmarks.images import use_threads
 from benchmarks.tables import comparison_rows, table
 from benchmarks.timing import Clock, Comparison, clock_for, measure
+from semfov.gaze.saliency.blur import gaussian_blur, gaussian_kernel
 from semfov.sensor import foveate, laplacian_pyramid, pyramid
 
 LEVELS = 4
+# Of VOCUS2: from its centre to its surround.
+SIGMA = (6.0**2 - 2.0**2) ** 0.5
 # All halve evenly so often, as Kornia needs.
 SHAPES = ((1, 3, 480, 640), (4, 3, 416, 416), (16, 3, 64, 64))
 
@@ -34,6 +38,16 @@ def view(image: Tensor) -> Tensor:
     """The sensor, its pyramid included."""
     gaze = torch.tensor([image.shape[-1] / 3, image.shape[-2] / 2], device=image.device)
     return foveate(image, gaze, sigma=image.shape[-1] / 6, levels=LEVELS).square().sum()
+
+
+def blur(image: Tensor) -> Tensor:
+    """The blur of VOCUS2's surround."""
+    if image.device.type in pyramid._AHEAD:
+        blurred = gaussian_blur(image, SIGMA)
+    else:
+        taps = len(gaussian_kernel(SIGMA))
+        blurred = gaussian_blur2d(image, (taps, taps), (SIGMA, SIGMA), "replicate")
+    return blurred.square().sum()
 
 
 def run(work: Callable[[Tensor], Tensor], image: Tensor, ahead: Collection[str], gradients: bool) -> Tensor:
@@ -59,7 +73,7 @@ def compare(work: Callable[[Tensor], Tensor], shape: tuple[int, ...], device: st
     def kornia() -> Tensor:
         return run(work, image, (), gradients)
 
-    name = {split: "pyramid", view: "sensor"}[work]
+    name = {split: "pyramid", view: "sensor", blur: "blur"}[work]
     how = "forwards and backwards" if gradients else "inference"
     return Comparison(
         f"{name}, {' x '.join(map(str, shape))}, {how}",
@@ -73,11 +87,11 @@ def rows(device: str, seconds: float, clock: Clock) -> list[list[str]]:
     """One for each work, shape and kind of run."""
     comparisons = (
         compare(work, shape, device, gradients)
-        for work in (split, view)
+        for work in (split, view, blur)
         for shape in SHAPES
         for gradients in (True, False)
     )
-    return [row for each in comparisons for row in comparison_rows(measure(each, seconds, clock))]
+    return [[name, *row] for each in comparisons for name, _, *row in comparison_rows(measure(each, seconds, clock))]
 
 
 def main() -> None:
@@ -91,7 +105,7 @@ def main() -> None:
     on_cpu = options.device == "cpu"
     clock, times = clock_for(options.threads if on_cpu else 0)
     print(f"{options.device}, {options.threads} thread{'s' * (options.threads > 1)}, times {times}\n")
-    head = ["work", "peer", "matrices, ms", "Kornia, ms", "Kornia / matrices"]
+    head = ["work", "matrices, ms", "Kornia, ms", "Kornia / matrices"]
     print(table(head, rows(options.device, options.seconds, clock)))
 
 
