@@ -1,6 +1,7 @@
 """Gaussian and Laplacian pyramids in Kornia's and in OpenCV's convention, for images of any size."""
 
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Literal, get_args
 
 import torch
@@ -11,6 +12,8 @@ from semfov.sensor.lines import Lines, Taps, banded, constant, separable
 
 Convention = Literal["kornia", "opencv"]
 
+# Devices where `python -m benchmarks.pyramid` finds the matrices of `lines` ahead of Kornia, with gradients too.
+_AHEAD = frozenset({"cpu"})
 _BLUR = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 # Pixels read that lie under a tile of those made: fewer make the products slow, more multiply more zeros.
 _SHIFT = 8
@@ -55,6 +58,8 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
       resizing to half the size, rounded down (to at least 1 pixel).
     - `opencv`: `cv2.pyrDown`: the same taps at every second pixel, half the size rounded up.
 
+    On accelerators Kornia computes its own; on a CPU products of matrices are faster (`benchmarks.pyramid`).
+
     Args:
         image: `(B, C, H, W)`.
 
@@ -66,6 +71,8 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     """
     _check_image(image)
     lookup(convention, get_args(Convention), "pyramid convention")
+    if _runs_in_kornia(image, convention):
+        return _kornia().pyrdown(image.contiguous())
     down, across = (_reducing(count, convention, image.dtype, image.device) for count in image.shape[-2:])
     return separable(image, down, across)
 
@@ -76,6 +83,8 @@ def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia
     - `kornia`: bilinear resizing, then the 5 taps with reflected borders: `kornia.geometry.transform.pyrup` where
       `size` is twice the image's.
     - `opencv`: `cv2.pyrUp` with `dstsize=size`.
+
+    On accelerators Kornia computes what it defines; on a CPU products of matrices are faster (`benchmarks.pyramid`).
 
     Args:
         image: `(B, C, H, W)`.
@@ -89,6 +98,8 @@ def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia
     if convention == "opencv":
         for count, length in zip(image.shape[-2:], size, strict=True):
             check(0 <= 2 * count - length <= 1, "size", f"{2 * count} or {2 * count - 1} for {count} pixels", length)
+    if _runs_in_kornia(image, convention, size):
+        return _kornia().pyrup(image.contiguous())
     lengths = zip(image.shape[-2:], size, strict=True)
     down, across = (_expanding(count, length, convention, image.dtype, image.device) for count, length in lengths)
     return separable(image, down, across)
@@ -119,6 +130,30 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
         details.append(image - expanded if fresh else torch.sub(image, expanded, out=expanded))
         image = smaller
     return Bands(tuple(details), image, convention)
+
+
+def _runs_in_kornia(image: Tensor, convention: Convention, size: tuple[int, int] | None = None) -> bool:
+    """Whether Kornia makes the next level of `image`, or enlarges it to `size`, rather than the matrices of `lines`.
+
+    It does in its own convention, on devices where `benchmarks.pyramid` does not show ours ahead, with gradients and
+    without. What it does not define stays ours: levels of fewer than three pixels along an axis, and enlargement to
+    other than twice the size. So does what it would make less exact or less repeatable than asked for.
+    """
+    if convention != "kornia" or image.device.type in _AHEAD:
+        return False
+    channels, height, width = image.shape[-3:]
+    # Of a single channel the convolution is no depthwise one, which CUDA rounds to ten bits unless told otherwise; and
+    # the gradient of reflected borders has no deterministic algorithm there.
+    if channels == 1 or torch.are_deterministic_algorithms_enabled():
+        return False
+    return min(height, width) > 2 if size is None else min(height, width) > 1 and tuple(size) == (2 * height, 2 * width)
+
+
+def _kornia() -> ModuleType:
+    """Kornia's geometry, imported when first needed: it takes a quarter of a second."""
+    import kornia.geometry.transform
+
+    return kornia.geometry.transform
 
 
 def _check_image(image: Tensor) -> None:

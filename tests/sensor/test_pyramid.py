@@ -6,8 +6,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from semfov import foveate
 from semfov.errors import InputError
-from semfov.sensor import laplacian_pyramid, pyrdown, pyrup
+from semfov.sensor import laplacian_pyramid, pyramid, pyrdown, pyrup
 
 CONVENTIONS = ("kornia", "opencv")
 SIZES = [(1, 1), (1, 2), (2, 1), (2, 2), (1, 9), (3, 3), (4, 4), (5, 4), (6, 7), (13, 8), (37, 50), (64, 64)]
@@ -35,6 +36,96 @@ def test_kornia_pyrdown(size, device):
 def test_kornia_pyrup(size, device):
     image = draw(2, 3, *size, dtype=torch.float32, device=device)
     close(pyrup(image, (2 * size[0], 2 * size[1])), kornia.pyrup(image))
+
+
+@pytest.fixture
+def in_kornia(monkeypatch):
+    """Let Kornia compute what it defines on every device, as it does on accelerators."""
+    monkeypatch.setattr(pyramid, "_AHEAD", frozenset())
+
+
+def levels_of(image, levels=4):
+    bands = laplacian_pyramid(image, levels)
+    return [*bands.details, bands.base]
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-10)])
+@pytest.mark.parametrize("size", [*SIZES, *LARGE, (480, 640)])
+def test_computed_by_kornia_or_not(monkeypatch, dtype, tolerance, size, device):
+    image = draw(2, 3, *size, dtype=dtype, device=device)
+    results = []
+    for ahead in (frozenset(), frozenset({device.type})):
+        monkeypatch.setattr(pyramid, "_AHEAD", ahead)
+        results.append(levels_of(image))
+    for by_kornia, by_matrices in zip(*results, strict=True):
+        assert by_kornia.dtype == dtype
+        close(by_kornia, by_matrices, tolerance)
+
+
+@pytest.mark.parametrize("requires_grad", [False, True])
+def test_kornia_runs_where_it_may(monkeypatch, requires_grad):
+    called = []
+    for name in ("pyrdown", "pyrup"):
+        function = getattr(kornia, name)
+        monkeypatch.setattr(kornia, name, lambda image, f=function, n=name: called.append(n) or f(image))
+    image = draw(1, 3, 32, 48).requires_grad_(requires_grad)
+    levels_of(image)
+    assert called == [], "on a CPU ours is faster, with gradients too"
+    monkeypatch.setattr(pyramid, "_AHEAD", frozenset())
+    levels_of(image)
+    assert called == ["pyrdown", "pyrup"] * 4
+    called.clear()
+    laplacian_pyramid(image, 2, "opencv")
+    levels_of(image[:, :1])
+    laplacian_pyramid(image[..., :2], 1)
+    pyrup(image, (64, 95))
+    torch.use_deterministic_algorithms(True)
+    try:
+        levels_of(image)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert called == []
+
+
+@pytest.mark.usefixtures("in_kornia")
+@pytest.mark.parametrize("size", [(6, 5), (12, 7)])
+def test_gradients_by_kornia(size):
+    image = draw(1, 2, *size).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: levels_of(x, 2), image)
+
+
+@pytest.mark.usefixtures("in_kornia")
+def test_gradients_of_the_sensor_by_kornia():
+    image = draw(1, 2, 8, 12).requires_grad_()
+    gaze = (4 * draw(1, 3, 2)).requires_grad_()
+    sigma = torch.tensor(3.0, dtype=torch.float64, requires_grad=True)
+    sensor = lambda image, gaze, sigma: foveate(image, gaze, sigma=sigma, levels=2)  # noqa: E731
+    assert torch.autograd.gradcheck(sensor, (image, gaze, sigma))
+
+
+@pytest.mark.usefixtures("in_kornia")
+@pytest.mark.parametrize("requires_grad", [False, True])
+def test_compiles_to_one_graph_by_kornia(requires_grad):
+    image, gaze = draw(1, 2, 40, 36).requires_grad_(requires_grad), 20 * draw(1, 3, 2)
+    torch.compiler.reset()
+
+    def sensor(image, gaze):
+        return foveate(image, gaze, sigma=7.0, levels=3)
+
+    compiled = torch.compile(sensor, fullgraph=True, backend="eager")
+    close(compiled(image, gaze), sensor(image, gaze), 1e-12)
+
+
+@pytest.mark.usefixtures("in_kornia")
+def test_strided_images_empty_batches_and_vmap_by_kornia():
+    image = draw(2, 3, 20, 24)
+    expected = levels_of(image, 2)
+    for same in (image.contiguous(memory_format=torch.channels_last), image.mT.contiguous().mT):
+        for a, b in zip(levels_of(same, 2), expected, strict=True):
+            close(a, b, 1e-14)
+    mapped = torch.func.vmap(lambda plane: levels_of(plane[None], 2)[-1][0])(image)
+    close(mapped, expected[-1], 1e-14)
+    assert [level.shape[0] for level in levels_of(image[:0], 2)] == [0, 0, 0]
 
 
 @pytest.mark.parametrize("levels", [1, 3, 5])

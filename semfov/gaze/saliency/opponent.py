@@ -1,4 +1,4 @@
-"""Opponent colours, as either model has them."""
+"""Opponent colours, as either model has them, and CIELAB."""
 
 import torch
 from torch import Tensor
@@ -32,6 +32,30 @@ def opponent_colours(image: Tensor) -> Tensor:
     check_image(image)
     red, green, blue = image.unbind(1)
     return torch.stack([(red + green + blue) / 3, red - green, blue - (red + green) / 2], 1)
+
+
+def lab_colours(image: Tensor) -> Tensor:
+    r"""CIELAB of sRGB (`kornia.color.rgb_to_lab`: illuminant D65, observer of 2°), scaled.
+
+    .. math:: (L^* / 100, \; a^* / 255, \; b^* / 255)
+
+    The scale is that of OpenCV's bytes divided by 255, as in the program of VOCUS2's authors. Their rounding and their
+    offset to the opponencies, which no contrast depends on, are left out.
+
+    Args:
+        image: `(B, 3, H, W)`, RGB in [0, 1].
+
+    Returns:
+        `(B, 3, H, W)`: lightness, red-green and blue-yellow opponency, positive for red and for yellow.
+
+    >>> lab_colours(torch.ones(1, 3, 1, 1))[0, 0].round(decimals=4)
+    tensor([[1.]])
+    """
+    # Imported when first needed: Kornia takes a quarter of a second.
+    from kornia.color import rgb_to_lab
+
+    check_image(image)
+    return rgb_to_lab(image) / image.new_tensor([100.0, 255.0, 255.0])[:, None, None]
 
 
 def double_opponency(image: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """VOCUS2: saliency as the contrast of two Gaussian pyramids, centre and surround."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -9,7 +9,12 @@ from torch.nn import functional as F
 from semfov.errors import check, check_shape, lookup
 from semfov.gaze.saliency.blur import gaussian_blur
 from semfov.gaze.saliency.fusion import Fusion, fuse, rescale
-from semfov.gaze.saliency.opponent import anchor, opponent_colours
+from semfov.gaze.saliency.opponent import anchor, lab_colours, opponent_colours
+
+ColorSpace = Literal["opponent", "lab"]
+
+# Maps of `lab` with a smaller range, in units of the rounding error at 1, hold nothing else.
+_FLAT = 8
 
 
 class Twin(NamedTuple):
@@ -88,6 +93,7 @@ def vocus2_saliency(
     layers: int = 5,
     scales: int = 2,
     fusion: Fusion = "mean",
+    color_space: ColorSpace = "opponent",
     normalise: bool = True,
 ) -> Tensor:
     """Saliency by VOCUS2 (Frintrop, Werner and Martin García, "Traditional saliency reloaded", CVPR 2015).
@@ -105,6 +111,9 @@ def vocus2_saliency(
         layers: layers of the pyramids, each half the one before.
         scales: scales of a layer.
         fusion: `mean` or `max`, within and across features.
+        color_space: `opponent`, the intensity and two opponencies of Frintrop, Werner and Martin García
+            (`semfov.gaze.saliency.opponent.opponent_colours`); or `lab`, CIELAB, which the authors' program offers too
+            (`lab_colours` there). The program rounds CIELAB to bytes. Values that are not rounded are ours.
         normalise: stretch every map to [0, 1].
 
     Returns:
@@ -117,14 +126,16 @@ def vocus2_saliency(
     True
     """
     lookup(fusion, ("mean", "max"), "fusion")
+    lookup(color_space, get_args(ColorSpace), "color space")
     # Products of single precision: contrasts are small differences.
     with torch.autocast(image.device.type, enabled=False):
-        pyramids = twin_pyramids(
-            anchor(opponent_colours(image)), centre_sigma, surround_sigma, layers=layers, scales=scales
-        )
+        channels = opponent_colours(image) if color_space == "opponent" else lab_colours(image)
+        pyramids = twin_pyramids(anchor(channels), centre_sigma, surround_sigma, layers=layers, scales=scales)
         maps = [torch.cat([_contrasts(twin, fusion) for twin in twins], 1) for twins in pyramids]
         saliency = fuse(maps, (image.shape[-2], image.shape[-1]), fusion)
-    return rescale(saliency) if normalise else saliency
+    # A power may round differently from pixel to pixel: in `lab` a uniform image has contrasts of a few digits' error.
+    flat = 0.0 if color_space == "opponent" else _FLAT * torch.finfo(saliency.dtype).eps
+    return rescale(saliency, flat) if normalise else saliency
 
 
 class VOCUS2(nn.Module):
@@ -142,16 +153,19 @@ class VOCUS2(nn.Module):
         layers: int = 5,
         scales: int = 2,
         fusion: Fusion = "mean",
+        color_space: ColorSpace = "opponent",
         normalise: bool = True,
     ) -> None:
         super().__init__()
         _check_settings(centre_sigma, surround_sigma, layers, scales)
         lookup(fusion, ("mean", "max"), "fusion")
+        lookup(color_space, get_args(ColorSpace), "color space")
         self.centre_sigma = centre_sigma
         self.surround_sigma = surround_sigma
         self.layers = layers
         self.scales = scales
         self.fusion: Fusion = fusion
+        self.color_space: ColorSpace = color_space
         self.normalise = normalise
 
     def forward(self, image: Tensor) -> Tensor:
@@ -163,13 +177,15 @@ class VOCUS2(nn.Module):
             layers=self.layers,
             scales=self.scales,
             fusion=self.fusion,
+            color_space=self.color_space,
             normalise=self.normalise,
         )
 
     def extra_repr(self) -> str:
         """Settings, for `print`."""
         sigmas = f"centre_sigma={self.centre_sigma:g}, surround_sigma={self.surround_sigma:g}"
-        return f"{sigmas}, layers={self.layers}, scales={self.scales}, fusion={self.fusion!r}"
+        settings = f"layers={self.layers}, scales={self.scales}, fusion={self.fusion!r}"
+        return f"{sigmas}, {settings}, color_space={self.color_space!r}"
 
 
 def _contrasts(twin: Twin, fusion: Fusion) -> Tensor:

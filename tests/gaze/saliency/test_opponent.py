@@ -1,10 +1,13 @@
-"""Opponent colours against plain Python, pixel by pixel."""
+"""Opponent colours against plain Python, pixel by pixel, and CIELAB against scikit-image and OpenCV."""
 
+import cv2
+import numpy as np
 import pytest
 import torch
+from skimage import color
 
 from semfov.errors import InputError
-from semfov.gaze.saliency.opponent import anchor, double_opponency, opponent_colours
+from semfov.gaze.saliency.opponent import anchor, double_opponency, lab_colours, opponent_colours
 
 
 def test_opponent_colours(dtype: torch.dtype) -> None:
@@ -29,6 +32,19 @@ def test_double_opponency(dtype: torch.dtype) -> None:
             red, green = max(r - (g + b) / 2, 0), max(g - (r + b) / 2, 0)
             blue, yellow = max(b - (r + g) / 2, 0), max((r + g) / 2 - abs(r - g) / 2 - b, 0)
             assert got.tolist() == pytest.approx([intensity, red - green, blue - yellow], abs=2e-6)
+
+
+def test_lab(dtype: torch.dtype) -> None:
+    pixels = np.random.default_rng(0).random((20, 30, 3))
+    # Black, white and dark greys, where the formula has another branch.
+    pixels[0, :4] = np.array([0.0, 1.0, 0.001, 0.02])[:, None]
+    channels = lab_colours(torch.from_numpy(pixels).permute(2, 0, 1)[None].to(dtype))
+    assert channels.dtype == dtype
+    result = channels[0].permute(1, 2, 0).numpy()
+    np.testing.assert_allclose(result, color.rgb2lab(pixels) / (100, 255, 255), atol=2e-6)
+    # The program of VOCUS2's authors has OpenCV's bytes, with an offset.
+    coded = cv2.cvtColor((255 * pixels).round().astype(np.uint8), cv2.COLOR_RGB2Lab) / 255
+    np.testing.assert_allclose(result + np.array([0, 128, 128]) / 255, coded, atol=0.01)
 
 
 @pytest.mark.parametrize("level", [0.0, 1e-30, 0.3, 1.0])
@@ -61,6 +77,6 @@ def test_anchor_leaves_differences() -> None:
     ],
 )
 def test_bad_image(image: torch.Tensor) -> None:
-    for function in (opponent_colours, double_opponency):
+    for function in (opponent_colours, double_opponency, lab_colours):
         with pytest.raises(InputError, match="image: expected"):
             function(image)

@@ -1,9 +1,12 @@
 """VOCUS2 against the steps of its authors' program (Frintrop, Werner and Martín García, 2015), written with OpenCV."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import pytest
 import torch
+from skimage import color
 
 from semfov.errors import InputError
 from semfov.gaze.saliency import VOCUS2, vocus2_saliency
@@ -34,17 +37,24 @@ def opencv_pyramids(
     return pyramids
 
 
-def opencv_vocus2(image: np.ndarray, centre: float, surround: float, scales: int, fusion: str) -> np.ndarray:
-    """Feature maps, then conspicuity maps, then saliency, in [0, 1]."""
+def opponents(image: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Intensity and two opponencies."""
     red, green, blue = np.moveaxis(image, -1, 0)
+    return (red + green + blue) / 3, red - green, blue - (red + green) / 2
+
+
+def opencv_vocus2(
+    channels: Sequence[np.ndarray], centre: float, surround: float, scales: int, fusion: str
+) -> np.ndarray:
+    """Feature maps, then conspicuity maps, then saliency, in [0, 1]."""
     join = np.mean if fusion == "mean" else np.max
     conspicuities = []
-    for channel in ((red + green + blue) / 3, red - green, blue - (red + green) / 2):
+    for channel in channels:
         pyramids = opencv_pyramids(channel, centre, surround, 5, scales)
         features = []
         for sign in (1, -1):
             contrasts = [np.maximum(sign * (c - s), 0) for layer in pyramids for c, s in layer]
-            size = image.shape[1::-1]
+            size = channel.shape[::-1]
             enlarged = [cv2.resize(each, size, interpolation=cv2.INTER_CUBIC) for each in contrasts]
             features.append(join(enlarged, axis=0))
         conspicuities.append(join(features, axis=0))
@@ -83,18 +93,30 @@ def test_saliency_is_opencvs(
     image = torch.from_numpy(photograph).permute(2, 0, 1)[None].to(dtype)
     saliency = VOCUS2(centre, surround, scales=scales, fusion=fusion)(image)
     assert saliency.dtype == dtype
-    expected = opencv_vocus2(photograph, centre, surround, scales, fusion)
+    expected = opencv_vocus2(opponents(photograph), centre, surround, scales, fusion)
     np.testing.assert_allclose(saliency[0].numpy(), expected, atol=2e-5)
 
 
+def test_saliency_in_lab_is_that_of_scikit_images_lab(photograph: np.ndarray) -> None:
+    lab = color.rgb2lab(photograph) / (100, 255, 255)
+    expected = opencv_vocus2(np.moveaxis(lab, -1, 0), 2.0, 6.0, 2, "mean")
+    saliency = VOCUS2(color_space="lab")(torch.from_numpy(photograph).permute(2, 0, 1)[None])
+    np.testing.assert_allclose(saliency[0].numpy(), expected, atol=2e-5)
+    assert np.abs(expected - opencv_vocus2(opponents(photograph), 2.0, 6.0, 2, "mean")).max() > 0.05
+
+
+@pytest.mark.parametrize("color_space", ["opponent", "lab"])
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (2, 3), (7, 5), (33, 200)])
-def test_any_size_and_uniform_images(size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> None:
+def test_any_size_and_uniform_images(
+    size: tuple[int, int], color_space: str, dtype: torch.dtype, device: torch.device
+) -> None:
     image = torch.rand(1, 3, *size, dtype=dtype, device=device)
-    saliency = vocus2_saliency(image)
+    saliency = vocus2_saliency(image, color_space=color_space)
     assert saliency.shape == (1, *size)
     assert torch.isfinite(saliency).all()
     for fusion in ("mean", "max"):
-        assert vocus2_saliency(image[..., :1, :1].expand_as(image), fusion=fusion).abs().max() == 0
+        uniform = image[..., :1, :1].expand_as(image)
+        assert vocus2_saliency(uniform, fusion=fusion, color_space=color_space).abs().max() == 0
 
 
 def test_batch_is_a_loop(dtype: torch.dtype, device: torch.device) -> None:
@@ -121,9 +143,11 @@ def test_saliency_is_linear_in_contrast(photograph: np.ndarray) -> None:
 
 @pytest.mark.parametrize("fusion", ["mean", "max"])
 @pytest.mark.parametrize("normalise", [True, False])
-def test_gradients(fusion: str, normalise: bool) -> None:
+@pytest.mark.parametrize("color_space", ["opponent", "lab"])
+def test_gradients(fusion: str, normalise: bool, color_space: str) -> None:
     image = torch.rand(1, 3, 6, 7, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(VOCUS2(1.0, 2.0, fusion=fusion, normalise=normalise), image)
+    model = VOCUS2(1.0, 2.0, fusion=fusion, normalise=normalise, color_space=color_space)
+    assert torch.autograd.gradcheck(model, image)
 
 
 def test_nothing_is_written_in_place_and_views_are_welcome() -> None:
@@ -134,9 +158,9 @@ def test_nothing_is_written_in_place_and_views_are_welcome() -> None:
     assert torch.equal(picture, before)
 
 
-@pytest.mark.parametrize("fusion", ["mean", "max"])
-def test_compilation(fusion: str) -> None:
-    model, image = VOCUS2(fusion=fusion), torch.rand(1, 3, 33, 70)
+@pytest.mark.parametrize(("fusion", "color_space"), [("mean", "opponent"), ("max", "opponent"), ("mean", "lab")])
+def test_compilation(fusion: str, color_space: str) -> None:
+    model, image = VOCUS2(fusion=fusion, color_space=color_space), torch.rand(1, 3, 33, 70)
     compiled = torch.compile(model, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(image), model(image))
 
@@ -151,12 +175,13 @@ def test_compilation(fusion: str) -> None:
         {"layers": 0},
         {"scales": 0},
         {"fusion": "sum"},
+        {"color_space": "lap"},
     ],
 )
 def test_bad_settings(settings: dict[str, object]) -> None:
-    with pytest.raises(InputError, match=r"sigma|layers|scales|fusion"):
+    with pytest.raises(InputError, match=r"sigma|layers|scales|fusion|color space"):
         VOCUS2(**settings)
-    with pytest.raises(InputError, match=r"sigma|layers|scales|fusion"):
+    with pytest.raises(InputError, match=r"sigma|layers|scales|fusion|color space"):
         vocus2_saliency(torch.rand(1, 3, 8, 8), **settings)
 
 
@@ -168,4 +193,5 @@ def test_bad_image() -> None:
 
 
 def test_settings_are_shown() -> None:
-    assert repr(VOCUS2(3, 13)) == "VOCUS2(centre_sigma=3, surround_sigma=13, layers=5, scales=2, fusion='mean')"
+    expected = "VOCUS2(centre_sigma=3, surround_sigma=13, layers=5, scales=2, fusion='mean', color_space='opponent')"
+    assert repr(VOCUS2(3, 13)) == expected

@@ -1,0 +1,104 @@
+"""Foveation at random places, as an augmentation of Kornia's."""
+
+from math import inf
+from typing import Any, get_args
+
+import torch
+from kornia.augmentation import IntensityAugmentationBase2D
+from kornia.augmentation.random_generator import PlainUniformGenerator
+from torch import Tensor
+
+from semfov.errors import check, lookup
+from semfov.sensor.foveation import foveate
+from semfov.sensor.pyramid import Convention
+
+
+class RandomFoveation(IntensityAugmentationBase2D):
+    r"""Foveate every image of a batch around a place drawn at random, with a fovea of random width.
+
+    .. math:: x_0 \sim U[-\tfrac12, W - \tfrac12], \quad y_0 \sim U[-\tfrac12, H - \tfrac12], \quad
+              \sigma \sim U[\sigma_{min}, \sigma_{max}]
+
+    and then `semfov.foveate`. It trains a network for views that are sharp anywhere. No pixel moves: boxes, masks and
+    keypoints stay as they are. Kornia's other augmentations say how `p`, `same_on_batch` and `keepdim` work, and what
+    draws depend on: torch's global generator. (The distributions are ours.)
+
+    What was drawn is in `_params`: `gaze`, `(B, 2)`, fixations `(x, y)` in image pixels, and `sigma`, `(B,)`, in
+    pixels. Handed back as `params`, it gives the same views again. They are differentiable in the image and, with
+    `params` of one's own, in the fixations and widths.
+
+    Args:
+        sigma: width σ of the fovea in image pixels, or the least and the largest.
+        levels: number of bands of the pyramid.
+        growth: factor by which the window of each coarser band is wider.
+        convention: `kornia` or `opencv` pyramid.
+        same_on_batch: one fixation and one width for all images of a batch.
+        p: probability that an image is foveated; the others come back as they are.
+        keepdim: give an image `(C, H, W)` back as such.
+
+    Shape:
+        `(C, H, W)` or `(B, C, H, W)`, floating-point; the result is `(B, C, H, W)`.
+
+    Raises:
+        InputError: a setting is not what it should be.
+
+    >>> augment = RandomFoveation((20.0, 60.0), p=1.0)
+    >>> image = torch.rand(2, 3, 48, 64)
+    >>> view = augment(image)
+    >>> augment._params["gaze"].shape, augment._params["sigma"].shape
+    (torch.Size([2, 2]), torch.Size([2]))
+    >>> torch.equal(augment(image, params=augment._params), view)
+    True
+
+    Beside other augmentations, with boxes:
+
+    >>> from kornia.augmentation import AugmentationSequential, RandomHorizontalFlip
+    >>> both = AugmentationSequential(RandomHorizontalFlip(), RandomFoveation(30.0), data_keys=["input", "bbox_xyxy"])
+    >>> view, boxes = both(image, torch.tensor([[[4.0, 8.0, 20.0, 30.0]]] * 2))
+    """
+
+    def __init__(
+        self,
+        sigma: float | tuple[float, float],
+        levels: int = 5,
+        growth: float = 2.0,
+        convention: Convention = "kornia",
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+    ) -> None:
+        super().__init__(p=p, same_on_batch=same_on_batch, keepdim=keepdim)
+        low, high = sigma if isinstance(sigma, tuple | list) else (sigma, sigma)
+        check(0 < low <= high < inf, "sigma", "a positive number, or the least and the largest", sigma)
+        check(levels >= 0, "levels", "0 or more", levels)
+        check(growth > 0, "growth", "a positive number", growth)
+        check(0 <= p <= 1, "p", "a probability", p)
+        lookup(convention, get_args(Convention), "pyramid convention")
+        self._param_generator = _Fixations(float(low), float(high))
+        self.flags = {"levels": levels, "growth": growth, "convention": convention}
+
+    def apply_transform(
+        self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Tensor:
+        """Foveate a batch around what was drawn."""
+        # Containers add flags of their own.
+        settings = {name: flags[name] for name in ("levels", "growth", "convention")}
+        return foveate(input, params["gaze"], sigma=params["sigma"], **settings)
+
+
+class _Fixations(PlainUniformGenerator):
+    """Draws fixations anywhere on an image, and widths."""
+
+    def __init__(self, low: float, high: float) -> None:
+        whole = (0.0, 1.0)
+        super().__init__(((low, high), "sigma", None, None), (whole, "x", None, None), (whole, "y", None, None))
+
+    def __repr__(self) -> str:
+        return f"sigma={self.samplers[0][0]}"
+
+    def forward(self, batch_shape: tuple[int, ...], same_on_batch: bool = False) -> dict[str, Tensor]:
+        """`gaze`, `(B, 2)`, and `sigma`, `(B,)`, for images `(B, C, H, W)`."""
+        drawn = super().forward(batch_shape, same_on_batch)
+        # Pixels are areas around whole numbers.
+        x, y = (drawn[name] * n - 0.5 for name, n in (("x", batch_shape[-1]), ("y", batch_shape[-2])))
+        return {"sigma": drawn["sigma"], "gaze": torch.stack([x, y], -1)}

@@ -1,0 +1,174 @@
+"""Random foveation as Kornia's augmentations behave, and against `foveate`."""
+
+import copy
+import math
+
+import pytest
+import torch
+from kornia.augmentation import AugmentationSequential, RandomHorizontalFlip
+from torch.utils.data import DataLoader
+
+import semfov.sensor
+from semfov import foveate
+from semfov.errors import InputError
+from semfov.sensor import RandomFoveation
+
+
+def draw(*shape, dtype=torch.float32, device=None):
+    return torch.rand(shape, dtype=dtype, generator=torch.Generator().manual_seed(sum(shape))).to(device)
+
+
+@pytest.mark.parametrize("settings", [{}, {"levels": 3, "growth": 1.0, "convention": "opencv"}])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_foveates_around_what_it_drew(settings, dtype, device):
+    image = draw(3, 3, 40, 56, dtype=dtype, device=device)
+    augment = RandomFoveation((5.0, 9.0), p=1.0, **settings)
+    view = augment(image)
+    gaze, sigma = augment._params["gaze"], augment._params["sigma"]
+    assert gaze.shape == (3, 2)
+    assert sigma.shape == (3,)
+    assert len(gaze.unique(dim=0)) == len(sigma.unique()) == 3
+    assert view.dtype == dtype
+    assert view.device.type == device.type
+    for b in range(3):
+        one = foveate(image[b : b + 1], gaze[b].to(device), sigma=sigma[b].item(), **settings)
+        torch.testing.assert_close(view[b : b + 1], one, rtol=0, atol=1e-6)
+
+
+def test_draws_are_uniform_over_the_image():
+    augment = RandomFoveation((5.0, 9.0), p=1.0)
+    torch.manual_seed(0)
+    drawn = augment.forward_parameters(torch.Size([20000, 3, 30, 50]))
+    for values, low, high in (
+        (drawn["gaze"][:, 0], -0.5, 49.5),
+        (drawn["gaze"][:, 1], -0.5, 29.5),
+        (drawn["sigma"], 5.0, 9.0),
+    ):
+        # Kolmogorov and Smirnov's distance; it is larger than this for one seed in a million.
+        share = ((values.double() - low) / (high - low)).sort().values
+        assert 0 <= share[0] <= share[-1] <= 1
+        distance = (share - (torch.arange(20000) + 0.5) / 20000).abs().max()
+        assert distance < 2.7 / math.sqrt(20000)
+    # Fixations and widths have nothing to do with each other.
+    together = torch.corrcoef(torch.cat([drawn["gaze"], drawn["sigma"][:, None]], 1).T)
+    assert (together - torch.eye(3)).abs().max() < 0.04
+
+
+def test_same_on_batch():
+    image = draw(1, 3, 24, 32).expand(4, -1, -1, -1)
+    augment = RandomFoveation((3.0, 30.0), same_on_batch=True, p=1.0)
+    view = augment(image)
+    assert len(augment._params["gaze"].unique(dim=0)) == len(augment._params["sigma"].unique()) == 1
+    torch.testing.assert_close(view, view[:1].expand_as(view))
+
+
+def test_parameters_and_seeds_repeat_it():
+    image = draw(4, 3, 24, 32)
+    augment = RandomFoveation((3.0, 30.0))
+    torch.manual_seed(3)
+    view = augment(image)
+    params = copy.deepcopy(augment._params)
+    assert not torch.equal(augment(image), view)
+    assert torch.equal(augment(image, params=params), view)
+    torch.manual_seed(3)
+    assert torch.equal(RandomFoveation((3.0, 30.0))(image), view)
+
+
+def test_probability():
+    image = draw(200, 1, 6, 7)
+    assert torch.equal(RandomFoveation(1.0, p=0.0)(image), image)
+    augment = RandomFoveation(1.0, p=0.3)
+    torch.manual_seed(0)
+    changed = (augment(image) != image).flatten(1).any(1)
+    assert torch.equal(changed, augment._params["batch_prob"] > 0.5)
+    assert 30 < changed.sum() < 90
+
+
+@pytest.mark.parametrize("keepdim", [False, True])
+def test_one_image(keepdim):
+    image = draw(3, 24, 32)
+    assert RandomFoveation(5.0, p=1.0, keepdim=keepdim)(image).shape == (image.shape if keepdim else (1, 3, 24, 32))
+
+
+def test_gradients():
+    augment = RandomFoveation((3.0, 6.0), levels=2, p=1.0)
+    image = draw(2, 1, 6, 7, dtype=torch.float64).requires_grad_()
+    augment(image)
+    drawn = augment._params
+    gaze, sigma = (drawn[name].double().requires_grad_() for name in ("gaze", "sigma"))
+
+    def view(image, gaze, sigma):
+        return augment(image, params=drawn | {"gaze": gaze, "sigma": sigma})
+
+    assert torch.autograd.gradcheck(view, (image, gaze, sigma))
+
+
+def test_beside_boxes_masks_and_keypoints(device):
+    image, mask = draw(2, 3, 40, 56, device=device), (draw(2, 1, 40, 56, device=device) > 0.5).float()
+    boxes = torch.tensor([[[3.0, 4.0, 20.0, 30.0], [0.0, 0.0, 55.0, 39.0]]], device=device).expand(2, 2, 4)
+    points = 30 * draw(2, 5, 2, device=device)
+    augment = AugmentationSequential(
+        RandomFoveation((4.0, 8.0), p=1.0), data_keys=["input", "bbox_xyxy", "mask", "keypoints"]
+    )
+    view, *rest = augment(image, boxes, mask, points)
+    assert not torch.equal(view, image)
+    for now, then in zip(rest, (boxes, mask, points), strict=True):
+        assert torch.equal(now, then)
+    again, *_ = augment(image, boxes, mask, points, params=augment._params)
+    assert torch.equal(again, view)
+
+
+def test_behind_a_flip_the_flip_moves_the_boxes():
+    image, boxes = draw(2, 3, 40, 56), torch.tensor([[[3.0, 4.0, 20.0, 30.0]]]).expand(2, 1, 4)
+    keys = ["input", "bbox_xyxy"]
+    both = AugmentationSequential(RandomHorizontalFlip(p=1.0), RandomFoveation(6.0, p=1.0), data_keys=keys)
+    view, moved = both(image, boxes)
+    _, expected = AugmentationSequential(RandomHorizontalFlip(p=1.0), data_keys=keys)(image, boxes)
+    torch.testing.assert_close(moved, expected)
+    gaze = both._params[1].data["gaze"]
+    torch.testing.assert_close(view, foveate(image.flip(-1), gaze, sigma=6.0))
+
+
+def test_compiles_to_one_graph():
+    image = draw(2, 3, 24, 32)
+    augment = RandomFoveation((3.0, 30.0), p=1.0)
+    augment(image)
+    params = copy.deepcopy(augment._params)
+    torch.compiler.reset()
+    compiled = torch.compile(augment, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(image, params=params), augment(image, params=params))
+
+
+def test_in_a_data_set():
+    augment = RandomFoveation(5.0, p=1.0, keepdim=True)
+    loader = DataLoader([(augment(draw(3, 16, 20)), 0)] * 2, batch_size=2)
+    assert next(iter(loader))[0].shape == (2, 3, 16, 20)
+
+
+def test_settings_are_shown():
+    text = repr(RandomFoveation((3.0, 30.0), levels=4))
+    assert text.startswith("RandomFoveation(sigma=(3.0, 30.0), p=0.5, ")
+    assert "levels=4, growth=2.0, convention=kornia" in text
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"sigma": 0.0}, "sigma: expected a positive number"),
+        ({"sigma": (5.0, 4.0)}, "sigma: expected"),
+        ({"sigma": math.inf}, "sigma: expected"),
+        ({"sigma": math.nan}, "sigma: expected"),
+        ({"levels": -1}, "levels: expected 0 or more"),
+        ({"growth": 0.0}, "growth: expected a positive number"),
+        ({"p": 1.5}, "p: expected a probability"),
+        ({"convention": "korina"}, "did you mean 'kornia'"),
+    ],
+)
+def test_bad_settings(settings, message):
+    with pytest.raises(InputError, match=message):
+        RandomFoveation(**{"sigma": 3.0} | settings)
+
+
+def test_no_other_name_is_made_up():
+    with pytest.raises(AttributeError, match="RandomFixation"):
+        _ = semfov.sensor.RandomFixation
