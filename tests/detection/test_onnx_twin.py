@@ -129,6 +129,18 @@ def test_other_precisions_take_torch(make, looks):
     torch.testing.assert_close(found.classes.double(), exact.classes, atol=1e-5, rtol=0)
 
 
+def test_other_devices_and_tensors_of_other_kinds_take_torch(make, looks):
+    class Marked(torch.Tensor):
+        pass
+
+    detector, canvas = make(), canvases(1, 3, 32, 64)
+    marked = detector.propose(canvas.as_subclass(Marked)).classes
+    torch.testing.assert_close(marked.as_subclass(torch.Tensor), make("torch").propose(canvas).classes)
+    assert detector.to("meta").propose(canvas.to("meta")).boxes.is_meta
+    assert detector.settings()["runtime"] == "torch"
+    assert not looks
+
+
 def test_changed_weights_take_torch(make, looks):
     detector, network, canvas = make(), make("torch"), canvases(1, 3, 32, 64)
     before = detector.propose(canvas).classes
