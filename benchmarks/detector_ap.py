@@ -112,15 +112,15 @@ def main() -> None:
     parser.add_argument("--annotations", type=Path, required=True, help="COCO annotation file")
     parser.add_argument("--stride", type=int, help="pad the canvas to a multiple of it; 0: the whole canvas")
     parser.add_argument("--multilabel", action="store_true", help="let a box count for every class")
-    parser.add_argument("--direct", action="store_true", help="plain convolutions instead of Winograd's (Darknet)")
+    parser.add_argument("--runtime", help="what computes a Darknet network: auto, torch or onnxruntime")
     arguments = parser.parse_args()
     options: dict[str, Any] = {}
     if arguments.weights:
         options["weights"] = arguments.weights
     if arguments.stride is not None:
         options["stride"] = arguments.stride or None
-    if arguments.direct:
-        options["winograd"] = False
+    if arguments.runtime:
+        options["runtime"] = arguments.runtime
     detector = load_detector(arguments.detector, **options)
     selections = list(SELECTIONS.values())
     scores = average_precision(

@@ -1,29 +1,27 @@
-"""Milliseconds per photograph of a Darknet detector, by three ways of computing its convolutions, in one run.
+"""Milliseconds per photograph of a Darknet detector in onnxruntime and in torch, side by side.
 
-Winograd's algorithm (the default on a CPU), plain torch in channels-last memory, and the same network exported to
-onnxruntime. Repetitions are interleaved and the least time is reported, so that other work on the machine disturbs
-little. `network` is the network alone; `all` has letterbox, decoding, suppression and score vectors with it.
+For the canvas of the photograph (padded to a multiple of 32 pixels, the default) and the whole square one. `network`
+goes from canvas to every candidate; `detect` adds suppression and score vectors; `all` adds the letterbox before.
+Repetitions are interleaved; a time is the median over them, a ratio, torch over onnxruntime within a repetition, stands
+with its quartiles.
 
-python -m benchmarks.detector_speed --detector yolov3-tiny --batch 1 4 --processes 2
+python -m benchmarks.detector_speed --detector yolov3-tiny --batch 1 4
 """
 
 import argparse
 import multiprocessing
-import tempfile
-import time
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from benchmarks.tables import number, spread, table
+from benchmarks.timing import Run, Spread, interleaved
 from semfov.detection import Detector
-from semfov.detection.export import export_onnx
-from semfov.detection.load import load_detector, load_yolo
+from semfov.detection.load import load_yolo
 from semfov.detection.placement import resize
 
-Run = Callable[[], object]
+RUNTIMES = ("onnxruntime", "torch")
 
 
 def photograph(width: int, height: int) -> Tensor:
@@ -33,67 +31,53 @@ def photograph(width: int, height: int) -> Tensor:
     return resize(torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255, (width, height))
 
 
-def detectors(name: str, weights: str | None, stride: int | None) -> dict[str, Detector]:
-    """The same detector three times."""
-    direct = load_yolo(name, weights=weights, stride=stride, winograd=False)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.onnx"
-        export_onnx(direct, path)
-        exported = load_detector(path)
-    winograd = load_yolo(name, weights=weights, stride=stride, winograd=True)
-    return {"torch, Winograd": winograd, "torch, direct": direct, "onnxruntime": exported}
+def programs(detector: Detector, images: Tensor) -> dict[str, Run]:
+    """What is timed, by its name."""
+    canvas, placement = detector.fit(images)
+    return {
+        "network": lambda: detector.propose(canvas),
+        "detect": lambda: detector.detect(canvas, placement),
+        "all": lambda: detector(images),
+    }
 
 
-def least_times(runs: dict[str, Run], repetitions: int) -> dict[str, float]:
-    """Least seconds of each run, over interleaved repetitions."""
-    best = dict.fromkeys(runs, float("inf"))
-    for _ in range(repetitions + 1):
-        for name, run in runs.items():
-            start = time.perf_counter()
-            run()
-            best[name] = min(best[name], time.perf_counter() - start)
-    return best
-
-
-@torch.no_grad()
-def measure(arguments: argparse.Namespace) -> dict[tuple[str, int], tuple[float, float]]:
-    """Milliseconds per photograph, of the network and of all, by backend and batch size."""
-    torch.set_num_threads(arguments.threads)
-    rows = {}
-    loaded = detectors(arguments.detector, arguments.weights, arguments.stride or None)
-    for batch in arguments.batch:
-        images = photograph(*arguments.size).expand(batch, -1, -1, -1).contiguous()
-        networks: dict[str, Run] = {}
-        whole: dict[str, Run] = {}
-        for name, detector in loaded.items():
-            canvas = detector.fit(images)[0]
-            networks[name] = lambda detector=detector, canvas=canvas: detector.propose(canvas)
-            whole[name] = lambda detector=detector, images=images: detector(images)
-        alone, together = least_times(networks, arguments.repetitions), least_times(whole, arguments.repetitions)
-        for name in loaded:
-            rows[name, batch] = (1e3 * alone[name] / batch, 1e3 * together[name] / batch)
+@torch.inference_mode()
+def measure(options: argparse.Namespace) -> list[list[str]]:
+    """Rows of the table."""
+    torch.set_num_threads(options.threads)
+    torch.empty(31 << 20, dtype=torch.uint8)  # freed, it has the C library keep memory, as in the evaluation's workers
+    rows = []
+    for stride in (32, None):
+        loaded = [load_yolo(options.detector, weights=options.weights, stride=stride, runtime=r) for r in RUNTIMES]
+        for batch in options.batch:
+            images = photograph(*options.size).expand(batch, -1, -1, -1).contiguous()
+            height, width = loaded[0].fit(images)[0].shape[-2:]
+            ours, theirs = (programs(detector, images) for detector in loaded)
+            for name in ours:
+                times = interleaved({"ours": ours[name], "theirs": theirs[name]}, 0, least=options.repetitions)
+                ratio = Spread.of([torchs / onnxs for onnxs, torchs in zip(*times.values(), strict=True)])
+                medians = [number(Spread.of(each).middle / batch) for each in times.values()]
+                rows.append([f"{width} × {height}", str(batch), name, *medians, spread(ratio)])
     return rows
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="milliseconds per photograph of a Darknet detector")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--detector", default="yolov3-tiny", help="yolov3-tiny, yolov3, yolov3-spp, or a cfg")
     parser.add_argument("--weights", help="weights file, for a cfg or instead of the published weights")
     parser.add_argument("--size", type=int, nargs=2, default=[640, 480], help="width and height of the photograph")
-    parser.add_argument("--stride", type=int, default=32, help="canvas padding; 0: the whole canvas")
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 4], help="photographs at once")
     parser.add_argument("--threads", type=int, default=1, help="threads of each process")
     parser.add_argument("--processes", type=int, default=1, help="processes that measure at the same time")
-    parser.add_argument("--repetitions", type=int, default=20)
-    arguments = parser.parse_args()
+    parser.add_argument("--repetitions", type=int, default=25)
+    options = parser.parse_args()
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(arguments.processes, mp_context=spawn) as pool:
-        results = list(pool.map(measure, [arguments] * arguments.processes))
-    print(f"{arguments.processes} processes of {arguments.threads} threads; milliseconds in one process")
-    print("| backend | batch | network | all |\n|---|---|---|---|")
-    for name, batch in results[0]:
-        network, whole = (max(result[name, batch][column] for result in results) for column in range(2))
-        print(f"| {name} | {batch} | {network:.1f} | {whole:.1f} |")
+    with ProcessPoolExecutor(options.processes, mp_context=spawn) as pool:
+        results = list(pool.map(measure, [options] * options.processes))
+    head = ["canvas", "batch", "what", "onnxruntime, ms per photograph", "torch", "torch / onnxruntime"]
+    for number_of, rows in enumerate(results, 1):
+        print(f"\nprocess {number_of} of {options.processes}, {options.threads} threads, {options.repetitions} times\n")
+        print(table(head, rows))
 
 
 if __name__ == "__main__":

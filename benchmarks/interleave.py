@@ -93,7 +93,7 @@ def in_turn(fixations: int = 10) -> Comparison:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "yolov3-tiny.onnx"
         with torch.inference_mode(False), torch.no_grad():
-            export_onnx(load_yolo("yolov3-tiny", winograd=False), path)
+            export_onnx(load_yolo("yolov3-tiny"), path)
         eye = Eye(semfov.Foveation(100.0), load(path, torch.get_num_threads(), spinning=False))
     view = eye.open(image)
 
@@ -229,7 +229,7 @@ def main() -> None:
         path = options.model
         if path is None:
             path = Path(folder) / "yolov3-tiny.onnx"
-            export_onnx(load_yolo("yolov3-tiny", winograd=False), path)
+            export_onnx(load_yolo("yolov3-tiny"), path)
         print(path.name)
         report_turns(path, image, options, clock)
         report_parts(path, image, options, clock)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from semfov.belief import Footprint, Memory
+from semfov.detection.onnx_twin import Runtime
 from semfov.detection.scores import BackgroundPolicy
 from semfov.gaze.saliency.cells import Reduction
 from semfov.sensor import SENSORS, Foveation, named_sensor
@@ -49,6 +50,7 @@ class DetectorConfig:
         stride: pad the view only to a multiple of this (None: to the detector's square input, as Darknet pads it;
             `auto`: what is fastest, 32 for Darknet's networks).
         input_size: longer side in pixels at which it works, for Darknet's networks (None: its own, 416).
+        runtime: what computes Darknet's networks: `torch`, `onnxruntime`, or what is faster (`auto`).
     """
 
     name: str = "yolov3-tiny"
@@ -59,6 +61,7 @@ class DetectorConfig:
     limit: int = 100
     stride: int | Literal["auto"] | None = "auto"
     input_size: int | None = None
+    runtime: Runtime = "auto"
 
 
 @dataclass(frozen=True)

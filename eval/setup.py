@@ -90,6 +90,8 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
         options["stride"] = detector.stride
     if detector.input_size is not None:
         options["input_size"] = detector.input_size
+    if detector.runtime != "auto":
+        options["runtime"] = detector.runtime
     model = semfov.load_detector(detector.name, **options)
     return Eye(sensor.make(), model, reference=sensor.reference).eval().requires_grad_(False)
 

@@ -45,7 +45,7 @@ def main() -> None:
         path = arguments.model
         if path is None:
             path = Path(folder) / "own.onnx"
-            export_onnx(semfov.load_detector("yolov3-tiny", winograd=False), path)
+            export_onnx(semfov.load_detector("yolov3-tiny"), path)
         detector = semfov.load_detector(path)
     print(f"{detector.name} knows {len(detector.classes)} classes and takes pictures of {detector.input_size}")
 

@@ -54,7 +54,7 @@ def test_public_surface():
 
 
 def test_import_is_light():
-    heavy = ["kornia", "onnxruntime", "pycocotools", "torchvision", "matplotlib", "skimage", "jsonargparse"]
+    heavy = ["kornia", "onnx", "onnxruntime", "pycocotools", "torchvision", "matplotlib", "skimage", "jsonargparse"]
     code = f"import sys, semfov; print([m for m in {heavy} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

@@ -1,5 +1,6 @@
 """Darknet networks as torch modules, built from the sections of a cfg."""
 
+import hashlib
 from collections.abc import Sequence
 
 import torch
@@ -8,7 +9,6 @@ from torch import Tensor, nn
 from semfov.detection.darknet_builder import Builder
 from semfov.detection.darknet_config import Section
 from semfov.detection.darknet_layers import Head
-from semfov.detection.winograd import WinogradConvolution
 from semfov.errors import DataError, check, check_shape
 
 
@@ -22,7 +22,8 @@ class Darknet(nn.Module):
         stride: both sides of an input must be multiples of it.
         heads: the yolo layers, in order.
         sections: what it was built from.
-        winograd: whether `use_winograd` was called.
+        sources: for each layer the layers that it reads; -1 is the image.
+        steps: for each layer, how many pixels of the image are one of its output.
 
     Shape:
         - input: `(B, C, H, W)`
@@ -36,7 +37,6 @@ class Darknet(nn.Module):
     def __init__(self, sections: Sequence[Section]) -> None:
         super().__init__()
         self.sections = tuple(sections)
-        self.winograd = False
         if not sections or sections[0].kind not in ("net", "network"):
             raise DataError("cfg: expected [net] as its first section")
         self.input_size = (sections[0].integer("width", 416), sections[0].integer("height", 416))
@@ -47,20 +47,18 @@ class Darknet(nn.Module):
         if not self.heads:
             raise DataError(f"{sections[0].where}: expected at least one [yolo] section, got none")
         self.stride = max(-(-shape.step.numerator // shape.step.denominator) for shape in builder.shapes)
-        self._sources = builder.sources
+        self.sources = builder.sources
+        self.steps = [shape.step for shape in builder.shapes]
         # The layer after which an output is needed no more; the maps of the heads are what the network returns.
         self._last_reader = {index: index for index in range(-1, len(self.layers))}
-        self._last_reader |= {source: index for index, read in enumerate(self._sources) for source in read}
+        self._last_reader |= {source: index for index, read in enumerate(self.sources) for source in read}
         self._last_reader |= {i: len(self.layers) for i, layer in enumerate(self.layers) if isinstance(layer, Head)}
         # The first layers have maps so large that a CPU is faster with one image of a batch after the other.
         self._stem = next((index for index, shape in enumerate(builder.shapes) if shape.step >= 8), 0)
 
     def forward(self, image: Tensor) -> list[Tensor]:
         """Raw maps of the heads."""
-        check_shape(image, "image", None, self.channels, None, None)
-        height, width = image.shape[-2:]
-        fits = height % self.stride == 0 and width % self.stride == 0 and height * width > 0
-        check(fits, "image", f"sides that are multiples of {self.stride}", f"{width} x {height}")
+        self.check_image(image)
         image = image.contiguous(memory_format=torch.channels_last)
         stem = self._stem if image.device.type == "cpu" and image.shape[0] > 1 else 0
         outputs = {-1: image}
@@ -70,21 +68,22 @@ class Darknet(nn.Module):
         outputs = self._run(outputs, stem, len(self.layers))
         return [outputs[index] for index, layer in enumerate(self.layers) if isinstance(layer, Head)]
 
+    def cfg_digest(self) -> str:
+        """sha256 of the sections."""
+        cfg = repr([(section.kind, sorted(section.options.items())) for section in self.sections])
+        return hashlib.sha256(cfg.encode()).hexdigest()
+
+    def check_image(self, image: Tensor) -> None:
+        """Raise `InputError` unless the network takes images of this shape."""
+        check_shape(image, "image", None, self.channels, None, None)
+        height, width = image.shape[-2:]
+        fits = height % self.stride == 0 and width % self.stride == 0 and height * width > 0
+        check(fits, "image", f"sides that are multiples of {self.stride}", f"{width} x {height}")
+
     def _run(self, outputs: dict[int, Tensor], start: int, stop: int) -> dict[int, Tensor]:
         """Outputs of layers `start` to `stop` that are read later, from the outputs that these layers read."""
         outputs = dict(outputs)
         for index in range(start, stop):
-            outputs[index] = self.layers[index](*(outputs[source] for source in self._sources[index]))
+            outputs[index] = self.layers[index](*(outputs[source] for source in self.sources[index]))
             outputs = {source: output for source, output in outputs.items() if self._last_reader[source] > index}
         return outputs
-
-    def use_winograd(self, *, channels: int = 64) -> None:
-        """Compute 3 x 3 convolutions of at least `channels` inputs by Winograd's algorithm, for inference on a CPU.
-
-        Output tiles are 4 pixels wide, or 2 where the transformed kernels would not fit into a CPU's cache.
-        """
-        self.winograd = True
-        for index, layer in enumerate(self.layers):
-            if WinogradConvolution.replaces(layer) and layer.in_channels >= channels:
-                tile = 4 if layer.in_channels * layer.out_channels < 2**17 else 2
-                self.layers[index] = WinogradConvolution(layer, tile)

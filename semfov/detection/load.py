@@ -13,6 +13,7 @@ from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import read_cfg
 from semfov.detection.darknet_weights import read_weights
 from semfov.detection.detector import Detector
+from semfov.detection.onnx_twin import Runtime
 from semfov.detection.scores import BackgroundPolicy
 from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
@@ -63,7 +64,7 @@ def load_yolo(
     iou: float = 0.5,
     limit: int = 100,
     per_class: bool = False,
-    winograd: bool | None = None,
+    runtime: Runtime = "auto",
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> YoloV3:
@@ -77,8 +78,8 @@ def load_yolo(
         stride: pad the canvas only to a multiple of it; None pads to `input_size`.
         background: background policy of the scores (`semfov.score_vectors`).
         threshold: see `Selection`, as for `iou`, `limit` and `per_class`.
-        winograd: compute 3 x 3 convolutions by Winograd's algorithm, with parameters that cannot be trained; None
-            does so on a CPU, where it is faster.
+        runtime: what computes the network: `"torch"`, `"onnxruntime"` on a CPU without gradients, or `"auto"`, which
+            takes onnxruntime where it can, as it is faster, and else torch (`semfov.detection.yolo.YoloV3`).
         device: where the network lives.
         dtype: of the network's parameters.
     """
@@ -91,8 +92,6 @@ def load_yolo(
         sections = ARCHITECTURES[name]()
     network = Darknet(sections).to(dtype).requires_grad_(False)
     digest = read_weights(network, fetch(name) if weights is None else weights)
-    if torch.device(device).type == "cpu" if winograd is None else winograd:
-        network.use_winograd()
     network.to(memory_format=torch.channels_last)
     detector = YoloV3(
         network,
@@ -103,6 +102,7 @@ def load_yolo(
         background=background,
         selection=Selection(threshold, iou, limit, per_class),
         digest=digest,
+        runtime=runtime,
     )
     return detector.to(device).eval()
 

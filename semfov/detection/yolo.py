@@ -1,6 +1,5 @@
 """YOLOv3 (Redmon and Farhadi 2018) as a `Detector`."""
 
-import hashlib
 from collections.abc import Sequence
 
 import torch
@@ -8,6 +7,7 @@ from torch import Tensor
 
 from semfov.detection.darknet import Darknet
 from semfov.detection.detector import Detector
+from semfov.detection.onnx_twin import RUNTIMES, OnnxTwin, Runtime, network_digest
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
 from semfov.errors import InputError, check
@@ -55,6 +55,11 @@ class YoloV3(Detector):
 
     Differentiable from the scores and boxes to the image. A canvas of another dtype is converted to the network's.
 
+    With runtime `"auto"` onnxruntime computes what no gradient is asked of, on a CPU: it is faster there, and equal up
+    to rounding. Torch computes all else: where gradients are enabled and the canvas or a parameter requires one, on
+    accelerators, in other precisions, with weights changed after loading, and in compiled, exported or transformed
+    functions. Forward hooks of the network see nothing of onnxruntime's work.
+
     Args:
         network: the network, trained.
         classes: names of its K classes.
@@ -64,6 +69,7 @@ class YoloV3(Detector):
         background: background policy of the scores.
         selection: which candidates are kept.
         digest: sha256 of the weights.
+        runtime: `"auto"`, always `"torch"`, or always `"onnxruntime"`, which refuses what it cannot compute.
     """
 
     def __init__(
@@ -77,7 +83,9 @@ class YoloV3(Detector):
         background: BackgroundPolicy = "residual",
         selection: Selection | None = None,
         digest: str = "",
+        runtime: Runtime = "torch",
     ) -> None:
+        check(runtime in RUNTIMES, "runtime", " or ".join(map(repr, RUNTIMES)), repr(runtime))
         size = network.input_size if input_size is None else input_size
         multiple = f"a multiple of {network.stride}"
         check(all(n > 0 and n % network.stride == 0 for n in size), "input_size", f"{multiple} in both axes", size)
@@ -86,11 +94,15 @@ class YoloV3(Detector):
             check(head.classes == len(classes), "classes", f"{head.classes} names", len(classes))
         super().__init__(name, classes, size, background=background, selection=selection, stride=stride, digest=digest)
         self.network = network
+        self.runtime = runtime
+        self._twin = None if runtime == "torch" else OnnxTwin(network_digest(network))
 
     def propose(self, canvas: Tensor) -> Candidates:
         """Every box of every head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
         if not canvas.is_floating_point():
             raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
+        if self._twin is not None and self._chosen(self._twin.obstacle_here(self.network, canvas)) == "onnxruntime":
+            return self._twin(self.network, canvas)
         maps = self.network(canvas.to(next(self.network.parameters()).dtype))
         size = (canvas.shape[-1], canvas.shape[-2])
         parts = [
@@ -102,11 +114,17 @@ class YoloV3(Detector):
             torch.cat([part.objectness for part in parts if part.objectness is not None], 1),
         )
 
+    def _chosen(self, obstacle: str | None) -> Runtime:
+        """What computes, where `obstacle` is why onnxruntime cannot."""
+        if obstacle is None:
+            return "onnxruntime"
+        check(self.runtime == "auto", "runtime", f"'auto' or 'torch' for {obstacle}", repr(self.runtime))
+        return "torch"
+
     def settings(self) -> dict[str, object]:
-        """What the detections depend on."""
-        cfg = repr([(section.kind, sorted(section.options.items())) for section in self.network.sections])
+        """What the detections depend on; `runtime` is what computes without gradients."""
         return super().settings() | {
-            "cfg": hashlib.sha256(cfg.encode()).hexdigest(),
-            "winograd": self.network.winograd,
+            "cfg": self.network.cfg_digest(),
+            "runtime": "torch" if self._twin is None else self._chosen(self._twin.obstacle(self.network)),
             "dtype": str(next(self.network.parameters()).dtype),
         }

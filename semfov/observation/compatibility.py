@@ -17,6 +17,10 @@ CONVERSIONS = (
 )
 """sha256 of files that are conversions of one checkpoint: here YOLOX-nano's, by Kazuhito00 and by its authors."""
 
+# Keys that are compared otherwise, and those of how a network is computed: its numbers are the same up to rounding.
+# (`winograd` is in models that were fitted before there was `runtime`.)
+_ALIKE = {"name", "digest", "background", "winograd", "runtime", "dtype"}
+
 
 def recommended(detector: str, growth: float) -> str:
     """Name of the observation model for a detector behind a sensor of this growth.
@@ -63,7 +67,7 @@ def check_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], what:
             f"model for this detector, or take the one it was fitted for"
         )
     check_background(fitted, detector.get("background"), what)
-    _warn_of_others("detector", fitted, detector, {"name", "digest", "background", "winograd", "dtype"}, what)
+    _warn_of_others("detector", fitted, detector, _ALIKE, what)
 
 
 def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str) -> None:

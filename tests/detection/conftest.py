@@ -154,6 +154,17 @@ def threads() -> Iterator[Callable[[], Iterator[int]]]:
 
 
 @pytest.fixture(scope="session")
+def exports(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where networks that run in onnxruntime are exported to: not into the user's cache."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(autouse=True)
+def _keep_exports_there(monkeypatch: pytest.MonkeyPatch, exports: Path) -> None:
+    monkeypatch.setattr("semfov.detection.onnx_twin.cache_folder", lambda: exports)
+
+
+@pytest.fixture(scope="session")
 def tiny_weights() -> Path:
     """The published weights of YOLOv3-tiny."""
     from semfov.detection.weights import fetch

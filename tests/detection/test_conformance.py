@@ -21,15 +21,18 @@ NAMES = ("cat", "dog", "cup")
 SHARED = Path(os.environ.get("SEMFOV_SHARED", Path(__file__).parents[3] / "shared")) / "weights"
 
 
-def build_darknet(tmp_path, small_cfg, small_weights, make_onnx):
-    return load_yolo(str(small_cfg), weights=small_weights, classes=NAMES[:2], stride=16)
+def build_darknet(runtime):
+    def build(tmp_path, small_cfg, small_weights, make_onnx):
+        return load_yolo(str(small_cfg), weights=small_weights, classes=NAMES[:2], stride=16, runtime=runtime)
+
+    return build
 
 
 def build_exported(static):
     def build(tmp_path, small_cfg, small_weights, make_onnx):
         from semfov.detection.export import export_onnx
 
-        options = {"weights": small_weights, "classes": NAMES[:2], "stride": None if static else 16, "winograd": False}
+        options = {"weights": small_weights, "classes": NAMES[:2], "stride": None if static else 16}
         export_onnx(load_yolo(str(small_cfg), **options), tmp_path / "small.onnx", static=static)
         return load_onnx(tmp_path / "small.onnx")
 
@@ -110,7 +113,8 @@ class Adapter:
 
 
 ADAPTERS = {
-    "darknet": Adapter(build_darknet, gradients=True),
+    "darknet": Adapter(build_darknet("auto"), gradients=True),
+    "darknet, torch": Adapter(build_darknet("torch"), gradients=True),
     "onnx, own export": Adapter(build_exported(static=False)),
     "onnx, own static export": Adapter(build_exported(static=True)),
     "onnx, yolox": Adapter(build_onnx(("output", (1, 84, 8)))),

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from semfov.detection.coco_classes import COCO_CLASSES
-from semfov.detection.export import OUTPUTS, export_onnx, largest_difference
+from semfov.detection.export import export_onnx, largest_difference
+from semfov.detection.export_graph import OUTPUTS
 from semfov.detection.load import load_detector, load_yolo
 from semfov.detection.onnx import load_onnx
 from semfov.errors import DataError, InputError
@@ -24,7 +25,7 @@ def small_weights(write_weights):
 def small(small_cfg, small_weights):
     """A network with every kind of layer and activation but one."""
     return lambda **options: load_yolo(
-        str(small_cfg), weights=small_weights, classes=CLASSES, **{"winograd": False, "stride": 16, **options}
+        str(small_cfg), weights=small_weights, classes=CLASSES, **{"stride": 16, "runtime": "torch", **options}
     )
 
 
@@ -61,7 +62,7 @@ def test_a_dynamic_export_takes_any_multiple_of_the_stride(small, tmp_path, size
 @pytest.mark.parametrize("activation", ["linear", "leaky", "relu", "mish", "swish", "logistic"])
 def test_every_activation(small_cfg, small_weights, tmp_path, activation):
     small_cfg.write_text(small_cfg.read_text().replace("activation=leaky", f"activation={activation}"))
-    detector = load_yolo(str(small_cfg), weights=small_weights, classes=CLASSES, winograd=False, stride=16)
+    detector = load_yolo(str(small_cfg), weights=small_weights, classes=CLASSES, stride=16, runtime="torch")
     export_onnx(detector, tmp_path / "small.onnx")
     assert largest_difference(detector, tmp_path / "small.onnx") <= 1e-4
 
@@ -84,8 +85,6 @@ def test_the_model_says_what_it_is(small, tmp_path):
 
 
 def test_what_cannot_be_exported(small, tmp_path, make_onnx):
-    with pytest.raises(InputError, match="winograd=False"):
-        export_onnx(small(winograd=True), tmp_path / "out.onnx")
     other = load_onnx(make_onnx({"output0": np.ones((1, 84, 7), np.float32).swapaxes(1, 2)}), classes=("a", "b", "c"))
     with pytest.raises(InputError, match="OnnxDetector"):
         export_onnx(other, tmp_path / "out.onnx")
@@ -109,7 +108,7 @@ def test_command_line(tiny_weights, tmp_path):
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "largest difference" in done.stdout
-    detector, exported = load_detector("yolov3-tiny", weights=tiny_weights, winograd=False), load_detector(path)
+    detector, exported = load_detector("yolov3-tiny", weights=tiny_weights, runtime="torch"), load_detector(path)
     assert exported.classes == COCO_CLASSES
     assert exported.name == "yolov3-tiny"
     assert largest_difference(detector, path) <= 1e-4

@@ -6,6 +6,7 @@ import torch
 
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.detection.load import load_detector
+from semfov.detection.onnx_twin import RUNTIMES
 from semfov.detection.placement import resize
 from semfov.errors import DataError, InputError
 
@@ -36,10 +37,10 @@ def test_options(small_cfg, write_weights, tmp_path):
     assert detector.background == "none"
     assert detector.settings()["selection"] == {"threshold": 0.02, "iou": 0.4, "limit": 3, "per_class": True}
     image = torch.rand(1, 3, 64, 96)
-    exact = load_detector(small_cfg, **options, winograd=False, dtype=torch.float64).propose(image)
+    exact = load_detector(small_cfg, **options, dtype=torch.float64).propose(image)
     assert exact.boxes.dtype == torch.float64
-    for winograd in (None, False):
-        proposed = load_detector(small_cfg, **options, winograd=winograd).propose(image)
+    for runtime in RUNTIMES:
+        proposed = load_detector(small_cfg, **options, runtime=runtime).propose(image)
         torch.testing.assert_close(proposed.boxes.double(), exact.boxes, atol=1e-3, rtol=1e-4)
 
 
@@ -123,10 +124,10 @@ def test_a_batch_equals_its_images_one_by_one(tiny):
 
 
 @pytest.mark.weights
-@pytest.mark.parametrize("winograd", [True, False])
-def test_one_thread_repeats_itself_and_two_agree_with_it(tiny_weights, threads, winograd):
+@pytest.mark.parametrize("runtime", ["torch", "onnxruntime"])
+def test_one_thread_repeats_itself_and_two_agree_with_it(tiny_weights, threads, runtime):
     """To the bit, and up to rounding: matrix products are cut otherwise for other numbers of threads."""
-    detector = load_detector("yolov3-tiny", weights=tiny_weights, winograd=winograd)
+    detector = load_detector("yolov3-tiny", weights=tiny_weights, runtime=runtime)
     image = torch.rand(1, 3, 240, 320, generator=torch.Generator().manual_seed(1))
     (one, again), (two, _) = [[detector.propose(detector.fit(image)[0]) for _ in range(2)] for _ in threads()]
     assert torch.equal(one.boxes, again.boxes)
@@ -136,15 +137,15 @@ def test_one_thread_repeats_itself_and_two_agree_with_it(tiny_weights, threads, 
 
 
 @pytest.mark.weights
-def test_winograd_finds_the_same(tiny, tiny_weights):
+def test_either_runtime_finds_the_same(tiny, tiny_weights):
     from skimage import data
 
     image = torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255
-    direct = load_detector("yolov3-tiny", weights=tiny_weights, winograd=False)
-    expected, actual = direct(image), tiny(image)
+    network = load_detector("yolov3-tiny", weights=tiny_weights, runtime="torch")
+    expected, actual = network(image), tiny(image)
     assert torch.equal(actual.labels, expected.labels)
     torch.testing.assert_close(actual.scores, expected.scores, atol=1e-4, rtol=0)
-    torch.testing.assert_close(actual.boxes, expected.boxes, atol=0.05, rtol=0)
+    torch.testing.assert_close(actual.boxes, expected.boxes, atol=0.01, rtol=0)
 
 
 @pytest.mark.weights

@@ -414,6 +414,7 @@ def test_a_detector_that_fits_is_accepted_and_others_are_not(tmp_path):
     load(path, detector=Toy())
     load(path, detector=Toy(name="renamed"))
     load(path, detector=Toy(input_size=(416, 416)))
+    load(path, detector=Toy(runtime="onnxruntime"))
     with pytest.raises(InputError, match=r"fitted for 'toy' \(sha256 abab"):
         load(path, detector=Toy(digest="cd" * 32))
     with pytest.raises(InputError, match="got 'other'"):

@@ -1,0 +1,176 @@
+"""The ONNX model of a Darknet network, boxes decoded."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from semfov.detection.darknet import Darknet
+from semfov.detection.darknet_layers import Convolution, Head, MaxPool, Route, Shortcut, Upsample
+
+VERSION = 1
+"""Of what this file makes of a network: raised with every change, so that no earlier model is taken for a new one."""
+
+OPSET = 17
+IR_VERSION = 8
+"""Of opset 17's time; newer ones are refused by runtimes that could run the model."""
+
+OUTPUTS = ("boxes", "objectness", "classes")
+
+
+class _Graph:
+    """Nodes and constants of a graph under construction; every method returns the name of its output."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Any] = []
+        self.constants: dict[str, Any] = {}
+
+    def add(self, op: str, *inputs: str, outputs: int = 1, **attributes: Any) -> Any:
+        from onnx import helper
+
+        start = f"{op.lower()}_{len(self.nodes)}"
+        names = [start] if outputs == 1 else [f"{start}_{index}" for index in range(outputs)]
+        self.nodes.append(helper.make_node(op, list(inputs), names, **attributes))
+        return start if outputs == 1 else names
+
+    def name_last(self, name: str) -> None:
+        """Call the output of the last node `name`."""
+        self.nodes[-1].output[0] = name
+
+    def constant(self, values: Tensor | list[int] | list[float] | int | float) -> str:
+        from onnx import numpy_helper
+
+        tensor = torch.as_tensor(values)
+        tensor = tensor.float() if tensor.is_floating_point() else tensor
+        name = f"constant_{len(self.constants)}"
+        self.constants[name] = numpy_helper.from_array(tensor.detach().cpu().contiguous().numpy(), name)
+        return name
+
+    def activation(self, kind: str, source: str) -> str:
+        """An activation of Darknet."""
+        if kind == "linear":
+            return source
+        if kind == "leaky":
+            return self.add("LeakyRelu", source, alpha=0.1)
+        if kind == "relu":
+            return self.add("Relu", source)
+        if kind == "mish":
+            return self.add("Mul", source, self.add("Tanh", self.add("Softplus", source)))
+        gate = self.add("Sigmoid", source)
+        return self.add("Mul", source, gate) if kind == "swish" else gate
+
+    def layer(self, layer: Any, *sources: str) -> str:
+        """A layer of a Darknet network."""
+        if isinstance(layer, Convolution):
+            return self.activation(layer.activation, self._convolution(layer, sources[0]))
+        if isinstance(layer, MaxPool):
+            before, after = layer.padding // 2, layer.padding - layer.padding // 2
+            return self.add(
+                "MaxPool",
+                sources[0],
+                kernel_shape=[layer.size] * 2,
+                strides=[layer.stride] * 2,
+                pads=[before, before, after, after],
+            )
+        if isinstance(layer, Upsample):
+            scales = self.constant([1.0, 1.0, float(layer.stride), float(layer.stride)])
+            return self.add("Resize", sources[0], "", scales, mode="nearest", nearest_mode="floor",
+                            coordinate_transformation_mode="asymmetric")  # fmt: skip
+        if isinstance(layer, Route):
+            parts = [self._part(source, layer) for source in sources]
+            return parts[0] if len(parts) == 1 else self.add("Concat", *parts, axis=1)
+        if isinstance(layer, Shortcut):
+            return self.activation(layer.activation, self.add("Add", *sources))
+        return sources[0]
+
+    def _convolution(self, layer: Convolution, source: str) -> str:
+        vertical, horizontal = (int(side) for side in layer.padding)
+        return self.add(
+            "Conv",
+            source,
+            self.constant(layer.weight),
+            self.constant(layer.bias),  # type: ignore[arg-type]
+            strides=list(layer.stride),
+            pads=[vertical, horizontal, vertical, horizontal],
+            group=layer.groups,
+        )
+
+    def _part(self, source: str, layer: Route) -> str:
+        return source if layer.groups == 1 else self.add("Split", source, outputs=layer.groups, axis=1)[layer.group]
+
+    def decode(self, head: Head, source: str, step: float) -> tuple[str, str, str]:
+        """Boxes `(B, h w A, 4)`, objectness `(B, h w A)` and classes `(B, h w A, K)` as `decode_yolo` computes them."""
+        anchors, channels = len(head.anchors), 5 + head.classes
+        shape = self.constant([0, anchors, channels, -1])
+        cells = self.add("Transpose", self.add("Reshape", source, shape), perm=[0, 3, 1, 2])
+        parts = self.add("Split", cells, self.constant([2, 2, 1, head.classes]), outputs=4, axis=3)
+        shift, size, objectness, classes = parts
+        centre = self.add("Mul", self.add("Sigmoid", shift), self.constant(float(head.scale)))
+        corner = self.add("Sub", self._corners(source), self.constant((head.scale - 1) / 2))
+        centre = self.add("Mul", self.add("Add", centre, corner), self.constant(step))
+        half = self.add("Mul", self.add("Exp", size), self.constant(torch.tensor(head.anchors) / 2))
+        boxes = self.add("Concat", self.add("Sub", centre, half), self.add("Add", centre, half), axis=3)
+        return (
+            self.add("Reshape", boxes, self.constant([0, -1, 4])),
+            self.add("Reshape", self.add("Sigmoid", objectness), self.constant([0, -1])),
+            self.add("Reshape", self.add("Sigmoid", classes), self.constant([0, -1, head.classes])),
+        )
+
+    def _corners(self, source: str) -> str:
+        """Column and row of every cell of a map, `(h w, 1, 2)`, for maps of any size."""
+        size = self.add("Shape", source)
+        rows, columns = (self.add("Gather", size, self.constant(axis)) for axis in (2, 3))
+        count = self.add("Mul", rows, columns)
+        cell = self.add("Range", self.constant(0), count, self.constant(1))
+        column, row = self.add("Mod", cell, columns), self.add("Div", cell, columns)
+        axes = self.constant([1, 2])
+        pair = [self.add("Unsqueeze", each, axes) for each in (column, row)]
+        return self.add("Cast", self.add("Concat", *pair, axis=2), to=1)
+
+
+def network_model(network: Darknet, name: str, size: tuple[int, int] | None = None) -> Any:
+    """An `onnx.ModelProto` of a network: from `images` `(B, 3, H, W)` to every box of every head, as `OUTPUTS`.
+
+    Args:
+        network: whose weights it takes, as float32.
+        name: of the graph.
+        size: `(width, height)` of the one image that it takes; None: any batch, of any size that the network takes.
+
+    Raises:
+        ModuleNotFoundError: the package onnx is not there.
+    """
+    try:
+        from onnx import TensorProto, helper
+    except ImportError as error:
+        raise ModuleNotFoundError("exporting to ONNX needs the package onnx: pip install onnx") from error
+    graph = _build(network)
+    batch, columns, rows = ("batch", "width", "height") if size is None else (1, *size)
+    boxes, classes = None if size else "boxes", network.heads[0].classes
+    shapes = {"boxes": [batch, boxes, 4], "objectness": [batch, boxes], "classes": [batch, boxes, classes]}
+    return helper.make_model(
+        helper.make_graph(
+            graph.nodes,
+            name,
+            [helper.make_tensor_value_info("images", TensorProto.FLOAT, [batch, 3, rows, columns])],
+            [helper.make_tensor_value_info(name, TensorProto.FLOAT, shapes[name]) for name in OUTPUTS],
+            list(graph.constants.values()),
+        ),
+        producer_name="semfov",
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+    )
+
+
+def _build(network: Darknet) -> _Graph:
+    """The whole graph, from `images` to `OUTPUTS`."""
+    graph = _Graph()
+    names = {-1: "images"}
+    found = []
+    for index, layer in enumerate(network.layers):
+        names[index] = graph.layer(layer, *(names[source] for source in network.sources[index]))
+        if isinstance(layer, Head):
+            found.append(graph.decode(layer, names[index], float(network.steps[index])))
+    for name, parts in zip(OUTPUTS, zip(*found, strict=True), strict=True):
+        graph.add("Concat", *parts, axis=1)
+        graph.name_last(name)
+    return graph

@@ -1,0 +1,315 @@
+import copy
+import hashlib
+import os
+import pickle
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+from torch.autograd import forward_ad
+from torch.func import functional_call, grad, jvp
+
+from semfov.detection.export_graph import VERSION, network_model
+from semfov.detection.load import load_yolo
+from semfov.detection.onnx_twin import OnnxTwin, exported, network_digest
+from semfov.errors import InputError
+
+CLASSES = ("cat", "dog")
+
+
+@pytest.fixture
+def make(small_cfg, write_weights):
+    """Loads the small network."""
+    weights = write_weights()
+    return lambda runtime="auto", **options: load_yolo(
+        str(small_cfg), weights=weights, classes=CLASSES, stride=16, runtime=runtime, **options
+    )
+
+
+@pytest.fixture
+def looks(monkeypatch):
+    """Canvases that onnxruntime looked at."""
+    seen = []
+    call = OnnxTwin.__call__
+    monkeypatch.setattr(OnnxTwin, "__call__", lambda self, *given: (seen.append(given[1]), call(self, *given))[1])
+    return seen
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A cache of this test's own, empty."""
+    path = tmp_path / "cache"
+    monkeypatch.setattr("semfov.detection.onnx_twin.cache_folder", lambda: path)
+    return path
+
+
+def canvases(*size, seed=0, **options):
+    return torch.rand(*size, generator=torch.Generator().manual_seed(seed)).to(**options)
+
+
+def same_as(network, canvas, found, side):
+    with torch.no_grad():
+        expected = network.propose(canvas)
+    torch.testing.assert_close(found.boxes / side, expected.boxes / side, atol=1e-4, rtol=0)
+    torch.testing.assert_close(found.classes, expected.classes, atol=1e-4, rtol=0)
+    torch.testing.assert_close(found.objectness, expected.objectness, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 32, 64), (1, 3, 64, 64), (3, 3, 16, 48)])
+@pytest.mark.parametrize("runtime", ["auto", "onnxruntime"])
+def test_equals_torch(make, looks, shape, runtime):
+    detector, canvas = make(runtime), canvases(*shape)
+    same_as(make("torch"), canvas, detector.propose(canvas), 64)
+    assert len(looks) == 1
+    assert detector.settings()["runtime"] == "onnxruntime"
+
+
+@pytest.mark.weights
+def test_published_weights_equal_torch(tiny_weights, looks):
+    from skimage import data
+
+    image = torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255
+    detector = load_yolo("yolov3-tiny", weights=tiny_weights)
+    network = load_yolo("yolov3-tiny", weights=tiny_weights, runtime="torch", dtype=torch.float64)
+    canvas = detector.fit(image)[0]
+    same_as(network.float(), canvas, detector.propose(canvas), 416)
+    assert len(looks) == 1
+
+
+def test_gradients_take_torch(make, looks):
+    detector = make()
+    canvas = canvases(1, 3, 32, 64).requires_grad_()
+    detector.propose(canvas).classes.sum().backward()
+    assert bool(canvas.grad.any())
+    canvas = canvas.detach()
+    detector.requires_grad_(True)
+    assert detector.propose(canvas).classes.requires_grad
+    assert not looks
+    with torch.no_grad():
+        detector.propose(canvas.requires_grad_())
+    with torch.inference_mode():
+        detector.propose(canvas)
+    assert len(looks) == 2
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:FutureWarning")  # torch's own, of its jvp
+def test_forward_gradients_and_transforms_take_torch(make, looks):
+    detector, canvas = make(), canvases(2, 3, 32, 64)
+    tangent = torch.ones_like(canvas)
+    with forward_ad.dual_level():
+        dual = forward_ad.unpack_dual(detector.propose(forward_ad.make_dual(canvas, tangent)).classes).tangent
+    assert bool(dual.any())
+    torch.testing.assert_close(jvp(lambda x: detector.propose(x).classes, (canvas,), (tangent,))[1], dual)
+    backward = grad(lambda x: detector.propose(x).classes.sum())(canvas)
+    torch.testing.assert_close(backward.sum(), dual.sum(), rtol=1e-4, atol=0)
+    assert not looks
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore:.*torch.jit.trace")
+def test_graphs_take_torch(make, looks):
+    detector, canvas = make(), canvases(1, 3, 32, 64)
+    compiled = torch.compile(lambda x: detector.propose(x).classes, fullgraph=True, backend="eager")(canvas)
+    traced = torch.jit.trace(lambda x: detector.propose(x).classes, canvas, check_trace=False)(canvas)
+    assert not looks
+    for classes in (compiled, traced):
+        torch.testing.assert_close(classes, make("torch").propose(canvas).classes)
+
+
+def test_other_precisions_take_torch(make, looks):
+    detector, canvas = make(), canvases(1, 3, 32, 64)
+    exact = detector.double().propose(canvas)
+    assert exact.boxes.dtype == torch.float64
+    assert detector.settings()["runtime"] == "torch"
+    assert not looks
+    found = detector.float().propose(canvas.double())
+    assert found.boxes.dtype == torch.float32
+    assert len(looks) == 1
+    torch.testing.assert_close(found.classes.double(), exact.classes, atol=1e-5, rtol=0)
+
+
+def test_other_devices_and_tensors_of_other_kinds_take_torch(make, looks):
+    class Marked(torch.Tensor):
+        pass
+
+    detector, canvas = make(), canvases(1, 3, 32, 64)
+    marked = detector.propose(canvas.as_subclass(Marked)).classes
+    torch.testing.assert_close(marked.as_subclass(torch.Tensor), make("torch").propose(canvas).classes)
+    assert detector.to("meta").propose(canvas.to("meta")).boxes.is_meta
+    assert detector.settings()["runtime"] == "torch"
+    assert not looks
+
+
+def test_changed_weights_take_torch(make, looks):
+    detector, network, canvas = make(), make("torch"), canvases(1, 3, 32, 64)
+    before = detector.propose(canvas).classes
+    kept = copy.deepcopy(detector.state_dict())
+    with torch.no_grad():
+        for each in (detector, network):
+            each.network.layers[0].weight.mul_(2)
+    assert torch.equal(detector.propose(canvas).classes, network.propose(canvas).classes)
+    assert detector.settings()["runtime"] == "torch"
+    detector.load_state_dict(kept)
+    assert torch.equal(detector.propose(canvas).classes, before)
+    zeros = {name: torch.zeros_like(value) for name, value in detector.named_parameters()}
+    with torch.no_grad():
+        assert not torch.equal(functional_call(detector, zeros, canvas).scores, detector(canvas).scores)
+    assert len(looks) == 3
+
+
+def test_what_onnxruntime_is_asked_for_and_cannot(make):
+    canvas = canvases(1, 3, 32, 64)
+    with pytest.raises(InputError, match="runtime: expected 'auto' or 'torch' or 'onnxruntime', got 'onnx'"):
+        make("onnx")
+    with pytest.raises(InputError, match="runtime: expected 'auto' or 'torch' for gradients, got 'onnxruntime'"):
+        make("onnxruntime").propose(canvas.clone().requires_grad_())
+    with pytest.raises(InputError, match=r"'torch' for a network of torch.float64, got"):
+        make("onnxruntime", dtype=torch.float64).propose(canvas)
+    with pytest.raises(InputError, match="'torch' for a canvas on meta, got"):
+        make("onnxruntime").propose(canvas.to("meta"))
+    detector = make("onnxruntime")
+    detector.network.layers[0].weight.mul_(2)
+    with pytest.raises(InputError, match="'torch' for weights that were changed after loading, got"):
+        detector.propose(canvas)
+
+
+@pytest.mark.parametrize("size", [(3, 32, 60), (1, 32, 64)])
+def test_refuses_images_that_do_not_fit(make, size):
+    with pytest.raises(InputError, match="image: expected"):
+        make().propose(torch.zeros(1, *size))
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda detector: pickle.loads(pickle.dumps(detector))])
+def test_copies_do_the_same(make, looks, duplicate):
+    detector, canvas = make(), canvases(1, 3, 32, 64)
+    classes = detector.propose(canvas).classes
+    assert torch.equal(duplicate(detector).propose(canvas).classes, classes)
+    assert len(looks) == 2
+
+
+def test_same_bits_for_any_threads_and_any_batch(make, threads):
+    canvas = canvases(3, 3, 64, 64)
+    detector = make()
+    one, two = [detector.propose(canvas) for _ in threads()]
+    assert torch.equal(one.classes, two.classes)
+    alone = detector.propose(canvas[1:2])
+    assert torch.equal(alone.classes[0], one.classes[1])
+    assert torch.equal(alone.boxes[0], one.boxes[1])
+
+
+def test_a_session_is_opened_for_its_threads_and_its_process(make, threads, monkeypatch):
+    detector, canvas = make(), canvases(1, 3, 32, 64)
+    for number in threads():
+        detector.propose(canvas)
+        session = detector._twin._opened[1]
+        assert session.threads == number
+        detector.propose(canvas)
+        assert detector._twin._opened[1] is session
+    pid = os.getpid()
+    monkeypatch.setattr(os, "getpid", lambda: pid + 1)
+    detector.propose(canvas)
+    assert detector._twin._opened[1] is not session
+
+
+@pytest.mark.parametrize("damage", [b"", b"half", None])
+def test_a_damaged_export_is_made_again(make, folder, damage):
+    network = make("torch").network
+    path = exported(network, folder)
+    whole = path.read_bytes()
+    content = whole[:1000] + bytes([whole[1000] ^ 1]) + whole[1001:] if damage is None else damage
+    path.write_bytes(content)
+    assert exported(network, folder) == path
+    assert path.read_bytes() == whole
+    assert os.listdir(folder) == [path.name]
+
+
+def test_an_export_is_for_one_network(make, folder, monkeypatch):
+    network = make("torch").network
+    path = exported(network, folder)
+    assert path.name.split(".")[1] == hashlib.sha256(path.read_bytes()).hexdigest()
+    written = path.stat().st_mtime_ns
+    assert exported(network, folder).stat().st_mtime_ns == written
+    monkeypatch.setattr("semfov.detection.export_graph.VERSION", VERSION + 1)
+    assert exported(network, folder) != path
+    with torch.no_grad():
+        network.layers[0].weight.mul_(2)
+    assert exported(network, folder) != path
+    assert len(os.listdir(folder)) == 3
+
+
+def test_a_cache_that_cannot_be_written_to(make, folder, looks):
+    folder.write_text("a file where the folder should be")
+    canvas = canvases(1, 3, 32, 64)
+    same_as(make("torch"), canvas, make().propose(canvas), 64)
+    assert len(looks) == 1
+
+
+def test_only_the_first_look_needs_the_package_onnx(make, folder, monkeypatch):
+    canvas = canvases(1, 3, 32, 64)
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "onnx", None)
+        with pytest.raises(ModuleNotFoundError, match="pip install onnx"):
+            make().propose(canvas)
+    found = make().propose(canvas)
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    assert torch.equal(make().propose(canvas).classes, found.classes)
+
+
+def test_exporting_leaves_random_numbers_and_settings_alone(make, folder):
+    detector, canvas = make(), canvases(1, 3, 32, 64)
+    torch.manual_seed(3)
+    before = torch.get_rng_state()
+    detector.propose(canvas)
+    assert torch.equal(torch.get_rng_state(), before)
+    whole = exported(detector.network, folder / "exported").read_bytes()
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert network_model(detector.network, "darknet").SerializeToString() == whole
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+LOOK = """
+import hashlib, sys, torch
+from semfov.detection.load import load_yolo
+torch.set_num_threads(1)
+detector = load_yolo(sys.argv[1], weights=sys.argv[2], classes=("cat", "dog"), stride=16, runtime="onnxruntime")
+found = detector.propose(torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0)))
+print(hashlib.sha256(found.boxes.numpy().tobytes() + found.classes.numpy().tobytes()).hexdigest())
+"""
+
+
+def test_processes_that_export_at_once(small_cfg, write_weights, make, tmp_path):
+    environment = {**os.environ, "SEMFOV_CACHE": str(tmp_path / "cold"), "PYTHONWARNINGS": "error"}
+    call = [sys.executable, "-c", LOOK, str(small_cfg), str(write_weights())]
+
+    def run(_):
+        return subprocess.run(call, env=environment, capture_output=True, text=True, check=True).stdout.strip()
+
+    with ThreadPoolExecutor(3) as pool:
+        digests = set(pool.map(run, range(3)))
+    found = make().propose(canvases(1, 3, 64, 64))
+    ours = hashlib.sha256(found.boxes.numpy().tobytes() + found.classes.numpy().tobytes()).hexdigest()
+    assert digests == {ours}
+    assert len(os.listdir(tmp_path / "cold" / "exported")) == 1
+
+
+def test_the_digest_tells_networks_apart(make):
+    network = make("torch").network
+    before = network_digest(network)
+    assert network_digest(copy.deepcopy(network).double()) == before
+    network.layers[0].bias.data[0] += 1
+    assert network_digest(network) != before
+
+
+def test_another_graph_has_another_version(make):
+    """A change of the graph has to raise VERSION; then the digest here changes with it."""
+    from onnx.helper import get_attribute_value
+
+    graph = network_model(make("torch").network, "darknet").graph
+    nodes = "\n".join(
+        f"{node.op_type} {[*node.input]} {[*node.output]} {[(a.name, get_attribute_value(a)) for a in node.attribute]}"
+        for node in graph.node
+    )
+    assert (VERSION, hashlib.sha256(nodes.encode()).hexdigest()[:12]) == (1, "9f909550f9c2")
