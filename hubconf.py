@@ -27,23 +27,18 @@ def yolov3_tiny_eye(sigma: float = 100.0, **options: Any) -> _semfov.Eye:
     return _semfov.Eye(foveation(sigma), yolov3_tiny_detector(**options)).eval()
 
 
-def yolov3_tiny_agent(
-    policy: str = "non-predictive", *, calibrated: bool = False, columns: int = 10, rows: int = 10, sigma: float = 100.0
-) -> _semfov.ActivePerception:
+def yolov3_tiny_agent(kind: str = "recommended", **options: Any) -> _semfov.ActivePerception:
     """An agent that searches: `agent.search(image, "cup") -> semfov.Scanpath`.
 
     Args:
-        policy: name of a search policy (`semfov.search_policy`).
-        calibrated: calibrate what is seen by the shipped observation model.
-        columns: cells in a row of the belief.
-        rows: cells in a column.
-        sigma: width of the fovea.
+        kind: `recommended`, `published` or `raw`.
+        options: of `semfov.ActivePerception.recommended`, `.published` or `.raw`.
     """
-    model = yolov3_tiny_observation().requires_grad_(False)
-    return _semfov.ActivePerception(
-        foveation(sigma),
-        yolov3_tiny_detector(),
-        model if calibrated else None,
-        (columns, rows),
-        _semfov.search_policy(policy, model),
-    ).eval()
+    agents = {
+        "recommended": _semfov.ActivePerception.recommended,
+        "published": _semfov.ActivePerception.published,
+        "raw": _semfov.ActivePerception.raw,
+    }
+    if kind not in agents:
+        raise _semfov.InputError(f"kind: expected {', '.join(agents)}, got {kind!r}")
+    return agents[kind]("yolov3-tiny", **options)

@@ -9,7 +9,6 @@ saliency has no belief: it foveates the photograph, models the saliency of the v
 import argparse
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from functools import reduce
 from pathlib import Path
 
 import torch
@@ -26,11 +25,10 @@ from semfov import (
     FovealObservationModel,
     Grid,
     acquisition,
-    exploration_policy,
+    observers,
+    policies,
     saliency,
-    search_policy,
 )
-from semfov.belief import SemanticObserver
 from semfov.gaze import select_fixation
 from semfov.sensor import named_sensor
 
@@ -73,13 +71,12 @@ def make_seen(grid: Grid, seed: int) -> Detections:
     return Detections(boxes, scores, torch.ones(1, DETECTIONS, dtype=torch.bool))
 
 
-def believe(observer: SemanticObserver, grid: Grid) -> DirichletBelief:
+def believe(observer: observers.Semantic, grid: Grid) -> DirichletBelief:
     """The belief after some looks."""
-
-    def look(belief: DirichletBelief, seed: int) -> DirichletBelief:
-        return observer.update(belief, observer.weigh(make_seen(grid, seed), grid.centres[seed : seed + 1], grid))
-
-    return reduce(look, range(LOOKS), observer.start(1, grid, torch.zeros(())))
+    belief = observer.start(1, grid, torch.zeros(()))
+    for seed in range(LOOKS):
+        belief = observer(belief, make_seen(grid, seed), grid.centres[seed : seed + 1], grid)
+    return belief
 
 
 def decide(value: acquisition.AcquisitionFunction, belief: DirichletBelief) -> Run:
@@ -96,27 +93,27 @@ def decide(value: acquisition.AcquisitionFunction, belief: DirichletBelief) -> R
 
 def on_the_map(model: FovealObservationModel, maps: dict[str, DirichletBelief], grid: Grid) -> dict[str, Run]:
     """Decisions that go by a belief."""
-    policies = {
-        "non-predictive": search_policy("non-predictive"),
-        "predictive": search_policy("predictive", model),
-        "KL divergence": exploration_policy("kl", model),
-        "negative entropy": exploration_policy("negative-entropy", model),
-        "two peaks": exploration_policy("two-peaks", model),
+    kinds = {
+        "non-predictive": policies.NonPredictive(),
+        "predictive": policies.Predictive(model),
+        "KL divergence": policies.KL(model),
+        "negative entropy": policies.Negentropy(model),
+        "two peaks": policies.Peaks(model),
     }
-    runs = {"random": decide(search_policy("random")(None, grid), maps["raw"])}
-    for name, policy in policies.items():
-        runs |= {f"{name}, {kind}": decide(policy(TARGET, grid), belief) for kind, belief in maps.items()}
+    runs = {"random": decide(policies.Random()(None, grid), maps["raw"])}
+    for name, policy in kinds.items():
+        runs |= {f"{name}, {scores}": decide(policy(TARGET, grid), belief) for scores, belief in maps.items()}
     return runs
 
 
 def updates(model: FovealObservationModel, belief: DirichletBelief, grid: Grid) -> dict[str, Run]:
     """What one look of 30 detections does to a belief."""
-    observer, seen, fixation = SemanticObserver(CLASSES + 1), make_seen(grid, LOOKS), torch.tensor([GAZE])
-    evidence, distance = observer.weigh(seen, fixation, grid), grid.box_distance(seen.boxes, fixation)
+    observer, seen, fixation = observers.Semantic(CLASSES + 1), make_seen(grid, LOOKS), torch.tensor([GAZE])
+    look, distance = observer.weigh(seen, fixation, grid), grid.box_distance(seen.boxes, fixation)
     return {
         f"cells and distances of {DETECTIONS} detections": lambda: observer.weigh(seen, fixation, grid),
         f"calibration of {DETECTIONS} detections": lambda: model.calibrate(seen.scores, distance),
-        f"Kaplan's rule for {DETECTIONS} detections": lambda: observer.update(belief, evidence),
+        f"Kaplan's rule for {DETECTIONS} detections": lambda: observer.update(belief, look),
     }
 
 
@@ -171,8 +168,8 @@ def measure_all(
     """Milliseconds of all rows, the names of those that are no decisions, and brute force."""
     grid = Grid(10, 10, (640, 480))
     maps = {
-        "raw": believe(SemanticObserver(CLASSES + 1), grid),
-        "calibrated": believe(SemanticObserver(CLASSES + 1, model), grid),
+        "raw": believe(observers.Semantic(CLASSES + 1), grid),
+        "calibrated": believe(observers.Semantic(CLASSES + 1, model), grid),
     }
     decisions, changes = on_the_map(model, maps, grid), updates(model, maps["raw"], grid)
     views, parts = on_the_view(grid)

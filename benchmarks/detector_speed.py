@@ -19,9 +19,10 @@ from benchmarks.tables import number, spread, table
 from benchmarks.timing import Run, Spread, interleaved
 from semfov.detection import Detector
 from semfov.detection.load import load_yolo
+from semfov.detection.onnx_twin import Runtime
 from semfov.detection.placement import resize
 
-RUNTIMES = ("onnxruntime", "torch")
+RUNTIMES: tuple[Runtime, ...] = ("onnxruntime", "torch")
 
 
 def photograph(width: int, height: int) -> Tensor:

@@ -31,9 +31,9 @@ import matplotlib.pyplot  # noqa: F401 (imported once for all forks)
 import torch
 from safetensors import safe_open
 
-from eval.cached import checksum
 from eval.explore import main as explore
 from eval.search import main as search
+from semfov.io.storage import checksum
 from train.fit_fom import main as fit
 
 Main = Callable[[Sequence[str]], int]
@@ -91,7 +91,7 @@ class Command:
 _RECORDS = ("episodes.jsonl", "summary.csv")
 COMMANDS = (
     Command("store", search, tuple(_SEARCH), (*_RECORDS, "cumulative_performance.png")),
-    Command("evaluation", explore, tuple(_EXPLORE), (*_RECORDS, "success_rate_objects.png"), stored=True),
+    Command("evaluation", explore, tuple(_EXPLORE), (*_RECORDS, "success_rate_all_classes.png"), stored=True),
     Command("fit", fit, tuple(_FIT), ("yolov3-tiny.safetensors", "report.md", "counts.csv")),
 )
 
@@ -130,7 +130,9 @@ def survive(command: Command, kills: int, seed: int = 0) -> Survived:
         shutil.copytree(cache, whole)
         seconds = finish(fork.Process(target=command.run, args=(whole,)))
         expected = command.digest(whole)
-        spared, identical, progress, remains = 0, 0, [], []
+        spared, identical = 0, 0
+        progress: list[int] = []
+        remains: list[int] = []
         while len(progress) < kills:
             shutil.copytree(cache, here)
             process = fork.Process(target=command.run, args=(here,))

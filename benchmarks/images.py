@@ -1,10 +1,12 @@
 """Sensor and saliency beside OpenCV and Kornia, for one photograph of 640 × 480."""
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import torch
 
-from benchmarks.saliency import gabor_filters, itti_koch_opencv, vocus2_opencv
+from benchmarks.saliency import Array, gabor_filters, itti_koch_opencv, vocus2_opencv
 from benchmarks.sensor import LEVELS, plain, planes, tuned, with_kornia
 from benchmarks.timing import Comparison
 from semfov.detection.placement import resize
@@ -26,13 +28,14 @@ def foveation(convention: Convention, *, reuse: bool) -> Comparison:
     """One fixation; the peers build their pyramid for it, semfov too unless it is reused."""
     image = photograph()
     pixels, gaze = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy()), torch.tensor(GAZE)
-    peers = {
+    kinds: dict[Convention, dict[str, Callable[[], Array | torch.Tensor]]] = {
         "opencv": {
             "OpenCV, plain": lambda: plain(pixels, GAZE, SIGMA),
             "OpenCV, tuned": lambda: tuned(pixels, GAZE, SIGMA),
         },
         "kornia": {"Kornia's pyramid": lambda: with_kornia(image, gaze, SIGMA)},
-    }[convention]
+    }
+    peers = kinds[convention]
     source = laplacian_pyramid(image, LEVELS, convention) if reuse else image
 
     def ours() -> torch.Tensor:

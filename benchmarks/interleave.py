@@ -24,7 +24,6 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -33,7 +32,7 @@ from torch import Tensor
 import semfov
 from benchmarks.detector_speed import photograph
 from benchmarks.timing import Comparison
-from semfov.belief.observer import SemanticObserver
+from semfov.agent import Strategy
 from semfov.detection import Detections
 from semfov.detection.export import export_onnx
 from semfov.detection.load import load_yolo
@@ -46,14 +45,6 @@ COLUMNS, ROWS, TARGET = 10, 10, 1
 EDGES = [50 * level / 640 for level in range(1, 8)]
 Clock = Callable[[], float]
 PARTS = ("sensor", "detector", "belief", "policy")
-
-
-@dataclass(frozen=True)
-class Policy:
-    """How a fixation is chosen, and whether scores are calibrated before."""
-
-    acquisition: semfov.acquisition.AcquisitionFunction
-    observation: semfov.FovealObservationModel | None
 
 
 def load(path: Path, threads: int, spinning: bool) -> OnnxDetector:
@@ -112,26 +103,25 @@ def in_turn(fixations: int = 10) -> Comparison:
     return Comparison(f"{fixations} fixations, sensor and detector in turn", ours, {"each alone": apart}, {}, agree)
 
 
-def policies(classes: Sequence[str], grid: semfov.Grid) -> dict[str, Policy]:
+def strategies(classes: Sequence[str]) -> dict[str, Strategy]:
     """From the cheapest search to exploration."""
     model = semfov.FovealObservationModel.identity(classes, EDGES).eval()
-    search = {
-        "search, non-predictive, raw": (semfov.search_policy("non-predictive"), None),
-        "search, predictive, calibrated": (semfov.search_policy("predictive", model), model),
+    raw, calibrated = (semfov.observers.Semantic(1 + len(classes), observation) for observation in (None, model))
+    return {
+        "search, non-predictive, raw": Strategy(raw, semfov.policies.NonPredictive()),
+        "search, predictive, calibrated": Strategy(calibrated, semfov.policies.Predictive(model)),
+        "exploration, KL divergence, calibrated": Strategy(calibrated, semfov.policies.KL(model)),
     }
-    made = {name: Policy(policy(TARGET, grid), observation) for name, (policy, observation) in search.items()}
-    explore = semfov.acquisition.KLDivergence(model, grid)
-    return made | {"exploration, KL divergence, calibrated": Policy(explore, model)}
 
 
 def scanpath(
-    eye: Eye, view: View, grid: semfov.Grid, policy: Policy, fixations: int, seed: int, clock: Clock
+    eye: Eye, view: View, grid: semfov.Grid, strategy: Strategy, fixations: int, seed: int, clock: Clock
 ) -> list[float]:
     """Milliseconds per fixation of each of `PARTS` along one scanpath."""
     generator = torch.Generator().manual_seed(seed)
-    observer = SemanticObserver(1 + len(eye.detector.classes), policy.observation)
+    acquisition = strategy.policy(TARGET, grid)
     visited = torch.zeros(1, len(grid), dtype=torch.bool)
-    belief = observer.start(1, grid, torch.zeros(()))
+    belief = strategy.observer.start(1, grid, torch.zeros(()))
     cell = torch.randint(len(grid), (1,), generator=generator)
     totals = torch.zeros(len(PARTS), dtype=torch.float64)
     for _ in range(fixations):
@@ -141,11 +131,11 @@ def scanpath(
         stamps.append(clock())
         detections = eye.detector.detect(canvas, view.placement)
         stamps.append(clock())
-        belief = observer.update(belief, observer.weigh(detections, fixation, grid))
+        belief = strategy.observer(belief, detections, fixation, grid)
         stamps.append(clock())
         visited = visited.scatter(-1, cell[:, None], True)
         noise = torch.rand(1, len(grid), generator=generator)
-        cell = select_fixation(policy.acquisition(belief, visited), visited, noise)
+        cell = select_fixation(acquisition(belief, visited), visited, noise)
         stamps.append(clock())
         totals += torch.tensor(stamps, dtype=torch.float64).diff()
     return (1e3 * totals / fixations).tolist()
@@ -187,15 +177,15 @@ def report_parts(path: Path, image: Tensor, options: argparse.Namespace, clock: 
     for threads in options.threads:
         torch.set_num_threads(threads)
         eye = Eye(semfov.Foveation(100.0), load(path, threads, spinning=False))
-        kinds = policies(eye.detector.classes, grid)
+        kinds = strategies(eye.detector.classes)
         opening: list[float] = []
         rows: dict[str, list[list[float]]] = {name: [] for name in kinds}
         for repetition in range(-1, options.repetitions):
             start = clock()
             view = eye.open(image)
             opening.append(1e3 * (clock() - start))
-            for name, policy in kinds.items():
-                row = scanpath(eye, view, grid, policy, options.fixations, repetition + 1, clock)
+            for name, strategy in kinds.items():
+                row = scanpath(eye, view, grid, strategy, options.fixations, repetition + 1, clock)
                 if repetition >= 0:
                     rows[name].append(row)
         for name, measured in rows.items():

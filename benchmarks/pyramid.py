@@ -50,6 +50,9 @@ def blur(image: Tensor) -> Tensor:
     return blurred.square().sum()
 
 
+WORKS: dict[str, Callable[[Tensor], Tensor]] = {"pyramid": split, "sensor": view, "blur": blur}
+
+
 def run(work: Callable[[Tensor], Tensor], image: Tensor, ahead: Collection[str], gradients: bool) -> Tensor:
     """The value of `work`, or its gradient, on matrices where the device is among those `ahead`."""
     with mock.patch.object(pyramid, "_AHEAD", ahead), torch.inference_mode(not gradients):
@@ -63,9 +66,9 @@ def run(work: Callable[[Tensor], Tensor], image: Tensor, ahead: Collection[str],
     return result
 
 
-def compare(work: Callable[[Tensor], Tensor], shape: tuple[int, ...], device: str, gradients: bool) -> Comparison:
+def compare(name: str, shape: tuple[int, ...], device: str, gradients: bool) -> Comparison:
     """Matrices beside Kornia."""
-    image = torch.rand(shape, generator=torch.Generator().manual_seed(0)).to(device)
+    work, image = WORKS[name], torch.rand(shape, generator=torch.Generator().manual_seed(0)).to(device)
 
     def ours() -> Tensor:
         return run(work, image, (device,), gradients)
@@ -73,7 +76,6 @@ def compare(work: Callable[[Tensor], Tensor], shape: tuple[int, ...], device: st
     def kornia() -> Tensor:
         return run(work, image, (), gradients)
 
-    name = {split: "pyramid", view: "sensor", blur: "blur"}[work]
     how = "forwards and backwards" if gradients else "inference"
     return Comparison(
         f"{name}, {' x '.join(map(str, shape))}, {how}",
@@ -86,10 +88,7 @@ def compare(work: Callable[[Tensor], Tensor], shape: tuple[int, ...], device: st
 def rows(device: str, seconds: float, clock: Clock) -> list[list[str]]:
     """One for each work, shape and kind of run."""
     comparisons = (
-        compare(work, shape, device, gradients)
-        for work in (split, view, blur)
-        for shape in SHAPES
-        for gradients in (True, False)
+        compare(name, shape, device, gradients) for name in WORKS for shape in SHAPES for gradients in (True, False)
     )
     return [[name, *row] for each in comparisons for name, _, *row in comparison_rows(measure(each, seconds, clock))]
 

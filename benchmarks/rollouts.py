@@ -5,9 +5,10 @@ from collections.abc import Callable
 import torch
 
 from benchmarks.timing import Comparison
-from eval.protocol import Episode, Searcher, run_episodes
-from semfov import Detections, Grid, search_policy
-from semfov.belief import SemanticObserver
+from semfov import Detections, Grid, observers, policies
+from semfov.agent import Strategy
+from semfov.experiments.candidates import Candidate
+from semfov.experiments.search_protocol import Episode, run_episodes
 
 CLASSES, SHIFTS = 80, 30
 
@@ -29,10 +30,10 @@ def searches(episodes: int) -> tuple[Detections, Callable[[int, int], object]]:
     seen = Detections(boxes, scores, torch.ones(100, 12, dtype=torch.bool))
     todo = [episode(n) for n in range(episodes)]
     noise = torch.rand(episodes, SHIFTS + 1, 100, generator=generator)
-    searcher = Searcher(SemanticObserver(CLASSES + 1), search_policy("non-predictive"))
+    candidate = Candidate(Strategy(observers.Semantic(CLASSES + 1), policies.NonPredictive()))
 
     def run(count: int, batch: int) -> object:
-        return run_episodes(todo[:count], searcher, seen, grid, noise[:count], shifts=SHIFTS, batch=batch)
+        return run_episodes(todo[:count], candidate, seen, grid, noise[:count], shifts=SHIFTS, batch=batch)
 
     return seen, run
 

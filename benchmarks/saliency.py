@@ -9,7 +9,9 @@ python -m benchmarks.saliency --size 640 480 --threads 2
 import argparse
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import reduce
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +22,7 @@ from torch.nn import functional as F
 
 from semfov.gaze.saliency import VOCUS2, IttiKoch
 
-Array = NDArray[np.float32]
+Array = NDArray[Any]
 
 
 def photograph(width: int, height: int) -> Tensor:
@@ -73,6 +75,11 @@ def promote(image: Array) -> Array:
     return image * np.float32((1 - others) ** 2)
 
 
+def total(images: Iterable[Array]) -> Array:
+    """Their sum."""
+    return reduce(np.add, images)
+
+
 def gabor_filters() -> list[Array]:
     """Even and odd filters of four orientations."""
     y, x = np.mgrid[-4:5, -4:5].astype(np.float32)
@@ -98,7 +105,7 @@ def itti_koch_opencv(image: Array, filters: list[Array]) -> Array:
     pyramid = [cv2.merge([intensity, red_green, np.maximum(blue - mean, 0) - yellow])]
     for _ in range(8):
         pyramid.append(cv2.pyrDown(pyramid[-1]))
-    features = []
+    features: list[list[Array]] = []
     for level in pyramid:
         answers = []
         if len(features) >= 2:
@@ -111,12 +118,12 @@ def itti_koch_opencv(image: Array, filters: list[Array]) -> Array:
         size = features[centre][0].shape[::-1]
         for index in range(7):
             here, around = features[centre][index], [features[centre + delta][index] for delta in (3, 4)]
-            both = sum(promote(cv2.absdiff(here, cv2.resize(surround, size))) for surround in around)
+            both = total(promote(cv2.absdiff(here, cv2.resize(surround, size))) for surround in around)
             for _ in range(4 - centre):
                 both = cv2.pyrDown(both)
             totals[index] += both
-    maps = [totals[0], totals[1] + totals[2], sum(promote(total) for total in totals[3:])]
-    saliency = sum(promote(each) for each in maps) / 3
+    maps = [totals[0], totals[1] + totals[2], total(promote(each) for each in totals[3:])]
+    saliency = total(promote(each) for each in maps) / 3
     return stretch(cv2.resize(saliency, image.shape[1::-1]))
 
 

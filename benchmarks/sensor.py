@@ -16,6 +16,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 
 import cv2
 import kornia.geometry.transform as kornia
@@ -106,7 +107,7 @@ def measure(height: int, width: int, sigma: float, repetitions: int) -> None:
     torch.manual_seed(0)
     image, gaze = torch.rand(1, 3, height, width), torch.tensor([0.45 * width, 0.6 * height])
     array, point = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy()), (gaze[0].item(), gaze[1].item())
-    peers = {
+    peers: dict[str, Callable[[], np.ndarray | Tensor]] = {
         "cv2, plain": lambda: plain(array, point, sigma),
         "cv2, tuned": lambda: tuned(array, point, sigma),
         "kornia": lambda: with_kornia(image, gaze, sigma),
@@ -118,8 +119,9 @@ def measure(height: int, width: int, sigma: float, repetitions: int) -> None:
     )
     for name, equals in same:
         bands = laplacian_pyramid(image, LEVELS, name)
-        runs[f"semfov {name}, whole"] = lambda c=name: foveate(image, gaze, sigma=sigma, levels=LEVELS, convention=c)
-        runs[f"semfov {name}, pyramid reused"] = lambda b=bands: foveate(b, gaze, sigma=sigma)
+        whole = partial(foveate, image, gaze, sigma=sigma, levels=LEVELS, convention=name)
+        runs[f"semfov {name}, whole"] = whole
+        runs[f"semfov {name}, pyramid reused"] = partial(foveate, bands, gaze, sigma=sigma)
         view = foveate(bands, gaze, sigma=sigma)
         for peer in equals:
             torch.testing.assert_close(view, planes(peers[peer]()), rtol=0, atol=1e-5)
@@ -130,14 +132,12 @@ def measure(height: int, width: int, sigma: float, repetitions: int) -> None:
         f"{'ms: least, median':30s}", *(f"{min(times[p]):8.2f} {statistics.median(times[p]):8.2f}    " for p in peers)
     )
     print(f"{'time / time of':30s}", *(f"{p:21s}" for p in peers))
-    for name in [run for run in runs if run not in peers]:
+    for run in [run for run in runs if run not in peers]:
         cells = []
         for peer in peers:
-            low, middle, high = statistics.quantiles(
-                [a / b for a, b in zip(times[name], times[peer], strict=True)], n=4
-            )
+            low, middle, high = statistics.quantiles([a / b for a, b in zip(times[run], times[peer], strict=True)], n=4)
             cells.append(f"{middle:5.2f} ({low:5.2f}-{high:5.2f})  ")
-        print(f"{name:30s}", *cells, f"{min(times[name]):6.2f} {statistics.median(times[name]):6.2f} ms")
+        print(f"{run:30s}", *cells, f"{min(times[run]):6.2f} {statistics.median(times[run]):6.2f} ms")
 
 
 def main() -> None:

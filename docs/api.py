@@ -14,10 +14,13 @@ MODULES = (
     "semfov.observation",
     "semfov.observation.dirichlet",
     "semfov.belief",
+    "semfov.belief.observers",
     "semfov.belief.fusion",
     "semfov.gaze",
+    "semfov.gaze.policies",
     "semfov.gaze.acquisition",
     "semfov.gaze.saliency",
+    "semfov.episode",
     "semfov.data",
     "semfov.errors",
 )

@@ -16,14 +16,14 @@ import torch
 import yaml
 
 import semfov
-from eval.calibration_metrics import Calibration, calibration
-from eval.command import run_command
-from eval.config import DataConfig, DetectorConfig, SensorConfig
-from eval.parallel import rank
-from eval.report import save_figure, table
-from eval.samples import Samples, SampleSettings, collect
-from eval.setup import make_observation, plain
-from semfov.files import write_text
+from semfov.experiments.command import run_command
+from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.experiments.parallel import rank
+from semfov.experiments.samples import Samples, SampleSettings, collect
+from semfov.experiments.setup import make_observation, plain
+from semfov.experiments.summary import save_figure, table
+from semfov.io.files import write_text
+from semfov.metrics.calibration import Calibration, calibration
 from semfov.viz import plot_reliability
 
 

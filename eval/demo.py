@@ -22,17 +22,17 @@ import torch
 from torch import Tensor
 
 import semfov
-from eval.animation import render, save_animation
-from eval.command import run_command
-from eval.html.episode import Pool, episode_data
-from eval.html.page import write_page
-from eval.pictures import Picture, embedded_picture, open_pictures
-from eval.report import save_figure
-from eval.stages import Stages
-from eval.views import foveated_views
 from semfov import ActivePerception, Scanpath, viz
+from semfov.data.sources import Picture, embedded_picture, open_pictures
 from semfov.errors import check, lookup
-from semfov.sensor import SENSORS, named_sensor
+from semfov.experiments.command import run_command
+from semfov.experiments.summary import save_figure
+from semfov.report.episode import Pool, episode_data
+from semfov.report.page import write_page
+from semfov.sensor import SENSORS
+from semfov.sensor.named import SensorName
+from semfov.viz.animation import render, save_animation
+from semfov.viz.views import foveated_views
 
 PHOTO = "photograph, folder of photographs or video (none: an embedded scene)"
 
@@ -66,7 +66,7 @@ class DemoConfig:
     camera: int | None = None
     agent: Literal["recommended", "published", "raw"] = "recommended"
     detector: str = "yolov3-tiny"
-    sensor: Literal["gradual", "published", "published-narrow"] | None = None
+    sensor: SensorName | None = None
     start: int | None = None
     shifts: int | None = None
     seed: int = 0
@@ -89,14 +89,14 @@ def demo(config: DemoConfig) -> None:
     written, pool, episodes = [], Pool(), []
     several = config.camera is not None or (config.photo is not None and is_many(config.photo))
     for number, picture in enumerate(pictures(config, agent)):
-        scanpath, stages = look_at(agent, picture, config)
-        print(told(picture.name, scanpath, stages))
+        scanpath = look_at(agent, picture, config)
+        print(told(picture.name, scanpath))
         views = foveated_views(agent.eye, picture.image, scanpath.fixations)
         folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
         written += draw(folder, scanpath, picture, views)
         if config.report is not None:
-            named = {"name": picture.name, "boxes": picture.boxes, "seconds": stages.looks}
-            episodes.append(episode_data(scanpath, picture.image, views, pool, **named))
+            shown = episode_data(scanpath, picture.image, views, pool, name=picture.name, boxes=picture.boxes)
+            episodes.append(shown)
     if config.report is not None:
         title = "exploration" if config.target is None else f"search for “{config.target}”"
         written.append(write_page(config.report, f"semfov: {title}", episodes, pool))
@@ -108,23 +108,15 @@ def demo(config: DemoConfig) -> None:
 def make_agent(config: DemoConfig) -> ActivePerception:
     """The agent that the settings name."""
     if config.agent == "recommended":
-        return ActivePerception.from_pretrained(config.detector, **SENSORS[config.sensor or "gradual"])
-    sensor = config.sensor or "published"
-    if config.agent == "published":
-        return ActivePerception.published(config.detector, sensor=sensor)
-    return ActivePerception(
-        named_sensor(sensor),
-        semfov.load_detector(config.detector),
-        None,
-        (10, 10),
-        semfov.search_policy("non-predictive"),
-        exploration=semfov.exploration_policy("random"),
-    ).eval()
+        sensor = SENSORS[config.sensor or "gradual"]
+        return ActivePerception.recommended(config.detector, sigma=sensor["sigma"], growth=sensor["growth"])
+    make = ActivePerception.published if config.agent == "published" else ActivePerception.raw
+    return make(config.detector, sensor=config.sensor or "published")
 
 
 def is_many(photo: Path) -> bool:
     """Whether this is a source of several pictures."""
-    from eval.pictures import VIDEOS
+    from semfov.data.sources import VIDEOS
 
     return photo.is_dir() or photo.suffix.lower() in VIDEOS
 
@@ -137,16 +129,14 @@ def pictures(config: DemoConfig, agent: ActivePerception) -> Iterator[Picture]:
         yield from open_pictures(config.photo, config.camera, config.frames)
 
 
-def look_at(agent: ActivePerception, picture: Picture, config: DemoConfig) -> tuple[Scanpath, Stages]:
-    """Search or explore a picture, and measure the stages."""
-    stages = Stages()
+def look_at(agent: ActivePerception, picture: Picture, config: DemoConfig) -> Scanpath:
+    """Search or explore a picture."""
     common: dict[str, Any] = {"start": start_cell(agent, picture, config), "seed": config.seed}
-    with torch.inference_mode(), stages.watch(agent):
+    with torch.inference_mode():
         if config.target is None:
-            shifts = 20 if config.shifts is None else config.shifts
-            return agent.explore(picture.image, shifts=shifts, **common), stages
+            return agent.explore(picture.image, shifts=20 if config.shifts is None else config.shifts, **common)
         shifts = 30 if config.shifts is None else config.shifts
-        return agent.search(picture.image, config.target, boxes=picture.boxes, shifts=shifts, **common), stages
+        return agent.search(picture.image, config.target, boxes=picture.boxes, shifts=shifts, **common)
 
 
 def start_cell(agent: ActivePerception, picture: Picture, config: DemoConfig) -> int | None:
@@ -159,15 +149,16 @@ def start_cell(agent: ActivePerception, picture: Picture, config: DemoConfig) ->
     return int(free[torch.randint(len(free), (1,), generator=generator)]) if len(free) else None
 
 
-def told(name: str, scanpath: Scanpath, stages: Stages) -> str:
+def told(name: str, scanpath: Scanpath) -> str:
     """What was done, fixation by fixation, as a table."""
-    wanted = scanpath.target is not None
-    values = viz.class_posterior(scanpath) if wanted else viz.entropy(scanpath)
-    what = f"p({scanpath.classes[scanpath.target]})" if wanted else "entropy (bits)"
+    if scanpath.target is None:
+        values, what = viz.entropy(scanpath), "entropy (bits)"
+    else:
+        values, what = viz.class_posterior(scanpath), f"p({scanpath.classes[scanpath.target]})"
     rows = [["#", "at (column, row)", "seen from there", f"{what} there", "highest", "at", "ms"]]
     for number, (cell, value) in enumerate(zip(scanpath.cells.tolist(), values, strict=True)):
         best = int(value.argmax())
-        milliseconds = 1000 * sum(stages.looks[number].values())
+        milliseconds = 1000 * sum(scanpath.seconds[number].values())
         figures = [f"{float(value[cell]):.3f}", f"{float(value[best]):.3f}", place(scanpath, best)]
         rows.append([str(number), place(scanpath, cell), seen(scanpath, number), *figures, f"{milliseconds:.0f}"])
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]

@@ -11,20 +11,20 @@ the same command is given again.
 import sys
 from collections.abc import Sequence
 
-from eval.command import run_command
-from eval.config import ExploreConfig
-from eval.explore_report import report
-from eval.parallel import rank
-from eval.run import finish
-from eval.tasks import ExploreRun
+from semfov.experiments.command import run_command
+from semfov.experiments.config import ExploreConfig
+from semfov.experiments.explore_report import report
+from semfov.experiments.parallel import rank
+from semfov.experiments.run import finish
+from semfov.experiments.runs import ExploreRun
 
 
 def explore(config: ExploreConfig) -> None:
     """Run a scene exploration experiment and write its tables, figures and records."""
     run = ExploreRun(config)
-    parts = finish(run, "exploring")
+    finish(run, "exploring")
     if rank() == 0:
-        report(run, parts)
+        report(run)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from eval.animation import Frame, in_palette, render
-from eval.views import foveated_views
 from semfov import ActivePerception, EmbeddedScenes
-from semfov.files import replacing
+from semfov.io.files import replacing
 from semfov.viz import plot_belief_strip, plot_foveated_strip
+from semfov.viz.animation import Frame, in_palette, render
+from semfov.viz.views import foveated_views
 
 PATH = Path(__file__).parents[1] / "docs" / "pictures" / "search.png"
 SCENE, TARGET, START = 5, "cup", 99
@@ -17,7 +17,7 @@ SCENE, TARGET, START = 5, "cup", 99
 
 def make_picture(path: Path = PATH) -> None:
     """Search the scene, and draw what was seen above what was believed, in a small file."""
-    agent = ActivePerception.from_pretrained("yolov3-tiny")
+    agent = ActivePerception.recommended("yolov3-tiny")
     scene = EmbeddedScenes(agent.classes[1:])[SCENE]
     boxes = scene.boxes[scene.labels == agent.classes.index(TARGET)]
     with torch.inference_mode():

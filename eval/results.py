@@ -13,14 +13,12 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from eval import paper
-from eval.command import run_command
-from eval.config import SearchConfig
-from eval.experiments import STUDIES, ResultsConfig, experiments
 from eval.explore import explore
-from eval.findings import findings
-from eval.page_figures import draw_figures
-from eval.page_tables import (
+from eval.page import paper
+from eval.page.experiments import CENTRAL, STUDIES, ResultsConfig, experiments
+from eval.page.figures import draw_figures
+from eval.page.findings import findings
+from eval.page.tables import (
     Runs,
     agreement,
     beside_paper,
@@ -36,7 +34,10 @@ from eval.page_tables import (
 )
 from eval.search import search
 from semfov.errors import DataError, lookup
-from semfov.files import write_text
+from semfov.experiments.command import run_command
+from semfov.experiments.config import SearchConfig
+from semfov.experiments.presets import label
+from semfov.io.files import write_text
 
 NOT_RUN = ["*Not run yet.*"]
 
@@ -100,7 +101,7 @@ TABLES: dict[str, Callable[[Path], list[str]]] = {
     "agreement": agreement,
     "first-fixations": first_fixations,
     "paired-search": partial(paired, baseline="random", shifts=(1, 5, 15, 30)),
-    "paired-learned": partial(paired, baseline="non-predictive-raw+tempered+central", shifts=(1, 5, 10, 15, 30)),
+    "paired-learned": partial(paired, baseline=label(CENTRAL, "search"), shifts=(1, 5, 10, 15, 30)),
     "paired-explore": partial(paired, baseline="random-raw", shifts=EXPLORED),
     "paired-explore-calibrated": partial(paired, baseline="random-calibrated", shifts=EXPLORED),
     "paired-explore-objects": paired_objects,

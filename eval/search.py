@@ -11,20 +11,20 @@ A run that was stopped goes on where it was when the same command is given again
 import sys
 from collections.abc import Sequence
 
-from eval.command import run_command
-from eval.config import SearchConfig
-from eval.parallel import rank
-from eval.run import finish
-from eval.search_report import report
-from eval.tasks import SearchRun
+from semfov.experiments.command import run_command
+from semfov.experiments.config import SearchConfig
+from semfov.experiments.parallel import rank
+from semfov.experiments.run import finish
+from semfov.experiments.runs import SearchRun
+from semfov.experiments.search_report import report
 
 
 def search(config: SearchConfig) -> None:
     """Run a visual search experiment and write its tables, figures and records."""
     run = SearchRun(config)
-    parts = finish(run, "searching")
+    finish(run, "searching")
     if rank() == 0:
-        report(run, parts)
+        report(run)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

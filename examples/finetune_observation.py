@@ -9,15 +9,25 @@ Run it from a checkout: python -m examples.finetune_observation
 
 import argparse
 import copy
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 import semfov
-from semfov.belief import fuse
 
 
-def looks_at(scenes: semfov.EmbeddedScenes, eye: torch.nn.Module, starts: int) -> list[dict[str, object]]:
+@dataclass(frozen=True)
+class Looks:
+    """What is seen from some cells of a scene, and the cells that hold each target."""
+
+    grid: semfov.Grid
+    cells: Tensor
+    detections: semfov.Detections
+    goals: dict[int, Tensor]
+
+
+def looks_at(scenes: semfov.EmbeddedScenes, eye: semfov.Eye, starts: int) -> list[Looks]:
     """What is seen from a few cells of every scene: these never change, so they are computed once."""
     looks = []
     for index in range(len(scenes)):
@@ -28,20 +38,19 @@ def looks_at(scenes: semfov.EmbeddedScenes, eye: torch.nn.Module, starts: int) -
         goals = {target: covered[scene.labels == target].any(0) for target in scenes.targets(index)}
         with torch.no_grad():
             detections = eye(scene.image[None], grid.centres[cells])
-        looks.append({"grid": grid, "cells": cells, "goals": goals, "detections": detections})
+        looks.append(Looks(grid, cells, detections, goals))
     return looks
 
 
-def chance_of_hit(model: semfov.FovealObservationModel, look: dict[str, object], sharpness: float) -> Tensor:
+def chance_of_hit(model: semfov.FovealObservationModel, looks: Looks, sharpness: float) -> Tensor:
     """Probability that the next fixation, drawn from a softmax over the target's posterior, lands on the target."""
-    grid, cells, detections = look["grid"], look["cells"], look["detections"]
-    evidence = semfov.weigh(detections, grid.centres[cells], grid, model)
-    beta = torch.full((len(cells), len(grid), evidence.likelihood.shape[-1]), 0.5)
-    beta = fuse(beta, evidence.likelihood, evidence.footprint)
+    grid, cells, seen = looks.grid, looks.cells, looks.detections
+    observer = semfov.observers.Semantic(len(model.classes) + 1, model)
+    belief = observer(observer.start(len(cells), grid, seen.scores), seen, grid.centres[cells], grid)
     here = torch.nn.functional.one_hot(cells, len(grid)).bool()
     hits = []
-    for target, goal in look["goals"].items():
-        values = semfov.DirichletBelief(beta).probability(target).clamp(min=1e-9).log()
+    for target, goal in looks.goals.items():
+        values = belief.probability(target).clamp(min=1e-9).log()
         choice = (sharpness * values).masked_fill(here, -torch.inf).softmax(-1)
         hits.append(choice[:, goal].sum(-1)[~goal[cells]])
     return torch.cat(hits)

@@ -67,8 +67,9 @@ def main() -> None:
         loss = -probabilities.gather(-1, labels[:, None]).clamp(min=1e-6).log().mean()
         print(f"{name}: {loss:.2f} nats lost per detection on other scenes")
 
-    policy = semfov.search_policy("predictive", model)
-    agent = semfov.ActivePerception(eye.sensor, detector, model, (10, 10), policy).eval()
+    observer = semfov.observers.Semantic(len(detector.classes) + 1, model)
+    search, explore = semfov.policies.Predictive(model), semfov.policies.KL(model)
+    agent = semfov.ActivePerception(eye, (observer, search), (observer, explore)).eval()
     scanpath = agent.search(others[0].image, "person", start=0)
     print(f"person {'found' if scanpath.found else 'not found'} after {scanpath.shifts} gaze shifts")
 

@@ -17,9 +17,9 @@ def main() -> None:
     parser.add_argument("--out", default="scanpath.png", help="where to write (default: scanpath.png)")
     arguments = parser.parse_args()
 
-    # An eye (a sensor before a detector), a belief about what is where, and a policy that chooses where to look next.
-    # `semfov.ActivePerception(...)` puts parts of your own together.
-    agent = semfov.ActivePerception.from_pretrained("yolov3-tiny")
+    # An eye (a sensor before a detector), an observer that turns looks into belief, and a policy that chooses where to
+    # look next. `.published` is the paper's agent; `semfov.ActivePerception(...)` puts parts of your own together.
+    agent = semfov.ActivePerception.recommended("yolov3-tiny")
 
     image = semfov.read_image(arguments.photo) if arguments.photo else semfov.EmbeddedScenes(agent.classes[1:])[1].image
     scanpath = agent.search(image, arguments.target, start=0)

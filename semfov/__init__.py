@@ -3,24 +3,25 @@
 from typing import TYPE_CHECKING, Any
 
 from semfov.agent import ActivePerception
-from semfov.belief import DirichletBelief, Evidence, Grid, SemanticMap, TargetEvidence, fusion, weigh
+from semfov.belief import Belief, DirichletBelief, Grid, TargetEvidence, fusion, observers
 from semfov.data import EmbeddedScenes, read_image
 from semfov.detection import Detections, Detector, Selection
 from semfov.detection.load import load_detector
+from semfov.episode import rollout
 from semfov.errors import DataError, InputError, SemfovError
 from semfov.eye import Eye
-from semfov.gaze import acquisition, exploration_policy, saliency, search_policy
+from semfov.gaze import acquisition, policies, saliency
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
 from semfov.scanpath import Scanpath
 from semfov.sensor import Foveation, foveate
+from semfov.version import __version__
 
 if TYPE_CHECKING:
     from semfov.data import CocoScenes
 
-__version__ = "0.1.0"
-
 __all__ = [
     "ActivePerception",
+    "Belief",
     "CocoScenes",
     "DataError",
     "Detections",
@@ -28,7 +29,6 @@ __all__ = [
     "DirichletBelief",
     "DirichletStatistics",
     "EmbeddedScenes",
-    "Evidence",
     "Eye",
     "FovealObservationModel",
     "Foveation",
@@ -36,19 +36,19 @@ __all__ = [
     "InputError",
     "Scanpath",
     "Selection",
-    "SemanticMap",
     "SemfovError",
     "TargetEvidence",
+    "__version__",
     "acquisition",
     "dirichlet",
-    "exploration_policy",
     "foveate",
     "fusion",
     "load_detector",
+    "observers",
+    "policies",
     "read_image",
+    "rollout",
     "saliency",
-    "search_policy",
-    "weigh",
 ]
 
 

@@ -1,31 +1,25 @@
-"""The chain: look, weigh what was seen, update the belief, choose where to look next."""
+"""An agent with a foveal sensor: it searches an image for a class, or explores it."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from semfov.belief.belief import Belief, dirichlet_belief
 from semfov.belief.context import ContextPrior
-from semfov.belief.context_observer import ContextObserver
-from semfov.belief.evidence import Observation
-from semfov.belief.grid import Footprint, Grid
-from semfov.belief.observer import Observer, SemanticObserver
+from semfov.belief.grid import Grid
+from semfov.belief.observers import Context, Observer, Semantic, Target
 from semfov.belief.target_evidence import TargetEvidence
-from semfov.belief.target_observer import TargetObserver
 from semfov.detection.detections import Detections
-from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
+from semfov.episode import LiveLooks, Step, rollout
 from semfov.errors import check, check_shape, lookup
 from semfov.eye import Eye
-from semfov.gaze.acquisition import AcquisitionFunction
-from semfov.gaze.policies import Policy, exploration_policy, search_policy
-from semfov.gaze.selection import select_fixation
-from semfov.observation.compatibility import recommended
+from semfov.gaze.choice import Greedy, drawn_by
+from semfov.gaze.policies import KL, Closer, NonPredictive, Policy, Predictive, Random
 from semfov.observation.foveal import FovealObservationModel
-from semfov.scanpath import Scanpath
+from semfov.scanpath import Scanpath, trace
 from semfov.sensor.foveation import Foveation
 from semfov.sensor.named import named_sensor
 
@@ -33,105 +27,51 @@ PUBLISHED_SENSORS = ("published", "published-narrow")
 """Named sensors of the paper, for which observation models of maximum likelihood are shipped."""
 
 
-@dataclass(frozen=True)
-class Step:
-    """What one look leaves behind.
-
-    Attributes:
-        belief: the belief after the look.
-        visited: `(B, X·Y)`, cells that inhibition of return keeps the gaze from.
-        values: `(B, X·Y)`, acquisition values.
-        cell: `(B,)`, the next cell to fixate, -1 where none is left.
-    """
-
-    belief: Belief
-    visited: Tensor
-    values: Tensor
-    cell: Tensor
-
-
-def step(
-    observer: Observer,
-    belief: Belief,
-    visited: Tensor,
-    cell: Tensor,
-    evidence: Any,
-    acquisition: AcquisitionFunction,
-    noise: Tensor,
-) -> Step:
-    """One cycle of active perception for a batch of episodes; agent and evaluation both call it.
+class Strategy(nn.Module):
+    """How to go about a task.
 
     Args:
         observer: turns looks into belief.
-        belief: before the look.
-        visited: `(B, X·Y)` boolean, cells fixated before.
-        cell: `(B,)`, the cell that is fixated now.
-        evidence: what the look from there says (`Observer.weigh`).
-        acquisition: values the cells by the new belief.
-        noise: `(B, X·Y)`, random numbers that break ties.
+        policy: chooses where to look by it.
     """
-    belief = observer.update(belief, evidence)
-    visited = visited.scatter(-1, cell[:, None], True)
-    values = acquisition(belief, visited)
-    return Step(belief, visited, values, select_fixation(values, visited, noise))
+
+    def __init__(self, observer: Observer, policy: Policy) -> None:
+        super().__init__()
+        self.observer = observer
+        self.policy = policy
 
 
 class ActivePerception(nn.Module):
-    """An agent with a foveal sensor that searches an image for a class, or explores it.
+    """An agent that moves its gaze over an image, to find a class or to learn what is where.
 
     Args:
-        sensor: the foveal sensor; its σ is in pixels of an image whose longer side is `reference`.
-        detector: turns foveated views into detections.
-        observation: calibrates scores by class and distance to the fovea; None takes them raw.
+        eye: sensor and detector.
+        search: observer and policy of searches.
+        explore: observer and policy of explorations; its observer keeps the map of all classes during searches, too.
         grid: `(columns, rows)` of the belief.
-        policy: makes the acquisition function (`semfov.search_policy`, `semfov.exploration_policy`).
-        prior: Dirichlet parameter of every class before the first look.
-        fusion: `kaplan`, `product` or `sum`.
-        footprint: which cells a detection updates (`Grid.footprint`).
-        semantics: observer that keeps the map of all classes; None makes one of the four settings before.
-        observer: observer that search goes by, where it is another one (`semfov.belief.TargetObserver`).
-        exploration: policy of `explore`, where it is another one.
-        reference: longer side in pixels of the image that the sensor's σ is meant for.
 
     Example::
 
-        agent = ActivePerception.from_pretrained("yolov3-tiny")
+        agent = ActivePerception.recommended("yolov3-tiny")
         scanpath = agent.search(read_image("kitchen.jpg"), "cup")
     """
 
     def __init__(
         self,
-        sensor: Foveation,
-        detector: Detector,
-        observation: Observation | None,
-        grid: tuple[int, int],
-        policy: Policy,
+        eye: Eye,
+        search: tuple[Observer, Policy],
+        explore: tuple[Observer, Policy],
         *,
-        prior: float = 0.5,
-        fusion: str = "kaplan",
-        footprint: Footprint = "overlap",
-        semantics: SemanticObserver | None = None,
-        observer: Observer | None = None,
-        exploration: Policy | None = None,
-        reference: float = 640.0,
+        grid: tuple[int, int] = (10, 10),
     ) -> None:
         super().__init__()
-        self.eye = Eye(sensor, detector, reference=reference)
-        self.observation = observation
+        self.eye = eye
+        self.searching = Strategy(*search)
+        self.exploring = Strategy(*explore)
         self.columns, self.rows = grid
-        self.policy = policy
-        self.exploration = exploration or policy
-        self.semantics = semantics or SemanticObserver(
-            len(self.classes), observation, prior=prior, fusion=fusion, footprint=footprint
-        )
-        self.observer: Observer = observer or self.semantics
-        # Observers are no modules; what they learned moves with the agent.
-        learned = dict.fromkeys([*models_of(self.semantics), *models_of(self.observer)])
-        known = set(self.modules())
-        self.learned = nn.ModuleList(model for model in learned if model not in known)
 
     @classmethod
-    def from_pretrained(
+    def recommended(
         cls,
         name: str = "yolov3-tiny",
         *,
@@ -141,12 +81,12 @@ class ActivePerception(nn.Module):
         context: bool = False,
         **options: Any,
     ) -> Self:
-        """The recommended agent: learned target evidence for search, the closer look for exploration.
+        """The agent for daily use: learned target evidence for search, the closer look for exploration.
 
         Args:
             name: a detector for which models are shipped, `yolov3-tiny` or `yolox-nano`.
             sigma: width of the fovea in pixels of an image of 640; the models are fitted for 100.
-            growth: see `Foveation`; the models are fitted for 2, the observation model for 1 too.
+            growth: see `Foveation`; the models are fitted for 2.
             grid: `(columns, rows)` of the belief.
             context: whether search also goes by the usual places and company of the target (`ContextPrior`).
             options: of `semfov.load_detector`.
@@ -156,26 +96,22 @@ class ActivePerception(nn.Module):
             DataError: the weights cannot be had, or are damaged.
         """
         detector = load_detector(name, **options)
-        fitted = recommended(detector.name, growth)
-        observation = FovealObservationModel.from_pretrained(fitted, detector=detector).requires_grad_(False)
-        evidence = TargetEvidence.from_pretrained(detector.name).requires_grad_(False)
-        observer: Observer = TargetObserver(evidence)
+        eye = Eye(Foveation(sigma, growth=growth), detector)
+        evidence = TargetEvidence.from_pretrained(detector.name)
+        evidence.check_compatible(eye.settings())
+        observer: Observer = Target(evidence)
         if context:
-            prior = ContextPrior.from_pretrained().requires_grad_(False)
+            prior = ContextPrior.from_pretrained()
             prior.check_compatible(detector.classes)
-            observer = ContextObserver(observer, prior)
-        agent = cls(
-            Foveation(sigma, growth=growth),
-            detector,
-            observation,
-            grid,
-            search_policy("non-predictive"),
-            semantics=SemanticObserver(len(detector.classes) + 1, tempering=0.5),
-            observer=observer,
-            exploration=exploration_policy("closer-look", fovea=sigma / 640),
-        )
-        evidence.check_compatible(agent.eye.settings())
+            observer = Context(observer, prior)
+        mapper = Semantic(len(detector.classes) + 1, tempering=0.5)
+        agent = cls(eye, (observer, NonPredictive()), (mapper, Closer(sigma / eye.reference)), grid=grid)
         return agent.eval().requires_grad_(False)
+
+    @classmethod
+    def from_pretrained(cls, name: str = "yolov3-tiny", **options: Any) -> Self:
+        """The recommended agent, by the name that fitted models have for this; arguments of `recommended`."""
+        return cls.recommended(name, **options)
 
     @classmethod
     def published(
@@ -208,18 +144,30 @@ class ActivePerception(nn.Module):
         lookup(sensor, PUBLISHED_SENSORS, "published sensor")
         lookup(search, ["predictive", "non-predictive"], "published search policy")
         detector = load_detector(name, **options)
-        fitted = f"{detector.name}-{sensor}"
-        observation = FovealObservationModel.from_pretrained(fitted, detector=detector).requires_grad_(False)
-        agent = cls(
-            named_sensor(sensor),
-            detector,
-            observation if calibrated else None,
-            (10, 10),
-            search_policy(search, observation),
-            exploration=exploration_policy("kl", observation),
-        )
-        observation.check_compatible(agent.eye.settings())
-        return agent.eval().requires_grad_(False)
+        eye = Eye(named_sensor(sensor), detector)
+        model = FovealObservationModel.from_pretrained(f"{detector.name}-{sensor}")
+        model.check_compatible(eye.settings(), detector.classes)
+        observer = Semantic(len(detector.classes) + 1, model if calibrated else None)
+        policy = Predictive(model) if search == "predictive" else NonPredictive()
+        return cls(eye, (observer, policy), (observer, KL(model))).eval().requires_grad_(False)
+
+    @classmethod
+    def raw(cls, name: str = "yolov3-tiny", *, sensor: str = "published", **options: Any) -> Self:
+        """The agent that needs no fitted model, for any detector: scores are likelihoods, exploration is at random.
+
+        Args:
+            name: of the detector, as for `semfov.load_detector`.
+            sensor: name of the sensor (`semfov.sensor.SENSORS`).
+            options: of `semfov.load_detector`.
+
+        Raises:
+            InputError: the detector or the sensor is unknown.
+            DataError: the weights cannot be had, or are damaged.
+        """
+        detector = load_detector(name, **options)
+        observer = Semantic(len(detector.classes) + 1)
+        eye = Eye(named_sensor(sensor), detector)
+        return cls(eye, (observer, NonPredictive()), (observer, Random())).eval().requires_grad_(False)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -260,11 +208,12 @@ class ActivePerception(nn.Module):
         index = self._target(target)
         goal = None if boxes is None else grid.footprint(boxes.to(image)).any(-2)
 
-        def ends(cell: int, detections: Detections) -> bool:
-            return bool(goal[cell]) if goal is not None else confirms(detections, grid, cell, index, confirm)
+        def finds(step: Step) -> Tensor:
+            if goal is not None:
+                return goal[step.cell]
+            return confirms(step.detections, grid, step.cell, index, confirm)
 
-        policy = self.policy(index, grid)
-        return self._gaze(image, grid, self.observer, policy, index, start, shifts, seed, ends)
+        return self._gaze(image, grid, self.searching, index, start, shifts, seed, finds)
 
     def explore(self, image: Tensor, *, start: int | None = None, shifts: int = 20, seed: int = 0) -> Scanpath:
         """Explore an image: build up the belief about the whole map, with no target.
@@ -273,13 +222,10 @@ class ActivePerception(nn.Module):
         scanpath has no target, and nothing is found.
 
         Raises:
-            InputError: the policy needs a target, or an argument does not fit.
+            InputError: an argument does not fit.
         """
         image, grid = self._frame(image)
-        policy = self.exploration(None, grid)
-        return self._gaze(
-            image, grid, self.semantics, policy, None, start, shifts, seed, lambda cell, detections: False
-        )
+        return self._gaze(image, grid, self.exploring, None, start, shifts, seed, None)
 
     def _frame(self, image: Tensor) -> tuple[Tensor, Grid]:
         """The image as a batch of one, and the grid over it."""
@@ -291,58 +237,39 @@ class ActivePerception(nn.Module):
         self,
         image: Tensor,
         grid: Grid,
-        observer: Observer,
-        acquisition: AcquisitionFunction,
+        strategy: Strategy,
         target: int | None,
         start: int | None,
         shifts: int,
         seed: int,
-        ends: Callable[[int, Detections], bool],
+        finds: Callable[[Step], Tensor] | None,
     ) -> Scanpath:
-        """Move the gaze until `ends` says so, for what is seen from a cell, or no shift or cell is left."""
+        """Move the gaze until the target is found, or no shift or cell is left."""
         generator = torch.Generator().manual_seed(seed)
         if start is None:
             start = int(torch.randint(len(grid), (1,), generator=generator))
         check(0 <= start < len(grid), "start", f"a cell from 0 to {len(grid) - 1}", start)
-        view = self.eye.open(image)
-        belief, semantics = observer.start(1, grid, image), self.semantics.start(1, grid, image)
-        visited = torch.zeros(1, len(grid), dtype=torch.bool, device=image.device)
-        cell, cells, seen, beliefs, present, values, found = start, [], [], [], [], [], False
-        while True:
-            fixation = grid.centres[cell].to(image)[None]
-            detections = self.eye.look(view, fixation)
-            evidence = observer.weigh(detections, fixation, grid, target)
-            noise = torch.rand(1, len(grid), generator=generator).to(image)
-            here = torch.tensor([cell], device=image.device)
-            after = step(observer, belief, visited, here, evidence, acquisition, noise)
-            belief, visited = after.belief, after.visited
-            if observer is self.semantics:
-                semantics = dirichlet_belief(belief)
-            else:
-                semantics = self.semantics.update(semantics, self.semantics.weigh(detections, fixation, grid))
-            cells.append(cell)
-            seen.append(detections)
-            beliefs.append(semantics.beta[0])
-            if target is not None:
-                present.append(belief.probability(target)[0])
-            values.append(after.values[0])
-            found = ends(cell, detections)
-            cell = int(after.cell)
-            if found or len(cells) > shifts or cell < 0:
-                break
-        visits = torch.tensor(cells, device=image.device)
-        return Scanpath(
-            grid=grid,
-            classes=self.classes,
-            target=target,
-            cells=visits,
-            fixations=grid.centres.to(image)[visits],
-            detections=tuple(seen),
-            beliefs=torch.stack(beliefs),
-            values=torch.stack(values),
-            found=found,
-            posterior=torch.stack(present) if present else None,
+        looks = LiveLooks(self.eye, self.eye.open(image), grid, target)
+        found = False
+
+        def ends(step: Step) -> Tensor:
+            nonlocal found
+            over = torch.zeros_like(step.cell, dtype=torch.bool) if finds is None else finds(step)
+            found = bool(over)
+            return over
+
+        steps = rollout(
+            looks,
+            strategy.observer,
+            strategy.policy(target, grid),
+            torch.tensor([start], device=image.device),
+            Greedy(drawn_by(generator, len(grid), image)),
+            most=shifts + 1,
+            ends=ends,
         )
+        mapper = self.exploring.observer
+        beside = None if mapper is strategy.observer else mapper
+        return replace(trace(steps, grid, self.classes, target, beside), found=found)
 
     def _target(self, target: str | int) -> int:
         if isinstance(target, str):
@@ -351,17 +278,8 @@ class ActivePerception(nn.Module):
         return target
 
 
-def models_of(observer: object) -> Iterator[nn.Module]:
-    """Modules that an observer holds: its own, those of an observer inside it, and those whose methods it calls."""
-    for value in vars(observer).values():
-        owner = getattr(value, "__self__", value)
-        if isinstance(owner, nn.Module):
-            yield owner
-        elif hasattr(owner, "weigh"):
-            yield from models_of(owner)
-
-
-def confirms(detections: Detections, grid: Grid, cell: int, target: int, score: float) -> bool:
-    """Whether a detection that overlaps `cell` has `target` as its best class, with at least this score."""
-    sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score)
-    return bool((grid.footprint(detections.boxes)[..., cell] & sure & detections.mask).any())
+def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:
+    """Whether a detection that overlaps `cell` `(B,)` has `target` as its best class with such a score, `(B,)`."""
+    sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score) & detections.mask
+    there = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
+    return (there & sure).any(-1)

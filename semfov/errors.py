@@ -2,9 +2,12 @@
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from typing import TypeVar
 
 import torch
 from torch import Tensor
+
+Name = TypeVar("Name", bound=str)
 
 
 class SemfovError(Exception):
@@ -28,13 +31,23 @@ def check(condition: bool, argument: str, expected: str, got: object) -> None:
         raise InputError(f"{argument}: expected {expected}, got {got}")
 
 
-def values_known() -> bool:
-    """Whether the values of tensors can be looked at here: not while a graph is traced, nor inside `torch.func.vmap`.
+def values_known(*tensors: Tensor) -> bool:
+    """Whether the values of tensors can be read: not while a graph is traced, nor under transforms of `torch.func`.
 
-    >>> values_known()
+    >>> values_known(torch.ones(2))
     True
+    >>> torch.func.vmap(lambda row: torch.tensor(values_known(row)))(torch.ones(2, 3))
+    tensor([False, False])
     """
-    return not torch.compiler.is_compiling() and torch._C._functorch.peek_interpreter_stack() is None
+    if torch.compiler.is_compiling():
+        return False
+    try:
+        for tensor in tensors:
+            # A transform wraps its tensors, and what it wraps has no memory of its own.
+            tensor.data_ptr()
+    except RuntimeError:
+        return False
+    return True
 
 
 def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
@@ -56,7 +69,7 @@ def check_finite(tensor: Tensor, argument: str) -> None:
     check(bad == 0, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not")
 
 
-def lookup(name: str, known: Iterable[str], what: str) -> str:
+def lookup(name: str, known: Iterable[Name], what: str) -> Name:
     """Return `name` if it is `known`, else raise `InputError` with the nearest known names.
 
     >>> lookup("cup", ["cup", "cat"], "class")
@@ -64,7 +77,7 @@ def lookup(name: str, known: Iterable[str], what: str) -> str:
     """
     names = list(known)
     if name in names:
-        return name
+        return names[names.index(name)]
     near = get_close_matches(name, names, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known: {', '.join(names)}"
     raise InputError(f"unknown {what} {name!r}; {hint}")

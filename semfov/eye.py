@@ -1,6 +1,7 @@
 """Sensor and detector as one eye: what is detected when an image is fixated at a point."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -79,7 +80,7 @@ class Eye(nn.Module):
         """`look` at an image `(1, 3, H, W)` from fixations `(F, 2)`."""
         return self.look(self.open(image), fixations)
 
-    def settings(self) -> dict[str, dict[str, object]]:
+    def settings(self) -> dict[str, Any]:
         """What the detections depend on, for the keys of caches and the metadata of fitted models."""
         sensor = self.sensor
         return {

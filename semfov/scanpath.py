@@ -1,11 +1,16 @@
 """The record of an episode: where the gaze went, what was seen and what was believed."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
+from semfov.belief.belief import DirichletBelief, dirichlet_belief
 from semfov.belief.grid import Grid
+from semfov.belief.observers.base import Observer
 from semfov.detection.detections import Detections
+from semfov.episode import Step
 
 
 @dataclass(frozen=True)
@@ -24,6 +29,7 @@ class Scanpath:
         found: whether the search ended on its target.
         posterior: `(n, X·Y)`, probability of the target in each cell as the search believed it after each look; None
             for exploration. Learned target evidence holds a fixated cell for empty: the search would have ended there.
+        seconds: what each look took, by stage (`semfov.episode.STAGES`).
     """
 
     grid: Grid
@@ -36,6 +42,7 @@ class Scanpath:
     values: Tensor
     found: bool
     posterior: Tensor | None = None
+    seconds: tuple[Mapping[str, float], ...] = ()
 
     def __len__(self) -> int:
         """Number of fixations, the start included."""
@@ -45,3 +52,46 @@ class Scanpath:
     def shifts(self) -> int:
         """Number of gaze shifts (saccades): fixations after the start."""
         return len(self) - 1
+
+
+def trace(
+    steps: Iterable[Step], grid: Grid, classes: tuple[str, ...], target: int | None, beside: Observer | None
+) -> Scanpath:
+    """The scanpath of one episode.
+
+    Args:
+        steps: of the episode, from `semfov.episode.rollout`.
+        grid: the cells.
+        classes: names of the classes, background first.
+        target: class that is searched for; None for exploration.
+        beside: observer that keeps a map of all classes; None where the episode's own belief is one.
+    """
+    cells, fixations, detections, beliefs, values, present, seconds = [], [], [], [], [], [], []
+    known: DirichletBelief | None = None
+    for step in steps:
+        if beside is None:
+            known = dirichlet_belief(step.belief)
+        else:
+            before = beside.start(1, grid, step.values) if known is None else known
+            known = dirichlet_belief(beside(before, step.detections, step.fixation, grid))
+        cells.append(step.cell)
+        fixations.append(step.fixation)
+        detections.append(step.detections)
+        beliefs.append(known.beta[0])
+        values.append(step.values[0])
+        seconds.append(step.seconds)
+        if target is not None:
+            present.append(step.belief.probability(target)[0])
+    return Scanpath(
+        grid=grid,
+        classes=classes,
+        target=target,
+        cells=torch.cat(cells),
+        fixations=torch.cat(fixations),
+        detections=tuple(detections),
+        beliefs=torch.stack(beliefs),
+        values=torch.stack(values),
+        found=False,
+        posterior=torch.stack(present) if present else None,
+        seconds=tuple(seconds),
+    )

@@ -1,8 +1,12 @@
-"""What all tests share: devices, the development photographs, and a hypothesis profile without a stopwatch."""
+"""What all tests share: devices, the development photographs, kills, and a hypothesis profile without a stopwatch."""
 
 import os
-from collections.abc import Iterator
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -27,6 +31,34 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def kill_when() -> Iterator[Callable[..., None]]:
+    """Start a command and kill it (SIGKILL) once something has happened.
+
+    The test fails where nothing was killed: the command ended before, or what was waited for did not come in time.
+    """
+    started: list[subprocess.Popen[bytes]] = []
+
+    def kill(call: Sequence[str], happened: Callable[[], Any], *, seconds: float = 300, **options: Any) -> None:
+        process = subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **options)
+        started.append(process)
+        deadline = time.monotonic() + seconds
+        while not happened():
+            if process.poll() is not None:
+                pytest.fail(f"nothing to kill: the command ended with exit code {process.returncode}")
+            if time.monotonic() > deadline:
+                pytest.fail(f"nothing was killed: what was waited for did not come within {seconds} s")
+            time.sleep(0.01)
+        process.kill()
+        if process.wait() != -signal.SIGKILL:
+            pytest.fail(f"nothing to kill: the command had ended with exit code {process.returncode}")
+
+    yield kill
+    for process in started:
+        process.kill()
+        process.wait()
 
 
 @pytest.fixture(scope="session")

@@ -5,13 +5,16 @@ import copy
 import pytest
 import torch
 
-from semfov import ActivePerception, FovealObservationModel, Foveation, Grid, SemanticMap, search_policy
-from semfov.agent import confirms, step
-from semfov.belief import SemanticObserver, TargetEvidence, TargetObserver
+from semfov import ActivePerception, FovealObservationModel, Foveation, Grid
+from semfov.agent import confirms
+from semfov.belief import ContextPrior, TargetEvidence
+from semfov.belief.observers import Context, Semantic, Target
 from semfov.detection import Candidates, Detections, Detector
+from semfov.episode import STAGES
 from semfov.errors import InputError
 from semfov.eye import Eye
-from semfov.gaze import exploration_policy
+from semfov.gaze import LearnedGaze
+from semfov.gaze.policies import KL, Learned, NonPredictive, Predictive, Random
 from semfov.sensor import foveate
 
 SIZE = (160, 120)
@@ -45,9 +48,13 @@ def image():
     return picture
 
 
+def squares_eye():
+    return Eye(Foveation(40.0), Squares(), reference=160.0)
+
+
 @pytest.fixture
 def agent():
-    return ActivePerception(Foveation(40.0), Squares(), None, (8, 6), search_policy("non-predictive"), reference=160.0)
+    return ActivePerception(squares_eye(), (Semantic(3), NonPredictive()), (Semantic(3), Random()), grid=(8, 6))
 
 
 def test_search_goes_to_the_target(agent, image):
@@ -72,33 +79,116 @@ def test_boxes_decide_what_is_found(agent, image):
     assert agent.search(image, "red", start=0, boxes=torch.tensor([[0.0, 0, 30, 30]])).shifts == 0
 
 
-def test_beliefs_are_those_of_a_semantic_map(agent, image):
-    scanpath = agent.search(image, "green", start=20, shifts=4, boxes=torch.tensor([[0.0, 119, 1, 120]]))
-    own = SemanticMap(Grid(8, 6, SIZE), ["red", "green"])
-    eye = Eye(Foveation(40.0), Squares(), reference=160.0)
-    for fixation, belief, seen in zip(scanpath.fixations, scanpath.beliefs, scanpath.detections, strict=True):
-        detections = eye(image[None], fixation[None])
-        torch.testing.assert_close(detections.boxes, seen.boxes)
-        own.update(detections, fixation[None])
-        torch.testing.assert_close(own.beta[0], belief)
-
-
-def test_what_observers_learned_moves_with_the_agent(image):
-    misses = FovealObservationModel.identity(["red", "green"], [0.2], miss_rate=torch.full((3, 2), 0.5))
+@pytest.mark.parametrize("mapper", [{}, {"prior": 0.25, "fusion": "sum"}], ids=["same", "other"])
+def test_beliefs_are_those_of_the_exploring_observer(image, mapper):
+    """It keeps the map of all classes in searches too, and the posterior is that of the searching observer."""
     agent = ActivePerception(
-        Foveation(40.0), Squares(), None, (8, 6), search_policy("non-predictive"), reference=160.0,
-        semantics=SemanticObserver(3, misses=misses.miss_likelihood), observer=TargetObserver(TargetEvidence(4, 4)),
-    )  # fmt: skip
-    assert set(agent.learned) == {misses, agent.observer.model}
+        squares_eye(), (Semantic(3), NonPredictive()), (Semantic(3, **mapper), Random()), grid=(8, 6)
+    )
+    scanpath = agent.search(image, "green", start=20, shifts=4, boxes=torch.tensor([[0.0, 119, 1, 120]]))
+    assert len(scanpath) == 5
+    grid, eye = Grid(8, 6, SIZE), squares_eye()
+    keeper, seeker = Semantic(3, **mapper), Semantic(3)
+    known, sought = keeper.start(1, grid, image), seeker.start(1, grid, image)
+    for number, fixation in enumerate(scanpath.fixations):
+        detections = eye(image[None], fixation[None])
+        torch.testing.assert_close(detections.boxes, scanpath.detections[number].boxes)
+        known = keeper(known, detections, fixation[None], grid)
+        sought = seeker(sought, detections, fixation[None], grid)
+        torch.testing.assert_close(known.beta[0], scanpath.beliefs[number])
+        torch.testing.assert_close(sought.probability(2)[0], scanpath.posterior[number])
+
+
+def test_one_observer_for_both_tasks_looks_once(image):
+    """Where both tasks share an observer, the map is the belief that the search goes by."""
+    shared = Semantic(3)
+    agent = ActivePerception(squares_eye(), (shared, NonPredictive()), (shared, Random()), grid=(8, 6))
+    apart = ActivePerception(squares_eye(), (shared, NonPredictive()), (Semantic(3), Random()), grid=(8, 6))
+    one, other = (each.search(image, "green", start=0) for each in (agent, apart))
+    assert torch.equal(one.cells, other.cells)
+    assert torch.equal(one.beliefs, other.beliefs)
+    torch.testing.assert_close(one.posterior, one.beliefs[..., 2] / one.beliefs.sum(-1))
+
+
+def toy_context():
+    generator = torch.Generator().manual_seed(0)
+    place, company = torch.randn(3, 3, 3, generator=generator), torch.randn(3, 3, 2, generator=generator)
+    return ContextPrior(["red", "green"], place, company, [0.2], weights={"evidence": (0.5, 0.25)})
+
+
+def test_what_was_learned_moves_with_the_agent(image):
+    """Models of observers and policies are modules of the agent: state, dtype, gradients and copies have them."""
+    misses = FovealObservationModel.identity(["red", "green"], [0.2], miss_rate=torch.full((3, 2), 0.5))
+    evidence, expected = TargetEvidence(4, 4), FovealObservationModel.identity(["red", "green"], [0.3])
+    search = Context(Target(evidence), toy_context()), NonPredictive()
+    agent = ActivePerception(squares_eye(), search, (Semantic(3, misses=misses), KL(expected)), grid=(8, 6))
+    learned = {
+        "searching.observer.observer.model": evidence,
+        "searching.observer.prior": search[0].prior,
+        "exploring.observer.misses": misses,
+        "exploring.policy.model": expected,
+    }
+    state, named = agent.state_dict(), dict(agent.named_parameters())
+    for path, model in learned.items():
+        assert agent.get_submodule(path) is model
+        assert {f"{path}.{name}" for name in model.state_dict()} <= set(state)
+        for name, parameter in model.named_parameters():
+            assert named[f"{path}.{name}"] is parameter
+    assert len([*evidence.parameters()]) > 0
     agent.double().requires_grad_(False)
+    for model in learned.values():
+        assert all(
+            tensor.dtype == torch.float64 for tensor in model.state_dict().values() if tensor.is_floating_point()
+        )
     scanpath = agent.search(image.double(), "green", start=0, shifts=2)
     assert scanpath.posterior.dtype == scanpath.beliefs.dtype == misses.edges.dtype == torch.float64
     other = copy.deepcopy(agent)
-    assert other.observer.model is not agent.observer.model
-    assert other.observer.model in set(other.learned)
-    assert not ActivePerception(
-        Foveation(40.0), Squares(), misses, (8, 6), search_policy("non-predictive"), reference=160.0
-    ).learned
+    for path, model in learned.items():
+        twin = other.get_submodule(path)
+        assert twin is not model
+        for name, tensor in twin.state_dict().items():
+            assert torch.equal(tensor, model.state_dict()[name])
+            assert tensor.data_ptr() != model.state_dict()[name].data_ptr()
+    again = other.search(image.double(), "green", start=0, shifts=2)
+    assert torch.equal(again.posterior, scanpath.posterior)
+    with torch.no_grad():
+        next(other.searching.observer.observer.model.parameters()).add_(1)
+    assert torch.equal(agent.search(image.double(), "green", start=0, shifts=2).posterior, scanpath.posterior)
+    # Neither observer nor policy have learned anything here; a state of another agent is loaded into this one.
+    plain = ActivePerception(squares_eye(), (Semantic(3), NonPredictive()), (Semantic(3), Random()))
+    assert all(name.startswith("eye.") for name in plain.state_dict())
+    other.load_state_dict(agent.state_dict())
+    assert torch.equal(other.search(image.double(), "green", start=0, shifts=2).posterior, scanpath.posterior)
+
+
+def test_a_model_of_two_parts_is_one_parameter(image):
+    """The model that calibrates and the one that predicts are the same, and stay it in a copy."""
+    model = FovealObservationModel.identity(["red", "green"], [0.2])
+    observer = Semantic(3, model)
+    agent = ActivePerception(squares_eye(), (observer, Predictive(model)), (observer, KL(model)), grid=(8, 6))
+    assert [*agent.parameters()] == [*squares_eye().parameters(), *model.parameters()]
+    twin = copy.deepcopy(agent)
+    assert twin.exploring.policy.model is twin.searching.policy.model is twin.searching.observer.observation
+    assert twin.exploring.observer is twin.searching.observer
+
+
+def test_a_learned_policy_reads_the_belief_of_its_observer(image):
+    torch.manual_seed(0)
+    gaze = LearnedGaze(4).requires_grad_(False)
+    torch.nn.init.normal_(gaze.network[-1].weight)
+    agent = ActivePerception(
+        squares_eye(), (gaze.observer(3), Learned(gaze)), (Semantic(3), Random()), grid=(8, 6)
+    ).eval()
+    scanpath = agent.search(image, "green", start=0, shifts=3, boxes=torch.tensor([[0.0, 119, 1, 120]]))
+    grid, observer = Grid(8, 6, SIZE), gaze.observer(3)
+    belief, visited = observer.start(1, grid, image), torch.zeros(1, 48, dtype=torch.bool)
+    for number, fixation in enumerate(scanpath.fixations):
+        belief = observer(belief, scanpath.detections[number], fixation[None], grid)
+        visited[0, scanpath.cells[number]] = True
+        torch.testing.assert_close(gaze(belief, visited, 2, 8)[0], scanpath.values[number])
+        left = scanpath.values[number].masked_fill(visited[0], -torch.inf)
+        if number < scanpath.shifts:
+            assert left.argmax() == scanpath.cells[number + 1]
 
 
 def test_same_seed_same_scanpath(agent, image):
@@ -109,7 +199,7 @@ def test_same_seed_same_scanpath(agent, image):
 
 
 def test_search_ends_when_every_cell_was_visited(image):
-    agent = ActivePerception(Foveation(40.0), Squares(), None, (3, 2), search_policy("random"), reference=160.0)
+    agent = ActivePerception(squares_eye(), (Semantic(3), Random()), (Semantic(3), Random()), grid=(3, 2))
     scanpath = agent.search(torch.full_like(image, 0.4), "red", shifts=50)
     assert not scanpath.found
     assert sorted(scanpath.cells.tolist()) == list(range(6))
@@ -121,8 +211,8 @@ def explorer():
     clarity = torch.tensor([4.0, 1.0, 0.2])
     alpha = 1 + torch.eye(3)[:, None] * clarity[:, None]
     model = FovealObservationModel(alpha, [0.2, 0.4], ["red", "green"]).requires_grad_(False).eval()
-    policy = exploration_policy("kl", model)
-    return ActivePerception(Foveation(40.0), Squares(), model, (8, 6), policy, reference=160.0)
+    observer = Semantic(3, model)
+    return ActivePerception(squares_eye(), (observer, NonPredictive()), (observer, KL(model)), grid=(8, 6))
 
 
 def test_exploration_makes_all_its_gaze_shifts(explorer, image):
@@ -137,14 +227,15 @@ def test_exploration_makes_all_its_gaze_shifts(explorer, image):
         assert left.max() > left.min() * 1.01
         left[scanpath.cells[: number + 1]] = -torch.inf
         assert left[scanpath.cells[number + 1]] >= left.max() * (1 - 1e-6)
-    own = SemanticMap(Grid(8, 6, SIZE), ["red", "green"], observation=explorer.observation)
+    grid, observer = Grid(8, 6, SIZE), Semantic(3, explorer.exploring.policy.model)
+    belief = observer.start(1, grid, image)
     for fixation, seen in zip(scanpath.fixations, scanpath.detections, strict=True):
-        own.update(seen, fixation[None])
-    torch.testing.assert_close(own.beta[0], scanpath.beliefs[-1])
+        belief = observer(belief, seen, fixation[None], grid)
+    torch.testing.assert_close(belief.beta[0], scanpath.beliefs[-1])
 
 
 def test_exploration_ends_when_every_cell_was_visited(image):
-    agent = ActivePerception(Foveation(40.0), Squares(), None, (3, 2), exploration_policy("random"), reference=160.0)
+    agent = ActivePerception(squares_eye(), (Semantic(3), Random()), (Semantic(3), Random()), grid=(3, 2))
     assert sorted(agent.explore(image, shifts=50).cells.tolist()) == list(range(6))
     first, second = (agent.explore(image, shifts=5, seed=seed).cells for seed in (1, 2))
     assert torch.equal(agent.explore(image, shifts=5, seed=1).cells, first)
@@ -156,9 +247,19 @@ def test_an_agent_that_calibrates_may_see_nothing(explorer, image):
     assert scanpath.beliefs.unique().tolist() == [0.5]
 
 
-def test_exploration_needs_a_policy_without_target(agent, image):
-    with pytest.raises(InputError, match="exploration_policy"):
+def test_exploration_needs_a_policy_without_target(image):
+    observer = Semantic(3)
+    agent = ActivePerception(squares_eye(), (observer, NonPredictive()), (observer, NonPredictive()), grid=(8, 6))
+    with pytest.raises(InputError, match="policy 'non-predictive': expected a target to search for"):
         agent.explore(image)
+
+
+def test_every_look_of_an_agent_is_timed(agent, image):
+    for scanpath in (agent.search(image, "green", start=0), agent.explore(image, start=0, shifts=2)):
+        assert len(scanpath.seconds) == len(scanpath)
+        for seconds in scanpath.seconds:
+            assert tuple(seconds) == STAGES
+            assert min(seconds.values()) > 0
 
 
 def test_class_names_are_suggested(agent, image):
@@ -170,33 +271,43 @@ def test_class_names_are_suggested(agent, image):
         agent.search(image, 1, start=48)
 
 
-def test_step_marks_visits_and_fuses(image):
-    grid = Grid(8, 6, SIZE)
-    detections = Squares()(image[None])
-    observer = SemanticObserver(3)
-    evidence = observer.weigh(detections, grid.centres[:1], grid)
-    belief, visited = observer.start(1, grid, image), torch.zeros(1, 48, dtype=torch.bool)
-    visited[0, 9] = True
-    acquisition = search_policy("non-predictive")(1, grid)
-    after = step(observer, belief, visited, torch.tensor([0]), evidence, acquisition, torch.rand(1, 48))
-    assert after.visited[0].nonzero()[:, 0].tolist() == [0, 9]
-    red = Grid(8, 6, SIZE).footprint(torch.tensor([[8.0, 8, 28, 28]]))[0]
-    assert red[after.cell[0]]
-    assert after.cell[0] not in (0, 9)
-    assert torch.equal(belief.beta, torch.full((1, 48, 3), 0.5))
-
-
 def test_confirmation_needs_place_class_and_score():
     grid = Grid(8, 6, SIZE)
     boxes = torch.tensor([[[10.0, 10, 19, 19]]])
     sure = Detections(boxes, torch.tensor([[[0.1, 0.8, 0.1]]]), torch.tensor([[True]]))
     unsure = Detections(boxes, torch.tensor([[[0.1, 0.4, 0.5]]]), torch.tensor([[True]]))
-    assert confirms(sure, grid, 0, 1, 0.5)
-    assert not confirms(sure, grid, 1, 1, 0.5)
-    assert not confirms(sure, grid, 0, 1, 0.9)
-    assert not confirms(unsure, grid, 0, 1, 0.3)
     padded = Detections(boxes, torch.tensor([[[0.1, 0.8, 0.1]]]), torch.tensor([[False]]))
-    assert not confirms(padded, grid, 0, 1, 0.5)
+
+    def confirmed(seen, cell, score):
+        answer = confirms(seen, grid, torch.tensor([cell]), 1, score)
+        assert answer.shape == (1,)
+        return bool(answer)
+
+    assert confirmed(sure, 0, 0.5)
+    assert not confirmed(sure, 1, 0.5)
+    assert not confirmed(sure, 0, 0.9)
+    assert not confirmed(unsure, 0, 0.3)
+    assert not confirmed(padded, 0, 0.5)
+
+
+def test_confirmation_of_a_batch_is_that_of_each_look():
+    grid, generator = Grid(4, 3, SIZE), torch.Generator().manual_seed(0)
+    corner = torch.rand(40, 3, 2, generator=generator) * 100
+    boxes = torch.cat([corner, corner + 5 + torch.rand(40, 3, 2, generator=generator) * 40], -1)
+    scores, mask = torch.rand(40, 3, 3, generator=generator), torch.rand(40, 3, generator=generator) < 0.8
+    cell = torch.randint(12, (40,), generator=generator)
+    expected = []
+    for look in range(40):
+        answer = False
+        for detection in range(3):
+            x, y, z, w = boxes[look, detection].tolist()
+            left, top = int(cell[look]) % 4 * 40, int(cell[look]) // 4 * 40
+            there = x < left + 40 and z > left and y < top + 40 and w > top
+            sure = scores[look, detection].tolist()
+            answer |= bool(mask[look, detection]) and there and max(sure) == sure[2] and sure[2] >= 0.6
+        expected.append(answer)
+    assert 0 < sum(expected) < 40
+    assert confirms(Detections(boxes, scores, mask), grid, cell, 2, 0.6).tolist() == expected
 
 
 def test_view_is_foveated_at_the_resolution_of_the_detector(image):
@@ -228,4 +339,6 @@ def test_view_shows_what_the_sensor_shows_of_a_reference_image(growth):
     scaled = foveate(view.bands, view.placement.points_to_canvas(gaze)[None], sigma=15.0, growth=growth)[0]
     error, other = ((each - shown).square().mean().sqrt() for each in (got, scaled))
     assert error < 0.02
-    assert error <= other
+    # With growth 1 both are one picture, and may differ by a rounding.
+    assert error <= other * (1 + 1e-4)
+    assert growth == 1 or error < other / 2

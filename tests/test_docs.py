@@ -3,9 +3,12 @@
 import importlib.util
 import inspect
 import re
+from difflib import unified_diff
 from pathlib import Path
 
 import pytest
+
+import semfov
 
 DOCS = Path(__file__).parents[1] / "docs"
 GUIDES = sorted(DOCS.glob("guides/*.md"))
@@ -42,7 +45,31 @@ def test_every_public_name_is_explained():
             assert len(inspect.getdoc(thing).splitlines()[0]) > 10, f"{module}.{name}"
 
 
-def test_reference_has_every_public_name():
-    """`python docs/api.py` writes it again."""
-    headings = re.findall(r"^### (\S+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+def test_reference_is_what_the_docstrings_say():
+    """The whole page, to the letter; `python docs/api.py` writes it again."""
+    page = reference().page()
+    headings = re.findall(r"^### (\S+)$", page, re.MULTILINE)
     assert headings == [f"{module}.{name}" for module, things in reference().entries().items() for name, _ in things]
+    written = (DOCS / "api.md").read_text(encoding="utf-8")
+    differences = list(unified_diff(written.splitlines(), page.splitlines(), "docs/api.md", "docstrings", lineterm=""))
+    assert written == page, "run `python docs/api.py`\n" + "\n".join(differences[:40])
+
+
+def test_reference_hangs_on_nothing_but_the_sources():
+    """No address of an object, and no path of this machine, is in it."""
+    page = reference().page()
+    assert not re.search(r"0x[0-9a-f]{6}| at 0x", page)
+    assert str(DOCS.parent) not in page
+
+
+def test_reference_has_every_public_name_of_the_package():
+    explained = {id(thing) for things in reference().entries().values() for _, thing in things}
+    names = [semfov, *(thing for thing in vars(semfov).values() if inspect.ismodule(thing) and thing is not semfov)]
+    for module in names:
+        if module.__name__ != "semfov" and module.__name__.split(".")[-1] not in semfov.__all__:
+            continue
+        public = getattr(module, "__all__", None) or []
+        for name in public:
+            thing = getattr(module, name)
+            if inspect.isclass(thing) or inspect.isfunction(thing):
+                assert id(thing) in explained, f"{module.__name__}.{name}"

@@ -48,6 +48,22 @@ def test_searching_draws_the_scanpath(tmp_path):
         assert min(picture.size) > 500
 
 
+def test_own_observer_sees_the_score_of_the_target_grow():
+    output = run("own_observer")
+    best = [float(value) for value in re.findall(r"best score of a cup so far ([\d.]+)", output)]
+    assert best == sorted(best)
+    assert best[-1] > best[0]
+    assert output.splitlines()[-1] == "found"
+
+
+def test_own_policy_needs_fewer_gaze_shifts():
+    output = run("own_policy")
+    found = re.findall(r"^([\w-]+): ([\d.]+) gaze shifts on average, (\d+) searches$", output, re.MULTILINE)
+    assert [name for name, _, _ in found] == ["non-predictive", "wide-inhibition"]
+    assert float(found[1][1]) < float(found[0][1])
+    assert found[0][2] == found[1][2] != "0"
+
+
 def test_own_detector_gets_an_observation_model(tmp_path):
     output = run("own_onnx_detector", "--scenes", 3, "--looks", 4, "--out", tmp_path / "model.safetensors")
     raw, fitted = (float(value) for value in re.findall(r": ([\d.]+) nats", output))

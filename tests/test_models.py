@@ -9,7 +9,7 @@ import torch
 import semfov
 from semfov.agent import PUBLISHED_SENSORS
 from semfov.belief import ContextPrior, DirichletBelief
-from semfov.observation.compatibility import recommended
+from semfov.io.compatibility import recommended
 from semfov.sensor import SENSORS
 
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))

@@ -3,6 +3,9 @@
 import ast
 import subprocess
 import sys
+from collections.abc import Iterable
+from graphlib import CycleError, TopologicalSorter
+from importlib.util import resolve_name
 from pathlib import Path
 
 import pytest
@@ -10,9 +13,11 @@ import pytest
 import semfov
 
 PACKAGE = Path(semfov.__file__).parent
+ROOT = PACKAGE.parent
 
 SURFACE = {
     "ActivePerception",
+    "Belief",
     "CocoScenes",
     "DataError",
     "Detections",
@@ -20,7 +25,6 @@ SURFACE = {
     "DirichletBelief",
     "DirichletStatistics",
     "EmbeddedScenes",
-    "Evidence",
     "Eye",
     "FovealObservationModel",
     "Foveation",
@@ -28,23 +32,43 @@ SURFACE = {
     "InputError",
     "Scanpath",
     "Selection",
-    "SemanticMap",
     "SemfovError",
     "TargetEvidence",
+    "__version__",
     "acquisition",
     "dirichlet",
-    "exploration_policy",
     "foveate",
     "fusion",
     "load_detector",
+    "observers",
+    "policies",
     "read_image",
+    "rollout",
     "saliency",
-    "search_policy",
-    "weigh",
 }
 
 # A room imports from itself and from the rooms before it.
-ROOMS = ["errors", "files", "sensor", "detection", "observation", "belief", "gaze", "scanpath", "eye", "agent"]
+ROOMS = [
+    "version",
+    "errors",
+    "io",
+    "data",
+    "sensor",
+    "detection",
+    "observation",
+    "belief",
+    "gaze",
+    "eye",
+    "episode",
+    "scanpath",
+    "agent",
+    "metrics",
+    "viz",
+    "report",
+    "experiments",
+    "training",
+]
+OUTSIDE = ("eval", "train", "tests", "benchmarks", "examples", "docs", "hubconf")
 
 
 def test_public_surface():
@@ -60,18 +84,174 @@ def test_import_is_light():
     assert result.stdout.strip() == "[]"
 
 
+def imports(source: str, module: str, *, package: bool = False) -> list[tuple[str, str]]:
+    """Everything that a module imports, anywhere in it: the module that a statement names, and what it takes of it.
+
+    Raises:
+        ValueError: a name is only known when it runs.
+    """
+    own = module if package else module.rpartition(".")[0]
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            name = resolve_name("." * node.level + (node.module or ""), own) if node.level else node.module
+            found += [(name, name if alias.name == "*" else f"{name}.{alias.name}") for alias in node.names]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("import_module", "__import__"):
+            words = {word.arg: word.value for word in node.keywords}
+            asked, *more = [*node.args, *(words[name] for name in ("name", "package") if name in words)]
+            if not isinstance(asked, ast.Constant):
+                raise ValueError(f"{module}, line {node.lineno}: imports what only it knows, {ast.unparse(node)}")
+            base = more[0].value if more and isinstance(more[0], ast.Constant) else own
+            name = resolve_name(asked.value, base) if asked.value.startswith(".") else asked.value
+            found.append((name, name))
+    return found
+
+
+def modules_of(folder: Path) -> dict[str, Path]:
+    """Every module of a package, by its name."""
+    found = {}
+    for file in folder.rglob("*.py"):
+        parts = (folder.name, *file.relative_to(folder).with_suffix("").parts)
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file
+    return found
+
+
+def imports_of(module: str, file: Path) -> list[tuple[str, str]]:
+    return imports(file.read_text(encoding="utf-8"), module, package=file.name == "__init__.py")
+
+
+def packages_above(module: str) -> Iterable[str]:
+    while module := module.rpartition(".")[0]:
+        yield module
+
+
+def graph_of(modules: dict[str, Path]) -> dict[str, set[str]]:
+    """Which modules each one runs when it is imported: those it names, and the packages that these are in.
+
+    The packages that the module itself is in are running already.
+    """
+    graph: dict[str, set[str]] = {}
+    for module, file in modules.items():
+        runs: set[str] = set()
+        for asked, taken in imports_of(module, file):
+            here = next((name for name in (taken, asked) if name in modules), None)
+            if here is not None:
+                runs |= {here, *packages_above(here)}
+        graph[module] = runs - set(packages_above(module)) - ({module} if file.name == "__init__.py" else set())
+    return graph
+
+
+MODULES = modules_of(PACKAGE)
+APPS = {app: modules_of(ROOT / app) for app in ("train", "eval")}
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("import semfov.io.files", [("semfov.io.files", "semfov.io.files")]),
+        ("import torch, semfov.eye as e", [("torch", "torch"), ("semfov.eye", "semfov.eye")]),
+        ("import semfov", [("semfov", "semfov")]),
+        ("from semfov import Eye, viz", [("semfov", "semfov.Eye"), ("semfov", "semfov.viz")]),
+        ("from semfov.io import files", [("semfov.io", "semfov.io.files")]),
+        ("from semfov.io.files import *", [("semfov.io.files", "semfov.io.files")]),
+        ("from . import grid", [("semfov.belief", "semfov.belief.grid")]),
+        ("from .grid import Grid", [("semfov.belief.grid", "semfov.belief.grid.Grid")]),
+        ("from .. import viz", [("semfov", "semfov.viz")]),
+        ("from ..gaze.choice import Given", [("semfov.gaze.choice", "semfov.gaze.choice.Given")]),
+        (
+            "def late():\n    if True:\n        from semfov.agent import confirms",
+            [("semfov.agent", "semfov.agent.confirms")],
+        ),
+        ("class A:\n    import semfov.viz", [("semfov.viz", "semfov.viz")]),
+        (
+            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import semfov.agent",
+            [("typing", "typing.TYPE_CHECKING"), ("semfov.agent", "semfov.agent")],
+        ),
+        ("try:\n    pass\nexcept ImportError:\n    import eval.demo", [("eval.demo", "eval.demo")]),
+        ("importlib.import_module('semfov.viz')", [("semfov.viz", "semfov.viz")]),
+        ("import_module(name='semfov.viz')", [("semfov.viz", "semfov.viz")]),
+        ("import_module('.context', __package__)", [("semfov.belief.context", "semfov.belief.context")]),
+        ("import_module('.curves', package='semfov.viz')", [("semfov.viz.curves", "semfov.viz.curves")]),
+        ("x = __import__('semfov.viz').viz", [("semfov.viz", "semfov.viz")]),
+        ("text = 'import semfov.viz'  # from semfov import viz", []),
+    ],
+)
+def test_the_scan_sees_every_form_of_import(source, found):
+    assert imports(source, "semfov.belief.grid") == found
+
+
+def test_the_scan_resolves_within_a_package_and_refuses_what_it_cannot_see():
+    assert imports("from .grid import Grid", "semfov.belief", package=True) == [
+        ("semfov.belief.grid", "semfov.belief.grid.Grid")
+    ]
+    for hidden in ("import_module(name)", "importlib.import_module(f'semfov.{room}')", "__import__('semfov.' + room)"):
+        with pytest.raises(ValueError, match=r"semfov\.eye, line 1"):
+            imports(hidden, "semfov.eye")
+
+
+def test_every_room_is_in_the_order():
+    rooms = {name.split(".")[1] for name in MODULES if name != "semfov"}
+    assert sorted(ROOMS) == sorted(rooms)
+
+
 @pytest.mark.parametrize("room", ROOMS)
 def test_imports_run_one_way(room):
-    files = list((PACKAGE / room).rglob("*.py")) if (PACKAGE / room).is_dir() else [PACKAGE / f"{room}.py"]
+    files = {name: file for name, file in MODULES.items() if name.split(".")[1:2] == [room]}
     assert files
     allowed = ROOMS[: ROOMS.index(room) + 1]
-    for file in files:
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            names = [node.module] if isinstance(node, ast.ImportFrom) else []
-            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            for name in names:
-                parts = (name or "").split(".")
-                if parts[0] in ("eval", "train", "tests", "benchmarks"):
-                    pytest.fail(f"{file} imports {name}")
-                if parts[0] == "semfov" and len(parts) > 1:
-                    assert parts[1] in allowed, f"{file} imports {name}"
+    for module, file in files.items():
+        for asked, taken in imports_of(module, file):
+            first, *more = taken.split(".")
+            assert first not in OUTSIDE, f"{module} imports {taken}"
+            if first == "semfov":
+                assert asked != "semfov", f"{module} imports from the package as a whole: {taken}"
+                assert more[0] in allowed, f"{module} imports {taken}"
+
+
+def test_the_package_itself_imports_rooms_alone():
+    """It may hand on what is theirs, and nothing is defined for all in its `__init__`."""
+    for asked, taken in imports_of("semfov", MODULES["semfov"]):
+        assert taken.split(".")[0] not in OUTSIDE
+        if taken.startswith("semfov"):
+            assert asked.split(".")[1] in ROOMS
+
+
+@pytest.mark.parametrize("modules", [MODULES, MODULES | APPS["train"] | APPS["eval"]], ids=["package", "with apps"])
+def test_no_module_imports_itself_by_way_of_others(modules):
+    graph = graph_of(modules)
+    assert sum(map(len, graph.values())) > 500
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" imports ".join(reversed(error.args[1])))
+
+
+def test_circles_are_found(tmp_path):
+    """By way of a package too, whose `__init__` runs when a part of it is imported."""
+    folder = tmp_path / "toy"
+    sources = {
+        "__init__.py": "", "one.py": "def f():\n    from toy.rooms.two import g",
+        "rooms/__init__.py": "import toy.three", "rooms/two.py": "from toy.rooms import four",
+        "rooms/four.py": "", "three.py": "pass",
+    }  # fmt: skip
+    for name, source in sources.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(source)
+    assert graph_of(modules_of(folder)) == {
+        "toy": set(), "toy.one": {"toy.rooms", "toy.rooms.two"}, "toy.rooms": {"toy.three"},
+        "toy.rooms.two": {"toy.rooms.four"}, "toy.rooms.four": set(), "toy.three": set(),
+    }  # fmt: skip
+    TopologicalSorter(graph_of(modules_of(folder))).prepare()
+    (folder / "three.py").write_text("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from . import one")
+    with pytest.raises(CycleError):
+        TopologicalSorter(graph_of(modules_of(folder))).prepare()
+
+
+@pytest.mark.parametrize(("app", "other"), [("train", "eval"), ("eval", "train")])
+def test_training_and_evaluation_know_nothing_of_each_other(app, other):
+    assert APPS[app]
+    for module, file in APPS[app].items():
+        for _, taken in imports_of(module, file):
+            assert taken.split(".")[0] not in (other, "tests", "benchmarks", "examples", "docs"), f"{module}: {taken}"

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from benchmarks.fuzz.runner import attempt, choose, draw_rng, failed, outcome
-from semfov import ActivePerception, FovealObservationModel, Foveation, Scanpath, search_policy
+from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Scanpath, observers, policies
 from semfov.detection import Candidates, Detector, Selection
 
 CLASSES = ("cat", "cup", "person")
@@ -38,10 +38,12 @@ def detectors(data: st.DataObject) -> str:
     model = None
     if data.draw(st.booleans(), label="calibrated"):
         model = FovealObservationModel.identity(CLASSES, [0.2, 0.4]).eval().requires_grad_(False)
-    policy = search_policy(choose(data, ("non-predictive", "random"), "policy"))
+    policy = policies.named_policy(choose(data, ("non-predictive", "random"), "policy"), "search")
     width, height = data.draw(st.integers(1, 40), label="width"), data.draw(st.integers(1, 40), label="height")
     columns, rows = data.draw(st.integers(1, 6), label="columns"), data.draw(st.integers(1, 6), label="rows")
-    agent = ActivePerception(Foveation(10.0), detector, model, (columns, rows), policy, reference=64.0)
+    observer = observers.Semantic(len(CLASSES) + 1, model)
+    eye = Eye(Foveation(10.0), detector, reference=64.0)
+    agent = ActivePerception(eye, (observer, policy), (observer, policies.Random()), grid=(columns, rows))
     image = torch.from_numpy(rng.random((3, height, width), dtype=np.float32))
     result = attempt(lambda: agent.search(image, "cup", shifts=3, confirm=2.0))
     if failed(result):

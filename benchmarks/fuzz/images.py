@@ -73,7 +73,8 @@ def picture(mode: str, size: tuple[int, int], rng: np.random.Generator) -> tuple
     shape = size[::-1]
     if mode in ("1", "F", "I;16"):
         deep = rng.integers(0, 2**16, shape, dtype=np.uint16)
-        stored = {"1": deep < 2**15, "F": (deep / 65535).astype(np.float32), "I;16": deep}[mode]
+        kinds: dict[str, NDArray[Any]] = {"1": deep < 2**15, "F": (deep / 65535).astype(np.float32), "I;16": deep}
+        stored = kinds[mode]
         return Image.fromarray(stored), (stored / (65535 if mode == "I;16" else 1.0))[..., None].repeat(3, -1)
     bands = {"LA": 2, "RGB": 3, "YCbCr": 3, "RGBA": 4, "CMYK": 4}.get(mode)
     pixels = rng.integers(0, 256, (*shape, bands) if bands else shape, dtype=np.uint8)

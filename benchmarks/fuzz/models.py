@@ -10,13 +10,13 @@ import torch
 from hypothesis import strategies as st
 
 from benchmarks.fuzz.runner import attempt, choose, draw_rng, failed, outcome
-from eval.cached import read_tensors, write_tensors
 from semfov import DirichletStatistics, FovealObservationModel
 from semfov.belief import TargetEvidence
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_config import read_cfg
 from semfov.detection.darknet_weights import read_weights
 from semfov.errors import DataError
+from semfov.io.cached import read_tensors, write_tensors
 
 CFG = """[net]
 width=32

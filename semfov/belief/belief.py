@@ -31,8 +31,16 @@ class Belief(ABC):
         """
 
     @abstractmethod
+    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """The belief with every tensor, each `(B, ...)`, replaced by `function` of it."""
+
     def __getitem__(self, index: Tensor | slice) -> Self:
         """Beliefs of some of the episodes."""
+        return self.map(lambda tensor: tensor[index])
+
+    def detach(self) -> Self:
+        """The same belief as a constant, through which no gradient flows."""
+        return self.map(Tensor.detach)
 
 
 @dataclass(frozen=True)
@@ -57,9 +65,9 @@ class DirichletBelief(Belief):
         if self.closest is None:
             object.__setattr__(self, "closest", torch.full_like(self.beta[..., 0], torch.inf))
 
-    def __getitem__(self, index: Tensor | slice) -> "DirichletBelief":
-        """Beliefs of some of the episodes."""
-        return DirichletBelief(self.beta[index], self.closest[index])
+    def map(self, function: Callable[[Tensor], Tensor]) -> "DirichletBelief":
+        """The belief with both tensors replaced."""
+        return DirichletBelief(function(self.beta), function(self.closest))
 
     @classmethod
     def uniform(cls, batch: int, cells: int, components: int, prior: float, like: Tensor) -> "DirichletBelief":
@@ -98,7 +106,7 @@ def pick(values: Tensor, target: Tensor) -> Tensor:
             [0.3000]])
     """
     components = values.shape[-1]
-    if values_known():
+    if values_known(target):
         inside = bool(((target >= 0) & (target < components)).all())
         check(inside, "target", f"a class index from 0 to {components - 1}", target.tolist())
     if target.ndim == 0:
@@ -117,6 +125,6 @@ def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
     >>> one_by_one(lambda row: row @ torch.ones(3, 1), torch.ones(2, 1, 3)).shape
     torch.Size([2, 1, 1])
     """
-    if not values_known() or len(rows[0]) <= 1:
+    if not values_known(*rows) or len(rows[0]) <= 1:
         return function(*rows)
     return torch.cat([function(*(row[index : index + 1] for row in rows)) for index in range(len(rows[0]))])

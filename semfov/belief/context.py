@@ -14,8 +14,8 @@ from torch.nn import functional as F
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
 from semfov.errors import check, check_shape, lookup, values_known
-from semfov.observation import compatibility
-from semfov.observation.pretrained import Pretrained
+from semfov.io import compatibility
+from semfov.io.pretrained import Pretrained
 
 
 class ContextPrior(Pretrained):
@@ -90,7 +90,7 @@ class ContextPrior(Pretrained):
         index = torch.as_tensor(target, device=presence.device)
         components = len(self.classes) + 1
         check_shape(presence, "presence", None, len(grid), components)
-        if values_known():
+        if values_known(index):
             inside = bool(((index >= 1) & (index < components)).all())
             check(inside, "target", f"a class from 1 to {components - 1}", target)
         place, company = weights

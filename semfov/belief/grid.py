@@ -130,6 +130,18 @@ class Grid:
         offset = torch.linalg.vector_norm(centre - fixation[..., None, :], dim=-1)
         return offset / self.extent.amax(-1)[..., None].to(offset)
 
+    def distance(self, fixation: Tensor) -> Tensor:
+        """Distance from each fixation `(..., 2)` to the centre of every cell, `(..., X·Y)`, in longer sides.
+
+        With a batch of sizes `(B, 2)` the fixations are `(B, 2)`.
+
+        >>> Grid(2, 1, (10, 10)).distance(torch.tensor([2.0, 4.5]))
+        tensor([0.0000, 0.5000])
+        """
+        check_shape(fixation, "fixation", 2)
+        offset = self.centres.to(fixation) - fixation[..., None, :]
+        return torch.linalg.vector_norm(offset, dim=-1) / self.extent.amax(-1).to(fixation)[..., None]
+
     def _window(self, boxes: Tensor) -> Tensor:
         """Weights of the `soft` footprint, before cells that a box does not touch are taken out."""
         half = self._align(self._cell_size(), boxes[..., :2])[..., None, :] / 2
@@ -144,8 +156,9 @@ class Grid:
 
         It is the d' = ‖x − f'‖ with which Luzio, Bernardino and Moreno (2024, equation 16) predict scores.
         """
-        centres = self.centres
-        offset = centres[..., :, None, :] - centres[..., None, :, :]
+        if self.extent.ndim == 1:
+            return self.distance(self.centres)
+        offset = self.centres[..., :, None, :] - self.centres[..., None, :, :]
         return torch.linalg.vector_norm(offset, dim=-1) / self.extent.amax(-1)[..., None, None]
 
     def _borders(self, axis: int) -> Tensor:
@@ -162,7 +175,7 @@ class Grid:
 
 
 def _check_numbers(values: Tensor, argument: str) -> None:
-    if values_known():
+    if values_known(values):
         check_finite(values, argument)
 
 

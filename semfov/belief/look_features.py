@@ -31,8 +31,7 @@ def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: 
     check_shape(fixation, "fixation", batch, 2)
     components = detections.scores.shape[-1]
     check(1 <= target < components, "target", f"a class from 1 to {components - 1}", target)
-    offset = grid.centres.to(fixation) - fixation[:, None]
-    distance = torch.linalg.vector_norm(offset, dim=-1) / grid.extent.amax().to(fixation)
+    distance = grid.distance(fixation)
     if detections.mask.shape[1] == 0:
         nothing = fixation.new_zeros(batch, 1, components)
         detections = Detections(fixation.new_zeros(batch, 1, 4), nothing, nothing[..., 0] > 0)

@@ -12,7 +12,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.look_features import FEATURES, look_features
 from semfov.detection.detections import Detections
 from semfov.errors import check_shape
-from semfov.observation.pretrained import PretrainedForEye
+from semfov.io.pretrained import PretrainedForEye
 
 _READOUT = 11
 

@@ -15,7 +15,7 @@ from semfov.detection.export_graph import network_model
 from semfov.detection.onnx_settings import METADATA_KEY
 from semfov.detection.yolo import YoloV3
 from semfov.errors import InputError
-from semfov.files import replacing
+from semfov.io.files import replacing
 
 
 def export_onnx(detector: Detector, path: str | PathLike[str], *, static: bool = False) -> None:

@@ -21,7 +21,7 @@ from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.errors import DataError, InputError, check, check_shape, lookup
-from semfov.files import sha256
+from semfov.io.files import sha256
 
 ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
 """Published models that `load_onnx` knows by name."""

@@ -19,7 +19,7 @@ from semfov.detection.onnx_session import OnnxSession
 from semfov.detection.scores import Candidates
 from semfov.detection.weights import cache_folder
 from semfov.errors import DataError, values_known
-from semfov.files import replacing, sha256
+from semfov.io.files import replacing, sha256
 
 Runtime = Literal["auto", "torch", "onnxruntime"]
 
@@ -62,7 +62,7 @@ class OnnxTwin:
 
     def obstacle_here(self, network: Darknet, canvas: Tensor) -> str | None:
         """Why a canvas cannot be looked at here, in words; None if it can."""
-        if not values_known() or torch.jit.is_tracing():  # type: ignore[attr-defined]
+        if not values_known(canvas, *network.parameters()) or torch.jit.is_tracing():  # type: ignore[attr-defined]
             return "graphs that are traced, and function transforms"
         tensors = [canvas, *network.parameters()]
         if any(type(tensor) not in (Tensor, nn.Parameter) for tensor in tensors):

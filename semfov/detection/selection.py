@@ -42,7 +42,7 @@ def select(
 
 def _check(image: int, confidence: Tensor, kept: Candidates) -> None:
     """Raise `InputError` where a detector returns NaN, or for a box that is kept what is no score or no place."""
-    if not values_known():
+    if not values_known(confidence, kept.boxes, kept.classes):
         return
     check_finite(confidence.detach(), f"detector: confidence in image {image}")
     check_finite(kept.boxes.detach(), f"detector: boxes in image {image}")

@@ -20,7 +20,7 @@ from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
 from semfov.detection.torchvision_heads import Raw, head_of
 from semfov.errors import DataError, InputError, check, check_shape, lookup
-from semfov.files import sha256
+from semfov.io.files import sha256
 
 PREFIX = "torchvision:"
 

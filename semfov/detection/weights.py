@@ -7,7 +7,7 @@ from pathlib import Path
 
 from semfov.detection.sources import Address, SourceDistribution
 from semfov.errors import DataError, lookup
-from semfov.files import replacing, sha256
+from semfov.io.files import replacing, sha256
 
 
 @dataclass(frozen=True)

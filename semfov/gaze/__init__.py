@@ -1,20 +1,22 @@
-"""Where to look next: acquisition functions over the belief, and the choice of a fixation from them."""
+"""Where to look next: acquisition functions over the belief, policies, and the choice of a fixation."""
 
-from semfov.gaze import acquisition, saliency
+from semfov.gaze import acquisition, policies, saliency
+from semfov.gaze.choice import Choice, Given, Greedy, Relaxed
 from semfov.gaze.learned import LearnedGaze
-from semfov.gaze.policies import EXPLORATION_POLICIES, SEARCH_POLICIES, Policy, exploration_policy, search_policy
+from semfov.gaze.policies import Policy
 from semfov.gaze.relaxation import soft_fixation
 from semfov.gaze.selection import select_fixation
 
 __all__ = [
-    "EXPLORATION_POLICIES",
+    "Choice",
+    "Given",
+    "Greedy",
     "LearnedGaze",
-    "SEARCH_POLICIES",
     "Policy",
+    "Relaxed",
     "acquisition",
-    "exploration_policy",
+    "policies",
     "saliency",
-    "search_policy",
     "select_fixation",
     "soft_fixation",
 ]

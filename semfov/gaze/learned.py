@@ -10,10 +10,9 @@ from torch import Tensor, nn
 
 from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief, one_by_one, pick
 from semfov.belief.grid import Grid
-from semfov.belief.observer import SemanticObserver
-from semfov.errors import InputError
+from semfov.belief.observers.semantic import Semantic
 from semfov.gaze.acquisition.base import AcquisitionFunction
-from semfov.observation.pretrained import PretrainedForEye
+from semfov.io.pretrained import PretrainedForEye
 
 FEATURES = 12
 
@@ -30,7 +29,7 @@ class LearnedGaze(PretrainedForEye):
 
     Args:
         width: channels of h.
-        belief: settings of the belief that it reads (of `SemanticObserver`); raw scores are likelihoods.
+        belief: settings of the belief that it reads (of `Semantic`); raw scores are likelihoods.
         metadata: JSON values kept with the model: `detector` and `sensor` (settings it was trained for).
 
     >>> gaze = LearnedGaze()
@@ -68,15 +67,9 @@ class LearnedGaze(PretrainedForEye):
         correction: Tensor = self.network(features.mT.unflatten(-1, (-1, columns)))
         return self.log_scale.exp() * present + correction[:, 0].flatten(1)
 
-    def policy(self, target: int | Tensor | None, grid: Grid) -> "LearnedAcquisition":
-        """The acquisition function for a target, a `Policy` for `ActivePerception`."""
-        if target is None:
-            raise InputError("learned gaze: expected a target to search for, got none")
-        return LearnedAcquisition(self, target, grid)
-
-    def observer(self, components: int) -> SemanticObserver:
+    def observer(self, components: int) -> Semantic:
         """The belief that it was trained behind, for so many classes, background included."""
-        return SemanticObserver(components, **self.belief)
+        return Semantic(components, **self.belief)
 
     def _record(self) -> dict[str, Any]:
         """Width of the network, and the belief that it reads."""

@@ -29,7 +29,7 @@ def select_fixation(values: Tensor, visited: Tensor, noise: Tensor, *, tolerance
     check_shape(values, "values", None, None)
     check_shape(visited, "visited", *values.shape)
     check_shape(noise, "noise", *values.shape)
-    if values_known():
+    if values_known(values, visited):
         unusable = torch.isnan(values) & ~visited
         check(not bool(unusable.any()), "values", "numbers", "NaN for a cell that is not visited")
     choice = torch.where(best_cells(values, visited, tolerance), noise, -1.0).argmax(-1)

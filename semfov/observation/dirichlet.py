@@ -166,7 +166,7 @@ def floor(scores: Tensor, epsilon: float) -> Tensor:
     """
     check_shape(scores, "scores", None)
     check(epsilon > 0, "epsilon", "a positive number", epsilon)
-    if scores.numel() and values_known():
+    if scores.numel() and values_known(scores):
         # NaN survives the minimum and the maximum, so one pass answers both questions.
         least, largest = scores.detach().aminmax()
         if not bool(torch.isfinite(least) & torch.isfinite(largest)):
@@ -178,5 +178,5 @@ def floor(scores: Tensor, epsilon: float) -> Tensor:
 
 def _check_parameters(alpha: Tensor, argument: str) -> None:
     check_shape(alpha, argument, None)
-    if values_known():
+    if values_known(alpha):
         check(bool((alpha > 0).all()), argument, "positive parameters", alpha.detach().amin().tolist())

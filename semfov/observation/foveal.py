@@ -10,12 +10,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semfov.detection.detector import Detector
 from semfov.errors import InputError, check, check_finite, check_shape, lookup, values_known
-from semfov.observation import compatibility
+from semfov.io import compatibility
+from semfov.io.pretrained import Pretrained
 from semfov.observation.dirichlet import floor, log_normaliser
 from semfov.observation.fitting import estimate_prior, expected_table, fit_table
 from semfov.observation.mle import Method
-from semfov.observation.pretrained import Pretrained
 from semfov.observation.statistics import DirichletStatistics
 
 
@@ -129,7 +130,7 @@ class FovealObservationModel(Pretrained):
 
     def level(self, distance: Tensor) -> Tensor:
         """Level of each distance, `(...)` from 0 (the fovea) to N - 1."""
-        if distance.numel() and values_known():
+        if distance.numel() and values_known(distance):
             check(bool((distance >= 0).all()), "distance", "numbers from 0 up", "NaN or a negative number")
         return torch.bucketize(distance.to(self.edges).contiguous(), self.edges)
 
@@ -287,7 +288,7 @@ class FovealObservationModel(Pretrained):
         return model
 
     @classmethod
-    def from_pretrained(cls, name_or_path: str | PathLike[str], *, detector: Any = None) -> Self:
+    def from_pretrained(cls, name_or_path: str | PathLike[str], *, detector: Detector | None = None) -> Self:
         """A model that is shipped with the package, by name, or one that `save` wrote, by path; in `eval` mode.
 
         Args:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import DataError, InputError, check, check_finite, check_shape
-from semfov.observation.storage import read, write
+from semfov.io.storage import read, write
 
 # Sums count quanta of 2^-32. Integers add exactly, so any order and any split of the samples give the same bits.
 FRACTION_BITS = 32

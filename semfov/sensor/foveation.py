@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from semfov.errors import check, check_finite, check_shape, lookup, values_known
 from semfov.sensor.lines import constant
-from semfov.sensor.pyramid import Bands, Convention, laplacian_pyramid, places, pyrup
+from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, places
 
 
 def foveate(
@@ -140,14 +140,14 @@ def _collapse(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Ten
         band = bands.details[k]
         across, down = windows[k]
         window = (down[..., :, None] * across[..., None, :])[:, :, None]
-        expanded = pyrup(result, (band.shape[-2], band.shape[-1]), bands.convention)
+        expanded = expand(result, (band.shape[-2], band.shape[-1]), bands.convention)
         if k == len(bands.details) - 1:
             # All fixations share the coarsest level.
             result = torch.addcmul(expanded[:, None], window, band[:, None]).flatten(0, 1)
         else:
             views = expanded.unflatten(0, (batch, many))
             # In place where nothing keeps a record of it, which saves memory that is fresh.
-            blend = views.addcmul_ if values_known() else views.addcmul
+            blend = views.addcmul_ if values_known(views, window, band) else views.addcmul
             result = blend(window, band[:, None]).flatten(0, 1)
     return result.unflatten(0, (batch, many))
 
@@ -190,7 +190,7 @@ def _widths(sigma: float | Tensor, like: Tensor) -> Tensor:
 
 
 def _check_values(gaze: Tensor, sigma: float | Tensor, growth: float | Tensor) -> None:
-    if not values_known():
+    if not values_known(gaze, *(value for value in (sigma, growth) if isinstance(value, Tensor))):
         return
     check_finite(gaze, "gaze")
     for name, value in (("sigma", sigma), ("growth", growth)):

@@ -104,7 +104,7 @@ def banded(
     first = _dense(index[:rows], weight[:rows], start + 2 * reach).to(device, dtype)
     middle = _dense(inner, weight[rows:rest].reshape(inner.shape), window).to(device, dtype)
     last = _dense(index[rest:] - behind, weight[rest:], count - behind).to(device, dtype)
-    if values_known() and bool((middle == middle[0]).all()):
+    if values_known(middle) and bool((middle == middle[0]).all()):
         # Mostly all are alike, and one stays in the fastest cache.
         middle = middle[:1].expand(tiles, -1, -1)
     return Lines(first, middle, last, start, shift)
@@ -112,7 +112,7 @@ def banded(
 
 def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
     """Columns of an image `(..., h, w)` made into others by `down`, its rows by `across`."""
-    if not values_known() or (image.requires_grad and torch.is_grad_enabled()) or image.device.type != "cpu":
+    if not values_known(image) or (image.requires_grad and torch.is_grad_enabled()) or image.device.type != "cpu":
         return _product(_product(image.mT, across).mT, down)
     if down.middle is None and across.middle is None:
         return down.first @ (image @ across.first.mT)

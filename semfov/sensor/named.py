@@ -1,11 +1,13 @@
 """Foveal sensors by name: the published ones, and the agent's own."""
 
-from typing import Any
+from typing import Any, Literal
 
 from semfov.errors import lookup
 from semfov.sensor.foveation import Foveation
 
-SENSORS: dict[str, dict[str, float]] = {
+SensorName = Literal["published", "published-narrow", "gradual"]
+
+SENSORS: dict[SensorName, dict[str, float]] = {
     "published": {"sigma": 100.0, "growth": 1.0},
     "published-narrow": {"sigma": 50.0, "growth": 1.0},
     "gradual": {"sigma": 100.0, "growth": 2.0},

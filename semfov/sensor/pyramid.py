@@ -71,6 +71,11 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
     """
     _check_image(image)
     lookup(convention, get_args(Convention), "pyramid convention")
+    return reduce(image, convention)
+
+
+def reduce(image: Tensor, convention: Convention) -> Tensor:
+    """`pyrdown` of what was checked before."""
     if _runs_in_kornia(image, convention):
         return _kornia().pyrdown(image.contiguous())
     down, across = (_reducing(count, convention, image.dtype, image.device) for count in image.shape[-2:])
@@ -98,6 +103,11 @@ def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia
     if convention == "opencv":
         for count, length in zip(image.shape[-2:], size, strict=True):
             check(0 <= 2 * count - length <= 1, "size", f"{2 * count} or {2 * count - 1} for {count} pixels", length)
+    return expand(image, size, convention)
+
+
+def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tensor:
+    """`pyrup` of what was checked before."""
     if _runs_in_kornia(image, convention, size):
         return _kornia().pyrup(image.contiguous())
     lengths = zip(image.shape[-2:], size, strict=True)
@@ -121,12 +131,13 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
     check(levels >= 0, "levels", "0 or more", levels)
     _check_image(image)
     check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
+    lookup(convention, get_args(Convention), "pyramid convention")
     details = []
     for _ in range(levels):
-        smaller = pyrdown(image, convention)
-        expanded = pyrup(smaller, (image.shape[-2], image.shape[-1]), convention)
+        smaller = reduce(image, convention)
+        expanded = expand(smaller, (image.shape[-2], image.shape[-1]), convention)
         # Fresh memory costs more than the difference itself, so it is taken only where a gradient or a graph needs it.
-        fresh = expanded.requires_grad or not values_known()
+        fresh = expanded.requires_grad or not values_known(image, expanded)
         details.append(image - expanded if fresh else torch.sub(image, expanded, out=expanded))
         image = smaller
     return Bands(tuple(details), image, convention)

@@ -5,16 +5,9 @@ import torch
 
 import semfov
 from semfov import Detections, Grid, InputError
-from semfov.belief import (
-    Belief,
-    ContextObserver,
-    ContextPrior,
-    DirichletBelief,
-    SemanticObserver,
-    TargetEvidence,
-    TargetObserver,
-)
+from semfov.belief import Belief, ContextPrior, DirichletBelief, TargetEvidence
 from semfov.belief.belief import dirichlet_belief, pick
+from semfov.belief.observers import Context, Semantic, Target
 
 GRID = Grid(4, 3, (80, 60))
 
@@ -23,26 +16,42 @@ def rand(*shape):
     return torch.rand(shape, generator=torch.Generator().manual_seed(len(shape)), dtype=torch.float64) + 0.1
 
 
+FIXATIONS = GRID.centres[[0, 7]].double()
+
+
+def looks():
+    """Two looks with one detection each."""
+    boxes = torch.tensor([[[5.0, 5, 30, 30]], [[40, 20, 75, 50]]]).double()
+    return Detections(boxes, rand(2, 1, 4).softmax(-1), torch.ones(2, 1, dtype=torch.bool))
+
+
 def seen(observer):
     """A batch of two beliefs after one look each."""
-    boxes = torch.tensor([[[5.0, 5, 30, 30]], [[40, 20, 75, 50]]]).double()
-    looks = Detections(boxes, rand(2, 1, 4).softmax(-1), torch.ones(2, 1, dtype=torch.bool))
-    evidence = observer.weigh(looks, GRID.centres[[0, 7]].double(), GRID, 2)
-    return observer.update(observer.start(2, GRID, looks.scores), evidence)
+    said = observer.weigh(looks(), FIXATIONS, GRID, 2)
+    return observer.update(observer.start(2, GRID, looks().scores), said)
+
+
+def tensors_of(belief):
+    """All tensors of a belief, whatever it is made of."""
+    found = []
+    for name in belief.__dataclass_fields__:
+        part = getattr(belief, name)
+        found += [part] if isinstance(part, torch.Tensor) else tensors_of(part)
+    return found
 
 
 def target_observer():
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return TargetObserver(TargetEvidence(8, 6).double().requires_grad_(False))
+        return Target(TargetEvidence(8, 6).double().requires_grad_(False))
 
 
 def context_observer():
     prior = ContextPrior(["cat", "cup", "dog"], rand(4, 3, 3), rand(4, 4, 2), [0.2], weights={"map": (1.0, 0.5)})
-    return ContextObserver(SemanticObserver(4), prior)
+    return Context(Semantic(4), prior)
 
 
-OBSERVERS = {"all classes": lambda: SemanticObserver(4), "target": target_observer, "context": context_observer}
+OBSERVERS = {"all classes": lambda: Semantic(4), "target": target_observer, "context": context_observer}
 
 
 def test_probability_of_a_target_is_that_of_a_loop():
@@ -80,6 +89,55 @@ def test_every_kind_answers_for_the_target_and_can_be_indexed(kind):
         torch.testing.assert_close(belief[index].closest, belief.closest[1:2])
 
 
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_every_kind_is_mapped_tensor_by_tensor(kind):
+    belief = seen(OBSERVERS[kind]())
+    met = []
+
+    def note(tensor):
+        met.append(tensor)
+        return tensor.clone()
+
+    other = belief.map(note)
+    assert type(other) is type(belief)
+    assert sorted(map(id, met)) == sorted(map(id, tensors_of(belief)))
+    for before, after in zip(tensors_of(belief), tensors_of(other), strict=True):
+        assert after is not before
+        assert torch.equal(after, before)
+
+
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_a_detached_belief_is_the_same_without_its_past(kind):
+    observer = OBSERVERS[kind]()
+    boxes, mask = looks().boxes, looks().mask
+    scores = looks().scores.requires_grad_()
+    said = observer.weigh(Detections(boxes, scores, mask), FIXATIONS, GRID, 2)
+    belief = observer.update(observer.start(2, GRID, boxes), said)
+    assert belief.probability(2).requires_grad
+    apart = belief.detach()
+    assert not any(tensor.requires_grad for tensor in tensors_of(apart))
+    assert torch.equal(apart.probability(2), belief.probability(2))
+
+
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_a_call_of_an_observer_is_to_weigh_and_to_update(kind):
+    observer = OBSERVERS[kind]()
+    called = observer(observer.start(2, GRID, looks().scores), looks(), FIXATIONS, GRID, 2)
+    for one, other in zip(tensors_of(called), tensors_of(seen(observer)), strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_an_observer_refuses_what_another_made(kind):
+    observer = OBSERVERS[kind]()
+    own, said = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
+    for make in (make for name, make in OBSERVERS.items() if name != kind):
+        with pytest.raises(InputError, match="belief: expected "):
+            observer.update(seen(make()), said)
+        with pytest.raises(InputError, match=f"look: expected {type(said).__name__}"):
+            observer.update(own, make().weigh(looks(), FIXATIONS, GRID, 2))
+
+
 @pytest.mark.parametrize("kind", ["target", "context"])
 def test_a_belief_about_one_target_answers_for_it_whatever_is_asked(kind):
     belief = seen(OBSERVERS[kind]())
@@ -92,7 +150,7 @@ def test_a_belief_about_one_target_is_none_about_all_classes(kind):
     belief = seen(OBSERVERS[kind]())
     with pytest.raises(InputError, match=rf"all classes \(DirichletBelief\), got {type(belief).__name__}"):
         dirichlet_belief(belief)
-    known = seen(SemanticObserver(4))
+    known = seen(Semantic(4))
     assert dirichlet_belief(known) is known
 
 
@@ -126,3 +184,5 @@ def test_beliefs_are_made_inside_a_graph():
 
 def test_it_is_public():
     assert semfov.DirichletBelief is DirichletBelief
+    assert semfov.Belief is Belief
+    assert semfov.observers.Semantic is Semantic

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from semfov import Detections, Grid
-from semfov.belief import ContextObserver, ContextPrior, SemanticObserver, TargetEvidence, TargetObserver
+from semfov.belief import ContextPrior, TargetEvidence
 from semfov.belief.context import presence_of, reaches
+from semfov.belief.observers import Context, Semantic, Target
 from semfov.errors import DataError, InputError
 
 GRID = Grid(5, 4, (100, 60))
@@ -115,14 +116,14 @@ def test_presence_equals_a_loop(looks):
 
 def observers():
     torch.manual_seed(3)
-    evidence = TargetObserver(TargetEvidence(8, 6).eval().requires_grad_(False))
-    return [evidence, SemanticObserver(4, tempering=0.25, footprint="box_centre")]
+    evidence = Target(TargetEvidence(8, 6).eval().requires_grad_(False))
+    return [evidence, Semantic(4, tempering=0.25, footprint="box_centre")]
 
 
 @pytest.mark.parametrize("kind", [0, 1], ids=["evidence", "map"])
 def test_observer_adds_context_to_the_log_odds(prior, looks, kind):
     inner = observers()[kind]
-    observer = ContextObserver(inner, prior)
+    observer = Context(inner, prior)
     assert observer.weights == ((0.5, 0.25), (1.0, 2.0))[kind]
     belief, plain = observer.start(1, GRID, looks.scores), inner.start(1, GRID, looks.scores)
     for look in range(3):
@@ -138,7 +139,7 @@ def test_observer_adds_context_to_the_log_odds(prior, looks, kind):
 
 @pytest.mark.parametrize("kind", [0, 1], ids=["evidence", "map"])
 def test_looks_joined_over_targets_are_those_of_each(prior, looks, kind):
-    observer = ContextObserver(observers()[kind], prior)
+    observer = Context(observers()[kind], prior)
     said = [observer.weigh(looks, FIXATIONS, GRID, target) for target in (1, 3)]
     joined = type(said[0]).join(said)
     start = observer.start(2, GRID, looks.scores)
@@ -150,7 +151,7 @@ def test_looks_joined_over_targets_are_those_of_each(prior, looks, kind):
 
 def test_without_weight_nothing_changes(prior, looks):
     inner = observers()[1]
-    observer = ContextObserver(inner, prior, (0.0, 0.0))
+    observer = Context(inner, prior, (0.0, 0.0))
     after = observer.update(observer.start(3, GRID, looks.scores), observer.weigh(looks, FIXATIONS, GRID, 1))
     plain = inner.update(inner.start(3, GRID, looks.scores), inner.weigh(looks, FIXATIONS, GRID, 1))
     torch.testing.assert_close(after.present, plain.probability(1))
@@ -184,7 +185,7 @@ def test_bad_input(prior, looks):
     with pytest.raises(InputError, match="size of one image"):
         prior(nothing, Grid(5, 4, torch.tensor([[100.0, 60.0]])), 1)
     with pytest.raises(InputError, match="target"):
-        ContextObserver(observers()[0], prior).weigh(looks, FIXATIONS, GRID)
+        Context(observers()[0], prior).weigh(looks, FIXATIONS, GRID)
     with pytest.raises(InputError, match="evidence"):
         prior.weights_for("evidnce")
     with pytest.raises(InputError, match="class 2"):

@@ -6,8 +6,9 @@ import scipy.ndimage
 import torch
 
 from semfov import Detections, FovealObservationModel, Grid
-from semfov.belief import TargetEvidence, TargetObserver
+from semfov.belief import TargetEvidence
 from semfov.belief.look_features import FEATURES, look_features
+from semfov.belief.observers import Target
 from semfov.belief.target_evidence import _blur, _peak
 from semfov.errors import DataError, InputError
 from semfov.gaze.acquisition import KLDivergence
@@ -92,7 +93,7 @@ def test_neighbourhoods_are_those_of_scipy():
 
 
 def test_belief_keeps_the_closest_look_and_the_strongest(looks, model):
-    observer = TargetObserver(model)
+    observer = Target(model)
     belief = observer.start(1, GRID, torch.empty(0))
     with torch.no_grad():
         for look in range(3):
@@ -111,7 +112,7 @@ def test_belief_keeps_the_closest_look_and_the_strongest(looks, model):
 
 
 def test_an_acquisition_about_all_classes_refuses_a_belief_about_one_target(model):
-    belief = TargetObserver(model).start(1, GRID, torch.empty(0))
+    belief = Target(model).start(1, GRID, torch.empty(0))
     observation = FovealObservationModel.identity(["cup", "cat"], [0.2])
     with pytest.raises(InputError, match="belief: expected a belief about all classes"):
         KLDivergence(observation, GRID)(belief, belief.visited)
@@ -150,6 +151,6 @@ def test_bad_input(looks, model):
     with pytest.raises(InputError, match="target"):
         model(looks, FIXATIONS, GRID, 4)
     with pytest.raises(InputError, match="target"):
-        TargetObserver(model).weigh(looks, FIXATIONS, GRID)
+        Target(model).weigh(looks, FIXATIONS, GRID)
     with pytest.raises(InputError, match="fixation"):
         model(looks, FIXATIONS[:2], GRID, 1)

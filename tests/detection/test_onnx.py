@@ -10,7 +10,7 @@ from semfov.detection.load import load_detector
 from semfov.detection.onnx import load_onnx
 from semfov.detection.preprocessing import Preprocessing
 from semfov.errors import DataError, InputError
-from semfov.files import sha256
+from semfov.io.files import sha256
 
 SIDE = 64
 NAMES = ("cat", "dog", "cup")

@@ -11,7 +11,7 @@ from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.detection.load import load_detector
 from semfov.detection.torchvision import TorchvisionDetector, load_torchvision
 from semfov.errors import DataError, InputError
-from semfov.files import sha256
+from semfov.io.files import sha256
 
 NAMES = ("cat", "dog", "cup")
 LITE = "ssdlite320_mobilenet_v3_large"

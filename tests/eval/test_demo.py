@@ -8,11 +8,12 @@ import torch
 from PIL import Image
 
 import eval.demo as program
-from eval.pictures import Picture, embedded_picture
-from eval.stages import STAGES, Stages
-from semfov import ActivePerception, Foveation, exploration_policy, search_policy
+from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, observers, policies, read_image
+from semfov.data.sources import Picture, embedded_picture
 from semfov.detection import Candidates, Detector
-from semfov.gaze import EXPLORATION_POLICIES, SEARCH_POLICIES, LearnedGaze
+from semfov.episode import STAGES
+from semfov.gaze import LearnedGaze
+from semfov.gaze.policies import Means, named_policy, policy_names
 
 
 class Squares(Detector):
@@ -32,9 +33,9 @@ class Squares(Detector):
 
 @pytest.fixture
 def agent():
-    searching, exploring = search_policy("non-predictive"), search_policy("random")
+    eye, observer = Eye(Foveation(40.0), Squares(), reference=160.0), observers.Semantic(3)
     return ActivePerception(
-        Foveation(40.0), Squares(), None, (8, 6), searching, exploration=exploring, reference=160.0
+        eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(8, 6)
     ).eval()
 
 
@@ -122,20 +123,23 @@ def test_help(capsys):
     assert "--camera" in printed
 
 
-def test_stages_measure_and_change_nothing(agent, photo):
-    from semfov import read_image
-
-    image = read_image(photo)
-    before = dict(vars(agent.eye)), dict(vars(agent.observer)), agent.policy
-    plain = agent.search(image, "red", start=40)
-    stages = Stages()
-    with torch.inference_mode(), stages.watch(agent):
-        watched = agent.search(image, "red", start=40)
+def test_stages_of_every_look_are_measured(agent, photo):
+    picture = Picture("photo", read_image(photo))
+    plain = agent.search(picture.image, "red", start=40)
+    watched = program.look_at(agent, picture, program.DemoConfig(target="red", start=40))
     assert torch.equal(plain.cells, watched.cells)
     assert torch.equal(plain.values, watched.values)
-    assert len(stages.looks) == len(watched)
-    assert all(set(look) == set(STAGES) and min(look.values()) > 0 for look in stages.looks)
-    assert (dict(vars(agent.eye)), dict(vars(agent.observer)), agent.policy) == before
+    assert len(watched.seconds) == len(watched) > 1
+    assert all(set(look) == set(STAGES) and min(look.values()) > 0 for look in watched.seconds)
+
+
+def test_what_a_look_took_is_printed(agent, photo):
+    picture = Picture("photo", read_image(photo))
+    scanpath = program.look_at(agent, picture, program.DemoConfig(explore=True, start=40, shifts=2))
+    lines = program.told("photo", scanpath).splitlines()
+    assert lines[1].endswith("ms")
+    milliseconds = [f"{1000 * sum(look.values()):.0f}" for look in scanpath.seconds]
+    assert [line.split()[-1] for line in lines[2:] if line] == milliseconds
 
 
 @pytest.fixture(scope="module")
@@ -152,38 +156,42 @@ def cup(usual) -> Picture:
 def watched_and_plain(agent, picture, **how):
     """The scanpaths of the demonstration, which measures each stage, and of the agent alone."""
     config = program.DemoConfig(start=0, shifts=2, **how)
-    watched, stages = program.look_at(agent, picture, config)
-    assert len(stages.looks) == len(watched)
-    assert all(set(look) == set(STAGES) for look in stages.looks)
+    watched = program.look_at(agent, picture, config)
+    assert len(watched.seconds) == len(watched)
+    assert all(set(look) == set(STAGES) for look in watched.seconds)
     with torch.inference_mode():
         if config.target is None:
             return watched, agent.explore(picture.image, start=0, shifts=2)
         return watched, agent.search(picture.image, config.target, start=0, shifts=2, boxes=picture.boxes)
 
 
-def policy_of(name, agent, make=search_policy):
-    if name == "learned":
-        return LearnedGaze.from_pretrained(agent.eye.detector.name).requires_grad_(False).policy
-    return make(name, agent.observation)
+@pytest.fixture(scope="module")
+def means(usual) -> Means:
+    """What every policy can be made from."""
+    name = usual.eye.detector.name
+    model, gaze = FovealObservationModel.from_pretrained(name), LearnedGaze.from_pretrained(name)
+    return Means(model.requires_grad_(False), gaze.requires_grad_(False))
 
 
 @pytest.mark.weights
-@pytest.mark.parametrize("name", [*SEARCH_POLICIES, "learned"])
-def test_every_search_can_be_watched(name, usual, cup, monkeypatch):
+@pytest.mark.parametrize("name", policy_names("search"))
+def test_every_search_can_be_watched(name, usual, means, cup):
     """By the map of all classes where a policy needs one, else by the belief that comes with the agent."""
-    monkeypatch.setattr(usual, "policy", policy_of(name, usual))
-    if name in ("predictive", "neighbourhood", "learned"):
-        monkeypatch.setattr(usual, "observer", usual.semantics)
-    watched, plain = watched_and_plain(usual, cup, target="cup")
+    mapping = usual.exploring.observer, usual.exploring.policy
+    observer = mapping[0] if name in ("predictive", "neighbourhood", "learned") else usual.searching.observer
+    agent = ActivePerception(usual.eye, (observer, named_policy(name, "search", means)), mapping).eval()
+    watched, plain = watched_and_plain(agent, cup, target="cup")
     assert torch.equal(watched.cells, plain.cells)
     assert torch.equal(watched.values, plain.values)
 
 
 @pytest.mark.weights
-@pytest.mark.parametrize("name", EXPLORATION_POLICIES)
-def test_every_exploration_can_be_watched(name, usual, cup, monkeypatch):
-    monkeypatch.setattr(usual, "exploration", policy_of(name, usual, exploration_policy))
-    watched, plain = watched_and_plain(usual, cup, explore=True)
+@pytest.mark.parametrize("name", policy_names("exploration"))
+def test_every_exploration_can_be_watched(name, usual, means, cup):
+    seeking = usual.searching.observer, usual.searching.policy
+    mapping = usual.exploring.observer, named_policy(name, "exploration", means)
+    agent = ActivePerception(usual.eye, seeking, mapping).eval()
+    watched, plain = watched_and_plain(agent, cup, explore=True)
     assert torch.equal(watched.cells, plain.cells)
     assert torch.equal(watched.values, plain.values)
     assert watched.shifts == 2

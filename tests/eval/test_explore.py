@@ -2,21 +2,29 @@
 
 import csv
 import json
-import signal
+import re
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from eval.config import BeliefConfig, DataConfig, DetectorConfig, ExploreConfig, ProtocolConfig, SaliencyConfig
 from eval.explore import explore, main
-from eval.saliency import SaliencyStore, saliency_table
-from eval.tasks import ExploreRun
-from semfov import SemanticMap
+from semfov import observers
+from semfov.experiments.config import (
+    BeliefConfig,
+    DataConfig,
+    DetectorConfig,
+    ExploreConfig,
+    ProtocolConfig,
+    SaliencyConfig,
+)
+from semfov.experiments.presets import presets
+from semfov.experiments.runs import ExploreRun
+from semfov.experiments.saliency_store import SaliencyStore, saliency_table
+from semfov.gaze.policies import POLICIES
 from semfov.gaze.saliency import VOCUS2
 
 pytestmark = pytest.mark.weights
@@ -54,16 +62,17 @@ def records_of(config: ExploreConfig) -> list[bytes]:
 
 
 def right_by_hand(run: ExploreRun, record: dict) -> tuple[list[int], list[int], int]:
-    """Right answers after each shift with a `SemanticMap` and loops over cells and objects."""
+    """Right answers after each shift with an observer of its own and loops over cells and objects."""
     index = run.scenes.ids.index(record["scene"])
     scene, grid, looks = run.scenes[index], run.grid(index), run.detections(index)
-    observation = run.model if record["policy"].endswith("calibrated") else None
-    belief = SemanticMap(grid, run.scenes.classes, observation=observation)
+    observation = run.models.observation if record["policy"].endswith("calibrated") else None
+    observer = observers.Semantic(len(run.scenes.classes) + 1, observation)
+    belief = observer.start(1, grid, looks.scores)
     right, without = [], []
     holds = grid.footprint(scene.boxes)
     objects = [{int(label) for label, there in zip(scene.labels, holds[:, c], strict=True) if there} for c in range(12)]
     for cell in record["cells"]:
-        belief.update(looks[torch.tensor([cell])], grid.centres[cell][None])
+        belief = observer(belief, looks[torch.tensor([cell])], grid.centres[cell][None], grid)
         counts = [0, 0]
         for place, classes in enumerate(objects):
             p = belief.probabilities[0, place]
@@ -170,18 +179,13 @@ def test_saliency_store_knows_what_it_depends_on(finished):
 
 
 @pytest.mark.slow
-def test_killed_run_resumes_with_the_same_result(finished, tmp_path):
+def test_killed_run_resumes_with_the_same_result(finished, tmp_path, kill_when):
     call = [
         sys.executable, "-m", "eval.explore", "--data.limit", "2", "--belief.columns", "4", "--belief.rows", "3",
         "--protocol.starts", "2", "--protocol.shifts", "4", "--policies", json.dumps(list(finished.policies)),
         "--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache"), "--workers", "1",
     ]  # fmt: skip
-    process = subprocess.Popen(call, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while not list(tmp_path.glob("out/parts/*/*.json")) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    kill_when(call, lambda: list(tmp_path.glob("out/parts/*/*.json")), cwd=ROOT)
     assert not (tmp_path / "out/summary.csv").exists()
     subprocess.run(call, cwd=ROOT, check=True, capture_output=True)
     assert records_of(replace(finished, out=tmp_path / "out")) == records_of(finished)
@@ -192,3 +196,18 @@ def test_errors_are_one_line(capsys, tmp_path):
     assert "did you mean 'kl-raw'" in capsys.readouterr().err
     assert main(["--policies", '["random"]', "--out", str(tmp_path)]) == 1
     assert "random-raw" in capsys.readouterr().err
+    assert main(["--policies", "[{policy: kl, tempering: 0}]", "--out", str(tmp_path)]) == 1
+    assert capsys.readouterr().err == "error: tempering: expected a positive number, got 0.0\n"
+
+
+def test_help_names_every_preset(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--help"])
+    assert stopped.value.code == 0
+    explained = "".join(re.search(r"--policies \[ITEM.*?\(type:", capsys.readouterr().out, re.DOTALL)[0].split())
+    for name, preset in presets("exploration").items():
+        if preset.policy in POLICIES and not POLICIES[preset.policy].__module__.startswith("semfov."):
+            continue  # registered by another test
+        assert f"`{name.removesuffix('-raw').removesuffix('-calibrated')}`" in explained, name
+    for ending in ("-raw", "-calibrated"):
+        assert f"`{ending}`" in explained

@@ -6,15 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eval import paper
-from eval.curves import behind
-from eval.experiments import ResultsConfig, experiments
-from eval.findings import FINDINGS, gain, overtaken
-from eval.page_figures import FIGURES, draw_figures
-from eval.page_tables import agreement, central, first_fixations, paired, summary
+from eval.page import paper
+from eval.page.curves import behind
+from eval.page.experiments import ResultsConfig, experiments
+from eval.page.figures import FIGURES, draw_figures
+from eval.page.findings import FINDINGS, gain, overtaken
+from eval.page.tables import agreement, central, first_fixations, paired, summary
 from eval.results import TABLES, WHOLE, fill
-from eval.setup import split_policy
 from semfov.errors import InputError
+from semfov.experiments.config import SearchConfig
+from semfov.experiments.presets import label
 
 ROOT = Path(__file__).parents[2]
 
@@ -69,9 +70,9 @@ def searched(runs):
 
 def test_every_policy_of_the_page_is_known(runs):
     for run in runs.values():
-        kind = "search" if hasattr(run, "scanpaths") else "exploration"
-        for policy in run.policies:
-            split_policy(policy, kind)
+        task = "search" if isinstance(run, SearchConfig) else "exploration"
+        labels = [label(choice, task) for choice in run.policies]
+        assert len(set(labels)) == len(labels) > 0
 
 
 def test_settings_are_studied_on_the_fit_set_and_results_on_the_named_photographs(tmp_path):
@@ -186,7 +187,7 @@ def test_first_fixations_are_central_or_at_the_border(tmp_path):
 
 
 def test_a_study_has_a_row_for_each_setting_and_policy(runs):
-    right = {"random-raw": (1, 2), "closer-look-raw+mild": (3, 4)}
+    right = {"random-raw": (1, 2), "closer-look-raw, tempering 0.5": (3, 4)}
     records = [
         {"policy": policy, "scene": scene, "right": [counts[scene]] * 21, "object_cells": 4}
         for policy, counts in right.items()
@@ -196,7 +197,7 @@ def test_a_study_has_a_row_for_each_setting_and_policy(runs):
     rows = [cells_of(row) for row in fill("@@ explore-sensor\n", runs).splitlines()]
     assert rows[0] == ["setting", "policy", "0", "1", "2", "3", "4", "10", "20"]
     assert rows[2][:3] == ["fovea 50 px, growth 1", "random-raw", "37.5 ± 12.5"]
-    assert rows[3][1:3] == ["closer-look-raw+mild", "87.5 ± 12.5"]
+    assert rows[3][1:3] == ["closer-look-raw, tempering 0.5", "87.5 ± 12.5"]
     assert len(rows) == 2 + 6 * 2
 
 

@@ -3,21 +3,22 @@
 import csv
 import json
 import os
-import signal
+import re
 import subprocess
 import sys
-import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
 
-from eval.config import BeliefConfig, DataConfig, ProtocolConfig, SearchConfig
 from eval.search import main, search
-from eval.store import DetectionStore, see_all
-from eval.tasks import SearchRun
+from semfov.experiments.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig, SearchConfig
+from semfov.experiments.presets import label, presets
+from semfov.experiments.runs import SearchRun
+from semfov.experiments.store import DetectionStore, see_all
+from semfov.gaze.policies import POLICIES
 
 pytestmark = pytest.mark.weights
 
@@ -32,7 +33,7 @@ def small(tmp_path_factory):
         data=DataConfig(limit=2),
         belief=BeliefConfig(columns=4, rows=3),
         protocol=ProtocolConfig(starts=3, shifts=6),
-        policies=("random", "itti-koch", "non-predictive-raw"),
+        policies=("random", "itti-koch", PolicyConfig("non-predictive", tempering=0.25), "non-predictive-raw"),
         cache=folder / "cache",
         out=folder / "out",
         workers=1,
@@ -55,7 +56,9 @@ def records_of(config: SearchConfig) -> list[bytes]:
 
 def test_run_leaves_everything(finished):
     records = [json.loads(line) for line in (finished.out / "episodes.jsonl").read_text().splitlines()]
-    assert {record["policy"] for record in records} == set(finished.policies)
+    policies = [label(choice, "search") for choice in finished.policies]
+    assert policies[2] == "non-predictive-raw, tempering 0.25"
+    assert list(dict.fromkeys(record["policy"] for record in records)) == policies
     for record in records:
         assert record["start"] == record["cells"][0]
         assert record["start"] not in record["goal"]
@@ -64,7 +67,7 @@ def test_run_leaves_everything(finished):
         assert record["found_at"] == (hits[0] if hits else -1)
     with (finished.out / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 3 * 7
+    assert len(rows) == 2 * 4 * 7
     everything = [r for r in rows if r["average"] == "all targets" and r["policy"] == "random" and r["shifts"] == "6"]
     by_scene = {}
     for record in records:
@@ -74,11 +77,15 @@ def test_run_leaves_everything(finished):
     assert float(everything[0]["performance"]) == pytest.approx(expected, abs=1e-6)
     manifest = json.loads((finished.out / "manifest.json").read_text())
     assert manifest["eye"]["detector"]["digest"]
-    assert yaml.safe_load((finished.out / "config.yaml").read_text())["protocol"]["starts"] == 3
+    settings = yaml.safe_load((finished.out / "config.yaml").read_text())
+    assert settings["protocol"]["starts"] == 3
+    assert settings["policies"][2]["tempering"] == 0.25
     pictures = sorted(path.name for path in finished.out.glob("*.png"))
     assert pictures[0] == "cumulative_performance.png"
     assert len(pictures) == 2
-    assert "CP@5" in (finished.out / "summary.md").read_text()
+    summary = (finished.out / "summary.md").read_text()
+    assert "CP@5" in summary
+    assert "| non-predictive-raw, tempering 0.25 |" in summary
 
 
 @pytest.mark.parametrize(
@@ -120,24 +127,25 @@ def test_damaged_parts_are_computed_again(finished, tmp_path):
     assert records_of(again) == records_of(finished)
 
 
+def given(policy: PolicyConfig) -> dict:
+    """The mapping that a user writes for a policy."""
+    return {name: value for name, value in asdict(policy).items() if value is not None}
+
+
 def command(config: SearchConfig, out: Path, cache: Path, *more: str) -> list[str]:
+    policies = [choice if isinstance(choice, str) else given(choice) for choice in config.policies]
     return [
         sys.executable, "-m", "eval.search", "--data.limit", "2", "--belief.columns", "4", "--belief.rows", "3",
-        "--protocol.starts", "3", "--protocol.shifts", "6", "--policies", json.dumps(list(config.policies)),
+        "--protocol.starts", "3", "--protocol.shifts", "6", "--policies", json.dumps(policies),
         "--out", str(out), "--cache", str(cache), "--workers", "1", "--scanpaths", "0", *more,
     ]  # fmt: skip
 
 
 @pytest.mark.slow
-def test_killed_run_resumes_with_the_same_result(finished, tmp_path):
+def test_killed_run_resumes_with_the_same_result(finished, tmp_path, kill_when):
     call = command(finished, tmp_path / "out", tmp_path / "cache")
     root = Path(__file__).parents[2]
-    process = subprocess.Popen(call, cwd=root, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while not list(tmp_path.glob("out/parts/*/*.json")) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    kill_when(call, lambda: list(tmp_path.glob("out/parts/*/*.json")), cwd=root)
     assert not (tmp_path / "out/summary.csv").exists()
     subprocess.run(call, cwd=root, check=True, capture_output=True)
     again = replace(finished, out=tmp_path / "out")
@@ -186,7 +194,29 @@ def test_help_and_print_config(capsys):
     text = capsys.readouterr().out
     for word in ("--sensor.sigma", "width of the fovea", "--config"):
         assert word in text
+    explained = "".join(re.search(r"--policies \[ITEM.*?\(type:", text, re.DOTALL)[0].split())
+    for name, preset in presets("search").items():
+        if preset.policy in POLICIES and not POLICIES[preset.policy].__module__.startswith("semfov."):
+            continue  # registered by another test
+        assert f"`{name.removesuffix('-raw').removesuffix('-calibrated')}`" in explained, name
+    assert "`-raw`or`-calibrated`" in explained
     with pytest.raises(SystemExit):
         main(["--sensor.sigma", "50", "--print_config"])
     printed = yaml.safe_load(capsys.readouterr().out)
     assert printed["sensor"]["sigma"] == 50
+
+
+def test_the_policy_that_help_spells_out_is_one(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = " ".join(capsys.readouterr().out.replace("-\n", "-").split())
+    mapping = re.search(r"mapping of settings such as `(\{.*?\})`", text)[1]
+    with pytest.raises(SystemExit):
+        main(["--policies", f"[{mapping}]", "--print_config"])
+    (policy,) = yaml.safe_load(capsys.readouterr().out)["policies"]
+    assert label(PolicyConfig(**policy), "search") == "non-predictive-calibrated, tempering 0.25"
+    with pytest.raises(SystemExit):
+        main(["--policies.help"])
+    settings = capsys.readouterr().out
+    for name in asdict(PolicyConfig("random")):
+        assert name in settings

@@ -5,8 +5,8 @@ import torch
 
 from semfov.belief import DirichletBelief, Grid
 from semfov.errors import InputError
-from semfov.gaze import exploration_policy
 from semfov.gaze.acquisition import ExpectedAccuracy
+from semfov.gaze.policies import Accuracy, Means, named_policy
 
 GRID = Grid(4, 3, (80, 60))
 
@@ -58,7 +58,9 @@ def test_nothing_is_gained_where_all_is_known():
 
 
 def test_policy_by_name(beta):
-    acquisition = exploration_policy("expected-accuracy", Model())(None, GRID)
+    policy = named_policy("expected-accuracy", "exploration", Means(Model()))
+    assert isinstance(policy, Accuracy)
+    acquisition = policy(None, GRID)
     assert torch.equal(values_of(acquisition, beta), values_of(ExpectedAccuracy(Model(), GRID), beta))
     compiled = torch.compile(acquisition, fullgraph=True, backend="eager")
     torch.testing.assert_close(values_of(compiled, beta), values_of(acquisition, beta))

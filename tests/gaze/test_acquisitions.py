@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, acquisition
-from semfov.belief.context_observer import ContextBelief
-from semfov.belief.target_observer import TargetBelief
+from semfov.belief.observers.context import ContextBelief
+from semfov.belief.observers.target import TargetBelief
 from semfov.gaze import LearnedGaze
+from semfov.gaze.policies import Learned
 
 GRID = Grid(4, 3, (80, 60))
 TARGETS = torch.tensor([2, 1, 3])
@@ -29,7 +30,7 @@ def learned():
         torch.manual_seed(0)
         gaze = LearnedGaze(4).double().requires_grad_(False)
         torch.nn.init.normal_(gaze.network[-1].weight)
-    return gaze.policy(TARGETS, GRID)
+    return Learned(gaze)(TARGETS, GRID)
 
 
 SEARCH = {

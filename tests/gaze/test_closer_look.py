@@ -7,8 +7,8 @@ import torch
 
 from semfov.belief import DirichletBelief, Grid
 from semfov.errors import InputError
-from semfov.gaze import exploration_policy
 from semfov.gaze.acquisition import CloserLook
+from semfov.gaze.policies import Closer, Means, named_policy
 
 GRID = Grid(4, 3, (80, 60))
 FOVEA = 0.2
@@ -63,7 +63,9 @@ def test_nothing_is_gained_where_all_is_known():
 
 
 def test_policy_by_name(belief):
-    acquisition = exploration_policy("closer-look", fovea=FOVEA)(None, GRID)
+    policy = named_policy("closer-look", "exploration", Means(fovea=FOVEA))
+    assert isinstance(policy, Closer)
+    acquisition = policy(None, GRID)
     visited = torch.zeros(2, 12, dtype=torch.bool)
     assert torch.equal(acquisition(belief, visited), CloserLook(GRID, FOVEA)(belief, visited))
     compiled = torch.compile(acquisition, fullgraph=True, backend="eager")

@@ -6,10 +6,10 @@ import pytest
 import torch
 from scipy import stats
 
-from semfov import DirichletBelief, FovealObservationModel, Grid, search_policy
+from semfov import DirichletBelief, FovealObservationModel, Grid
 from semfov.belief import fusion
 from semfov.errors import InputError
-from semfov.gaze import EXPLORATION_POLICIES, exploration_policy, select_fixation
+from semfov.gaze import select_fixation
 from semfov.gaze.acquisition import (
     BayesianSurprise,
     KLDivergence,
@@ -18,6 +18,7 @@ from semfov.gaze.acquisition import (
     TwoPeaks,
     UpperConfidenceBound,
 )
+from semfov.gaze.policies import KL, Means, NonPredictive, named_policy, policy_names
 
 ACQUISITIONS = {
     "kl": KLDivergence,
@@ -235,19 +236,22 @@ def test_policies_by_name(model):
         "upper-confidence-bound": UpperConfidenceBound,
         "probability-of-improvement": ProbabilityOfImprovement,
     }
-    assert {"random", *named} <= set(EXPLORATION_POLICIES)
+    assert {"random", *named} <= set(policy_names("exploration"))
     for name, acquisition in named.items():
-        got = values_of(exploration_policy(name, model)(None, grid), beta)
+        got = values_of(named_policy(name, "exploration", Means(model))(None, grid), beta)
         assert torch.equal(got, values_of(acquisition(model, grid), beta))
-    other = values_of(exploration_policy("kl", model, prior=2.0)(None, grid), beta)
-    assert torch.equal(other, values_of(KLDivergence(model, grid, prior=2.0), beta))
-    assert torch.equal(values_of(exploration_policy("random")(None, grid), beta), torch.zeros(3, 8).double())
+    expected = values_of(KLDivergence(model, grid, prior=2.0), beta)
+    for policy in (named_policy("kl", "exploration", Means(model, prior=2.0)), KL(model, 2.0)):
+        assert torch.equal(values_of(policy(None, grid), beta), expected)
+    assert torch.equal(values_of(named_policy("random", "exploration")(None, grid), beta), torch.zeros(3, 8).double())
     with pytest.raises(InputError, match="did you mean 'two-peaks'"):
-        exploration_policy("two-peak", model)
+        named_policy("two-peak", "exploration", Means(model))
     with pytest.raises(InputError, match="observation model"):
-        exploration_policy("kl")
-    with pytest.raises(InputError, match="exploration_policy"):
-        search_policy("non-predictive")(None, grid)
+        named_policy("kl", "exploration")
+    with pytest.raises(InputError, match="exploration policy 'non-predictive'"):
+        named_policy("non-predictive", "exploration")
+    with pytest.raises(InputError, match="policy 'non-predictive': expected a target to search for"):
+        NonPredictive()(None, grid)
 
 
 def test_bad_arguments(model):

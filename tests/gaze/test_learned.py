@@ -9,6 +9,7 @@ from semfov import DataError, Grid, InputError
 from semfov.belief import DirichletBelief
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.learned import LearnedGaze, gaze_features
+from semfov.gaze.policies import Learned, Means, named_policy
 from semfov.gaze.relaxation import soft_fixation
 
 CELLS, CLASSES, COLUMNS = 12, 5, 4
@@ -101,7 +102,9 @@ def test_features_equal_a_loop(belief, visited):
 def test_it_starts_as_non_predictive_search(belief, visited):
     gaze = LearnedGaze().double()
     target = torch.tensor([1, 4, 2])
-    values = gaze.policy(target, Grid(COLUMNS, 3, (64, 48)))(belief, visited)
+    grid = Grid(COLUMNS, 3, (64, 48))
+    values = Learned(gaze)(target, grid)(belief, visited)
+    assert torch.equal(named_policy("learned", "search", Means(gaze=gaze))(target, grid)(belief, visited), values)
     assert values.shape == (3, CELLS)
     assert torch.equal(values.argsort(), TargetPosterior(target)(belief, visited).argsort())
 
@@ -139,7 +142,9 @@ def test_save_and_load(tmp_path, belief, visited):
 
 def test_wrong_arguments():
     with pytest.raises(InputError, match="target"):
-        LearnedGaze().policy(None, Grid(2, 2, (4, 4)))
+        Learned(LearnedGaze())(None, Grid(2, 2, (4, 4)))
+    with pytest.raises(InputError, match="policy 'learned': expected a learned gaze policy"):
+        named_policy("learned", "search")
     zeros = torch.zeros(1, 3)
     with pytest.raises(InputError, match="temperature"):
         soft_fixation(zeros, zeros > 0, torch.zeros(3, 2), zeros, temperature=0.0)

@@ -8,8 +8,8 @@ import torch
 
 from semfov.belief import DirichletBelief, Grid
 from semfov.errors import InputError
-from semfov.gaze import search_policy
 from semfov.gaze.acquisition import FovealHit, PlaceInformation
+from semfov.gaze.policies import Means, named_policy
 
 GRID = Grid(4, 3, (80, 60))
 
@@ -70,12 +70,12 @@ def entropy(q):
 
 @pytest.mark.parametrize("name", ["foveal-hit", "place-information"])
 def test_policies_need_miss_rates(name, beta):
-    acquisition = search_policy(name, Misses())(1, GRID)
+    acquisition = named_policy(name, "search", Means(Misses()))(1, GRID)
     assert values_of(acquisition, beta).shape == (2, 12)
     assert torch.autograd.gradcheck(partial(values_of, acquisition), beta[:1].requires_grad_())
     blind = Misses()
     blind.miss_rate = None
     with pytest.raises(InputError, match="miss rates"):
-        search_policy(name, blind)(1, GRID)
+        named_policy(name, "search", Means(blind))(1, GRID)
     with pytest.raises(InputError, match="observation model"):
-        search_policy(name)
+        named_policy(name, "search")

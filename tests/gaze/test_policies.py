@@ -1,4 +1,4 @@
-"""Policies by name: what they refuse, and that they can be copied and sent to another process."""
+"""Policies by name: what they refuse, that they are modules, and that they can be copied and sent elsewhere."""
 
 import copy
 import pickle
@@ -9,14 +9,16 @@ import torch
 from semfov import FovealObservationModel
 from semfov.belief import DirichletBelief, Grid
 from semfov.errors import InputError
-from semfov.gaze import EXPLORATION_POLICIES, SEARCH_POLICIES, exploration_policy, search_policy
+from semfov.gaze import LearnedGaze, acquisition, policies
+from semfov.gaze.policies import POLICIES, Means, Policy, named_policy, policy_names
 
 GRID = Grid(4, 3, (80, 60))
 
 
 def values_of(acquisition, beta):
-    """Values for a Dirichlet belief with these parameters, when nothing was visited."""
-    return acquisition(DirichletBelief(beta), torch.zeros(beta.shape[:-1], dtype=torch.bool))
+    """Values for a Dirichlet belief with these parameters after a look at the first cell, when nothing was visited."""
+    closest = GRID.cell_distance[0].to(beta).expand(beta.shape[:-1])
+    return acquisition(DirichletBelief(beta, closest), torch.zeros(beta.shape[:-1], dtype=torch.bool))
 
 
 @pytest.fixture
@@ -26,19 +28,105 @@ def model():
     return model.requires_grad_(False)
 
 
-@pytest.mark.parametrize("name", ["non-predictive", "predictive", "neighbourhood", "foveal-hit", "place-information"])
-def test_a_copied_or_pickled_search_policy_values_alike(name, model):
-    policy = search_policy(name, model)
+@pytest.fixture
+def means(model):
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        gaze = LearnedGaze(4).requires_grad_(False)
+        torch.nn.init.normal_(gaze.network[-1].weight)
+    return Means(model, gaze)
+
+
+def test_names_are_those_of_the_tasks():
+    assert policy_names("search") == [
+        "random",
+        "non-predictive",
+        "predictive",
+        "neighbourhood",
+        "foveal-hit",
+        "place-information",
+        "learned",
+    ]
+    assert sorted(policy_names("exploration")) == sorted(
+        [
+            "random",
+            "kl",
+            "surprise",
+            "negative-entropy",
+            "two-peaks",
+            "upper-confidence-bound",
+            "probability-of-improvement",
+            "expected-accuracy",
+            "closer-look",
+        ]
+    )
+
+
+def test_every_policy_is_public_under_its_class():
+    for name, kind in POLICIES.items():
+        assert kind.name == name
+        assert getattr(policies, kind.__name__) is kind
+        assert kind.__name__ in policies.__all__
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_models_are_parts_of_the_policy(name, means):
+    """As modules they are in its state, and move with it."""
+    policy = POLICIES[name].make(means)
+    assert isinstance(policy, Policy)
+    part = means.model if policy.needs_model else means.gaze if policy.needs_gaze else None
+    owned = list(policy.state_dict())
+    assert owned == (
+        [] if part is None else [f"{'model' if policy.needs_model else 'gaze'}.{n}" for n in part.state_dict()]
+    )
+    policy.double()
+    moved = [tensor.dtype for tensor in policy.state_dict().values() if tensor.is_floating_point()]
+    assert set(moved) <= {torch.float64}
+    assert bool(moved) == (part is not None)
+
+
+def test_a_policy_of_ones_own_is_named_once_defined():
+    class Last(Policy):
+        name = "last-of-all"
+        tasks = ("search",)
+
+        def forward(self, target, grid):
+            return acquisition.Static(torch.arange(float(len(grid))))
+
+    class Nameless(Policy):
+        def forward(self, target, grid):
+            return acquisition.Uniform()
+
+    try:
+        assert policy_names("search")[-1] == "last-of-all"
+        assert "last-of-all" not in policy_names("exploration")
+        made = named_policy("last-of-all", "search")
+        assert isinstance(made, Last)
+        assert values_of(made(1, GRID), torch.ones(1, 12, 3)).argmax() == 11
+        assert Nameless not in POLICIES.values()
+    finally:
+        del POLICIES["last-of-all"]
+
+
+@pytest.mark.parametrize(
+    "name", ["non-predictive", "predictive", "neighbourhood", "foveal-hit", "place-information", "learned"]
+)
+def test_a_copied_or_pickled_search_policy_values_alike(name, means):
+    policy = named_policy(name, "search", means)
     beta = torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)) + 0.1
     expected = values_of(policy(1, GRID), beta)
+    assert bool(expected.isfinite().all())
     for other in (copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))):
         assert torch.equal(values_of(other(1, GRID), beta), expected)
-        assert other.model is not model
+        mine = {tensor.data_ptr() for tensor in policy.state_dict().values()}
+        assert mine.isdisjoint(tensor.data_ptr() for tensor in other.state_dict().values())
+        if name not in ("non-predictive", "learned"):
+            assert other.model is not means.model
 
 
 @pytest.mark.parametrize("name", ["random", "kl", "surprise", "two-peaks", "expected-accuracy", "closer-look"])
-def test_a_copied_or_pickled_exploration_policy_values_alike(name, model):
-    policy = exploration_policy(name, model)
+def test_a_copied_or_pickled_exploration_policy_values_alike(name, means):
+    policy = named_policy(name, "exploration", means)
     beta = torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)) + 0.1
     for other in (copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))):
         assert torch.equal(values_of(other(None, GRID), beta), values_of(policy(None, GRID), beta))
@@ -46,10 +134,24 @@ def test_a_copied_or_pickled_exploration_policy_values_alike(name, model):
 
 def test_a_missing_model_is_told_at_once():
     free = {"random", "non-predictive", "closer-look"}
-    for names, make in ((SEARCH_POLICIES, search_policy), (EXPLORATION_POLICIES, exploration_policy)):
-        for name in names:
+    for task in ("search", "exploration"):
+        for name in policy_names(task):
             if name in free:
-                make(name)(1, GRID)
+                named_policy(name, task)(1, GRID)
                 continue
-            with pytest.raises(InputError, match=f"policy '{name}': expected an observation model"):
-                make(name)
+            needed = "a learned gaze policy" if name == "learned" else "an observation model"
+            with pytest.raises(InputError, match=f"policy '{name}': expected {needed}"):
+                named_policy(name, task)
+
+
+@pytest.mark.parametrize("name", [name for name in policy_names("search") if name != "random"])
+def test_a_missing_target_is_told_by_the_name_of_the_policy(name, means):
+    with pytest.raises(InputError, match=f"policy '{name}': expected a target"):
+        named_policy(name, "search", means)(None, GRID)
+
+
+def test_a_policy_for_another_task_is_refused(means):
+    with pytest.raises(InputError, match="search policy 'kl'"):
+        named_policy("kl", "search", means)
+    with pytest.raises(InputError, match="exploration policy 'predictive'"):
+        named_policy("predictive", "exploration", means)

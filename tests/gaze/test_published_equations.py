@@ -13,7 +13,8 @@ import pytest
 import scipy.stats
 import torch
 
-from semfov import DirichletBelief, FovealObservationModel, Grid, acquisition, exploration_policy, search_policy
+from semfov import DirichletBelief, FovealObservationModel, Grid, acquisition
+from semfov.gaze.policies import Means, named_policy
 
 LEVELS = 8
 SHAPES = {"wide": (4, 3, (640, 480)), "tall": (2, 5, (300, 500)), "row": (6, 1, (60, 10))}
@@ -173,7 +174,7 @@ def agree(got, wanted, tolerance, constant=False):
 
 @pytest.mark.parametrize("name", EXPLORATION)
 def test_exploration(name, paper):
-    wanted, function = EXPLORATION[name](paper), exploration_policy(name, paper.model)(None, paper.grid)
+    wanted, function = EXPLORATION[name](paper), named_policy(name, "exploration", Means(paper.model))(None, paper.grid)
     agree(paper.values(function), wanted, DOUBLE, constant=name in UP_TO_A_CONSTANT)
     agree(paper.values(function, torch.float32), wanted, SINGLE[name], constant=name in UP_TO_A_CONSTANT)
 
@@ -182,7 +183,7 @@ def test_exploration(name, paper):
 def test_search(paper, target):
     searches = {"non-predictive": paper.non_predictive(target), "predictive": paper.predictive(target)}
     for name, wanted in searches.items():
-        function = search_policy(name, paper.model)(target, paper.grid)
+        function = named_policy(name, "search", Means(paper.model))(target, paper.grid)
         agree(paper.values(function), wanted, 1e-12)
         agree(paper.values(function, torch.float32), wanted, 1e-6)
 
@@ -207,7 +208,7 @@ def test_the_neighbourhood_of_one_cell_is_predictive_search(paper):
 def test_the_papers_map(name):
     """10 × 10 cells of 81 classes: a hundred fixations, ten thousand simulated updates."""
     paper = full_size()
-    function, wanted = exploration_policy(name, paper.model)(None, paper.grid), EXPLORATION[name](paper)
+    function, wanted = named_policy(name, "exploration", Means(paper.model))(None, paper.grid), EXPLORATION[name](paper)
     agree(paper.values(function), wanted, DOUBLE, constant=name in UP_TO_A_CONSTANT)
     agree(paper.values(function, torch.float32), wanted, SINGLE[name], constant=name in UP_TO_A_CONSTANT)
 
@@ -215,13 +216,13 @@ def test_the_papers_map(name):
 @pytest.mark.parametrize("prior", [0.1, 0.5, 2.0])
 def test_divergence_from_another_prior(prior):
     paper = Paper(SHAPES["wide"], 5, 3)
-    function = exploration_policy("kl", paper.model, prior=prior)(None, paper.grid)
+    function = named_policy("kl", "exploration", Means(paper.model, prior=prior))(None, paper.grid)
     agree(paper.values(function), paper.total(lambda beta: divergence(beta, prior)), DOUBLE, constant=True)
 
 
 @pytest.mark.parametrize(("name", "metric"), [("kl", divergence), ("negative-entropy", negentropy)])
 def test_the_constant_is_that_of_the_present_map(name, metric, paper):
-    function = exploration_policy(name, paper.model)(None, paper.grid)
+    function = named_policy(name, "exploration", Means(paper.model))(None, paper.grid)
     present = sum(metric(beta) for beta in paper.beta)
     np.testing.assert_allclose(paper.values(function), np.array(paper.total(metric)) - present, rtol=0, atol=1e-9)
 

@@ -7,8 +7,8 @@ import torch
 
 from semfov.belief import DirichletBelief, Grid, fusion
 from semfov.errors import InputError
-from semfov.gaze import search_policy
-from semfov.gaze.acquisition import PredictedTargetPosterior, Static, TargetPosterior, Uniform
+from semfov.gaze.acquisition import NeighbourhoodPosterior, PredictedTargetPosterior, Static, TargetPosterior, Uniform
+from semfov.gaze.policies import Means, Neighbourhood, NonPredictive, Predictive, Random, named_policy
 
 GRID = Grid(3, 2, (30, 20))
 
@@ -19,6 +19,9 @@ class Model:
     def __init__(self, classes: int) -> None:
         generator = torch.Generator().manual_seed(classes)
         self.table = torch.rand(classes, 3, classes, generator=generator).double().softmax(-1)
+
+    def level(self, distance):
+        return torch.bucketize(distance, torch.tensor([0.2, 0.5]))
 
     def expected_scores(self):
         return self.table
@@ -70,14 +73,21 @@ def test_static_and_uniform(beta):
 
 def test_policies_by_name(beta):
     model = Model(5)
-    assert torch.equal(values_of(search_policy("random")(1, GRID), beta), values_of(Uniform(), beta))
-    assert torch.equal(values_of(search_policy("non-predictive")(1, GRID), beta), values_of(TargetPosterior(1), beta))
-    predicted = search_policy("predictive", model)(1, GRID)
-    assert torch.equal(values_of(predicted, beta), values_of(PredictedTargetPosterior(1, model), beta))
+    named = {
+        "random": (Random(), Uniform()),
+        "non-predictive": (NonPredictive(), TargetPosterior(1)),
+        "predictive": (Predictive(model), PredictedTargetPosterior(1, model)),
+        "neighbourhood": (Neighbourhood(model), NeighbourhoodPosterior(1, model, GRID)),
+    }
+    for name, (policy, acquisition) in named.items():
+        made = named_policy(name, "search", Means(model))
+        assert type(made) is type(policy)
+        for each in (made, policy):
+            assert torch.equal(values_of(each(1, GRID), beta), values_of(acquisition, beta))
     with pytest.raises(InputError, match="did you mean 'predictive'"):
-        search_policy("predicitve")
+        named_policy("predicitve", "search")
     with pytest.raises(InputError, match="observation model"):
-        search_policy("predictive")
+        named_policy("predictive", "search")
 
 
 @pytest.mark.parametrize("target", [-1, 5])

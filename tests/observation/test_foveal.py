@@ -16,8 +16,8 @@ import torch
 
 from semfov.belief.fusion import kaplan
 from semfov.errors import DataError, InputError
+from semfov.io.compatibility import CONVERSIONS, check_detector
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
-from semfov.observation.compatibility import CONVERSIONS, check_detector
 from semfov.observation.fitting import estimate_prior, expected_table, fit_table
 
 CLASSES = ["cup", "cat", "dog"]

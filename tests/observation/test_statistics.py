@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semfov.errors import DataError, InputError
+from semfov.io.storage import write
 from semfov.observation import DirichletStatistics
-from semfov.observation.storage import write
 
 
 def samples(count, components=5, seed=0, dtype=torch.float32):

@@ -1,16 +1,18 @@
 """What fuzzing has found, each as its smallest case."""
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from eval.cached import read_tensors, write_tensors
 from semfov import FovealObservationModel, Grid, InputError, acquisition, fusion, read_image
 from semfov.belief import fuse
 from semfov.errors import DataError
+from semfov.io.cached import read_tensors, write_tensors
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -78,6 +80,25 @@ def test_a_changed_bit_in_a_model_is_noticed(tmp_path):
     path.write_bytes(content)
     with pytest.raises(DataError, match="damaged"):
         FovealObservationModel.from_pretrained(path)
+
+
+def test_a_model_that_does_not_fit_on_the_disk_is_told_of(tmp_path):
+    """`safetensors` tells of it by an error of its own; what was there before stays."""
+    path = tmp_path / "model.safetensors"
+    FovealObservationModel.identity(["cup"], [0.2]).save(path)
+    before = path.read_bytes()
+    code = (
+        "import resource, sys, semfov\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (600, 600))\n"
+        "try:\n"
+        "    semfov.FovealObservationModel.identity([f'class {n}' for n in range(40)], [0.2]).save(sys.argv[1])\n"
+        "except semfov.DataError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(f"cannot write {path}: ")
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
 def test_tensors_of_another_file_are_not_taken(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import semfov
+from semfov import observers, policies
 
 ROOT = str(Path(__file__).parents[2])
 
@@ -40,12 +41,41 @@ def test_parts_without_weights():
 
 
 @pytest.mark.weights
-def test_agent_sees_and_searches():
+def test_eye_sees():
     scene = semfov.EmbeddedScenes(("person", "cat", "cup", "motorcycle"), count=1)[0]
-    eye = load("yolov3_tiny_eye")
     with torch.inference_mode():
-        seen = eye(scene.image[None], torch.tensor([[320.0, 240.0]]))
-        agent = load("yolov3_tiny_agent", policy="predictive", calibrated=True, columns=4, rows=3)
-        path = agent.search(scene.image, "cat", shifts=2)
+        seen = load("yolov3_tiny_eye")(scene.image[None], torch.tensor([[320.0, 240.0]]))
     assert seen.scores.shape[-1] == 81
+
+
+AGENTS = {
+    "recommended": ({"grid": (4, 3)}, observers.Target, policies.NonPredictive, policies.Closer),
+    "published": ({"search": "predictive"}, observers.Semantic, policies.Predictive, policies.KL),
+    "raw": ({"sensor": "published-narrow"}, observers.Semantic, policies.NonPredictive, policies.Random),
+}
+
+
+@pytest.mark.weights
+@pytest.mark.parametrize("kind", AGENTS)
+def test_agents_search_and_explore(kind):
+    options, observer, search, explore = AGENTS[kind]
+    scene = semfov.EmbeddedScenes(("person", "cat", "cup", "motorcycle"), count=1)[0]
+    agent = load("yolov3_tiny_agent", kind=kind, **options)
+    assert type(agent.searching.observer) is observer
+    assert type(agent.searching.policy) is search
+    assert type(agent.exploring.observer) is observers.Semantic
+    assert type(agent.exploring.policy) is explore
+    with torch.inference_mode():
+        path = agent.search(scene.image, "cat", shifts=2)
+        explored = agent.explore(scene.image, shifts=1)
     assert 1 <= len(path) <= 3
+    assert len(explored) == 2
+    columns, rows = options.get("grid", (10, 10))
+    assert path.beliefs.shape[1:] == explored.beliefs.shape[1:] == (columns * rows, 81)
+
+
+@pytest.mark.weights
+def test_the_recommended_agent_is_given_unless_another_is_asked_for():
+    assert type(load("yolov3_tiny_agent").searching.observer) is observers.Target
+    with pytest.raises(semfov.InputError, match="kind: expected recommended, published, raw, got 'best'"):
+        load("yolov3_tiny_agent", kind="best")

@@ -15,12 +15,14 @@ import torch
 from torch import Tensor, nn
 
 import semfov
-from semfov import Eye, FovealObservationModel, Foveation, Grid, SemanticMap, acquisition, fusion, saliency
+from semfov import Eye, FovealObservationModel, Foveation, Grid, acquisition, fusion, policies, saliency
 from semfov.agent import ActivePerception
 from semfov.belief import ContextPrior, DirichletBelief, TargetEvidence
+from semfov.belief.observers import Context, Observer, Semantic, Target
 from semfov.detection import Candidates, Detections, Detector, Selection
-from semfov.gaze import LearnedGaze, select_fixation
+from semfov.gaze import LearnedGaze, Policy, select_fixation
 from semfov.observation import FoldedObservationModel
+from semfov.sensor import RandomFoveation
 
 CLASSES = ("cat", "cup", "person")
 GRID = Grid(4, 3, (64, 48))
@@ -67,13 +69,44 @@ class Looking(nn.Module):
         return self.part(seen, fixation, *self.arguments)
 
 
-class FirstLook(Looking):
-    """The same on a map that knows nothing yet."""
+class Watching(nn.Module):
+    """What an observer believes of a class after it was shown the same from two points."""
+
+    def __init__(self, part: Observer) -> None:
+        super().__init__()
+        self.part = part
 
     def forward(self, scores: Tensor, boxes: Tensor, fixation: Tensor) -> Tensor:
-        self.part.beta = torch.full_like(self.part.beta, 0.5)
-        self.part.closest = torch.full_like(self.part.closest, torch.inf)
-        return super().forward(scores, boxes, fixation)
+        seen = Detections(boxes, scores, torch.ones(scores.shape[:2], dtype=torch.bool, device=scores.device))
+        belief = self.part.start(len(scores), GRID, scores)
+        for point in (fixation, fixation + 15):
+            belief = self.part(belief, seen, point, GRID, 2)
+        return belief.probability(2)
+
+
+class WholeMap(Watching):
+    """The parameters of the belief about all classes after one look."""
+
+    def forward(self, scores: Tensor, boxes: Tensor, fixation: Tensor) -> Tensor:
+        seen = Detections(boxes, scores, torch.ones(scores.shape[:2], dtype=torch.bool, device=scores.device))
+        return self.part(self.part.start(len(scores), GRID, scores), seen, fixation, GRID).beta
+
+
+class Augmenting(nn.Module):
+    """An augmentation at places that were drawn before."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.part = RandomFoveation((5.0, 9.0), p=1.0)
+
+    def forward(self, image: Tensor, gaze: Tensor, sigma: Tensor) -> Tensor:
+        drawn = {
+            "gaze": gaze,
+            "sigma": sigma,
+            "batch_prob": torch.ones(len(image)),
+            "forward_input_shape": torch.tensor(image.shape),
+        }
+        return self.part(image, params=drawn)
 
 
 class Given(nn.Module):
@@ -99,6 +132,17 @@ class Valuing(nn.Module):
         return self.part(DirichletBelief(beta, closest), closest == 0)
 
 
+class Deciding(nn.Module):
+    """What a policy's acquisition function makes of a belief."""
+
+    def __init__(self, part: Policy) -> None:
+        super().__init__()
+        self.part = part
+
+    def forward(self, beta: Tensor, closest: Tensor) -> Tensor:
+        return self.part(2, GRID)(DirichletBelief(beta, closest), closest == 0)
+
+
 class Scores(nn.Module):
     """The scores that an eye sees."""
 
@@ -110,9 +154,11 @@ class Scores(nn.Module):
         return self.eye(image, fixations).scores
 
 
-def in_order(target: int | Tensor | None, grid: Grid) -> nn.Module:
+class InOrder(Policy):
     """A policy whose choices do not hang on digits."""
-    return acquisition.Static(rand(len(grid)))
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> acquisition.AcquisitionFunction:
+        return acquisition.Static(rand(len(grid)))
 
 
 class Exploring(nn.Module):
@@ -120,8 +166,8 @@ class Exploring(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        parts = Foveation(9.0), Blobs(), model().requires_grad_(False), (GRID.columns, GRID.rows), in_order
-        self.agent = ActivePerception(*parts, reference=64.0)
+        eye, strategy = Eye(Foveation(9.0), Blobs(), reference=64.0), (observing(), InOrder())
+        self.agent = ActivePerception(eye, strategy, strategy, grid=(GRID.columns, GRID.rows))
 
     def forward(self, image: Tensor) -> Tensor:
         return self.agent.explore(image, start=5, shifts=2).beliefs
@@ -154,6 +200,10 @@ def model() -> FovealObservationModel:
     return FovealObservationModel(alpha, [0.2, 0.5], CLASSES, miss_rate=0.1 + 0.8 * rand(4, 3)).eval()
 
 
+def observing() -> Semantic:
+    return Semantic(4, model().requires_grad_(False))
+
+
 def beliefs() -> Tensor:
     return 0.5 + 3 * rand(2, len(GRID), 4)
 
@@ -165,7 +215,7 @@ SEARCHERS: dict[str, Callable[[], nn.Module]] = {
     "FovealHit": lambda: acquisition.FovealHit(2, model(), GRID),
     "PlaceInformation": lambda: acquisition.PlaceInformation(2, model(), GRID),
     "SaliencyPrior": lambda: acquisition.SaliencyPrior(acquisition.TargetPosterior(2), rand(len(GRID)), weight=0.5),
-    "LearnedGaze": lambda: LearnedGaze().policy(2, GRID),
+    "LearnedGaze": lambda: policies.Learned(LearnedGaze())(2, GRID),
     "CloserLook": lambda: acquisition.CloserLook(GRID),
     "Static": lambda: acquisition.Static(rand(len(GRID))),
     "Uniform": acquisition.Uniform,
@@ -195,17 +245,32 @@ OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]
         lambda: (rand(5, 6, 4).softmax(-1), rand(5, 6)),
     ),
     "TargetEvidence": (lambda: Looking(TargetEvidence(4, 4).eval(), GRID, 2), look),
-    "SemanticMap": (lambda: FirstLook(SemanticMap(GRID, CLASSES, observation=model().requires_grad_(False))), look),
+    "Semantic": (lambda: Watching(observing()), look),
+    "Semantic, whole map": (lambda: WholeMap(observing()), look),
+    "Semantic, misses": (lambda: Watching(Semantic(4, misses=model().requires_grad_(False), memory="closest")), look),
+    "Target": (lambda: Watching(Target(TargetEvidence(4, 4).eval())), look),
+    "Context": (lambda: Watching(Context(observing(), context())), look),
     "VOCUS2": (saliency.VOCUS2, lambda: (rand(1, 3, 40, 60),)),
     "IttiKoch": (saliency.IttiKoch, lambda: (rand(1, 3, 64, 96),)),
 }
-# How many boxes are kept, when an episode ends, how far context reaches depends on values: these are no single graph.
+# A policy makes its acquisition function, and that is what becomes a graph.
+DECIDERS: dict[str, Callable[[], nn.Module]] = {
+    "Random": policies.Random,
+    "NonPredictive": policies.NonPredictive,
+    "Learned": lambda: policies.Learned(LearnedGaze()),
+    "Closer": policies.Closer,
+} | {
+    kind.__name__: partial(lambda kind: kind(model()), kind) for kind in policies.POLICIES.values() if kind.needs_model
+}
+# How many boxes are kept, when an episode ends, what is augmented depends on values: these are no single graph.
 BRANCHING = {
     "Eye": (Scores, lambda: (rand(1, 3, 48, 64), torch.tensor([[20.0, 30.0], [5.0, 6.0]]))),
+    "RandomFoveation": (Augmenting, lambda: (rand(2, 3, 48, 64), 40 * rand(2, 2), torch.tensor([5.0, 9.0]))),
     "ActivePerception": (Exploring, lambda: (rand(1, 3, 48, 64),)),
 }
 TENSORS = OTHERS | {name: (partial(valuing, make), memory) for name, make in ACQUISITIONS.items()}
-PARTS = TENSORS | BRANCHING
+DECISIONS = {name: (partial(lambda make: Deciding(make()), make), memory) for name, make in DECIDERS.items()}
+PARTS = TENSORS | BRANCHING | DECISIONS
 
 # bfloat16 has 8 bits: a value is off by up to 2^-9, 0.2 %. Calibration multiplies logarithms of small scores by large
 # parameters, and exploration takes differences of what is nearly equal: digits that are not there then count.
@@ -304,9 +369,9 @@ def test_autocast(part):
     assert float((result.float() - expected).abs().max()) <= AUTOCAST.get(name, 0.02) * scale
 
 
-@pytest.mark.parametrize("name", [name for name in TENSORS if name != "SemanticMap"])
+@pytest.mark.parametrize("name", TENSORS)
 def test_vectorises(name):
-    """Over the first input: images, beliefs or scores. (A map keeps what it is shown; `fuse` vectorises.)"""
+    """Over the first input: images, beliefs or scores."""
     _, module, (first, *others) = make(name)
     module.requires_grad_(False)
     many = torch.stack([first, first.flip(-1), first.flip(0)])
@@ -365,17 +430,33 @@ def test_gradients_flow_from_the_choice_back_to_gaze_and_scores():
         assert float(leaf.grad.abs().sum()) > 0
 
 
-def test_maps_and_evidence_are_modules_too():
-    """Modules that take detections: state, copies and dtype."""
-    boxes = torch.tensor([[[4.0, 4, 30, 30], [20, 10, 60, 40]]])
-    seen = Detections(boxes, rand(1, 2, 4).softmax(-1), torch.ones(1, 2, dtype=torch.bool))
-    fixation = torch.tensor([[20.0, 20.0]])
-    own = SemanticMap(GRID, CLASSES, observation=model())
-    twin = copy.deepcopy(own)
-    own(seen, fixation)
-    assert float(twin.beta.max()) == 0.5
+def test_observers_and_evidence_are_modules_too():
+    """Modules that take detections: state and copies; a belief is what the caller keeps, and no observer changes it."""
+    scores, boxes, fixation = look()
+    seen = Detections(boxes, scores, torch.ones(1, 2, dtype=torch.bool))
+    own = Semantic(4, model().requires_grad_(False))
+    twin, start = copy.deepcopy(own), own.start(1, GRID, scores)
+    after = own(start, seen, fixation, GRID)
+    assert float(start.beta.max()) == float(start.beta.min()) == 0.5
+    assert float(after.beta.max()) > 0.5
+    with torch.no_grad():
+        for parameter in own.parameters():
+            parameter.mul_(1.25)
+    changed = own(start, seen, fixation, GRID)
+    assert torch.equal(twin(start, seen, fixation, GRID).beta, after.beta)
+    assert not torch.equal(changed.beta, after.beta)
     twin.load_state_dict(own.state_dict())
-    assert torch.equal(twin.beta, own.beta)
+    assert torch.equal(twin(start, seen, fixation, GRID).beta, changed.beta)
+    # Observers that stand in one another are one module with all their parts.
+    whole = Context(
+        Target(TargetEvidence(4, 4)),
+        ContextPrior(CLASSES, rand(4, 3, 3), rand(4, 4, 3), [0.2, 0.4], weights={"evidence": (0.5, 0.2)}),
+    ).eval()
+    again = pickle.loads(pickle.dumps(whole))
+    assert list(again.state_dict()) == list(whole.state_dict())
+    assert {name.split(".")[0] for name in whole.state_dict()} == {"observer", "prior"}
+    present = [each(each.start(1, GRID, scores), seen, fixation, GRID, 2).present for each in (whole, again)]
+    assert torch.equal(*present)
     evidence = TargetEvidence(4, 4).eval()
     again = pickle.loads(pickle.dumps(evidence))
     assert torch.equal(evidence(seen, fixation, GRID, 2), again(seen, fixation, GRID, 2))

@@ -37,7 +37,7 @@ class ExpectedAccuracy(AcquisitionFunction):
 
     Cells in which an object is already known gain nothing, and clear background gains nothing: what draws the gaze is
     where something may have been missed. Use it with an observer that takes account of misses
-    (`semfov.belief.SemanticObserver(misses=...)`).
+    (`semfov.observers.Semantic(misses=...)`).
 
     Args:
         model: the observation model, with miss rates; c is its expected score of the true class.

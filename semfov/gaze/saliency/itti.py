@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.errors import check, check_shape
-from semfov.gaze.saliency.fusion import rescale
+from semfov.gaze.saliency.conspicuity import rescale
 from semfov.gaze.saliency.opponent import anchor, double_opponency
 from semfov.sensor.pyramid import pyrdown
 

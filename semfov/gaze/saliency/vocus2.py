@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from semfov.errors import check, check_shape, lookup
 from semfov.gaze.saliency.blur import gaussian_blur
-from semfov.gaze.saliency.fusion import Fusion, fuse, rescale
+from semfov.gaze.saliency.conspicuity import Fusion, fuse, rescale
 from semfov.gaze.saliency.opponent import anchor, lab_colours, opponent_colours
 
 ColorSpace = Literal["opponent", "lab"]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov.errors import InputError
-from semfov.gaze.saliency.fusion import fuse, rescale
+from semfov.gaze.saliency.conspicuity import fuse, rescale
 
 
 @pytest.mark.parametrize("fusion", ["mean", "max"])

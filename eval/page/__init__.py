@@ -1,0 +1,1 @@
+"""The results page: its experiments, tables and figures."""

@@ -1,0 +1,85 @@
+"""Curves of finished runs: per image, paired over images, and by repetition as the paper averages them."""
+
+import json
+from collections import defaultdict
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from semfov.experiments.parts import Record
+from semfov.metrics.averages import Array, standard_error
+from semfov.metrics.exploration import success_rate
+from semfov.metrics.search import cumulative_performance
+
+OBJECTS = "right_without_background"
+
+
+@cache
+def read_records(folder: Path) -> tuple[Record, ...]:
+    """What a run wrote of every episode."""
+    lines = (folder / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
+    return tuple(json.loads(line) for line in lines)
+
+
+def records_of(folder: Path, policy: str, *, commonest: bool = False) -> list[Record]:
+    """Records of a policy; of searches for the commonest target of each image alone, as the paper counts."""
+    return [r for r in read_records(folder) if r["policy"] == policy and (r["commonest"] if commonest else True)]
+
+
+def policies_of(folder: Path) -> list[str]:
+    """Policies of a run, in its order."""
+    return list(dict.fromkeys(record["policy"] for record in read_records(folder)))
+
+
+def curve_of_record(record: Record, last: int, field: str = "right") -> Array:
+    """Figure of merit of an episode after 0..`last` gaze shifts; `field` is the answer that an exploration counts."""
+    if "found_at" in record:
+        return cumulative_performance(np.array([record["found_at"]]), last)
+    return success_rate(record[field], record["object_cells"])[: last + 1]
+
+
+def per_image(records: list[Record], last: int, field: str = "right") -> Array:
+    """Figure of merit of each image, in order of the images, `(images, last+1)`."""
+    images: dict[str, list[Array]] = defaultdict(list)
+    for record in records:
+        images[str(record["scene"])].append(curve_of_record(record, last, field))
+    return np.stack([np.mean(images[scene], axis=0) for scene in sorted(images)])
+
+
+def repetition_error(records: list[Record], last: int, field: str = "right") -> Array:
+    """Standard error of the mean over the repetitions, as published, `(last+1,)`."""
+    repetitions: dict[int, list[Record]] = defaultdict(list)
+    for record in records:
+        repetitions[record["repetition"]].append(record)
+    return standard_error(np.stack([per_image(group, last, field).mean(0) for group in repetitions.values()]))
+
+
+def difference(one: Array, other: Array) -> tuple[Array, Array]:
+    """Mean difference paired over images, and its standard error, each `(last+1,)`."""
+    paired = one - other
+    return paired.mean(0), standard_error(paired)
+
+
+def behind(mean: Array, error: Array) -> list[int]:
+    """Gaze shifts at which a paired difference is below zero by two standard errors; not at the start.
+
+    >>> behind(np.array([0.0, -0.3, -0.1, 0.2]), np.array([0.0, 0.1, 0.1, 0.1]))
+    [1]
+    """
+    return [n for n in range(1, len(mean)) if mean[n] < -2 * error[n]]
+
+
+def spans(numbers: list[int]) -> str:
+    """Numbers as spans.
+
+    >>> spans([1, 2, 3, 7, 9, 10])
+    '1 to 3, 7, 9 to 10'
+    """
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1].append(number)
+        else:
+            parts.append([number])
+    return ", ".join(str(part[0]) if len(part) == 1 else f"{part[0]} to {part[-1]}" for part in parts)

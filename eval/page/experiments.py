@@ -1,0 +1,250 @@
+"""The experiments of the results page: which policies, detectors, sensors and settings."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from semfov.experiments.config import (
+    BeliefConfig,
+    DataConfig,
+    DetectorConfig,
+    ExploreConfig,
+    PolicyConfig,
+    ProtocolConfig,
+    RunConfig,
+    SearchConfig,
+    SensorConfig,
+)
+from semfov.experiments.presets import Choice
+from semfov.sensor.named import SensorName
+
+DETECTORS = {"nano": "YOLOX-nano", "tiny": "YOLOv3-tiny"}
+"""Detectors of the page, by the names that experiments have."""
+
+FOVEAE: dict[SensorName, str] = {"published": "wide", "published-narrow": "narrow"}
+"""Published sensors, in the paper's words."""
+
+CENTRAL = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
+"""Non-predictive search by hand-made settings, from which the learned gaze policy started."""
+
+GUIDED = (
+    PolicyConfig("non-predictive", "calibrated", saliency="vocus2"),
+    PolicyConfig("predictive", "calibrated", saliency="vocus2"),
+)
+"""Searches with saliency as a prior over the cells."""
+
+PUBLISHED = (
+    "random",
+    "non-predictive-raw",
+    "predictive-raw",
+    "non-predictive-calibrated",
+    "predictive-calibrated",
+    "vocus2",
+)
+"""Searches of the paper."""
+
+PUBLISHED_EXPLORATION = (
+    "random-raw",
+    "kl-raw",
+    "random-calibrated",
+    "kl-calibrated",
+    "negative-entropy-calibrated",
+    "two-peaks-calibrated",
+    "vocus2-calibrated",
+)
+"""Explorations of the paper."""
+
+PROPOSED = (
+    "random",
+    "non-predictive-calibrated",
+    "neighbourhood-calibrated",
+    *GUIDED,
+    "vocus2",
+    "itti-koch",
+)
+"""What the paper proposes to try next, with its own sensor and observation model."""
+
+BEYOND = (
+    "random",
+    "non-predictive-raw",
+    "non-predictive-calibrated",
+    PolicyConfig("non-predictive", tempering=0.25),
+    CENTRAL,
+    PolicyConfig("non-predictive", "calibrated", tempering=0.25, footprint="soft"),
+    "target-evidence",
+)
+"""Searches with our own sensor and models."""
+
+BEYOND_EXPLORATION = (
+    "random-raw",
+    "kl-raw",
+    "surprise-raw",
+    "closer-look-raw",
+    "recommended",
+    "random-calibrated",
+    "kl-calibrated",
+    "closer-look-calibrated",
+)
+"""Explorations with our own models."""
+
+Changes = dict[str, dict[str, object]]
+
+SENSITIVITY: dict[str, Changes] = {
+    "as published": {},
+    "OpenCV's pyramid": {"sensor": {"convention": "opencv"}},
+    "growth 2": {"sensor": {"growth": 2.0}},
+    "background policy normalised": {"detector": {"background": "normalised"}},
+    "background policy uniform": {"detector": {"background": "uniform"}},
+    "background policy none": {"detector": {"background": "none"}},
+    "score threshold 0.1": {"detector": {"threshold": 0.1}},
+    "prior 0.1": {"belief": {"prior": 0.1}},
+    "prior 2": {"belief": {"prior": 2.0}},
+    "footprint centre": {"belief": {"footprint": "centre"}},
+    "footprint box_centre": {"belief": {"footprint": "box_centre"}},
+    "footprint soft": {"belief": {"footprint": "soft"}},
+    "ties by first index": {"protocol": {"ties": "first"}},
+    "fusion product": {"belief": {"fusion": "product"}},
+    "fusion sum": {"belief": {"fusion": "sum"}},
+    "tempering 0.25": {"belief": {"tempering": 0.25}},
+    "closest look": {"belief": {"memory": "closest"}},
+}
+"""Settings that change one thing each; of non-predictive search with raw scores."""
+
+SENSORS: dict[str, Changes] = {
+    f"fovea {sigma} px, growth {growth}": {"sensor": {"sigma": float(sigma), "growth": float(growth)}}
+    for sigma in (50, 100, 200)
+    for growth in (1, 2)
+}
+"""Sensors."""
+
+WEIGHTS: dict[str, Changes] = {
+    f"weight {weight:g}": {"saliency": {"weight": weight}} for weight in (0.0, 0.1, 0.3, 1.0, 3.0)
+}
+"""Weights of a saliency map as a prior."""
+
+VIEWS: dict[str, Changes] = {
+    "foveated view, as published": {"saliency": {"view": "foveated"}},
+    "whole photograph, once": {"saliency": {"view": "picture"}},
+}
+"""What the saliency models see."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """Runs on photographs of the fit set that differ in their settings; a row of its table is a setting and a policy.
+
+    Attributes:
+        settings: by name, what changes.
+        policies: that are compared.
+        explores: whether scenes are explored, or targets searched for.
+        shifts: that the table shows.
+        model: ending of the observation model's name, where one is named.
+    """
+
+    settings: dict[str, Changes]
+    policies: tuple[Choice, ...]
+    explores: bool = False
+    shifts: tuple[int, ...] = (1, 5, 10, 15, 30)
+    model: str | None = None
+
+
+STUDIES = {
+    "sensitivity": Study(SENSITIVITY, ("non-predictive-raw",)),
+    "sensor": Study(SENSORS, ("random", "non-predictive-raw", CENTRAL)),
+    "explore-sensor": Study(SENSORS, ("random-raw", "recommended"), True, (0, 1, 2, 3, 4, 10, 20)),
+    "saliency": Study(VIEWS, ("random", "vocus2", "itti-koch")),
+    "weights": Study(WEIGHTS, GUIDED, model="published"),
+}
+
+
+@dataclass(frozen=True)
+class ResultsConfig:
+    """Which photographs, and where the page goes.
+
+    Args:
+        root: folder of the photographs of COCO val2017.
+        annotations: COCO-format instances file for them.
+        ids: text file with the ids of the photographs that results are measured on.
+        fit_root: folder of photographs that the models were fitted on, for the studies of settings (None: no studies).
+        fit_annotations: COCO-format instances file for them.
+        yolox: ONNX file of YOLOX-nano (None: the published one).
+        limit: only the first so many photographs, for a trial.
+        study: photographs for the studies of settings, which look anew for every sensor and detector setting.
+        only: experiments to run (None: all); the page says of the others what is there from before, or nothing.
+        page: file to write.
+        template: its text.
+        pictures: folder for the page's figures.
+        out: folder for the runs.
+        cache: folder for what the detectors saw (None: the user's cache).
+        workers: processes (None: one for each CPU core).
+    """
+
+    root: Path
+    annotations: Path
+    ids: Path = Path("configs/results_photographs.txt")
+    fit_root: Path | None = None
+    fit_annotations: Path | None = None
+    yolox: Path | None = None
+    limit: int | None = None
+    study: int = 30
+    only: tuple[str, ...] | None = None
+    page: Path = Path("docs/results.md")
+    template: Path = Path("docs/results.template.md")
+    pictures: Path = Path("docs/pictures")
+    out: Path = Path("runs/results")
+    cache: Path | None = None
+    workers: int | None = None
+
+
+def experiments(config: ResultsConfig) -> dict[str, RunConfig]:
+    """The experiments of the page, by name."""
+    runs = dict(_measured(config))
+    if config.fit_root is not None:
+        runs |= dict(_studies(config))
+    folder = str.maketrans({" ": "-", ",": None, "'": None})
+    return {name: replace(run, out=config.out / name.translate(folder)) for name, run in runs.items()}
+
+
+def detector(name: str, config: ResultsConfig) -> DetectorConfig:
+    """Settings of a detector of the page."""
+    return DetectorConfig(name="yolox-nano", weights=config.yolox) if name == "nano" else DetectorConfig()
+
+
+def _measured(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:
+    """Experiments on the photographs that results are measured on, those of the paper first."""
+    data = DataConfig(root=config.root, annotations=config.annotations, ids=config.ids, limit=config.limit)
+    for name in DETECTORS:
+        settings = detector(name, config)
+        common: dict[str, Any] = {"data": data, "detector": settings, "cache": config.cache, "workers": config.workers}
+        seek, tour = partial(SearchConfig, **common, scanpaths=0), partial(ExploreConfig, **common)
+        for fovea in FOVEAE:
+            sensor, belief = SensorConfig(name=fovea), BeliefConfig(model=f"{settings.name}-{fovea}")
+            yield f"search-{fovea}-{name}", seek(sensor=sensor, belief=belief, policies=PUBLISHED)
+            yield f"explore-{fovea}-{name}", tour(sensor=sensor, belief=belief, policies=PUBLISHED_EXPLORATION)
+        sensor, belief = SensorConfig(name="published"), BeliefConfig(model=f"{settings.name}-published")
+        yield f"proposed-{name}", seek(sensor=sensor, belief=belief, policies=PROPOSED)
+        yield f"beyond-search-{name}", seek(policies=BEYOND)
+        for control in ("wrong-class", "permuted"):
+            protocol = ProtocolConfig(control=control)
+            yield f"{control}-{name}", seek(policies=("random", "target-evidence"), protocol=protocol)
+        yield f"beyond-explore-{name}", tour(policies=BEYOND_EXPLORATION)
+        yield f"beyond-explore-published-{name}", tour(policies=BEYOND_EXPLORATION, sensor=sensor)
+        if name == "tiny":
+            yield "learned-tiny", seek(policies=(CENTRAL, "learned"))
+
+
+def _studies(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:
+    """Experiments on photographs of the fit set, by which settings are chosen."""
+    data = DataConfig(root=config.fit_root, annotations=config.fit_annotations, limit=config.study)
+    nano = detector("nano", config)
+    few: dict[str, Any] = {"data": data, "detector": nano, "cache": config.cache, "workers": config.workers}
+    few["sensor"] = SensorConfig(name="published")
+    for title, study in STUDIES.items():
+        base = ExploreConfig(**few) if study.explores else SearchConfig(**few, scanpaths=0)
+        if study.model is not None:
+            base = replace(base, belief=BeliefConfig(model=f"{nano.name}-{study.model}"))
+        for label, changes in study.settings.items():
+            parts = {part: replace(getattr(base, part), **values) for part, values in changes.items()}
+            yield f"{title} {label}", replace(base, **parts, policies=study.policies)

@@ -1,0 +1,66 @@
+"""Figures of the results page: the paper's four, each for both detectors and both foveas."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from eval.page.curves import per_image, records_of, repetition_error
+from eval.page.findings import LAST
+from eval.page.tables import Runs, columns
+from semfov.experiments.summary import Array, save_figure
+
+
+@dataclass(frozen=True)
+class PaperFigure:
+    """A figure of the paper: which experiment, and which of its policies.
+
+    Attributes:
+        kind: of the experiment.
+        policies: that it compares.
+    """
+
+    kind: str
+    policies: tuple[str, ...]
+
+
+FIGURES = {
+    "prediction_and_calibration": PaperFigure(
+        "search", ("predictive-raw", "predictive-calibrated", "non-predictive-raw", "non-predictive-calibrated")
+    ),
+    "search_baselines": PaperFigure(
+        "search", ("random", "vocus2", "predictive-calibrated", "non-predictive-calibrated")
+    ),
+    "acquisition_functions": PaperFigure(
+        "explore", ("kl-calibrated", "negative-entropy-calibrated", "two-peaks-calibrated")
+    ),
+    "exploration_baselines": PaperFigure(
+        "explore", ("kl-raw", "kl-calibrated", "random-raw", "random-calibrated", "vocus2-calibrated")
+    ),
+}
+"""By the name of their file."""
+
+LABELS = {"search": "targets found (%)", "explore": "cells with the right class (%)"}
+
+
+def draw_figures(folder: Path, runs: Runs) -> list[Path]:
+    """Draw the figures whose experiments have all run; returns their files."""
+    from semfov.viz import plot_curve_panels
+
+    written = []
+    for name, figure in FIGURES.items():
+        folders = columns(figure.kind, runs)
+        if any(run is None for run in folders.values()):
+            continue
+        panels = {title: panel(run, figure) for title, run in folders.items() if run is not None}
+        drawn = plot_curve_panels(panels, label=LABELS[figure.kind])
+        written.append(save_figure(drawn, folder / f"{name}.png"))
+    return written
+
+
+def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Curves of a run's policies, and their standard errors over the repetitions, as in the paper."""
+    last = LAST[figure.kind]
+    records = {policy: records_of(folder, policy, commonest=figure.kind == "search") for policy in figure.policies}
+    return (
+        {policy: per_image(these, last).mean(0) for policy, these in records.items()},
+        {policy: repetition_error(these, last) for policy, these in records.items()},
+    )

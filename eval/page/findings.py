@@ -1,0 +1,185 @@
+"""For each of the paper's findings, whether it holds here: a figure and a verdict for each detector and fovea."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from eval.page.curves import behind, difference, per_image, records_of, spans
+from eval.page.tables import Runs, columns
+from semfov.experiments.summary import table
+from semfov.metrics.averages import Array
+
+LAST = {"search": 30, "explore": 20}
+
+Answer = Callable[[Path], str]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A finding of the paper.
+
+    Attributes:
+        text: what the paper finds.
+        kind: of the experiment that tells.
+        shown: what the figures are.
+        answer: figures and verdict for the folder of a run.
+    """
+
+    text: str
+    kind: str
+    shown: str
+    answer: Answer
+
+
+def gain(one: str, other: str, shifts: tuple[int, ...], kind: str, *, expected: int = 1) -> Answer:
+    """Paired difference of two policies in points at some gaze shifts, and whether it has the expected sign.
+
+    It holds where every difference has it by two standard errors; where all are within two standard errors of nothing
+    they are level. `expected` 0 asks for just that.
+    """
+
+    def answer(folder: Path) -> str:
+        mean, error = compare(folder, one, other, kind)
+        figures = " / ".join(f"{100 * mean[n]:+.1f}" for n in shifts)
+        signs = {int(np.sign(mean[n])) if abs(mean[n]) > 2 * error[n] else 0 for n in shifts}
+        return f"{figures}: {verdict(signs, expected)}"
+
+    return answer
+
+
+def verdict(signs: set[int], expected: int) -> str:
+    """In words, for the signs of differences that are more than two standard errors from nothing.
+
+    >>> verdict({1}, 1), verdict({1, 0}, 1), verdict({0}, 1), verdict({-1}, 1), verdict({-1, 0}, 1), verdict({0}, 0)
+    ('holds', 'holds in part', 'level', 'reversed', 'reversed in part', 'holds')
+    """
+    if signs == {expected}:
+        return "holds"
+    if expected == 0:
+        return "does not hold"
+    words = {
+        frozenset({0}): "level",
+        frozenset({-expected}): "reversed",
+        frozenset({expected, 0}): "holds in part",
+        frozenset({-expected, 0}): "reversed in part",
+    }
+    return words.get(frozenset(signs), "mixed")
+
+
+def overtaken(policy: str, baseline: str, kind: str) -> Answer:
+    """From which gaze shift on a policy is behind its baseline by two standard errors, and where it leads."""
+
+    def answer(folder: Path) -> str:
+        mean, error = compare(folder, policy, baseline, kind)
+        leads, trails = behind(-mean, error), behind(mean, error)
+        first = bool(leads) and (not trails or leads[0] < trails[0])
+        told = f"ahead at {spans(leads) or 'no shift'}, behind at {spans(trails) or 'no shift'}"
+        return f"{told}: {'holds' if first and trails else 'leads, not overtaken' if first else 'does not hold'}"
+
+    return answer
+
+
+def compare(folder: Path, one: str, other: str, kind: str) -> tuple[Array, Array]:
+    """Paired difference of two policies of a run; of searches for all legal targets, for there are most of them."""
+    curves = [per_image(records_of(folder, policy), LAST[kind]) for policy in (one, other)]
+    return difference(*curves)
+
+
+SEARCH, EXPLORE = (5, 15, 30), (1, 5, 15)
+
+FINDINGS = (
+    Finding(
+        "Calibration is considerably beneficial for non-predictive search.",
+        "search",
+        "calibrated less raw at 5 / 15 / 30 shifts",
+        gain("non-predictive-calibrated", "non-predictive-raw", SEARCH, "search"),
+    ),
+    Finding(
+        "Calibration does not influence predictive search.",
+        "search",
+        "calibrated less raw at 5 / 15 / 30 shifts",
+        gain("predictive-calibrated", "predictive-raw", SEARCH, "search", expected=0),
+    ),
+    Finding(
+        "Predictive search comfortably outperforms non-predictive search on raw scores",
+        "search",
+        "predictive less non-predictive at 5 / 15 / 30 shifts",
+        gain("predictive-raw", "non-predictive-raw", SEARCH, "search"),
+    ),
+    Finding(
+        "… and on calibrated scores.",
+        "search",
+        "the same",
+        gain("predictive-calibrated", "non-predictive-calibrated", SEARCH, "search"),
+    ),
+    Finding(
+        "Calibrated predictive search leads random gaze at first (to the 13th iteration) and is overtaken",
+        "search",
+        "gaze shifts",
+        overtaken("predictive-calibrated", "random", "search"),
+    ),
+    Finding(
+        "… calibrated non-predictive search too (to the 10th),",
+        "search",
+        "gaze shifts",
+        overtaken("non-predictive-calibrated", "random", "search"),
+    ),
+    Finding(
+        "… and raw non-predictive search.",
+        "search",
+        "gaze shifts",
+        overtaken("non-predictive-raw", "random", "search"),
+    ),
+    Finding(
+        "VOCUS2 is far below random gaze in search.",
+        "search",
+        "random less VOCUS2 at 5 / 15 / 30 shifts",
+        gain("random", "vocus2", SEARCH, "search"),
+    ),
+    Finding(
+        "KL divergence consistently outperforms negative entropy (calibrated).",
+        "explore",
+        "KL less negative entropy at 1 / 5 / 15 shifts",
+        gain("kl-calibrated", "negative-entropy-calibrated", EXPLORE, "explore"),
+    ),
+    Finding(
+        "KL divergence collects more in the first iterations than the two-peak difference (calibrated).",
+        "explore",
+        "KL less two-peak at 1 / 2 / 4 shifts",
+        gain("kl-calibrated", "two-peaks-calibrated", (1, 2, 4), "explore"),
+    ),
+    Finding(
+        "KL divergence outperforms VOCUS2 in exploration (calibrated).",
+        "explore",
+        "KL less VOCUS2 at 1 / 5 / 15 shifts",
+        gain("kl-calibrated", "vocus2-calibrated", EXPLORE, "explore"),
+    ),
+    Finding(
+        "KL divergence leads random gaze at first; random gaze overtakes it after about 4 saccades (calibrated).",
+        "explore",
+        "gaze shifts",
+        overtaken("kl-calibrated", "random-calibrated", "explore"),
+    ),
+    Finding("The same with raw scores.", "explore", "gaze shifts", overtaken("kl-raw", "random-raw", "explore")),
+    Finding(
+        "Exploration has no particular advantage from calibration.",
+        "explore",
+        "KL, calibrated less raw at 1 / 5 / 15 shifts",
+        gain("kl-calibrated", "kl-raw", EXPLORE, "explore", expected=0),
+    ),
+)
+"""Findings that curves can tell; costs are measured by `python -m benchmarks.decisions`."""
+
+
+def findings(runs: Runs) -> list[str]:
+    """The table of all findings."""
+    folders = {kind: columns(kind, runs) for kind in LAST}
+    rows = [["the paper finds", "shown", *folders["search"]]]
+    for finding in FINDINGS:
+        answers = (
+            "not run yet" if folder is None else finding.answer(folder) for folder in folders[finding.kind].values()
+        )
+        rows.append([finding.text, finding.shown, *answers])
+    return table(rows)

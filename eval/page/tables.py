@@ -1,0 +1,196 @@
+"""Tables of the results page, from what the runs wrote."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eval.page import paper
+from eval.page.curves import (
+    OBJECTS,
+    behind,
+    difference,
+    per_image,
+    policies_of,
+    records_of,
+    repetition_error,
+    spans,
+)
+from eval.page.experiments import DETECTORS, FOVEAE, STUDIES
+from semfov.errors import DataError
+from semfov.experiments.config import RunConfig
+from semfov.experiments.presets import label as name_of
+from semfov.experiments.summary import table
+from semfov.metrics.averages import standard_error
+from semfov.metrics.search import random_search
+
+Runs = dict[str, RunConfig]
+
+
+def finished(run: RunConfig | None) -> bool:
+    """Whether a run has left its tables."""
+    return run is not None and (run.out / "summary.md").exists()
+
+
+def columns(kind: str, runs: Runs) -> dict[str, Path | None]:
+    """Folders of the published experiments of a kind by the head of their column; None where it has not run."""
+    found = {}
+    for name, title in DETECTORS.items():
+        for fovea, width in FOVEAE.items():
+            run = runs[f"{kind}-{fovea}-{name}"]
+            found[f"{title}, {width}"] = run.out if finished(run) else None
+    return found
+
+
+def beside_paper(published: Mapping[str, tuple[float, ...]], runs: Runs) -> list[str]:
+    """A table of the paper, each of its cells beside ours: the commonest class of each image is the target."""
+    folders = columns("search", runs)
+    rows = [["policy", "", "paper", *folders]]
+    for policy, figures in published.items():
+        for place, n in enumerate(paper.SHIFTS):
+            ours = [performance(folder, policy, n) for folder in folders.values()]
+            rows.append([policy if place == 0 else "", f"CP@{n}", f"{figures[place]:.2f}", *ours])
+        ours = [largest_error(folder, policy) for folder in folders.values()]
+        rows.append(["", "max. SEM", f"{figures[-1]:.3f}", *ours])
+    return table(rows)
+
+
+def performance(folder: Path | None, policy: str, shifts: int) -> str:
+    """Cumulative performance in percent, with its standard error over images."""
+    if folder is None:
+        return "not run yet"
+    curves = per_image(records_of(folder, policy, commonest=True), shifts)[:, shifts]
+    return f"{100 * curves.mean():.1f} ± {100 * standard_error(curves):.1f}"
+
+
+def largest_error(folder: Path | None, policy: str) -> str:
+    """Largest standard error of the mean over the repetitions, in percent, as published."""
+    if folder is None:
+        return "not run yet"
+    return f"{100 * repetition_error(records_of(folder, policy, commonest=True), max(paper.SHIFTS)).max():.3f}"
+
+
+def readings(runs: Runs) -> list[str]:
+    """What random gaze is expected to find by formula, under both readings of n, for the commonest class."""
+    folder = next((folder for folder in columns("search", runs).values() if folder is not None), None)
+    rows = [["random gaze, by formula", *(f"CP@{n}" for n in paper.SHIFTS)]]
+    rows.append(["paper, measured", *(f"{figure:.2f}" for figure in paper.TABLE_II["random"][:-1])])
+    if folder is not None:
+        goals = [len(r["goal"]) for r in records_of(folder, "random", commonest=True) if r["repetition"] == 0]
+        curve = np.mean([random_search(count, max(paper.SHIFTS)) for count in goals], axis=0)
+        rows.append(["n gaze shifts (the reading of this page)", *(f"{100 * curve[n]:.1f}" for n in paper.SHIFTS)])
+        rows.append(["n fixations, the first among them", *(f"{100 * curve[n - 1]:.1f}" for n in paper.SHIFTS)])
+    return table(rows)
+
+
+def study_table(title: str, runs: Runs) -> list[str]:
+    """One row for each setting and policy, of the curves over all targets; of explorations by the published measure."""
+    study = STUDIES[title]
+    several = len(study.policies) > 1
+    shifts = [str(n) if study.explores else f"CP@{n}" for n in study.shifts]
+    rows = [["setting", *(["policy"] if several else []), *shifts]]
+    for label in study.settings:
+        run = runs.get(f"{title} {label}")
+        for choice in study.policies:
+            policy = name_of(choice, "exploration" if study.explores else "search")
+            head = [label, *([policy] if several else [])]
+            if run is None or not finished(run):
+                rows.append([*head, *("not run yet" for _ in shifts)])
+                continue
+            curves = per_image(records_of(run.out, policy), max(study.shifts))
+            mean, error = curves.mean(0), standard_error(curves)
+            rows.append([*head, *(f"{100 * mean[n]:.1f} ± {100 * error[n]:.1f}" for n in study.shifts)])
+    return table(rows)
+
+
+def summary(folder: Path, section: int | None = None) -> list[str]:
+    """The tables that a run printed, or one of them."""
+    text = (folder / "summary.md").read_text(encoding="utf-8").strip()
+    parts = ["**" + part.strip() for part in text.split("\n**")]
+    parts[0] = parts[0].removeprefix("**")
+    return text.splitlines() if section is None else parts[section].splitlines()
+
+
+def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "right") -> list[str]:
+    """Differences of every policy to `baseline` over the same images, in points, with standard errors."""
+    last = max(shifts)
+    curves = {policy: per_image(records_of(folder, policy), last, field) for policy in policies_of(folder)}
+    if baseline not in curves:
+        raise DataError(f"{folder}: no policy {baseline!r} to compare with; run the experiment again")
+    rows = [[f"difference to {baseline}", *(str(n) for n in shifts), "behind by two standard errors at"]]
+    for policy, curve in curves.items():
+        if policy == baseline:
+            continue
+        mean, error = difference(curve, curves[baseline])
+        cells = [f"{100 * mean[n]:+.1f} ± {100 * error[n]:.1f}" for n in shifts]
+        rows.append([policy, *cells, spans(behind(mean, error)) or "no shift"])
+    return table(rows)
+
+
+def paired_objects(folder: Path) -> list[str]:
+    """`paired` for explorations whose answer is never background."""
+    return paired(folder, "random-raw", (1, 2, 3, 4, 10, 20), OBJECTS)
+
+
+def agreement(folder: Path) -> list[str]:
+    """How often predictive and non-predictive search choose the same cell, first and all the way."""
+    rows = [["scores", "same first gaze shift", "found after as many shifts"]]
+    for mode in ("raw", "calibrated"):
+        names = [f"{kind}-{mode}" for kind in ("non-predictive", "predictive")]
+        pairs = list(zip(*(records_of(folder, name) for name in names), strict=True))
+        first = [a["cells"][1] == b["cells"][1] for a, b in pairs]
+        found = [a["found_at"] == b["found_at"] for a, b in pairs]
+        rows.append([mode, *(f"{100 * np.mean(same):.1f} %" for same in (first, found))])
+    return table(rows)
+
+
+def first_fixations(folder: Path) -> list[str]:
+    """Where explorations look first: share of the first gaze shifts that end in the middle half, or at the border."""
+    rows = [["policy", "in the middle half of rows and columns", "at the border"]]
+    for policy in policies_of(folder):
+        cells = np.array([record["cells"][1] for record in records_of(folder, policy)])
+        middle, border = central(cells)
+        rows.append([policy, f"{100 * middle.mean():.1f} %", f"{100 * border.mean():.1f} %"])
+    return table(rows)
+
+
+def central(cells: NDArray[np.int64], size: int = 10) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which cells of a square grid lie in the middle half of rows and columns, and which at its border.
+
+    >>> central(np.array([0, 33, 55, 22]))
+    (array([False,  True,  True, False]), array([ True, False, False, False]))
+    """
+    axes = np.stack([cells % size, cells // size])
+    middle = (axes + 0.5 > size / 4) & (axes + 0.5 < 3 * size / 4)
+    border = (axes == 0) | (axes == size - 1)
+    return np.asarray(middle.all(0)), np.asarray(border.any(0))
+
+
+def photographs(runs: Runs) -> list[str]:
+    """What the photographs of the page are: how many, with how many objects, and how many show a person."""
+    from semfov.detection.coco_classes import COCO_CLASSES
+    from semfov.experiments.setup import make_scenes
+
+    run = runs["search-published-nano"]
+    scenes = make_scenes(run.data, COCO_CLASSES)
+    labels = [scenes.annotation(index).labels for index in range(len(scenes))]
+    counts = np.array([len(each) for each in labels])
+    person = COCO_CLASSES.index("person") + 1
+    targets = sum(len(scenes.targets(index)) for index in range(len(scenes)))
+    figures = {
+        "photographs": f"{len(scenes):,}",
+        "boxes": f"{counts.sum():,}",
+        "boxes in a photograph, median": f"{np.median(counts):g}",
+        "photographs with a person": f"{sum(bool((each == person).any()) for each in labels)}",
+        "pairs of photograph and target": f"{targets:,}",
+    }
+    return table([["of the photographs of this page", ""], *([name, value] for name, value in figures.items())])
+
+
+def decisions(path: Path = Path("benchmarks/results/decisions.md")) -> list[str]:
+    """Table III and the cost rows of tables I and II, from the benchmark that measures them in one run."""
+    if not path.exists():
+        return ["*Not run yet.*"]
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return [f"#{line}" if line.startswith("## ") else line for line in lines if not line.startswith("# ")]

@@ -1,0 +1,106 @@
+"""An observer of your own: remember the largest score of every class in every cell.
+
+It needs no prior and no rule of fusion, and one confident look outweighs any number of doubtful ones.
+
+Run it from a checkout: python -m examples.own_observer
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+import semfov
+from semfov.episode import LiveLooks
+from semfov.gaze.choice import Greedy, drawn_by
+from semfov.sensor import named_sensor
+
+
+@dataclass(frozen=True)
+class ScoreLook(semfov.observers.Look):
+    """What looks say: the largest score of each class in each cell."""
+
+    scores: Tensor  # (B, X·Y, K+1)
+    distance: Tensor  # (B, X·Y), from the fixation
+
+    def __getitem__(self, index: Tensor | slice) -> "ScoreLook":
+        """Some of the looks."""
+        return ScoreLook(self.scores[index], self.distance[index])
+
+    @classmethod
+    def join(cls, looks: Sequence["ScoreLook"]) -> "ScoreLook":
+        """All looks of several batches."""
+        return cls(torch.cat([look.scores for look in looks]), torch.cat([look.distance for look in looks]))
+
+
+@dataclass(frozen=True)
+class ScoreBelief(semfov.Belief):
+    """What is believed: the largest score so far."""
+
+    scores: Tensor  # (B, X·Y, K+1)
+    closest: Tensor  # (B, X·Y), distance to the closest fixation; every belief has it
+
+    def probability(self, target: int | Tensor) -> Tensor:
+        """Largest score of the target in each cell, `(B, X·Y)`."""
+        return self.scores[torch.arange(len(self.scores)), :, target]
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> "ScoreBelief":
+        """The belief with both tensors replaced."""
+        return ScoreBelief(function(self.scores), function(self.closest))
+
+
+class BestScore(semfov.observers.Observer):
+    """Keeps the largest score of each class in each cell."""
+
+    def __init__(self, components: int) -> None:
+        super().__init__()
+        self.components = components
+
+    def start(self, batch: int, grid: semfov.Grid, like: Tensor) -> ScoreBelief:
+        """Nothing was seen."""
+        scores = like.new_zeros(batch, len(grid), self.components)
+        return ScoreBelief(scores, torch.full_like(scores[..., 0], torch.inf))
+
+    def weigh(
+        self, detections: semfov.Detections, fixation: Tensor, grid: semfov.Grid, target: int | None = None
+    ) -> ScoreLook:
+        """The largest score among the boxes that overlap a cell."""
+        covered = grid.footprint(detections.boxes) & detections.mask[..., None]  # (B, L, X·Y)
+        scores = detections.scores.new_zeros(len(fixation), len(grid), self.components)
+        for box in range(covered.shape[1]):
+            scores = torch.maximum(scores, covered[:, box, :, None] * detections.scores[:, box, None])
+        return ScoreLook(scores, grid.distance(fixation))
+
+    def update(self, belief: semfov.Belief, look: semfov.observers.Look) -> ScoreBelief:
+        """The belief after one more look."""
+        assert isinstance(belief, ScoreBelief)
+        assert isinstance(look, ScoreLook)
+        return ScoreBelief(torch.maximum(belief.scores, look.scores), torch.minimum(belief.closest, look.distance))
+
+
+def main() -> None:
+    """Search an embedded scene for a cup."""
+    detector = semfov.load_detector("yolov3-tiny")
+    eye = semfov.Eye(named_sensor("published"), detector).eval().requires_grad_(False)
+    scene = semfov.EmbeddedScenes(detector.classes)[1]
+    image, grid, cup = scene.image[None], semfov.Grid(10, 10, scene.size), detector.classes.index("cup") + 1
+    goal = grid.footprint(scene.boxes[scene.labels == cup]).any(0)
+
+    steps = semfov.rollout(
+        LiveLooks(eye, eye.open(image), grid),
+        BestScore(len(detector.classes) + 1),
+        semfov.acquisition.TargetPosterior(cup),
+        torch.tensor([0]),  # the cell that each episode starts in; here is one episode
+        Greedy(drawn_by(torch.Generator().manual_seed(0), len(grid), image)),
+        most=20,
+        ends=lambda step: goal[step.cell],
+    )
+    for step in steps:
+        (x, y), best = step.fixation[0].tolist(), float(step.belief.probability(cup).max())
+        print(f"fixation {step.shift} at ({x:.0f}, {y:.0f}), best score of a cup so far {best:.2f}")
+    print("found" if goal[step.cell] else "not found")
+
+
+if __name__ == "__main__":
+    main()

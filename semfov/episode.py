@@ -1,0 +1,245 @@
+"""The loop of active perception: look, weigh what was seen, update the belief, choose where to look next."""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.belief.belief import Belief
+from semfov.belief.grid import Grid
+from semfov.belief.observers.base import Look, Observer
+from semfov.detection.detections import Detections
+from semfov.eye import Eye, View
+from semfov.gaze.acquisition.base import AcquisitionFunction
+from semfov.gaze.choice import Choice
+
+STAGES = ("foveate", "detect", "weigh", "update belief", "choose")
+"""Stages of a cycle, in order."""
+
+Acquire = Callable[[Tensor, Tensor], AcquisitionFunction]
+"""Makes the acquisition function of some episodes `(A,)` that fixate cells `(A,)`."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What is seen by a look of each episode that goes on.
+
+    Attributes:
+        look: what the observer takes it to say.
+        detections: gives the boxes and scores, a batch of A.
+        seconds: by stage.
+    """
+
+    look: Look
+    detections: Callable[[], Detections]
+    seconds: dict[str, float]
+
+
+class Looks(ABC):
+    """Base of what episodes look at.
+
+    Attributes:
+        grid: the cells.
+        like: tensor whose dtype and device beliefs take.
+    """
+
+    grid: Grid
+    like: Tensor
+
+    @abstractmethod
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """What episodes `(A,)` see that fixate points `(A, 2)` in cells `(A,)`."""
+
+
+class LiveLooks(Looks):
+    """Looks of an eye at one image.
+
+    Args:
+        eye: sensor and detector.
+        view: the image, as the eye holds it.
+        grid: the cells over it.
+        target: class that all episodes search for, for observers that go by the target.
+    """
+
+    def __init__(self, eye: Eye, view: View, grid: Grid, target: int | None = None) -> None:
+        self.eye, self.view, self.grid, self.target = eye, view, grid, target
+        self.like = view.bands.base
+
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """Foveate, detect and weigh."""
+        watch = Stopwatch()
+        canvases = self.eye.foveated(self.view, fixation)
+        watch.lap("foveate")
+        detections = self.eye.detector.detect(canvases, self.view.placement)
+        watch.lap("detect")
+        look = observer.weigh(detections, fixation, self.grid, self.target)
+        watch.lap("weigh")
+        return Sight(look, lambda: detections, watch.seconds)
+
+
+class StoredLooks(Looks):
+    """Looks at one image from the centres of all cells, detected before; each is weighed once.
+
+    Args:
+        detections: what is seen from every cell, a batch of X·Y.
+        grid: the cells.
+        targets: `(B,)`, class that each episode searches for; None where nothing is searched for.
+    """
+
+    def __init__(self, detections: Detections, grid: Grid, targets: Tensor | None = None) -> None:
+        self.detections, self.grid, self.targets = detections, grid, targets
+        self.like = detections.scores
+        self._weighed: tuple[Observer, Look] | None = None
+        self._classes = [] if targets is None else targets.unique().tolist()
+
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """What the store has of the cells; the fixations are their centres."""
+        watch = Stopwatch()
+        row = cell
+        if observer.by_target and self.targets is not None:
+            # One row for each target and cell.
+            order = torch.searchsorted(self.targets.new_tensor(self._classes), self.targets[episodes])
+            row = order * len(self.grid) + cell
+        look = self.weighed(observer)[row]
+        watch.lap("weigh")
+        return Sight(look, lambda: self.detections[cell], watch.seconds)
+
+    def weighed(self, observer: Observer) -> Look:
+        """What looks from all cells say, target by target where the observer goes by it."""
+        if self._weighed is None or self._weighed[0] is not observer:
+            centres = self.grid.centres.to(self.like)
+            targets = self._classes if observer.by_target else [None]
+            said = [observer.weigh(self.detections, centres, self.grid, target) for target in targets]
+            self._weighed = observer, said[0] if len(said) == 1 else type(said[0]).join(said)
+        return self._weighed[1]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One cycle of the A episodes that go on.
+
+    Attributes:
+        shift: gaze shifts that were made before.
+        episodes: `(A,)`, their numbers, from 0 to B - 1.
+        cell: `(A,)`, the cell that is fixated.
+        fixation: `(A, 2)`, the point.
+        sight: what is seen from there.
+        belief: after the look.
+        visited: `(A, X·Y)` boolean, cells that inhibition of return keeps the gaze from, this one among them.
+        values: `(A, X·Y)`, acquisition values.
+        next_cell: `(A,)`, the chosen cell; it has no meaning where all were visited.
+        next_fixation: `(A, 2)`, the chosen point.
+        seconds: by stage (`STAGES`).
+    """
+
+    shift: int
+    episodes: Tensor
+    cell: Tensor
+    fixation: Tensor
+    sight: Sight
+    belief: Belief
+    visited: Tensor
+    values: Tensor
+    next_cell: Tensor
+    next_fixation: Tensor
+    seconds: dict[str, float]
+
+    @property
+    def detections(self) -> Detections:
+        """Boxes and scores, a batch of A."""
+        return self.sight.detections()
+
+
+def rollout(
+    looks: Looks,
+    observer: Observer,
+    acquisition: AcquisitionFunction | Acquire,
+    start: Tensor,
+    choice: Choice,
+    *,
+    most: int,
+    ends: Callable[[Step], Tensor] | None = None,
+    window: int | None = None,
+) -> Iterator[Step]:
+    """Episodes of active perception in one image, a step of all of them at a time.
+
+    An episode is over when `ends` says so, when every cell was visited, or after `most` looks.
+
+    Args:
+        looks: what is looked at: by an eye (`LiveLooks`) or in a store (`StoredLooks`).
+        observer: turns looks into belief.
+        acquisition: values the cells; a function of the episodes that go on where it differs from one to the next.
+        start: `(B,)`, the cell that each episode fixates first.
+        choice: how the next fixation is chosen: `Greedy`, `Relaxed` for gradients, or `Given`.
+        most: most looks of an episode.
+        ends: which of the episodes of a step end with it, `(A,)` boolean.
+        window: looks that a gradient flows through; at the border of two windows belief and fixation become constants
+            (truncated backpropagation through time), once the step was used.
+
+    Example::
+
+        choice = Greedy(drawn_by(torch.Generator(), len(grid), image))
+        for step in rollout(LiveLooks(eye, eye.open(image), grid), observer, acquisition, start, choice, most=10):
+            print(step.cell, step.belief.probability(target))
+    """
+    if not len(start):
+        return
+    acquire = (lambda episodes, cell: acquisition) if isinstance(acquisition, AcquisitionFunction) else acquisition
+    centres = looks.grid.centres.to(looks.like)
+    episodes, cell, fixation = torch.arange(len(start), device=start.device), start, centres[start]
+    belief = observer.start(len(start), looks.grid, looks.like)
+    visited = torch.zeros(len(start), len(looks.grid), dtype=torch.bool, device=start.device)
+    for shift in range(most):
+        sight = looks.see(observer, episodes, cell, fixation)
+        watch = Stopwatch(sight.seconds)
+        belief = observer.update(belief, sight.look)
+        watch.lap("update belief")
+        visited = visited.scatter(-1, cell[:, None], True)
+        values = acquire(episodes, cell)(belief, visited)
+        next_fixation, next_cell = choice(shift, episodes, values, visited, centres)
+        watch.lap("choose")
+        step = Step(
+            shift,
+            episodes,
+            cell,
+            fixation,
+            sight,
+            belief,
+            visited,
+            values,
+            next_cell,
+            next_fixation,
+            seconds=watch.seconds,
+        )
+        yield step
+        over = visited.all(-1)
+        going = ~over if ends is None else ~(over | ends(step))
+        if not going.any():
+            return
+        if window is not None and (shift + 1) % window == 0:
+            belief, next_fixation = belief.detach(), next_fixation.detach()
+        cell, fixation = next_cell, next_fixation
+        if not going.all():
+            episodes, cell, fixation = episodes[going], cell[going], fixation[going]
+            belief, visited = belief[going], visited[going]
+
+
+class Stopwatch:
+    """Seconds by stage.
+
+    Args:
+        seconds: of stages that were measured before.
+    """
+
+    def __init__(self, seconds: dict[str, float] | None = None) -> None:
+        self.seconds = dict(seconds or {})
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Count the time since the last lap to a stage."""
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
+        self._last = now

@@ -1,0 +1,1 @@
+"""Experiments over many scenes: settings, stores, protocols, runs and tables."""

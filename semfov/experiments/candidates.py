@@ -1,0 +1,151 @@
+"""From a policy's settings to what it observes by and chooses by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from semfov.agent import Strategy
+from semfov.belief import ContextPrior, Grid, TargetEvidence
+from semfov.belief.observers import Context, Observer, Semantic, Target
+from semfov.errors import InputError, check
+from semfov.experiments.config import BeliefConfig, PolicyConfig, RunConfig, SearchConfig
+from semfov.experiments.presets import SALIENCY, TARGET_EVIDENCE, resolve
+from semfov.experiments.setup import make_context, make_learned_gaze, make_observation, make_target_evidence
+from semfov.eye import Eye
+from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static
+from semfov.gaze.learned import LearnedGaze
+from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, Task, named_policy
+from semfov.observation.foveal import FovealObservationModel
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A policy under comparison, in one scene.
+
+    Attributes:
+        strategy: observer and policy.
+        saliency: `(X·Y, X·Y)`, saliency of all cells seen from each cell, or `(1, X·Y)`.
+        weight: of the saliency as a prior over the cells (`SaliencyPrior`); None: saliency takes the policy's place.
+    """
+
+    strategy: Strategy
+    saliency: Tensor | None = None
+    weight: float | None = None
+
+    @property
+    def observer(self) -> Observer:
+        """Turns looks into belief."""
+        return self.strategy.observer
+
+    def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
+        """The acquisition function of episodes that fixate `cell` `(B,)`."""
+        if self.saliency is None:
+            return self.strategy.policy(target, grid)
+        salient = self.saliency[cell if len(self.saliency) > 1 else torch.zeros_like(cell)]
+        if self.weight is None:
+            return Static(salient)
+        return SaliencyPrior(self.strategy.policy(target, grid), salient, weight=self.weight)
+
+
+@dataclass(frozen=True)
+class Models:
+    """Fitted models that the policies of a run need; None for those that none of them does."""
+
+    observation: FovealObservationModel | None = None
+    evidence: TargetEvidence | None = None
+    context: ContextPrior | None = None
+    gaze: LearnedGaze | None = None
+
+
+def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
+    """The models that a run needs, checked to belong to its eye."""
+    check(len(config.policies) > 0, "policies", "at least one policy", "none")
+    policies = [resolve(choice, task) for choice in config.policies]
+    belief = config.belief
+    gazes = any(policy.policy in POLICIES and POLICIES[policy.policy].needs_gaze for policy in policies)
+    return Models(
+        make_observation(belief.model, eye) if needs_observation(policies, belief) else None,
+        make_target_evidence(belief.target_model, eye)
+        if any(policy.policy == TARGET_EVIDENCE for policy in policies)
+        else None,
+        make_context(belief.context_model, eye)
+        if any(_of(policy.context, belief.context) != "none" for policy in policies)
+        else None,
+        make_learned_gaze(config.gaze_model, eye) if gazes and isinstance(config, SearchConfig) else None,
+    )
+
+
+def needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -> bool:
+    """Whether a policy needs an observation model: to predict, to calibrate, or for its miss rates."""
+    return any(
+        policy.scores == "calibrated"
+        or _of(policy.misses, belief.misses)
+        or (policy.policy in POLICIES and POLICIES[policy.policy].needs_model)
+        for policy in policies
+    )
+
+
+def make_strategy(
+    policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, models: Models, fovea: float
+) -> Strategy:
+    """Observer and policy of a policy's settings.
+
+    Args:
+        policy: the settings.
+        task: what it is for.
+        belief: settings of the run, for what the policy does not set itself.
+        components: classes, background included.
+        models: fitted models.
+        fovea: width of the fovea in longer sides of the image.
+    """
+    context = _of(policy.context, belief.context)
+    if context == "none":
+        return _strategy(policy, task, belief, components, models, fovea)
+    if task != "search" or policy.policy not in (TARGET_EVIDENCE, NonPredictive.name):
+        raise InputError(f"context: expected a search by the probability of the target, got policy {policy.policy!r}")
+    inner = _strategy(policy, task, belief, components, models, fovea)
+    prior = _given(models.context, "context", "a fitted context")
+    place, company = prior.weights_for("evidence" if inner.observer.by_target else "map")
+    weights = place * (context != "cooccurrence"), company * (context != "place")
+    return Strategy(Context(inner.observer, prior, weights), inner.policy)
+
+
+def _strategy(
+    policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, models: Models, fovea: float
+) -> Strategy:
+    if policy.policy == TARGET_EVIDENCE:
+        return Strategy(Target(_given(models.evidence, "policy", "learned target evidence")), NonPredictive())
+    means = Means(models.observation, models.gaze, fovea, belief.prior)
+    chosen = Random() if policy.policy == SALIENCY else named_policy(policy.policy, task, means)
+    if chosen.needs_gaze and models.gaze is not None:
+        return Strategy(models.gaze.observer(components), chosen)
+    misses = _of(policy.misses, belief.misses)
+    calibrated = policy.scores == "calibrated"
+    observer = Semantic(
+        components,
+        _given(models.observation, "scores", "an observation model") if calibrated else None,
+        prior=belief.prior,
+        fusion=belief.fusion,
+        footprint=_of(policy.footprint, belief.footprint),
+        tempering=_of(policy.tempering, belief.tempering),
+        memory=_of(policy.memory, belief.memory),
+        misses=_given(models.observation, "misses", "an observation model") if misses else None,
+    )
+    return Strategy(observer, chosen)
+
+
+def _of(own: T | None, common: T) -> T:
+    return common if own is None else own
+
+
+def _given(model: T | None, argument: str, expected: str) -> T:
+    if model is None:
+        raise InputError(f"{argument}: expected {expected}, got none")
+    return model

@@ -1,0 +1,111 @@
+"""The protocol of explorations: which episodes there are, and what comes of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.belief.belief import dirichlet_belief
+from semfov.belief.grid import Grid
+from semfov.data.scene import Scenes
+from semfov.detection.detections import Detections
+from semfov.episode import StoredLooks, rollout
+from semfov.experiments.candidates import Candidate
+from semfov.experiments.config import ProtocolConfig
+from semfov.experiments.seeds import generator_for, noise_for
+from semfov.gaze.choice import Greedy, drawn_from
+from semfov.metrics.exploration import count_right
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """One exploration of a scene.
+
+    Attributes:
+        scene: index of the scene in its data set.
+        repetition: which of the starts, from 0.
+        start: cell of the first fixation.
+    """
+
+    scene: int
+    repetition: int
+    start: int
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What came of an exploration.
+
+    Attributes:
+        cells: fixated cells in order.
+        right: after 0, 1, … gaze shifts, how many of the cells with objects are given the class of one of them: the
+            published measure, where the most probable of all classes is the answer, background among them.
+        right_without_background: the same, where the most probable class but background is the answer.
+    """
+
+    cells: tuple[int, ...]
+    right: tuple[int, ...]
+    right_without_background: tuple[int, ...]
+
+
+def explorations_of(scenes: Scenes, index: int, cells: int, protocol: ProtocolConfig) -> list[Exploration]:
+    """All explorations of a scene; starts differ from each other as long as there are enough cells."""
+    generator = generator_for("start", protocol.seed, scenes.ids[index])
+    rounds = -(-protocol.starts // cells)
+    order = torch.cat([torch.randperm(cells, generator=generator) for _ in range(rounds)])
+    return [Exploration(index, number, start) for number, start in enumerate(order[: protocol.starts].tolist())]
+
+
+def explore_noise(scenes: Scenes, episode: Exploration, cells: int, protocol: ProtocolConfig) -> Tensor:
+    """Random numbers that break an exploration's ties, `(shifts+1, X·Y)`; the same for every policy."""
+    return noise_for(protocol, cells, scenes.ids[episode.scene], "exploration", episode.repetition)
+
+
+def run_explorations(
+    episodes: Sequence[Exploration],
+    candidate: Candidate,
+    detections: Detections,
+    grid: Grid,
+    answers: Tensor,
+    noise: Tensor,
+    *,
+    shifts: int,
+    batch: int,
+) -> list[Progress]:
+    """Run explorations of one scene, `batch` at a time, until their gaze shifts are spent or no cell is left.
+
+    Args:
+        episodes: of one and the same scene.
+        candidate: how they explore.
+        detections: what is seen from every cell of the scene, a batch of X·Y.
+        grid: the grid over the scene.
+        answers: right classes of each cell (`answers_of`).
+        noise: `(episodes, shifts+1, X·Y)`, from `explore_noise`.
+        shifts: gaze shifts.
+        batch: episodes in a tensor.
+    """
+    starts = torch.tensor([episode.start for episode in episodes])
+    looks = StoredLooks(detections, grid)
+    progress: list[Progress] = []
+    for start, random in zip(starts.split(batch), noise.split(batch), strict=True):
+        choice = Greedy(drawn_from(random))
+        visits, right, without = [], [], []
+        for step in rollout(
+            looks,
+            candidate.observer,
+            lambda _, cell: candidate.acquisition(None, grid, cell),
+            start,
+            choice,
+            most=shifts + 1,
+        ):
+            beta = dirichlet_belief(step.belief).beta
+            visits.append(step.cell)
+            right.append(count_right(beta, answers))
+            without.append(count_right(beta[..., 1:], answers[:, 1:]))
+        # All episodes have made as many shifts, and so all run out of cells at once: nothing changes after that.
+        for counts in (right, without):
+            counts += [counts[-1]] * (shifts + 1 - len(counts))
+        tables = [torch.stack(columns, 1).tolist() for columns in (visits, right, without)]
+        progress += [Progress(tuple(a), tuple(b), tuple(c)) for a, b, c in zip(*tables, strict=True)]
+    return progress

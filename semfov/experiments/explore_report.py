@@ -1,0 +1,97 @@
+"""What an exploration run leaves: the success rate after each gaze shift, with and without background as an answer."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from semfov.errors import DataError
+from semfov.experiments.parts import Record
+from semfov.experiments.run_report import write_run_report
+from semfov.experiments.runs import ExploreRun
+from semfov.experiments.summary import (
+    LAST_COLUMN,
+    Array,
+    Curve,
+    announce,
+    collect,
+    curve_of,
+    curve_rows,
+    curves_csv,
+    save_figure,
+    sensing,
+    table,
+    write_files,
+)
+from semfov.metrics.exploration import success_rate
+
+SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
+"""Gaze shifts at which tables show the success rate."""
+
+ANSWERS = {
+    "all classes": ("right", "as published: the answer is the most probable of all classes, background among them"),
+    "without background": ("right_without_background", "the answer is the most probable class but background"),
+}
+"""What counts as an answer: the records' field, and in words."""
+
+
+def report(run: ExploreRun) -> None:
+    """Write everything that a finished run leaves, and print the tables."""
+    records, seconds = collect(run)
+    if not records:
+        raise DataError("data: no scene has an object; lower data.min_instances or raise data.limit")
+    curves = {answer: success(records, list(run.policies), answer) for answer in ANSWERS}
+    summary = summary_markdown(curves, run.config.protocol.shifts, sensing(run))
+    tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("answers", "success_rate"))}
+    written = write_files(run, "eval.explore", tables, records, seconds)
+    written += [draw_curves(run, curves[answer], answer) for answer in ANSWERS]
+    written.append(
+        write_run_report(
+            run,
+            records,
+            curves,
+            titles={name: title for name, (_, title) in ANSWERS.items()},
+            label="cells with the right class (%)",
+            shifts=SHIFTS,
+        )
+    )
+    announce(summary, written)
+
+
+def success(records: list[Record], policies: Sequence[str], answer: str) -> dict[str, Curve]:
+    """Success rate of each policy after each gaze shift."""
+    measure = partial(_rate, field=ANSWERS[answer][0])
+    return {policy: curve_of((r for r in records if r["policy"] == policy), measure) for policy in policies}
+
+
+def _rate(record: Record, field: str) -> Array:
+    return success_rate(record[field], record["object_cells"])
+
+
+def summary_markdown(curves: dict[str, dict[str, Curve]], last: int, sensing: str) -> str:
+    """The tables that the run prints: success rates with standard errors over images."""
+    shifts = [n for n in SHIFTS if n <= last]
+    head = ["policy", *(str(n) for n in shifts), LAST_COLUMN]
+    lines = []
+    for answer, policies in curves.items():
+        first = next(iter(policies.values()))
+        lines += [
+            f"**{ANSWERS[answer][1]}** ({sensing}; {first.images} images, {first.episodes} explorations per policy; "
+            "% of the cells with objects that are given the class of one after n gaze shifts, ± standard error over "
+            "images)",
+            "",
+            *table([head, *curve_rows(policies, shifts)]),
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def draw_curves(run: ExploreRun, curves: dict[str, Curve], answer: str) -> Path:
+    """The success-rate figure."""
+    from semfov.viz import plot_success_rate
+
+    figure = plot_success_rate(
+        {name: curve.mean for name, curve in curves.items()},
+        {name: curve.over_images for name, curve in curves.items()},
+        title=f"Exploration, {sensing(run)}\n{answer}",
+    )
+    return save_figure(figure, run.config.out / f"success_rate_{answer.replace(' ', '_')}.png")

@@ -1,0 +1,103 @@
+"""Policies by name, and what to call one that has no name."""
+
+from dataclasses import fields
+from typing import get_args
+
+from semfov.belief.grid import Footprint
+from semfov.belief.observers import Memory
+from semfov.errors import InputError, check, lookup
+from semfov.experiments.config import Context, PolicyConfig, SaliencyModel, Scores
+from semfov.gaze.policies import POLICIES, Task, policy_names
+
+SALIENCY = "saliency"
+TARGET_EVIDENCE = "target-evidence"
+SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
+
+WORDS = {"scores": Scores, "footprint": Footprint, "memory": Memory, "saliency": SaliencyModel, "context": Context}
+"""Settings that are one of a few words."""
+
+OF_THE_MAP = ("tempering", "footprint", "memory", "misses")
+"""Settings of the map of all classes."""
+
+Choice = str | PolicyConfig
+"""A policy as settings have it: the name of a preset, or its settings."""
+
+
+def known_policies(task: Task) -> list[str]:
+    """Names that `PolicyConfig.policy` may have."""
+    own = [SALIENCY, TARGET_EVIDENCE] if task == "search" else [SALIENCY]
+    return [*policy_names(task), *own]
+
+
+def presets(task: Task) -> dict[str, PolicyConfig]:
+    """The presets for a task."""
+    if task == "search":
+        alone = {name: PolicyConfig(name) for name in ("random", "learned", TARGET_EVIDENCE)}
+        alone |= {name: PolicyConfig(SALIENCY, saliency=name) for name in SALIENCY_MODELS}
+        best, published = PolicyConfig(TARGET_EVIDENCE), PolicyConfig("predictive", "calibrated")
+        scored = {name: PolicyConfig(name) for name in policy_names("search") if name not in alone}
+    else:
+        alone = {}
+        best, published = PolicyConfig("closer-look", tempering=0.5), PolicyConfig("kl", "calibrated")
+        scored = {name: PolicyConfig(name) for name in policy_names("exploration")}
+        scored |= {name: PolicyConfig(SALIENCY, saliency=name) for name in SALIENCY_MODELS}
+    both = {
+        f"{name}-{scores}": PolicyConfig(policy.policy, scores, saliency=policy.saliency)
+        for name, policy in scored.items()
+        for scores in ("raw", "calibrated")
+    }
+    return {**alone, **both, "recommended": best, "published": published}
+
+
+def resolve(choice: Choice, task: Task) -> PolicyConfig:
+    """The settings of a policy.
+
+    Raises:
+        InputError: there is no such preset, no such policy, or its settings contradict each other.
+    """
+    known = presets(task)
+    if isinstance(choice, str):
+        if choice[:1] in ("[", "{"):
+            settings = ", ".join(field.name for field in fields(PolicyConfig))
+            raise InputError(f"policies: expected names of presets, or mappings with {settings}; got {choice}")
+        return known[lookup(choice, known, "policy")]
+    lookup(choice.policy, known_policies(task), "policy")
+    if choice.policy == SALIENCY and choice.saliency is None:
+        raise InputError(f"saliency: expected a saliency model for policy 'saliency' ({', '.join(SALIENCY_MODELS)})")
+    for setting, words in WORDS.items():
+        if getattr(choice, setting) is not None:
+            lookup(getattr(choice, setting), get_args(words), setting)
+    if choice.tempering is not None:
+        check(choice.tempering > 0, "tempering", "a positive number", choice.tempering)
+    if choice.scores == "calibrated" and not _scored(choice, task):
+        raise InputError(f"scores: expected 'raw' for policy {choice.policy!r}, got 'calibrated'")
+    if choice.policy == TARGET_EVIDENCE or (choice.policy in POLICIES and POLICIES[choice.policy].needs_gaze):
+        given = next((setting for setting in OF_THE_MAP if getattr(choice, setting) is not None), None)
+        if given is not None:
+            raise InputError(f"{given}: expected none, for policy {choice.policy!r} comes with its own belief")
+    return choice
+
+
+def label(choice: Choice, task: Task) -> str:
+    """What tables call a policy: the preset that is nearest to it, and what differs from that.
+
+    >>> label(PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre"), "search")
+    'non-predictive-raw, tempering 0.25, footprint box_centre'
+    """
+    settings = resolve(choice, task)
+    names = {preset: name for name, preset in presets(task).items() if name not in ("recommended", "published")}
+    alone = settings.saliency if settings.policy == SALIENCY else None
+    base = names[PolicyConfig(settings.policy, settings.scores, saliency=alone)]
+    differs = []
+    for field in fields(PolicyConfig)[2:]:
+        value = getattr(settings, field.name)
+        if value is not None and not (field.name == "saliency" and alone is not None):
+            shown = f"{value:.15g}" if isinstance(value, float) else str(value).lower()
+            differs.append(field.name if value is True else f"{field.name} {shown}")
+    return ", ".join([base, *differs])
+
+
+def _scored(policy: PolicyConfig, task: Task) -> bool:
+    """Whether presets of this policy say which scores it takes."""
+    saliency = policy.saliency if policy.policy == SALIENCY else None
+    return PolicyConfig(policy.policy, "calibrated", saliency=saliency) in presets(task).values()

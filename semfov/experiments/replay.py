@@ -1,0 +1,50 @@
+"""Recorded episodes once more, with what was seen and believed at each fixation."""
+
+from dataclasses import replace
+
+import torch
+
+from semfov.belief.observers import Semantic
+from semfov.episode import StoredLooks, rollout
+from semfov.experiments.candidates import make_strategy
+from semfov.experiments.parts import Record
+from semfov.experiments.presets import resolve
+from semfov.experiments.run import Run
+from semfov.gaze.choice import Given
+from semfov.scanpath import Scanpath, trace
+
+
+def replay(run: Run, index: int, record: Record) -> Scanpath:
+    """The scanpath of a recorded episode.
+
+    A belief about the target alone tells nothing of other classes: the recommended map is kept beside it, as the agent
+    does.
+
+    Args:
+        run: that the record is of.
+        index: of the scene.
+        record: from `episodes.jsonl`.
+    """
+    grid, candidate = run.grid(index), run.candidate(record["policy"], index)
+    cue = record.get("cue")
+    cells = torch.tensor([record["cells"]])
+    looks = StoredLooks(run.detections(index), grid, None if cue is None else torch.tensor([cue]))
+    steps = rollout(
+        looks,
+        candidate.observer,
+        lambda _, cell: candidate.acquisition(cue, grid, cell),
+        cells[:, 0],
+        Given(cells),
+        most=cells.shape[1],
+    )
+    beside = None
+    if not isinstance(candidate.observer, Semantic):
+        components, fovea = len(run.scenes.classes) + 1, run.config.sensor.fovea
+        # Whatever the run adds to its searches.
+        recommended = replace(resolve("recommended", "exploration"), misses=False, context="none")
+        beside = make_strategy(recommended, "exploration", run.config.belief, components, run.models, fovea).observer
+    with torch.no_grad():
+        scanpath = trace(steps, grid, ("background", *run.scenes.classes), cue, beside)
+    found = record.get("found_at", -1) >= 0
+    # How long it takes to read a store is no time of the eye's.
+    return replace(scanpath, target=record.get("target"), found=found, seconds=())

@@ -1,0 +1,167 @@
+"""An experiment over scenes, one at a time: what it is made of, and finishing it wherever it was stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import ABC, abstractmethod
+from dataclasses import asdict
+from pathlib import Path
+from typing import ClassVar
+
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.data.scene import Scenes
+from semfov.detection.detections import Detections
+from semfov.errors import DataError, lookup
+from semfov.experiments.candidates import Candidate, load_models, make_strategy
+from semfov.experiments.config import RunConfig, SaliencyModel
+from semfov.experiments.parallel import available_cores, mine, run_tasks, wait_for_all
+from semfov.experiments.parts import Parts, Record
+from semfov.experiments.presets import SALIENCY, label, resolve
+from semfov.experiments.saliency_store import SaliencyStore, saliency_table
+from semfov.experiments.setup import make_eye, make_scenes, prepare_worker
+from semfov.experiments.store import DetectionStore, see_all
+from semfov.gaze.policies import Task
+from semfov.io.storage import checksum
+
+
+class Run(ABC):
+    """Everything that a run is made of, built from its settings in each process.
+
+    Attributes:
+        task: what episodes are for.
+        policies: settings of the policies under comparison, by what tables call them.
+        key: sha256 of everything that the outcomes depend on; parts of another run are never mixed in.
+    """
+
+    task: ClassVar[Task]
+
+    def __init__(self, config: RunConfig) -> None:
+        self.config = config
+        self.policies = {label(choice, self.task): resolve(choice, self.task) for choice in config.policies}
+        self.eye = make_eye(config.detector, config.sensor)
+        self.scenes: Scenes = make_scenes(config.data, self.eye.detector.classes)
+        if not len(self.scenes):
+            raise DataError("data: no scene passes the selection; lower data.min_instances or raise data.limit")
+        self.models = load_models(config, self.task, self.eye)
+        components, fovea = len(self.scenes.classes) + 1, config.sensor.fovea
+        self.strategies = {
+            name: make_strategy(policy, self.task, config.belief, components, self.models, fovea)
+            for name, policy in self.policies.items()
+        }
+        settings, cache = self.eye.settings(), cache_folder(config)
+        size = config.belief.columns, config.belief.rows
+        self.store = DetectionStore(cache / "looks", settings, *size)
+        self.saliency_stores = {
+            name: SaliencyStore(cache / "saliency", name, config.saliency, settings["sensor"], size)
+            for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
+            if name is not None
+        }
+        self.key = self._key()
+
+    def _key(self) -> str:
+        config, models = self.config, self.models
+        fitted = {
+            name: None if model is None else checksum(model.state_dict())
+            for name, model in (
+                ("observation", models.observation),
+                ("evidence", models.evidence),
+                ("gaze", models.gaze),
+            )
+        }
+        fitted["context"] = None if models.context is None else models.context.digest()
+        belief = {name: value for name, value in asdict(config.belief).items() if not name.endswith("model")}
+        protocol = {name: value for name, value in asdict(config.protocol).items() if name != "batch"}
+        saliency = {name: [store.key, config.saliency.weight] for name, store in self.saliency_stores.items()}
+        policies = {name: asdict(policy) for name, policy in self.policies.items()}
+        what = [self.task, self.store.key, self.scenes.fingerprint, belief, fitted, protocol, policies, saliency]
+        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def parts(self) -> Parts:
+        """Outcomes of finished scenes."""
+        return Parts(self.config.out / "parts", self.key)
+
+    @abstractmethod
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Records of all episodes of a scene under all policies, and the seconds that they took."""
+
+    def candidate(self, name: str, index: int) -> Candidate:
+        """The policy that tables call `name`, in a scene."""
+        policy = self.policies[lookup(name, self.policies, "policy of this run")]
+        if policy.saliency is None:
+            return Candidate(self.strategies[name])
+        weight = None if policy.policy == SALIENCY else self.config.saliency.weight
+        return Candidate(self.strategies[name], self.saliency(policy.saliency, index), weight)
+
+    def grid(self, index: int) -> Grid:
+        """The grid over a scene."""
+        return Grid(self.config.belief.columns, self.config.belief.rows, self.scenes.annotation(index).size)
+
+    def detections(self, index: int) -> Detections:
+        """What is seen from every cell of a scene, from the store or computed (and kept)."""
+        digest = self.scenes.digest(index)
+        seen = self.store.load(digest) if self.config.store else None
+        if seen is None:
+            seen = see_all(self.eye, self.scenes[index].image, self.grid(index))
+            if self.config.store:
+                self.store.save(digest, seen)
+        return seen
+
+    def saliency(self, name: SaliencyModel, index: int) -> Tensor:
+        """Saliency of the cells of a scene (`saliency_table`), from the store or computed (and kept)."""
+        digest, store = self.scenes.digest(index), self.saliency_stores[name]
+        saliency = store.load(digest) if self.config.store else None
+        if saliency is None:
+            image = self.scenes[index].image
+            sensor, reference = self.eye.sensor, self.config.sensor.reference
+            saliency = saliency_table(name, self.config.saliency, sensor, reference, image, self.grid(index))
+            if self.config.store:
+                store.save(digest, saliency)
+        return saliency
+
+
+def cache_folder(config: RunConfig) -> Path:
+    """Folder of the stores."""
+    if config.cache is not None:
+        return config.cache
+    from semfov.detection.weights import cache_folder as user_cache
+
+    return user_cache()
+
+
+def finish(run: Run, title: str) -> None:
+    """Run all scenes that have no part yet, this rank its share of them, and wait for the other ranks."""
+    parts = run.parts
+    todo = [index for index in mine(range(len(run.scenes))) if parts.load(index) is None]
+    done = run_tasks(
+        finish_scene,
+        todo,
+        workers=run.config.workers or available_cores(),
+        setup=prepare_process,
+        settings=(type(run), run.config),
+        title=title,
+        unit="scene",
+    )
+    for _ in done:
+        pass
+    wait_for_all()
+
+
+_process: dict[str, Run] = {}
+
+
+def prepare_process(make: type[Run], config: RunConfig) -> None:
+    """Build the run once in this process."""
+    prepare_worker()
+    _process["run"] = make(config)
+
+
+def finish_scene(index: int) -> int:
+    """Run all episodes of a scene and keep their outcomes as a part; returns the scene."""
+    run = _process["run"]
+    records, seconds = run.outcomes(index)
+    run.parts.save(index, records, seconds)
+    return index

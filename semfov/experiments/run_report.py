@@ -1,0 +1,105 @@
+"""The page of a whole run: its curves, its tables, and some of its episodes to step through."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from semfov.experiments.parts import Record
+from semfov.experiments.replay import replay
+from semfov.experiments.run import Run
+from semfov.experiments.setup import plain
+from semfov.experiments.summary import LAST_COLUMN, Array, Curve, curve_rows
+from semfov.report.curves import curves_html, table_html
+from semfov.report.episode import Data, Pool, episode_data
+from semfov.report.page import write_page
+from semfov.viz.views import foveated_views
+
+LIMIT = 4_500_000
+"""No further episode is added to a page that is as large as this, in bytes."""
+
+
+def write_run_report(
+    run: Run,
+    records: list[Record],
+    curves: Mapping[str, dict[str, Curve]],
+    *,
+    titles: Mapping[str, str],
+    label: str,
+    shifts: Sequence[int],
+    others: Mapping[str, Array] | None = None,
+    episodes: int = 18,
+) -> Path:
+    """Write `report.html` to the folder of a run, and return its path.
+
+    Args:
+        run: the finished run.
+        records: of its episodes.
+        curves: by average and policy.
+        titles: of the averages, in words.
+        label: what the curves show, in percent.
+        shifts: gaze shifts at which the tables show them.
+        others: curves of the first average that no policy made.
+        episodes: at least this many to step through, where the page does not grow too large.
+    """
+    sections = []
+    for order, (average, policies) in enumerate(curves.items()):
+        first = next(iter(policies.values()))
+        added = dict(others or {}) if order == 0 else {}
+        means = {**{name: curve.mean for name, curve in policies.items()}, **added}
+        errors = {name: curve.over_images for name, curve in policies.items()}
+        at = [n for n in shifts if n < len(first.mean)]
+        rows = [["policy", *(str(n) for n in at), LAST_COLUMN], *curve_rows(policies, at)]
+        rows += [[name, *(f"{100 * curve[n]:.1f}" for n in at), ""] for name, curve in added.items()]
+        caption = f"{label} after n gaze shifts ± standard error over {first.images} images, {first.episodes} episodes"
+        title = escape(titles[average])
+        sections.append(f"<section><h2>{title[:1].upper()}{title[1:]}</h2>")
+        sections.append(curves_html(means, errors, label) + table_html(rows, caption) + "</section>")
+    settings = escape(yaml.safe_dump(plain(asdict(run.config)), sort_keys=False))
+    sections.append(f'<details><summary>Settings</summary><pre class="wide">{settings}</pre></details>')
+    pool = Pool()
+    data = _episodes(run, choose_episodes(records, list(run.policies), episodes), pool)
+    title = f"semfov: {run.task} with {run.eye.detector.name}"
+    return write_page(run.config.out / "report.html", title, data, pool, sections="\n".join(sections))
+
+
+def choose_episodes(records: list[Record], policies: Sequence[str], count: int) -> list[Record]:
+    """Records to show: the same episode under all policies side by side, of as many scenes as `count` allows.
+
+    Of each scene the first start is taken, with the commonest target.
+    """
+    order = {policy: number for number, policy in enumerate(policies)}
+    groups: dict[Any, list[Record]] = defaultdict(list)
+    for record in records:
+        if record["repetition"] == 0 and record.get("commonest", True):
+            groups[record["scene"]].append(record)
+    chosen: list[Record] = []
+    for group in groups.values():
+        if len(chosen) >= count:
+            break
+        chosen += sorted(group, key=lambda record: order[record["policy"]])
+    return chosen
+
+
+def _episodes(run: Run, records: Sequence[Record], pool: Pool) -> list[Data]:
+    data, size = [], 0
+    for record in records:
+        if len(pool) + size > LIMIT:
+            break
+        index = list(run.scenes.ids).index(record["scene"])
+        scene, scanpath = run.scenes[index], replay(run, index, record)
+        views = foveated_views(run.eye, scene.image, scanpath.fixations)
+        boxes = None if scanpath.target is None else scene.boxes[scene.labels == scanpath.target]
+        name = f"{scene.name}, {record['policy']}"
+        data.append(
+            episode_data(scanpath, scene.image, views, pool, name=name, boxes=boxes, classes=10, width=256, quality=60)
+        )
+        size += sum(len(each["data"]) for each in [*data[-1]["maps"], data[-1]["entropy"]])
+        size += 7 * scanpath.values.numel()
+    return data

@@ -1,0 +1,108 @@
+"""The unit of work of each experiment: one scene, from photograph to outcomes of all policies."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import ClassVar
+
+import torch
+
+from semfov.episode import Stopwatch
+from semfov.experiments.config import ExploreConfig, SearchConfig
+from semfov.experiments.exploration_protocol import (
+    Exploration,
+    Progress,
+    explorations_of,
+    explore_noise,
+    run_explorations,
+)
+from semfov.experiments.parts import Record
+from semfov.experiments.run import Run
+from semfov.experiments.search_protocol import Episode, Outcome, episodes_of, run_episodes, tie_noise
+from semfov.gaze.policies import Task
+from semfov.metrics.exploration import answers_of
+
+
+class SearchRun(Run):
+    """Visual search."""
+
+    task: ClassVar[Task] = "search"
+    config: SearchConfig
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Records of all searches of a scene under all policies, and the seconds that they took."""
+        config, protocol = self.config, self.config.protocol
+        episodes = episodes_of(self.scenes, index, config.belief.columns, config.belief.rows, protocol)
+        watch = Stopwatch()
+        records: list[Record] = []
+        detections, grid = self.detections(index), self.grid(index)
+        watch.lap("look")
+        if not episodes:
+            return records, watch.seconds
+        noise = torch.stack([tie_noise(self.scenes, episode, len(grid), protocol) for episode in episodes])
+        for name in self.policies:
+            candidate = self.candidate(name, index)
+            watch.lap("saliency")
+            with torch.inference_mode():
+                outcomes = run_episodes(
+                    episodes, candidate, detections, grid, noise, shifts=protocol.shifts, batch=protocol.batch
+                )
+            watch.lap(name)
+            records += [self._record(name, *pair) for pair in zip(episodes, outcomes, strict=True)]
+        return records, watch.seconds
+
+    def _record(self, policy: str, episode: Episode, outcome: Outcome) -> Record:
+        fields = asdict(episode)
+        scene = fields.pop("scene")
+        return {
+            "policy": policy,
+            "scene": self.scenes.ids[scene],
+            **fields,
+            "target_name": self.scenes.classes[fields["target"] - 1],
+            "cells": list(outcome.cells),
+            "found_at": outcome.found_at,
+        }
+
+
+class ExploreRun(Run):
+    """Scene exploration."""
+
+    task: ClassVar[Task] = "exploration"
+    config: ExploreConfig
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Records of all explorations of a scene under all policies, and the seconds that they took."""
+        protocol = self.config.protocol
+        watch = Stopwatch()
+        records: list[Record] = []
+        grid = self.grid(index)
+        answers = answers_of(self.scenes.annotation(index), grid, len(self.scenes.classes) + 1)
+        if not answers.any():
+            return records, watch.seconds
+        detections = self.detections(index)
+        watch.lap("look")
+        episodes = explorations_of(self.scenes, index, len(grid), protocol)
+        noise = torch.stack([explore_noise(self.scenes, episode, len(grid), protocol) for episode in episodes])
+        for name in self.policies:
+            candidate = self.candidate(name, index)
+            watch.lap("saliency")
+            with torch.inference_mode():
+                outcomes = run_explorations(
+                    episodes, candidate, detections, grid, answers, noise, shifts=protocol.shifts, batch=protocol.batch
+                )
+            watch.lap(name)
+            objects = int(answers.any(-1).sum())
+            records += [self._record(name, objects, *pair) for pair in zip(episodes, outcomes, strict=True)]
+        return records, watch.seconds
+
+    def _record(self, policy: str, objects: int, episode: Exploration, progress: Progress) -> Record:
+        return {
+            "policy": policy,
+            "scene": self.scenes.ids[episode.scene],
+            "repetition": episode.repetition,
+            "start": episode.start,
+            "cells": list(progress.cells),
+            "object_cells": objects,
+            "right": list(progress.right),
+            "right_without_background": list(progress.right_without_background),
+        }

@@ -1,0 +1,91 @@
+"""Saliency of every cell of a scene, from every fixation or once for the whole photograph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.detection.placement import resize
+from semfov.experiments.config import SaliencyConfig
+from semfov.experiments.store import SceneStore, code_digest
+from semfov.gaze.saliency import VOCUS2, IttiKoch, cell_saliency
+from semfov.sensor import Bands, Foveation
+
+Model = Callable[[Tensor], Tensor]
+
+SALIENCY_MODELS: dict[str, Callable[[], Model]] = {"vocus2": VOCUS2, "itti-koch": IttiKoch}
+
+
+class SaliencyStore(SceneStore):
+    """Saliency of a scene's cells, `(F, X·Y)` with F = X·Y fixations or 1.
+
+    Args:
+        folder: where the store lies.
+        name: of the model.
+        saliency: settings of the baselines.
+        sensor: settings of the sensor; what the whole photograph shows does not depend on them.
+        grid: `(columns, rows)`.
+    """
+
+    def __init__(
+        self, folder: Path, name: str, saliency: SaliencyConfig, sensor: Mapping[str, Any], grid: tuple[int, int]
+    ) -> None:
+        what = {
+            "model": name,
+            "view": saliency.view,
+            "reduction": saliency.reduction,
+            "sensor": sensor if saliency.view == "foveated" else None,
+            "grid": list(grid),
+        }
+        super().__init__(folder, what, code_digest("gaze/saliency/*.py"))
+
+    def load(self, digest: str) -> Tensor | None:
+        """Saliency of a scene, or None if the store does not have it whole."""
+        tensors = self.read(digest)
+        return None if tensors is None else tensors["saliency"]
+
+    def save(self, digest: str, saliency: Tensor) -> None:
+        """Keep the saliency of a scene."""
+        self.write(digest, {"saliency": saliency})
+
+
+def saliency_table(
+    name: str, saliency: SaliencyConfig, sensor: Foveation, reference: float, image: Tensor, grid: Grid
+) -> Tensor:
+    """Saliency of every cell: seen from the centre of every cell `(X·Y, X·Y)`, or of the photograph `(1, X·Y)`.
+
+    No detector has a part in it: the sensor is shown the photograph at the size that its σ is meant for.
+
+    Args:
+        name: of the model.
+        saliency: settings of the baselines.
+        sensor: what the photograph is seen through.
+        reference: longer side in pixels that the sensor's σ is meant for.
+        image: `(3, H, W)`.
+        grid: the grid over it.
+    """
+    model = SALIENCY_MODELS[name]()
+    with torch.inference_mode():
+        if saliency.view == "picture":
+            return cells_of(model, image[None], grid, saliency)
+        bands, fixations = seen_by(sensor, reference, image, grid.centres)
+        # One view at a time: rounding then does not depend on which views share a batch.
+        return torch.cat([cells_of(model, sensor(bands, fixation), grid, saliency) for fixation in fixations])
+
+
+def seen_by(sensor: Foveation, reference: float, image: Tensor, points: Tensor) -> tuple[Bands, Tensor]:
+    """Pyramid of a photograph `(3, H, W)` whose longer side is made `reference`, and `points` `(F, 2)` of it there."""
+    scale = reference / max(image.shape[-2:])
+    size = round(image.shape[-1] * scale), round(image.shape[-2] * scale)
+    ratio = points.new_tensor(size) / points.new_tensor((image.shape[-1], image.shape[-2]))
+    return sensor.pyramid(resize(image[None], size)), (points + 0.5) * ratio - 0.5
+
+
+def cells_of(model: Model, pictures: Tensor, grid: Grid, saliency: SaliencyConfig) -> Tensor:
+    """Saliency of the cells of pictures `(B, 3, h, w)`, `(B, X·Y)`."""
+    return cell_saliency(model(pictures), grid.columns, grid.rows, saliency.reduction)

@@ -1,0 +1,219 @@
+"""Labelled detections: what the detector scored, how far from the fovea, and what was really there."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.data.scene import Scenes
+from semfov.detection.detections import Detections
+from semfov.errors import DataError
+from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.experiments.parallel import available_cores, mine, run_tasks, wait_for_all
+from semfov.experiments.seeds import generator_for
+from semfov.experiments.setup import make_eye, make_scenes, prepare_worker
+from semfov.experiments.store import code_digest
+from semfov.eye import Eye
+from semfov.io.cached import read_tensors, write_tensors
+from semfov.observation.matching import match
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Detections with their true classes, and the looks that they come from.
+
+    Attributes:
+        boxes: `(M, 4)`, in pixels of the image.
+        scores: `(M, K+1)`, score vectors.
+        distance: `(M,)`, from the box's centre to the fixation, in longer sides of the image.
+        labels: `(M,)`, true classes, 0 where a detection shows no object.
+        look: `(M,)`, the look that a detection belongs to, an index into `scenes` and `fixations`.
+        scenes: `(R,)`, index of the scene that each look was at; a look may have seen nothing.
+        fixations: `(R, 2)`, where each look was fixated.
+    """
+
+    boxes: Tensor
+    scores: Tensor
+    distance: Tensor
+    labels: Tensor
+    look: Tensor
+    scenes: Tensor
+    fixations: Tensor
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __getitem__(self, index: Tensor) -> Samples:
+        """Some of the detections; the looks stay."""
+        chosen = {name: getattr(self, name)[index] for name in _DETECTIONS}
+        return Samples(**chosen, scenes=self.scenes, fixations=self.fixations)
+
+    @property
+    def scene(self) -> Tensor:
+        """Index of the scene of each detection, `(M,)`."""
+        return self.scenes[self.look]
+
+    def seen(self, looks: slice) -> Detections:
+        """What successive looks saw, a batch of them."""
+        numbers = torch.arange(looks.start, looks.stop + 1)
+        bounds = torch.searchsorted(self.look, numbers).tolist()
+        return Detections.stack([self._view(slice(a, b)) for a, b in itertools.pairwise(bounds)])
+
+    def _view(self, rows: slice) -> Detections:
+        boxes, scores = self.boxes[rows], self.scores[rows]
+        return Detections(boxes[None], scores[None], torch.ones(1, len(boxes), dtype=torch.bool))
+
+    @classmethod
+    def join(cls, parts: list[Samples]) -> Samples:
+        """All samples of several sets, in order."""
+        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in _NAMES}
+        counts = torch.tensor([len(part.scenes) for part in parts])
+        first = (counts.cumsum(0) - counts).repeat_interleave(torch.tensor([len(part) for part in parts]))
+        return cls(**{**joined, "look": joined["look"] + first})
+
+
+_DETECTIONS = ("boxes", "scores", "distance", "labels", "look")
+_NAMES = (*_DETECTIONS, "scenes", "fixations")
+
+
+@dataclass(frozen=True)
+class SampleSettings:
+    """What labelled detections depend on.
+
+    Attributes:
+        data: the photographs.
+        detector: which detector looks through the fovea.
+        sensor: the foveal sensor.
+        fixations: random fixations in each photograph, uniform over its pixels.
+        iou: overlap from which a detection shows an object.
+        seed: of the fixations.
+        shard: photographs in a shard, the unit of work.
+    """
+
+    data: DataConfig
+    detector: DetectorConfig
+    sensor: SensorConfig
+    fixations: int
+    iou: float
+    seed: int
+    shard: int = 32
+
+    @classmethod
+    def of(cls, config: Any) -> SampleSettings:
+        """Those of a command, whose settings have the same names."""
+        return cls(**{field.name: getattr(config, field.name) for field in fields(cls)})
+
+
+class Sampler:
+    """Looks at photographs from random fixations; one shard is a run of successive photographs.
+
+    Attributes:
+        key: sha256 of everything that the samples depend on.
+    """
+
+    def __init__(self, settings: SampleSettings) -> None:
+        self.settings = settings
+        self.eye: Eye = make_eye(settings.detector, settings.sensor)
+        self.scenes: Scenes = make_scenes(settings.data, self.eye.detector.classes)
+        what = [self.eye.settings(), self.scenes.fingerprint, settings.fixations, settings.iou, settings.seed]
+        what += [settings.shard, torch.__version__, code_digest()]
+        self.key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def shards(self) -> range:
+        """Numbers of the shards."""
+        return range(-(-len(self.scenes) // self.settings.shard))
+
+    def path(self, folder: Path, shard: int) -> Path:
+        """File of a shard."""
+        return folder / self.key[:16] / f"{shard:06d}.safetensors"
+
+    def load(self, folder: Path, shard: int) -> Samples | None:
+        """Samples of a shard, or None if they are not there whole."""
+        tensors = read_tensors(self.path(folder, shard), self.key)
+        return None if tensors is None else Samples(**tensors)
+
+    def save(self, folder: Path, shard: int, samples: Samples) -> None:
+        """Keep the samples of a shard."""
+        write_tensors(self.path(folder, shard), self.key, {name: getattr(samples, name) for name in _NAMES})
+
+    def sample(self, shard: int) -> Samples:
+        """Look at the photographs of a shard."""
+        first = shard * self.settings.shard
+        scenes = range(first, min(first + self.settings.shard, len(self.scenes)))
+        return Samples.join([self._look(index) for index in scenes])
+
+    def _look(self, index: int) -> Samples:
+        settings, scene = self.settings, self.scenes[index]
+        grid = Grid(1, 1, scene.size)
+        generator = generator_for("fixations", settings.seed, scene.id)
+        points = torch.rand(settings.fixations, 2, generator=generator) * grid.extent - 0.5
+        with torch.inference_mode():
+            view = self.eye.open(scene.image[None])
+            # One view at a time: the bits then do not depend on which views share a batch.
+            seen = Detections.stack([self.eye.look(view, point[None]) for point in points])
+            distance = grid.box_distance(seen.boxes, points)
+            labels = [
+                match(boxes[mask], scene.boxes, scene.labels, iou=settings.iou)
+                for boxes, mask in zip(seen.boxes, seen.mask, strict=True)
+            ]
+            return Samples(
+                boxes=seen.boxes[seen.mask],
+                scores=seen.scores[seen.mask],
+                distance=distance[seen.mask],
+                labels=torch.cat(labels),
+                look=seen.mask.nonzero()[:, 0],
+                scenes=torch.full((len(points),), index),
+                fixations=points,
+            )
+
+
+_process: dict[str, tuple[Sampler, Path]] = {}
+
+
+def _prepare(settings: SampleSettings, folder: Path) -> None:
+    prepare_worker()
+    _process["sampler"] = Sampler(settings), folder
+
+
+def _run_shard(shard: int) -> int:
+    sampler, folder = _process["sampler"]
+    sampler.save(folder, shard, sampler.sample(shard))
+    return shard
+
+
+def collect(settings: SampleSettings, folder: Path, workers: int | None, title: str) -> tuple[Sampler, Samples]:
+    """Labelled detections of all photographs, in order; finished shards are read back, the others computed.
+
+    The result is the same to the last bit for any number of workers and ranks.
+    """
+    sampler = Sampler(settings)
+    todo = [shard for shard in mine(sampler.shards) if sampler.load(folder, shard) is None]
+    done = run_tasks(
+        _run_shard,
+        todo,
+        workers=workers or available_cores(),
+        setup=_prepare,
+        settings=(settings, folder),
+        title=title,
+        unit="shard",
+    )
+    for _ in done:
+        pass
+    wait_for_all()
+    parts = []
+    for shard in sampler.shards:
+        part = sampler.load(folder, shard)
+        if part is None:
+            path = sampler.path(folder, shard)
+            raise DataError(f"{path} is missing or damaged; run the same command again")
+        parts.append(part)
+    return sampler, Samples.join(parts)

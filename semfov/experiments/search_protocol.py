@@ -1,0 +1,146 @@
+"""The protocol of searches: which episodes there are, and what comes of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.data.scene import Scenes
+from semfov.detection.detections import Detections
+from semfov.episode import Step, StoredLooks, rollout
+from semfov.experiments.candidates import Candidate
+from semfov.experiments.config import ProtocolConfig
+from semfov.experiments.seeds import generator_for, noise_for
+from semfov.gaze.acquisition import AcquisitionFunction
+from semfov.gaze.choice import Greedy, drawn_from
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One search: a target class in a scene, from a start.
+
+    Attributes:
+        scene: index of the scene in its data set.
+        target: class index, 1..K.
+        cue: class that the searcher is told to look for, the target except in a control.
+        repetition: which of the starts, from 0.
+        start: cell of the first fixation.
+        goal: cells that an object of the target class overlaps.
+        commonest: whether the target is the scene's class with most instances (the first of them by index).
+    """
+
+    scene: int
+    target: int
+    cue: int
+    repetition: int
+    start: int
+    goal: tuple[int, ...]
+    commonest: bool
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of an episode: the fixated cells in order, and the gaze shift that found the target, or -1."""
+
+    cells: tuple[int, ...]
+    found_at: int
+
+
+def episodes_of(scenes: Scenes, index: int, columns: int, rows: int, protocol: ProtocolConfig) -> list[Episode]:
+    """All episodes of one scene: every legal target, `starts` cells that no object of it overlaps.
+
+    Starts differ from each other as long as there are enough cells.
+    """
+    annotation = scenes.annotation(index)
+    labels, covered = annotation.labels, Grid(columns, rows, annotation.size).footprint(annotation.boxes)
+    counts = torch.bincount(labels, minlength=1)
+    targets = scenes.targets(index)
+    commonest = max(targets, key=lambda t: (int(counts[t]), -t)) if targets else None
+    episodes = []
+    for target in targets:
+        goal, cue = covered[labels == target].any(0), target
+        if protocol.control == "permuted":
+            goal = goal[
+                torch.randperm(len(goal), generator=generator_for("goal", protocol.seed, scenes.ids[index], target))
+            ]
+        elif protocol.control == "wrong-class":
+            others = [other for other in range(1, len(scenes.classes) + 1) if other != target]
+            draw = generator_for("cue", protocol.seed, scenes.ids[index], target)
+            cue = others[int(torch.randint(len(others), (1,), generator=draw))]
+        free = (~goal).nonzero()[:, 0]
+        if not len(free) or not goal.any():
+            continue
+        generator = generator_for("start", protocol.seed, scenes.ids[index], target)
+        rounds = -(-protocol.starts // len(free))
+        order = torch.cat([torch.randperm(len(free), generator=generator) for _ in range(rounds)])
+        cells = tuple(goal.nonzero()[:, 0].tolist())
+        episodes += [
+            Episode(index, target, cue, repetition, start, cells, target == commonest)
+            for repetition, start in enumerate(free[order[: protocol.starts]].tolist())
+        ]
+    return episodes
+
+
+def tie_noise(scenes: Scenes, episode: Episode, cells: int, protocol: ProtocolConfig) -> Tensor:
+    """Random numbers that break an episode's ties, `(shifts+1, X·Y)`; the same for every policy."""
+    return noise_for(protocol, cells, scenes.ids[episode.scene], episode.target, episode.repetition)
+
+
+def run_episodes(
+    episodes: Sequence[Episode],
+    candidate: Candidate,
+    detections: Detections,
+    grid: Grid,
+    noise: Tensor,
+    *,
+    shifts: int,
+    batch: int,
+) -> list[Outcome]:
+    """Run episodes of one scene, `batch` at a time, each until its target is found or its gaze shifts are spent.
+
+    Args:
+        episodes: of one and the same scene.
+        candidate: how they search.
+        detections: what is seen from every cell of the scene, a batch of X·Y.
+        grid: the grid over the scene.
+        noise: `(episodes, shifts+1, X·Y)`, from `tie_noise`.
+        shifts: most gaze shifts.
+        batch: episodes in a tensor.
+    """
+    outcomes: list[Outcome] = []
+    for first in range(0, len(episodes), batch):
+        part = slice(first, first + batch)
+        outcomes += _run_batch(episodes[part], candidate, detections, grid, noise[part], shifts)
+    return outcomes
+
+
+def _run_batch(
+    episodes: Sequence[Episode], candidate: Candidate, detections: Detections, grid: Grid, noise: Tensor, shifts: int
+) -> list[Outcome]:
+    goals = torch.zeros(len(episodes), len(grid), dtype=torch.bool)
+    for row, episode in enumerate(episodes):
+        goals[row, list(episode.goal)] = True
+    cues = torch.tensor([episode.cue for episode in episodes])
+    starts = torch.tensor([episode.start for episode in episodes])
+    visits = torch.full((len(episodes), shifts + 1), -1)
+    visits[:, 0] = starts
+    found_at = torch.where(goals.gather(1, starts[:, None])[:, 0], 0, -1)
+    # A search that starts on its target is over before it has looked.
+    seeking = (found_at < 0).nonzero()[:, 0]
+
+    def acquisition(order: Tensor, cell: Tensor) -> AcquisitionFunction:
+        return candidate.acquisition(cues[seeking[order]], grid, cell)
+
+    def lands(step: Step) -> Tensor:
+        return goals[seeking[step.episodes], step.next_cell]
+
+    looks = StoredLooks(detections, grid, cues[seeking])
+    choice = Greedy(drawn_from(noise[seeking]))
+    for step in rollout(looks, candidate.observer, acquisition, starts[seeking], choice, most=shifts, ends=lands):
+        going = ~step.visited.all(-1)
+        number = seeking[step.episodes[going]]
+        visits[number, step.shift + 1] = step.next_cell[going]
+        found_at[number[lands(step)[going]]] = step.shift + 1
+    return [Outcome(tuple(row[row >= 0].tolist()), int(at)) for row, at in zip(visits, found_at, strict=True)]

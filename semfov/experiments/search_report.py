@@ -1,0 +1,138 @@
+"""What a search run leaves: cumulative performance as tables and curves, and a few scanpaths."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semfov.errors import DataError
+from semfov.experiments.parts import Record
+from semfov.experiments.replay import replay
+from semfov.experiments.run_report import write_run_report
+from semfov.experiments.runs import SearchRun
+from semfov.experiments.summary import (
+    LAST_COLUMN,
+    Array,
+    Curve,
+    announce,
+    collect,
+    curve_of,
+    curve_rows,
+    curves_csv,
+    save_figure,
+    sensing,
+    table,
+    write_files,
+)
+from semfov.metrics.search import cumulative_performance, random_search
+from semfov.viz.views import foveated_views
+
+SHIFTS = (1, 5, 10, 15, 30)
+"""Gaze shifts at which tables show the cumulative performance."""
+
+AVERAGES = {
+    "all targets": "mean over images, every legal target of an image",
+    "commonest": "mean over images, the target class with most instances",
+}
+
+
+def report(run: SearchRun) -> None:
+    """Write everything that a finished run leaves, and print the table."""
+    records, seconds = collect(run)
+    if not records:
+        raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
+    shifts = run.config.protocol.shifts
+    curves = {average: performance(records, list(run.policies), shifts, average) for average in AVERAGES}
+    expected = expected_random(records, shifts, run.config.belief.columns * run.config.belief.rows)
+    summary = summary_markdown(curves, expected, sensing(run))
+    tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("average", "performance"))}
+    written = write_files(run, "eval.search", tables, records, seconds)
+    written += [draw_curves(run, curves["all targets"], expected), *draw_scanpaths(run, records)]
+    written.append(
+        write_run_report(
+            run,
+            records,
+            curves,
+            titles=AVERAGES,
+            label="targets found (%)",
+            shifts=SHIFTS,
+            others={"random, by formula": expected},
+        )
+    )
+    announce(summary, written)
+
+
+def performance(records: list[Record], policies: Sequence[str], shifts: int, average: str) -> dict[str, Curve]:
+    """Cumulative performance of each policy, over all targets or the commonest of each image."""
+    measure = partial(_found, shifts=shifts)
+    counted = [record for record in records if record["commonest"] or average == "all targets"]
+    return {policy: curve_of((r for r in counted if r["policy"] == policy), measure) for policy in policies}
+
+
+def _found(record: Record, shifts: int) -> Array:
+    return cumulative_performance(np.array([record["found_at"]]), shifts)
+
+
+def expected_random(records: list[Record], shifts: int, cells: int) -> Array:
+    """What random search must give on these targets by the hypergeometric formula, mean over images."""
+    targets: dict[Any, dict[int, int]] = defaultdict(dict)
+    for record in records:
+        targets[record["scene"]][record["target"]] = len(record["goal"])
+    curves = [
+        np.mean([random_search(count, shifts, cells) for count in goals.values()], axis=0) for goals in targets.values()
+    ]
+    return np.asarray(np.mean(curves, axis=0), dtype=np.float64)
+
+
+def summary_markdown(curves: dict[str, dict[str, Curve]], expected: Array, sensing: str) -> str:
+    """The tables that the run prints: cumulative performance with standard errors over images."""
+    shifts = [n for n in SHIFTS if n < len(expected)]
+    head = ["policy", *(f"CP@{n}" for n in shifts), LAST_COLUMN]
+    lines = []
+    for average, policies in curves.items():
+        first = next(iter(policies.values()))
+        lines += [
+            f"**{AVERAGES[average]}** ({sensing}; {first.images} images, {first.episodes} searches per policy; "
+            "% found after n gaze shifts, the first fixation not counted, ± standard error over images)",
+            "",
+        ]
+        rows = curve_rows(policies, shifts)
+        if average == "all targets":
+            rows.append(["random, by formula", *(f"{100 * expected[n]:.1f}" for n in shifts), ""])
+        lines += [*table([head, *rows]), ""]
+    return "\n".join(lines)
+
+
+def draw_curves(run: SearchRun, curves: dict[str, Curve], expected: Array) -> Path:
+    """The cumulative-performance figure."""
+    from semfov.viz import plot_cumulative_performance
+
+    figure = plot_cumulative_performance(
+        {**{name: curve.mean for name, curve in curves.items()}, "random, by formula": expected},
+        {name: curve.over_images for name, curve in curves.items()},
+        title=f"Visual search, {sensing(run)}",
+    )
+    return save_figure(figure, run.config.out / "cumulative_performance.png")
+
+
+def draw_scanpaths(run: SearchRun, records: list[Record]) -> list[Path]:
+    """Pictures of a few episodes of the last policy, of different scenes, those with a few gaze shifts first."""
+    from semfov.viz import plot_episode
+
+    last = [record for record in records if record["policy"] == list(run.policies)[-1]]
+    last.sort(key=lambda record: (record["found_at"] < 0, not 2 <= record["found_at"] <= 6))
+    chosen = list({record["scene"]: record for record in reversed(last)}.values())
+    chosen.sort(key=last.index)
+    paths = []
+    for record in chosen[: run.config.scanpaths]:
+        index = run.scenes.ids.index(record["scene"])
+        scene = run.scenes[index]
+        scanpath = replay(run, index, record)
+        views = foveated_views(run.eye, scene.image, scanpath.fixations)
+        boxes = scene.boxes[scene.labels == record["target"]]
+        name = f"scanpath_{record['scene']}_{record['target_name'].replace(' ', '-')}.png"
+        paths.append(save_figure(plot_episode(scanpath, scene.image, views, boxes=boxes), run.config.out / name))
+    return paths

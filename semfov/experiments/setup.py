@@ -1,0 +1,112 @@
+"""From settings to objects: scenes, eye, models."""
+
+from __future__ import annotations
+
+import json
+import logging
+import multiprocessing
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from semfov.belief import ContextPrior, TargetEvidence
+from semfov.data.scene import Scenes
+from semfov.detection.load import load_detector
+from semfov.errors import DataError, InputError
+from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.eye import Eye
+from semfov.gaze.learned import LearnedGaze
+from semfov.io.compatibility import recommended
+from semfov.observation.foveal import FovealObservationModel
+
+
+def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
+    """The scenes to search: photographs where a root is given, else embedded ones."""
+    if (data.root is None) != (data.annotations is None):
+        raise InputError("data: expected both data.root and data.annotations, or neither for the embedded scenes")
+    if data.root is None or data.annotations is None:
+        from semfov.data.scenes import EmbeddedScenes
+
+        return EmbeddedScenes(classes, count=data.limit or 8, seed=data.scene_seed)
+    from semfov.data.coco import CocoScenes
+
+    return CocoScenes(
+        data.root,
+        data.annotations,
+        classes,
+        min_instances=data.min_instances,
+        ids=None if data.ids is None else read_ids(data.ids),
+        max_target_area=data.max_target_area,
+        limit=data.limit,
+    )
+
+
+def read_ids(path: Path) -> list[str]:
+    """Ids of photographs, one a line."""
+    try:
+        return path.read_text(encoding="utf-8").split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read as a list of ids ({error})") from None
+
+
+def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
+    """The foveal sensor and the detector behind it."""
+    options: dict[str, object] = {
+        "background": detector.background,
+        "threshold": detector.threshold,
+        "iou": detector.iou,
+        "limit": detector.limit,
+    }
+    if detector.weights is not None:
+        options["weights"] = detector.weights
+    if detector.stride != "auto":
+        options["stride"] = detector.stride
+    if detector.input_size is not None:
+        options["input_size"] = detector.input_size
+    if detector.runtime != "auto":
+        options["runtime"] = detector.runtime
+    model = load_detector(detector.name, **options)
+    return Eye(sensor.make(), model, reference=sensor.reference).eval().requires_grad_(False)
+
+
+def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
+    """The observation model of that name, or the one for this eye; checked to belong to detector and class list."""
+    model = FovealObservationModel.from_pretrained(name or recommended(eye.detector.name, eye.sensor.growth))
+    model.check_compatible(eye.settings(), eye.detector.classes)
+    return model.requires_grad_(False)
+
+
+def make_target_evidence(name: str | None, eye: Eye) -> TargetEvidence:
+    """The learned evidence for a target of that name, or the one for this detector; checked to belong to it."""
+    model = TargetEvidence.from_pretrained(name or eye.detector.name)
+    model.check_compatible(eye.settings())
+    return model.requires_grad_(False)
+
+
+def make_learned_gaze(name: str | None, eye: Eye) -> LearnedGaze:
+    """The learned gaze policy of that name, or the one for this detector; checked to belong to it."""
+    gaze = LearnedGaze.from_pretrained(name or eye.detector.name)
+    gaze.check_compatible(eye.settings())
+    return gaze.requires_grad_(False)
+
+
+def make_context(name: str, eye: Eye) -> ContextPrior:
+    """The context of searches, checked to know the detector's classes."""
+    prior = ContextPrior.from_pretrained(name)
+    prior.check_compatible(eye.detector.classes)
+    return prior.requires_grad_(False)
+
+
+def plain(settings: dict[str, Any]) -> Any:
+    """Settings as JSON and YAML have them: paths as text, tuples as lists."""
+    return json.loads(json.dumps(settings, default=str))
+
+
+def prepare_worker() -> None:
+    """One thread a process, so that detections do not depend on how many share the work; and no repeated notices."""
+    torch.set_num_threads(1)
+    # Freeing one large block raises glibc's threshold for handing memory back, or it would do so after every look.
+    torch.empty(31 << 20, dtype=torch.uint8)
+    if multiprocessing.parent_process() is not None:
+        logging.getLogger("semfov").setLevel(logging.ERROR)

@@ -1,0 +1,216 @@
+"""What every run leaves: tables, figures, per-episode records and the manifest."""
+
+import csv
+import io
+import json
+import platform
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from numpy.typing import NDArray
+
+from semfov.errors import DataError
+from semfov.experiments.parts import Record
+from semfov.experiments.run import Run
+from semfov.experiments.setup import plain
+from semfov.io.compatibility import recommended
+from semfov.io.files import replacing, write_text
+from semfov.io.storage import checksum
+from semfov.metrics.averages import standard_error
+from semfov.version import __version__
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A figure of merit after 0, 1, … gaze shifts: mean, and standard errors over images and over repetitions."""
+
+    mean: Array
+    over_images: Array
+    over_repetitions: Array
+    images: int
+    episodes: int
+
+
+def curve_of(records: Iterable[Record], measure: Callable[[Record], Array]) -> Curve:
+    """Average episodes, those of an image first.
+
+    Args:
+        records: of one policy.
+        measure: an episode's figure of merit after 0, 1, … gaze shifts.
+    """
+    images: dict[Any, list[Array]] = defaultdict(list)
+    repetitions: dict[int, dict[Any, list[Array]]] = defaultdict(lambda: defaultdict(list))
+    for record in records:
+        curve = measure(record)
+        images[record["scene"]].append(curve)
+        repetitions[record["repetition"]][record["scene"]].append(curve)
+
+    def per_image(groups: dict[Any, list[Array]]) -> Array:
+        return np.stack([np.mean(group, axis=0) for group in groups.values()])
+
+    means = per_image(images)
+    return Curve(
+        means.mean(0),
+        standard_error(means),
+        standard_error(np.stack([per_image(groups).mean(0) for groups in repetitions.values()])),
+        len(means),
+        sum(map(len, images.values())),
+    )
+
+
+def collect(run: Run) -> tuple[list[Record], dict[str, float]]:
+    """Records of all scenes, those of a policy together, and the seconds spent by stage."""
+    records: list[Record] = []
+    seconds: dict[str, float] = defaultdict(float)
+    for index in range(len(run.scenes)):
+        part = run.parts.load(index)
+        if part is None:
+            raise DataError(f"{run.parts.path(index)} is missing or damaged; run the same command again")
+        records += part["records"]
+        for stage, value in part["seconds"].items():
+            seconds[stage] += value
+    order = {policy: number for number, policy in enumerate(run.policies)}
+    records.sort(key=lambda record: order[record["policy"]])
+    return records, dict(seconds)
+
+
+def write_files(
+    run: Run,
+    program: str,
+    tables: dict[str, str],
+    records: list[Record],
+    seconds: dict[str, float],
+) -> list[Path]:
+    """Write tables (text by file name), records, settings and manifest; returns their paths."""
+    files = {
+        **tables,
+        "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records),
+        "config.yaml": yaml.safe_dump(plain(asdict(run.config)), sort_keys=False),
+        "manifest.json": json.dumps(manifest(run, program, seconds), indent=2) + "\n",
+    }
+    for name, text in files.items():
+        write_text(run.config.out / name, text)
+    return [run.config.out / name for name in files]
+
+
+def announce(summary: str, written: Iterable[Path]) -> None:
+    """Print the tables and where everything lies."""
+    print(summary)
+    print("written:")
+    for path in written:
+        print(f"  {path}")
+
+
+def curves_csv(curves: dict[str, dict[str, Curve]], head: tuple[str, str]) -> str:
+    """The curves as a table, one row for each average, policy and number of gaze shifts.
+
+    Args:
+        curves: by average and policy.
+        head: what the averages, and what the values are called.
+    """
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    average, value = head
+    errors = ["error_over_images", "error_over_repetitions"]
+    rows.writerow([average, "policy", "shifts", value, *errors, "images", "episodes"])
+    for average, policies in curves.items():
+        for policy, curve in policies.items():
+            for shift in range(len(curve.mean)):
+                figures = (f"{values[shift]:.6f}" for values in (curve.mean, curve.over_images, curve.over_repetitions))
+                rows.writerow([average, policy, shift, *figures, curve.images, curve.episodes])
+    return text.getvalue()
+
+
+def curve_rows(curves: dict[str, Curve], shifts: Iterable[int]) -> list[list[str]]:
+    """A row of a table for each policy: its curve at these gaze shifts, in percent, with both standard errors."""
+    return [
+        [
+            name,
+            *(percent(curve.mean[n], curve.over_images[n]) for n in shifts),
+            f"{100 * curve.over_repetitions.max():.2f}",
+        ]
+        for name, curve in curves.items()
+    ]
+
+
+LAST_COLUMN = "max. SEM over repetitions"
+"""Head of the last column of `curve_rows`: the largest standard error of the mean over the starts (published)."""
+
+
+def percent(value: float, error: float) -> str:
+    """`12.3 ± 0.4` for a share and its standard error."""
+    return f"{100 * value:.1f} ± {100 * error:.1f}" if np.isfinite(error) else f"{100 * value:.1f}"
+
+
+def table(rows: list[list[str]]) -> list[str]:
+    """A Markdown table, its columns aligned; the first row is the head."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
+    ]
+    return [lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]]
+
+
+def manifest(run: Run, program: str, seconds: dict[str, float]) -> dict[str, object]:
+    """Where the figures come from: versions, commit, checksums, seed, and where the time went."""
+    return {
+        "command": ["python", "-m", program, *sys.argv[1:]],
+        "commit": commit(),
+        "versions": {
+            "semfov": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+        },
+        "machine": platform.machine(),
+        "run_key": run.key,
+        "store_key": run.store.key,
+        "saliency_keys": {name: store.key for name, store in run.saliency_stores.items()},
+        "scenes_sha256": run.scenes.fingerprint,
+        "eye": run.eye.settings(),
+        "model_sha256": None if run.models.observation is None else checksum(run.models.observation.state_dict()),
+        "seed": run.config.protocol.seed,
+        "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
+    }
+
+
+def commit() -> str | None:
+    """Commit of the checkout, with `+` where it has changes; None outside a checkout."""
+    folder = Path(__file__).parent
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(folder), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def sensing(run: Run) -> str:
+    """Detector, sensor and observation model of a run, for titles."""
+    sensor, model = run.config.sensor, run.config.belief.model
+    spread = run.eye.sensor
+    what = f"{run.eye.detector.name}, {sensor.name} fovea (σ {float(spread.sigma):g} px, growth {spread.growth:g})"
+    if run.models.observation is None:
+        return what
+    own = model or recommended(run.eye.detector.name, float(spread.growth))
+    return f"{what}, observation model {Path(own).stem}"
+
+
+def save_figure(figure: Any, path: Path) -> Path:
+    """Save a matplotlib figure atomically."""
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=150, format=path.suffix[1:])
+    return path

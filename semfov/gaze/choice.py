@@ -1,0 +1,105 @@
+"""How the next fixation is chosen from the values of the cells."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from semfov.gaze.relaxation import soft_fixation
+from semfov.gaze.selection import select_fixation
+
+Noise = Callable[[int, Tensor], Tensor]
+"""Random numbers `(A, X·Y)` in [0, 1) for the n-th choice of some episodes `(A,)`."""
+
+
+class Choice(ABC):
+    """Base of all ways to choose the next fixation."""
+
+    @abstractmethod
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The next fixation `(A, 2)` and its cell `(A,)`; any cell where all were visited.
+
+        Args:
+            shift: gaze shifts that were made before.
+            episodes: `(A,)`, numbers of the episodes that go on.
+            values: `(A, X·Y)`, acquisition values.
+            visited: `(A, X·Y)` boolean, cells that are out.
+            centres: `(X·Y, 2)`, of the cells.
+        """
+
+
+class Greedy(Choice):
+    """The best cell not visited (`select_fixation`).
+
+    Args:
+        noise: breaks ties.
+    """
+
+    def __init__(self, noise: Noise) -> None:
+        self.noise = noise
+
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The centre of the best cell; the first cell where all were visited."""
+        cell = select_fixation(values, visited, self.noise(shift, episodes)).clamp(min=0)
+        return centres[cell], cell
+
+
+class Relaxed(Choice):
+    """A draw by Gumbel-softmax, through which gradients flow (`soft_fixation`).
+
+    Args:
+        noise: draws.
+        centres: of the cells.
+        temperature: of the softmax.
+        hard: straight-through, or the soft point.
+        cell_of: cell of a soft point.
+    """
+
+    def __init__(
+        self, noise: Noise, cell_of: Callable[[Tensor], Tensor], *, temperature: float = 1.0, hard: bool = True
+    ) -> None:
+        self.noise = noise
+        self.cell_of = cell_of
+        self.temperature = temperature
+        self.hard = hard
+
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The drawn fixation."""
+        drawn = self.noise(shift, episodes)
+        fixation, cell = soft_fixation(values, visited, centres, drawn, temperature=self.temperature, hard=self.hard)
+        return fixation, cell if self.hard else self.cell_of(fixation.detach())
+
+
+class Given(Choice):
+    """A scanpath that is known already.
+
+    Args:
+        cells: `(B, n)`, the cells that each episode fixates, the start first.
+    """
+
+    def __init__(self, cells: Tensor) -> None:
+        self.cells = cells
+
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The next cell of the scanpath; its last one at the end."""
+        cell = self.cells[episodes, min(shift + 1, self.cells.shape[1] - 1)]
+        return centres[cell], cell
+
+
+def drawn_from(noise: Tensor) -> Noise:
+    """Random numbers from a table `(B, shifts, X·Y)`."""
+    return lambda shift, episodes: noise[episodes, shift]
+
+
+def drawn_by(generator: torch.Generator, cells: int, like: Tensor) -> Noise:
+    """Random numbers as they are needed; dtype and device as `like`."""
+    return lambda shift, episodes: torch.rand(len(episodes), cells, generator=generator).to(like)

@@ -1,0 +1,48 @@
+"""Policies: registered by name, each makes the acquisition function for a target on a grid."""
+
+from semfov.gaze.policies.base import POLICIES, Means, ModelPolicy, Policy, Task, named_policy, policy_names, wanted
+from semfov.gaze.policies.exploration import (
+    KL,
+    Accuracy,
+    Closer,
+    ConfidenceBound,
+    Improvement,
+    Negentropy,
+    Peaks,
+    Surprise,
+)
+from semfov.gaze.policies.search import (
+    FovealHits,
+    InformationOnPlace,
+    Learned,
+    Neighbourhood,
+    NonPredictive,
+    Predictive,
+    Random,
+)
+
+__all__ = [
+    "KL",
+    "POLICIES",
+    "Accuracy",
+    "Closer",
+    "ConfidenceBound",
+    "FovealHits",
+    "Improvement",
+    "InformationOnPlace",
+    "Learned",
+    "Means",
+    "ModelPolicy",
+    "Negentropy",
+    "Neighbourhood",
+    "NonPredictive",
+    "Peaks",
+    "Policy",
+    "Predictive",
+    "Random",
+    "Surprise",
+    "Task",
+    "named_policy",
+    "policy_names",
+    "wanted",
+]

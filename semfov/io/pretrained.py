@@ -1,0 +1,77 @@
+"""Fitted modules that are kept in files, some of which are shipped with the package."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from torch import Tensor, nn
+
+from semfov.errors import DataError, InputError
+from semfov.io.compatibility import check_detector, check_sensor
+from semfov.io.storage import find, read, write
+from semfov.version import __version__
+
+
+class Pretrained(nn.Module):
+    """A module with a form of its own on disk: tensors, and JSON values that say what they are.
+
+    Attributes:
+        kind: of file, as its record says.
+        title: what messages call it.
+        shipped: folder of the models that come with the package.
+        metadata: JSON values kept with the model.
+    """
+
+    kind: ClassVar[str]
+    title: ClassVar[str]
+    shipped: ClassVar[Path]
+    metadata: dict[str, Any]
+
+    @abstractmethod
+    def _record(self) -> dict[str, Any]:
+        """JSON values that `_restore` needs beside tensors and metadata."""
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """Tensors that are kept."""
+        return self.state_dict()
+
+    @classmethod
+    @abstractmethod
+    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """The module from what was kept; an error of any kind where something is missing or does not fit."""
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the model to a safetensors file with its metadata as JSON in the header, whole or not at all."""
+        record = {"kind": self.kind, "version": __version__, **self._record(), "metadata": self.metadata}
+        write(path, self._tensors(), record)
+
+    @classmethod
+    def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:
+        """A model that is shipped with the package, by name, or one that `save` wrote, by path; in `eval` mode.
+
+        Raises:
+            InputError: no model of that name is shipped.
+            DataError: the file is missing, damaged or not such a model.
+        """
+        path = find(name_or_path, cls.shipped, cls.title)
+        tensors, record = read(path, cls.kind)
+        try:
+            model = cls._restore(record, tensors)
+        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, InputError) as error:
+            raise DataError(f"{path}: not a complete {cls.title} ({error})") from None
+        return model.eval()
+
+
+class PretrainedForEye(Pretrained):
+    """Base of the models that are trained behind one eye, whose `metadata` tells `detector` and `sensor`."""
+
+    def check_compatible(self, settings: Mapping[str, Any]) -> None:
+        """Raise `InputError` beside another detector than it was trained for, warn of other settings.
+
+        Args:
+            settings: `Eye.settings()`.
+        """
+        check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
+        check_sensor(self.metadata.get("sensor", {}), settings["sensor"], self.title)

@@ -1,0 +1,91 @@
+"""Tensors and what they mean in one file: safetensors with a JSON record in its header, and a checksum over both."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from semfov.errors import DataError, lookup
+from semfov.io.files import replacing
+
+# One key only: the order of several would differ from one write to the next.
+_KEY = "semfov"
+_CHECKSUM = "sha256"
+
+
+def write(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> None:
+    """Write tensors and a record of JSON values to a file, whole or not at all; the same content gives the same bytes.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    from safetensors.torch import save
+
+    whole = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    verified = {**record, _CHECKSUM: checksum(whole, record)}
+    header = {_KEY: json.dumps(verified, sort_keys=True, allow_nan=False)}
+    content = save(whole, header)
+    # The file is written here: `safetensors` tells of a full disk by an error that is no `OSError`.
+    with replacing(Path(path)) as temporary:
+        temporary.write_bytes(content)
+
+
+def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and record of a file that `write` made; nothing in the file is executed.
+
+    Args:
+        path: the file.
+        kind: what the record must say under `kind`.
+
+    Raises:
+        DataError: the file is missing, damaged, or of another kind.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            record = json.loads((file.metadata() or {})[_KEY])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except (OSError, SafetensorError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise DataError(f"{path}: not a readable safetensors file ({reason}); write or fetch it again") from None
+    except KeyError:
+        raise DataError(f"{path}: expected a file that semfov wrote, got one without its record") from None
+    if not isinstance(record, dict) or record.get("kind") != kind:
+        found = record.get("kind") if isinstance(record, dict) else type(record).__name__
+        raise DataError(f"{path}: expected {kind}, got {found}")
+    # Files of before there were checksums have none to compare with.
+    told = record.pop(_CHECKSUM, None)
+    if told is not None and told != checksum(tensors, record):
+        raise DataError(f"{path}: damaged, its content does not have the sha256 it was written with; fetch it again")
+    return tensors, record
+
+
+def find(name_or_path: str | PathLike[str], shipped: Path, kind: str) -> Path:
+    """The path itself, or the file of that name among the models in `shipped`.
+
+    Raises:
+        InputError: no model of that name is shipped; `kind` says of what.
+    """
+    path = Path(name_or_path)
+    if path.suffix == ".safetensors" or len(path.parts) > 1:
+        return path
+    names = sorted(file.stem for file in shipped.glob("*.safetensors"))
+    return shipped / f"{lookup(str(name_or_path), names, kind)}.safetensors"
+
+
+def checksum(tensors: Mapping[str, Tensor], record: Mapping[str, Any] | None = None) -> str:
+    """sha256 over the record, and over names, shapes, types and bytes of the tensors."""
+    digest = hashlib.sha256(json.dumps(record or {}, sort_keys=True).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].detach().cpu().contiguous()
+        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,1 @@
+"""Pages to step through in a browser."""

@@ -1,0 +1,164 @@
+"""An episode as data for a page: pictures as JPEG, probabilities in steps of 1/255 of their greatest."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from semfov.detection.placement import resize
+from semfov.observation.dirichlet import mean
+from semfov.scanpath import Scanpath
+from semfov.viz.belief import class_posterior, entropy
+from semfov.viz.labels import place_labels
+from semfov.viz.scanpath import describe
+
+Data = dict[str, Any]
+
+LEAST = 0.05
+"""Detections that are less confident are left out."""
+
+
+class Pool:
+    """Pictures of a page, each kept once.
+
+    Attributes:
+        pictures: data URIs.
+    """
+
+    def __init__(self) -> None:
+        self.pictures: list[str] = []
+        self._index: dict[str, int] = {}
+
+    def add(self, image: Tensor, width: int, quality: int) -> int:
+        """Number of a picture `(3, H, W)`, at most `width` pixels wide."""
+        uri = jpeg_uri(image, width, quality)
+        if uri not in self._index:
+            self._index[uri] = len(self.pictures)
+            self.pictures.append(uri)
+        return self._index[uri]
+
+    def __len__(self) -> int:
+        """Bytes that the pictures take."""
+        return sum(map(len, self.pictures))
+
+
+def jpeg_uri(image: Tensor, width: int, quality: int) -> str:
+    """A picture `(3, H, W)` as a data URI, at most `width` pixels wide."""
+    from PIL import Image
+
+    if image.shape[-1] > width:
+        image = resize(image[None], (width, max(1, round(width * image.shape[-2] / image.shape[-1]))))[0]
+    pixels = (image.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "JPEG", quality=quality, optimize=True)
+    return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+def episode_data(
+    scanpath: Scanpath,
+    image: Tensor,
+    views: Sequence[Tensor],
+    pool: Pool,
+    *,
+    name: str,
+    boxes: Tensor | None = None,
+    classes: int | None = None,
+    width: int = 416,
+    quality: int = 75,
+) -> Data:
+    """What a page shows of an episode, as JSON values.
+
+    Args:
+        scanpath: the episode.
+        image: `(3, H, W)`, RGB in [0, 1].
+        views: for each fixation the foveated photograph `(3, h, w)`, of any size.
+        pool: takes the pictures.
+        name: what to call the episode.
+        boxes: `(M, 4)`, where the target really is.
+        classes: keep the belief about so many classes beside background, the most probable anywhere (None: all).
+        width: of the views in pixels; the photograph is half as wide again.
+        quality: of the JPEG files.
+    """
+    grid = scanpath.grid
+    size = grid.extent.tolist()
+    timed = len(scanpath.seconds) > 0
+    after = [*scanpath.cells.tolist()[1:], None]
+    fixations = [
+        {
+            "cell": cell,
+            "view": pool.add(view, width, quality),
+            "detections": detection_data(scanpath, number),
+            "values": [rounded(value) for value in scanpath.values[number].tolist()],
+            "next": after[number],
+            "seconds": dict(scanpath.seconds[number]) if timed else None,
+        }
+        for number, (cell, view) in enumerate(zip(scanpath.cells.tolist(), views, strict=True))
+    ]
+    return {
+        "name": name,
+        "summary": describe(scanpath),
+        "size": size,
+        "grid": [grid.columns, grid.rows],
+        "image": pool.add(image, width * 3 // 2, quality),
+        "target": None if scanpath.target is None else scanpath.classes[scanpath.target],
+        "found": scanpath.found,
+        "truth": [] if boxes is None else boxes.tolist(),
+        "fixations": fixations,
+        "maps": map_data(scanpath, classes),
+        "entropy": quantised(entropy(scanpath)),
+    }
+
+
+def detection_data(scanpath: Scanpath, fixation: int, most: int = 10, scores: int = 5) -> list[Data]:
+    """The most confident detections of a look, each with its greatest class scores and a place for its label."""
+    detections = scanpath.detections[fixation][0]
+    width, height = scanpath.grid.extent.tolist()
+    unit = width / 640
+    kept = []
+    for box, vector in zip(detections.boxes[:most], detections.scores[:most], strict=True):
+        if float(vector[1:].max()) >= LEAST:
+            best = vector.topk(min(scores, len(vector)))
+            pairs = zip(best.values.tolist(), best.indices.tolist(), strict=True)
+            top = [[scanpath.classes[index], rounded(score)] for score, index in pairs]
+            label = scanpath.classes[int(vector[1:].argmax()) + 1]
+            kept.append({"box": [round(x, 1) for x in box.tolist()], "label": label, "scores": top})
+    texts = [f"{number} {detection['label']}" for number, detection in enumerate(kept, 1)]
+    sizes = [(unit * (11.5 * len(text) + 8), unit * 25) for text in texts]
+    x, y = (scanpath.fixations[fixation] + 0.5).tolist()
+    gaze = (x - 14 * unit, y - 14 * unit, x + 14 * unit, y + 14 * unit)
+    places = place_labels([tuple(detection["box"]) for detection in kept], sizes, (width, height), [gaze])
+    for detection, place in zip(kept, places, strict=True):
+        detection["tag"] = [round(x, 1) for x in place]
+    return kept
+
+
+def map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
+    """Probability maps `(n, X·Y)`: the target's first, those that are most probable anywhere, background at the end."""
+    probabilities = mean(scanpath.beliefs).detach().cpu()
+    order = (1 + probabilities[..., 1:].amax((0, 1)).argsort(descending=True, stable=True)).tolist()
+    target, maps = scanpath.target, []
+    if target is not None:
+        order = [target, *(index for index in order if index != target)]
+        if scanpath.posterior is not None:
+            searched = class_posterior(scanpath)
+            maps.append({"label": f"{scanpath.classes[target]} (as searched for)", **quantised(searched)})
+    kept = [*order[:classes], 0]
+    return maps + [{"label": scanpath.classes[index], **quantised(probabilities[..., index])} for index in kept]
+
+
+def quantised(values: Tensor) -> Data:
+    """Numbers from 0 up in 255 steps of the greatest, row by row, in base 64."""
+    greatest = max(float(values.max()), 1e-12)
+    steps = (values.detach().cpu().double() / greatest * 255).round().to(torch.uint8)
+    return {"max": rounded(greatest), "data": base64.b64encode(np.ascontiguousarray(steps.numpy()).tobytes()).decode()}
+
+
+def rounded(value: float) -> float | None:
+    """Four digits of a number; None for what is not finite."""
+    return float(f"{value:.4g}") if np.isfinite(value) else None

@@ -1,0 +1,1 @@
+"""Fitting semfov's models to photographs with boxes."""

@@ -1,0 +1,183 @@
+"""Counting the context of searches: where classes are, and beside what."""
+
+import json
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from semfov.belief import ContextPrior
+from semfov.belief.context import reaches
+from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.errors import DataError, check
+from semfov.experiments.parallel import rank
+from semfov.experiments.samples import SampleSettings, collect
+from semfov.experiments.setup import make_scenes
+from semfov.experiments.summary import table
+from semfov.training.context_weights import fit_weights, make_cases
+from semfov.training.outputs import training_of, write_outputs
+from semfov.training.places import FitContextConfig, Places, read_places
+
+
+def fit_context(config: FitContextConfig) -> None:
+    """Count, judge on held-out photographs, fit the weights, and write everything."""
+    check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
+    sampler, samples, scenes = None, None, None
+    if config.weigh:
+        settings = SampleSettings.of(config)
+        sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
+        scenes = sampler.scenes
+    if rank() > 0:
+        return
+    scenes = make_scenes(config.data, COCO_CLASSES) if scenes is None else scenes
+    places = read_places(scenes, config)
+    held_out = [index % config.holdout == 0 for index in range(len(places))]
+    known = [place for place, out in zip(places, held_out, strict=True) if not out]
+    prior = fit(known, scenes.classes, config)
+    judged = judge(prior, [place for place, out in zip(places, held_out, strict=True) if out], config.min_objects)
+    weights = dict.fromkeys(("evidence", "map"), (1.0, 1.0))
+    metadata = training_of(config, scenes)
+    if sampler is not None and samples is not None:
+        usable = [index for index, out in enumerate(held_out) if not out]
+        folds = cross_fit(places, usable, scenes.classes, config)
+        for kind in weights:
+            weights[kind] = fit_weights(make_cases(kind, sampler, samples, folds, places, config))
+        metadata |= sampler.eye.settings()
+    model = ContextPrior(
+        scenes.classes, prior.place, prior.cooccurrence, config.edges, weights=weights, metadata=metadata
+    )
+    path = config.out / f"{config.name}.safetensors"
+    model.save(path)
+    text = report(judged, weights, len(known), config)
+    write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
+
+
+def fit(places: Sequence[Places], classes: Sequence[str], config: FitContextConfig) -> ContextPrior:
+    """The prior that these photographs tell."""
+    chance = occupation(places, config.place_smoothing)
+    odds = chance.logit()
+    size = config.resolution, config.resolution
+    place = (odds - odds.mean(-1, keepdim=True)).unflatten(-1, size)
+    observed, expected = count_pairs(places, chance, config.edges)
+    ratio = shrunk_ratio(observed, expected, config.class_smoothing, config.pair_smoothing)
+    return ContextPrior(classes, place, ratio.log(), config.edges)
+
+
+def cross_fit(
+    places: Sequence[Places], usable: Sequence[int], classes: Sequence[str], config: FitContextConfig
+) -> list[tuple[ContextPrior, list[int]]]:
+    """Priors, each with the photographs to weigh it on, none of which it has counted."""
+    rich = [index for index in usable if places[index].objects >= config.min_objects]
+    chosen = rich[:: max(1, len(rich) // config.weigh)][: config.weigh]
+    folds = []
+    for fold in range(config.folds):
+        part = [index for position, index in enumerate(chosen) if position % config.folds == fold]
+        kept = set(usable).difference(part)
+        folds.append((fit([places[index] for index in sorted(kept)], classes, config), part))
+    return folds
+
+
+def occupation(places: Sequence[Places], smoothing: float) -> Tensor:
+    r"""Probability that a class that is in a picture is in each of its cells, `(K+1, X·Y)`.
+
+    .. math:: P(k \in x) = \frac{n_k(x) + s \, \bar P(x)}{n_k + s}
+
+    with n pictures that hold the class (at x), and P̄ the same over all classes.
+    """
+    cells, components = places[0].occupied.shape
+    there, pictures = torch.zeros(components, cells), torch.zeros(components)
+    for place in places:
+        there[place.targets] += place.occupied[:, place.targets].t().float()
+        pictures[place.targets] += 1
+    if not pictures.any():
+        raise DataError("data: no photograph has a class to search for; relax max_target_area")
+    average = (there.sum(0) + 0.5) / (pictures.sum() + 1)
+    return (there + smoothing * average) / (pictures[:, None] + smoothing)
+
+
+def count_pairs(places: Sequence[Places], chance: Tensor, edges: Sequence[float]) -> tuple[Tensor, Tensor]:
+    r"""Cells of k by the band of the nearest j: how many there are, and how many place alone would make expect.
+
+    .. math:: O_{kjn} = \sum_i \sum_{x \in k} [\text{band}_j(x) = n], \qquad
+              E_{kjn} = \sum_i \sum_x \frac{|k| \, P(k \in x)}{\sum_y P(k \in y)} [\text{band}_j(x) = n]
+
+    over the pictures i that hold both, j ≠ k. Both `(K+1, K+1, N)`.
+    """
+    components = len(chance)
+    observed = torch.zeros(components, components, len(edges) + 1)
+    expected = torch.zeros_like(observed)
+    for place in places:
+        present = place.occupied.any(0).nonzero()[:, 0]
+        targets = torch.tensor(place.targets, dtype=torch.long)
+        if not len(targets) or len(present) < 2:
+            continue
+        there = torch.stack(list(reaches(place.occupied[None, :, present].float(), place.grid, edges)), -1)[0]
+        bands = there.diff(dim=-1, prepend=torch.zeros_like(there[..., :1]))
+        own = place.occupied[:, targets].t().float()
+        share = chance[targets] / chance[targets].sum(-1, keepdim=True) * own.sum(-1, keepdim=True)
+        other = (targets[:, None] != present)[..., None]
+        observed[targets[:, None], present] += torch.einsum("kx,xjn->kjn", own, bands) * other
+        expected[targets[:, None], present] += torch.einsum("kx,xjn->kjn", share, bands) * other
+    return observed, expected
+
+
+def shrunk_ratio(observed: Tensor, expected: Tensor, class_smoothing: float, pair_smoothing: float) -> Tensor:
+    r"""Ratio of observed to expected cells, `(K+1, K+1, N)`; 1 for background, and for a class beside itself.
+
+    A pair is drawn towards what its two classes do beside any other, and these towards what all do:
+
+    .. math:: \rho_{kjn} = \frac{O_{kjn} + s \, \rho_{k \cdot n} \rho_{\cdot jn} / \rho_n}{E_{kjn} + s}, \qquad
+              \rho_{k \cdot n} = \frac{\sum_j O_{kjn} + s' \rho_n}{\sum_j E_{kjn} + s'}
+    """
+    every = (observed.sum((0, 1)) + 1) / (expected.sum((0, 1)) + 1)
+    towards = [
+        (observed.sum(axis) + class_smoothing * every) / (expected.sum(axis) + class_smoothing) for axis in (1, 0)
+    ]
+    both = towards[0][:, None] * towards[1] / every
+    ratio = (observed + pair_smoothing * both) / (expected + pair_smoothing)
+    ratio[0], ratio[:, 0] = 1, 1
+    ratio.diagonal().fill_(1)
+    return ratio
+
+
+def judge(prior: ContextPrior, places: Sequence[Places], min_objects: int) -> list[dict[str, object]]:
+    r"""How well context tells where a class is when all other objects are known.
+
+    The mean of :math:`\ln \sum_{x \in \text{goal}} \mathrm{softmax}(c)(x)` over pairs of photograph and class: the log
+    probability that one fixation, drawn by context alone, lands on the target.
+    """
+    choices = {"nothing": (0.0, 0.0), "place": (1.0, 0.0), "co-occurrence": (0.0, 1.0), "both": (1.0, 1.0)}
+    rows: list[dict[str, object]] = []
+    for name, weights in choices.items():
+        gained = []
+        for place in places:
+            for target in place.targets if place.objects >= min_objects else ():
+                value = prior(place.occupied[None].float(), place.grid, target, weights)[0]
+                gained.append(value[place.occupied[:, target]].logsumexp(0) - value.logsumexp(0))
+        if not gained:
+            raise DataError("data: no photograph to judge by was held out; give more photographs")
+        rows.append({"context": name, "log_likelihood": float(torch.stack(gained).mean()), "pairs": len(gained)})
+    return rows
+
+
+def report(
+    judged: list[dict[str, object]], weights: dict[str, tuple[float, float]], known: int, config: FitContextConfig
+) -> str:
+    """What was fitted, and how it does on photographs that were held out, as Markdown."""
+    rows = [[str(row["context"]), f"{row['log_likelihood']:.3f}"] for row in judged]
+    beside = [[kind, f"{place:.2g}", f"{company:.2g}"] for kind, (place, company) in weights.items()]
+    fitted = f"fitted on looks at {config.weigh} of" if config.weigh else "not fitted on looks at"
+    return "\n".join(
+        [
+            f"Counted on {known} photographs, judged on {judged[0]['pairs']} pairs of photograph and class of those "
+            f"that were held out (every {config.holdout}th): mean log probability that a fixation drawn by context "
+            "alone lands on the target, where all other objects are known.",
+            "",
+            *table([["context", "log likelihood"], *rows]),
+            "",
+            f"Weights beside a belief, {fitted} the photographs:",
+            "",
+            *table([["belief", "place", "co-occurrence"], *beside]),
+            "",
+        ]
+    )

@@ -1,0 +1,95 @@
+"""Fitting a foveal observation model to labelled detections."""
+
+import warnings
+from typing import Any
+
+from semfov.errors import DataError, check
+from semfov.experiments.parallel import rank
+from semfov.experiments.samples import Sampler, Samples, SampleSettings, collect
+from semfov.observation import fit_discriminative
+from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.mle import Method
+from semfov.observation.statistics import DirichletStatistics
+from semfov.training.misses import count_misses
+from semfov.training.observation_report import write_report
+from semfov.training.observation_settings import FitConfig
+
+
+def fit_fom(config: FitConfig) -> None:
+    """Collect labelled detections, fit the model, judge it on held-out photographs, and write everything."""
+    check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
+    settings = SampleSettings.of(config)
+    sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
+    if rank() > 0:
+        return
+    held_out = samples.scene % config.holdout == 0
+    if not held_out.any() or held_out.all():
+        raise DataError(f"data: too few detections to fit on and to judge by ({len(samples)}); give more photographs")
+    model = fit_model(config, sampler, samples[~held_out])
+    fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
+    model.miss_rate = count_misses(sampler, samples, fitted_on, model.edges).rates().to(model.edges)
+    path = config.out / f"{config.name or sampler.eye.detector.name}.safetensors"
+    model.save(path)
+    written = write_report(config, model, fit_all(config, sampler, samples[~held_out], model), samples, held_out)
+    print("written:")
+    for file in [path, *written]:
+        print(f"  {file}")
+
+
+def fit_model(config: FitConfig, sampler: Sampler, samples: Samples) -> FovealObservationModel:
+    """The model of the method that the settings name."""
+    if config.method != "discriminative":
+        return published_model(config, sampler, samples, config.method)
+    start = published_model(config, sampler, samples, "newton", expected="empirical")
+    return fit_discriminative(start, samples.scores, samples.distance, samples.labels)
+
+
+def published_model(
+    config: FitConfig,
+    sampler: Sampler,
+    samples: Samples,
+    method: Method,
+    **options: Any,
+) -> FovealObservationModel:
+    """Dirichlets of maximum likelihood where a cell has enough detections, as published; others are shrunk."""
+    classes = sampler.eye.detector.classes
+    model = FovealObservationModel.identity(classes, config.edges)
+    with warnings.catch_warnings():
+        # The report tells which levels fell back.
+        warnings.simplefilter("ignore", UserWarning)
+        return model.fit(
+            statistics_of(model, samples),
+            method=method,
+            minimum=config.minimum,
+            shrinkage=config.shrinkage,
+            enough=config.enough,
+            **options,
+            **sampler.eye.settings(),
+            samples=len(samples),
+            data=sampler.scenes.fingerprint,
+            fixations=config.fixations,
+            seed=config.seed,
+        ).eval()
+
+
+def statistics_of(model: FovealObservationModel, samples: Samples) -> DirichletStatistics:
+    """Sufficient statistics of samples by class and level."""
+    components, levels = model.alpha.shape[:2]
+    statistics = DirichletStatistics((components, levels), components, epsilon=model.epsilon)
+    return statistics.update(samples.scores, (samples.labels, model.level(samples.distance)))
+
+
+def fit_all(
+    config: FitConfig, sampler: Sampler, samples: Samples, model: FovealObservationModel
+) -> dict[str, FovealObservationModel]:
+    """The models that the report compares: raw scores, the published estimators, and the model that was asked for."""
+    edges, classes = config.edges, sampler.eye.detector.classes
+    models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
+    methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")
+    for method in methods:
+        models[f"Dirichlet, {method}"] = published_model(config, sampler, samples, method)
+    models["Dirichlet with class prior"] = published_model(config, sampler, samples, "newton", prior=True)
+    models["the same, tempered 0.1"] = published_model(config, sampler, samples, "newton", prior=True, tempering=0.1)
+    if config.method == "discriminative":
+        models["discriminative"] = model
+    return models

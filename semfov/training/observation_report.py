@@ -1,0 +1,110 @@
+"""What a fit leaves besides the model: figures on held-out photographs, counts, and a reliability diagram."""
+
+import csv
+import io
+import json
+import platform
+import sys
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+import yaml
+
+from semfov.experiments.samples import Samples
+from semfov.experiments.setup import plain
+from semfov.experiments.summary import commit, save_figure, table
+from semfov.io.files import write_text
+from semfov.metrics.calibration import Calibration, calibration
+from semfov.observation.foveal import FovealObservationModel
+from semfov.training.observation_settings import FitConfig
+from semfov.version import __version__
+from semfov.viz import plot_reliability
+
+Models = dict[str, FovealObservationModel]
+
+
+def write_report(
+    config: FitConfig, model: FovealObservationModel, models: Models, samples: Samples, held_out: torch.Tensor
+) -> list[Path]:
+    """Judge the models on held-out samples, print the table, and write the report; returns the files."""
+    judged = samples[held_out]
+    with torch.inference_mode():
+        predictions = {name: m.calibrate(judged.scores, judged.distance) for name, m in models.items()}
+        likelihood = {
+            name: float(m.log_likelihood(judged.scores, judged.distance).gather(1, judged.labels[:, None]).mean())
+            for name, m in models.items()
+        }
+    figures = {name: calibration(p, judged.labels) for name, p in predictions.items()}
+    text = report_markdown(config, model, figures, likelihood, len(samples) - len(judged))
+    print(text)
+    write_text(config.out / "report.md", text)
+    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    write_text(config.out / "manifest.json", json.dumps(manifest(model, figures), indent=2) + "\n")
+    last = list(models)[-1]
+    write_text(config.out / "counts.csv", counts_csv(model))
+    figure = plot_reliability({name: (predictions[name], judged.labels) for name in ("raw scores", last)})
+    names = ["report.md", "counts.csv", "config.yaml", "manifest.json"]
+    return [*(config.out / name for name in names), save_figure(figure, config.out / "reliability.png")]
+
+
+def report_markdown(
+    config: FitConfig,
+    model: FovealObservationModel,
+    figures: dict[str, Calibration],
+    likelihood: dict[str, float],
+    fitted: int,
+) -> str:
+    """The report: figures of each model, then counts by level."""
+    judged = next(iter(figures.values())).count
+    head = ["model", "log likelihood", "NLL", "Brier", "ECE", "classwise ECE", "accuracy"]
+    rows = [
+        [name, f"{likelihood[name]:.2f}", *(f"{value:.3f}" for value in (f.nll, f.brier, f.ece)),
+         f"{f.classwise_ece:.4f}", f"{f.accuracy:.3f}"]
+        for name, f in figures.items()
+    ]  # fmt: skip
+    counts = torch.tensor(model.metadata["counts"])
+    fallback = model.metadata["fallback"]
+    edges = ["0", *(f"{edge:.3f}" for edge in model.edges.tolist()), "…"]
+    levels = [
+        [f"{low} - {high}", str(int(counts[0, n])), str(int(counts[1:, n].sum())), str(fallback.get(str(n), ""))]
+        for n, (low, high) in enumerate(pairwise(edges))
+    ]
+    return "\n".join(
+        [
+            f"Fitted on {fitted} detections, judged on {judged} of photographs that were held out "
+            f"(every {config.holdout}th). Log likelihood of the scores given the true class, and figures of the "
+            "posterior of the class, background included.",
+            "",
+            *table([head, *rows]),
+            "",
+            "Detections that the fit saw, by distance to the fixation in longer sides of the image; levels with too",
+            "few objects take the parameters of another level.",
+            "",
+            *table([["distance", "background", "objects", "takes those of level"], *levels]),
+            "",
+        ]
+    )
+
+
+def counts_csv(model: FovealObservationModel) -> str:
+    """Detections of each true class at each level that the fit saw."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["class", *(f"level {n}" for n in range(len(model.edges) + 1))])
+    for name, counts in zip(("background", *model.classes), model.metadata["counts"], strict=True):
+        rows.writerow([name, *counts])
+    return text.getvalue()
+
+
+def manifest(model: FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:
+    """Where the figures come from."""
+    known = {key: value for key, value in model.metadata.items() if key != "counts"}
+    return {
+        "command": ["python", "-m", "train.fit_fom", *sys.argv[1:]],
+        "commit": commit(),
+        "versions": {"semfov": __version__, "python": platform.python_version(), "torch": torch.__version__},
+        "model": known,
+        "held_out": {name: asdict(figure) for name, figure in figures.items()},
+    }

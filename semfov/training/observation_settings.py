@@ -1,0 +1,62 @@
+"""Settings of the fit of a foveal observation model."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Fit p(scores | class, distance to the fovea) on photographs with boxes.
+
+    Args:
+        data: photographs to fit on (all of them: no selection by number of objects).
+        detector: which detector looks through the fovea.
+        sensor: the foveal sensor.
+        name: name of the model (None: the detector's).
+        method: `newton`, `fixed_point` (both Minka's; the paper does not say which) and `gradient` maximise the
+            likelihood, where `enough` lets them;
+            `discriminative` trains the posterior of the class itself, which is what calibration needs.
+        fixations: random fixations in each photograph.
+        levels: levels of distance, each `width` wide and the last one open.
+        width: width of a level for a fovea of 100 pixels, in pixels of an image whose longer side is 640; it grows
+            with the fovea.
+        minimum: objects that a level needs, or it takes the parameters of its inner neighbour (0: none does).
+        shrinkage: detections of a class's other levels that a level is given, so that few do not decide.
+        enough: detections of a class at a level from which that cell is not shrunk, but fitted by maximum likelihood
+            alone, as published (None: all are shrunk).
+        holdout: every n-th photograph is kept out of the fit and used to judge it.
+        iou: overlap from which a detection shows an object.
+        seed: of the fixations.
+        shard: photographs in a unit of work; a run that is stopped loses no more than one for each worker.
+        out: folder for the model, the report and the figures.
+        cache: folder for the labelled detections (None: `out`).
+        workers: processes (None: one for each CPU core).
+    """
+
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    name: str | None = None
+    method: Literal["newton", "fixed_point", "gradient", "discriminative"] = "discriminative"
+    fixations: int = 8
+    levels: int = 8
+    width: float = 50.0
+    minimum: int = 100
+    shrinkage: float = 10.0
+    enough: int | None = None
+    holdout: int = 10
+    iou: float = 0.5
+    seed: int = 0
+    shard: int = 32
+    out: Path = Path("runs/fit_fom")
+    cache: Path | None = None
+    workers: int | None = None
+
+    @property
+    def edges(self) -> list[float]:
+        """Borders between the levels, in longer sides of the image."""
+        step = self.width / 100.0 * self.sensor.fovea
+        return [step * n for n in range(1, self.levels)]

@@ -1,0 +1,150 @@
+"""The observer of all classes, with the options beyond the published one, against loops over cells."""
+
+import pytest
+import torch
+
+from semfov import Detections, FovealObservationModel, Grid
+from semfov.belief import fusion, likelihoods
+from semfov.belief.observers import Semantic, SemanticLook
+from semfov.errors import InputError
+
+GRID = Grid(5, 4, (100, 80))
+FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]
+
+
+@pytest.fixture
+def looks():
+    """Three looks with a few random detections each."""
+    torch.manual_seed(0)
+    corner = torch.rand(3, 4, 2) * 60
+    boxes = torch.cat([corner, corner + 5 + torch.rand(3, 4, 2) * 30], -1)
+    mask = torch.tensor([[True, True, True, False], [True, True, False, False], [True, True, True, True]])
+    return Detections(boxes, torch.rand(3, 4, 4).softmax(-1), mask)
+
+
+class Misses:
+    """Background is missed always, class 3 never."""
+
+    def miss_likelihood(self, distance):
+        return torch.stack([torch.ones_like(distance), 0.2 + distance, distance.clamp(max=1), 0 * distance], -1)
+
+
+MISSES = Misses()
+
+
+def watch(observer, looks):
+    belief = observer.start(1, GRID, torch.empty(0, dtype=torch.float64))
+    for look in range(3):
+        said = observer.weigh(looks[look : look + 1], FIXATIONS[look : look + 1], GRID)
+        belief = observer.update(belief, said)
+    return belief
+
+
+def loop(looks, *, tempering=1.0, footprint="overlap", memory="all", missed=None):
+    """The same in scalars."""
+    beta = torch.full((20, 4), 0.5, dtype=torch.float64)
+    for cell in range(20):
+        order = range(3)
+        offset = torch.linalg.vector_norm(GRID.centres[cell] - FIXATIONS, dim=-1) / 100
+        if memory == "closest":
+            order = [int(offset.argmin())]
+        for look in order:
+            covered = False
+            for detection in looks.mask[look].nonzero()[:, 0].tolist():
+                weight = float(GRID.footprint(looks.boxes[look, detection][None], footprint)[0, cell])
+                if weight > 0:
+                    covered = True
+                    likelihood = looks.scores[look, detection].double() ** (tempering * weight)
+                    beta[cell] = fusion.kaplan(beta[cell], likelihood)
+            if missed is not None and not covered:
+                beta[cell] = fusion.kaplan(beta[cell], missed.miss_likelihood(offset[look]).double())
+    return beta
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"tempering": 0.25},
+        {"footprint": "soft"},
+        {"footprint": "centre"},
+        {"memory": "closest"},
+        {"misses": MISSES},
+    ],
+    ids=["published", "tempered", "soft", "centre", "closest", "misses"],
+)
+def test_belief_equals_the_loop(looks, options):
+    belief = watch(Semantic(4, **options), looks)
+    told = {("missed" if name == "misses" else name): value for name, value in options.items()}
+    torch.testing.assert_close(belief.beta[0], loop(looks, **told), rtol=1e-5, atol=1e-6)
+    offset = torch.cdist(GRID.centres, FIXATIONS) / 100
+    torch.testing.assert_close(belief.closest[0].float(), offset.amin(1))
+
+
+def test_the_same_look_twice_teaches_a_closest_memory_nothing(looks):
+    observer = Semantic(4, memory="closest")
+    look = observer.weigh(looks[:1], FIXATIONS[:1], GRID)
+    once = observer.update(observer.start(1, GRID, torch.empty(0)), look)
+    assert torch.equal(observer.update(once, look).beta, once.beta)
+
+
+def test_misses_move_clear_cells_towards_background():
+    nothing = Detections.empty(1, 3)
+    observer = Semantic(4, misses=MISSES)
+    look = observer.weigh(nothing, FIXATIONS[:1], GRID)
+    after = observer.update(observer.start(1, GRID, torch.empty(0)), look).beta
+    background = after[0, :, 0] / after[0].sum(-1)
+    assert background.argmax() == 0
+    assert (background > 0.25).all()
+
+
+def test_a_call_is_to_weigh_and_to_update(looks):
+    observer = Semantic(4, tempering=0.5, memory="closest", footprint="soft")
+    belief = observer.start(1, GRID, torch.empty(0, dtype=torch.float64))
+    for look in range(3):
+        belief = observer(belief, looks[look : look + 1], FIXATIONS[look : look + 1], GRID)
+    expected = watch(observer, looks)
+    assert torch.equal(belief.beta, expected.beta)
+    assert torch.equal(belief.closest, expected.closest)
+
+
+@pytest.mark.parametrize("options", [{}, {"footprint": "soft"}, {"misses": MISSES}], ids=["hard", "soft", "misses"])
+def test_a_batch_of_looks_is_each_look(looks, options):
+    """Weighed together, taken out one by one or joined again, they say the same to the bit."""
+    observer = Semantic(4, **options)
+    together = observer.weigh(looks, FIXATIONS, GRID)
+    belief = observer.start(3, GRID, looks.scores)
+    whole = observer.update(belief, together)
+    alone = [observer.weigh(looks[look : look + 1], FIXATIONS[look : look + 1], GRID) for look in range(3)]
+    joined = observer.update(belief, SemanticLook.join(alone))
+    for look in range(3):
+        for said in (alone[look], together[look : look + 1], together[torch.tensor([look])]):
+            after = observer.update(belief[look : look + 1], said)
+            for batch in (whole, joined):
+                assert torch.equal(after.beta[0], batch.beta[look])
+                assert torch.equal(after.closest[0], batch.closest[look])
+
+
+def test_models_are_parts_of_the_observer():
+    """A fitted model is a parameter of it, told once where it serves twice; an object that is no module is kept."""
+    model = FovealObservationModel.identity(["a", "b"], [0.2], miss_rate=torch.full((3, 2), 0.5))
+    observer = Semantic(3, model, misses=model)
+    assert set(map(id, observer.parameters())) == set(map(id, model.parameters()))
+    assert {name.removeprefix("observation.") for name in observer.state_dict()} >= set(model.state_dict())
+    observer.double()
+    assert model.edges.dtype == torch.float64
+    assert Semantic(4, misses=MISSES).misses is MISSES
+    assert not Semantic(4, misses=MISSES).state_dict()
+
+
+@pytest.mark.parametrize("options", [{"memory": "best"}, {"fusion": "max"}, {"prior": 0}])
+def test_bad_settings(options):
+    with pytest.raises(InputError):
+        Semantic(3, **options)
+
+
+def test_tempering_is_positive(looks):
+    with pytest.raises(InputError, match="tempering"):
+        likelihoods(looks, FIXATIONS, GRID, tempering=0)
+    with pytest.raises(InputError, match="tempering"):
+        Semantic(4, tempering=0).weigh(looks, FIXATIONS, GRID)

@@ -1,0 +1,162 @@
+"""Fusing many detections into many maps against a loop over detections and cells."""
+
+import pytest
+import torch
+
+from semfov import Detections, Grid
+from semfov.belief import fuse, fusion, likelihoods
+from semfov.belief.observers import Semantic
+from semfov.errors import InputError
+
+
+def fuse_by_loop(beta, likelihood, footprint, rule):
+    beta = beta.clone()
+    for image in range(beta.shape[0]):
+        for detection in range(likelihood.shape[1]):
+            for cell in range(beta.shape[1]):
+                if footprint[image, detection, cell]:
+                    beta[image, cell] = rule(beta[image, cell], likelihood[image, detection])
+    return beta
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
+def test_fuse_equals_the_loop(name, dtype):
+    torch.manual_seed(0)
+    beta = torch.rand(3, 6, 5, dtype=dtype) + 0.2
+    likelihood = torch.rand(3, 7, 5, dtype=dtype)
+    footprint = torch.rand(3, 7, 6) < 0.4
+    before = beta.clone()
+    got = fuse(beta, likelihood, footprint, name)
+    torch.testing.assert_close(got, fuse_by_loop(beta, likelihood, footprint, getattr(fusion, name)))
+    assert torch.equal(beta, before)
+
+
+def test_fuse_is_the_same_bits_in_any_batch():
+    torch.manual_seed(0)
+    beta, likelihood = torch.rand(40, 100, 81) + 0.2, torch.rand(40, 12, 81)
+    footprint = torch.rand(40, 12, 100) < 0.2
+    whole = fuse(beta, likelihood, footprint)
+    for size in (1, 7):
+        parts = [
+            fuse(b, l, f)
+            for b, l, f in zip(beta.split(size), likelihood.split(size), footprint.split(size), strict=True)
+        ]
+        assert torch.equal(torch.cat(parts), whole)
+
+
+def test_fuse_without_coverage_changes_nothing():
+    beta = torch.rand(2, 3, 4)
+    got = fuse(beta, torch.zeros(2, 5, 4), torch.zeros(2, 5, 3, dtype=torch.bool))
+    assert torch.equal(got, beta)
+    assert got.data_ptr() != beta.data_ptr()
+
+
+@pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
+@pytest.mark.parametrize("soft", [False, True])
+def test_fuse_vectorises(name, soft):
+    beta, likelihood, footprint = piled(soft)
+    expected = torch.stack([fuse(b, l, f, name) for b, l, f in zip(beta, likelihood, footprint, strict=True)])
+    together = torch.func.vmap(lambda b, l, f: fuse(b, l, f, name))(beta, likelihood, footprint)
+    torch.testing.assert_close(together, expected)
+
+
+def test_fuse_compiles_whole():
+    """For any number of detections."""
+    beta, likelihood, footprint = (tensor[0] for tensor in piled(soft=True))
+    torch.compiler.reset()
+    compiled = torch.compile(fuse, fullgraph=True, backend="eager")
+    for looks in (4, 3):
+        given = beta, likelihood[:, :looks], footprint[:, :looks]
+        torch.testing.assert_close(compiled(*given), fuse(*given))
+
+
+def piled(soft):
+    """Three batches of two maps, four detections each, the last of which is padding."""
+    torch.manual_seed(2)
+    beta, likelihood = torch.rand(3, 2, 6, 5) + 0.2, torch.rand(3, 2, 4, 5)
+    footprint = torch.rand(3, 2, 4, 6) * (torch.rand(3, 2, 4, 6) < 0.5)
+    footprint[:, :, 3] = 0
+    likelihood[:, :, 3] = 0
+    return beta, likelihood, footprint if soft else footprint > 0
+
+
+def test_fuse_gradients():
+    torch.manual_seed(1)
+    beta = (torch.rand(1, 3, 3, dtype=torch.float64) + 0.2).requires_grad_()
+    likelihood = (torch.rand(1, 4, 3, dtype=torch.float64) + 0.1).requires_grad_()
+    footprint = torch.rand(1, 4, 3) < 0.6
+    assert torch.autograd.gradcheck(lambda b, l: fuse(b, l, footprint), (beta, likelihood))
+
+
+def test_300_updates_stay_near_float64():
+    torch.manual_seed(3)
+    likelihood = torch.rand(1, 300, 81)
+    likelihood[..., 2:] *= 1e-4
+    footprint = torch.ones(1, 300, 1, dtype=torch.bool)
+    single = fuse(torch.full((1, 1, 81), 0.5), likelihood, footprint)
+    double = fuse(torch.full((1, 1, 81), 0.5, dtype=torch.float64), likelihood.double(), footprint)
+    torch.testing.assert_close(single.double(), double, rtol=2e-4, atol=0)
+
+
+def seen(grid: Grid) -> Detections:
+    boxes = torch.tensor([[[0.0, 0, 30, 30], [20, 20, 90, 60], [0, 0, 0, 0]]])
+    scores = torch.tensor([[[0.1, 0.6, 0.3], [0.5, 0.1, 0.4], [0, 0, 0]]])
+    return Detections(boxes, scores, torch.tensor([[True, True, False]]))
+
+
+class Sharper:
+    """An observation model that squares scores near the fovea and ignores those far away."""
+
+    def calibrate(self, scores, distance):
+        return torch.where(distance[..., None] < 0.3, scores**2, torch.ones_like(scores))
+
+
+def test_a_look_of_the_observer_equals_the_loop():
+    grid = Grid(4, 3, (100, 60))
+    detections, fixation = seen(grid), torch.tensor([[10.0, 10.0]])
+    observer = Semantic(3)
+    updated = observer(observer.start(1, grid, detections.scores), detections, fixation, grid)
+    footprint = grid.footprint(detections.boxes)
+    expected = fuse_by_loop(torch.full((1, 12, 3), 0.5), detections.scores[:, :2], footprint[:, :2], fusion.kaplan)
+    torch.testing.assert_close(updated.beta, expected)
+    torch.testing.assert_close(updated.probabilities.sum(-1), torch.ones(1, 12))
+
+
+def test_observation_model_sees_the_distance():
+    grid = Grid(4, 3, (100, 60))
+    fixation = torch.tensor([[10.0, 10.0]])
+    near = likelihoods(seen(grid), fixation, grid, Sharper())
+    torch.testing.assert_close(near[0, 0], torch.tensor([0.01, 0.36, 0.09]))
+    torch.testing.assert_close(near[0, 1], torch.ones(3))
+    said = Semantic(3, Sharper()).weigh(seen(grid), fixation, grid)
+    assert torch.equal(said.likelihood, near)
+    assert torch.equal(said.footprint[0, :2], grid.footprint(seen(grid).boxes)[0, :2])
+    assert not said.footprint[0, 2].any()
+
+
+def test_likelihoods_of_raw_scores_are_the_scores_and_uniform_for_padding():
+    grid = Grid(4, 3, (100, 60))
+    raw = likelihoods(seen(grid), torch.tensor([[10.0, 10.0]]), grid)
+    assert torch.equal(raw[0, :2], seen(grid).scores[0, :2])
+    torch.testing.assert_close(raw[0, 2], torch.full((3,), 1 / 3))
+    tempered = likelihoods(seen(grid), torch.tensor([[10.0, 10.0]]), grid, tempering=0.25)
+    torch.testing.assert_close(tempered, raw.double().pow(0.25).float())
+
+
+def test_a_map_starts_with_the_prior_in_the_dtype_it_is_given():
+    start = Semantic(2, prior=0.25).start(3, Grid(2, 2, (10, 10)), torch.empty(0, dtype=torch.float64))
+    assert torch.equal(start.beta, torch.full((3, 4, 2), 0.25, dtype=torch.float64))
+    assert torch.equal(start.closest, torch.full((3, 4), torch.inf, dtype=torch.float64))
+
+
+def test_bad_input():
+    beta = torch.ones(1, 4, 3)
+    with pytest.raises(InputError, match="likelihood"):
+        fuse(beta, torch.ones(1, 2, 5), torch.ones(1, 2, 4, dtype=torch.bool))
+    with pytest.raises(InputError, match="footprint"):
+        fuse(beta, torch.ones(1, 2, 3), torch.ones(1, 2, 4, dtype=torch.int64))
+    with pytest.raises(InputError, match="fusion rule"):
+        fuse(beta, torch.ones(1, 2, 3), torch.ones(1, 2, 4, dtype=torch.bool), "kalman")
+    with pytest.raises(InputError, match="prior"):
+        Semantic(2, prior=0)

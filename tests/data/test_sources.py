@@ -1,0 +1,79 @@
+"""Pictures come from files, folders, videos and embedded scenes, and what cannot be read says why."""
+
+import builtins
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from semfov.data.sources import embedded_picture, open_pictures
+from semfov.errors import DataError, InputError
+
+SHADES = (20, 90, 160, 230)
+
+
+@pytest.fixture
+def video(tmp_path):
+    """Eight frames, two of each shade."""
+    cv2 = pytest.importorskip("cv2")
+    path = tmp_path / "video.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 5, (64, 48))
+    for shade in SHADES:
+        for _ in range(2):
+            writer.write(np.full((48, 64, 3), (shade, 0, 0), np.uint8))
+    writer.release()
+    return path
+
+
+def test_photograph_and_folder(tmp_path):
+    for name in ("b.png", "a.jpg"):
+        Image.new("RGB", (8, 6), "red").save(tmp_path / name)
+    (tmp_path / "notes.txt").write_text("no picture")
+    (one,) = open_pictures(tmp_path / "b.png", None, 1)
+    assert one.name == "b.png"
+    torch.testing.assert_close(one.image, torch.tensor([1.0, 0, 0])[:, None, None].expand(3, 6, 8))
+    assert [picture.name for picture in open_pictures(tmp_path, None, 1)] == ["a.jpg", "b.png"]
+
+
+def test_frames_of_a_video_are_evenly_spaced(video):
+    taken = list(open_pictures(video, None, 4))
+    assert len(taken) == 4
+    # Blue, which OpenCV puts first, is the last channel here.
+    shades = [float(picture.image[2].mean() * 255) for picture in taken]
+    np.testing.assert_allclose(shades, SHADES, atol=6)
+    assert all(float(picture.image[0].mean()) < 0.1 for picture in taken)
+    assert taken[0].name == "video.avi, frame 1"
+
+
+def test_more_frames_than_there_are(video):
+    assert len(list(open_pictures(video, None, 100))) == 8
+
+
+def test_what_cannot_be_read(tmp_path, monkeypatch):
+    with pytest.raises(DataError, match="no such file"):
+        list(open_pictures(tmp_path / "none.jpg", None, 1))
+    with pytest.raises(DataError, match="found none"):
+        list(open_pictures(tmp_path, None, 1))
+    with pytest.raises(InputError, match="both or none"):
+        list(open_pictures(tmp_path, 0, 1))
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes(b"no video")
+    real = builtins.__import__
+
+    def without_opencv(name, *rest, **options):
+        if name == "cv2":
+            raise ImportError(name)
+        return real(name, *rest, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without_opencv)
+    with pytest.raises(DataError, match="pip install opencv-python-headless"):
+        list(open_pictures(broken, None, 1))
+
+
+def test_embedded_scene_holds_the_target():
+    picture = embedded_picture(("person", "cup"), "cup", seed=2)
+    assert picture.image.shape == (3, 480, 640)
+    assert len(picture.boxes) == 1
+    with pytest.raises(InputError, match="hold cup, person"):
+        embedded_picture(("person", "cup", "car"), "car", seed=0)

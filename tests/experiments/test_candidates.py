@@ -1,0 +1,246 @@
+"""From a policy's settings to observer, policy and models."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from semfov import DirichletBelief, FovealObservationModel, Grid, TargetEvidence, observers, policies
+from semfov.agent import Strategy
+from semfov.belief import ContextPrior
+from semfov.errors import InputError
+from semfov.experiments import candidates
+from semfov.experiments.candidates import Candidate, Models, load_models, make_strategy, needs_observation
+from semfov.experiments.config import BeliefConfig, ExploreConfig, PolicyConfig, SearchConfig
+from semfov.experiments.presets import known_policies, presets, resolve
+from semfov.gaze import LearnedGaze
+from semfov.gaze.acquisition import (
+    ExpectedAccuracy,
+    NeighbourhoodPosterior,
+    PredictedTargetPosterior,
+    SaliencyPrior,
+    Static,
+    TargetPosterior,
+)
+
+GRID = Grid(4, 3, (40, 30))
+FOVEA = 100 / 640
+
+
+@pytest.fixture
+def model():
+    return FovealObservationModel.identity(["cup", "cat"], [0.2], miss_rate=torch.full((3, 2), 0.5))
+
+
+@pytest.fixture
+def context():
+    weights = {"evidence": (0.5, 0.25), "map": (1.0, 2.0)}
+    return ContextPrior(["cup", "cat"], torch.zeros(3, 2, 2), torch.zeros(3, 3, 1), [], weights=weights)
+
+
+def strategy(policy, task="search", belief=None, fovea=FOVEA, **models):
+    """The strategy of a policy for two classes, by the models that are given."""
+    return make_strategy(resolve(policy, task), task, belief or BeliefConfig(), 3, Models(**models), fovea)
+
+
+def needed(belief=None, *choices, task="search"):
+    return needs_observation([resolve(choice, task) for choice in choices], belief or BeliefConfig())
+
+
+def test_a_model_is_needed_to_predict_to_calibrate_and_for_misses():
+    soft = PolicyConfig("non-predictive", footprint="soft")
+    assert not needed(None, "random", "target-evidence", "learned", "vocus2", "non-predictive-raw", soft)
+    assert not needed(None, "random-raw", "closer-look-raw", "itti-koch-raw", "recommended", task="exploration")
+    assert needed(None, PolicyConfig("non-predictive", misses=True))
+    assert needed(None, "random", "non-predictive-calibrated")
+    assert needed(None, "closer-look-calibrated", task="exploration")
+    assert needed(BeliefConfig(misses=True), "non-predictive-raw")
+    assert not needed(BeliefConfig(misses=True), PolicyConfig("non-predictive", misses=False))
+    ahead = ("predictive", "neighbourhood", "foveal-hit", "place-information")
+    assert all(needed(None, PolicyConfig(name)) for name in ahead)
+    without = {"random", "closer-look", "saliency"}
+    for name in known_policies("exploration"):
+        given = PolicyConfig(name, saliency="vocus2" if name == "saliency" else None)
+        assert needed(None, given, task="exploration") == (name not in without)
+
+
+def test_a_model_is_needed_for_every_preset_that_cannot_be_made_without(model):
+    """What is needed is what making it asks for, and nothing else."""
+    others = {"evidence": TargetEvidence(4, 4), "gaze": LearnedGaze(4)}
+    for task in ("search", "exploration"):
+        for preset in presets(task).values():
+            assert isinstance(strategy(preset, task, observation=model, **others), Strategy)
+            if needs_observation([preset], BeliefConfig()):
+                with pytest.raises(InputError, match="observation model"):
+                    strategy(preset, task, **others)
+            else:
+                strategy(preset, task, **others)
+
+
+def test_what_a_policy_needs_does_not_hang_on_saliency():
+    for policy in ("random", "non-predictive", "predictive", "target-evidence", "learned"):
+        assert needed(None, PolicyConfig(policy, saliency="vocus2")) == needed(None, PolicyConfig(policy))
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Which models a run would load, by the names that they are asked for."""
+    asked = []
+    for kind in ("observation", "target_evidence", "context", "learned_gaze"):
+
+        def make(name, eye, kind=kind):
+            asked.append((kind, name))
+            return kind
+
+        monkeypatch.setattr(candidates, f"make_{kind}", make)
+    return asked
+
+
+def test_a_run_loads_what_its_policies_need_and_nothing_else(asked):
+    eye = SimpleNamespace()
+    assert load_models(SearchConfig(policies=("random", "non-predictive-raw")), "search", eye) == Models()
+    assert load_models(ExploreConfig(policies=("recommended", "vocus2-raw")), "exploration", eye) == Models()
+    assert asked == []
+    guided = PolicyConfig("target-evidence", saliency="vocus2", context="place")
+    every = SearchConfig(
+        policies=("random", guided, "learned", "predictive-raw"),
+        belief=BeliefConfig(model="mine", target_model="sought", context_model="company"),
+        gaze_model="gaze",
+    )
+    models = load_models(every, "search", eye)
+    assert models == Models("observation", "target_evidence", "context", "learned_gaze")
+    assert sorted(asked) == [
+        ("context", "company"),
+        ("learned_gaze", "gaze"),
+        ("observation", "mine"),
+        ("target_evidence", "sought"),
+    ]
+
+
+def test_context_is_loaded_where_a_policy_or_the_run_asks_for_it(asked):
+    eye = SimpleNamespace()
+
+    def loads(belief, *choices):
+        return load_models(SearchConfig(policies=choices, belief=belief), "search", eye).context is not None
+
+    assert loads(BeliefConfig(), "random", PolicyConfig("target-evidence", context="both"))
+    assert loads(BeliefConfig(context="place"), "target-evidence")
+    assert not loads(BeliefConfig(), "target-evidence", PolicyConfig("non-predictive", footprint="soft"))
+    assert not loads(BeliefConfig(context="place"), PolicyConfig("target-evidence", context="none"))
+
+
+@pytest.mark.parametrize("config", [SearchConfig, ExploreConfig])
+def test_a_run_has_a_policy(config):
+    with pytest.raises(InputError, match="policies: expected at least one"):
+        load_models(config(policies=()), "search" if config is SearchConfig else "exploration", SimpleNamespace())
+
+
+def test_strategies_are_made_as_set(model):
+    ahead = strategy(PolicyConfig("predictive", misses=True, tempering=0.25), observation=model)
+    assert ahead.observer.misses is model
+    assert ahead.observer.observation is None
+    assert ahead.observer.tempering == 0.25
+    assert isinstance(ahead.policy(1, GRID), PredictedTargetPosterior)
+    explorer = strategy(PolicyConfig("expected-accuracy", "calibrated", misses=True), "exploration", observation=model)
+    assert explorer.observer.observation is model
+    assert explorer.observer.misses is model
+    assert isinstance(explorer.policy(None, GRID), ExpectedAccuracy)
+    with pytest.raises(InputError, match="misses"):
+        strategy("random", belief=BeliefConfig(misses=True))
+    with pytest.raises(InputError, match="scores"):
+        strategy("non-predictive-calibrated")
+
+
+def test_what_a_policy_does_not_set_is_as_the_run_has_it(model):
+    run = BeliefConfig(prior=0.3, fusion="sum", footprint="soft", tempering=0.7, memory="closest", misses=True)
+    plain = strategy("non-predictive-raw", belief=run, observation=model).observer
+    settings = plain.prior, plain.fusion, plain.footprint, plain.tempering, plain.memory, plain.misses
+    assert settings == (0.3, "sum", "soft", 0.7, "closest", model)
+    own = PolicyConfig("non-predictive", tempering=1.0, footprint="box_centre", memory="all", misses=False)
+    changed = strategy(own, belief=run, observation=model).observer
+    settings = changed.prior, changed.fusion, changed.footprint, changed.tempering, changed.memory, changed.misses
+    assert settings == (0.3, "sum", "box_centre", 1.0, "all", None)
+
+
+def test_neighbours_come_from_a_predicted_map(model):
+    made = strategy("neighbourhood-raw", observation=model)
+    assert isinstance(made.policy(1, GRID), NeighbourhoodPosterior)
+    with pytest.raises(InputError, match="observation model"):
+        strategy("neighbourhood-raw")
+
+
+def test_divergence_is_from_the_prior_of_the_run(model):
+    explorer = strategy("kl-raw", "exploration", BeliefConfig(prior=0.25), observation=model)
+    assert explorer.policy(None, GRID).prior == explorer.observer.prior == 0.25
+
+
+def test_the_closer_look_is_through_the_fovea_of_the_run():
+    assert strategy("closer-look-raw", "exploration", fovea=0.07).policy.fovea == 0.07
+
+
+def test_learned_beliefs_come_with_their_policies():
+    evidence, gaze = TargetEvidence(4, 4), LearnedGaze(4)
+    sought = strategy("target-evidence", evidence=evidence)
+    assert isinstance(sought.observer, observers.Target)
+    assert sought.observer.model is evidence
+    assert isinstance(sought.policy, policies.NonPredictive)
+    learned = strategy("learned", belief=BeliefConfig(prior=0.3), gaze=gaze)
+    own = gaze.observer(3)
+    assert (learned.observer.prior, learned.observer.tempering) == (own.prior, own.tempering)
+    assert learned.policy.gaze is gaze
+    for name in ("target-evidence", "learned"):
+        with pytest.raises(InputError, match="learned"):
+            strategy(name)
+
+
+def test_context_is_added_where_a_policy_asks_for_it(context):
+    given = {"context": context, "evidence": TargetEvidence(4, 4)}
+    assert isinstance(strategy("non-predictive-raw", **given).observer, observers.Semantic)
+    parts = {"both": (1.0, 2.0), "place": (1.0, 0.0), "cooccurrence": (0.0, 2.0)}
+    for part, expected in parts.items():
+        own = strategy(PolicyConfig("non-predictive", context=part), **given).observer
+        of_the_run = strategy("non-predictive-raw", belief=BeliefConfig(context=part), **given).observer
+        for observer in (own, of_the_run):
+            assert isinstance(observer, observers.Context)
+            assert isinstance(observer.observer, observers.Semantic)
+            assert observer.weights == expected
+    sought = strategy(PolicyConfig("target-evidence", context="both"), **given).observer
+    assert isinstance(sought.observer, observers.Target)
+    assert sought.weights == (0.5, 0.25)
+    none = strategy(PolicyConfig("non-predictive", context="none"), belief=BeliefConfig(context="both"), **given)
+    assert isinstance(none.observer, observers.Semantic)
+    with pytest.raises(InputError, match="context: expected a fitted context"):
+        strategy(PolicyConfig("non-predictive", context="both"))
+
+
+def test_context_is_refused_where_a_policy_cannot_use_it(context, model):
+    for policy, task in (("predictive", "search"), ("random", "search"), ("random", "exploration")):
+        with pytest.raises(InputError, match="context: expected a search by the probability of the target"):
+            strategy(PolicyConfig(policy, context="both"), task, context=context, observation=model)
+
+
+def test_saliency_alone_stands_on_the_belief_of_the_run(model):
+    made = strategy(PolicyConfig("saliency", "calibrated", saliency="vocus2"), "exploration", observation=model)
+    assert isinstance(made.policy, policies.Random)
+    assert made.observer.observation is model
+
+
+@pytest.mark.parametrize("rows", [1, 12], ids=["of the picture", "from every cell"])
+def test_saliency_takes_a_policys_place_or_stands_beside_it(rows):
+    cell, visited = torch.tensor([5, 0]), torch.zeros(2, 12, dtype=torch.bool)
+    table = torch.rand(rows, 12, generator=torch.Generator().manual_seed(0))
+    seen = table[cell] if rows > 1 else table.expand(2, -1)
+    belief = DirichletBelief(0.5 + torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)))
+    random = Strategy(observers.Semantic(3), policies.Random())
+    alone = Candidate(random, table).acquisition(1, GRID, cell)
+    assert isinstance(alone, Static)
+    torch.testing.assert_close(alone(belief, visited), seen)
+    sought = Strategy(observers.Semantic(3), policies.NonPredictive())
+    beside = Candidate(sought, table, 0.4).acquisition(1, GRID, cell)
+    assert isinstance(beside, SaliencyPrior)
+    raised = seen + 1e-3 * seen.amax(-1, keepdim=True)
+    expected = belief.probability(1).log() + 0.4 * (raised / raised.sum(-1, keepdim=True)).log()
+    torch.testing.assert_close(beside(belief, visited), expected)
+    plain = Candidate(sought)
+    assert plain.observer is sought.observer
+    assert isinstance(plain.acquisition(1, GRID, cell), TargetPosterior)

@@ -1,0 +1,221 @@
+"""Policies as settings have them: names, mappings, what tables call them, and what is refused."""
+
+from dataclasses import asdict, fields, replace
+from itertools import combinations
+from typing import get_args
+
+import pytest
+import yaml
+
+from semfov.errors import InputError
+from semfov.experiments.command import run_command
+from semfov.experiments.config import ExploreConfig, PolicyConfig, SearchConfig
+from semfov.experiments.presets import WORDS, known_policies, label, presets, resolve
+from semfov.experiments.setup import plain
+from semfov.gaze.policies import Task, policy_names
+
+TASKS = get_args(Task)
+ALIASES = {
+    "search": {"recommended": "target-evidence", "published": "predictive-calibrated"},
+    "exploration": {"recommended": "closer-look-raw, tempering 0.5", "published": "kl-calibrated"},
+}
+
+# One change each; together, every word that a setting can be.
+CHANGES = [
+    {"tempering": 0.25},
+    {"tempering": 0.5},
+    {"tempering": 1.0},
+    {"misses": True},
+    {"misses": False},
+    *({name: word} for name, words in WORDS.items() if name != "scores" for word in get_args(words)),
+]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_policy_has_a_preset(task):
+    made = {preset.policy for preset in presets(task).values()}
+    assert made == set(known_policies(task)) >= set(policy_names(task))
+    for name, preset in presets(task).items():
+        assert resolve(name, task) == resolve(preset, task) == preset
+
+
+def test_names_tell_policy_scores_and_saliency():
+    assert resolve("predictive-calibrated", "search") == PolicyConfig("predictive", "calibrated")
+    assert resolve("place-information-raw", "search") == PolicyConfig("place-information", "raw")
+    assert resolve("learned", "search") == PolicyConfig("learned")
+    assert resolve("vocus2", "search") == PolicyConfig("saliency", saliency="vocus2")
+    assert resolve("expected-accuracy-raw", "exploration") == PolicyConfig("expected-accuracy")
+    assert resolve("itti-koch-calibrated", "exploration") == PolicyConfig(
+        "saliency", "calibrated", saliency="itti-koch"
+    )
+    assert resolve("recommended", "search") == PolicyConfig("target-evidence")
+    assert resolve("recommended", "exploration") == PolicyConfig("closer-look", tempering=0.5)
+    assert resolve("published", "search") == PolicyConfig("predictive", "calibrated")
+    assert resolve("published", "exploration") == PolicyConfig("kl", "calibrated")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_presets_are_called_by_their_names(task):
+    for name in presets(task):
+        assert label(name, task) == ALIASES[task].get(name, name)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_labels_are_unique(task):
+    """Two policies of a run with one label would be one policy of its tables."""
+    several = [{}, *CHANGES, *({**one, **other} for one, other in combinations(CHANGES, 2))]
+    made = set()
+    for preset in presets(task).values():
+        for change in several:
+            try:
+                made.add(resolve(replace(preset, **change), task))
+            except InputError:
+                continue
+    labels = {label(policy, task) for policy in made}
+    assert len(labels) == len(made) > 500
+    assert labels >= {label(name, task) for name in presets(task)}
+
+
+def test_labels_say_what_differs_from_a_preset():
+    central = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
+    assert label(central, "search") == "non-predictive-raw, tempering 0.25, footprint box_centre"
+    everything = PolicyConfig("predictive", "calibrated", 1.0, "soft", "closest", True, "vocus2", "none")
+    assert len(fields(PolicyConfig)) == 8
+    expected = (
+        "predictive-calibrated, tempering 1, footprint soft, memory closest, misses, saliency vocus2, context none"
+    )
+    assert label(everything, "search") == expected
+    assert label(PolicyConfig("saliency", saliency="itti-koch", misses=False), "search") == "itti-koch, misses false"
+    assert label(PolicyConfig("target-evidence", context="place"), "search") == "target-evidence, context place"
+    assert label(PolicyConfig("kl", saliency="itti-koch"), "exploration") == "kl-raw, saliency itti-koch"
+
+
+@pytest.mark.parametrize(
+    ("choice", "task", "suggested"),
+    [
+        ("predicitve-raw", "search", "predictive-raw"),
+        ("target-evidenc", "search", "target-evidence"),
+        ("recomended", "exploration", "recommended"),
+        ("random", "exploration", "random-raw"),
+        (PolicyConfig("predictiv"), "search", "predictive"),
+        (PolicyConfig("closer-lok"), "exploration", "closer-look"),
+        (PolicyConfig("kl", memory="closets"), "exploration", "closest"),
+        (PolicyConfig("kl", footprint="box-centre"), "exploration", "box_centre"),
+        (PolicyConfig("kl", saliency="vocus"), "exploration", "vocus2"),
+        (PolicyConfig("kl", "calibratd"), "exploration", "calibrated"),
+        (PolicyConfig("non-predictive", context="cooccurence"), "search", "cooccurrence"),
+    ],
+    ids=str,
+)
+def test_unknown_names_get_a_suggestion(choice, task, suggested):
+    for call in (resolve, label):
+        with pytest.raises(InputError, match=f"did you mean '{suggested}'"):
+            call(choice, task)
+
+
+def test_a_policy_of_the_other_task_is_refused():
+    with pytest.raises(InputError, match="policy"):
+        resolve(PolicyConfig("kl"), "search")
+    with pytest.raises(InputError, match="policy"):
+        resolve(PolicyConfig("target-evidence"), "exploration")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_saliency_without_a_model_is_refused(task):
+    with pytest.raises(InputError, match=r"^saliency: .*vocus2, itti-koch"):
+        resolve(PolicyConfig("saliency"), task)
+
+
+@pytest.mark.parametrize("tempering", [0.0, -0.5, float("nan")])
+def test_an_exponent_out_of_range_is_refused(tempering):
+    with pytest.raises(InputError, match=r"^tempering: expected a positive number"):
+        resolve(PolicyConfig("kl", tempering=tempering), "exploration")
+
+
+@pytest.mark.parametrize("policy", ["random", "learned", "target-evidence", "saliency"])
+def test_scores_that_a_policy_has_no_use_for_are_refused(policy):
+    """Its label could not tell it from the one with raw scores."""
+    saliency = "vocus2" if policy == "saliency" else None
+    with pytest.raises(InputError, match=f"^scores: .*'{policy}'"):
+        resolve(PolicyConfig(policy, "calibrated", saliency=saliency), "search")
+
+
+@pytest.mark.parametrize("policy", ["learned", "target-evidence"])
+@pytest.mark.parametrize(
+    "change", [{"tempering": 0.25}, {"footprint": "soft"}, {"memory": "all"}, {"misses": True}], ids=str
+)
+def test_settings_of_a_map_are_refused_where_a_belief_comes_with_the_policy(policy, change):
+    with pytest.raises(InputError, match=f"^{next(iter(change))}: .*'{policy}'"):
+        resolve(PolicyConfig(policy, **change), "search")
+
+
+def parsed(config, *arguments):
+    """What a command line gives."""
+    got = []
+    assert run_command(got.append, config, "Policies.", arguments) == 0
+    (settings,) = got
+    return settings.policies
+
+
+MAPPING = "[{policy: non-predictive, tempering: 0.25}, random]"
+
+
+def test_a_mapping_is_a_policy_on_the_command_line():
+    assert parsed(SearchConfig, "--policies", MAPPING) == (PolicyConfig("non-predictive", tempering=0.25), "random")
+    given = "[recommended, {policy: kl, scores: calibrated, memory: closest, misses: true}]"
+    expected = "recommended", PolicyConfig("kl", "calibrated", memory="closest", misses=True)
+    assert parsed(ExploreConfig, "--policies", given) == expected
+
+
+def test_a_mapping_is_a_policy_in_yaml(tmp_path):
+    path = tmp_path / "run.yaml"
+    path.write_text(f"policies: {MAPPING}\n")
+    assert parsed(SearchConfig, "--config", str(path)) == (PolicyConfig("non-predictive", tempering=0.25), "random")
+    path.write_text("policies:\n- policy: saliency\n  saliency: vocus2\n- kl-raw\n")
+    assert parsed(ExploreConfig, "--config", str(path)) == (PolicyConfig("saliency", saliency="vocus2"), "kl-raw")
+
+
+@pytest.mark.parametrize("config", [SearchConfig, ExploreConfig])
+def test_settings_that_a_run_wrote_are_its_settings(config, tmp_path):
+    policies = (PolicyConfig("random", saliency="vocus2"), *config().policies)
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(plain(asdict(replace(config(), policies=policies))), sort_keys=False))
+    assert parsed(config, "--config", str(path)) == policies
+
+
+BAD = {
+    "temperring": "{policy: non-predictive, temperring: 0.25}",
+    "tempering": "{policy: non-predictive, tempering: cold}",
+    "scores": "{policy: non-predictive, scores: cooked}",
+    "policy": "{tempering: 0.25}",
+}
+
+
+@pytest.mark.parametrize("wrong", BAD)
+def test_a_mapping_that_is_none_of_a_policy_is_refused_in_yaml(wrong, tmp_path, capsys):
+    path = tmp_path / "run.yaml"
+    path.write_text(f"policies:\n- {BAD[wrong]}\n")
+    with pytest.raises(SystemExit) as stopped:
+        parsed(SearchConfig, "--config", str(path))
+    assert stopped.value.code == 2
+    told = capsys.readouterr().err
+    assert "policies" in told
+    assert wrong in told
+
+
+@pytest.mark.parametrize("wrong", BAD)
+def test_a_mapping_that_is_none_of_a_policy_is_refused_on_the_command_line(wrong, capsys):
+    """The parser may take such a thing for text, which is then no name."""
+
+    def run(config):
+        for choice in config.policies:
+            resolve(choice, "search")
+
+    try:
+        code = run_command(run, SearchConfig, "Policies.", ["--policies", f"[random, {BAD[wrong]}]"])
+    except SystemExit as stopped:
+        code = stopped.code
+    assert code in (1, 2)
+    told = capsys.readouterr().err
+    assert "policies" in told
+    assert wrong in told

@@ -1,0 +1,100 @@
+"""The page of a run shows the run: its curves, its episodes as recorded, no more bytes than it may."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import semfov.experiments.run_report as module
+from semfov.experiments import explore_report, search_report
+from semfov.experiments.config import BeliefConfig, DataConfig, ExploreConfig, ProtocolConfig, SearchConfig
+from semfov.experiments.run_report import choose_episodes, write_run_report
+from semfov.experiments.runs import ExploreRun, SearchRun
+
+pytestmark = pytest.mark.weights
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    return {
+        "data": DataConfig(limit=2),
+        "belief": BeliefConfig(columns=4, rows=3),
+        "protocol": ProtocolConfig(starts=2, shifts=5),
+        "cache": folder / "cache",
+        "out": folder / "out",
+        "workers": 1,
+    }
+
+
+@pytest.fixture(scope="module")
+def searched(settings):
+    run = SearchRun(SearchConfig(**settings, policies=("random", "non-predictive-raw")))
+    return run, [record for index in range(2) for record in run.outcomes(index)[0]]
+
+
+def write_search(run, records, **options):
+    policies = list(run.policies)
+    curves = {"all targets": search_report.performance(records, policies, 5, "all targets")}
+    path = write_run_report(
+        run,
+        records,
+        curves,
+        titles=search_report.AVERAGES,
+        label="targets found (%)",
+        shifts=search_report.SHIFTS,
+        others={"random, by formula": search_report.expected_random(records, 5, 12)},
+        **options,
+    )
+    page = path.read_text(encoding="utf-8")
+    return curves, page, json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])
+
+
+def test_search(searched):
+    run, records = searched
+    curves, page, data = write_search(run, records)
+    chosen = choose_episodes(records, list(run.policies), 18)
+    assert len(chosen) == 4
+    for episode, record in zip(data["episodes"], chosen, strict=True):
+        assert [each["cell"] for each in episode["fixations"]] == record["cells"]
+        assert record["policy"] in episode["name"]
+        assert episode["target"] == record["target_name"]
+        assert episode["found"] == (record["found_at"] >= 0)
+    policies = [record["policy"] for record in chosen]
+    assert policies == ["random", "non-predictive-raw"] * 2
+    curve = curves["all targets"]["random"]
+    assert f"{100 * curve.mean[5]:.1f} ± {100 * curve.over_images[5]:.1f}" in page
+    assert "random, by formula" in page
+    assert "min_instances" in page
+
+
+def test_no_more_than_the_limit(searched, monkeypatch):
+    run, records = searched
+    monkeypatch.setattr(module, "LIMIT", 1)
+    _, _, data = write_search(run, records)
+    assert len(data["episodes"]) == 1
+
+
+def test_exploration(settings):
+    run = ExploreRun(ExploreConfig(**settings, policies=("random-raw", "kl-calibrated")))
+    records = run.outcomes(0)[0]
+    curves = {"all classes": explore_report.success(records, list(run.policies), "all classes")}
+    path = write_run_report(
+        run,
+        records,
+        curves,
+        titles={"all classes": "all classes"},
+        label="cells with the right class (%)",
+        shifts=explore_report.SHIFTS,
+    )
+    data = json.loads(re.search(r'id="data">(.*?)</script>', path.read_text(encoding="utf-8"), re.S)[1])
+    assert [episode["target"] for episode in data["episodes"]] == [None, None]
+    kl = next(record for record in records if record["policy"] == "kl-calibrated" and record["repetition"] == 0)
+    assert [each["cell"] for each in data["episodes"][1]["fixations"]] == kl["cells"]
+    # What was replayed is what the gaze followed: of the cells not yet visited, the next has the greatest value.
+    fixations = data["episodes"][1]["fixations"]
+    for number, each in enumerate(fixations[:-1]):
+        values = np.array(each["values"], dtype=float)
+        values[[earlier["cell"] for earlier in fixations[: number + 1]]] = -np.inf
+        assert values[each["next"]] == pytest.approx(values.max(), rel=1e-3)

@@ -1,0 +1,119 @@
+"""Tables of a run: averages and both standard errors by hand, and what stands in which column."""
+
+import csv
+import io
+import statistics
+
+import numpy as np
+import pytest
+
+from semfov.experiments import explore_report, search_report
+from semfov.experiments.summary import LAST_COLUMN, curve_of, curve_rows, curves_csv, percent
+from semfov.metrics.exploration import success_rate
+
+# Gaze shift at which a search found its target, by image and repetition.
+FOUND = {"one": [0, 1, -1], "two": [1, 1, 2], "three": [-1, 2, 0]}
+
+
+def searches(policy="random"):
+    return [
+        {"policy": policy, "scene": scene, "repetition": repetition, "commonest": True, "found_at": found}
+        for scene, repetitions in FOUND.items()
+        for repetition, found in enumerate(repetitions)
+    ]
+
+
+def explorations(policy="kl-raw"):
+    """Two images of four cells with objects: after each of two shifts one more cell is right."""
+    return [
+        {
+            "policy": policy,
+            "scene": scene,
+            "repetition": repetition,
+            "right": [scene + repetition, scene + repetition + 1, scene + repetition + 2],
+            "right_without_background": [4, 4, 4],
+            "object_cells": 4,
+        }
+        for scene in (0, 1)
+        for repetition in (0, 1)
+    ]
+
+
+def error(values):
+    return statistics.stdev(values) / len(values) ** 0.5
+
+
+def found_by(shift):
+    """Share of an image's searches that have found their target, and of a repetition's."""
+    hits = {scene: [0 <= at <= shift for at in found] for scene, found in FOUND.items()}
+    return [statistics.mean(each) for each in hits.values()], [
+        statistics.mean(r) for r in zip(*hits.values(), strict=True)
+    ]
+
+
+def test_means_and_errors_by_hand():
+    curve = search_report.performance(searches(), ("random",), 2, "all targets")["random"]
+    assert (curve.images, curve.episodes) == (3, 9)
+    for shift in range(3):
+        images, repetitions = found_by(shift)
+        assert curve.mean[shift] == pytest.approx(statistics.mean(images))
+        assert curve.over_images[shift] == pytest.approx(error(images))
+        assert curve.over_repetitions[shift] == pytest.approx(error(repetitions))
+
+
+def test_the_last_column_is_the_largest_error_over_repetitions():
+    """The paper's Max. SEM: over the mean curves of the repetitions, the largest of all gaze shifts."""
+    curves = search_report.performance(searches(), ("random",), 2, "all targets")
+    (row,) = curve_rows(curves, [0, 2])
+    largest = max(error(found_by(shift)[1]) for shift in range(3))
+    assert row == ["random", *(percent(*map(float, each)) for each in ends(curves["random"])), f"{100 * largest:.2f}"]
+    assert LAST_COLUMN == "max. SEM over repetitions"
+
+
+def ends(curve):
+    return [(curve.mean[shift], curve.over_images[shift]) for shift in (0, 2)]
+
+
+def cells_of(text):
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
+
+
+def test_search_tables_have_a_row_for_each_policy_and_no_times():
+    curves = {
+        average: search_report.performance(searches(), ("random",), 2, average) for average in search_report.AVERAGES
+    }
+    text = search_report.summary_markdown(curves, np.array([0.0, 0.25, 0.5]), "an eye")
+    head, _, row, formula, *rest = cells_of(text)
+    assert head == ["policy", "CP@1", LAST_COLUMN]
+    assert (row[0], formula) == ("random", ["random, by formula", "25.0", ""])
+    assert len(rest) == 3
+    assert " ms" not in text
+    assert "millisecond" not in text
+
+
+def test_exploration_tables_name_the_published_answer_first():
+    curves = {answer: explore_report.success(explorations(), ("kl-raw",), answer) for answer in explore_report.ANSWERS}
+    text = explore_report.summary_markdown(curves, 2, "an eye")
+    published, other = text.split("**as published", 1)[1].split("**the answer", 1)
+    assert "most probable of all classes, background among them" in published
+    assert "most probable class but background" in other
+    head, _, row = cells_of(published)
+    assert head == ["policy", "0", "1", "2", LAST_COLUMN]
+    # Means 1/4, 2/4, 3/4; images and repetitions differ by a quarter, so both errors are an eighth.
+    assert row == ["kl-raw", "25.0 ± 12.5", "50.0 ± 12.5", "75.0 ± 12.5", "12.50"]
+    assert cells_of(other)[2] == ["kl-raw", *["100.0 ± 0.0"] * 3, "0.00"]
+
+
+def test_csv_has_every_gaze_shift():
+    curves = {"all targets": search_report.performance(searches(), ("random",), 2, "all targets")}
+    rows = list(csv.DictReader(io.StringIO(curves_csv(curves, ("average", "performance")))))
+    assert [int(row["shifts"]) for row in rows] == [0, 1, 2]
+    for row, shift in zip(rows, range(3), strict=True):
+        assert float(row["error_over_repetitions"]) == pytest.approx(error(found_by(shift)[1]), abs=1e-6)
+
+
+def test_one_repetition_has_no_error():
+    curve = curve_of([r for r in explorations() if r["repetition"] == 0], lambda r: success_rate(r["right"], 4))
+    assert np.isnan(curve.over_repetitions).all()
+    assert curve.over_images == pytest.approx([0.125] * 3)
+    assert percent(0.5, float("nan")) == "50.0"

@@ -1,0 +1,39 @@
+"""Figures of explorations: what is right for a cell, and when a belief is right about it."""
+
+import numpy as np
+import torch
+
+from semfov import Grid
+from semfov.data import Annotation
+from semfov.metrics.exploration import answers_of, count_right, success_rate
+
+
+def test_answers_are_the_classes_of_overlapping_objects():
+    annotation = Annotation(
+        torch.tensor([[1.0, 1, 19, 19], [15, 5, 45, 15], [62, 42, 78, 58]]),
+        torch.tensor([1, 2, 3]),
+        torch.zeros(3, dtype=torch.bool),
+        (80, 60),
+    )
+    answers = answers_of(annotation, Grid(4, 3, (80, 60)), 4)
+    found = {cell: set(row.nonzero()[:, 0].tolist()) for cell, row in enumerate(answers) if row.any()}
+    assert found == {0: {1, 2}, 1: {2}, 2: {2}, 11: {3}}
+
+
+def test_success_is_the_most_probable_of_all_classes():
+    """Section IV-A: the "highest categorical score" must fit an overlapping object, and background has a score, too."""
+    answers = torch.tensor([[False, True, False]] * 4)
+    beta = torch.tensor([[[0.2, 0.7, 0.1], [0.6, 0.3, 0.1], [0.1, 0.3, 0.6], [0.4, 0.35, 0.25]]])
+    assert count_right(beta, answers).tolist() == [1]
+    # Without background as an answer the class is right where background was a little more probable.
+    assert count_right(beta[..., 1:], answers[:, 1:]).tolist() == [3]
+
+
+def test_what_is_not_known_is_not_right():
+    answers = torch.tensor([[False, True], [False, True], [True, True]])
+    beta = torch.tensor([[[0.5, 0.5], [0.5, 0.6], [0.6, 0.5]]])
+    assert count_right(beta, answers).tolist() == [2]
+
+
+def test_success_rate_by_hand():
+    np.testing.assert_allclose(success_rate([0, 1, 3], 4), [0, 0.25, 0.75])

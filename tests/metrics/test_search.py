@@ -1,0 +1,19 @@
+"""Figures of searches against simulation and hand counts."""
+
+import numpy as np
+
+from semfov.metrics.search import cumulative_performance, random_search
+
+
+def test_cumulative_performance_by_hand():
+    found = np.array([[1, -1, 2], [0, 0, 5]])
+    curves = cumulative_performance(found, 3)
+    np.testing.assert_allclose(curves, [[0, 1 / 3, 2 / 3, 2 / 3], [2 / 3] * 4])
+
+
+def test_random_search_equals_simulation():
+    generator = np.random.default_rng(0)
+    hits = np.array([min(np.flatnonzero(np.isin(generator.permutation(19), range(3)))) + 1 for _ in range(20_000)])
+    simulated = [(hits <= n).mean() for n in range(20)]
+    np.testing.assert_allclose(random_search(3, 19, cells=20), simulated, atol=0.015)
+    assert random_search(3, 25, cells=20)[-1] == 1

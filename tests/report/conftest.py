@@ -1,0 +1,76 @@
+"""An episode and a run that need no detector, with names that try to be markup."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from semfov import Detections, Grid, Scanpath
+from semfov.experiments import run_report
+from semfov.experiments.config import DataConfig, PolicyConfig, SearchConfig
+from semfov.experiments.summary import Curve
+
+
+@pytest.fixture
+def hostile() -> str:
+    """A name that would run if it were taken for markup: in an attribute, a text, the title or a script."""
+    attack = "<img src=x onerror=\"alert('taken')\"><script>alert('taken')</script>"
+    return f"\"'>{attack}</title></script>{attack}<!--<script>"
+
+
+@pytest.fixture
+def scanpath(hostile: str) -> Scanpath:
+    """Three fixations on a 4 × 3 grid; what is believed and seen differs from each to the next."""
+    generator = torch.Generator().manual_seed(0)
+    grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 6, 11])
+    scores = torch.rand(3, 2, 4, generator=generator).softmax(-1)
+    corner = torch.rand(3, 2, 2, generator=generator) * 40
+    boxes = torch.cat([corner, corner + 18], -1)
+    looks = Detections(boxes, scores, torch.ones(3, 2, dtype=torch.bool))
+    return Scanpath(
+        grid=grid,
+        classes=("background", "cat", hostile, "cup"),
+        target=2,
+        cells=cells,
+        fixations=grid.centres[cells],
+        detections=tuple(looks[number : number + 1] for number in range(3)),
+        beliefs=torch.rand(3, 12, 4, generator=generator) + 0.1,
+        values=torch.rand(3, 12, generator=generator),
+        found=True,
+        posterior=torch.rand(3, 12, generator=generator),
+    )
+
+
+@pytest.fixture
+def image() -> torch.Tensor:
+    """A picture in the frame of the episode."""
+    across, down = torch.linspace(0, 1, 80).expand(60, 80), torch.linspace(0, 1, 60)[:, None].expand(60, 80)
+    return torch.stack([across, down, 1 - across])
+
+
+@pytest.fixture
+def run_page(scanpath: Scanpath, image: torch.Tensor, hostile: str, tmp_path: Path, monkeypatch) -> Path:
+    """The page of a run of which everything is called that."""
+    scene = SimpleNamespace(name=hostile, image=image, boxes=torch.ones(1, 4), labels=torch.tensor([2]))
+    run = SimpleNamespace(
+        task=hostile,
+        policies={hostile: PolicyConfig("random")},
+        config=SearchConfig(data=DataConfig(annotations=Path(hostile)), policies=(hostile,), out=tmp_path / "run"),
+        eye=SimpleNamespace(detector=SimpleNamespace(name=hostile)),
+        scenes=type("Scenes", (list,), {"ids": [7]})([scene]),
+    )
+    run.config.out.mkdir()
+    monkeypatch.setattr(run_report, "foveated_views", lambda eye, image, fixations: [image] * len(fixations))
+    monkeypatch.setattr(run_report, "replay", lambda run, index, record: scanpath)
+    share = np.array([0.0, 0.5, 1.0])
+    return run_report.write_run_report(
+        run,
+        [{"policy": hostile, "scene": 7, "repetition": 0}],
+        {"average": {hostile: Curve(share, share / 10, share / 10, 1, 1)}},
+        titles={"average": hostile},
+        label=hostile,
+        shifts=(0, 2),
+        others={hostile + "2": share},
+    )

@@ -1,0 +1,156 @@
+"""Pages hold what was computed, in one file, and take no name for markup."""
+
+import base64
+import io
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from semfov.observation.dirichlet import mean
+from semfov.report.curves import curves_html, table_html
+from semfov.report.episode import Pool, episode_data
+from semfov.report.page import write_page
+
+
+class Elements(HTMLParser):
+    """The elements of a page, with their attributes, as a browser finds them."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.found, self.texts, self._open = [], [], None
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        self.found.append((tag, dict(attributes)))
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+
+@pytest.fixture
+def page(scanpath, image, hostile, tmp_path):
+    pool = Pool()
+    timed = replace(scanpath, seconds=({"detect": 0.1, "choose": 0.001},) * 3)
+    data = episode_data(timed, image, [image * 0.5] * 3, pool, name=hostile)
+    sections = table_html([[hostile, "1"], [hostile, hostile]], hostile)
+    return write_page(tmp_path / "page.html", hostile, [data], pool, sections=sections).read_text(encoding="utf-8")
+
+
+def data_of(page):
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)[1])
+
+
+def decoded(data, *shape):
+    steps = np.frombuffer(base64.b64decode(data["data"]), np.uint8).reshape(shape)
+    return steps / 255 * data["max"]
+
+
+@pytest.mark.parametrize("kind", ["episode", "run"])
+def test_names_are_never_markup(kind, hostile, request):
+    if kind == "run":
+        page = request.getfixturevalue("run_page").read_text(encoding="utf-8")
+    else:
+        page = request.getfixturevalue("page")
+    assert hostile not in page
+    elements = Elements(page)
+    tags = [tag for tag, _ in elements.found]
+    assert tags.count("script") == 2
+    assert "img" not in tags
+    assert not [name for _, attributes in elements.found for name in attributes if name.startswith("on")]
+    assert elements.texts.count(hostile) >= 3
+    assert any(hostile in (attributes.get("aria-label") or "") for _, attributes in elements.found)
+    (episode,) = data_of(page)["episodes"]
+    assert episode["name"].startswith(hostile)
+    assert hostile in {each["label"] for each in episode["maps"]}
+    assert "<" not in re.search(r'id="data">(.*?)</script>', page, re.S)[1]
+
+
+def test_a_name_cannot_fill_in_a_place_of_the_template(scanpath, image, tmp_path):
+    data = episode_data(scanpath, image, [image] * 3, pool := Pool(), name="{{program}}")
+    page = write_page(tmp_path / "page.html", "{{data}}", [data], pool).read_text(encoding="utf-8")
+    assert "<title>{{data}}</title>" in page
+    assert data_of(page)["episodes"][0]["name"] == "{{program}}"
+
+
+def test_nothing_is_fetched(page):
+    for tag, attributes in Elements(page).found:
+        for name in ("src", "href", "action", "data"):
+            assert attributes.get(name, "data:").startswith("data:"), (tag, attributes)
+    assert "url(" not in page
+    assert "default-src 'none'" in page
+
+
+def test_every_control_has_a_label(page):
+    elements = Elements(page).found
+    labelled = {attributes.get("for") for tag, attributes in elements if tag == "label"}
+    controls = [attributes for tag, attributes in elements if tag in ("select", "input")]
+    assert len(controls) == 3
+    assert all(attributes["id"] in labelled for attributes in controls)
+
+
+def test_beliefs_come_through(page, scanpath):
+    (episode,) = data_of(page)["episodes"]
+    maps = {each["label"]: decoded(each, 3, 12) for each in episode["maps"]}
+    first, *_, last = maps
+    assert (first, last) == (f"{scanpath.classes[2]} (as searched for)", "background")
+    np.testing.assert_allclose(maps[first], scanpath.posterior, atol=1 / 500)
+    probabilities = mean(scanpath.beliefs)
+    for index, name in enumerate(scanpath.classes):
+        np.testing.assert_allclose(maps[name], probabilities[..., index], atol=1 / 500)
+    entropy = -(probabilities * probabilities.log2()).sum(-1)
+    np.testing.assert_allclose(decoded(episode["entropy"], 3, 12), entropy, atol=2 / 500)
+
+
+def test_fixations_come_through(page, scanpath, image):
+    data = data_of(page)
+    (episode,) = data["episodes"]
+    assert [each["cell"] for each in episode["fixations"]] == [0, 6, 11]
+    assert [each["next"] for each in episode["fixations"]] == [6, 11, None]
+    for number, each in enumerate(episode["fixations"]):
+        np.testing.assert_allclose(each["values"], scanpath.values[number], rtol=1e-3)
+        seen = scanpath.detections[number]
+        for row, detection in enumerate(each["detections"]):
+            np.testing.assert_allclose(detection["box"], seen.boxes[0, row], atol=0.06)
+            best = seen.scores[0, row].sort(descending=True)
+            assert [name for name, _ in detection["scores"]] == [scanpath.classes[index] for index in best.indices]
+            np.testing.assert_allclose([score for _, score in detection["scores"]], best.values, rtol=1e-3)
+        assert each["seconds"] == {"detect": 0.1, "choose": 0.001}
+    picture = data["pictures"][episode["image"]]
+    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(picture.split(",")[1]))), dtype=float) / 255
+    assert np.abs(pixels - image.permute(1, 2, 0).numpy()).mean() < 0.02
+    assert len(data["pictures"]) == 2  # the three views are one and the same
+
+
+def test_an_episode_that_was_not_timed_has_no_times(scanpath, image):
+    data = episode_data(scanpath, image, [image] * 3, Pool(), name="replayed")
+    assert [each["seconds"] for each in data["fixations"]] == [None] * 3
+
+
+def test_fewer_classes_on_request(scanpath, image):
+    data = episode_data(replace(scanpath, posterior=None), image, [image] * 3, Pool(), name="few", classes=1)
+    assert [each["label"] for each in data["maps"]] == [scanpath.classes[2], "background"]
+
+
+def test_values_that_are_not_finite(scanpath, image, tmp_path):
+    values = scanpath.values.clone()
+    values[0, 3] = -torch.inf
+    data = episode_data(replace(scanpath, values=values), image, [image] * 3, pool := Pool(), name="-inf")
+    page = write_page(tmp_path / "page.html", "t", [data], pool).read_text(encoding="utf-8")
+    assert data_of(page)["episodes"][0]["fixations"][0]["values"][3] is None
+
+
+def test_curves_are_the_numbers(hostile):
+    text = curves_html({"flat": np.full(3, 0.5), hostile: np.array([0, 0.5, 1.0])}, {"flat": np.full(3, 0.1)}, hostile)
+    assert hostile not in text
+    lines = re.findall(r'<polyline [^>]*points="([^"]+ [^"]+ [^"]+)"', text)
+    flat, rising = ([tuple(map(float, point.split(","))) for point in line.split()] for line in lines)
+    assert len({y for _, y in flat}) == 1
+    assert rising[1] == flat[1]
+    assert rising[0][1] - rising[1][1] == pytest.approx(rising[1][1] - rising[2][1], abs=0.2)
+    assert text.count("<polygon") == 1

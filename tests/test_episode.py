@@ -1,0 +1,631 @@
+"""The loop of active perception against a loop in scalars; live and stored looks, gradients, replay and timing."""
+
+import math
+from functools import partial
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import nn
+
+import semfov
+from semfov import FovealObservationModel, Foveation, Grid, InputError
+from semfov.belief import ContextPrior, TargetEvidence
+from semfov.belief.observers import Context, Semantic, Target
+from semfov.detection import Candidates, Detections, Detector, Selection
+from semfov.episode import STAGES, LiveLooks, Looks, Sight, StoredLooks, rollout
+from semfov.eye import Eye
+from semfov.gaze import Choice, Given, Greedy, LearnedGaze, Relaxed, soft_fixation
+from semfov.gaze.acquisition import AcquisitionFunction, Static, TargetPosterior, Uniform
+from semfov.gaze.choice import drawn_by, drawn_from
+from semfov.gaze.policies import KL, Learned, NonPredictive, Random
+
+GRID = Grid(3, 2, (90, 60))
+CELLS = len(GRID)
+TARGETS = torch.tensor([1, 3, 1, 2, 3])
+START = torch.tensor([0, 4, 2, 2, 5])
+BATCH = len(START)
+# Where each episode ends: one where it starts, one never.
+GOAL = torch.tensor([3, 4, 0, -1, 1])
+
+
+def rand(*shape, seed=0):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+NOISE = rand(BATCH, CELLS + 1, CELLS, seed=9)
+
+
+def stored(classes=3, most=4, dtype=torch.float64):
+    """What is seen from every cell, some of it padding; from one of them nothing."""
+    corner = rand(CELLS, most, 2) * 50
+    boxes = torch.cat([corner, corner + 4 + 30 * rand(CELLS, most, 2, seed=1)], -1)
+    scores = (3 * rand(CELLS, most, classes + 1, seed=2)).softmax(-1)
+    count = torch.tensor([most, 1, 0, 2, most - 1, 3])
+    return Detections(boxes.to(dtype), scores.to(dtype), torch.arange(most) < count[:, None])
+
+
+def evidence():
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return TargetEvidence(6, 5).eval().requires_grad_(False)
+
+
+def context(classes=3):
+    names = [f"class {number}" for number in range(1, classes + 1)]
+    place, company = rand(classes + 1, 3, 3), rand(classes + 1, classes + 1, 2)
+    return ContextPrior(names, place, company, [0.3], weights={"evidence": (0.5, 0.25), "map": (1.0, 2.0)})
+
+
+def reached(step):
+    return step.cell == GOAL[step.episodes]
+
+
+def by_target(episodes, cell):
+    return TargetPosterior(TARGETS[episodes])
+
+
+def records(steps):
+    """What every episode did, step by step."""
+    episodes = [[] for _ in range(BATCH)]
+    for number, step in enumerate(steps):
+        assert step.shift == number
+        for row, episode in enumerate(step.episodes.tolist()):
+            assert len(episodes[episode]) == number
+            episodes[episode].append(
+                {
+                    "cell": int(step.cell[row]),
+                    "fixation": step.fixation[row],
+                    "present": step.belief.probability(TARGETS[step.episodes])[row],
+                    "closest": step.belief.closest[row],
+                    "values": step.values[row],
+                    "visited": step.visited[row],
+                    "next": int(step.next_cell[row]),
+                    "next point": step.next_fixation[row],
+                    "seen": int(step.detections.count[row]),
+                }
+            )
+    return episodes
+
+
+class SemanticLoop:
+    """The published belief of one episode, in floats; options of `Semantic` that the loop knows."""
+
+    def __init__(self, seen, target, tempering=1.0):
+        self.seen, self.target, self.tempering = seen, target, tempering
+        self.beta = [[0.5] * seen.scores.shape[-1] for _ in range(CELLS)]
+
+    def look(self, at):
+        for detection in range(int(self.seen.count[at])):
+            likelihood = [score**self.tempering for score in self.seen.scores[at, detection].tolist()]
+            left, top, right, bottom = self.seen.boxes[at, detection].tolist()
+            for cell in range(CELLS):
+                x, y = cell % 3 * 30, cell // 3 * 30
+                if left < x + 30 and right > x and top < y + 30 and bottom > y:
+                    self.fuse(self.beta[cell], likelihood)
+
+    def fuse(self, beta, likelihood):
+        expected = sum(b * s for b, s in zip(beta, likelihood, strict=True))
+        least = min(likelihood)
+        for k, score in enumerate(likelihood):
+            beta[k] *= (1 + score / expected) / (1 + least / expected)
+
+    def present(self):
+        return [beta[self.target] / sum(beta) for beta in self.beta]
+
+
+class TargetLoop:
+    """Evidence for the target: the closest look at each cell, and the strongest of all."""
+
+    def __init__(self, seen, target, model):
+        self.seen, self.target, self.model = seen, target, model
+        self.nearest, self.best = [0.0] * CELLS, [-math.inf] * CELLS
+        self.closest, self.visited = [math.inf] * CELLS, [False] * CELLS
+
+    def look(self, at):
+        fixation = GRID.centres[at : at + 1].double()
+        said = self.model(self.seen[at : at + 1], fixation, GRID, self.target)[0].tolist()
+        for cell in range(CELLS):
+            distance = away(cell, at)
+            if distance < self.closest[cell]:
+                self.closest[cell], self.nearest[cell] = distance, said[cell]
+            self.best[cell] = max(self.best[cell], said[cell])
+        self.visited[at] = True
+
+    def present(self):
+        rows = (torch.tensor([row], dtype=torch.float64) for row in (self.nearest, self.best, self.closest))
+        odds = self.model.log_odds(*rows, torch.tensor([self.visited]), GRID.columns)
+        return [1 / (1 + math.exp(-value)) for value in odds[0].tolist()]
+
+
+def away(cell, other):
+    """Distance between the centres of two cells, in longer sides."""
+    return math.hypot(cell % 3 - other % 3, cell // 3 - other // 3) / 3
+
+
+def scalar_episode(loop, episode, most, values_of=None):
+    """Looks, update and choice of one episode, by hand; every entry as `records` has it."""
+    visited, path, at = [], [], int(START[episode])
+    while True:
+        loop.look(at)
+        visited.append(at)
+        values = loop.present() if values_of is None else values_of
+        left = [cell for cell in range(CELLS) if cell not in visited]
+        chosen = None
+        if left:
+            best = max(values[cell] for cell in left)
+            tied = [cell for cell in left if values[cell] >= best - 1e-6 * abs(best)]
+            chosen = max(tied, key=NOISE[episode, len(path)].tolist().__getitem__)
+        path.append((at, loop.present(), values, list(visited), chosen))
+        if chosen is None or at == int(GOAL[episode]) or len(path) == most:
+            return path
+        at = chosen
+
+
+def check_against_loop(observer, make_loop, acquisition, most, values_of=None):
+    seen = stored()
+    looks = StoredLooks(seen, GRID, TARGETS)
+    steps = rollout(looks, observer, acquisition, START, Greedy(drawn_from(NOISE)), most=most, ends=reached)
+    found = records(steps)
+    lengths = set()
+    for episode in range(BATCH):
+        expected = scalar_episode(make_loop(seen, int(TARGETS[episode])), episode, most, values_of)
+        lengths.add(len(expected))
+        assert len(found[episode]) == len(expected)
+        for step, (at, present, values, visited, chosen) in zip(found[episode], expected, strict=True):
+            assert step["cell"] == at
+            assert torch.equal(step["fixation"], GRID.centres[at].double())
+            assert step["present"].tolist() == pytest.approx(present, rel=1e-6)
+            assert step["values"].tolist() == pytest.approx(values, rel=1e-6)
+            assert step["visited"].nonzero()[:, 0].tolist() == sorted(visited)
+            assert step["closest"].tolist() == pytest.approx([min(away(c, v) for v in visited) for c in range(CELLS)])
+            assert step["seen"] == int(seen.count[at])
+            if chosen is not None:
+                assert step["next"] == chosen
+                assert torch.equal(step["next point"], GRID.centres[chosen].double())
+    if most > 2:
+        assert len(lengths) > 1  # They do end at different times.
+
+
+MOST = [1, 3, CELLS, 50]
+
+
+@pytest.mark.parametrize("most", MOST)
+@pytest.mark.parametrize("tempering", [1.0, 0.25])
+def test_searches_by_a_map_equal_the_scalar_loop(most, tempering):
+    observer = Semantic(4, tempering=tempering)
+    check_against_loop(observer, partial(SemanticLoop, tempering=tempering), by_target, most)
+
+
+@pytest.mark.parametrize("most", MOST)
+def test_searches_for_several_targets_equal_the_scalar_loop(most):
+    model = evidence().double()
+    check_against_loop(Target(model), partial(TargetLoop, model=model), by_target, most)
+
+
+@pytest.mark.parametrize("most", MOST)
+@pytest.mark.parametrize("values", [[0.0] * CELLS, [0.3, 0.9, 0.9, 0.1, 0.9, 0.3]], ids=["all tied", "some tied"])
+def test_ties_go_to_each_episodes_own_noise(most, values):
+    acquisition = Static(torch.tensor(values, dtype=torch.float64))
+    check_against_loop(Semantic(4), SemanticLoop, acquisition, most, values)
+
+
+def test_an_episode_ends_when_every_cell_was_visited():
+    looks = StoredLooks(stored(), GRID)
+    steps = list(rollout(looks, Semantic(4), Uniform(), START, Greedy(drawn_from(NOISE)), most=50))
+    assert len(steps) == CELLS
+    assert bool(steps[-1].visited.all())
+    assert all(len(step.episodes) == BATCH for step in steps)
+    for episode in range(BATCH):
+        assert sorted(int(step.cell[episode]) for step in steps) == list(range(CELLS))
+
+
+def test_without_episodes_or_looks_there_is_no_step():
+    looks, choice = StoredLooks(stored(), GRID), Greedy(drawn_from(NOISE))
+    assert not list(rollout(looks, Semantic(4), Uniform(), START[:0], choice, most=3))
+    assert not list(rollout(looks, Semantic(4), Uniform(), START, choice, most=0))
+
+
+def test_a_step_marks_visits_and_fuses():
+    """Of a look at a box in one corner; what was believed before is left as it was."""
+    boxes = torch.tensor([[[61.0, 31, 89, 59]]]).expand(CELLS, 1, 4)
+    seen = Detections(boxes, torch.tensor([[[0.1, 0.8, 0.1]]]).expand(CELLS, 1, 3), torch.ones(CELLS, 1).bool())
+    steps = rollout(
+        StoredLooks(seen, GRID), Semantic(3), TargetPosterior(1), torch.tensor([0]), Greedy(drawn_from(NOISE)), most=3
+    )
+    first, second, third = steps
+    assert [step.visited[0].nonzero()[:, 0].tolist() for step in (first, second)] == [[0], [0, 5]]
+    assert first.next_cell.tolist() == second.cell.tolist() == [5]
+    assert not third.visited[0, third.next_cell]
+    present = [step.belief.probability(1)[0] for step in (first, second)]
+    assert bool(((present[0] > 1 / 3 + 1e-6) == (torch.arange(CELLS) == 5)).all())
+    assert present[1][5] > present[0][5]
+
+
+def test_the_acquisition_is_made_for_the_episodes_that_go_on():
+    asked = []
+
+    def acquire(episodes, cell):
+        asked.append((episodes.tolist(), cell.tolist()))
+        return by_target(episodes, cell)
+
+    looks = StoredLooks(stored(), GRID, TARGETS)
+    choice = Greedy(drawn_from(NOISE))
+    steps = list(rollout(looks, Semantic(4), acquire, START, choice, most=4, ends=reached))
+    assert asked == [(step.episodes.tolist(), step.cell.tolist()) for step in steps]
+    assert len({len(step.episodes) for step in steps}) > 1
+
+
+def test_choices_are_asked_for_the_shift_and_the_episodes():
+    asked = []
+
+    class Noted(Greedy):
+        def __call__(self, shift, episodes, values, visited, centres):
+            asked.append((shift, episodes.tolist(), tuple(values.shape), tuple(visited.shape), tuple(centres.shape)))
+            return super().__call__(shift, episodes, values, visited, centres)
+
+    looks = StoredLooks(stored(), GRID, TARGETS)
+    steps = list(rollout(looks, Semantic(4), by_target, START, Noted(drawn_from(NOISE)), most=4, ends=reached))
+    assert asked == [
+        (step.shift, step.episodes.tolist(), (len(step.episodes), CELLS), (len(step.episodes), CELLS), (CELLS, 2))
+        for step in steps
+    ]
+
+
+def test_stored_looks_are_weighed_once_for_each_target():
+    class Counted(Semantic):
+        weighed = 0
+
+        def weigh(self, *arguments):
+            self.weighed += 1
+            return super().weigh(*arguments)
+
+    class CountedTarget(Target):
+        asked = ()
+
+        def weigh(self, detections, fixation, grid, target=None):
+            self.asked = (*self.asked, target)
+            return super().weigh(detections, fixation, grid, target)
+
+    looks = StoredLooks(stored(), GRID, TARGETS)
+    mapper, seeker = Counted(4), CountedTarget(evidence().double())
+    for observer in (mapper, seeker):
+        list(rollout(looks, observer, by_target, START, Greedy(drawn_from(NOISE)), most=4))
+    assert mapper.weighed == 1
+    assert seeker.asked == (1, 2, 3)
+    list(rollout(looks, mapper, by_target, START, Greedy(drawn_from(NOISE)), most=2))
+    assert mapper.weighed == 2  # Those of one observer are kept.
+
+
+def test_an_observer_that_goes_by_the_target_is_told_of_a_lack_of_one():
+    looks = LiveLooks(*live(), GRID)
+    steps = rollout(looks, Target(evidence()), Uniform(), START, Greedy(drawn_from(NOISE)), most=2)
+    with pytest.raises(InputError, match="target: expected a class to search for"):
+        list(steps)
+
+
+class Quarters(Detector):
+    """A box in each quarter of the canvas, scored by its mean colour; dull quarters show nothing."""
+
+    def __init__(self):
+        super().__init__("quarters", ("red", "green", "blue"), (96, 64), selection=Selection(threshold=0.3, iou=1.0))
+
+    def propose(self, canvas):
+        corners = canvas.new_tensor([[0, 0], [48, 0], [0, 32], [48, 32]])
+        boxes = torch.cat([corners, corners + canvas.new_tensor([48, 32])], -1)
+        colours = nn.functional.max_pool2d(canvas, (32, 48)).flatten(2).mT
+        return Candidates(boxes.expand(len(canvas), 4, 4), colours)
+
+
+def live():
+    eye = Eye(Foveation(8.0), Quarters(), reference=90.0)
+    picture = 0.1 + 0.1 * rand(1, 3, 60, 90).float()
+    for channel, (x, y) in enumerate([(20, 10), (70, 40), (75, 8)]):
+        picture[0, channel, y : y + 6, x : x + 6] = 0.9
+    return eye, eye.open(picture)
+
+
+@pytest.mark.parametrize("kind", ["map", "target", "context"])
+@pytest.mark.parametrize("target", [1, 3])
+def test_live_and_stored_looks_give_one_scanpath(kind, target):
+    eye, view = live()
+    seen = eye.look(view, GRID.centres)
+    assert len(set(seen.count.tolist())) > 1  # It hangs on the fixation what is seen.
+    mapper = Semantic(4, tempering=0.5)
+    observer = {"map": mapper, "target": Target(evidence()), "context": Context(mapper, context())}[kind]
+    run = partial(
+        rollout, observer=observer, acquisition=TargetPosterior(target), start=START, choice=Greedy(drawn_from(NOISE))
+    )
+    targets = torch.full((BATCH,), target)
+    ends = partial(run, ends=reached, most=5)
+    paths = [list(ends(looks)) for looks in (LiveLooks(eye, view, GRID, target), StoredLooks(seen, GRID, targets))]
+    for one, other in zip(*paths, strict=True):
+        for name in ("shift", "episodes", "cell", "fixation", "visited", "next_cell", "next_fixation"):
+            assert torch.equal(*(torch.as_tensor(getattr(step, name)) for step in (one, other))), name
+        torch.testing.assert_close(one.values, other.values)
+        torch.testing.assert_close(one.belief.probability(target), other.belief.probability(target))
+        torch.testing.assert_close(one.belief.closest, other.belief.closest)
+        for row in range(len(one.episodes)):
+            mine, theirs = (step.detections for step in (one, other))
+            assert mine.count[row] == theirs.count[row]
+            torch.testing.assert_close(mine.boxes[row][mine.mask[row]], theirs.boxes[row][theirs.mask[row]])
+            torch.testing.assert_close(mine.scores[row][mine.mask[row]], theirs.scores[row][theirs.mask[row]])
+
+
+def tensors_of(thing):
+    found = []
+    for name in thing.__dataclass_fields__:
+        part = getattr(thing, name)
+        found += [part] if isinstance(part, torch.Tensor) else tensors_of(part)
+    return found
+
+
+def learned_gaze():
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        gaze = LearnedGaze(4).requires_grad_(False)
+        nn.init.normal_(gaze.network[-1].weight)
+    return gaze
+
+
+def observed():
+    names = [f"class {number}" for number in range(1, 21)]
+    alpha = 0.5 + 4 * rand(21, 2, 21) + 3 * torch.eye(21)[:, None]
+    return FovealObservationModel(alpha, [0.4], names, miss_rate=0.1 + 0.8 * rand(21, 2)).float().requires_grad_(False)
+
+
+STRATEGIES = {
+    "map, non-predictive": lambda: (Semantic(21), NonPredictive()),
+    "map with misses, non-predictive": lambda: (Semantic(21, observed(), misses=observed()), NonPredictive()),
+    "soft map, learned": lambda: (Semantic(21, tempering=0.25, footprint="soft"), Learned(learned_gaze())),
+    "closest look, kl": lambda: (Semantic(21, memory="closest"), KL(observed())),
+    "target, non-predictive": lambda: (Target(evidence()), NonPredictive()),
+    "context of a map, non-predictive": lambda: (Context(Semantic(21), context(20).float()), NonPredictive()),
+    "context of evidence, non-predictive": lambda: (Context(Target(evidence()), context(20)), NonPredictive()),
+    "map, random": lambda: (Semantic(21), Random()),
+}
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_a_batch_of_episodes_is_each_episode_to_the_bit(name):
+    observer, policy = STRATEGIES[name]()
+    seen = stored(20, 7, torch.float32)
+    targets = torch.tensor([1, 17, 1, 20, 17])
+    noise = NOISE.float()
+
+    def run(episodes):
+        """Steps of some of the episodes, as if there were no others."""
+
+        def reached_too(step):
+            return step.cell == GOAL[episodes][step.episodes]
+
+        looks, choice = StoredLooks(seen, GRID, targets[episodes]), Greedy(drawn_from(noise[episodes]))
+        acquire = lambda going, cell: policy(targets[episodes][going], GRID)  # noqa: E731
+        return list(rollout(looks, observer, acquire, START[episodes], choice, most=5, ends=reached_too))
+
+    together = run(torch.arange(BATCH))
+    assert {len(step.episodes) for step in together} != {BATCH}
+    for episode in range(BATCH):
+        alone = run(torch.tensor([episode]))
+        shared = [(step, step.episodes.tolist().index(episode)) for step in together if episode in step.episodes]
+        for one, (step, row) in zip(alone, shared, strict=True):
+            for field in ("cell", "fixation", "visited", "values", "next_cell", "next_fixation"):
+                assert torch.equal(getattr(one, field)[0], getattr(step, field)[row]), field
+            for mine, theirs in zip(tensors_of(one.belief), tensors_of(step.belief), strict=True):
+                assert torch.equal(mine[0], theirs[row])
+
+
+# Differentiable from the choice of a fixation to what is seen there.
+
+
+class Smooth(Looks):
+    """Scores that change smoothly with the point of fixation, of two boxes."""
+
+    def __init__(self):
+        self.grid, self.like = GRID, torch.empty(0, dtype=torch.float64)
+
+    def seen(self, fixation):
+        boxes = torch.tensor([[2.0, 2, 55, 28], [40, 20, 88, 58]], dtype=torch.float64).expand(len(fixation), 2, 4)
+        places = torch.tensor([[20.0, 20], [70, 40], [30, 50]], dtype=torch.float64)
+        near = -((fixation[:, None, None] - places) / 40).square().sum(-1)
+        scores = (near * torch.tensor([[1.0], [-2.0]], dtype=torch.float64)).softmax(-1)
+        return Detections(boxes, scores, torch.ones(len(fixation), 2, dtype=torch.bool))
+
+    def see(self, observer, episodes, cell, fixation):
+        seen = self.seen(fixation)
+        return Sight(observer.weigh(seen, fixation, self.grid), lambda: seen, {})
+
+
+class Biased(AcquisitionFunction):
+    """Log odds of a class, and a parameter for every cell."""
+
+    def __init__(self, bias):
+        super().__init__()
+        self.bias = bias
+
+    def forward(self, belief, visited):
+        return 4 * belief.probability(1).log() + self.bias
+
+
+def relaxed(hard):
+    return Relaxed(drawn_from(NOISE), GRID.cell_of, temperature=0.8, hard=hard)
+
+
+def relaxed_steps(bias, hard, most, window=None):
+    return list(rollout(Smooth(), Semantic(3), Biased(bias), START[:2], relaxed(hard), most=most, window=window))
+
+
+def test_soft_choices_pass_the_gradient_of_all_looks():
+    def believed(bias):
+        return [step.belief.probability(1) for step in relaxed_steps(bias, hard=False, most=4)]
+
+    bias = rand(CELLS, seed=5).requires_grad_()
+    assert torch.autograd.gradcheck(lambda given: torch.stack(believed(given)), bias)
+    # The first look comes before any choice; every later one is reached.
+    for shift, present in enumerate(believed(bias)):
+        assert present.requires_grad == (shift > 0)
+        if shift:
+            (gradient,) = torch.autograd.grad(present.square().sum(), bias, retain_graph=True)
+            assert gradient.abs().max() > 1e-6
+
+
+def test_hard_choices_are_centres_with_the_gradient_of_the_soft_point():
+    bias = rand(CELLS, seed=5).requires_grad_()
+    first, second = relaxed_steps(bias, hard=True, most=2)
+    assert torch.equal(second.fixation.detach(), GRID.centres[second.cell].double())
+    assert torch.equal(first.next_cell, second.cell)
+    (got,) = torch.autograd.grad(second.belief.probability(1).square().sum(), bias)
+    # By hand: how the loss changes with the fixation, through how the soft point changes with the parameters.
+    observer, point = Semantic(3), GRID.centres[second.cell].double().requires_grad_()
+    after = observer(first.belief.detach(), Smooth().seen(point), point, GRID)
+    (slope,) = torch.autograd.grad(after.probability(1).square().sum(), point)
+    values = Biased(bias)(first.belief.detach(), first.visited)
+    soft, _ = soft_fixation(values, first.visited, GRID.centres.double(), NOISE[:2, 0], temperature=0.8, hard=False)
+    (expected,) = torch.autograd.grad(soft, bias, slope)
+    torch.testing.assert_close(got, expected)
+    assert got.abs().max() > 1e-6
+
+
+@pytest.mark.parametrize("hard", [True, False])
+@pytest.mark.parametrize(("window", "reached_at"), [(None, "-++++"), (1, "-----"), (2, "-+-+-"), (3, "-++-+")])
+def test_a_window_cuts_the_gradient_and_nothing_else(window, reached_at, hard):
+    bias = rand(CELLS, seed=5).requires_grad_()
+    whole, steps = (relaxed_steps(bias, hard, 5, each) for each in (None, window))
+    assert "".join("-+"[step.belief.beta.requires_grad] for step in steps) == reached_at
+    assert all(step.next_fixation.requires_grad for step in steps)  # Within its step a choice keeps its gradient.
+    for one, other in zip(whole, steps, strict=True):
+        for name in ("cell", "fixation", "visited", "values", "next_fixation"):
+            assert torch.equal(getattr(one, name), getattr(other, name)), name
+        assert torch.equal(one.belief.beta, other.belief.beta)
+
+
+def test_gradients_after_the_border_of_a_window_are_those_of_a_fresh_start():
+    bias = rand(CELLS, seed=5).requires_grad_()
+    steps = relaxed_steps(bias, hard=False, most=4, window=2)
+    (got,) = torch.autograd.grad(steps[3].belief.probability(1).square().sum(), bias)
+    # By hand from the border between the second look and the third, whose belief and point are constants.
+    observer, before, point = Semantic(3), steps[1].belief.detach(), steps[1].next_fixation.detach()
+    third = observer(before, Smooth().seen(point), point, GRID)
+    assert torch.equal(third.beta, steps[2].belief.beta)
+    values = Biased(bias)(third, steps[2].visited)
+    point, _ = soft_fixation(values, steps[2].visited, GRID.centres.double(), NOISE[:2, 2], temperature=0.8, hard=False)
+    fourth = observer(third, Smooth().seen(point), point, GRID)
+    (expected,) = torch.autograd.grad(fourth.probability(1).square().sum(), bias)
+    torch.testing.assert_close(got, expected)
+    uncut = relaxed_steps(bias, hard=False, most=4)[3].belief.probability(1).square().sum()
+    (whole,) = torch.autograd.grad(uncut, bias)
+    assert not torch.allclose(got, whole, rtol=1e-3)
+
+
+def test_a_soft_point_is_in_the_cell_that_it_lies_in():
+    for step in relaxed_steps(rand(CELLS, seed=5), hard=False, most=4):
+        assert torch.equal(step.next_cell, GRID.cell_of(step.next_fixation))
+        assert not any(bool((GRID.centres == point.float()).all(-1).any()) for point in step.next_fixation)
+
+
+@pytest.mark.parametrize("kind", ["map", "target"])
+def test_a_recorded_scanpath_is_replayed_to_the_bit(kind):
+    observer = Semantic(4) if kind == "map" else Target(evidence().double())
+    looks = StoredLooks(stored(), GRID, TARGETS)
+    run = partial(rollout, looks, observer, by_target, START)
+    first = list(run(Greedy(drawn_from(NOISE)), most=5, ends=reached))
+    lengths = torch.tensor([sum(episode in step.episodes for step in first) for episode in range(BATCH)])
+    assert len(set(lengths.tolist())) > 1
+    cells = torch.zeros(BATCH, len(first), dtype=torch.long)
+    for step in first:
+        cells[step.episodes, step.shift] = step.cell
+    again = list(run(Given(cells), most=5, ends=lambda step: step.shift + 1 == lengths[step.episodes]))
+    for one, other in zip(first, again, strict=True):
+        for name in ("episodes", "cell", "fixation", "visited", "values"):
+            assert torch.equal(getattr(one, name), getattr(other, name)), name
+        for mine, theirs in zip(tensors_of(one.belief), tensors_of(other.belief), strict=True):
+            assert torch.equal(mine, theirs)
+
+
+def test_given_cells_are_fixated_again_and_the_last_one_stays():
+    """A scanpath may come back to a cell; after its end there is no other place to go to."""
+    cells = torch.tensor([[0, 3, 0], [4, 4, 1]])
+    looks = StoredLooks(stored(), GRID)
+    steps = list(rollout(looks, Semantic(4), Uniform(), cells[:, 0], Given(cells), most=5))
+    assert torch.stack([step.cell for step in steps], 1).tolist() == [[0, 3, 0, 0, 0], [4, 4, 1, 1, 1]]
+    assert steps[-1].visited.sum(-1).tolist() == [2, 2]
+
+
+def test_noise_drawn_as_needed_repeats_with_its_seed():
+    looks = StoredLooks(stored(), GRID)
+
+    def cells(seed):
+        choice = Greedy(drawn_by(torch.Generator().manual_seed(seed), CELLS, looks.like))
+        return torch.stack([step.cell for step in rollout(looks, Semantic(4), Uniform(), START, choice, most=4)])
+
+    assert torch.equal(cells(3), cells(3))
+    assert not torch.equal(cells(3), cells(4))
+
+
+def test_a_choice_of_ones_own():
+    class First(Choice):
+        """The first cell that was not visited."""
+
+        def __call__(self, shift, episodes, values, visited, centres):
+            cell = visited.logical_not().int().argmax(-1)
+            return centres[cell], cell
+
+    steps = list(rollout(StoredLooks(stored(), GRID), Semantic(4), Uniform(), START[1:2], First(), most=50))
+    assert [int(step.cell) for step in steps] == [4, 0, 1, 2, 3, 5]
+
+
+def test_every_stage_of_a_cycle_is_timed_and_nothing_else(monkeypatch):
+    """By a clock that runs only while a stage works."""
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr("semfov.episode.time", SimpleNamespace(perf_counter=lambda: clock.now))
+
+    def taking(seconds, work):
+        def slow(*arguments, **options):
+            clock.now += seconds
+            return work(*arguments, **options)
+
+        return slow
+
+    eye, view = live()
+    observer, choice = Semantic(4), taking(16, Greedy(drawn_from(NOISE)))
+    spent = {"foveate": 1.0, "detect": 2.0, "weigh": 4.0, "update belief": 8.0, "choose": 16.0 + 32.0}
+    assert tuple(spent) == STAGES
+    acquire = taking(32, by_target)
+    observer.weigh, observer.update = taking(4, observer.weigh), taking(8, observer.update)
+    seen = eye.look(view, GRID.centres)
+    eye.foveated = taking(1, eye.foveated)
+    eye.detector.detect = taking(2, eye.detector.detect)
+    for step in rollout(LiveLooks(eye, view, GRID), observer, acquire, START, choice, most=3):
+        assert step.seconds == spent
+        clock.now += 1000.0  # What the caller does with a step is no part of it.
+    # In a store there is nothing to foveate and to detect, and all is weighed at the first look.
+    rows = [step.seconds for step in rollout(StoredLooks(seen, GRID), observer, acquire, START, choice, most=3)]
+    rest = {stage: spent[stage] for stage in STAGES[2:]}
+    assert rows == [rest, rest | {"weigh": 0.0}, rest | {"weigh": 0.0}]
+
+
+def test_stages_take_time():
+    eye, view = live()
+    for step in rollout(LiveLooks(eye, view, GRID), Semantic(4), Uniform(), START, Greedy(drawn_from(NOISE)), most=2):
+        assert tuple(step.seconds) == STAGES
+        assert all(0 < seconds < 60 for seconds in step.seconds.values())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", ["map", "target"])
+def test_beliefs_are_where_the_looks_are(kind, dtype, device):
+    """On the device and in the dtype of what is seen."""
+    seen = stored(dtype=dtype)
+    seen = Detections(seen.boxes.to(device), seen.scores.to(device), seen.mask.to(device))
+    model = evidence().to(device, dtype)
+    observer, targets = Semantic(4) if kind == "map" else Target(model), TARGETS.to(device)
+    looks, choice = StoredLooks(seen, GRID, targets), Greedy(drawn_from(NOISE.to(device, dtype)))
+    acquire = lambda episodes, cell: TargetPosterior(targets[episodes])  # noqa: E731
+    for step in rollout(looks, observer, acquire, START.to(device), choice, most=3):
+        for tensor in (step.values, step.fixation, step.next_fixation, step.belief.probability(targets)):
+            assert tensor.dtype == dtype
+            assert tensor.device.type == device.type
+
+
+def test_it_is_public():
+    assert semfov.rollout is rollout

@@ -1,0 +1,125 @@
+"""`python -m train.fit_fom` as a user runs it: small, on the embedded scenes, with the real detector."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from eval.calibration import main as calibrate
+from semfov import FovealObservationModel
+from semfov.experiments.config import DataConfig
+from semfov.experiments.samples import Sampler, SampleSettings
+from semfov.observation import match
+from semfov.training.observation import fit_fom
+from semfov.training.observation_settings import FitConfig
+from train.fit_fom import main
+
+pytestmark = [pytest.mark.weights, pytest.mark.slow]
+
+ROOT = Path(__file__).parents[2]
+SMALL = ["--data.limit", "6", "--fixations", "2", "--holdout", "3", "--shard", "2", "--method", "newton", "--workers"]
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """A model fitted to two looks at each of 6 embedded scenes, in three shards."""
+    out = tmp_path_factory.mktemp("fit")
+    threads = torch.get_num_threads()
+    assert main([*SMALL, "1", "--out", str(out)]) == 0
+    torch.set_num_threads(threads)
+    return out
+
+
+def bits(out: Path) -> list[bytes]:
+    return [(out / "yolov3-tiny.safetensors").read_bytes(), (out / "report.md").read_bytes()]
+
+
+def test_fit_leaves_a_model_and_a_report(fitted):
+    model = FovealObservationModel.from_pretrained(fitted / "yolov3-tiny.safetensors")
+    counts = torch.tensor(model.metadata["counts"])
+    assert counts.shape == (81, 8)
+    assert counts.sum() == model.metadata["samples"] > 30
+    person, cup = model.classes.index("person") + 1, model.classes.index("cup") + 1
+    assert counts[person].sum() > 0
+    assert counts[cup].sum() > 0
+    report = (fitted / "report.md").read_text()
+    for word in ("raw scores", "Dirichlet, fixed_point", "takes those of level"):
+        assert word in report
+    assert json.loads((fitted / "manifest.json").read_text())["model"]["method"] == "newton"
+    assert (fitted / "reliability.png").stat().st_size > 3000
+
+
+def test_estimators_agree(fitted):
+    rows = [line for line in (fitted / "report.md").read_text().splitlines() if line.startswith("| Dirichlet, ")]
+    figures = [[float(cell) for cell in row.split("|")[2:-1]] for row in rows]
+    assert len(figures) == 3
+    # The last digit may be rounded either way.
+    assert figures[1] == pytest.approx(figures[0], rel=1e-4, abs=1.1e-3)
+    assert figures[2] == pytest.approx(figures[0], rel=1e-4, abs=1.1e-3)
+
+
+def test_two_workers_and_larger_shards_give_the_same_bits(fitted, tmp_path):
+    assert main([*SMALL, "2", "--shard", "3", "--out", str(tmp_path)]) == 0
+    assert bits(tmp_path) == bits(fitted)
+
+
+def test_two_ranks_give_the_same_bits(fitted, tmp_path):
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    call = [*launch, "-m", "train.fit_fom", *SMALL, "1", "--out", str(tmp_path)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run(call, cwd=ROOT, check=True, capture_output=True, env=environment)
+    assert bits(tmp_path) == bits(fitted)
+
+
+def test_killed_fit_resumes_with_the_same_bits(fitted, tmp_path, kill_when):
+    call = [sys.executable, "-m", "train.fit_fom", *SMALL, "1", "--out", str(tmp_path)]
+    kill_when(call, lambda: list(tmp_path.glob("samples/*/*.safetensors")), cwd=ROOT)
+    assert not (tmp_path / "report.md").exists()
+    subprocess.run(call, cwd=ROOT, check=True, capture_output=True)
+    assert bits(tmp_path) == bits(fitted)
+
+
+def test_discriminative_fit_is_better_calibrated_than_the_published_one(fitted, tmp_path):
+    data = DataConfig(limit=6, min_instances=0, max_target_area=None)
+    fit_fom(FitConfig(data=data, fixations=2, holdout=3, shard=2, out=tmp_path, cache=fitted, workers=1))
+    figures = json.loads((tmp_path / "manifest.json").read_text())["held_out"]
+    # Raw scores are hard to beat with the hundred detections of four scenes.
+    assert figures["discriminative"]["nll"] < figures["Dirichlet, newton"]["nll"] / 2
+
+
+def test_calibration_report(fitted, tmp_path, capsys):
+    model = fitted / "yolov3-tiny.safetensors"
+    arguments = ["--data.limit", "3", "--fixations", "2", "--model", str(model), "--out", str(tmp_path)]
+    assert calibrate([*arguments, "--workers", "1"]) == 0
+    assert "classwise ECE" in capsys.readouterr().out
+    assert (tmp_path / "reliability.png").exists()
+    rows = [line.split("|") for line in (tmp_path / "calibration.md").read_text().splitlines()[2:]]
+    counts = [int(row[3]) for row in rows if row[2].strip() == "raw"]
+    assert len(counts) == 9
+    assert sum(counts[:-1]) == counts[-1]
+
+
+def test_samples_are_what_a_loop_sees():
+    settings = SampleSettings(DataConfig(limit=2), FitConfig().detector, FitConfig().sensor, 2, 0.5, 0)
+    sampler = Sampler(settings)
+    samples = sampler.sample(0)
+    scene = sampler.scenes[1]
+    mine = samples[samples.scene == 1]
+    first = torch.rand(2, 2, generator=_generator(0, scene.id))[0] * torch.tensor([scene.size]).float() - 0.5
+    seen = sampler.eye(scene.image[None], first)
+    count = int(seen.count)
+    torch.testing.assert_close(mine.scores[:count], seen.scores[0])
+    expected = match(seen.boxes[0], scene.boxes, scene.labels)
+    assert torch.equal(mine.labels[:count], expected)
+    centre = (seen.boxes[0, :, :2] + seen.boxes[0, :, 2:]) / 2 - 0.5
+    torch.testing.assert_close(mine.distance[:count], (centre - first).norm(dim=1) / max(scene.size))
+
+
+def _generator(seed, scene):
+    from semfov.experiments.seeds import generator_for
+
+    return generator_for("fixations", seed, scene)
