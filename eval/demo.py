@@ -54,6 +54,9 @@ class DemoConfig:
             takes the agent's own.
         start: first cell, numbered row by row (none: drawn at random).
         shifts: most gaze shifts (none: 30 for a search, 20 for an exploration).
+        confirm: probability that the target is there, from which on it counts as found (none: the one chosen when the
+            belief was fitted; for agents without a fitted belief the score of a detection, 0.5).
+        give_up: probability below which a cell is not worth a look (none: the one chosen).
         seed: of the start, of ties and of the embedded scene.
         frames: how many frames of a video or camera to look at.
         report: write a page to step through in a browser to this file.
@@ -69,6 +72,8 @@ class DemoConfig:
     sensor: SensorName | None = None
     start: int | None = None
     shifts: int | None = None
+    confirm: float | None = None
+    give_up: float | None = None
     seed: int = 0
     frames: int = 4
     report: Path | None = None
@@ -136,7 +141,8 @@ def look_at(agent: ActivePerception, picture: Picture, config: DemoConfig) -> Sc
         if config.target is None:
             return agent.explore(picture.image, shifts=20 if config.shifts is None else config.shifts, **common)
         shifts = 30 if config.shifts is None else config.shifts
-        return agent.search(picture.image, config.target, boxes=picture.boxes, shifts=shifts, **common)
+        common |= {"confirm": config.confirm, "give_up": config.give_up}
+        return agent.search(picture.image, config.target, shifts=shifts, **common)
 
 
 def start_cell(agent: ActivePerception, picture: Picture, config: DemoConfig) -> int | None:

@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from semfov.belief.context import ContextPrior
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Context, Observer, Semantic, Target
-from semfov.belief.target_evidence import TargetEvidence
+from semfov.belief.target_evidence import TargetEvidence, Thresholds
+from semfov.decision import OUTCOMES, Decision, best_box, decide
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.episode import LiveLooks, Step, rollout
@@ -183,14 +184,20 @@ class ActivePerception(nn.Module):
         shifts: int = 30,
         seed: int = 0,
         boxes: Tensor | None = None,
-        confirm: float = 0.5,
+        confirm: float | None = None,
+        give_up: float | None = None,
     ) -> Scanpath:
-        """Search an image for a target class.
+        """Search an image for a target class, and decide whether it is there (`Scanpath.decision`).
 
-        The search ends when the target is found, after `shifts` gaze shifts, or when no cell is left. With `boxes`
-        the target is found when the gaze is on a cell that one of them overlaps (the protocol of the paper);
-        without, when a detection that overlaps the fixated cell has the target as its best class with a score of
-        `confirm`.
+        The search ends when the target is found: it is probable enough that the image holds it, and the gaze has been
+        on the most probable cell. It ends without the target when no cell is left that is probable enough
+        to be worth a look, and after `shifts` gaze shifts.
+
+        Beliefs that no thresholds were chosen for (those of Kaplan's rule) do not give up. They find the target when a
+        detection that overlaps the fixated cell has it as its best class, with a score of `confirm`.
+
+        With `boxes` no decision is made: the search ends when the gaze is on a cell that one of them overlaps (the
+        protocol of the paper).
 
         Args:
             image: `(3, H, W)` or `(1, 3, H, W)`, RGB in [0, 1].
@@ -199,21 +206,42 @@ class ActivePerception(nn.Module):
             shifts: most gaze shifts to make.
             seed: of the generator that draws the start and breaks ties.
             boxes: `(M, 4)`, where the target really is.
-            confirm: score at which a detection at the fixation counts as finding the target.
+            confirm: probability that the image holds the target, from which on it counts as found; None takes the one
+                that was chosen when the belief was fitted, or a score of 0.5.
+            give_up: probability below which a cell is not worth a look; None takes the one that was chosen.
 
         Raises:
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
         """
+        for name, value in (("confirm", confirm), ("give_up", give_up)):
+            check(value is None or 0 <= value <= 1, name, "a probability", value)
         image, grid = self._frame(image)
         index = self._target(target)
         goal = None if boxes is None else grid.footprint(boxes.to(image)).any(-2)
+        chosen = self.searching.observer.thresholds
+        thresholds = None
+        if chosen is not None:
+            thresholds = Thresholds(
+                chosen.confirm if confirm is None else confirm, chosen.give_up if give_up is None else give_up
+            )
 
-        def finds(step: Step) -> Tensor:
+        def outcome(step: Step) -> Tensor:
             if goal is not None:
-                return goal[step.cell]
-            return confirms(step.detections, grid, step.cell, index, confirm)
+                return goal[step.cell].long()
+            if thresholds is not None:
+                return decide(step, index, thresholds)
+            return confirms(step.detections, grid, step.cell, index, 0.5 if confirm is None else confirm).long()
 
-        return self._gaze(image, grid, self.searching, index, start, shifts, seed, finds)
+        scanpath, ended, last = self._gaze(image, grid, self.searching, index, start, shifts, seed, outcome)
+        scanpath = replace(scanpath, found=ended == 1)
+        if goal is not None:
+            return scanpath
+        probability = float(last.belief.presence(index))
+        cell = int(last.belief.probability(index).argmax() if thresholds is not None else last.cell)
+        if ended != 1:
+            return replace(scanpath, decision=Decision(OUTCOMES[ended], probability))
+        box = best_box(scanpath.detections, grid, cell, index)
+        return replace(scanpath, decision=Decision("found", probability, cell, box))
 
     def explore(self, image: Tensor, *, start: int | None = None, shifts: int = 20, seed: int = 0) -> Scanpath:
         """Explore an image: build up the belief about the whole map, with no target.
@@ -225,7 +253,7 @@ class ActivePerception(nn.Module):
             InputError: an argument does not fit.
         """
         image, grid = self._frame(image)
-        return self._gaze(image, grid, self.exploring, None, start, shifts, seed, None)
+        return self._gaze(image, grid, self.exploring, None, start, shifts, seed, None)[0]
 
     def _frame(self, image: Tensor) -> tuple[Tensor, Grid]:
         """The image as a batch of one, and the grid over it."""
@@ -242,21 +270,21 @@ class ActivePerception(nn.Module):
         start: int | None,
         shifts: int,
         seed: int,
-        finds: Callable[[Step], Tensor] | None,
-    ) -> Scanpath:
-        """Move the gaze until the target is found, or no shift or cell is left."""
+        outcome: Callable[[Step], Tensor] | None,
+    ) -> tuple[Scanpath, int, Step]:
+        """Move the gaze until there is an outcome, or no shift or cell is left; also the outcome and the last step."""
         generator = torch.Generator().manual_seed(seed)
         if start is None:
             start = int(torch.randint(len(grid), (1,), generator=generator))
         check(0 <= start < len(grid), "start", f"a cell from 0 to {len(grid) - 1}", start)
         looks = LiveLooks(self.eye, self.eye.open(image), grid, target)
-        found = False
+        ended: tuple[int, Step] | None = None
 
         def ends(step: Step) -> Tensor:
-            nonlocal found
-            over = torch.zeros_like(step.cell, dtype=torch.bool) if finds is None else finds(step)
-            found = bool(over)
-            return over
+            nonlocal ended
+            came = torch.zeros_like(step.cell) if outcome is None else outcome(step)
+            ended = int(came), step
+            return came > 0
 
         steps = rollout(
             looks,
@@ -269,7 +297,9 @@ class ActivePerception(nn.Module):
         )
         mapper = self.exploring.observer
         beside = None if mapper is strategy.observer else mapper
-        return replace(trace(steps, grid, self.classes, target, beside), found=found)
+        scanpath = trace(steps, grid, self.classes, target, beside)
+        assert ended is not None
+        return scanpath, *ended
 
     def _target(self, target: str | int) -> int:
         if isinstance(target, str):

@@ -9,6 +9,7 @@ from torch import Tensor
 from semfov.belief.belief import DirichletBelief, dirichlet_belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Observer
+from semfov.decision import Decision
 from semfov.detection.detections import Detections
 from semfov.episode import Step
 
@@ -28,7 +29,8 @@ class Scanpath:
         values: `(n, X·Y)`, acquisition values that the next fixation was chosen by.
         found: whether the search ended on its target.
         posterior: `(n, X·Y)`, probability of the target in each cell as the search believed it after each look; None
-            for exploration. Learned target evidence holds a fixated cell for empty: the search would have ended there.
+            for exploration.
+        decision: what the search decided; None for exploration, and where the protocol ended it on a given box.
         seconds: what each look took, by stage (`semfov.episode.STAGES`).
     """
 
@@ -42,6 +44,7 @@ class Scanpath:
     values: Tensor
     found: bool
     posterior: Tensor | None = None
+    decision: Decision | None = None
     seconds: tuple[Mapping[str, float], ...] = ()
 
     def __len__(self) -> int:

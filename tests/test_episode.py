@@ -12,6 +12,7 @@ import semfov
 from semfov import FovealObservationModel, Foveation, Grid, InputError
 from semfov.belief import ContextPrior, TargetEvidence
 from semfov.belief.observers import Context, Semantic, Target
+from semfov.belief.target_evidence import Gathered
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.episode import STAGES, LiveLooks, Looks, Sight, StoredLooks, rollout
 from semfov.eye import Eye
@@ -113,14 +114,17 @@ class SemanticLoop:
     def present(self):
         return [beta[self.target] / sum(beta) for beta in self.beta]
 
+    chance = present
+
 
 class TargetLoop:
-    """Evidence for the target: the closest look at each cell, and the strongest of all."""
+    """Evidence for the target: that of the closest look at each cell, the strongest, and the mean of all."""
 
     def __init__(self, seen, target, model):
         self.seen, self.target, self.model = seen, target, model
         self.nearest, self.best = [0.0] * CELLS, [-math.inf] * CELLS
-        self.closest, self.visited = [math.inf] * CELLS, [False] * CELLS
+        self.total, self.weight, self.closest = [0.0] * CELLS, [0.0] * CELLS, [math.inf] * CELLS
+        self.score, self.looks, self.visited = 0.0, 0, [False] * CELLS
 
     def look(self, at):
         fixation = GRID.centres[at : at + 1].double()
@@ -130,11 +134,27 @@ class TargetLoop:
             if distance < self.closest[cell]:
                 self.closest[cell], self.nearest[cell] = distance, said[cell]
             self.best[cell] = max(self.best[cell], said[cell])
+            self.total[cell] += math.exp(-6 * distance) * said[cell]
+            self.weight[cell] += math.exp(-6 * distance)
+        for detection in range(int(self.seen.count[at])):
+            self.score = max(self.score, float(self.seen.scores[at, detection, self.target]))
+        self.looks += 1
         self.visited[at] = True
 
+    def gathered(self):
+        mean = [total / weight for total, weight in zip(self.total, self.weight, strict=True)]
+        rows = [
+            torch.tensor([row], dtype=torch.float64)
+            for row in (self.nearest, self.best, mean, self.closest, self.score, float(self.looks))
+        ]
+        return Gathered(*rows, torch.tensor([self.visited]), torch.tensor([self.target]))
+
     def present(self):
-        rows = (torch.tensor([row], dtype=torch.float64) for row in (self.nearest, self.best, self.closest))
-        odds = self.model.log_odds(*rows, torch.tensor([self.visited]), GRID.columns)
+        odds = self.model.log_odds(self.gathered(), GRID.columns)
+        return [1 / (1 + math.exp(-value)) for value in odds[0].tolist()]
+
+    def chance(self):
+        odds = self.model.chance(self.gathered(), GRID.columns)
         return [1 / (1 + math.exp(-value)) for value in odds[0].tolist()]
 
 
@@ -149,7 +169,7 @@ def scalar_episode(loop, episode, most, values_of=None):
     while True:
         loop.look(at)
         visited.append(at)
-        values = loop.present() if values_of is None else values_of
+        values = loop.chance() if values_of is None else values_of
         left = [cell for cell in range(CELLS) if cell not in visited]
         chosen = None
         if left:

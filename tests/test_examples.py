@@ -43,7 +43,7 @@ def test_foveating_keeps_what_is_looked_at(tmp_path):
 def test_searching_draws_the_scanpath(tmp_path):
     output = run("search_photograph", "--out", tmp_path / "scanpath.png")
     assert "fixation 0 at (32, 24)" in output
-    assert re.search(r"“cup” (found after|not found in) \d+ gaze shift", output)
+    assert re.search(r"“cup” (found|not there|undecided) after \d+ gaze shifts? \(probability [01]\.\d\d\)", output)
     with Image.open(tmp_path / "scanpath.png") as picture:
         assert min(picture.size) > 500
 

@@ -60,6 +60,7 @@ ROOMS = [
     "gaze",
     "eye",
     "episode",
+    "decision",
     "scanpath",
     "agent",
     "metrics",

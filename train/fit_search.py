@@ -1,14 +1,15 @@
-"""Learn to search: `python -m train.fit_search` trains the evidence for a target on series of looks at photographs.
+"""Learn evidence for targets: `python -m train.fit_search` trains what the recommended agent believes and decides by.
 
     python -m train.fit_search --data.root DIR --data.annotations instances.json --out runs/fit_search
 
 Without photographs it uses the embedded scenes, which is only good for trying it out.
 
-Every photograph is fixated at random points (the looks are shared with `train.fit_fom` under the same `--cache`). For
-each class that may be searched for, some of the looks are drawn, and the model is trained by gradient, through the
-gathering of evidence and a soft choice of the next fixation, so that this choice lands on the target. The folder `out`
-gets the model (`<name>.safetensors`), and a report that judges it on photographs that it was not trained on.
-Use it with `--policies target-evidence --belief.target_model runs/fit_search/<name>.safetensors`.
+Every photograph is looked at from every cell (shared with `eval.search` under the same `--cache`). Then the model
+searches them for classes that they hold and for classes that they do not, and learns from its own looks where the
+target is, whether it is there at all, and where to look next. The folder `out` gets the model (`<name>.safetensors`)
+with the thresholds of its decisions, and a report that judges it on photographs that were held out. Looking goes on
+where it was when the same command is given again.
+Use it with `--policies [target-evidence] --belief.target_model runs/fit_search/<name>.safetensors`.
 """
 
 import sys

@@ -45,7 +45,7 @@ def detectors(data: st.DataObject) -> str:
     eye = Eye(Foveation(10.0), detector, reference=64.0)
     agent = ActivePerception(eye, (observer, policy), (observer, policies.Random()), grid=(columns, rows))
     image = torch.from_numpy(rng.random((3, height, width), dtype=np.float32))
-    result = attempt(lambda: agent.search(image, "cup", shifts=3, confirm=2.0))
+    result = attempt(lambda: agent.search(image, "cup", shifts=3, confirm=1.0))
     if failed(result):
         assert boxes in ("NaN", "infinite") or scores in ("NaN", "negative", "above one"), result
         return outcome(result)

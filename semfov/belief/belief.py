@@ -30,6 +30,20 @@ class Belief(ABC):
                 for that target, whatever is asked.
         """
 
+    def chance(self, target: int | Tensor) -> Tensor:
+        """Probability that each cell holds the target if no fixated cell does, as in a search that goes on, `(B, X·Y)`.
+
+        Without knowing better that is `probability`. Values of fixated cells have no meaning.
+        """
+        return self.probability(target)
+
+    def presence(self, target: int | Tensor) -> Tensor:
+        """Probability that the target is anywhere in the image, `(B,)`.
+
+        A belief that was not made to tell gives a bound: the probability of the most probable cell.
+        """
+        return self.probability(target).amax(-1)
+
     @abstractmethod
     def map(self, function: Callable[[Tensor], Tensor]) -> Self:
         """The belief with every tensor, each `(B, ...)`, replaced by `function` of it."""

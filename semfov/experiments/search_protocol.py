@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.data.scene import Scenes
+from semfov.data.scene import Annotation, Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.episode import Step, StoredLooks, rollout
 from semfov.experiments.candidates import Candidate
@@ -81,6 +81,19 @@ def episodes_of(scenes: Scenes, index: int, columns: int, rows: int, protocol: P
             for repetition, start in enumerate(free[order[: protocol.starts]].tolist())
         ]
     return episodes
+
+
+def choose_classes(
+    scenes: Scenes, index: int, annotation: Annotation, classes: int, max_area: float, seed: int
+) -> list[int]:
+    """Up to so many classes that a photograph holds and that may be searched for, and as many that it does not hold."""
+    generator = generator_for("classes", seed, scenes.ids[index])
+    held = set(annotation.labels.tolist())
+    legal = legal_targets(annotation, max_area)
+    present = [legal[place] for place in torch.randperm(len(legal), generator=generator)[:classes].tolist()]
+    others = [target for target in range(1, len(scenes.classes) + 1) if target not in held]
+    absent = [others[place] for place in torch.randperm(len(others), generator=generator)[: len(present)].tolist()]
+    return [*present, *absent]
 
 
 def tie_noise(scenes: Scenes, episode: Episode, cells: int, protocol: ProtocolConfig) -> Tensor:

@@ -49,6 +49,26 @@ class Greedy(Choice):
         return centres[cell], cell
 
 
+class Exploratory(Greedy):
+    """`Greedy` with some fixations astray, which training needs to see all cells.
+
+    Args:
+        noise: breaks ties, and draws: other numbers whenever it is asked.
+        astray: probability of a fixation at random.
+    """
+
+    def __init__(self, noise: Noise, astray: float) -> None:
+        super().__init__(noise)
+        self.astray = astray
+
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The best cell, or any."""
+        lost = self.noise(shift, episodes)[:, :1] < self.astray
+        return super().__call__(shift, episodes, torch.where(lost, 0.0, values.detach()), visited, centres)
+
+
 class Relaxed(Choice):
     """A draw by Gumbel-softmax, through which gradients flow (`soft_fixation`).
 

@@ -78,7 +78,7 @@ def make_cases(
             said = observer.weigh(seen, fixations, place.grid, target)
             for look in used.split(1):
                 belief = observer.update(belief, said[look])
-            present = belief.probability(target)[0]
+            present = belief.chance(target)[0]
             shown = presence[used].amax(0, keepdim=True)
             alone = [prior(shown, place.grid, target, weights)[0] for weights in ((1.0, 0.0), (0.0, 1.0))]
             visited = torch.zeros(len(place.grid), dtype=torch.bool).scatter(0, cells[used], True)

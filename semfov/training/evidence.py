@@ -1,6 +1,7 @@
-"""Training evidence for targets on series of looks."""
+"""Training evidence for targets on the looks of whole searches."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,13 +11,24 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from semfov.belief import TargetEvidence
+from semfov.belief.grid import Grid
+from semfov.belief.observers import Target, TargetBelief
+from semfov.belief.target_evidence import Thresholds
+from semfov.episode import Step, rollout
 from semfov.errors import DataError, check
-from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.experiments.config import BeliefConfig, DataConfig, DetectorConfig, SearchConfig, SensorConfig
 from semfov.experiments.parallel import rank
-from semfov.experiments.samples import SampleSettings, collect
+from semfov.experiments.run import finish
 from semfov.experiments.summary import table
-from semfov.training.evidence_examples import Examples, make_examples
+from semfov.gaze.acquisition import TargetPosterior
+from semfov.gaze.choice import Exploratory
+from semfov.metrics.calibration import calibration_error
+from semfov.metrics.presence import area_under_roc
+from semfov.training.evidence_examples import ExampleLooks, Examples, LookingRun, make_examples
 from semfov.training.outputs import training_of, write_outputs
+
+JUDGED = (1, 5, 15)
+"""Looks after which a belief is judged."""
 
 
 @dataclass(frozen=True)
@@ -24,147 +36,247 @@ class FitSearchConfig:
     """Train the evidence for a target.
 
     Args:
-        data: photographs to learn from (all of them: no selection by number of objects).
+        data: photographs to learn from.
         detector: which detector looks through the fovea.
         sensor: the foveal sensor.
         name: name of the model (None: the detector's).
-        fixations: random fixations in each photograph.
-        iou: as in `train.fit_fom`, for looks to be shared with it.
-        seed: of fixations, first parameters and training.
-        shard: photographs in a unit of work.
+        classes: classes that a photograph holds to learn from, and as many that it does not.
         columns: cells in a row.
         rows: cells in a column.
-        min_objects: photographs with fewer objects are left out.
         max_target_area: classes that cover a larger share of the image are not searched for.
-        holdout: every n-th photograph is kept out and used to judge.
+        holdout: every n-th photograph is kept out and used to judge, and to choose thresholds by.
+        looks: of a search.
+        astray: share of the fixations that are drawn at random, so that all cells are learned from.
+        landing: weight in the loss of landing on the target with the next fixation.
+        presence: weight in the loss of telling whether the target is in the photograph.
+        false_alarms: share of absent targets that may be called found, by which the threshold is chosen.
+        lost: share of the targets that may be missed because no cell is worth a look any more.
         steps: steps of training.
         batch: examples in a step.
         rate: highest learning rate.
+        seed: of the choice of classes, first parameters and training.
         out: folder for the model and the report.
-        cache: folder for the labelled detections (None: `out`).
+        cache: folder for what was seen from every cell, shared with `eval.search` (None: the user's cache).
         workers: processes that look (None: one for each CPU core).
     """
 
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     name: str | None = None
-    fixations: int = 8
-    iou: float = 0.5
-    seed: int = 0
-    shard: int = 32
+    classes: int = 2
     columns: int = 10
     rows: int = 10
-    min_objects: int = 4
     max_target_area: float = 0.2
-    holdout: int = 10
-    steps: int = 2000
-    batch: int = 128
+    holdout: int = 5
+    looks: int = 16
+    astray: float = 0.3
+    landing: float = 1.0
+    presence: float = 0.5
+    false_alarms: float = 0.015
+    lost: float = 0.02
+    steps: int = 500
+    batch: int = 48
     rate: float = 5e-3
+    seed: int = 0
     out: Path = Path("runs/fit_search")
     cache: Path | None = None
     workers: int | None = None
 
 
 def fit_search(config: FitSearchConfig) -> None:
-    """Collect looks, train, judge on held-out photographs, and write everything."""
+    """Look from every cell, train, judge on held-out photographs, and write everything."""
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
-    settings = SampleSettings.of(config)
-    sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
+    check(config.looks >= 2, "looks", "2 or more", config.looks)
+    run = LookingRun(
+        SearchConfig(
+            data=config.data,
+            detector=config.detector,
+            sensor=config.sensor,
+            belief=BeliefConfig(columns=config.columns, rows=config.rows),
+            policies=("random",),
+            out=config.out,
+            cache=config.cache,
+            workers=config.workers,
+        )
+    )
+    finish(run, "looking")
     if rank() > 0:
         return
-    examples = make_examples(sampler, samples, config.columns, config.rows, config.min_objects, config.max_target_area)
+    examples = make_examples(run, config.classes, config.max_target_area, config.seed)
     held_out = examples.scene % config.holdout == 0
     if held_out.all() or not held_out.any():
         raise DataError(f"data: too few examples to train and to judge by ({len(examples)}); give more photographs")
-    metadata = {**sampler.eye.settings(), **training_of(config, sampler.scenes)}
-    model, judged = train(config, examples[~held_out], examples[held_out], metadata)
-    path = config.out / f"{config.name or sampler.eye.detector.name}.safetensors"
+    grid = Grid(config.columns, config.rows, (config.columns, config.rows))
+    metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
+    model = train(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
+    judged, model.thresholds = judge(config, model, examples[held_out], grid)
+    path = config.out / f"{config.name or run.eye.detector.name}.safetensors"
     model.save(path)
-    text = report(judged, int((~held_out).sum()), int(held_out.sum()))
+    text = report(judged, model.thresholds, int((~held_out).sum()), int(held_out.sum()))
     write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
 
 
 def train(
-    config: FitSearchConfig, examples: Examples, held_out: Examples, metadata: dict[str, object]
-) -> tuple[TargetEvidence, list[dict[str, float]]]:
-    """The trained model, and how well it did on held-out examples as training went on."""
+    config: FitSearchConfig, examples: Examples, grid: Grid, metadata: dict[str, object], components: int
+) -> TargetEvidence:
+    """The model, trained on searches that it makes itself, with fixations astray among them."""
     generator = torch.Generator().manual_seed(config.seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        model = TargetEvidence(metadata=metadata)
+        model = TargetEvidence(components=components, metadata=metadata)
     optimiser = torch.optim.AdamW(model.parameters(), lr=config.rate, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.rate, total_steps=config.steps)
-    judged = []
-    bar = tqdm(range(1, config.steps + 1), desc="training", unit="step", dynamic_ncols=True)
-    for step in bar:
+    bar = tqdm(range(config.steps), desc="training", unit="step", dynamic_ncols=True)
+    for number in bar:
         chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
-        loss = objective(*series(model, chosen, config.columns, generator))
+        # At first the model knows nothing, and where it would look does not matter.
+        astray = 1.0 if number < config.steps // 20 else config.astray * (number % 2)
+        counted = torch.randint(2, config.looks + 1, (2,), generator=generator).tolist()
+        loss = chosen.score.new_zeros(())
+        for step in searches(model, chosen, grid, config.looks, astray, generator):
+            if step.shift + 1 in (1, *counted):
+                loss = loss + objective(config, step, chosen.goal)
         optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimiser.step()
         schedule.step()
-        if step in (1, config.steps) or step % 250 == 0:
-            judged.append({"step": step, **judge(model, held_out, config.columns)})
-            bar.set_postfix(held_out=f"{judged[-1]['hit']:.3f}")
-    return model.eval(), judged
+        if number % 25 == 0:
+            bar.set_postfix(loss=f"{float(loss.detach()):.3f}")
+    return model.eval()
 
 
-def series(
-    model: TargetEvidence, examples: Examples, columns: int, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Log odds after a random number of random looks at each example, `(B, X·Y)`; goals; visited cells.
+def searches(
+    model: TargetEvidence, examples: Examples, grid: Grid, looks: int, astray: float, generator: torch.Generator
+) -> Iterator[Step]:
+    """A search of every example from a start at random, which does not end on its target."""
+    count = len(examples)
+    start = torch.randint(len(grid), (count,), generator=generator)
+    choice = Exploratory(lambda _, episodes: torch.rand(len(episodes), len(grid), generator=generator), astray)
+    observer = Target(model, together=True)
+    return rollout(ExampleLooks(examples, grid), observer, TargetPosterior(1), start, choice, most=looks)
 
-    Looks that fixate the target would have ended the search and are left out.
+
+def objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
+    r"""Cross-entropy of cells and of presence, and minus the log probability that a soft fixation lands on the target.
+
+    .. math:: \sum_x \mathrm{BCE}(P(t \in x)) / 25 + w_p \, \mathrm{BCE}(P(t)) - w_l \ln \frac{
+              \sum_{x \in \text{goal}} o(x)}{\sum_x o(x)}, \qquad o = p / (1 - p)
+
+    over cells that were not visited; cells count four times as much as one mean over them would.
     """
-    count, looks = examples.fixated.shape
-    order = torch.rand(count, looks, generator=generator)
-    order = order.masked_fill(examples.goal.gather(1, examples.fixated), torch.inf)
-    number = torch.randint(1, looks + 1, (count, 1), generator=generator)
-    used = (order.argsort(1).argsort(1) < number) & order.isfinite()
-    kept = used.any(1)
-    used, examples = used[kept], examples[kept]
-    evidence = model.evidence(examples.features)
-    distance, look = examples.distance.masked_fill(~used[..., None], torch.inf).min(1, keepdim=True)
-    nearest = evidence.gather(1, look)[:, 0]
-    best = evidence.masked_fill(~used[..., None], -torch.inf).amax(1)
-    visited = torch.zeros(len(used), examples.goal.shape[1] + 1, dtype=torch.bool)
-    visited = visited.scatter(1, torch.where(used, examples.fixated, examples.goal.shape[1]), True)[:, :-1]
-    return model.log_odds(nearest, best, distance[:, 0], visited, columns), examples.goal, visited
-
-
-def objective(log_odds: Tensor, goal: Tensor, visited: Tensor) -> Tensor:
-    r"""Cross-entropy of the odds, and minus the log probability that a soft fixation lands on the target.
-
-    .. math:: -\ln \sum_{x \in \text{goal}} \mathrm{softmax}(\ell)(x) + \mathrm{BCE}(\ell)
-    """
-    open_odds = log_odds.masked_fill(visited, -torch.inf)
-    hit = open_odds.masked_fill(~goal, -torch.inf).logsumexp(1) - open_odds.logsumexp(1)
-    return F.binary_cross_entropy_with_logits(log_odds[~visited], goal[~visited].to(log_odds)) - hit.mean()
+    belief = step.belief
+    assert isinstance(belief, TargetBelief)
+    cells, present = belief.present.logit(eps=1e-7), goal.any(-1).to(belief.anywhere)
+    loss = 4 * F.binary_cross_entropy_with_logits(cells, goal.to(cells))
+    loss = loss + config.presence * F.binary_cross_entropy(belief.anywhere, present)
+    # Where the target was fixated, the search would be over.
+    some = goal.any(-1) & ~(goal & step.visited).any(-1)
+    if some.any():
+        odds = belief.following.logit(eps=1e-7)[some].masked_fill(step.visited[some], -torch.inf)
+        landing = odds.masked_fill(~goal[some], -torch.inf).logsumexp(-1) - odds.logsumexp(-1)
+        loss = loss - config.landing * landing.mean()
+    return loss
 
 
 @torch.no_grad()
-def judge(model: TargetEvidence, examples: Examples, columns: int) -> dict[str, float]:
-    """How often the most probable cell holds the target, and the cross-entropy of the odds, on the same series."""
-    model.eval()
-    log_odds, goal, visited = series(model, examples, columns, torch.Generator().manual_seed(0))
-    model.train()
-    best = log_odds.masked_fill(visited, -torch.inf).argmax(1, keepdim=True)
-    entropy = F.binary_cross_entropy_with_logits(log_odds[~visited], goal[~visited].to(log_odds))
-    return {"hit": float(goal.gather(1, best).float().mean()), "cross_entropy": float(entropy)}
+def judge(
+    config: FitSearchConfig, model: TargetEvidence, examples: Examples, grid: Grid
+) -> tuple[list[dict[str, float]], Thresholds]:
+    """How well the model does on held-out searches after some looks, and the thresholds that they ask for."""
+    generator = torch.Generator().manual_seed(config.seed)
+    looks = max(*JUDGED, config.looks)
+    goal, visited, present, anywhere = examples.goal, [], [], []
+    for step in searches(model, examples, grid, looks, 0.0, generator):
+        assert isinstance(step.belief, TargetBelief)
+        present.append(step.belief.present)
+        anywhere.append(step.belief.anywhere)
+        visited.append(step.visited)
+    there = goal.any(-1)
+    judged = []
+    for number in (each for each in JUDGED if each <= len(present)):
+        cells, image, seen = present[number - 1], anywhere[number - 1], visited[number - 1]
+        judged.append(
+            {
+                "looks": number,
+                "found": float((seen & goal).any(-1)[there].double().mean()),
+                "cells_nll": float(F.binary_cross_entropy(cells.double(), goal.double())),
+                "cells_ece": float(calibration_error(cells.flatten(), goal.flatten())),
+                "visited_ece": float(calibration_error(cells[seen], goal[seen])),
+                "presence_area": area_under_roc(image, there),
+                "presence_ece": float(calibration_error(image, there)),
+            }
+        )
+    return judged, choose_thresholds(config, torch.stack(anywhere), torch.stack(present), torch.stack(visited), there)
 
 
-def report(judged: list[dict[str, float]], trained: int, held_out: int) -> str:
-    """How training went, as Markdown."""
-    rows = [[str(int(j["step"])), f"{100 * j['hit']:.1f}", f"{j['cross_entropy']:.4f}"] for j in judged]
+def choose_thresholds(
+    config: FitSearchConfig, anywhere: Tensor, present: Tensor, visited: Tensor, there: Tensor
+) -> Thresholds:
+    """The least confirmation with so few false alarms, and the largest price of a look that loses so few targets.
+
+    Args:
+        config: of the fit.
+        anywhere: `(n, E)`, probability of presence after each look of each search.
+        present: `(n, E, X·Y)`, that of every cell.
+        visited: `(n, E, X·Y)` boolean.
+        there: `(E,)` boolean, whether the target is there.
+    """
+    looked = visited.gather(-1, present.argmax(-1, keepdim=True))[..., 0]
+    left = present.masked_fill(visited, 0).amax(-1)
+
+    def found(confirm: float, give_up: float) -> Tensor:
+        """Which searches end with the target found."""
+        sure, tired = (anywhere >= confirm) & looked, left < give_up
+        number = torch.arange(len(sure))[:, None]
+        first = torch.where(sure, number, len(sure)).amin(0)
+        return sure.any(0) & ~(tired & (number < first)).any(0)
+
+    confirm = 1.0
+    for candidate in torch.arange(0.99, 0.49, -0.01).tolist():
+        if float(found(candidate, 0.0)[~there].double().mean()) > config.false_alarms:
+            break
+        confirm = candidate
+    told = int(found(confirm, 0.0)[there].sum())
+    for give_up in (0.1, 0.07, 0.05, 0.03, 0.02, 0.01):
+        if told - int(found(confirm, give_up)[there].sum()) <= config.lost * int(there.sum()):
+            return Thresholds(confirm, give_up)
+    return Thresholds(confirm, 0.0)
+
+
+def report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int, held_out: int) -> str:
+    """How the model does, as Markdown."""
+    head = [
+        "looks",
+        "gaze on target, %",
+        "NLL of cells",
+        "ECE of cells",
+        "ECE, fixated",
+        "area under ROC",
+        "ECE, presence",
+    ]
+    rows = [
+        [
+            str(int(row["looks"])),
+            f"{100 * row['found']:.1f}",
+            *(
+                f"{row[name]:.4f}"
+                for name in ("cells_nll", "cells_ece", "visited_ece", "presence_area", "presence_ece")
+            ),
+        ]
+        for row in judged
+    ]
     return "\n".join(
         [
-            f"Trained on {trained} pairs of photograph and class, judged on {held_out} of photographs that were held "
-            "out, after one to all of the looks at each: how often the most probable cell held the target (%), and the "
-            "cross-entropy of the odds over all cells.",
+            f"Trained on {trained} pairs of photograph and class, half of them without the class, judged on {held_out} "
+            "of photographs that were held out, in searches that go by the model: how often the gaze has been on the "
+            "target, negative log likelihood and expected calibration error of the probability of the target in every "
+            "cell, that of fixated cells alone, and how well the probability that the class is there tells.",
             "",
-            *table([["step", "next fixation hits", "cross-entropy"], *rows]),
+            *table([head, *rows]),
+            "",
+            f"Thresholds: found from {thresholds.confirm:.3f}, a cell is worth a look from {thresholds.give_up:.2f}.",
             "",
         ]
     )

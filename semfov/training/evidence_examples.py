@@ -1,8 +1,9 @@
-"""Series of looks to learn search from: what each look showed of a target, and where the target really was."""
+"""Photographs to learn evidence from: what looks from every cell show of a class, and where the class really is."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -10,26 +11,47 @@ from tqdm import tqdm
 
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import look_features
-from semfov.data.scene import legal_targets
-from semfov.experiments.samples import Sampler, Samples
+from semfov.belief.observers import Observer
+from semfov.belief.observers.base import own
+from semfov.belief.observers.target import Target, TargetLook
+from semfov.detection.detections import Detections
+from semfov.episode import Looks, Sight
+from semfov.errors import DataError
+from semfov.experiments.parts import Record
+from semfov.experiments.run import Run
+from semfov.experiments.search_protocol import choose_classes
+from semfov.gaze.policies import Task
+
+
+class LookingRun(Run):
+    """Looks at every scene from every cell, and keeps what was seen; there are no episodes."""
+
+    task: ClassVar[Task] = "search"
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """No records."""
+        self.detections(index)
+        return [], {}
 
 
 @dataclass(frozen=True)
 class Examples:
-    """One example for each photograph and class to search for, with all looks at the photograph.
+    """One example for each photograph and class to search for, the class in the photograph or not.
 
     Attributes:
-        features: `(E, R, X·Y, F)`, of `look_features`.
-        distance: `(E, R, X·Y)`, from each fixation to every cell, in longer sides.
-        fixated: `(E, R)`, cell of each fixation.
-        goal: `(E, X·Y)` boolean, cells that an object of the class overlaps.
+        features: `(E, X·Y, X·Y, F)`, of `look_features`, for looks from every cell; half precision.
+        score: `(E, X·Y)`, highest score of the class in looks from every cell.
+        distance: `(E, X·Y, X·Y)`, from every cell to every cell, in longer sides.
+        goal: `(E, X·Y)` boolean, cells that an object of the class overlaps; none where it is absent.
+        target: `(E,)`, the class.
         scene: `(E,)`, index of the photograph.
     """
 
     features: Tensor
+    score: Tensor
     distance: Tensor
-    fixated: Tensor
     goal: Tensor
+    target: Tensor
     scene: Tensor
 
     def __len__(self) -> int:
@@ -37,30 +59,65 @@ class Examples:
 
     def __getitem__(self, index: Tensor) -> Examples:
         """Some of the examples."""
-        return Examples(
-            self.features[index], self.distance[index], self.fixated[index], self.goal[index], self.scene[index]
+        return Examples(*(getattr(self, field.name)[index] for field in fields(self)))
+
+
+class ExampleLooks(Looks):
+    """Looks at many photographs at once, an episode at each.
+
+    Args:
+        examples: the photographs, one for each episode.
+        grid: cells, as many as theirs.
+    """
+
+    def __init__(self, examples: Examples, grid: Grid) -> None:
+        self.examples, self.grid = examples, grid
+        self.like = examples.score
+
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """What looks from the cells show, weighed by the model that is being trained."""
+        known, model = self.examples, own(observer, Target, "observer").model
+        evidence = model.evidence(known.features[episodes, cell].float())
+        look = TargetLook(
+            evidence,
+            known.distance[episodes, cell],
+            known.score[episodes, cell],
+            cell,
+            known.target[episodes],
+            self.grid.columns,
         )
+        return Sight(look, _no_detections, {})
 
 
-def make_examples(
-    sampler: Sampler, samples: Samples, columns: int, rows: int, min_objects: int, max_area: float
-) -> Examples:
-    """Examples from labelled detections and the annotations of their photographs."""
-    looks = sampler.settings.fixations
+def _no_detections() -> Detections:
+    raise NotImplementedError("examples keep no detections")
+
+
+def make_examples(run: LookingRun, classes: int, max_area: float, seed: int) -> Examples:
+    """Examples from all photographs of a run: up to `classes` classes that are there, and as many that are not.
+
+    Args:
+        run: that has looked.
+        classes: of each kind, at most.
+        max_area: classes that cover a larger share of the image are left out.
+        seed: of the choice of classes.
+    """
     parts = []
-    for index in tqdm(range(len(sampler.scenes)), desc="describing looks", unit="scene", dynamic_ncols=True):
-        annotation = sampler.scenes.annotation(index)
-        targets = legal_targets(annotation, max_area) if len(annotation.labels) >= min_objects else []
-        if not targets:
-            continue
-        here = slice(index * looks, (index + 1) * looks)
-        seen, fixations = samples.seen(here), samples.fixations[here]
-        grid = Grid(columns, rows, annotation.size)
-        distance = grid.distance(fixations)
+    for index in tqdm(range(len(run.scenes)), desc="describing looks", unit="scene", dynamic_ncols=True):
+        annotation, grid = run.scenes.annotation(index), run.grid(index)
         covered = grid.footprint(annotation.boxes)
-        for target in targets:
+        chosen = choose_classes(run.scenes, index, annotation, classes, max_area, seed)
+        detections = run.detections(index) if chosen else None
+        for target in chosen:
+            assert detections is not None
             goal = covered[annotation.labels == target].any(0)
-            if goal.any() and not goal.all():
-                features = look_features(seen, fixations, grid, target)
-                parts.append((features, distance, grid.cell_of(fixations), goal, torch.tensor(index)))
+            if goal.all():
+                continue
+            with torch.inference_mode():
+                features = look_features(detections, grid.centres, grid, target).half()
+            scores = detections.scores[..., target] * detections.mask
+            score = scores.amax(-1) if scores.shape[-1] else scores.new_zeros(len(scores))
+            parts.append((features, score, grid.cell_distance, goal, torch.tensor(target), torch.tensor(index)))
+    if not parts:
+        raise DataError("data: no photograph has a class that may be searched for; raise max_target_area")
     return Examples(*(torch.stack(column) for column in zip(*parts, strict=True)))

@@ -156,7 +156,13 @@ def describe(scanpath: Scanpath) -> str:
     shifts = f"{scanpath.shifts} gaze shift{'s' if scanpath.shifts != 1 else ''}"
     if scanpath.target is None:
         return f"explored with {shifts}"
-    return f"“{scanpath.classes[scanpath.target]}” {'found after' if scanpath.found else 'not found in'} {shifts}"
+    name, decision = scanpath.classes[scanpath.target], scanpath.decision
+    if decision is None:
+        return f"“{name}” {'found after' if scanpath.found else 'not found in'} {shifts}"
+    sure = f"probability {decision.probability:.2f}"
+    if decision.outcome == "found":
+        return f"“{name}” found after {shifts} ({sure})"
+    return f"“{name}” {'not there' if decision.outcome == 'absent' else 'undecided'} after {shifts} ({sure})"
 
 
 def _draw_view(axes: Axes, scanpath: Scanpath, fixation: int, view: Tensor) -> None:

@@ -10,6 +10,7 @@ from semfov import Detections, Grid
 from semfov.belief import ContextPrior, TargetEvidence
 from semfov.belief.context import presence_of, reaches
 from semfov.belief.observers import Context, Semantic, Target
+from semfov.belief.target_evidence import Thresholds
 from semfov.errors import DataError, InputError
 
 GRID = Grid(5, 4, (100, 60))
@@ -116,7 +117,7 @@ def test_presence_equals_a_loop(looks):
 
 def observers():
     torch.manual_seed(3)
-    evidence = Target(TargetEvidence(8, 6).eval().requires_grad_(False))
+    evidence = Target(TargetEvidence(8, 6, thresholds=Thresholds(0.8, 0.1)).eval().requires_grad_(False))
     return [evidence, Semantic(4, tempering=0.25, footprint="box_centre")]
 
 
@@ -135,6 +136,13 @@ def test_observer_adds_context_to_the_log_odds(prior, looks, kind):
     expected = (present.log() - torch.log1p(-present) + context).sigmoid()
     torch.testing.assert_close(belief.probability(2), expected, rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(belief.closest, plain.closest)
+    # The same for where to look next; whether the target is there at all is as the other observer has it.
+    chance = plain.chance(2)
+    expected = (chance.log() - torch.log1p(-chance) + context).sigmoid()
+    torch.testing.assert_close(belief.chance(2), expected, rtol=1e-4, atol=1e-6)
+    assert torch.equal(belief.presence(2), plain.presence(2))
+    assert torch.equal(belief.chance(2), belief.probability(2)) == (kind == 1)
+    assert observer.thresholds == inner.thresholds
 
 
 @pytest.mark.parametrize("kind", [0, 1], ids=["evidence", "map"])

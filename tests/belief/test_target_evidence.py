@@ -1,4 +1,7 @@
-"""Learned target evidence: features against a loop, the networks' inputs against scipy, memory against its rules."""
+"""Learned target evidence: features, memory and read-out against loops in scalars, the neighbourhoods against scipy."""
+
+import math
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -8,10 +11,12 @@ import torch
 from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief import TargetEvidence
 from semfov.belief.look_features import FEATURES, look_features
-from semfov.belief.observers import Target
-from semfov.belief.target_evidence import _blur, _peak
+from semfov.belief.observers import Target, TargetBelief
+from semfov.belief.observers.target import TargetLook
+from semfov.belief.target_evidence import Gathered, Thresholds, _blur, _peak
 from semfov.errors import DataError, InputError
 from semfov.gaze.acquisition import KLDivergence
+from semfov.io.storage import write
 
 GRID = Grid(6, 4, (90, 60))
 
@@ -28,10 +33,11 @@ def looks():
 @pytest.fixture
 def model():
     torch.manual_seed(1)
-    return TargetEvidence(8, 6).eval()
+    return TargetEvidence(8, 6, components=4).eval()
 
 
-FIXATIONS = GRID.centres[torch.tensor([0, 9, 20])]
+FIXATED = [0, 9, 20]
+FIXATIONS = GRID.centres[FIXATED]
 
 
 def test_features_equal_a_loop(looks):
@@ -92,59 +98,427 @@ def test_neighbourhoods_are_those_of_scipy():
         np.testing.assert_allclose(peak.reshape(4, 6), scipy.ndimage.maximum_filter(grid, 3, mode="nearest"))
 
 
-def test_belief_keeps_the_closest_look_and_the_strongest(looks, model):
-    observer = Target(model)
-    belief = observer.start(1, GRID, torch.empty(0))
+def sigmoid(value):
+    return 1 / (1 + math.exp(-value))
+
+
+def neural(network, inputs):
+    """A network of two hidden layers, in float64 scalars of numpy."""
+    value = np.array(inputs, dtype=np.float64)
+    for number, layer in enumerate(network):
+        if number % 2:
+            value = np.array([x / 2 * (1 + math.erf(x / math.sqrt(2))) for x in value])
+        else:
+            value = layer.weight.detach().double().numpy() @ value + layer.bias.detach().double().numpy()
+    return float(value[0])
+
+
+def shrunk(odds):
+    return math.log(odds + 1e-3) / 2 + 1
+
+
+def blurred(odds, sigma, columns=6):
+    """Gaussian average, over all that lies within 3 cells of each other; nothing lies outside."""
+    kernel = [math.exp(-(step**2) / (2 * sigma**2)) for step in range(-3, 4)]
+    kernel = [value / sum(kernel) for value in kernel]
+    answer = []
+    for cell in range(len(odds)):
+        total = 0.0
+        for other in range(len(odds)):
+            down, right = other // columns - cell // columns, other % columns - cell % columns
+            if abs(down) <= 3 and abs(right) <= 3:
+                total += odds[other] * kernel[down + 3] * kernel[right + 3]
+        answer.append(total)
+    return answer
+
+
+def read_cells(network, known, prior, nearest, more=None):
+    """What a network makes of 6 × 4 cells, cell by cell in scalars."""
+    best, mean, closest = known["best"], known["mean"], known["closest"]
+    odds = [sigmoid(value) for value in nearest]
+    narrow, wide = blurred(odds, 0.6), blurred(odds, 1.5)
+    cells = []
+    for cell in range(24):
+        down, right = divmod(cell, 6)
+        around = [nearest[o] for o in range(24) if abs(o // 6 - down) <= 1 and abs(o % 6 - right) <= 1]
+        y, x = 2 * down / 3 - 1, 2 * right / 5 - 1
+        inputs = [
+            nearest[cell] / 2 + 1,
+            best[cell] / 2 + 1,
+            mean[cell] / 2 + 1,
+            4 * closest[cell],
+            shrunk(narrow[cell]),
+            shrunk(wide[cell]),
+            max(around) / 2 + 1,
+            max(nearest) / 2,
+            max(best) / 2,
+            shrunk(sum(odds)),
+            x**2 + y**2,
+            y,
+            math.log(known["looks"]) / 2,
+            prior,
+        ]
+        inputs += [] if more is None else [more[cell]]
+        cells.append(nearest[cell] + neural(network, inputs))
+    return cells
+
+
+def read_out(model, known, target):
+    """Log odds of all cells, of all cells if none that was fixated holds the target, and of presence."""
+    nearest, prior, visited = known["nearest"], float(model.prior[target]), known["visited"]
+    cells = read_cells(model.read, known, prior, nearest)
+    emptied = [-8.0 if seen else value for value, seen in zip(nearest, visited, strict=True)]
+    following = read_cells(model.guide, known, prior, emptied, blurred([float(seen) for seen in visited], 0.6))
+    inputs = [
+        max(cells) / 3,
+        math.log(sum(math.exp(value) for value in cells)) / 3,
+        sorted(cells)[-5] / 3,
+        max(known["best"]) / 3,
+        max(nearest) / 3,
+        4 * sum(known["closest"]) / 24,
+        math.log(known["looks"]) / 2,
+        prior,
+        shrunk(known["score"]),
+    ]
+    return cells, following, max(cells) + neural(model.judge, inputs)
+
+
+def remember(looks, model, order, target):
+    """What looks in this order leave, look by look and cell by cell."""
+    evidence = model(looks, FIXATIONS, GRID, target)
+    cells = range(24)
+    known = {"nearest": [0.0] * 24, "best": [-math.inf] * 24, "closest": [math.inf] * 24, "score": 0.0, "looks": 0}
+    known["visited"] = [False] * 24
+    total, weight = [0.0] * 24, [0.0] * 24
+    for look in order:
+        for cell in cells:
+            said = float(evidence[look, cell])
+            distance = math.dist(GRID.centres[cell].tolist(), FIXATIONS[look].tolist()) / 90
+            if distance < known["closest"][cell] - 1e-6:
+                known["closest"][cell], known["nearest"][cell] = distance, said
+            known["best"][cell] = max(known["best"][cell], said)
+            total[cell] += math.exp(-6 * distance) * said
+            weight[cell] += math.exp(-6 * distance)
+        for detection in range(5):
+            if looks.mask[look, detection]:
+                known["score"] = max(known["score"], float(looks.scores[look, detection, target]))
+        known["looks"] += 1
+        known["visited"][FIXATED[look]] = True
+    return {**known, "total": total, "weight": weight, "mean": [t / w for t, w in zip(total, weight, strict=True)]}
+
+
+def believe(observer, looks, order, target):
+    """Belief after looks in this order."""
+    belief = observer.start(1, GRID, looks.scores)
+    for look in order:
+        part = slice(look, look + 1)
+        belief = observer.update(belief, observer.weigh(looks[part], FIXATIONS[part], GRID, target))
+    return belief
+
+
+@pytest.mark.parametrize("order", [(0,), (2,), (0, 1, 2), (2, 1, 0), (1, 1, 0)], ids=str)
+@pytest.mark.parametrize("target", [1, 3])
+def test_belief_equals_a_loop_over_looks_and_cells(looks, model, order, target):
     with torch.no_grad():
-        for look in range(3):
-            evidence = observer.weigh(looks[look : look + 1], FIXATIONS[look : look + 1], GRID, 2)
-            belief = observer.update(belief, evidence)
-        said = model(looks, FIXATIONS, GRID, 2)
-        offset = torch.cdist(GRID.centres, FIXATIONS)
-        nearest = said.t().gather(1, offset.argmin(1)[:, None])[:, 0]
-        torch.testing.assert_close(belief.nearest[0], nearest)
-        torch.testing.assert_close(belief.best[0], said.amax(0))
-        assert belief.visited[0].nonzero()[:, 0].tolist() == [0, 9, 20]
-        odds = model.log_odds(belief.nearest, belief.best, offset.amin(1)[None] / 90, belief.visited, 6)
-    torch.testing.assert_close(belief.present, odds.sigmoid())
+        model.prior.copy_(torch.tensor([0.3, -1.0, 2.0, 0.7]))
+        belief = believe(Target(model), looks, order, target)
+        known = remember(looks, model, order, target)
+        cells, following, anywhere = read_out(model, known, target)
+    for name in ("nearest", "best", "closest", "total", "weight"):
+        assert getattr(belief, name)[0].tolist() == pytest.approx(known[name], abs=1e-5), name
+    assert float(belief.score) == pytest.approx(known["score"])
+    assert float(belief.looks) == len(order)
+    assert belief.visited[0].tolist() == known["visited"]
+    assert belief.present[0].tolist() == pytest.approx([sigmoid(value) for value in cells], abs=1e-5)
+    assert belief.following[0].tolist() == pytest.approx([sigmoid(value) for value in following], abs=1e-5)
+    assert float(belief.anywhere) == pytest.approx(sigmoid(anywhere), abs=1e-5)
     # It is about the target that was searched for, whatever is asked.
     assert belief.probability(7) is belief.probability(torch.tensor([2])) is belief.present
+    assert belief.chance(7) is belief.chance(torch.tensor([2])) is belief.following
+    assert belief.presence(7) is belief.presence(torch.tensor([2])) is belief.anywhere
+
+
+def test_belief_before_the_first_look(model):
+    belief = Target(model).start(2, GRID, torch.empty(0, dtype=torch.float64))
+    assert torch.equal(belief.present, torch.full((2, 24), 0.5, dtype=torch.float64))
+    assert torch.equal(belief.anywhere, torch.full((2,), 0.5, dtype=torch.float64))
+    assert torch.equal(belief.following, belief.present)
+    assert bool(belief.closest.isinf().all())
+    assert not belief.looks.any()
+    assert not belief.visited.any()
+
+
+def test_without_learned_corrections_the_closest_look_decides(looks, model):
+    """Networks that add nothing leave the evidence of the closest look, and the most probable cell's for the image."""
+    with torch.no_grad():
+        for network in (model.read, model.guide, model.judge):
+            network[-1].weight.zero_()
+            network[-1].bias.zero_()
+        belief = believe(Target(model), looks, (0, 1, 2), 2)
+        said = model(looks, FIXATIONS, GRID, 2)
+    closest = torch.cdist(GRID.centres, FIXATIONS).argmin(1)
+    expected = said.t().gather(1, closest[:, None])[:, 0].sigmoid()
+    torch.testing.assert_close(belief.present[0], expected)
+    # A search goes on because no fixated cell holds the target.
+    expected[FIXATED] = torch.tensor(-8.0).sigmoid()
+    torch.testing.assert_close(belief.following[0], expected)
+    torch.testing.assert_close(belief.anywhere, belief.present.amax(-1))
+
+
+def test_the_prior_of_a_class_counts_for_that_class_alone(looks, model):
+    observer = Target(model)
+    with torch.no_grad():
+        before = {target: believe(observer, looks, (0, 1), target) for target in (1, 2)}
+        model.prior[2] += 3
+        after = {target: believe(observer, looks, (0, 1), target) for target in (1, 2)}
+    assert torch.equal(before[1].present, after[1].present)
+    assert torch.equal(before[1].anywhere, after[1].anywhere)
+    assert not torch.isclose(before[2].present, after[2].present).any()
+    assert not torch.isclose(before[2].anywhere, after[2].anywhere).any()
+
+
+def test_no_detection_at_all_and_a_single_column(model):
+    """Grids of one row or one column, and looks that hold not even padding."""
+    for grid in (Grid(1, 5, (60, 90)), Grid(5, 1, (90, 60)), Grid(1, 1, (10, 10))):
+        observer = Target(model)
+        nothing = Detections(torch.zeros(2, 0, 4), torch.zeros(2, 0, 4), torch.zeros(2, 0, dtype=torch.bool))
+        with torch.no_grad():
+            belief = observer(observer.start(2, grid, torch.empty(0)), nothing, grid.centres[[0, 0]], grid, 1)
+        assert belief.present.shape == (2, len(grid))
+        assert torch.equal(belief.score, torch.zeros(2))
+        for tensor in (belief.present, belief.following, belief.anywhere):
+            assert bool(((tensor > 0) & (tensor < 1)).all())
+
+
+def batches(looks):
+    """Two looks of each of three episodes, each of its own target."""
+    observer_looks = []
+    for order in ([0, 1, 2], [1, 2, 0]):
+        index = torch.tensor(order)
+        observer_looks.append((looks[index], FIXATIONS[index]))
+    return observer_looks
+
+
+def run_together(observer, looks):
+    belief = observer.start(3, GRID, looks.scores)
+    for seen, fixation in batches(looks):
+        said = [observer.weigh(seen[row : row + 1], fixation[row : row + 1], GRID, row + 1) for row in range(3)]
+        belief = observer.update(belief, TargetLook.join(said))
+    return belief
+
+
+def run_apart(observer, looks, row):
+    belief = observer.start(1, GRID, looks.scores)
+    for seen, fixation in batches(looks):
+        part = slice(row, row + 1)
+        belief = observer.update(belief, observer.weigh(seen[part], fixation[part], GRID, row + 1))
+    return belief
+
+
+def test_a_batch_is_its_episodes_one_by_one(looks, model):
+    with torch.no_grad():
+        batch, joint = run_together(Target(model), looks), run_together(Target(model, together=True), looks)
+        for row in range(3):
+            alone = run_apart(Target(model), looks, row)
+            for part in fields(TargetBelief):
+                mine, one = getattr(batch, part.name)[row : row + 1], getattr(alone, part.name)
+                assert torch.equal(mine, one), part.name
+                torch.testing.assert_close(getattr(joint, part.name)[row : row + 1], one, atol=1e-5, rtol=1e-5)
+
+
+def test_looks_and_beliefs_of_some_episodes(looks, model):
+    observer = Target(model)
+    index = torch.tensor([2, 0])
+    with torch.no_grad():
+        said = observer.weigh(looks, FIXATIONS, GRID, 2)
+        belief = observer.update(observer.start(3, GRID, looks.scores), said)
+        some = observer.update(observer.start(2, GRID, looks.scores), said[index])
+    for part in fields(TargetBelief):
+        assert torch.equal(getattr(belief[index], part.name), getattr(some, part.name)), part.name
+    assert said[index].columns == 6
+    assert said[index].target.tolist() == [2, 2]
+
+
+def believer():
+    """A model whose evidence is the clipped score of the target, and nothing else: no correction of cell or image."""
+    model = TargetEvidence(4, 4).requires_grad_(False).eval()
+    for parameter in model.parameters():
+        parameter.zero_()
+    # The second feature is log(score · weight) / 4 + 1; GELU of large numbers is the identity, of -large ones nothing.
+    model.look[0].weight[0, 1] = 100
+    model.look[0].bias[0] = -60
+    model.look[2].weight[0, 0] = 1
+    model.look[4].weight[0, 0] = 0.25
+    model.look[4].bias[0] = -4
+    return model
+
+
+def test_a_fixated_cell_that_shows_the_target_is_not_forced_down():
+    observer, cell = Target(believer()), 9
+    x, y = GRID.centres[cell].tolist()
+    box = torch.tensor([[[x - 7, y - 7, x + 7, y + 7]]])
+    shown = Detections(box, torch.tensor([[[0.02, 0.02, 0.94, 0.02]]]), torch.ones(1, 1, dtype=torch.bool))
+    belief = observer.start(1, GRID, box)
+    history = []
+    for where, seen in ((0, Detections.empty(1, 3)), (cell, shown), (cell, shown), (23, Detections.empty(1, 3))):
+        belief = observer(belief, seen, GRID.centres[[where]], GRID, 2)
+        history.append(belief)
+    blank, first, second, later = (float(each.present[0, cell]) for each in history)
+    assert blank < 0.05
+    assert first > 0.9
+    assert first == second == later
+    assert int(history[-1].present.argmax()) == cell
+    assert all(float(each.anywhere) > 0.9 for each in history[1:])
+    # Where to look next is another question.
+    assert float(history[1].following[0, cell]) < 0.001
+    assert float(history[1].following[0, 0]) < 0.001 < float(history[1].following[0, 8])
+    # A cell that was fixated and showed nothing is as any other that showed nothing.
+    assert float(history[0].present[0, 0]) == pytest.approx(blank)
 
 
 def test_an_acquisition_about_all_classes_refuses_a_belief_about_one_target(model):
     belief = Target(model).start(1, GRID, torch.empty(0))
     observation = FovealObservationModel.identity(["cup", "cat"], [0.2])
     with pytest.raises(InputError, match="belief: expected a belief about all classes"):
-        KLDivergence(observation, GRID)(belief, belief.visited)
+        KLDivergence(observation, GRID)(belief, torch.zeros(1, 24, dtype=torch.bool))
+
+
+def random_gathered(dtype=torch.float64, batch=2, cells=24):
+    generator = torch.Generator().manual_seed(5)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=dtype)
+
+    nearest = draw(batch, cells)
+    best = nearest + draw(batch, cells).abs()
+    mean, distance = draw(batch, cells), draw(batch, cells).abs() / 4
+    score, looks = draw(batch).sigmoid(), torch.arange(1, batch + 1).to(dtype)
+    visited = draw(batch, cells) > 1
+    return Gathered(nearest, best, mean, distance, score, looks, visited, torch.tensor([1, 3])[:batch])
 
 
 def test_gradients_reach_every_parameter(looks):
     torch.manual_seed(1)
-    model = TargetEvidence(4, 4).double()
+    model = TargetEvidence(4, 4, components=4).double()
+    torch.nn.init.normal_(model.prior)
     seen = Detections(looks.boxes.double(), looks.scores.double(), looks.mask)
-    features = look_features(seen, FIXATIONS.double(), GRID, 1)
-    visited = torch.zeros(1, 24, dtype=torch.bool)
+    observer = Target(model)
+    belief = observer.start(3, GRID, seen.scores)
+    for order in (torch.tensor([0, 1, 2]), torch.tensor([1, 0, 2])):
+        belief = observer(belief, seen[order], FIXATIONS.double()[order], GRID, 1)
+    (belief.present.sum() + belief.following.sum() + belief.anywhere.sum()).backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        assert float(parameter.grad.abs().sum()) > 0, name
+    # Of the prior, that of the target alone.
+    assert model.prior.grad.nonzero()[:, 0].tolist() == [1]
 
-    def odds(features):
-        evidence = model.evidence(features)
-        return model.log_odds(evidence[:1], evidence.amax(0, keepdim=True), features[:1, :, 0] / 4, visited, 6)
 
-    odds(features).sum().backward()
-    assert all(parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in model.parameters())
-    small = features[:, :, :].detach().clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda f: odds(f).sum(), small, atol=1e-4)
+def test_gradients_through_log_odds_and_presence():
+    torch.manual_seed(1)
+    model = TargetEvidence(4, 4, components=4).double().requires_grad_(False)
+    torch.nn.init.normal_(model.prior)
+    start = random_gathered()
+
+    def odds(nearest, best, mean, distance, score, prior):
+        gathered = Gathered(nearest, best, mean, distance, score, start.looks, start.visited, start.target)
+        with torch.nn.utils.stateless._reparametrize_module(model, {"prior": prior}):
+            cells = model.log_odds(gathered, 6)
+            return cells, model.chance(gathered, 6), model.presence(cells, gathered)
+
+    values = [start.nearest, start.best, start.mean, start.distance, start.score, model.prior]
+    assert torch.autograd.gradcheck(odds, [value.detach().clone().requires_grad_() for value in values])
 
 
-def test_saved_and_loaded_is_the_same(tmp_path, looks, model):
+def test_gradients_through_the_evidence(looks):
+    torch.manual_seed(1)
+    model = TargetEvidence(4, 4).double()
+    features = look_features(Detections(looks.boxes.double(), looks.scores.double(), looks.mask), FIXATIONS, GRID, 1)
+    assert torch.autograd.gradcheck(model.evidence, features[:1].double().clone().requires_grad_())
+
+
+def test_log_odds_equal_scalars_in_float64():
+    torch.manual_seed(1)
+    model = TargetEvidence(4, 4, components=4).double().requires_grad_(False)
+    torch.nn.init.normal_(model.prior)
+    gathered = random_gathered()
+    cells = model.log_odds(gathered, 6)
+    emptied, image = model.chance(gathered, 6), model.presence(cells, gathered)
+    for row in range(2):
+        known = {
+            "nearest": gathered.nearest[row].tolist(),
+            "best": gathered.best[row].tolist(),
+            "mean": gathered.mean[row].tolist(),
+            "closest": gathered.distance[row].tolist(),
+            "score": float(gathered.score[row]),
+            "looks": float(gathered.looks[row]),
+            "visited": gathered.visited[row].tolist(),
+        }
+        expected, following, anywhere = read_out(model, known, int(gathered.target[row]))
+        assert cells[row].tolist() == pytest.approx(expected, abs=1e-7)
+        assert emptied[row].tolist() == pytest.approx(following, abs=1e-7)
+        assert float(image[row]) == pytest.approx(anywhere, abs=1e-7)
+
+
+@pytest.mark.parametrize("thresholds", [None, Thresholds(0.83, 0.05)], ids=["none", "chosen"])
+def test_saved_and_loaded_is_the_same(tmp_path, looks, thresholds):
+    torch.manual_seed(1)
+    model = TargetEvidence(8, 6, components=4, thresholds=thresholds).eval()
+    torch.nn.init.normal_(model.prior)
     model.metadata = {"detector": {"name": "toy"}, "sensor": {}}
     model.save(tmp_path / "model.safetensors")
     loaded = TargetEvidence.from_pretrained(tmp_path / "model.safetensors")
     assert loaded.metadata == model.metadata
-    assert torch.equal(loaded(looks, FIXATIONS, GRID, 1), model(looks, FIXATIONS, GRID, 1))
+    assert loaded.thresholds == thresholds == Target(loaded).thresholds
+    assert loaded.widths == (8, 6)
+    assert loaded.prior.shape == (4,)
+    with torch.no_grad():
+        ours, theirs = (believe(Target(each), looks, (0, 1, 2), 3) for each in (model, loaded))
+    assert torch.equal(ours.present, theirs.present)
+    assert torch.equal(ours.following, theirs.following)
+    assert torch.equal(ours.anywhere, theirs.anywhere)
+    loaded.save(tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "model.safetensors").read_bytes()
     with pytest.raises(InputError, match="fitted for 'toy'"):
         loaded.check_compatible({"detector": {"name": "other"}, "sensor": {}})
     with pytest.raises(DataError):
         TargetEvidence.from_pretrained(tmp_path / "none.safetensors")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda record, tensors: record.pop("thresholds"),
+        lambda record, tensors: record.pop("components"),
+        lambda record, tensors: record.pop("widths"),
+        lambda record, tensors: record.update(thresholds={"confirm": 0.5}),
+        lambda record, tensors: record.update(components=9),
+        lambda record, tensors: record.update(widths=[8, 7]),
+        lambda record, tensors: tensors.pop("prior"),
+        lambda record, tensors: tensors.pop("judge.0.weight"),
+        lambda record, tensors: tensors.pop("guide.4.bias"),
+    ],
+    ids=[
+        "no thresholds",
+        "no components",
+        "no widths",
+        "half a threshold",
+        "classes",
+        "widths",
+        "no prior",
+        "no judge",
+        "no guide",
+    ],
+)
+def test_files_that_are_not_whole_are_refused(tmp_path, model, change):
+    """Those of earlier versions among them, which had neither a prior nor a network for presence."""
+    record = {"kind": model.kind, "version": "0", **model._record(), "metadata": {}}
+    tensors = {name: tensor.detach() for name, tensor in model.state_dict().items()}
+    change(record, tensors)
+    path = tmp_path / "old.safetensors"
+    write(path, tensors, record)
+    with pytest.raises(DataError, match=r"old\.safetensors: not a complete model of target evidence"):
+        TargetEvidence.from_pretrained(path)
 
 
 def test_bad_input(looks, model):

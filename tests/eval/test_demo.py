@@ -9,6 +9,7 @@ from PIL import Image
 
 import eval.demo as program
 from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, observers, policies, read_image
+from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import Picture, embedded_picture
 from semfov.detection import Candidates, Detector
 from semfov.episode import STAGES
@@ -62,7 +63,7 @@ def run(agent, monkeypatch, tmp_path, capsys):
 def test_search(run, photo, tmp_path):
     code, printed = run(photo, "--target", "red", "--start", 47, "--report", tmp_path / "page.html")
     assert code == 0
-    assert "my photo.png: “red” found after 1 gaze shift" in printed.out
+    assert re.search(r"my photo\.png: “red” found after 1 gaze shift \(probability [01]\.\d\d\)", printed.out)
     rows = [line.split() for line in printed.out.splitlines() if line[:1] in ("0", "1")]
     assert rows[0][:3] == ["0", "(7,", "5)"]
     for name in ("scanpath.png", "views.png", "belief.png", "belief_bars.png", "animation.gif"):
@@ -107,11 +108,45 @@ def test_mistakes_are_told_in_one_line(run, photo, tmp_path):
         ((photo, "--target", "red", "--explore"), "none with --explore"),
         ((photo, "--target", "red", "--start", 48), "a cell from 0 to 47"),
         ((photo, "--camera", 0, "--target", "red"), "got both"),
+        ((photo, "--target", "red", "--confirm", 50), "confirm: expected a probability"),
+        ((photo, "--target", "red", "--give_up", -1), "give_up: expected a probability"),
     ]:
         code, printed = run(*arguments)
         assert code == 1
         assert told in printed.err
         assert len(printed.err.strip().splitlines()) == 1
+
+
+def test_a_score_that_no_detection_has_confirms_nothing(run, photo):
+    code, printed = run(photo, "--target", "red", "--start", 47, "--confirm", 1, "--shifts", 3)
+    assert code == 0
+    assert "“red” undecided after 3 gaze shifts" in printed.out
+
+
+class Sure(observers.Semantic):
+    """An observer by which a search may decide."""
+
+    thresholds = Thresholds(0.99, 0.0)
+
+
+def test_embedded_boxes_decide_nothing(agent, photo):
+    """What is known of a picture is drawn, and kept from the search; thresholds come from the command line."""
+    observer = Sure(3)
+    sure = ActivePerception(
+        agent.eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(8, 6)
+    ).eval()
+    picture = Picture("photo", read_image(photo), boxes=torch.tensor([[0.0, 0.0, 160.0, 120.0]]))
+    common = {"target": "red", "start": 47, "shifts": 4}
+    never = program.look_at(sure, picture, program.DemoConfig(**common))
+    assert (never.found, never.shifts, never.decision.outcome) == (False, 4, "undecided")
+    soon = program.look_at(sure, picture, program.DemoConfig(**common, confirm=0.0))
+    assert soon.decision.outcome == "found"
+    assert 1 <= soon.shifts < 4
+    assert int(soon.posterior[-1].argmax()) == soon.decision.cell
+    assert soon.decision.cell in soon.cells.tolist()
+    tired = program.look_at(sure, picture, program.DemoConfig(**common, give_up=1.0))
+    assert (tired.found, tired.shifts) == (False, 0)
+    assert tired.decision.outcome == ("absent" if tired.decision.probability < 0.5 else "undecided")
 
 
 def test_help(capsys):
@@ -121,6 +156,8 @@ def test_help(capsys):
     printed = capsys.readouterr().out
     assert "[photo]" in printed
     assert "--camera" in printed
+    assert "--confirm" in printed
+    assert "--give_up" in printed
 
 
 def test_stages_of_every_look_are_measured(agent, photo):
@@ -162,7 +199,7 @@ def watched_and_plain(agent, picture, **how):
     with torch.inference_mode():
         if config.target is None:
             return watched, agent.explore(picture.image, start=0, shifts=2)
-        return watched, agent.search(picture.image, config.target, start=0, shifts=2, boxes=picture.boxes)
+        return watched, agent.search(picture.image, config.target, start=0, shifts=2)
 
 
 @pytest.fixture(scope="module")

@@ -65,11 +65,17 @@ def beliefs():
     return DirichletBelief(0.3 + 4 * rand(3, 12, 4, seed=1) ** 2, GRID.cell_distance[[0, 6, 11]].double())
 
 
+def told_of(present, following, closest):
+    """A belief about one target that says this of it, and anything of the rest."""
+    others, rest = rand(4, 3, 12, seed=7), rand(3, 3, seed=8)
+    return TargetBelief(present, following, rest[0], closest, *others, *rest[1:], visits())
+
+
 def about_one_target():
-    present, closest, more = rand(3, 12), GRID.cell_distance[[0, 6, 11]].double(), torch.zeros(3, 12)
+    present, closest = rand(3, 12), GRID.cell_distance[[0, 6, 11]].double()
     return [
-        TargetBelief(present, closest, more, more, more.bool()),
-        ContextBelief(present, closest, beliefs(), rand(3, 12, 4)),
+        told_of(present, present, closest),
+        ContextBelief(present, present, closest, beliefs(), rand(3, 12, 4)),
     ]
 
 
@@ -174,8 +180,13 @@ def test_only_the_probability_of_the_target_counts(name):
     """A belief about one target and one about all classes that say the same of it."""
     known = beliefs()
     present = known.probability(TARGETS)
-    alone = TargetBelief(present, known.closest, present, present, visits())
+    alone = told_of(present, present, known.closest)
     torch.testing.assert_close(EVERY[name]()(alone, visits()), EVERY[name]()(known, visits()))
+
+
+def test_searches_look_where_the_target_would_be_if_no_fixated_cell_held_it():
+    alone = told_of(rand(3, 12), rand(3, 12, seed=1), GRID.cell_distance[[0, 6, 11]].double())
+    assert torch.equal(EVERY["TargetPosterior"]()(alone, visits()), alone.following)
 
 
 def test_nothing_of_the_callers_is_changed(name):

@@ -1,115 +1,334 @@
 """`python -m train.fit_search`: small on the embedded scenes, and its parts against loops."""
 
 import json
+import math
+from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+from semfov import Detections, Grid
 from semfov.belief import TargetEvidence
-from semfov.training.evidence import objective, series
-from semfov.training.evidence_examples import Examples
+from semfov.belief.look_features import look_features
+from semfov.belief.observers import Target
+from semfov.belief.target_evidence import Thresholds
+from semfov.data.scenes import EmbeddedScenes
+from semfov.episode import StoredLooks, rollout
+from semfov.experiments.search_protocol import choose_classes
+from semfov.gaze.acquisition import TargetPosterior
+from semfov.gaze.choice import Given
+from semfov.training.evidence import JUDGED, FitSearchConfig, choose_thresholds, judge, objective, searches, train
+from semfov.training.evidence_examples import ExampleLooks, make_examples
 from train.fit_search import main
 
-CELLS = 12
+GRID = Grid(4, 4, (640, 480))
+CELLS = 16
+CLASSES = ("person", "cat", "cup", "motorcycle", "zebra", "banana", "kite", "toaster")
 
 
-@pytest.fixture
-def examples():
-    torch.manual_seed(0)
-    goal = torch.rand(30, CELLS) < 0.2
-    goal[:, 0] = True
-    goal[:, 5] = False
-    return Examples(
-        features=torch.rand(30, 4, CELLS, 10),
-        distance=torch.rand(30, 4, CELLS),
-        fixated=torch.randint(0, CELLS, (30, 4)),
-        goal=goal,
-        scene=torch.arange(30),
-    )
+def seen_in(index, most=5):
+    """What is seen from every cell of a scene, at random."""
+    generator = torch.Generator().manual_seed(index)
+    corner = torch.rand(CELLS, most, 2, generator=generator) * 400
+    boxes = torch.cat([corner, corner + 20 + torch.rand(CELLS, most, 2, generator=generator) * 150], -1)
+    scores = (3 * torch.rand(CELLS, most, len(CLASSES) + 1, generator=generator)).softmax(-1)
+    return Detections(boxes, scores, torch.rand(CELLS, most, generator=generator) < 0.6)
 
 
-def test_series_use_only_looks_off_target(examples):
+@pytest.fixture(scope="module")
+def run():
+    """A run that has looked at five embedded scenes."""
+    scenes = EmbeddedScenes(CLASSES, count=5)
+    return SimpleNamespace(scenes=scenes, grid=lambda index: GRID, detections=seen_in)
+
+
+@pytest.fixture(scope="module")
+def examples(run):
+    return make_examples(run, 2, 0.5, 0)
+
+
+def test_examples_are_what_looks_from_every_cell_show(run, examples):
+    assert len(examples) == len(examples.goal) > 10
+    kinds = set()
+    for row in range(len(examples)):
+        index, target = int(examples.scene[row]), int(examples.target[row])
+        annotation, seen = run.scenes.annotation(index), seen_in(index)
+        features = look_features(seen, GRID.centres, GRID, target)
+        assert examples.features.dtype == torch.float16
+        assert torch.equal(examples.features[row], features.half())
+        for cell in range(CELLS):
+            shown = [float(seen.scores[cell, d, target]) for d in range(5) if seen.mask[cell, d]]
+            assert float(examples.score[row, cell]) == pytest.approx(max(shown, default=0.0))
+            left, top = cell % 4 * 160, cell // 4 * 120
+            there = any(
+                x < left + 160 and z > left and y < top + 120 and w > top
+                for (x, y, z, w), label in zip(annotation.boxes.tolist(), annotation.labels.tolist(), strict=True)
+                if label == target
+            )
+            assert bool(examples.goal[row, cell]) == there
+            for other in range(CELLS):
+                offset = math.dist(GRID.centres[cell].tolist(), GRID.centres[other].tolist())
+                assert float(examples.distance[row, cell, other]) == pytest.approx(offset / 640, abs=1e-5)
+        held = target in annotation.labels.tolist()
+        assert bool(examples.goal[row].any()) == held
+        kinds.add(held)
+    assert kinds == {True, False}
+
+
+def test_so_many_classes_there_and_not_there(run, examples):
+    for index in range(len(run.scenes)):
+        labels = set(run.scenes.annotation(index).labels.tolist())
+        chosen = examples.target[examples.scene == index].tolist()
+        there = [target for target in chosen if target in labels]
+        assert len(chosen) == len(set(chosen)) == 2 * len(there)
+        assert 1 <= len(there) <= 2
+        annotation = run.scenes.annotation(index)
+        assert chosen == choose_classes(run.scenes, index, annotation, 2, 0.5, 0)
+        # Another scene, or seed, draws others; the number of scenes has nothing to do with it.
+        assert chosen == choose_classes(EmbeddedScenes(CLASSES, count=9), index, annotation, 2, 0.5, 0)
+    draws = {seed: choose_classes(run.scenes, 0, run.scenes.annotation(0), 1, 1.0, seed) for seed in range(20)}
+    assert len({tuple(draw) for draw in draws.values()}) > 5
+    assert choose_classes(run.scenes, 0, run.scenes.annotation(0), 2, 0.0, 0) == []
+
+
+def test_looks_of_examples_are_those_of_a_store(run, examples):
+    """The same belief, but for the rounding of features to half precision."""
     torch.manual_seed(1)
-    model = TargetEvidence(4, 4)
-    log_odds, goal, visited = series(model, examples, 4, torch.Generator().manual_seed(0))
-    assert log_odds.shape == goal.shape == visited.shape
-    assert len(goal) == int((~examples.goal.gather(1, examples.fixated)).any(1).sum())
-    assert not (goal & visited).any()
-    assert visited.any(1).all()
-    assert set(visited.sum(1).tolist()) >= {1, 2, 3}
-
-
-def test_a_series_of_one_look_is_that_look(examples):
-    torch.manual_seed(1)
-    model = TargetEvidence(4, 4)
-    first = slice(0, 1)
-    single = Examples(
-        examples.features[:, first],
-        examples.distance[:, first],
-        examples.fixated[:, first],
-        examples.goal,
-        examples.scene,
+    model = TargetEvidence(6, 5, components=len(CLASSES) + 1).eval().requires_grad_(False)
+    cells = torch.tensor([[3, 7, 1, 12], [0, 15, 14, 2]])
+    chosen = torch.tensor([0, len(examples) - 1])
+    steps = rollout(
+        ExampleLooks(examples[chosen], GRID), Target(model), TargetPosterior(1), cells[:, 0], Given(cells), most=4
     )
-    kept = ~single.goal.gather(1, single.fixated)[:, 0]
-    log_odds, _, visited = series(model, single, 4, torch.Generator().manual_seed(0))
-    evidence = model.evidence(single.features[kept, 0])
-    fixated = torch.nn.functional.one_hot(single.fixated[kept, 0], CELLS).bool()
-    assert torch.equal(visited, fixated)
-    expected = model.log_odds(evidence, evidence, single.distance[kept, 0], fixated, 4)
-    torch.testing.assert_close(log_odds, expected)
+    beliefs = [step.belief for step in steps]
+    for row, example in enumerate(chosen.tolist()):
+        target = examples.target[example : example + 1]
+        stored = StoredLooks(seen_in(int(examples.scene[example])), GRID, target)
+        path = cells[row : row + 1]
+        alone = rollout(stored, Target(model), TargetPosterior(target), path[:, 0], Given(path), most=4)
+        for number, step in enumerate(alone):
+            both = beliefs[number]
+            assert torch.equal(both.visited[row], step.belief.visited[0])
+            for name in ("present", "following", "anywhere", "nearest", "best", "closest", "score"):
+                torch.testing.assert_close(
+                    getattr(both, name)[row], getattr(step.belief, name)[0], atol=5e-3, rtol=5e-3, msg=name
+                )
 
 
-def test_objective_equals_its_formula():
-    torch.manual_seed(0)
-    log_odds, goal = torch.randn(3, CELLS, dtype=torch.float64), torch.zeros(3, CELLS, dtype=torch.bool)
-    goal[:, [2, 7]] = True
-    visited = torch.zeros(3, CELLS, dtype=torch.bool)
-    visited[:, 4] = True
-    hit, entropy = [], []
+def test_searches_go_over_every_cell_once(examples):
+    torch.manual_seed(1)
+    model = TargetEvidence(4, 4, components=len(CLASSES) + 1).requires_grad_(False)
+    for astray in (0.0, 0.5, 1.0):
+        generator = torch.Generator().manual_seed(0)
+        steps = list(searches(model, examples, GRID, 30, astray, generator))
+        assert len(steps) == CELLS
+        cells = torch.stack([step.cell for step in steps])
+        assert torch.equal(cells.sort(0).values, torch.arange(CELLS)[:, None].expand_as(cells))
+        if astray == 0:
+            for before, after in pairwise(steps):
+                best = before.belief.following.masked_fill(before.visited, -1).amax(-1)
+                chosen = before.belief.following.gather(1, after.cell[:, None])[:, 0]
+                torch.testing.assert_close(chosen, best)
+
+
+@pytest.mark.parametrize("held", [[[2, 7], [], [4]], [[], [], []], [[4], [4], [4]]], ids=str)
+def test_objective_equals_its_formula(held):
+    """In scalars; the searches of the last case are over, those of the one before never were on the target."""
+    generator = torch.Generator().manual_seed(0)
+    cells, following = torch.rand(2, 3, CELLS, generator=generator, dtype=torch.float64)
+    anywhere = torch.rand(3, generator=generator, dtype=torch.float64)
+    goal, visited = torch.zeros(2, 3, CELLS, dtype=torch.bool)
+    for row, places in enumerate(held):
+        goal[row, places] = True
+    visited[:, [4, 9]] = True
+    config = FitSearchConfig(landing=0.7, presence=0.4)
+    entropy, telling, landing = [], [], []
     for row in range(3):
-        free = [cell for cell in range(CELLS) if cell != 4]
-        weights = log_odds[row, free].exp()
-        hit.append(torch.log(log_odds[row, [2, 7]].exp().sum() / weights.sum()))
-        chance = log_odds[row, free].sigmoid()
-        truth = goal[row, free]
-        entropy.append(-torch.where(truth, chance.log(), (1 - chance).log()))
-    expected = torch.cat(entropy).mean() - torch.stack(hit).mean()
-    torch.testing.assert_close(objective(log_odds, goal, visited), expected)
+        for cell in range(CELLS):
+            p = float(cells[row, cell])
+            entropy.append(-math.log(p if cell in held[row] else 1 - p))
+        p = float(anywhere[row])
+        telling.append(-math.log(p if held[row] else 1 - p))
+        if held[row] and 4 not in held[row]:
+            odds = {c: float(following[row, c] / (1 - following[row, c])) for c in range(CELLS) if c not in (4, 9)}
+            landing.append(-math.log(sum(odds[c] for c in held[row]) / sum(odds.values())))
+    expected = 4 * sum(entropy) / len(entropy) + 0.4 * sum(telling) / 3
+    expected += 0.7 * sum(landing) / len(landing) if landing else 0
+    belief = Target(TargetEvidence(4, 4)).start(3, GRID, cells)
+    belief = type(belief)(cells, following, anywhere, *[getattr(belief, name) for name in REST])
+    got = objective(config, SimpleNamespace(belief=belief, visited=visited), goal)
+    assert float(got) == pytest.approx(expected, rel=1e-6)
+
+
+REST = ("closest", "nearest", "best", "total", "weight", "score", "looks", "visited")
+
+
+def test_gradients_of_certain_beliefs_are_finite():
+    """Probabilities of 0 and 1 that are wrong cost much, but not infinitely much."""
+    cells = torch.tensor([[0.0, 1.0] * 8, [1.0, 0.0] * 8]).requires_grad_()
+    goal = torch.zeros(2, CELLS, dtype=torch.bool)
+    goal[0, 2] = True
+    belief = Target(TargetEvidence(4, 4)).start(2, GRID, cells.detach())
+    belief = type(belief)(cells, cells, cells[:, 0], *[getattr(belief, name) for name in REST])
+    loss = objective(FitSearchConfig(), SimpleNamespace(belief=belief, visited=goal.new_zeros(2, CELLS)), goal)
+    loss.backward()
+    assert bool(loss.isfinite())
+    assert bool(cells.grad.isfinite().all())
+
+
+def brute_force(config, anywhere, present, visited, there):
+    """All searches at all thresholds, look by look."""
+
+    def found(search, confirm, give_up):
+        for look in range(len(anywhere)):
+            row, seen = present[look, search].tolist(), visited[look, search].tolist()
+            best = max(range(len(row)), key=row.__getitem__)
+            if float(anywhere[look, search]) >= confirm and seen[best]:
+                return True
+            if max([0.0, *(p for p, s in zip(row, seen, strict=True) if not s)]) < give_up:
+                return False
+        return False
+
+    holding = there.nonzero()[:, 0].tolist()
+    others = (~there).nonzero()[:, 0].tolist()
+    passing = []
+    for confirm in torch.arange(0.99, 0.49, -0.01).tolist():
+        if sum(found(search, confirm, 0.0) for search in others) > config.false_alarms * len(others):
+            break
+        passing.append(confirm)
+    confirm = min(passing, default=1.0)
+    told = sum(found(search, confirm, 0.0) for search in holding)
+    kept = [
+        give_up
+        for give_up in (0.1, 0.07, 0.05, 0.03, 0.02, 0.01)
+        if told - sum(found(search, confirm, give_up) for search in holding) <= config.lost * len(holding)
+    ]
+    return Thresholds(confirm, max(kept, default=0.0))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_thresholds_equal_trying_all(seed):
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.rand(shape, generator=generator, dtype=torch.float64)
+
+    looks, searched, cells = 5, 60, 6
+    there = draw(searched) < 0.5
+    scale = 0.4 + 0.6 * draw(searched)
+    anywhere = (draw(looks, searched) * 0.5 + 0.5 * there) * (scale if seed % 2 else 1)
+    present = draw(looks, searched, cells).pow(2 + 4 * (seed % 3)) * draw(searched, 1)
+    visited = torch.zeros(looks, searched, cells, dtype=torch.bool)
+    order = draw(searched, cells).argsort(-1)
+    for look in range(looks):
+        visited[look:].scatter_(-1, order[:, look].expand(looks - look, -1)[..., None], True)
+    config = FitSearchConfig(false_alarms=(0.0, 0.03, 0.2)[seed % 3], lost=(0.0, 0.05)[seed % 2])
+    got = choose_thresholds(config, anywhere, present, visited, there)
+    assert got == brute_force(config, anywhere, present, visited, there)
+
+
+def test_thresholds_at_the_ends():
+    """Searches that tell nothing confirm nothing; those that tell all are confirmed from a half on."""
+    there = torch.tensor([True, False])
+    present = torch.tensor([[[0.9, 0.2], [0.2, 0.005]]])
+    visited = torch.tensor([[[True, False], [True, False]]])
+    config = FitSearchConfig()
+    blind = choose_thresholds(config, torch.tensor([[1.0, 1.0]]), present, visited, there)
+    assert blind.confirm == 1
+    sharp = choose_thresholds(config, torch.tensor([[1.0, 0.0]]), present, visited, there)
+    assert sharp.confirm == pytest.approx(0.5, abs=0.001)
+    assert sharp.give_up == 0.1
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_training_is_repeatable_and_leaves_the_caller_alone(examples):
+    config = FitSearchConfig(columns=4, rows=4, steps=12, batch=4, looks=3)
+    torch.manual_seed(5)
+    state = torch.random.get_rng_state()
+    first = train(config, examples, GRID, {"some": "metadata"}, len(CLASSES) + 1)
+    assert torch.equal(torch.random.get_rng_state(), state)
+    torch.manual_seed(6)
+    second = train(config, examples, GRID, {}, len(CLASSES) + 1)
+    assert not first.training
+    assert first.metadata == {"some": "metadata"}
+    for name, value in first.state_dict().items():
+        assert torch.equal(value, second.state_dict()[name]), name
+        assert bool(value.isfinite().all()), name
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_training_learns_and_judging_tells(examples):
+    """More steps make a lower entropy of cells, on what was trained on."""
+    nll = []
+    for steps in (1, 60):
+        config = FitSearchConfig(columns=4, rows=4, steps=steps, batch=8, looks=4)
+        model = train(config, examples, GRID, {}, len(CLASSES) + 1)
+        judged, thresholds = judge(config, model, examples, GRID)
+        assert [row["looks"] for row in judged] == list(JUDGED)
+        assert 0.49 < thresholds.confirm <= 1
+        assert 0 <= thresholds.give_up <= 0.1
+        for row in judged:
+            assert all(math.isfinite(value) for value in row.values())
+        nll.append(judged[-1]["cells_nll"])
+        found = [row["found"] for row in judged]
+        assert found == sorted(found)
+    assert nll[1] < nll[0] - 0.1
+
+
+@pytest.mark.parametrize("name", ["holdout", "looks"])
+def test_settings_that_make_no_sense_are_told(name, capsys, tmp_path):
+    assert main([f"--{name}", "1", "--out", str(tmp_path)]) == 1
+    assert f"{name}: expected 2 or more, got 1" in capsys.readouterr().err
 
 
 SMALL = [
-    "--data.limit", "6", "--fixations", "3", "--holdout", "3", "--min_objects", "1", "--shard", "2", "--steps", "40",
-    "--batch", "8", "--workers",
+    "--data.limit", "6", "--columns", "4", "--rows", "4", "--looks", "4", "--holdout", "3", "--max_target_area", "0.5",
+    "--steps", "30", "--batch", "8",
 ]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A model trained on three looks at each of 6 embedded scenes."""
+    """A model trained on 6 embedded scenes."""
     out = tmp_path_factory.mktemp("fit_search")
     threads = torch.get_num_threads()
-    assert main([*SMALL, "1", "--out", str(out)]) == 0
+    torch.set_num_threads(1)
+    assert main([*SMALL, "--workers", "1", "--out", str(out / "out"), "--cache", str(out / "cache")]) == 0
     torch.set_num_threads(threads)
     return out
 
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_training_leaves_a_model_that_hits_more_often(trained):
-    model = TargetEvidence.from_pretrained(trained / "yolov3-tiny.safetensors")
+def test_training_leaves_model_report_and_figures(trained):
+    model = TargetEvidence.from_pretrained(trained / "out/yolov3-tiny.safetensors")
     assert model.metadata["detector"]["name"] == "yolov3-tiny"
-    assert model.metadata["training"]["steps"] == 40
-    judged = json.loads((trained / "judged.json").read_text())
-    assert judged[-1]["cross_entropy"] < judged[0]["cross_entropy"] / 2
-    assert "next fixation hits" in (trained / "report.md").read_text()
+    assert model.metadata["training"]["steps"] == 30
+    assert len(model.prior) == 81
+    judged = json.loads((trained / "out/judged.json").read_text())
+    assert [row["looks"] for row in judged] == list(JUDGED)
+    report = (trained / "out/report.md").read_text()
+    assert "area under ROC" in report
+    assert f"found from {model.thresholds.confirm:.3f}" in report
+    assert f"worth a look from {model.thresholds.give_up:.2f}" in report
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line[:1] == "|"][2:]
+    for row, cells in zip(judged, rows, strict=True):
+        assert cells[:3] == [str(row["looks"]), f"{100 * row['found']:.1f}", f"{row['cells_nll']:.4f}"]
+        assert cells[3:] == [
+            f"{row[name]:.4f}" for name in ("cells_ece", "visited_ece", "presence_area", "presence_ece")
+        ]
 
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_two_workers_give_the_same_bits(trained, tmp_path):
-    threads = torch.get_num_threads()
+@pytest.mark.usefixtures("one_thread")
+def test_looks_are_shared_and_the_result_is_the_same(trained, tmp_path):
+    """With what was seen before, by two workers: the same bits; no photograph is looked at again."""
+    stored = {path: path.stat().st_mtime_ns for path in (trained / "cache/looks").rglob("*") if path.is_file()}
+    assert len([path for path in stored if path.suffix == ".safetensors"]) >= 6
     torch.manual_seed(1)  # what the caller draws elsewhere changes nothing
-    assert main([*SMALL, "2", "--out", str(tmp_path)]) == 0
-    torch.set_num_threads(threads)
+    assert main([*SMALL, "--workers", "2", "--out", str(tmp_path), "--cache", str(trained / "cache")]) == 0
+    assert stored == {path: path.stat().st_mtime_ns for path in stored}
     for name in ("yolov3-tiny.safetensors", "judged.json", "report.md"):
-        assert (tmp_path / name).read_bytes() == (trained / name).read_bytes(), name
+        assert (tmp_path / name).read_bytes() == (trained / "out" / name).read_bytes(), name

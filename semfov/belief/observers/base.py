@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
+from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
 
@@ -38,6 +39,11 @@ class Observer(nn.Module, ABC):
     """
 
     by_target: ClassVar[bool] = False
+
+    @property
+    def thresholds(self) -> Thresholds | None:
+        """Probabilities at which a search decides; None where the belief is none to decide by."""
+        return None
 
     @abstractmethod
     def start(self, batch: int, grid: Grid, like: Tensor) -> Belief:

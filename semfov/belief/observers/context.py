@@ -10,6 +10,7 @@ from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.context import ContextPrior, presence_of
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Look, Observer, own
+from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
 
@@ -48,24 +49,36 @@ class ContextBelief(Belief):
 
     Attributes:
         present: `(B, X·Y)`, probability that a cell holds the target.
+        following: `(B, X·Y)`, the same if no fixated cell holds it.
         closest: `(B, X·Y)`, see `Belief`.
         inner: belief of the other observer.
-        presence: `(B, X·Y, K+1)`, highest score of each class in each cell in any look.
+        shown: `(B, X·Y, K+1)`, highest score of each class in each cell in any look.
     """
 
     present: Tensor
+    following: Tensor
     closest: Tensor
     inner: Belief
-    presence: Tensor
+    shown: Tensor
 
     def probability(self, target: int | Tensor) -> Tensor:
         """Probability of the target that was searched for, `(B, X·Y)`, whatever `target` is."""
         return self.present
 
+    def chance(self, target: int | Tensor) -> Tensor:
+        """As for `probability`, if no fixated cell holds the target."""
+        return self.following
+
+    def presence(self, target: int | Tensor) -> Tensor:
+        """As the other observer has it: context tells of places."""
+        return self.inner.presence(target)
+
     def map(self, function: Callable[[Tensor], Tensor]) -> "ContextBelief":
         """The belief with all tensors replaced, those of the other observer's among them."""
         inner = self.inner.map(function)
-        return ContextBelief(function(self.present), function(self.closest), inner, function(self.presence))
+        return ContextBelief(
+            function(self.present), function(self.following), function(self.closest), inner, function(self.shown)
+        )
 
 
 class Context(Observer):
@@ -90,12 +103,17 @@ class Context(Observer):
         self.prior = prior
         self.weights = weights or prior.weights_for("evidence" if observer.by_target else "map")
 
+    @property
+    def thresholds(self) -> Thresholds | None:
+        """Those of the other observer."""
+        return self.observer.thresholds
+
     def start(self, batch: int, grid: Grid, like: Tensor) -> ContextBelief:
         """Even odds in every cell, nothing seen."""
         inner = self.observer.start(batch, grid, like)
         even = like.new_full((batch, len(grid)), 0.5)
         nothing = like.new_zeros(batch, len(grid), len(self.prior.classes) + 1)
-        return ContextBelief(even, inner.closest, inner, nothing)
+        return ContextBelief(even, even, inner.closest, inner, nothing)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> ContextLook:
         """What looks from `fixation` `(B, 2)` say of the target, and what they show around it."""
@@ -109,13 +127,16 @@ class Context(Observer):
         """Belief after a look in each episode."""
         known, said = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")
         inner = self.observer.update(known.inner, said.inner)
-        presence = torch.maximum(known.presence, said.presence)
+        presence = torch.maximum(known.shown, said.presence)
 
         def in_context(alone: Tensor, shown: Tensor, target: Tensor) -> Tensor:
             return (log_odds(alone) + self.prior(shown, said.grid, target, self.weights)).sigmoid()
 
-        present = one_by_one(in_context, inner.probability(said.target), presence, said.target)
-        return ContextBelief(present, inner.closest, inner, presence)
+        present, following = (
+            one_by_one(in_context, alone, presence, said.target)
+            for alone in (inner.probability(said.target), inner.chance(said.target))
+        )
+        return ContextBelief(present, following, inner.closest, inner, presence)
 
 
 def log_odds(probability: Tensor) -> Tensor:

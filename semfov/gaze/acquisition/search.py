@@ -26,7 +26,7 @@ class TargetPosterior(AcquisitionFunction):
     .. math:: a(x) = P(C^x = t) = \beta_t(x) / \sum_j \beta_j(x)
 
     for a Dirichlet belief (Luzio, Bernardino and Moreno, 2024, Non-Predictive Visual Search); any other belief says
-    itself what the probability is.
+    itself what the probability is (`Belief.chance`).
 
     Args:
         target: index of the target class, 1..K, or a tensor `(B,)` with one for each episode.
@@ -45,7 +45,7 @@ class TargetPosterior(AcquisitionFunction):
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(B, X·Y)`."""
-        return belief.probability(self.target)
+        return belief.chance(self.target)
 
 
 class PredictedTargetPosterior(AcquisitionFunction):

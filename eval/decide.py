@@ -1,0 +1,157 @@
+"""Is it there, where, and how sure: `python -m eval.decide` searches for what is there and for what is not.
+
+    python -m eval.decide --data.root DIR --data.annotations instances.json --out runs/decide
+
+Without photographs it uses the embedded scenes. In every photograph a class that is there and one that is not are
+searched for until the agent decides. The table has the area under the ROC of the last probability, hits at some shares
+of false alarms, and what came of the decisions; beside it the same belief under random gaze, and the largest score of
+one sharp look at the whole photograph. What is seen from every cell is shared with `python -m eval.search`.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+import torch
+
+from semfov.errors import DataError
+from semfov.experiments.command import run_command
+from semfov.experiments.config import (
+    BeliefConfig,
+    DataConfig,
+    DetectorConfig,
+    ProtocolConfig,
+    SearchConfig,
+    SensorConfig,
+)
+from semfov.experiments.decisions import DecisionRun
+from semfov.experiments.parallel import rank
+from semfov.experiments.parts import Record
+from semfov.experiments.run import finish
+from semfov.experiments.summary import sensing, table
+from semfov.io.files import write_text
+from semfov.metrics.presence import area_under_roc, hits_at
+
+SHARES = (0.01, 0.02, 0.05)
+
+
+@dataclass(frozen=True)
+class DecideConfig:
+    """Searches for what is there and for what is not, each until it decides.
+
+    Args:
+        data: which scenes to search.
+        detector: which detector looks through the fovea.
+        sensor: the foveal sensor.
+        belief: the grid of beliefs; `target_model` is the learned evidence.
+        protocol: gaze shifts, seed.
+        out: folder for table and records.
+        cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
+        workers: processes (None: one for each CPU core).
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
+    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    out: Path = Path("runs/decide")
+    cache: Path | None = None
+    workers: int | None = None
+
+
+def search_and_decide(config: DecideConfig) -> None:
+    """Run the searches and write their table and records."""
+    settings = {each.name: getattr(config, each.name) for each in fields(config)}
+    run = DecisionRun(SearchConfig(**settings, policies=("target-evidence",)))
+    finish(run, "deciding")
+    if rank() > 0:
+        return
+    records: list[Record] = []
+    for index in range(len(run.scenes)):
+        part = run.parts.load(index)
+        if part is None:
+            raise DataError(f"{run.parts.path(index)} is missing or damaged; run the same command again")
+        records += part["records"]
+    if not records:
+        raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
+    text = summary(records, sensing(run))
+    print(text)
+    write_text(config.out / "decisions.md", text)
+    write_text(config.out / "episodes.jsonl", "".join(json.dumps(record) + "\n" for record in records))
+    print("written:", *(f"  {config.out / name}" for name in ("decisions.md", "episodes.jsonl")), sep="\n")
+
+
+def summary(records: Sequence[Record], sensed: str) -> str:
+    """The tables, as Markdown."""
+    names = list(dict.fromkeys(record["policy"] for record in records))
+    groups = {name: [record for record in records if record["policy"] == name] for name in names}
+    first = groups[names[0]]
+    there = torch.tensor([record["present"] for record in first])
+    told = {name: torch.tensor([record["probability"] for record in group]) for name, group in groups.items()}
+    told["one sharp look, largest score"] = torch.tensor([record["sharp"] for record in first])
+    rows = [["", "area under ROC", *(f"hits at {share:.0%}" for share in SHARES)]]
+    rows += [
+        [
+            name,
+            f"{area_under_roc(score, there):.3f}",
+            *(f"{100 * hits_at(score, there, share):.0f}" for share in SHARES),
+        ]
+        for name, score in told.items()
+    ]
+    decided = [["", "found, there", "found, not there", "undecided", "looks, there", "looks, not there", "place right",
+                "IoU", "p before and after landing"]]  # fmt: skip
+    for name, group in groups.items():
+        present = [record for record in group if record["present"]]
+        absent = [record for record in group if not record["present"]]
+        found = [record for record in present if record["outcome"] == "found"]
+        landings = [record["landing"] for record in present if record["landing"] is not None]
+        places = [record["right_place"] for record in group if record["outcome"] == "found"]
+        decided.append(
+            [
+                name,
+                percent(len(found), len(present)),
+                percent(sum(record["outcome"] == "found" for record in absent), len(absent)),
+                percent(sum(record["outcome"] == "undecided" for record in group), len(group)),
+                mean([record["looks"] for record in present]),
+                mean([record["looks"] for record in absent]),
+                percent(sum(places), len(places)),
+                mean([record["overlap"] for record in found if record["overlap"] is not None], 2),
+                " → ".join(mean(list(column), 2) for column in zip(*landings, strict=True)) or "-",
+            ]
+        )
+    return "\n".join(
+        [
+            f"Is the target there? {len(there)} searches ({sensed}), {int(there.sum())} for a class that is. "
+            "Hits at a share of false alarms in %.",
+            "",
+            *table(rows),
+            "",
+            "Decisions at the thresholds of the model, in %, and mean looks; the place is right where the target "
+            "overlaps the most probable cell.",
+            "",
+            *table(decided),
+            "",
+        ]
+    )
+
+
+def percent(count: int, total: int) -> str:
+    """A share in percent."""
+    return f"{100 * count / total:.1f}" if total else "-"
+
+
+def mean(values: Sequence[float], digits: int = 1) -> str:
+    """A mean."""
+    return f"{sum(values) / len(values):.{digits}f}" if values else "-"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    return run_command(search_and_decide, DecideConfig, __doc__, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,150 @@
+"""`python -m eval.decide` as a user runs it: small, on the embedded scenes, with the real detector."""
+
+import json
+
+import pytest
+import torch
+
+from eval.decide import DecideConfig, main, mean, percent, search_and_decide, summary
+from semfov.belief import TargetEvidence
+from semfov.belief.target_evidence import Thresholds
+from semfov.decision import OUTCOMES
+from semfov.experiments.config import BeliefConfig, DataConfig, DetectorConfig, ProtocolConfig, SensorConfig
+from semfov.experiments.setup import make_eye
+from semfov.metrics.presence import area_under_roc, hits_at
+
+POLICIES = ["target-evidence", "random gaze"]
+
+
+def rows_of(text):
+    """The cells of all tables, their heads and rules left out."""
+    lines = [line for line in text.splitlines() if line[:1] == "|"]
+    tables = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    return [row for row in tables if not set("".join(row)) <= set("-:") and row[0]]
+
+
+@pytest.fixture(scope="module")
+def arguments(tmp_path_factory):
+    """Of a run of two scenes on 4 × 3 cells, by an untrained model."""
+    folder = tmp_path_factory.mktemp("decide")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = TargetEvidence(8, 6, thresholds=Thresholds(0.6, 0.3))
+    model.metadata = make_eye(DetectorConfig(), SensorConfig()).settings()
+    model.save(folder / "model.safetensors")
+    return [
+        "--data.limit", "2", "--data.max_target_area", "0.5", "--belief.columns", "4", "--belief.rows", "3",
+        "--belief.target_model", str(folder / "model.safetensors"), "--protocol.shifts", "5",
+        "--cache", str(folder / "cache"),
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def finished(arguments, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    threads = torch.get_num_threads()
+    assert main([*arguments, "--workers", "1", "--out", str(out)]) == 0
+    torch.set_num_threads(threads)
+    return out
+
+
+def records_in(out):
+    return [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.weights
+def test_run_leaves_table_and_records(finished):
+    records = records_in(finished)
+    assert len(records) == 8
+    for record in records:
+        assert record["policy"] in POLICIES
+        assert record["outcome"] in OUTCOMES
+        assert 1 <= record["looks"] <= 6
+        assert 0 < record["probability"] < 1
+    assert [record["present"] for record in records] == 2 * [True, True, False, False]
+    text = (finished / "decisions.md").read_text()
+    rows = rows_of(text)
+    assert [row[0] for row in rows] == [*POLICIES, "one sharp look, largest score", *POLICIES]
+    assert "4 searches" in text
+    assert "2 for a class that is" in text
+    for row in rows[:2]:
+        group = [record for record in records if record["policy"] == row[0]]
+        score = torch.tensor([record["probability"] for record in group])
+        there = torch.tensor([record["present"] for record in group])
+        assert row[1] == f"{area_under_roc(score, there):.3f}"
+
+
+@pytest.mark.weights
+def test_finished_scenes_are_not_searched_again(finished, arguments, tmp_path):
+    """A run that was stopped goes on; a damaged part is computed again; workers change no bit."""
+    out = tmp_path / "out"
+    threads = torch.get_num_threads()
+    assert main([*arguments, "--workers", "2", "--out", str(out)]) == 0
+    assert records_in(out) == records_in(finished)
+    first, second = sorted(out.glob("parts/*/*.json"))
+    kept = first.stat().st_mtime_ns
+    second.write_text(second.read_text()[:-40])
+    (out / "episodes.jsonl").unlink()
+    assert main([*arguments, "--workers", "1", "--out", str(out)]) == 0
+    torch.set_num_threads(threads)
+    assert first.stat().st_mtime_ns == kept
+    for name in ("episodes.jsonl", "decisions.md"):
+        assert (out / name).read_bytes() == (finished / name).read_bytes()
+    part = json.loads(second.read_text())
+    assert part["records"] == records_in(finished)[4:]
+
+
+@pytest.mark.weights
+def test_no_class_to_search_for_is_told(arguments, tmp_path, capsys):
+    assert main([*arguments, "--data.max_target_area", "1e-9", "--workers", "1", "--out", str(tmp_path)]) == 1
+    assert "no scene has a class that may be searched for; raise data.max_target_area" in capsys.readouterr().err
+
+
+def test_help_and_defaults(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--help"])
+    assert stopped.value.code == 0
+    printed = capsys.readouterr().out
+    assert "--belief.target_model" in printed
+    assert "Is it there, where, and how sure" in printed
+    assert DecideConfig().data == DataConfig()
+    assert (DecideConfig().belief, DecideConfig().protocol) == (BeliefConfig(), ProtocolConfig())
+    assert callable(search_and_decide)
+
+
+def record(policy, present, outcome, probability, looks, **more):
+    base = {"right_place": None, "overlap": None, "landing": None, "sharp": probability / 2}
+    return {"policy": policy, "present": present, "outcome": outcome, "probability": probability, "looks": looks} | (
+        base | more
+    )
+
+
+def test_the_table_by_hand():
+    """Four searches for what is there, two for what is not; the second policy finds nothing."""
+    first = [
+        record("a", True, "found", 0.9, 3, right_place=True, overlap=0.75, landing=[0.2, 0.8]),
+        record("a", True, "found", 0.8, 5, right_place=False, overlap=0.25, landing=[0.4, 0.9]),
+        record("a", True, "absent", 0.3, 4, landing=[0.3, 0.1]),
+        record("a", True, "undecided", 0.6, 8),
+        record("a", False, "found", 0.85, 2, right_place=False),
+        record("a", False, "absent", 0.1, 3),
+    ]
+    second = [record("b", each["present"], "undecided", 0.5, 9) for each in first]
+    text = summary([*first, *second], "sensed")
+    assert "6 searches (sensed), 4 for a class that is." in text
+    area, other, sharp, a, b = rows_of(text)
+    there = torch.tensor([each["present"] for each in first])
+    score = torch.tensor([each["probability"] for each in first])
+    hits = [f"{100 * hits_at(score, there, share):.0f}" for share in (0.01, 0.02, 0.05)]
+    # Of 8 pairs, 5 are in order: 0.9 beats both, the others the lower alone.
+    assert area == ["a", "0.625", *hits]
+    assert hits == ["25", "25", "25"]
+    assert other == ["b", "0.500", "0", "0", "0"]
+    assert sharp == ["one sharp look, largest score", "0.625", *hits]
+    assert a == ["a", "50.0", "50.0", "16.7", "5.0", "2.5", "33.3", "0.50", "0.30 → 0.60"]
+    assert b == ["b", "0.0", "0.0", "100.0", "9.0", "9.0", "-", "-", "-"]
+
+
+def test_shares_and_means_of_nothing():
+    assert (percent(1, 8), percent(0, 3), percent(0, 0)) == ("12.5", "0.0", "-")
+    assert (mean([1, 2]), mean([0.125], 2), mean([])) == ("1.5", "0.12", "-")

@@ -1,0 +1,189 @@
+"""Searches that decide: records against a rollout by hand, overlaps and landings against loops."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov import DirichletBelief
+from semfov.belief import TargetEvidence
+from semfov.belief.observers import Target
+from semfov.belief.target_evidence import Thresholds
+from semfov.decision import OUTCOMES, best_box, decide
+from semfov.episode import StoredLooks, rollout
+from semfov.experiments.config import (
+    BeliefConfig,
+    DataConfig,
+    DetectorConfig,
+    ProtocolConfig,
+    SearchConfig,
+    SensorConfig,
+)
+from semfov.experiments.decisions import DecisionRun, landing, overlap
+from semfov.experiments.search_protocol import choose_classes
+from semfov.experiments.seeds import generator_for, noise_for
+from semfov.experiments.setup import make_eye
+from semfov.gaze.acquisition import TargetPosterior, Uniform
+from semfov.gaze.choice import Greedy, drawn_from
+
+AT = Thresholds(0.5, 0.375)
+
+
+def write_evidence(path, thresholds, seed=2):
+    """An untrained model that fits the default eye; it is lifted so that some searches find, and some give up."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        model = TargetEvidence(
+            8, 6, thresholds=thresholds, metadata=make_eye(DetectorConfig(), SensorConfig()).settings()
+        )
+        for network in (model.look, model.read, model.judge):
+            for layer in (network[0], network[2], network[4]):
+                torch.nn.init.normal_(layer.weight, std=1.2 / layer.in_features**0.5)
+        torch.nn.init.normal_(model.prior)
+    model.save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("decisions")
+
+
+@pytest.fixture(scope="module")
+def config(folder):
+    return SearchConfig(
+        data=DataConfig(limit=3, max_target_area=0.5),
+        belief=BeliefConfig(columns=4, rows=3, target_model=str(write_evidence(folder / "model.safetensors", AT))),
+        protocol=ProtocolConfig(shifts=6),
+        policies=("target-evidence",),
+        cache=folder / "cache",
+        out=folder / "out",
+        workers=1,
+    )
+
+
+@pytest.fixture(scope="module")
+def run(config):
+    return DecisionRun(config)
+
+
+@pytest.mark.weights
+def test_records_are_those_of_searches_by_hand(run):
+    outcomes = set()
+    evidence = run.models.evidence
+    for index in range(3):
+        records, seconds = run.outcomes(index)
+        assert set(seconds) == {"look", "search"}
+        annotation, grid, scene = run.scenes.annotation(index), run.grid(index), run.scenes.ids[index]
+        targets = choose_classes(run.scenes, index, annotation, 1, 0.5, 0)
+        assert [(r["target"], r["policy"]) for r in records] == [
+            (target, policy) for target in targets for policy in ("target-evidence", "random gaze")
+        ]
+        assert [r["present"] for r in records] == [True, True, False, False]
+        detections = run.detections(index)
+        sharp = run.eye.detector(run.scenes[index].image[None])
+        for record in records:
+            target = record["target"]
+            assert record["scene"] == scene
+            assert record["present"] == (target in annotation.labels.tolist())
+            largest = [float(sharp.scores[0, d, target]) for d in range(sharp.scores.shape[1]) if sharp.mask[0, d]]
+            assert record["sharp"] == pytest.approx(max(largest, default=0.0))
+            start = torch.randint(12, (1,), generator=generator_for("start", 0, scene, target))
+            noise = noise_for(run.config.protocol, 12, scene, target, 0)[None]
+            acquisition = Uniform() if record["policy"] == "random gaze" else TargetPosterior(target)
+            looks = StoredLooks(detections, grid, torch.tensor([target]))
+            steps, ended = [], 0
+            with torch.inference_mode():
+                choice = Greedy(drawn_from(noise))
+                for step in rollout(looks, Target(evidence), acquisition, start, choice, most=7):
+                    steps.append(step)
+                    ended = int(decide(step, target, AT))
+                    if ended:
+                        break
+            belief, seen = steps[-1].belief, [int(step.cell) for step in steps]
+            assert record["looks"] == len(steps)
+            assert record["outcome"] == OUTCOMES[ended]
+            assert record["probability"] == pytest.approx(float(belief.anywhere), abs=1e-6)
+            outcomes.add(record["outcome"])
+            goal = grid.footprint(annotation.boxes)[annotation.labels == target].any(0)
+            best = int(belief.present.argmax())
+            if record["outcome"] == "found":
+                assert best in seen
+                assert record["right_place"] == bool(goal[best])
+                box = best_box([detections[cell : cell + 1] for cell in seen], grid, best, target)
+                assert record["overlap"] == overlap(box, annotation.boxes[annotation.labels == target])
+            else:
+                assert record["right_place"] is record["overlap"] is None
+            hit = next((number for number, cell in enumerate(seen) if goal[cell]), 0)
+            if hit == 0:
+                assert record["landing"] is None
+            else:
+                before, after = (float(steps[n].belief.present[0, seen[hit]]) for n in (hit - 1, hit))
+                assert record["landing"] == pytest.approx([before, after], abs=1e-6)
+    assert {"found", "absent"} <= outcomes
+
+
+@pytest.mark.weights
+def test_parts_are_of_what_decisions_depend_on(config, run, folder):
+    def key(**change):
+        return DecisionRun(replace(config, **change)).key
+
+    def with_model(path):
+        return key(belief=replace(config.belief, target_model=str(path)))
+
+    same = [key(), key(workers=2, out=folder / "other"), key(cache=folder / "other")]
+    assert set(same) == {run.key}
+    others = [
+        key(protocol=ProtocolConfig(shifts=7)),
+        key(data=DataConfig(limit=2, max_target_area=0.5)),
+        with_model(write_evidence(folder / "seed.safetensors", AT, seed=1)),
+        with_model(write_evidence(folder / "confirm.safetensors", Thresholds(0.51, 0.375))),
+        with_model(write_evidence(folder / "none.safetensors", None)),
+    ]
+    assert len({run.key, *others}) == 6
+
+
+@pytest.mark.weights
+def test_a_model_without_thresholds_still_decides(config, folder):
+    path = write_evidence(folder / "none.safetensors", None)
+    run = DecisionRun(replace(config, belief=replace(config.belief, target_model=str(path))))
+    records, _ = run.outcomes(0)
+    assert len(records) == 4
+
+
+corner = st.floats(0, 50)
+boxes = st.tuples(corner, corner, st.floats(1, 40), st.floats(1, 40)).map(
+    lambda b: (b[0], b[1], b[0] + b[2], b[1] + b[3])
+)
+
+
+@given(boxes, st.lists(boxes, max_size=4))
+def test_overlap_equals_a_loop(box, others):
+    def area(b):
+        return (b[2] - b[0]) * (b[3] - b[1])
+
+    best = []
+    for other in others:
+        width = max(0.0, min(box[2], other[2]) - max(box[0], other[0]))
+        height = max(0.0, min(box[3], other[3]) - max(box[1], other[1]))
+        best.append(width * height / (area(box) + area(other) - width * height))
+    got = overlap(torch.tensor(box, dtype=torch.float64), torch.tensor(others, dtype=torch.float64).reshape(-1, 4))
+    assert got == (pytest.approx(max(best), abs=1e-9) if best else None)
+    assert overlap(None, torch.tensor(others).reshape(-1, 4)) is None
+
+
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [((2, 3, 1), [0.1, 0.2]), ((1, 3, 2), None), ((0, 2), None), ((0, 1, 3), [0.1, 0.2]), ((0, 2, 3), [0.2, 0.3])],
+)
+def test_landing_is_before_and_after_the_first_look_at_the_target(path, expected):
+    """Probabilities of cell `c` after look `n` are (n + 1) / 10; the target is in cells 1 and 3."""
+    goal = torch.tensor([False, True, False, True])
+    beliefs = []
+    for number in range(len(path)):
+        beta = torch.tensor([9.0 - number, 1.0 + number]).expand(1, 4, 2)
+        beliefs.append(DirichletBelief(beta))
+    got = landing(beliefs, torch.tensor(path), goal, 1)
+    assert got == (None if expected is None else pytest.approx(expected))

@@ -1,0 +1,69 @@
+"""Choices that go astray: how often, where to, and that visited cells are never among them."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.gaze.choice import Exploratory, Greedy
+
+CENTRES = torch.stack([torch.arange(9.0), torch.zeros(9)], -1)
+
+
+def fresh(seed):
+    """Other random numbers whenever some are asked for."""
+    generator = torch.Generator().manual_seed(seed)
+    return lambda shift, episodes: torch.rand(len(episodes), 9, generator=generator)
+
+
+@pytest.mark.parametrize("astray", [0.0, 0.3, 1.0])
+def test_so_many_fixations_go_astray(astray):
+    count = 20_000
+    values, visited = torch.zeros(count, 9), torch.zeros(count, 9, dtype=torch.bool)
+    values[:, 4] = 1
+    visited[:, 7] = True
+    fixation, cell = Exploratory(fresh(0), astray)(0, torch.arange(count), values, visited, CENTRES)
+    assert torch.equal(fixation, CENTRES[cell])
+    counts = torch.bincount(cell, minlength=9)
+    # Those astray are even over the cells that are left, the best one among them; five standard deviations.
+    share = torch.full((9,), astray / 8)
+    share[4] += 1 - astray
+    share[7] = 0
+    deviation = (count * share * (1 - share)).clamp(min=0).sqrt()
+    assert bool(((counts - count * share).abs() <= 5 * deviation).all())
+
+
+@given(st.integers(0, 10_000), st.floats(0, 1))
+def test_never_a_visited_cell(seed, astray):
+    generator = torch.Generator().manual_seed(seed)
+    values, visited = torch.rand(6, 9, generator=generator), torch.rand(6, 9, generator=generator) < 0.7
+    left = ~visited.all(-1)
+    before = values.clone()
+    _, cell = Exploratory(fresh(seed), astray)(0, torch.arange(6), values, visited, CENTRES)
+    assert not visited[left].gather(1, cell[left, None]).any()
+    assert torch.equal(values, before)
+
+
+def test_whole_searches_visit_every_cell_once():
+    choice, visited = Exploratory(fresh(1), 0.5), torch.zeros(5, 9, dtype=torch.bool)
+    for shift in range(9):
+        _, cell = choice(shift, torch.arange(5), torch.rand(5, 9), visited, CENTRES)
+        assert not visited.gather(1, cell[:, None]).any()
+        visited = visited.scatter(1, cell[:, None], True)
+    assert bool(visited.all())
+
+
+def test_without_stray_fixations_it_is_greedy():
+    values, noise = torch.rand(50, 9).mul(4).round(), torch.rand(50, 9)
+    visited = torch.rand(50, 9) < 0.3
+    got, expected = (
+        make(0, torch.arange(50), values, visited, CENTRES)[1]
+        for make in (Exploratory(lambda *_: noise, 0.0), Greedy(lambda *_: noise))
+    )
+    assert torch.equal(got, expected)
+
+
+def test_no_gradient_flows_through_a_choice():
+    values = torch.rand(3, 9, requires_grad=True)
+    fixation, _ = Exploratory(fresh(2), 0.5)(0, torch.arange(3), values, torch.zeros(3, 9, dtype=torch.bool), CENTRES)
+    assert not fixation.requires_grad

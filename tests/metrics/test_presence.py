@@ -1,0 +1,103 @@
+"""Figures of telling whether a target is there, against scipy and against trying every threshold."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import mannwhitneyu
+
+from semfov.errors import InputError
+from semfov.metrics.presence import area_under_roc, hits_at, threshold_for
+
+# Few values, so that many are tied.
+scores = st.lists(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.9, 1.0]) | st.floats(0, 1), min_size=1, max_size=25)
+shares = st.sampled_from([0.0, 0.01, 0.05, 0.25, 0.5, 0.9]) | st.floats(0, 0.99)
+
+
+def cases(hits, misses, seed=0):
+    """Scores of both kinds in a random order, and which kind each is."""
+    order = torch.randperm(len(hits) + len(misses), generator=torch.Generator().manual_seed(seed))
+    values = torch.tensor([*hits, *misses], dtype=torch.float64)
+    return values[order], (torch.arange(len(values)) < len(hits))[order]
+
+
+@given(scores, scores, st.integers(0, 100))
+def test_area_is_the_statistic_of_mann_and_whitney(hits, misses, seed):
+    statistic = mannwhitneyu(hits, misses, method="asymptotic").statistic if len({*hits, *misses}) > 1 else None
+    expected = 0.5 if statistic is None else statistic / (len(hits) * len(misses))
+    assert area_under_roc(*cases(hits, misses, seed)) == pytest.approx(expected, abs=1e-12)
+
+
+@given(scores, scores)
+def test_area_is_that_under_the_curve(hits, misses):
+    """The trapezoids under the curve of hits over false alarms, from the strictest threshold to none."""
+    area, before = 0.0, (0.0, 0.0)
+    for threshold in sorted({*hits, *misses}, reverse=True):
+        now = sum(m >= threshold for m in misses) / len(misses), sum(h >= threshold for h in hits) / len(hits)
+        area += (now[0] - before[0]) * (now[1] + before[1]) / 2
+        before = now
+    assert area_under_roc(*cases(hits, misses)) == pytest.approx(area, abs=1e-12)
+
+
+@given(scores, scores)
+def test_area_of_the_opposite_and_of_the_double_score(hits, misses):
+    score, present = cases(hits, misses)
+    area = area_under_roc(score, present)
+    assert area_under_roc(-score, present) == pytest.approx(1 - area, abs=1e-12)
+    assert area_under_roc(score, ~present) == pytest.approx(1 - area, abs=1e-12)
+    assert area_under_roc(2 * score, present) == pytest.approx(area, abs=1e-12)
+
+
+def test_area_at_the_ends_and_in_single_precision():
+    present = torch.tensor([True, False, True, False])
+    assert area_under_roc(torch.tensor([0.9, 0.1, 0.8, 0.2]), present) == 1
+    assert area_under_roc(torch.tensor([0.1, 0.9, 0.2, 0.8]), present) == 0
+    assert area_under_roc(torch.zeros(4), present) == 0.5
+
+
+@pytest.mark.parametrize("present", [[True, True], [False, False], []], ids=["there", "not there", "none"])
+def test_cases_of_both_kinds_are_needed(present):
+    with pytest.raises(InputError, match="present: expected cases with and without the target"):
+        area_under_roc(torch.zeros(len(present)), torch.tensor(present, dtype=torch.bool))
+
+
+@given(scores, shares)
+def test_threshold_is_the_least_one(misses, share):
+    values = torch.tensor(misses, dtype=torch.float64)
+    got = threshold_for(values, share)
+
+    def alarms(threshold):
+        return sum(value >= threshold for value in misses)
+
+    assert alarms(got) <= share * len(misses)
+    # The next smaller number is reached by too many.
+    assert alarms(math.nextafter(got, -math.inf)) > int(share * len(misses))
+
+
+@given(scores, scores, shares)
+def test_hits_equal_trying_every_threshold(hits, misses, share):
+    allowed = int(share * len(misses))
+    candidates = [*hits, *misses, 2.0]
+    passing = [t for t in candidates if sum(m >= t for m in misses) <= allowed]
+    expected = max(sum(h >= t for h in hits) for t in passing) / len(hits)
+    assert hits_at(*cases(hits, misses), share) == pytest.approx(expected, abs=1e-12)
+
+
+@given(scores, scores)
+def test_hits_grow_with_the_share(hits, misses):
+    given_cases = cases(hits, misses)
+    found = [hits_at(*given_cases, share) for share in (0.0, 0.1, 0.3, 0.6, 0.99)]
+    assert found == sorted(found)
+
+
+def test_a_score_in_single_precision_is_no_alarm_of_itself():
+    """The threshold lies between two doubles, and what is equal to the allowed case does not reach it."""
+    score = torch.tensor([0.3, 0.3, 0.30000004])
+    assert hits_at(score, torch.tensor([True, False, True]), 0.0) == 0.5
+
+
+def test_a_threshold_needs_a_case():
+    with pytest.raises(InputError, match="absent: expected at least one case"):
+        threshold_for(torch.zeros(0), 0.1)

@@ -1,0 +1,381 @@
+"""What searches decide: by beliefs made by hand, against a loop, and by agents whose observers follow a script."""
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov import ActivePerception, Detections, DirichletBelief, Foveation, Grid
+from semfov.belief import Belief, ContextPrior
+from semfov.belief.observers import Context, Look, Observer, Semantic
+from semfov.belief.target_evidence import Thresholds
+from semfov.decision import OUTCOMES, Decision, best_box, decide
+from semfov.detection import Candidates, Detector
+from semfov.errors import InputError
+from semfov.eye import Eye
+from semfov.gaze.policies import NonPredictive, Random
+from semfov.viz.scanpath import describe
+
+SIZE = (160, 120)
+AT = Thresholds(0.8, 0.1)
+
+
+@dataclass(frozen=True)
+class Known(Belief):
+    """A belief that says what it was told to."""
+
+    present: torch.Tensor
+    anywhere: torch.Tensor
+    closest: torch.Tensor
+
+    def probability(self, target):
+        return self.present
+
+    def presence(self, target):
+        return self.anywhere
+
+    def map(self, function):
+        return Known(function(self.present), function(self.anywhere), function(self.closest))
+
+
+def step(cells, visited, presence=0.5):
+    """Searches at these probabilities, with these cells visited."""
+    cells = torch.tensor(cells)
+    seen = torch.zeros(cells.shape, dtype=torch.bool)
+    for row, places in enumerate(visited):
+        seen[row, list(places)] = True
+    anywhere = torch.as_tensor(presence).expand(len(cells))
+    return SimpleNamespace(belief=Known(cells, anywhere, cells), visited=seen)
+
+
+def number(cells, visited, presence, thresholds=AT):
+    return int(decide(step([cells], [visited], presence), 1, thresholds)[0])
+
+
+def test_outcomes():
+    assert OUTCOMES == ("undecided", "found", "absent", "undecided")
+
+
+def test_found_only_where_the_gaze_has_been():
+    assert number([0.2, 0.9, 0.3], [1], 0.9) == 1
+    assert number([0.2, 0.9, 0.3], [0], 0.9) == 0
+    assert number([0.2, 0.9, 0.3], [0, 2], 0.9) == 0
+    assert number([0.2, 0.9, 0.3], [0, 1, 2], 0.9) == 1
+    # Another cell that is probable, and was fixated, is not the most probable one.
+    assert number([0.2, 0.9, 0.85], [2], 0.9) == 0
+    # How probable the cell is does not matter, as long as none is more so.
+    assert number([0.2, 0.4, 0.3], [1], 0.9) == 1
+
+
+def test_found_from_the_threshold_on():
+    assert number([0.2, 0.8, 0.3], [1], 0.75, Thresholds(0.75, 0.1)) == 1
+    assert number([0.2, 0.99, 0.3], [1], 0.799) == 0
+    assert number([0.2, 0.1, 0.3], [2], 0.0, Thresholds(0.0, 0.0)) == 1
+    assert number([0.2, 0.999, 0.3], [1], 0.999, Thresholds(1.0, 0.0)) == 0
+
+
+def test_gives_up_where_no_cell_is_worth_a_look():
+    assert number([0.7, 0.05, 0.09], [0], 0.4) == 2
+    assert number([0.7, 0.05, 0.09], [0], 0.5) == number([0.7, 0.05, 0.09], [0], 0.79) == 3
+    # A cell that is left, and worth it.
+    assert number([0.7, 0.05, 0.2], [0], 0.1) == 0
+    assert number([0.05, 0.05, 0.05], [], 0.49) == 2
+    # Never, at a price of nothing, not even where every cell was visited.
+    assert number([0.0, 0.0, 0.0], [0, 1, 2], 0.0, Thresholds(0.8, 0.0)) == 0
+    assert number([0.7, 0.7, 0.7], [0, 1, 2], 0.3) == 2
+
+
+def test_finding_comes_before_giving_up():
+    assert number([0.95, 0.01, 0.01], [0], 0.9) == 1
+    assert number([0.95, 0.01, 0.01], [1], 0.9, Thresholds(0.8, 0.96)) == 3
+
+
+def test_a_belief_that_tells_no_presence_goes_by_its_most_probable_cell():
+    beta = torch.tensor([[[1.0, 1.5], [8.0, 0.2], [9.0, 0.1]], [[3.0, 1.0], [8.0, 0.2], [9.0, 0.1]]])
+    belief = DirichletBelief(beta)
+    torch.testing.assert_close(belief.presence(1), torch.tensor([0.6, 0.25]))
+    visited = torch.tensor([[True, False, False]] * 2)
+    found = decide(SimpleNamespace(belief=belief, visited=visited), torch.tensor([1, 1]), AT)
+    assert found.tolist() == [3, 2]
+
+
+probability = st.sampled_from([0.0, 0.05, 0.1, 0.3, 0.5, 0.8, 0.9]) | st.floats(0, 1, width=32)
+
+
+@st.composite
+def batches(draw):
+    searches, cells = draw(st.integers(1, 5)), draw(st.integers(1, 6))
+
+    def rows(what):
+        return [[draw(what) for _ in range(cells)] for _ in range(searches)]
+
+    presence = [draw(probability) for _ in range(searches)]
+    return rows(probability), rows(st.booleans()), presence, Thresholds(draw(probability), draw(probability))
+
+
+@given(batches())
+def test_a_batch_is_decided_as_a_loop_does(batch):
+    cells, visited, presence, thresholds = batch
+    confirm, give_up = (float(value) for value in (thresholds.confirm, thresholds.give_up))
+    stated = SimpleNamespace(
+        belief=Known(torch.tensor(cells).double(), torch.tensor(presence).double(), torch.zeros(())),
+        visited=torch.tensor(visited),
+    )
+    got = decide(stated, torch.ones(len(cells), dtype=torch.long), thresholds).tolist()
+    for row, outcome in enumerate(got):
+        exact = torch.tensor(cells[row]).double().tolist()
+        best = max(range(len(exact)), key=exact.__getitem__)
+        left = [value for value, seen in zip(exact, visited[row], strict=True) if not seen]
+        anywhere = float(torch.tensor(presence[row]).double())
+        if anywhere >= confirm and visited[row][best]:
+            assert outcome == 1
+        elif max([0.0, *left]) < give_up:
+            assert outcome == (2 if anywhere < 0.5 else 3)
+        else:
+            assert outcome == 0
+
+
+def random_looks(count, most, seed):
+    generator = torch.Generator().manual_seed(seed)
+    corner = torch.rand(count, most, 2, generator=generator) * 100
+    boxes = torch.cat([corner, corner + 5 + torch.rand(count, most, 2, generator=generator) * 50], -1)
+    scores = torch.rand(count, most, 4, generator=generator).softmax(-1)
+    return Detections(boxes, scores, torch.rand(count, most, generator=generator) < 0.6)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_best_box_equals_a_loop(seed):
+    grid, looks = Grid(4, 3, SIZE), random_looks(3, 4, seed)
+    parts = [looks[row : row + 1] for row in range(3)]
+    for cell in range(12):
+        for target in (1, 3):
+            best, expected = 0.0, None
+            for look in range(3):
+                for detection in range(4):
+                    if not looks.mask[look, detection]:
+                        continue
+                    box = looks.boxes[look, detection]
+                    weight = float(grid.footprint(box[None], "soft")[0, cell])
+                    score = weight * float(looks.scores[look, detection, target])
+                    if score > best * (1 + 1e-6):
+                        best, expected = score, box
+            got = best_box(parts, grid, cell, target)
+            assert (got is None) == (expected is None)
+            if expected is not None:
+                assert torch.equal(got, expected)
+
+
+def test_best_box_of_nothing():
+    grid = Grid(4, 3, SIZE)
+    assert best_box([], grid, 0, 1) is None
+    assert best_box([Detections.empty(1, 3)], grid, 0, 1) is None
+    far = Detections(torch.tensor([[[130.0, 100, 150, 110]]]), torch.full((1, 1, 4), 0.25), torch.ones(1, 1).bool())
+    assert best_box([far], grid, 0, 1) is None
+    assert best_box([far], grid, 11, 1).tolist() == [130, 100, 150, 110]
+    assert best_box([replace(far, mask=torch.zeros(1, 1).bool())], grid, 11, 1) is None
+
+
+class Square(Detector):
+    """Detects the bounding box of what is red (class 1), sure of it; class 2 is never seen."""
+
+    def __init__(self) -> None:
+        super().__init__("square", ("red", "green"), SIZE)
+
+    def propose(self, canvas):
+        ys, xs = (canvas[0, 0] - canvas[0, 1] > 0.1).nonzero(as_tuple=True)
+        if not len(xs):
+            return Candidates(canvas.new_zeros(1, 0, 4), canvas.new_zeros(1, 0, 2))
+        box = torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas)
+        return Candidates(box[None, None], canvas.new_tensor([[[0.9, 0.05]]]))
+
+
+@dataclass(frozen=True)
+class Nothing(Look):
+    """A look that says nothing; its number is counted by the belief."""
+
+    count: int
+
+    def __getitem__(self, index):
+        return self
+
+    @classmethod
+    def join(cls, looks):
+        return looks[0]
+
+
+class Scripted(Observer):
+    """Believes, look by look, what it was told to: `(probabilities of 12 cells, presence)`; the last is kept."""
+
+    by_target = True
+
+    def __init__(self, *script, thresholds=AT):
+        super().__init__()
+        self.script, self.chosen, self.looks = script, thresholds, 0
+
+    @property
+    def thresholds(self):
+        return self.chosen
+
+    def start(self, batch, grid, like):
+        self.looks = 0
+        return Known(like.new_full((1, len(grid)), 0.5), like.new_full((1,), 0.5), like.new_ones(1, len(grid)))
+
+    def weigh(self, detections, fixation, grid, target=None):
+        return Nothing(0)
+
+    def update(self, belief, look):
+        cells, presence = self.script[min(self.looks, len(self.script) - 1)]
+        self.looks += 1
+        return Known(torch.tensor([cells]), torch.tensor([presence]), belief.closest)
+
+
+def cells(**at):
+    """Probabilities of 12 cells: 0.2, except where told otherwise."""
+    return [at.get(f"c{cell}", at.get("rest", 0.2)) for cell in range(12)]
+
+
+@pytest.fixture
+def image():
+    """A red square in the last cell."""
+    picture = torch.full((3, 120, 160), 0.4)
+    picture[:, 90:110, 130:150] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
+    return picture
+
+
+def agent(observer):
+    eye = Eye(Foveation(200.0), Square(), reference=160.0)
+    return ActivePerception(eye, (observer, NonPredictive()), (Semantic(3), Random()), grid=(4, 3)).eval()
+
+
+def test_a_search_that_finds(image):
+    script = [(cells(c5=0.4), 0.9), (cells(c11=0.9), 0.9), (cells(c11=0.95), 0.97)]
+    scanpath = agent(Scripted(*script)).search(image, "red", start=0)
+    assert scanpath.cells.tolist() == [0, 5, 11]
+    assert scanpath.found
+    decision = scanpath.decision
+    assert (decision.outcome, decision.cell) == ("found", 11)
+    assert decision.probability == pytest.approx(0.97)
+    torch.testing.assert_close(decision.box, torch.tensor([130.0, 90, 150, 110]), atol=6, rtol=0)
+    boxes = torch.cat([seen.boxes[0] for seen in scanpath.detections])
+    assert bool((boxes == decision.box).all(-1).any())
+    assert describe(scanpath) == "“red” found after 2 gaze shifts (probability 0.97)"
+
+
+def test_what_is_found_may_be_elsewhere_than_the_gaze(image):
+    """The most probable cell was fixated before; the look that settles it may be another."""
+    script = [(cells(c3=0.5), 0.3), (cells(c7=0.7), 0.9), (cells(c3=0.7), 0.9)]
+    scanpath = agent(Scripted(*script)).search(image, "red", start=0)
+    assert scanpath.cells.tolist() == [0, 3, 7]
+    assert (scanpath.decision.outcome, scanpath.decision.cell) == ("found", 3)
+    # No box was seen there.
+    assert scanpath.decision.box is None
+
+
+@pytest.mark.parametrize(
+    ("presence", "outcome", "words"), [(0.2, "absent", "not there"), (0.7, "undecided", "undecided")]
+)
+def test_a_search_that_gives_up(image, presence, outcome, words):
+    script = [(cells(c5=0.4), 0.3), (cells(rest=0.04, c5=0.6), presence)]
+    scanpath = agent(Scripted(*script)).search(image, "red", start=0)
+    assert scanpath.cells.tolist() == [0, 5]
+    assert not scanpath.found
+    assert scanpath.decision == Decision(outcome, pytest.approx(presence))
+    assert describe(scanpath) == f"“red” {words} after 1 gaze shift (probability {presence:.2f})"
+
+
+def test_a_search_that_runs_out_of_shifts(image):
+    scanpath = agent(Scripted((cells(), 0.1))).search(image, "red", start=0, shifts=4)
+    assert scanpath.shifts == 4
+    assert scanpath.decision == Decision("undecided", pytest.approx(0.1))
+    assert describe(scanpath) == "“red” undecided after 4 gaze shifts (probability 0.10)"
+
+
+def test_a_search_that_runs_out_of_cells(image):
+    """Where every cell was visited, none is left that is worth a look."""
+    scanpath = agent(Scripted((cells(), 0.1))).search(image, "red", start=0, shifts=40)
+    assert sorted(scanpath.cells.tolist()) == list(range(12))
+    assert scanpath.decision.outcome == "absent"
+
+
+def test_a_search_decides_with_its_last_shift(image):
+    script = [(cells(c5=0.4), 0.3), (cells(c5=0.9), 0.9)]
+    scanpath = agent(Scripted(*script)).search(image, "red", start=0, shifts=1)
+    assert scanpath.decision.outcome == "found"
+    scanpath = agent(Scripted((cells(c0=0.9), 0.9))).search(image, "red", start=0, shifts=0)
+    assert (scanpath.decision.outcome, scanpath.shifts) == ("found", 0)
+
+
+def test_thresholds_may_be_given(image):
+    script = [(cells(c5=0.4), 0.3), (cells(c5=0.6), 0.6)]
+    searcher = agent(Scripted(*script))
+    assert searcher.search(image, "red", start=0, confirm=0.6 - 1e-6).decision.outcome == "found"
+    assert searcher.search(image, "red", start=0, confirm=0.61, shifts=3).decision.outcome == "undecided"
+    ended = searcher.search(image, "red", start=0, give_up=0.41)
+    assert (ended.decision.outcome, ended.shifts) == ("absent", 0)
+    # Either alone leaves the other as it was chosen.
+    assert searcher.search(image, "red", start=0, give_up=0.3, shifts=1).decision.outcome == "undecided"
+    assert searcher.search(image, "red", start=0, confirm=0.5, shifts=1).decision.cell == 5
+
+
+def test_with_boxes_nothing_is_decided(image):
+    script = [(cells(c5=0.95), 0.9), (cells(c5=0.95), 0.9), (cells(c6=0.95), 0.9)]
+    boxes = torch.tensor([[85.0, 45, 90, 50]])
+    scanpath = agent(Scripted(*script)).search(image, "red", start=0, boxes=boxes, shifts=1)
+    assert scanpath.cells.tolist() == [0, 5]
+    assert (scanpath.found, scanpath.decision) == (False, None)
+    assert describe(scanpath) == "“red” not found in 1 gaze shift"
+    script[1] = (cells(c6=0.3), 0.9)
+    scanpath = agent(Scripted(*script)).search(image, "red", start=0, boxes=boxes)
+    assert scanpath.cells.tolist() == [0, 5, 6]
+    assert (scanpath.found, scanpath.decision) == (True, None)
+    assert describe(scanpath) == "“red” found after 2 gaze shifts"
+
+
+def test_an_exploration_decides_nothing(image):
+    scanpath = agent(Scripted((cells(), 0.5))).explore(image, start=0, shifts=1)
+    assert scanpath.decision is None
+    assert describe(scanpath) == "explored with 1 gaze shift"
+
+
+def test_without_thresholds_a_detection_decides(image):
+    """Beliefs of Kaplan's rule: the fixated cell, and the score of a detection that overlaps it."""
+    searcher = agent(Semantic(3))
+    scanpath = searcher.search(image, "red", start=0)
+    assert scanpath.found
+    assert scanpath.decision.outcome == "found"
+    assert scanpath.decision.cell == int(scanpath.cells[-1])
+    goal = Grid(4, 3, SIZE).footprint(scanpath.detections[-1].boxes)[0].any(0)
+    assert bool(goal[scanpath.cells[-1]])
+    assert not goal[scanpath.cells[:-1]].any()
+    assert scanpath.decision.probability == pytest.approx(float(scanpath.posterior[-1].max()))
+    assert torch.equal(scanpath.decision.box, scanpath.detections[-1].boxes[0, 0])
+    # They never give up, and a score that no detection has finds nothing.
+    for options in ({"confirm": 0.95}, {"confirm": 0.95, "give_up": 1.0}):
+        never = searcher.search(image, "red", start=0, shifts=40, **options)
+        assert len(never) == 12
+        assert (never.found, never.decision.outcome) == (False, "undecided")
+    assert searcher.search(image, "green", start=0, shifts=3).decision.outcome == "undecided"
+
+
+def test_context_decides_by_the_thresholds_of_the_other_observer(image):
+    nothing = ContextPrior(
+        ["red", "green"], torch.zeros(3, 3, 3), torch.zeros(3, 3, 2), [0.2], weights={"evidence": (1.0, 1.0)}
+    )
+    script = [(cells(c5=0.4), 0.3), (cells(c5=0.9), 0.85)]
+    observer = Context(Scripted(*script), nothing)
+    assert observer.thresholds == AT
+    assert Semantic(3).thresholds is Context(Semantic(3), nothing, (1.0, 1.0)).thresholds is None
+    scanpath = agent(observer).search(image, "red", start=0)
+    assert (scanpath.decision.outcome, scanpath.decision.cell) == ("found", 5)
+    assert scanpath.decision.probability == pytest.approx(0.85)
+
+
+@pytest.mark.parametrize("observer", [Scripted((cells(), 0.5)), Semantic(3)], ids=["thresholds", "none"])
+@pytest.mark.parametrize("given", [{"confirm": 50}, {"give_up": -1}, {"confirm": float("nan")}], ids=str)
+def test_what_is_no_probability_is_refused_by_name(image, observer, given):
+    (name,) = given
+    with pytest.raises(InputError, match=f"^{name}: expected a probability"):
+        agent(observer).search(image, "red", **given)
