@@ -30,7 +30,7 @@ from semfov.experiments.decisions import DecisionRun
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.run import finish
-from semfov.experiments.summary import sensing, table
+from semfov.experiments.summary import announce, gather, sensing, table
 from semfov.io.files import write_text
 from semfov.metrics.presence import area_under_roc, hits_at
 
@@ -69,19 +69,14 @@ def search_and_decide(config: DecideConfig) -> None:
     finish(run, "deciding")
     if rank() > 0:
         return
-    records: list[Record] = []
-    for index in range(len(run.scenes)):
-        part = run.parts.load(index)
-        if part is None:
-            raise DataError(f"{run.parts.path(index)} is missing or damaged; run the same command again")
-        records += part["records"]
+    records, _ = gather(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
     text = summary(records, sensing(run))
-    print(text)
-    write_text(config.out / "decisions.md", text)
-    write_text(config.out / "episodes.jsonl", "".join(json.dumps(record) + "\n" for record in records))
-    print("written:", *(f"  {config.out / name}" for name in ("decisions.md", "episodes.jsonl")), sep="\n")
+    files = {"decisions.md": text, "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records)}
+    for name, content in files.items():
+        write_text(config.out / name, content)
+    announce(text, [config.out / name for name in files])
 
 
 def summary(records: Sequence[Record], sensed: str) -> str:

@@ -11,6 +11,12 @@ FEATURES = 10
 _FLOOR = 1e-6
 
 
+def highest_score(detections: Detections, target: int) -> Tensor:
+    """Highest score of a class among the detections of each look, `(B,)`; 0 where there are none."""
+    scores = detections.scores[..., target] * detections.mask
+    return scores.amax(-1) if scores.shape[-1] else scores.new_zeros(len(scores))
+
+
 def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: int) -> Tensor:
     r"""Describe what looks show of `target` in every cell, `(B, X·Y, 10)`.
 

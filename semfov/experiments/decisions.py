@@ -12,6 +12,7 @@ from torch import Tensor
 
 from semfov.agent import Strategy
 from semfov.belief.belief import Belief
+from semfov.belief.look_features import highest_score
 from semfov.belief.observers import Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, best_box, decide
@@ -24,6 +25,7 @@ from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.seeds import generator_for, noise_for
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import NonPredictive, Random, Task
+from semfov.observation.matching import box_iou
 
 
 class DecisionRun(Run):
@@ -37,12 +39,8 @@ class DecisionRun(Run):
     config: SearchConfig
 
     def __init__(self, config: SearchConfig) -> None:
-        check(
-            config.belief.context == "none",
-            "belief.context",
-            "none: decisions are by evidence alone",
-            config.belief.context,
-        )
+        context = config.belief.context
+        check(context == "none", "belief.context", "none: decisions are by evidence alone", context)
         super().__init__(config)
         evidence = self.models.evidence
         assert evidence is not None
@@ -76,12 +74,11 @@ class DecisionRun(Run):
             start = generator_for("start", protocol.seed, self.scenes.ids[index], target)
             cell = torch.randint(len(grid), (1,), generator=start)
             noise = noise_for(protocol, len(grid), self.scenes.ids[index], target, 0)[None]
-            scores = sharp.scores[0, :, target][sharp.mask[0]]
             common = {
                 "scene": self.scenes.ids[index],
                 "target": target,
                 "present": bool(goal.any()),
-                "sharp": float(scores.max()) if len(scores) else 0.0,
+                "sharp": float(highest_score(sharp, target)),
             }
             for name, strategy in self.compared.items():
                 looks = StoredLooks(detections, grid, torch.tensor([target]))
@@ -129,9 +126,7 @@ def overlap(box: Tensor | None, boxes: Tensor) -> float | None:
     """Largest intersection over union of a box with any of some; None without a box or with none to compare."""
     if box is None or not len(boxes):
         return None
-    size = (torch.minimum(box[2:], boxes[:, 2:]) - torch.maximum(box[:2], boxes[:, :2])).clamp(min=0).prod(-1)
-    area = (boxes[:, 2:] - boxes[:, :2]).prod(-1) + (box[2:] - box[:2]).prod()
-    return float((size / (area - size)).max())
+    return float(box_iou(box[None], boxes).max())
 
 
 def landing(beliefs: list[Belief], cells: Tensor, goal: Tensor, target: int) -> list[float] | None:

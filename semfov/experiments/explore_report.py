@@ -92,6 +92,6 @@ def draw_curves(run: ExploreRun, curves: dict[str, Curve], answer: str) -> Path:
     figure = plot_success_rate(
         {name: curve.mean for name, curve in curves.items()},
         {name: curve.over_images for name, curve in curves.items()},
-        title=f"Exploration, {sensing(run)}\n{answer}",
+        title=f"Exploration, {answer}\n{sensing(run)}",
     )
     return save_figure(figure, run.config.out / f"success_rate_{answer.replace(' ', '_')}.png")

@@ -113,7 +113,7 @@ def draw_curves(run: SearchRun, curves: dict[str, Curve], expected: Array) -> Pa
     figure = plot_cumulative_performance(
         {**{name: curve.mean for name, curve in curves.items()}, "random, by formula": expected},
         {name: curve.over_images for name, curve in curves.items()},
-        title=f"Visual search, {sensing(run)}",
+        title=f"Visual search\n{sensing(run)}",
     )
     return save_figure(figure, run.config.out / "cumulative_performance.png")
 

@@ -70,6 +70,14 @@ def curve_of(records: Iterable[Record], measure: Callable[[Record], Array]) -> C
 
 def collect(run: Run) -> tuple[list[Record], dict[str, float]]:
     """Records of all scenes, those of a policy together, and the seconds spent by stage."""
+    records, seconds = gather(run)
+    order = {policy: number for number, policy in enumerate(run.policies)}
+    records.sort(key=lambda record: order[record["policy"]])
+    return records, seconds
+
+
+def gather(run: Run) -> tuple[list[Record], dict[str, float]]:
+    """Records of all scenes in their order, and the seconds spent by stage."""
     records: list[Record] = []
     seconds: dict[str, float] = defaultdict(float)
     for index in range(len(run.scenes)):
@@ -79,8 +87,6 @@ def collect(run: Run) -> tuple[list[Record], dict[str, float]]:
         records += part["records"]
         for stage, value in part["seconds"].items():
             seconds[stage] += value
-    order = {policy: number for number, policy in enumerate(run.policies)}
-    records.sort(key=lambda record: order[record["policy"]])
     return records, dict(seconds)
 
 

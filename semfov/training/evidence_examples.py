@@ -10,7 +10,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from semfov.belief.grid import Grid
-from semfov.belief.look_features import look_features
+from semfov.belief.look_features import highest_score, look_features
 from semfov.belief.observers import Observer
 from semfov.belief.observers.base import own
 from semfov.belief.observers.target import Target, TargetLook
@@ -115,8 +115,7 @@ def make_examples(run: LookingRun, classes: int, max_area: float, seed: int) -> 
                 continue
             with torch.inference_mode():
                 features = look_features(detections, grid.centres, grid, target).half()
-            scores = detections.scores[..., target] * detections.mask
-            score = scores.amax(-1) if scores.shape[-1] else scores.new_zeros(len(scores))
+            score = highest_score(detections, target)
             parts.append((features, score, grid.cell_distance, goal, torch.tensor(target), torch.tensor(index)))
     if not parts:
         raise DataError("data: no photograph has a class that may be searched for; raise max_target_area")

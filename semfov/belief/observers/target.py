@@ -8,6 +8,7 @@ from torch import Tensor
 
 from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.grid import Grid
+from semfov.belief.look_features import highest_score
 from semfov.belief.observers.base import Look, Observer, own
 from semfov.belief.target_evidence import Gathered, TargetEvidence, Thresholds
 from semfov.detection.detections import Detections
@@ -132,8 +133,7 @@ class Target(Observer):
         if target is None:
             raise InputError("target: expected a class to search for, got None")
         evidence = self.model(detections, fixation, grid, target)
-        scores = detections.scores[..., target] * detections.mask
-        score = scores.amax(-1) if scores.shape[-1] else scores.new_zeros(len(scores))
+        score = highest_score(detections, target)
         wanted = torch.full((len(fixation),), target, device=fixation.device)
         return TargetLook(evidence, grid.distance(fixation), score, grid.cell_of(fixation), wanted, grid.columns)
 
