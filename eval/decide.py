@@ -16,23 +16,23 @@ from pathlib import Path
 
 import torch
 
-from semfov.errors import DataError
+from semfov.errors import DataError, check
 from semfov.experiments.command import run_command
 from semfov.experiments.config import (
     BeliefConfig,
     DataConfig,
     DetectorConfig,
     ProtocolConfig,
-    SearchConfig,
     SensorConfig,
 )
-from semfov.experiments.decisions import DecisionRun
+from semfov.experiments.decisions import DecisionConfig, DecisionRun
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.run import finish
-from semfov.experiments.summary import announce, gather, sensing, table
+from semfov.experiments.summary import announce, gather, save_figure, sensing, table
 from semfov.io.files import write_text
 from semfov.metrics.presence import area_under_roc, hits_at
+from semfov.viz.presence import plot_roc
 
 SHARES = (0.01, 0.02, 0.05)
 
@@ -47,6 +47,9 @@ class DecideConfig:
         sensor: the foveal sensor.
         belief: the grid of beliefs; `target_model` is the learned evidence.
         protocol: gaze shifts, seed.
+        confirm: probability that the image holds the target, from which on it counts as found (None: the model's).
+        give_up: probability below which a cell is not worth a look (None: the model's).
+        prices: of a look in right decisions; for each, searches that end when looking on is not worth it.
         out: folder for table and records.
         cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
         workers: processes (None: one for each CPU core).
@@ -57,6 +60,9 @@ class DecideConfig:
     sensor: SensorConfig = field(default_factory=SensorConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
+    confirm: float | None = None
+    give_up: float | None = None
+    prices: tuple[float, ...] = (0.002, 0.005, 0.01, 0.02, 0.05)
     out: Path = Path("runs/decide")
     cache: Path | None = None
     workers: int | None = None
@@ -65,28 +71,43 @@ class DecideConfig:
 def search_and_decide(config: DecideConfig) -> None:
     """Run the searches and write their table and records."""
     settings = {each.name: getattr(config, each.name) for each in fields(config)}
-    run = DecisionRun(SearchConfig(**settings, policies=("target-evidence",)))
+    for name in ("confirm", "give_up"):
+        value = getattr(config, name)
+        check(value is None or 0 <= value <= 1, name, "a probability", value)
+    for price in config.prices:
+        check(0 < price < 1, "prices", "prices between 0 and 1 right decisions", price)
+    run = DecisionRun(DecisionConfig(**settings))
     finish(run, "deciding")
     if rank() > 0:
         return
     records, _ = gather(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
-    text = summary(records, sensing(run))
+    text = summary(records, sensing(run), config.prices)
     files = {"decisions.md": text, "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records)}
     for name, content in files.items():
         write_text(config.out / name, content)
-    announce(text, [config.out / name for name in files])
+    scores, there = probabilities(records)
+    picture = save_figure(plot_roc(scores, there), config.out / "roc.png")
+    announce(text, [*(config.out / name for name in files), picture])
 
 
-def summary(records: Sequence[Record], sensed: str) -> str:
-    """The tables, as Markdown."""
+def probabilities(records: Sequence[Record]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    """What each way to search, and sharp looks, say of presence, `(M,)`, and whether the target is there, `(M,)`."""
     names = list(dict.fromkeys(record["policy"] for record in records))
     groups = {name: [record for record in records if record["policy"] == name] for name in names}
     first = groups[names[0]]
-    there = torch.tensor([record["present"] for record in first])
     told = {name: torch.tensor([record["probability"] for record in group]) for name, group in groups.items()}
-    told["one sharp look, largest score"] = torch.tensor([record["sharp"] for record in first])
+    told["one sharp look, highest score"] = torch.tensor([record["sharp"] for record in first])
+    told["sharp look and its quarters, highest score"] = torch.tensor([record["tiled"] for record in first])
+    return told, torch.tensor([record["present"] for record in first])
+
+
+def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> str:
+    """The tables, as Markdown."""
+    names = list(dict.fromkeys(record["policy"] for record in records))
+    groups = {name: [record for record in records if record["policy"] == name] for name in names}
+    told, there = probabilities(records)
     rows = [["", "area under ROC", *(f"hits at {share:.0%}" for share in SHARES)]]
     rows += [
         [
@@ -124,13 +145,38 @@ def summary(records: Sequence[Record], sensed: str) -> str:
             "",
             *table(rows),
             "",
-            "Decisions at the thresholds of the model, in %, and mean looks; the place is right where the target "
-            "overlaps the most probable cell.",
+            "Decisions in %, and mean looks; the place is right where the target overlaps the cell that is named. Rows "
+            "with a price end when looking on is not worth that, in right decisions a look, the others at thresholds.",
             "",
             *table(decided),
             "",
+            *worth(groups, prices),
         ]
     )
+
+
+def worth(groups: dict[str, list[Record]], prices: Sequence[float]) -> list[str]:
+    """Right decisions less the price of their looks, of searches by thresholds and of those by price."""
+    if not prices:
+        return []
+    head = ["price of a look", "by thresholds", "by price"]
+    rows = [head]
+    for price in prices:
+        names = ("target-evidence", f"price {price:g}")
+        rows.append([f"{price:g}", *(f"{utility(groups[name], price):.4f}" for name in names)])
+    return [
+        "Mean worth of a search: 1 where the decision is right, less the price of its looks; undecided is not right.",
+        "",
+        *table(rows),
+        "",
+    ]
+
+
+def utility(records: Sequence[Record], price: float) -> float:
+    """Mean of 1 for each right decision less the price of the looks."""
+    right = [record["outcome"] == ("found" if record["present"] else "absent") for record in records]
+    looks = [record["looks"] for record in records]
+    return sum(each - price * count for each, count in zip(right, looks, strict=True)) / len(records)
 
 
 def percent(count: int, total: int) -> str:

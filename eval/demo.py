@@ -57,6 +57,9 @@ class DemoConfig:
         confirm: probability that the target is there, from which on it counts as found (none: the one chosen when the
             belief was fitted; for agents without a fitted belief the score of a detection, 0.5).
         give_up: probability below which a cell is not worth a look (none: the one chosen).
+        price: price of a look in right decisions: a search ends when looking on is not worth it (none: by thresholds).
+        until: price of a look in cells: an exploration ends when none is expected to name so many more right (none: 0.1
+            where the map was learned; 0: never).
         seed: of the start, of ties and of the embedded scene.
         frames: how many frames of a video or camera to look at.
         report: write a page to step through in a browser to this file.
@@ -74,6 +77,8 @@ class DemoConfig:
     shifts: int | None = None
     confirm: float | None = None
     give_up: float | None = None
+    price: float | None = None
+    until: float | None = None
     seed: int = 0
     frames: int = 4
     report: Path | None = None
@@ -139,9 +144,10 @@ def look_at(agent: ActivePerception, picture: Picture, config: DemoConfig) -> Sc
     common: dict[str, Any] = {"start": start_cell(agent, picture, config), "seed": config.seed}
     with torch.inference_mode():
         if config.target is None:
-            return agent.explore(picture.image, shifts=20 if config.shifts is None else config.shifts, **common)
+            shifts = 20 if config.shifts is None else config.shifts
+            return agent.explore(picture.image, shifts=shifts, until=config.until, **common)
         shifts = 30 if config.shifts is None else config.shifts
-        common |= {"confirm": config.confirm, "give_up": config.give_up}
+        common |= {"confirm": config.confirm, "give_up": config.give_up, "price": config.price}
         return agent.search(picture.image, config.target, shifts=shifts, **common)
 
 
@@ -161,15 +167,34 @@ def told(name: str, scanpath: Scanpath) -> str:
         values, what = viz.entropy(scanpath), "entropy (bits)"
     else:
         values, what = viz.class_posterior(scanpath), f"p({scanpath.classes[scanpath.target]})"
-    rows = [["#", "at (column, row)", "seen from there", f"{what} there", "highest", "at", "ms"]]
+    anywhere = None if scanpath.presence is None else scanpath.presence.tolist()
+    head = ["#", "at (column, row)", "seen from there", f"{what} there", "highest", "at"]
+    rows = [[*head, *([] if anywhere is None else ["anywhere"]), "ms"]]
     for number, (cell, value) in enumerate(zip(scanpath.cells.tolist(), values, strict=True)):
         best = int(value.argmax())
         milliseconds = 1000 * sum(scanpath.seconds[number].values())
         figures = [f"{float(value[cell]):.3f}", f"{float(value[best]):.3f}", place(scanpath, best)]
+        figures += [] if anywhere is None else [f"{anywhere[number]:.3f}"]
         rows.append([str(number), place(scanpath, cell), seen(scanpath, number), *figures, f"{milliseconds:.0f}"])
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join([f"{name}: {viz.describe(scanpath)}", *lines, ""])
+    if scanpath.target is None:
+        lines += ["", "what is where:", *named(scanpath)]
+    return "\n".join([f"{name}: {viz.describe(scanpath)}. {viz.why_it_ended(scanpath)}".rstrip(), *lines, ""])
+
+
+def named(scanpath: Scanpath) -> list[str]:
+    """What the map names at the end, a line for each class: in how many cells, how sure at best, and where that is."""
+    parts: dict[str, list[int]] = {}
+    for label, cells, _ in viz.named_regions(scanpath):
+        parts.setdefault(label, []).extend(cells)
+    lines = []
+    for label, cells in sorted(parts.items(), key=lambda item: -len(item[1])):
+        chance = scanpath.probabilities[-1, cells, scanpath.classes.index(label)]
+        best = cells[int(chance.argmax())]
+        many = f"{len(cells)} cell{'s' if len(cells) != 1 else ''}"
+        lines.append(f"  {label}: {many}, p up to {float(chance.max()):.2f} at {place(scanpath, best)}")
+    return lines or ["  nothing that is more probable than background"]
 
 
 def seen(scanpath: Scanpath, fixation: int, most: int = 3) -> str:

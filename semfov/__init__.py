@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from semfov.agent import ActivePerception
-from semfov.belief import Belief, DirichletBelief, Grid, TargetEvidence, fusion, observers
+from semfov.belief import Belief, DirichletBelief, Grid, MapEvidence, TargetEvidence, fusion, observers
 from semfov.data import EmbeddedScenes, read_image
 from semfov.detection import Detections, Detector, Selection
 from semfov.detection.load import load_detector
@@ -34,6 +34,7 @@ __all__ = [
     "Foveation",
     "Grid",
     "InputError",
+    "MapEvidence",
     "Scanpath",
     "Selection",
     "SemfovError",

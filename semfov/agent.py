@@ -1,5 +1,6 @@
 """An agent with a foveal sensor: it searches an image for a class, or explores it."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Self
@@ -9,23 +10,29 @@ from torch import Tensor, nn
 
 from semfov.belief.context import ContextPrior
 from semfov.belief.grid import Grid
-from semfov.belief.observers import Context, Observer, Semantic, Target
+from semfov.belief.map_evidence import MapEvidence
+from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
-from semfov.decision import OUTCOMES, Decision, best_box, decide
+from semfov.decision import conclude, decide, decide_by_price
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.episode import LiveLooks, Step, rollout
-from semfov.errors import check, check_shape, lookup
+from semfov.errors import InputError, check, check_shape, lookup
 from semfov.eye import Eye
+from semfov.gaze.acquisition import ExpectedGain
 from semfov.gaze.choice import Greedy, drawn_by
 from semfov.gaze.policies import KL, Closer, NonPredictive, Policy, Predictive, Random
+from semfov.io.compatibility import learned_for
 from semfov.observation.foveal import FovealObservationModel
-from semfov.scanpath import Scanpath, trace
+from semfov.scanpath import Ending, Scanpath, trace
 from semfov.sensor.foveation import Foveation
 from semfov.sensor.named import named_sensor
 
 PUBLISHED_SENSORS = ("published", "published-narrow")
 """Named sensors of the paper, for which observation models of maximum likelihood are shipped."""
+
+PRICE = 0.1
+"""How many more cells a look must be expected to name right, for an exploration by a learned map to go on."""
 
 
 class Strategy(nn.Module):
@@ -82,12 +89,12 @@ class ActivePerception(nn.Module):
         context: bool = False,
         **options: Any,
     ) -> Self:
-        """The agent for daily use: learned target evidence for search, the closer look for exploration.
+        """The agent for daily use: it searches by learned target evidence, and explores by a learned map.
 
         Args:
             name: a detector for which models are shipped, `yolov3-tiny` or `yolox-nano`.
             sigma: width of the fovea in pixels of an image of 640; the models are fitted for 100.
-            growth: see `Foveation`; the models are fitted for 2.
+            growth: see `Foveation`; models are fitted for 2, and for 1 as published.
             grid: `(columns, rows)` of the belief.
             context: whether search also goes by the usual places and company of the target (`ContextPrior`).
             options: of `semfov.load_detector`.
@@ -98,15 +105,18 @@ class ActivePerception(nn.Module):
         """
         detector = load_detector(name, **options)
         eye = Eye(Foveation(sigma, growth=growth), detector)
-        evidence = TargetEvidence.from_pretrained(detector.name)
+        name = learned_for(detector.name, growth)
+        evidence = TargetEvidence.from_pretrained(name)
         evidence.check_compatible(eye.settings())
+        everything = MapEvidence.from_pretrained(name)
+        everything.check_compatible(eye.settings())
         observer: Observer = Target(evidence)
         if context:
             prior = ContextPrior.from_pretrained()
             prior.check_compatible(detector.classes)
             observer = Context(observer, prior)
-        mapper = Semantic(len(detector.classes) + 1, tempering=0.5)
-        agent = cls(eye, (observer, NonPredictive()), (mapper, Closer(sigma / eye.reference)), grid=grid)
+        mapping = LearnedMap(everything), Closer(sigma / eye.reference)
+        agent = cls(eye, (observer, NonPredictive()), mapping, grid=grid)
         return agent.eval().requires_grad_(False)
 
     @classmethod
@@ -186,12 +196,13 @@ class ActivePerception(nn.Module):
         boxes: Tensor | None = None,
         confirm: float | None = None,
         give_up: float | None = None,
+        price: float | None = None,
     ) -> Scanpath:
         """Search an image for a target class, and decide whether it is there (`Scanpath.decision`).
 
         The search ends when the target is found: it is probable enough that the image holds it, and the gaze has been
-        on the most probable cell. It ends without the target when no cell is left that is probable enough
-        to be worth a look, and after `shifts` gaze shifts.
+        on a cell that is about as probable as any. It ends without the target when no cell is left that is probable
+        enough to be worth a look, and after `shifts` gaze shifts (`semfov.decision.decide`).
 
         Beliefs that no thresholds were chosen for (those of Kaplan's rule) do not give up. They find the target when a
         detection that overlaps the fixated cell has it as its best class, with a score of `confirm`.
@@ -209,6 +220,8 @@ class ActivePerception(nn.Module):
             confirm: probability that the image holds the target, from which on it counts as found; None takes the one
                 that was chosen when the belief was fitted, or a score of 0.5.
             give_up: probability below which a cell is not worth a look; None takes the one that was chosen.
+            price: of a look, in right decisions: the search then ends when looking on is not worth it, in place of the
+                thresholds (`semfov.decision.decide_by_price`).
 
         Raises:
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
@@ -219,6 +232,8 @@ class ActivePerception(nn.Module):
         index = self._target(target)
         goal = None if boxes is None else grid.footprint(boxes.to(image)).any(-2)
         chosen = self.searching.observer.thresholds
+        if price is not None and (chosen is None or confirm is not None or give_up is not None):
+            raise InputError("price: expected None, with thresholds or for a belief that tells no presence")
         thresholds = None
         if chosen is not None:
             thresholds = Thresholds(
@@ -228,6 +243,8 @@ class ActivePerception(nn.Module):
         def outcome(step: Step) -> Tensor:
             if goal is not None:
                 return goal[step.cell].long()
+            if price is not None:
+                return decide_by_price(step, index, price)
             if thresholds is not None:
                 return decide(step, index, thresholds)
             return confirms(step.detections, grid, step.cell, index, 0.5 if confirm is None else confirm).long()
@@ -235,25 +252,44 @@ class ActivePerception(nn.Module):
         scanpath, ended, last = self._gaze(image, grid, self.searching, index, start, shifts, seed, outcome)
         scanpath = replace(scanpath, found=ended == 1)
         if goal is not None:
-            return scanpath
-        probability = float(last.belief.presence(index))
-        cell = int(last.belief.probability(index).argmax() if thresholds is not None else last.cell)
-        if ended != 1:
-            return replace(scanpath, decision=Decision(OUTCOMES[ended], probability))
-        box = best_box(scanpath.detections, grid, cell, index)
-        return replace(scanpath, decision=Decision("found", probability, cell, box))
+            return replace(scanpath, ending="box") if ended else scanpath
+        if ended:
+            scanpath = replace(scanpath, ending="decision")
+        # A belief without thresholds found what it looked at.
+        cell = None if thresholds is not None else int(last.cell)
+        return replace(scanpath, decision=conclude(ended, last.belief, scanpath.detections, grid, index, cell))
 
-    def explore(self, image: Tensor, *, start: int | None = None, shifts: int = 20, seed: int = 0) -> Scanpath:
+    def explore(
+        self, image: Tensor, *, start: int | None = None, shifts: int = 20, seed: int = 0, until: float | None = None
+    ) -> Scanpath:
         """Explore an image: build up the belief about the whole map, with no target.
 
-        The exploration ends after `shifts` gaze shifts, or when no cell is left. Arguments as for `search`; the
-        scanpath has no target, and nothing is found.
+        The exploration ends after `shifts` gaze shifts, when no cell is left, and, where the map was learned, when no
+        look is expected to name `until` more cells right. Other arguments as for `search`; the scanpath has no target,
+        and nothing is found.
+
+        Args:
+            until: the price of a look in cells that are named right (`semfov.acquisition.ExpectedGain`); 0 goes on to
+                the end; None takes `PRICE` where the map was learned.
 
         Raises:
-            InputError: an argument does not fit.
+            InputError: an argument does not fit, or only a learned map could tell what a look will bring.
         """
+        check(until is None or 0 <= until < math.inf, "until", "a price in cells, 0 or more", until)
         image, grid = self._frame(image)
-        return self._gaze(image, grid, self.exploring, None, start, shifts, seed, None)[0]
+        observer = self.exploring.observer
+        if not isinstance(observer, LearnedMap):
+            if until:
+                raise InputError("until: expected None, for only a learned map tells what a look will bring")
+            return self._gaze(image, grid, self.exploring, None, start, shifts, seed, None)[0]
+        gain, price = ExpectedGain(observer.model, grid), PRICE if until is None else until
+
+        def spent(step: Step) -> Tensor:
+            worth = gain(step.belief, step.visited).masked_fill(step.visited, -math.inf).amax(-1)
+            return ((worth < price) & (price > 0) & ~step.visited.all(-1)).long()
+
+        scanpath, ended, _ = self._gaze(image, grid, self.exploring, None, start, shifts, seed, spent)
+        return replace(scanpath, ending="price") if ended else scanpath
 
     def _frame(self, image: Tensor) -> tuple[Tensor, Grid]:
         """The image as a batch of one, and the grid over it."""
@@ -299,7 +335,8 @@ class ActivePerception(nn.Module):
         beside = None if mapper is strategy.observer else mapper
         scanpath = trace(steps, grid, self.classes, target, beside)
         assert ended is not None
-        return scanpath, *ended
+        ending: Ending = "cells" if bool(ended[1].visited.all()) else "shifts"
+        return replace(scanpath, ending=ending), *ended
 
     def _target(self, target: str | int) -> int:
         if isinstance(target, str):

@@ -1,5 +1,6 @@
 """What a search decides: whether the target is there, where, and how sure that is."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -7,14 +8,19 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
 from semfov.episode import Step
+from semfov.errors import check
 
 Outcome = Literal["found", "absent", "undecided"]
 OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")
 """Outcomes by the number that `decide` gives them; the first is that of searches that run out of gaze shifts."""
+
+NEARLY = 0.9
+"""A fixated cell this many times as probable as the most probable one is looked at well enough to find its object."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +31,7 @@ class Decision:
         outcome: `found`; `absent`, when nothing is left to look at and the image rather does not hold the target; or
             `undecided`, when it rather does, but is not sure enough, or gaze shifts ran out before.
         probability: that the target is in the image, after the last look.
-        cell: for `found`, the most probable cell.
+        cell: for `found`, where the target is (`conclude`).
         box: `(4,)`, of all detections the one that says most of the target in that cell; None where there is none.
     """
 
@@ -38,9 +44,10 @@ class Decision:
 def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
     """Which searches end with this step, `(A,)`: 0 for none, else the number of the outcome in `OUTCOMES`.
 
-    A search has found its target when it is probable enough that the image holds it, and the gaze has been on the most
-    probable cell. It gives up when no cell is left that is probable enough to be worth a look; the target is then
-    absent, unless the image rather holds it than not.
+    A search has found its target when it is probable enough that the image holds it, and a cell was fixated that is
+    about as probable as any: at least `NEARLY` times. It gives up when no cell is left that is worth a look, which
+    another would be if no fixated cell holds the target (`Belief.chance`); the target is then absent, unless the image
+    rather holds it than not.
 
     Args:
         step: of searches, from `semfov.episode.rollout`.
@@ -48,12 +55,94 @@ def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
         thresholds: probabilities.
     """
     presence = step.belief.presence(target)
-    cells = step.belief.probability(target)
-    best = cells.argmax(-1, keepdim=True)
-    found = (presence >= thresholds.confirm) & step.visited.gather(-1, best)[:, 0]
-    nothing = cells.masked_fill(step.visited, 0).amax(-1) < thresholds.give_up
+    looked = nearly_fixated(step.belief.probability(target), step.visited)
+    nothing = step.belief.chance(target).masked_fill(step.visited, 0).amax(-1) < thresholds.give_up
     rest = torch.where(nothing, torch.where(presence < 0.5, 2, 3), 0)
-    return torch.where(found, 1, rest)
+    return torch.where((presence >= thresholds.confirm) & looked, 1, rest)
+
+
+def decide_by_price(step: Step, target: int | Tensor, price: float) -> Tensor:
+    r"""Which searches end with this step, `(A,)`, as for `decide`: when looking on is not worth the price of the looks.
+
+    A right decision is worth 1 and a look costs `price`. With P the probability that the image holds the target, to
+    decide now is worth :math:`\max(P, 1 - P)`. The next m looks would go to the cells left with the highest
+    probabilities p(x); they meet the target with probability :math:`U_m`, and it is then found for sure:
+
+    .. math:: U_m = P \, \frac{\sum_{i \le m} p(x_i)}{\sum_x p(x)}, \qquad
+              V_m = U_m + \max(P - U_m, \; 1 - P) - \text{price} \sum_{i < m} (1 - U_i)
+
+    The search goes on as long as :math:`V_m` is greater than the value of deciding for any m, and ends with what is
+    rather the case than not. (Ross, 1969, *A problem in optimal search and stop*; here over a fixed order of cells.)
+
+    Args:
+        step: of searches, from `semfov.episode.rollout`.
+        target: class 1..K, or `(A,)`.
+        price: of a look, in right decisions.
+
+    Raises:
+        InputError: the price is negative or not finite.
+    """
+    check(0 <= price < math.inf, "price", "0 or more right decisions", price)
+    presence = step.belief.presence(target)[:, None]
+    cells = step.belief.probability(target)
+    left = cells.masked_fill(step.visited, 0).sort(-1, descending=True).values
+    met = presence * left.cumsum(-1) / cells.sum(-1, keepdim=True).clamp(min=1e-12)
+    before = torch.cat([torch.zeros_like(met[:, :1]), met[:, :-1]], -1)
+    paid = price * (1 - before).cumsum(-1)
+    value = met + torch.maximum(presence - met, 1 - presence) - paid
+    # What is left is always at least nothing: rounding alone must not make a search go on.
+    on = value.amax(-1) > torch.maximum(presence, 1 - presence)[:, 0] + 1e-6
+    return torch.where(on, 0, torch.where(presence[:, 0] >= 0.5, 1, 2))
+
+
+def nearly_fixated(cells: Tensor, visited: Tensor) -> Tensor:
+    """Whether a fixated cell is about as probable as the most probable one, `(..., )`.
+
+    All cells of a large object are about as probable; to fixate each of them would tell nothing more.
+
+    Args:
+        cells: `(..., X·Y)`, probabilities.
+        visited: `(..., X·Y)` boolean, cells that were fixated.
+
+    >>> nearly_fixated(torch.tensor([[0.95, 0.9, 0.1]]), torch.tensor([[False, True, False]]))
+    tensor([True])
+    """
+    return cells.masked_fill(~visited, 0).amax(-1) >= NEARLY * cells.amax(-1)
+
+
+def conclude(
+    outcome: int, belief: Belief, looks: Sequence[Detections], grid: Grid, target: int, cell: int | None = None
+) -> Decision:
+    r"""The decision of one search that ended.
+
+    A target that was found is in the cell where belief and detections together say most of it,
+
+    .. math:: x = \arg\max_x P(t \in x) \max_l s_{lt} w_l(x)
+
+    over the detections l of all looks, with scores s and `soft` footprints w.
+
+    Args:
+        outcome: number of the outcome in `OUTCOMES`.
+        belief: after the last look, of one episode.
+        looks: what was seen, batches of one.
+        grid: the cells.
+        target: class 1..K.
+        cell: where it was found, if that is known.
+    """
+    probability = float(belief.presence(target))
+    if OUTCOMES[outcome] != "found":
+        return Decision(OUTCOMES[outcome], probability)
+    if cell is None:
+        cells = belief.probability(target)[0]
+        shown = torch.stack([cells.new_zeros(len(grid)), *(strength(seen, grid, target) for seen in looks)]).amax(0)
+        cell = int((cells * shown if bool(shown.any()) else cells).argmax())
+    return Decision("found", probability, cell, best_box(looks, grid, cell, target))
+
+
+def strength(seen: Detections, grid: Grid, target: int) -> Tensor:
+    """How strongly the detections of one look show the target in each cell, `(X·Y,)`: score times `soft` footprint."""
+    shown = grid.footprint(seen.boxes, "soft")[0] * (seen.mask[0] * seen.scores[0, :, target])[:, None]
+    return shown.amax(0) if len(shown) else shown.sum(0)
 
 
 def best_box(looks: Sequence[Detections], grid: Grid, cell: int, target: int) -> Tensor | None:

@@ -2,16 +2,21 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import DirichletBelief, dirichlet_belief
+from semfov.belief.belief import Belief, probabilities_of
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Observer
 from semfov.decision import Decision
 from semfov.detection.detections import Detections
 from semfov.episode import Step
+
+Ending = Literal["box", "decision", "price", "shifts", "cells"]
+"""Why an episode ended: the gaze was on a given box, the search decided, no look was worth its price, all gaze shifts
+were made, or every cell was fixated."""
 
 
 @dataclass(frozen=True)
@@ -25,12 +30,15 @@ class Scanpath:
         cells: `(n,)`, fixated cells.
         fixations: `(n, 2)`, their centres as points `(x, y)`.
         detections: what was seen from each fixation, batches of one.
-        beliefs: `(n, X·Y, K+1)`, Dirichlet parameters after each look.
+        probabilities: `(n, X·Y, K+1)`, that each cell holds each class, after each look; the first is background. Of a
+            learned map they are marginal: several classes can share a cell, and they need not sum to 1.
         values: `(n, X·Y)`, acquisition values that the next fixation was chosen by.
         found: whether the search ended on its target.
         posterior: `(n, X·Y)`, probability of the target in each cell as the search believed it after each look; None
             for exploration.
+        presence: `(n,)`, probability that the image holds the target, after each look; None for exploration.
         decision: what the search decided; None for exploration, and where the protocol ended it on a given box.
+        ending: why it ended; None where that is not known.
         seconds: what each look took, by stage (`semfov.episode.STAGES`).
     """
 
@@ -40,11 +48,13 @@ class Scanpath:
     cells: Tensor
     fixations: Tensor
     detections: tuple[Detections, ...]
-    beliefs: Tensor
+    probabilities: Tensor
     values: Tensor
     found: bool
     posterior: Tensor | None = None
+    presence: Tensor | None = None
     decision: Decision | None = None
+    ending: Ending | None = None
     seconds: tuple[Mapping[str, float], ...] = ()
 
     def __len__(self) -> int:
@@ -69,22 +79,23 @@ def trace(
         target: class that is searched for; None for exploration.
         beside: observer that keeps a map of all classes; None where the episode's own belief is one.
     """
-    cells, fixations, detections, beliefs, values, present, seconds = [], [], [], [], [], [], []
-    known: DirichletBelief | None = None
+    cells, fixations, detections, maps, values, present, anywhere, seconds = [], [], [], [], [], [], [], []
+    known: Belief | None = None
     for step in steps:
         if beside is None:
-            known = dirichlet_belief(step.belief)
+            known = step.belief
         else:
             before = beside.start(1, grid, step.values) if known is None else known
-            known = dirichlet_belief(beside(before, step.detections, step.fixation, grid))
+            known = beside(before, step.detections, step.fixation, grid)
         cells.append(step.cell)
         fixations.append(step.fixation)
         detections.append(step.detections)
-        beliefs.append(known.beta[0])
+        maps.append(probabilities_of(known)[0])
         values.append(step.values[0])
         seconds.append(step.seconds)
         if target is not None:
             present.append(step.belief.probability(target)[0])
+            anywhere.append(step.belief.presence(target)[0])
     return Scanpath(
         grid=grid,
         classes=classes,
@@ -92,9 +103,10 @@ def trace(
         cells=torch.cat(cells),
         fixations=torch.cat(fixations),
         detections=tuple(detections),
-        beliefs=torch.stack(beliefs),
+        probabilities=torch.stack(maps),
         values=torch.stack(values),
         found=False,
         posterior=torch.stack(present) if present else None,
+        presence=torch.stack(anywhere) if anywhere else None,
         seconds=tuple(seconds),
     )

@@ -12,7 +12,7 @@ from semfov import ActivePerception, Detections, DirichletBelief, Foveation, Gri
 from semfov.belief import Belief, ContextPrior
 from semfov.belief.observers import Context, Look, Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import OUTCOMES, Decision, best_box, decide
+from semfov.decision import NEARLY, OUTCOMES, Decision, best_box, conclude, decide, decide_by_price, strength
 from semfov.detection import Candidates, Detector
 from semfov.errors import InputError
 from semfov.eye import Eye
@@ -41,6 +41,13 @@ class Known(Belief):
         return Known(function(self.present), function(self.anywhere), function(self.closest))
 
 
+class Guided(Known):
+    """A belief that sees no chance elsewhere once it has looked."""
+
+    def chance(self, target):
+        return self.present / 10
+
+
 def step(cells, visited, presence=0.5):
     """Searches at these probabilities, with these cells visited."""
     cells = torch.tensor(cells)
@@ -64,8 +71,9 @@ def test_found_only_where_the_gaze_has_been():
     assert number([0.2, 0.9, 0.3], [0], 0.9) == 0
     assert number([0.2, 0.9, 0.3], [0, 2], 0.9) == 0
     assert number([0.2, 0.9, 0.3], [0, 1, 2], 0.9) == 1
-    # Another cell that is probable, and was fixated, is not the most probable one.
-    assert number([0.2, 0.9, 0.85], [2], 0.9) == 0
+    # Another cell that was fixated, and is nearly as probable, will do.
+    assert number([0.2, 0.9, 0.85], [2], 0.9) == 1
+    assert number([0.2, 0.9, 0.8], [2], 0.9) == 0
     # How probable the cell is does not matter, as long as none is more so.
     assert number([0.2, 0.4, 0.3], [1], 0.9) == 1
 
@@ -82,6 +90,11 @@ def test_gives_up_where_no_cell_is_worth_a_look():
     assert number([0.7, 0.05, 0.09], [0], 0.5) == number([0.7, 0.05, 0.09], [0], 0.79) == 3
     # A cell that is left, and worth it.
     assert number([0.7, 0.05, 0.2], [0], 0.1) == 0
+    # What counts is the chance if no fixated cell holds the target.
+    stated = step([[0.7, 0.3, 0.2]], [[0]], 0.1)
+    assert int(decide(stated, 1, AT)) == 0
+    stated.belief = Guided(*(getattr(stated.belief, name) for name in ("present", "anywhere", "closest")))
+    assert int(decide(stated, 1, AT)) == 2
     assert number([0.05, 0.05, 0.05], [], 0.49) == 2
     # Never, at a price of nothing, not even where every cell was visited.
     assert number([0.0, 0.0, 0.0], [0, 1, 2], 0.0, Thresholds(0.8, 0.0)) == 0
@@ -127,10 +140,10 @@ def test_a_batch_is_decided_as_a_loop_does(batch):
     got = decide(stated, torch.ones(len(cells), dtype=torch.long), thresholds).tolist()
     for row, outcome in enumerate(got):
         exact = torch.tensor(cells[row]).double().tolist()
-        best = max(range(len(exact)), key=exact.__getitem__)
+        looked = max([0.0, *(value for value, seen in zip(exact, visited[row], strict=True) if seen)])
         left = [value for value, seen in zip(exact, visited[row], strict=True) if not seen]
         anywhere = float(torch.tensor(presence[row]).double())
-        if anywhere >= confirm and visited[row][best]:
+        if anywhere >= confirm and looked >= NEARLY * max(exact):
             assert outcome == 1
         elif max([0.0, *left]) < give_up:
             assert outcome == (2 if anywhere < 0.5 else 3)
@@ -265,13 +278,98 @@ def test_a_search_that_finds(image):
 
 
 def test_what_is_found_may_be_elsewhere_than_the_gaze(image):
-    """The most probable cell was fixated before; the look that settles it may be another."""
+    """The most probable cell was fixated before; the look that settles it may be another, and so may the box."""
     script = [(cells(c3=0.5), 0.3), (cells(c7=0.7), 0.9), (cells(c3=0.7), 0.9)]
     scanpath = agent(Scripted(*script)).search(image, "red", start=0)
     assert scanpath.cells.tolist() == [0, 3, 7]
-    assert (scanpath.decision.outcome, scanpath.decision.cell) == ("found", 3)
-    # No box was seen there.
-    assert scanpath.decision.box is None
+    # A box was seen in the last cell alone.
+    assert (scanpath.decision.outcome, scanpath.decision.cell) == ("found", 11)
+    assert scanpath.decision.box is not None
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_place_equals_a_loop(seed):
+    grid, looks = Grid(4, 3, SIZE), random_looks(3, 4, seed)
+    parts = [looks[row : row + 1] for row in range(3)]
+    known = torch.rand(1, 12, generator=torch.Generator().manual_seed(seed))
+    belief = Known(known, torch.tensor([0.75]), known)
+    weight = grid.footprint(looks.boxes, "soft")
+    value = [
+        float(known[0, cell])
+        * max(
+            float(weight[look, n, cell] * looks.scores[look, n, 2]) if looks.mask[look, n] else 0.0
+            for look in range(3)
+            for n in range(4)
+        )
+        for cell in range(12)
+    ]
+    decision = conclude(1, belief, parts, grid, 2)
+    assert decision.cell == value.index(max(value))
+    assert torch.equal(decision.box, best_box(parts, grid, decision.cell, 2))
+    assert decision.probability == 0.75
+    assert conclude(1, belief, parts, grid, 2, cell=5).cell == 5
+    assert conclude(2, belief, parts, grid, 2) == Decision("absent", 0.75)
+    # Where nothing was detected the belief alone tells.
+    nothing = [Detections.empty(1, 3)]
+    assert conclude(1, belief, nothing, grid, 2) == Decision("found", 0.75, int(known.argmax()))
+    assert strength(nothing[0], grid, 2).tolist() == [0.0] * 12
+
+
+def worth_of_looks(cells, visited, presence, price):
+    """Value of deciding now, and the best value of deciding after m more looks, by following every course of them."""
+    left = sorted((p for p, seen in zip(cells, visited, strict=True) if not seen), reverse=True)
+    total, best = sum(cells), -1.0
+    for most in range(1, len(left) + 1):
+        paid, value, unmet = 0.0, 0.0, 1.0
+        for p in left[:most]:
+            paid += price
+            met = presence * p / total
+            # It is met with this look: right, for what has been paid.
+            value += met * (1 - paid)
+            unmet -= met
+        here = unmet - (1 - presence)
+        value += max(here, 1 - presence) - unmet * paid
+        best = max(best, value)
+    return max(presence, 1 - presence), best
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.01, 0.99), st.booleans()), min_size=2, max_size=6),
+    st.floats(0.01, 0.99),
+    st.floats(0.0001, 0.3),
+)
+def test_the_price_of_looks_equals_following_every_course(cells, presence, price):
+    known, visited = (list(column) for column in zip(*cells, strict=True))
+    stated = SimpleNamespace(
+        belief=Known(torch.tensor([known]).double(), torch.tensor([presence]).double(), torch.zeros(())),
+        visited=torch.tensor([visited]),
+    )
+    now, later = worth_of_looks(known, visited, presence, price)
+    outcome = int(decide_by_price(stated, 1, price))
+    if later > now + 1e-5:
+        assert outcome == 0
+    elif later < now - 1e-5:
+        assert outcome == (1 if presence >= 0.5 else 2)
+
+
+def test_looks_that_are_free_go_on_and_dear_ones_do_not():
+    stated = step([[0.4, 0.3, 0.2]], [[0]], 0.6)
+    assert int(decide_by_price(stated, 1, 1e-4)) == 0
+    assert int(decide_by_price(stated, 1, 0.9)) == 1
+    # Where every cell was fixated nothing is left to pay for.
+    assert int(decide_by_price(step([[0.4, 0.3]], [[0, 1]], 0.4), 1, 1e-4)) == 2
+    for price in (-0.1, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="price: expected 0 or more"):
+            decide_by_price(stated, 1, price)
+
+
+def test_a_search_may_end_by_price(image):
+    script = [(cells(c5=0.9), 0.6), (cells(c5=0.99), 0.97)]
+    assert agent(Scripted(*script)).search(image, "red", start=0, price=0.02).cells.tolist() == [0, 5]
+    assert agent(Scripted(*script)).search(image, "red", start=0, price=0.9).decision.outcome == "found"
+    for observer, options in ((Scripted(*script), {"confirm": 0.5}), (Semantic(3), {})):
+        with pytest.raises(InputError, match="price: expected None"):
+            agent(observer).search(image, "red", price=0.1, **options)
 
 
 @pytest.mark.parametrize(
@@ -317,7 +415,7 @@ def test_thresholds_may_be_given(image):
     assert (ended.decision.outcome, ended.shifts) == ("absent", 0)
     # Either alone leaves the other as it was chosen.
     assert searcher.search(image, "red", start=0, give_up=0.3, shifts=1).decision.outcome == "undecided"
-    assert searcher.search(image, "red", start=0, confirm=0.5, shifts=1).decision.cell == 5
+    assert searcher.search(image, "red", start=0, confirm=0.5, shifts=1).decision.outcome == "found"
 
 
 def test_with_boxes_nothing_is_decided(image):
@@ -369,7 +467,7 @@ def test_context_decides_by_the_thresholds_of_the_other_observer(image):
     assert observer.thresholds == AT
     assert Semantic(3).thresholds is Context(Semantic(3), nothing, (1.0, 1.0)).thresholds is None
     scanpath = agent(observer).search(image, "red", start=0)
-    assert (scanpath.decision.outcome, scanpath.decision.cell) == ("found", 5)
+    assert (scanpath.decision.outcome, scanpath.cells.tolist()) == ("found", [0, 5])
     assert scanpath.decision.probability == pytest.approx(0.85)
 
 

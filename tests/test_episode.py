@@ -11,8 +11,8 @@ from torch import nn
 import semfov
 from semfov import FovealObservationModel, Foveation, Grid, InputError
 from semfov.belief import ContextPrior, TargetEvidence
+from semfov.belief.evidence import Gathered
 from semfov.belief.observers import Context, Semantic, Target
-from semfov.belief.target_evidence import Gathered
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.episode import STAGES, LiveLooks, Looks, Sight, StoredLooks, rollout
 from semfov.eye import Eye

@@ -9,11 +9,12 @@ import torch
 import semfov
 from semfov.agent import PUBLISHED_SENSORS
 from semfov.belief import ContextPrior, DirichletBelief
-from semfov.io.compatibility import recommended
+from semfov.io.compatibility import learned_for, recommended
 from semfov.sensor import SENSORS
 
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
 TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
+MAPS = sorted(semfov.MapEvidence.shipped.glob("*.safetensors"))
 GAZE = sorted(semfov.gaze.LearnedGaze.shipped.glob("*.safetensors"))
 
 
@@ -33,11 +34,18 @@ def test_observation_model(path):
     assert "/" not in text.replace("://", "")
 
 
+def check_eye(model, path):
+    """A model's name tells the eye that it was trained for."""
+    detector = path.stem.removesuffix("-published")
+    assert model.metadata["detector"]["name"] == detector
+    assert learned_for(detector, model.metadata["sensor"]["growth"]) == path.stem
+
+
 @pytest.mark.parametrize("path", TARGET, ids=lambda path: path.stem)
 def test_target_evidence(path):
     model = semfov.TargetEvidence.from_pretrained(path.stem)
     assert path.stat().st_size < 100_000
-    assert model.metadata["detector"]["name"] == path.stem
+    check_eye(model, path)
     assert "/" not in json.dumps(model.metadata)
     grid = semfov.Grid(10, 10, (640, 480))
     box = torch.tensor([[[300.0, 200.0, 360.0, 260.0]]])
@@ -50,6 +58,27 @@ def test_target_evidence(path):
     middle = int(grid.cell_of(torch.tensor([330.0, 230.0])))
     assert odds.argmax() == middle
     assert odds[middle] > max(0.0, float(other[middle]) + 1)
+
+
+@pytest.mark.parametrize("path", MAPS, ids=lambda path: path.stem)
+def test_map_evidence(path):
+    model = semfov.MapEvidence.from_pretrained(path.stem)
+    assert path.stat().st_size < 100_000
+    check_eye(model, path)
+    assert "/" not in json.dumps(model.metadata)
+    assert f"`{path.stem}`" in (path.parent / "README.md").read_text(encoding="utf-8")
+    # A sure detection at the fovea is named where it is, and a cell far from it is empty.
+    grid, fixation = semfov.Grid(10, 10, (640, 480)), torch.tensor([[330.0, 230.0]])
+    scores = torch.full((1, 1, 81), 0.001)
+    scores[..., 7] = 0.92
+    box = torch.tensor([[[300.0, 200.0, 360.0, 260.0]]])
+    seen = semfov.Detections(box, scores, torch.ones(1, 1, dtype=torch.bool))
+    mapper = semfov.observers.LearnedMap(model)
+    with torch.no_grad():
+        belief = mapper(mapper.start(1, grid, fixation), seen, fixation, grid)
+    named = belief.probabilities[0].argmax(-1)
+    assert named[grid.cell_of(fixation)[0]] == 7
+    assert named[0] == named[99] == 0
 
 
 @pytest.mark.parametrize("path", sorted(ContextPrior.shipped.glob("*.safetensors")), ids=lambda path: path.stem)
@@ -87,8 +116,9 @@ def test_learned_gaze():
 
 
 def test_both_kinds_exist_for_every_detector():
-    names = {path.stem for path in TARGET}
-    assert names == {"yolov3-tiny", "yolox-nano"}
+    names = {"yolov3-tiny", "yolox-nano"}
+    learned = {learned_for(name, growth) for name in names for growth in (1.0, 2.0)}
+    assert {path.stem for path in TARGET} == {path.stem for path in MAPS} == learned
     kinds = ("", "-sharp", "-published", "-published-narrow")
     assert {path.stem for path in OBSERVATION} == {name + kind for name in names for kind in kinds}
 
@@ -136,7 +166,7 @@ def test_recommended_agent_searches_and_explores():
     found = agent.search(scene.image, target, boxes=scene.boxes[scene.labels == target], start=0)
     assert found.found
     assert found.shifts <= 10
-    assert found.beliefs.shape[-1] == 81
+    assert found.probabilities.shape[-1] == 81
     assert found.posterior.shape == (len(found), 100)
     assert bool(((found.posterior >= 0) & (found.posterior <= 1)).all())
     explored = agent.explore(scene.image, start=0, shifts=2)

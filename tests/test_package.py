@@ -30,6 +30,7 @@ SURFACE = {
     "Foveation",
     "Grid",
     "InputError",
+    "MapEvidence",
     "Scanpath",
     "Selection",
     "SemfovError",

@@ -180,6 +180,6 @@ def test_code_runs(folder, weights, monkeypatch):
     names = {}
     exec(compile(code, "README.md", "exec"), names)
     assert names["scanpath"].classes[names["scanpath"].target] == "cup"
-    assert names["explored"].shifts == 10
+    assert 1 <= names["explored"].shifts <= 20
     assert Path("scanpath.png").is_file()
     assert Path("map.png").is_file()

@@ -11,12 +11,14 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from semfov import Detections, Grid, InputError, Scanpath
 from semfov.gaze.saliency import cell_saliency
+from semfov.metrics.calibration import BinarySums
 from semfov.viz import (
     COLOURS,
     entropy,
     plot_belief,
     plot_belief_bars,
     plot_belief_strip,
+    plot_cell_reliability,
     plot_cumulative_performance,
     plot_episode,
     plot_fixation,
@@ -46,7 +48,7 @@ def scanpath():
         cells=cells,
         fixations=grid.centres[cells],
         detections=(seen,) * 3,
-        beliefs=torch.rand(3, 12, 3) + 0.1,
+        probabilities=torch.rand(3, 12, 3).add(0.1).softmax(-1),
         values=torch.rand(3, 12),
         found=True,
     )
@@ -101,8 +103,8 @@ def test_scanpath_shows_numbered_fixations(scanpath, image):
 def test_belief_is_the_posterior(scanpath):
     figure = draw(plot_belief(scanpath, 1))
     shown = np.asarray(figure.axes[0].images[0].get_array())
-    belief = scanpath.beliefs[1]
-    np.testing.assert_allclose(shown, (belief[:, 2] / belief.sum(1)).reshape(3, 4), rtol=1e-6)
+    belief = scanpath.probabilities[1]
+    np.testing.assert_allclose(shown, (belief[:, 2]).reshape(3, 4), rtol=1e-6)
 
 
 def test_belief_refuses_what_is_not_there(scanpath):
@@ -118,13 +120,13 @@ def test_belief_of_the_search_comes_before_that_of_the_map(scanpath):
     shown = np.asarray(draw(plot_belief(searched)).axes[0].images[0].get_array())
     np.testing.assert_allclose(shown, searched.posterior[-1].reshape(3, 4))
     other = np.asarray(draw(plot_belief(searched, target=1)).axes[0].images[0].get_array())
-    belief = scanpath.beliefs[-1]
-    np.testing.assert_allclose(other, (belief[:, 1] / belief.sum(1)).reshape(3, 4), rtol=1e-6)
+    belief = scanpath.probabilities[-1]
+    np.testing.assert_allclose(other, (belief[:, 1]).reshape(3, 4), rtol=1e-6)
 
 
 def test_belief_strip_shows_every_fixation_on_one_scale(scanpath, image):
     figure = draw(plot_belief_strip(scanpath, image=image, columns=2))
-    belief = scanpath.beliefs[..., 2] / scanpath.beliefs.sum(-1)
+    belief = scanpath.probabilities[..., 2]
     maps = [axes.images[-1] for axes in figure.axes if axes.get_title()]
     np.testing.assert_allclose([np.asarray(m.get_array()).ravel() for m in maps], belief, rtol=1e-6)
     assert {m.get_clim() for m in maps} == {(0, float(belief.max()))}
@@ -133,7 +135,7 @@ def test_belief_strip_shows_every_fixation_on_one_scale(scanpath, image):
 def test_bars_are_as_high_as_the_posterior(scanpath):
     with mock.patch.object(Axes3D, "bar3d", autospec=True, side_effect=Axes3D.bar3d) as drawn:
         draw(plot_belief_bars(scanpath, most=2))
-    belief = scanpath.beliefs[..., 2] / scanpath.beliefs.sum(-1)
+    belief = scanpath.probabilities[..., 2]
     assert drawn.call_count == 2
     for call, fixation in zip(drawn.call_args_list, (0, 2), strict=True):
         axes, x, y, bottom, _, _, height = call.args
@@ -174,26 +176,26 @@ def test_fixation_is_scanpath_view_and_belief(scanpath, image):
     path, seen, believed = draw(plot_fixation(scanpath, 1, image, image * 0.5)).axes
     assert [text.get_text() for text in path.texts] == ["0", "1"]
     np.testing.assert_allclose(np.asarray(seen.images[0].get_array()), (image * 0.5).permute(1, 2, 0))
-    belief = scanpath.beliefs[1]
+    belief = scanpath.probabilities[1]
     shown = np.asarray(believed.images[-1].get_array()).ravel()
-    np.testing.assert_allclose(shown, belief[:, 2] / belief.sum(1), rtol=1e-6)
+    np.testing.assert_allclose(shown, belief[:, 2], rtol=1e-6)
     explored = draw(plot_fixation(replace(scanpath, target=None), 1, image, image))
     assert explored.axes[2].get_title() == "what is where after fixation 1"
 
 
 def test_semantic_map_names_what_is_more_probable_than_background():
     beliefs = torch.tensor([[[1.0, 50, 1], [1, 50, 1], [50, 9, 9], [1, 1, 1], [1, 1, 50], [50, 9, 9]]])
+    p = beliefs[0] / beliefs[0].sum(-1, keepdim=True)
     grid = Grid(3, 2, (30, 20))
     nothing = Detections.empty(1, 2)
     scanpath = Scanpath(
-        grid, ("background", "cat", "cup"), None, torch.tensor([0]), grid.centres[:1], (nothing,), beliefs,
+        grid, ("background", "cat", "cup"), None, torch.tensor([0]), grid.centres[:1], (nothing,), p[None],
         torch.zeros(1, 6), False,
     )  # fmt: skip
     named, unsure, *_ = draw(plot_semantic_map(scanpath)).axes
     texts = {text.get_text(): text.get_position() for text in named.texts}
     assert set(texts) == {"cat", "cup"}
     assert texts["cup"] == (15, 15)
-    p = beliefs[0] / beliefs[0].sum(-1, keepdim=True)
     np.testing.assert_allclose(np.asarray(named.images[-1].get_array()).ravel(), p[:, 1:].amax(-1), rtol=1e-6)
     bits = -(p * p.log2()).sum(-1)
     np.testing.assert_allclose(entropy(scanpath)[0], bits, rtol=1e-5)
@@ -258,6 +260,25 @@ def test_reliability_of_a_calibrated_model_lies_on_the_diagonal():
     axes = draw(plot_reliability({"perfect": (probabilities, labels)})).axes[0]
     x, y = axes.lines[1].get_data()
     np.testing.assert_allclose(x, y, atol=0.03)
+
+
+def test_reliability_of_cells_lies_on_the_diagonal_in_log_odds():
+    torch.manual_seed(0)
+    p = torch.rand(200_000, dtype=torch.float64) ** 3
+    sums = BinarySums.of(p, torch.rand(len(p)) < p)
+    few = BinarySums.of(p[:5], p[:5] > 2)
+    panels = {"after 1 look": {"right": sums.bins, "rare": few.bins}, "after 5 looks": {"right": sums.bins}}
+    errors = {"right": {"fixated": 0.01, "others": 0.02}, "rare": {"fixated": 0.2, "others": 0.1}}
+    first, second, last = draw(plot_cell_reliability(panels, errors, groups="cells")).axes
+    for axes in (first, second):
+        assert (axes.get_xscale(), axes.get_yscale()) == ("logit", "logit")
+        x, y = axes.lines[1].get_data()
+        assert len(x) > 18
+        np.testing.assert_allclose(x, y, atol=0.02)
+    assert len(first.lines[2].get_xdata()) == 0
+    assert [axes.get_title() for axes in (first, second)] == list(panels)
+    assert [list(line.get_ydata()) for line in last.lines] == [list(each.values()) for each in errors.values()]
+    assert [line.get_color() for line in last.lines] == [line.get_color() for line in first.lines[1:]]
 
 
 def test_scanpath_without_target_needs_one(scanpath):

@@ -56,10 +56,10 @@ def detectors(data: st.DataObject) -> str:
 def check(path: object, selection: Selection, size: tuple[int, int], cells: int) -> None:
     """Everything that a scanpath promises."""
     assert isinstance(path, Scanpath)
-    beliefs = path.beliefs
-    assert bool(torch.isfinite(beliefs).all())
-    assert bool((beliefs.diff(dim=0) >= 0).all())
-    assert bool((beliefs >= 0.5).all())
+    probabilities = path.probabilities
+    assert bool(torch.isfinite(probabilities).all())
+    assert bool((probabilities >= 0).all())
+    assert bool((probabilities.sum(-1) - 1).abs().max() < 1e-5)
     visited = path.cells.tolist()
     assert len(set(visited)) == len(visited) == min(4, cells)
     assert all(0 <= cell < cells for cell in visited)

@@ -80,12 +80,13 @@ BEYOND = (
 BEYOND_EXPLORATION = (
     "random-raw",
     "kl-raw",
-    "surprise-raw",
     "closer-look-raw",
-    "recommended",
     "random-calibrated",
     "kl-calibrated",
     "closer-look-calibrated",
+    "random-learned",
+    "expected-gain-learned",
+    "closer-look-learned",
 )
 """Explorations with our own models."""
 

@@ -149,6 +149,9 @@ def first_fixations(folder: Path) -> list[str]:
     """Where explorations look first: share of the first gaze shifts that end in the middle half, or at the border."""
     rows = [["policy", "in the middle half of rows and columns", "at the border"]]
     for policy in policies_of(folder):
+        # What one sharp look gives has no fixations.
+        if not records_of(folder, policy)[0]["cells"]:
+            continue
         cells = np.array([record["cells"][1] for record in records_of(folder, policy)])
         middle, border = central(cells)
         rows.append([policy, f"{100 * middle.mean():.1f} %", f"{100 * border.mean():.1f} %"])

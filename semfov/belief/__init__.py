@@ -6,6 +6,7 @@ from semfov.belief.context import ContextPrior
 from semfov.belief.fusion import fuse
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.likelihood import Observation, likelihoods
+from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.target_evidence import TargetEvidence
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "DirichletBelief",
     "Footprint",
     "Grid",
+    "MapEvidence",
     "Observation",
     "TargetEvidence",
     "fuse",

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
+from typing import Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -96,6 +96,27 @@ class DirichletBelief(Belief):
     def probability(self, target: int | Tensor) -> Tensor:
         """Posterior of the target class in each cell, `(B, X·Y)`."""
         return pick(self.beta, torch.as_tensor(target)) / self.beta.sum(-1)
+
+
+@runtime_checkable
+class AllClasses(Protocol):
+    """A belief about all classes."""
+
+    @property
+    def probabilities(self) -> Tensor:
+        """Of every class, background first, `(B, X·Y, K+1)`."""
+        ...
+
+
+def probabilities_of(belief: Belief) -> Tensor:
+    """Probability of every class in every cell, background first, `(B, X·Y, K+1)`.
+
+    Raises:
+        InputError: the belief is about a target alone.
+    """
+    if not isinstance(belief, AllClasses):
+        raise InputError(f"belief: expected a belief about all classes, got {type(belief).__name__}")
+    return belief.probabilities
 
 
 def dirichlet_belief(belief: Belief) -> DirichletBelief:

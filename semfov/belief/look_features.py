@@ -11,10 +11,14 @@ FEATURES = 10
 _FLOOR = 1e-6
 
 
-def highest_score(detections: Detections, target: int) -> Tensor:
-    """Highest score of a class among the detections of each look, `(B,)`; 0 where there are none."""
-    scores = detections.scores[..., target] * detections.mask
-    return scores.amax(-1) if scores.shape[-1] else scores.new_zeros(len(scores))
+def highest_score(detections: Detections, target: int | Tensor) -> Tensor:
+    """Highest score of a class among the detections of each look, `(B,)`; 0 where there are none.
+
+    Of several classes `(T,)` that of each, `(B, T)`.
+    """
+    scores = detections.scores * detections.mask[..., None]
+    highest = scores.amax(1) if scores.shape[1] else scores.new_zeros(len(scores), scores.shape[-1])
+    return highest[..., target]
 
 
 def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: int) -> Tensor:
@@ -33,41 +37,49 @@ def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: 
         grid: the cells of one image.
         target: class 1..K.
     """
+    components = detections.scores.shape[-1]
+    check(1 <= target < components, "target", f"a class from 1 to {components - 1}", target)
+    wanted = torch.tensor([target], device=fixation.device)
+    return class_features(detections, fixation, grid, wanted)[:, 0]
+
+
+def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets: Tensor) -> Tensor:
+    """`look_features` of several classes `(T,)`, `(B, T, X·Y, 10)`."""
     batch = detections.mask.shape[0]
     check_shape(fixation, "fixation", batch, 2)
     components = detections.scores.shape[-1]
-    check(1 <= target < components, "target", f"a class from 1 to {components - 1}", target)
-    distance = grid.distance(fixation)
+    distance = grid.distance(fixation)[:, None]
     if detections.mask.shape[1] == 0:
         nothing = fixation.new_zeros(batch, 1, components)
         detections = Detections(fixation.new_zeros(batch, 1, 4), nothing, nothing[..., 0] > 0)
-    weight = grid.footprint(detections.boxes, "soft") * detections.mask[..., None]
+    # Looks, classes, detections, cells.
+    weight = (grid.footprint(detections.boxes, "soft") * detections.mask[..., None])[:, None]
     touches = weight > 0
-    score = detections.scores[..., target, None]
-    objectness = (1 - detections.scores[..., 0, None]).clamp(min=_FLOOR)
-    strongest, best = (score * weight).max(1, keepdim=True)
+    score = detections.scores[..., targets].transpose(1, 2)[..., None]
+    objectness = (1 - detections.scores[..., 0]).clamp(min=_FLOOR)[:, None, :, None]
+    strongest, best = (score * weight).max(2)
 
     def of_best(values: Tensor) -> Tensor:
-        return values.expand(weight.shape).gather(1, best)[:, 0] * seen
+        """Of each class's best detection in each cell, from `(B, 1 or T, L, 1 or X·Y)`."""
+        wide = values.expand(batch, len(targets), *weight.shape[2:])
+        return wide.gather(2, best[:, :, None])[:, :, 0] * seen
 
-    seen = touches.any(1)
+    seen = touches.any(2)
     edges = detections.boxes[..., 2:] - detections.boxes[..., :2]
-    size = (edges.clamp(min=0).prod(-1, keepdim=True) / grid.extent.prod().to(edges)).sqrt()
-    return torch.stack(
-        [
-            4 * distance,
-            _log(strongest[:, 0]),
-            _log((score * touches).amax(1)),
-            2 * of_best(objectness),
-            2 * of_best(weight),
-            3 * of_best(size),
-            2 * of_best(score / objectness),
-            2 * (objectness * weight).amax(1),
-            2 * ((objectness - score).clamp(min=0) * weight).amax(1),
-            (~seen).to(weight.dtype),
-        ],
-        -1,
-    )
+    size = (edges.clamp(min=0).prod(-1) / grid.extent.prod().to(edges)).sqrt()[:, None, :, None]
+    told = [
+        4 * distance,
+        _log(strongest),
+        _log((score * touches).amax(2)),
+        2 * of_best(objectness),
+        2 * of_best(weight),
+        3 * of_best(size),
+        2 * of_best(score / objectness),
+        2 * (objectness * weight).amax(2),
+        2 * ((objectness - score).clamp(min=0) * weight).amax(2),
+        (~seen).to(weight.dtype),
+    ]
+    return torch.stack([each.expand(batch, len(targets), len(grid)) for each in told], -1)
 
 
 def _log(score: Tensor) -> Tensor:

@@ -10,12 +10,18 @@ import torch
 from torch import Tensor
 
 from semfov.agent import Strategy
-from semfov.belief import ContextPrior, Grid, TargetEvidence
-from semfov.belief.observers import Context, Observer, Semantic, Target
+from semfov.belief import ContextPrior, Grid, MapEvidence, TargetEvidence
+from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
 from semfov.errors import InputError, check
 from semfov.experiments.config import BeliefConfig, PolicyConfig, RunConfig, SearchConfig
 from semfov.experiments.presets import SALIENCY, TARGET_EVIDENCE, resolve
-from semfov.experiments.setup import make_context, make_learned_gaze, make_observation, make_target_evidence
+from semfov.experiments.setup import (
+    make_context,
+    make_learned_gaze,
+    make_map_evidence,
+    make_observation,
+    make_target_evidence,
+)
 from semfov.eye import Eye
 from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static
 from semfov.gaze.learned import LearnedGaze
@@ -62,6 +68,7 @@ class Models:
     evidence: TargetEvidence | None = None
     context: ContextPrior | None = None
     gaze: LearnedGaze | None = None
+    map: MapEvidence | None = None
 
 
 def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
@@ -79,6 +86,7 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
         if any(_of(policy.context, belief.context) != "none" for policy in policies)
         else None,
         make_learned_gaze(config.gaze_model, eye) if gazes and isinstance(config, SearchConfig) else None,
+        make_map_evidence(belief.map_model, eye) if any(policy.scores == "learned" for policy in policies) else None,
     )
 
 
@@ -122,10 +130,12 @@ def _strategy(
 ) -> Strategy:
     if policy.policy == TARGET_EVIDENCE:
         return Strategy(Target(_given(models.evidence, "policy", "learned target evidence")), NonPredictive())
-    means = Means(models.observation, models.gaze, fovea, belief.prior)
+    means = Means(models.observation, models.gaze, models.map, fovea, belief.prior)
     chosen = Random() if policy.policy == SALIENCY else named_policy(policy.policy, task, means)
     if chosen.needs_gaze and models.gaze is not None:
         return Strategy(models.gaze.observer(components), chosen)
+    if policy.scores == "learned":
+        return Strategy(LearnedMap(_given(models.map, "scores", "a learned map")), chosen)
     misses = _of(policy.misses, belief.misses)
     calibrated = policy.scores == "calibrated"
     observer = Semantic(

@@ -14,7 +14,7 @@ from semfov.sensor.named import SensorName
 
 SaliencyModel = Literal["vocus2", "itti-koch"]
 Context = Literal["none", "place", "cooccurrence", "both"]
-Scores = Literal["raw", "calibrated"]
+Scores = Literal["raw", "calibrated", "learned"]
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,8 @@ class BeliefConfig:
         misses: take account of cells in which nothing was detected, by the observation model's miss rates.
         model: fitted observation model, by name or file (None: our own for the detector and growth; published: the
             detector's name and `-published` or `-published-narrow`).
-        target_model: learned target evidence, by name or file (None: the one shipped for the detector).
+        target_model: learned target evidence, by name or file (None: the one shipped for detector and sensor).
+        map_model: learned map, by name or file (None: the one shipped for detector and sensor).
         context: what is added to the log odds of a target: `none`, its usual `place`, its `cooccurrence` with what was
             seen, or `both`; for `target-evidence` and `non-predictive`.
         context_model: fitted context, by name or file.
@@ -134,6 +135,7 @@ class BeliefConfig:
     misses: bool = False
     model: str | None = None
     target_model: str | None = None
+    map_model: str | None = None
     context: Context = "none"
     context_model: str = "coco"
 
@@ -161,7 +163,8 @@ class PolicyConfig:
     Args:
         policy: name of a registered policy (`semfov.gaze.policies`), `saliency`, which goes by a saliency map alone, or
             `target-evidence`, which goes by learned evidence for the target.
-        scores: whether scores are likelihoods as they are, `raw`, or go through the observation model, `calibrated`.
+        scores: whether scores are likelihoods as they are, `raw`, or go through the observation model, `calibrated`;
+            or, for explorations, the map is a `learned` one.
         tempering: exponent of the likelihoods.
         footprint: which cells a detection updates: `overlap`, `centre`, `box_centre` or `soft`.
         memory: fuse `all` looks, or keep what the `closest` look at each cell says.
@@ -261,10 +264,11 @@ class ExploreConfig:
         saliency: the saliency baselines.
         protocol: the experiment.
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: kl, scores:
-            calibrated, memory: closest}` (`PolicyConfig`). Presets: `recommended` (closer-look, tempering 0.5),
-            `published` (kl-calibrated), and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
+            calibrated, memory: closest}` (`PolicyConfig`). Presets: `recommended` (closer-look-learned), `published`
+            (kl-calibrated), and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
             `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`, `vocus2` or
-            `itti-koch` followed by `-raw` or `-calibrated`.
+            `itti-koch` followed by `-raw` or `-calibrated`. With a learned map there are `random-learned`,
+            `closer-look-learned`, `expected-gain-learned`, `vocus2-learned` and `itti-koch-learned`.
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
         store: keep what was seen on disk; false recomputes it (the result is the same).

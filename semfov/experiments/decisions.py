@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -15,10 +17,10 @@ from semfov.belief.belief import Belief
 from semfov.belief.look_features import highest_score
 from semfov.belief.observers import Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import OUTCOMES, best_box, decide
+from semfov.decision import conclude, decide, decide_by_price
 from semfov.episode import Step, Stopwatch, StoredLooks, rollout
 from semfov.errors import check
-from semfov.experiments.config import SearchConfig
+from semfov.experiments.config import PolicyConfig, SearchConfig
 from semfov.experiments.parts import Record
 from semfov.experiments.run import Run
 from semfov.experiments.search_protocol import choose_classes
@@ -27,33 +29,58 @@ from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import NonPredictive, Random, Task
 from semfov.observation.matching import box_iou
 
+Rule = Callable[[Step, int], Tensor]
+"""Which searches for a class end with a step: numbers of their outcomes."""
+
+
+@dataclass(frozen=True)
+class DecisionConfig(SearchConfig):
+    """Searches that decide; `policies` are of no account.
+
+    Args:
+        confirm: probability that the image holds the target, from which on it counts as found (None: the model's).
+        give_up: probability below which a cell is not worth a look (None: the model's).
+        prices: of a look, for searches that end by `decide_by_price`, beside those that end by thresholds.
+    """
+
+    policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
+    confirm: float | None = None
+    give_up: float | None = None
+    prices: tuple[float, ...] = ()
+
 
 class DecisionRun(Run):
     """Searches by learned target evidence, and by the same belief under random gaze.
 
     Args:
-        config: of the run; its policies are `target-evidence`.
+        config: of the run.
     """
 
     task: ClassVar[Task] = "search"
-    config: SearchConfig
+    config: DecisionConfig
 
-    def __init__(self, config: SearchConfig) -> None:
+    def __init__(self, config: DecisionConfig) -> None:
         context = config.belief.context
         check(context == "none", "belief.context", "none: decisions are by evidence alone", context)
         super().__init__(config)
         evidence = self.models.evidence
         assert evidence is not None
-        self.compared = {
-            "target-evidence": Strategy(Target(evidence), NonPredictive()),
-            "random gaze": Strategy(Target(evidence), Random()),
+        chosen = evidence.thresholds or Thresholds(0.9, 0.05)
+        self.thresholds = Thresholds(
+            chosen.confirm if config.confirm is None else config.confirm,
+            chosen.give_up if config.give_up is None else config.give_up,
+        )
+        learned, random = Strategy(Target(evidence), NonPredictive()), Strategy(Target(evidence), Random())
+        by_thresholds = partial(decide, thresholds=self.thresholds)
+        self.compared: dict[str, tuple[Strategy, Rule]] = {
+            "target-evidence": (learned, by_thresholds),
+            "random gaze": (random, by_thresholds),
+            **{f"price {price:g}": (learned, partial(decide_by_price, price=price)) for price in config.prices},
         }
-
-    def _key(self) -> str:
-        evidence = self.models.evidence
-        assert evidence is not None
-        what = ["decisions", super()._key(), asdict(evidence.thresholds) if evidence.thresholds else None]
-        return hashlib.sha256(json.dumps(what).encode()).hexdigest()
+        # The key is asked for once more, now that it is known what is compared.
+        self.key = hashlib.sha256(
+            json.dumps(["decisions", self.key, asdict(self.thresholds), list(self.compared)]).encode()
+        ).hexdigest()
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
         """Records of all searches of a scene, and the seconds that they took."""
@@ -67,7 +94,9 @@ class DecisionRun(Run):
             return records, watch.seconds
         detections = self.detections(index)
         with torch.inference_mode():
-            sharp = self.eye.detector(self.scenes[index].image[None])
+            image = self.scenes[index].image[None]
+            sharp = self.eye.detector(image)
+            tiles = [self.eye.detector(tile) for tile in quarters(image)]
         watch.lap("look")
         for target in classes:
             goal = covered[annotation.labels == target].any(0)
@@ -79,36 +108,33 @@ class DecisionRun(Run):
                 "target": target,
                 "present": bool(goal.any()),
                 "sharp": float(highest_score(sharp, target)),
+                "tiled": max(float(highest_score(seen, target)) for seen in (sharp, *tiles)),
             }
-            for name, strategy in self.compared.items():
+            for name, (strategy, rule) in self.compared.items():
                 looks = StoredLooks(detections, grid, torch.tensor([target]))
                 with torch.inference_mode():
-                    steps = self._search(strategy, looks, cell, noise, target)
+                    steps = self._search(strategy, rule, looks, cell, noise, target)
                 last, seen = steps[-1], torch.cat([step.cell for step in steps])
-                outcome = OUTCOMES[int(decide(last, target, self._thresholds(strategy)))]
-                found = outcome == "found"
-                best = int(last.belief.probability(target).argmax())
-                box = best_box([detections[place] for place in seen.split(1)], grid, best, target) if found else None
+                ended = int(rule(last, target))
+                decision = conclude(ended, last.belief, [detections[cell] for cell in seen.split(1)], grid, target)
                 records.append(
                     {
                         "policy": name,
                         **common,
-                        "outcome": outcome,
-                        "probability": float(last.belief.presence(target)),
+                        "outcome": decision.outcome,
+                        "probability": decision.probability,
                         "looks": len(steps),
-                        "right_place": bool(goal[best]) if found else None,
-                        "overlap": overlap(box, annotation.boxes[annotation.labels == target]),
+                        "right_place": None if decision.cell is None else bool(goal[decision.cell]),
+                        "overlap": overlap(decision.box, annotation.boxes[annotation.labels == target]),
                         "landing": landing([step.belief for step in steps], seen, goal, target),
                     }
                 )
         watch.lap("search")
         return records, watch.seconds
 
-    def _thresholds(self, strategy: Strategy) -> Thresholds:
-        return strategy.observer.thresholds or Thresholds(0.9, 0.05)
-
-    def _search(self, strategy: Strategy, looks: StoredLooks, start: Tensor, noise: Tensor, target: int) -> list[Step]:
-        thresholds = self._thresholds(strategy)
+    def _search(
+        self, strategy: Strategy, rule: Rule, looks: StoredLooks, start: Tensor, noise: Tensor, target: int
+    ) -> list[Step]:
         return list(
             rollout(
                 looks,
@@ -117,9 +143,16 @@ class DecisionRun(Run):
                 start,
                 Greedy(drawn_from(noise)),
                 most=self.config.protocol.shifts + 1,
-                ends=lambda step: decide(step, target, thresholds) > 0,
+                ends=lambda step: rule(step, target) > 0,
             )
         )
+
+
+def quarters(image: Tensor) -> list[Tensor]:
+    """The four quarters of pictures `(B, C, H, W)`."""
+    row, column = image.shape[-2] // 2, image.shape[-1] // 2
+    rows = image[..., :row, :], image[..., row:, :]
+    return [part for half in rows for part in (half[..., :column], half[..., column:])]
 
 
 def overlap(box: Tensor | None, boxes: Tensor) -> float | None:

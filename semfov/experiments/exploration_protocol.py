@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import dirichlet_belief
+from semfov.belief.belief import probabilities_of
 from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
@@ -42,11 +42,13 @@ class Progress:
         right: after 0, 1, … gaze shifts, how many of the cells with objects are given the class of one of them: the
             published measure, where the most probable of all classes is the answer, background among them.
         right_without_background: the same, where the most probable class but background is the answer.
+        right_everywhere: of all cells, how many are given the class of an object there, or background where none is.
     """
 
     cells: tuple[int, ...]
     right: tuple[int, ...]
     right_without_background: tuple[int, ...]
+    right_everywhere: tuple[int, ...]
 
 
 def explorations_of(scenes: Scenes, index: int, cells: int, protocol: ProtocolConfig) -> list[Exploration]:
@@ -90,7 +92,7 @@ def run_explorations(
     progress: list[Progress] = []
     for start, random in zip(starts.split(batch), noise.split(batch), strict=True):
         choice = Greedy(drawn_from(random))
-        visits, right, without = [], [], []
+        visits, counts = [], []
         for step in rollout(
             looks,
             candidate.observer,
@@ -99,13 +101,18 @@ def run_explorations(
             choice,
             most=shifts + 1,
         ):
-            beta = dirichlet_belief(step.belief).beta
+            known = probabilities_of(step.belief)
             visits.append(step.cell)
-            right.append(count_right(beta, answers))
-            without.append(count_right(beta[..., 1:], answers[:, 1:]))
+            counts.append(counts_of(known, answers))
         # All episodes have made as many shifts, and so all run out of cells at once: nothing changes after that.
-        for counts in (right, without):
-            counts += [counts[-1]] * (shifts + 1 - len(counts))
-        tables = [torch.stack(columns, 1).tolist() for columns in (visits, right, without)]
-        progress += [Progress(tuple(a), tuple(b), tuple(c)) for a, b, c in zip(*tables, strict=True)]
+        counts += [counts[-1]] * (shifts + 1 - len(counts))
+        tables = torch.stack(visits, 1).tolist(), *(torch.stack(each, 1).tolist() for each in zip(*counts, strict=True))
+        progress += [Progress(*map(tuple, row)) for row in zip(*tables, strict=True)]
     return progress
+
+
+def counts_of(probabilities: Tensor, answers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The three counts of `Progress` for maps `(B, X·Y, K+1)`, each `(B,)`."""
+    everywhere = torch.cat([~answers.any(-1, keepdim=True), answers[:, 1:]], -1)
+    without = count_right(probabilities[..., 1:], answers[:, 1:])
+    return count_right(probabilities, answers), without, count_right(probabilities, everywhere)

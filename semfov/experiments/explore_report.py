@@ -1,4 +1,4 @@
-"""What an exploration run leaves: the success rate after each gaze shift, with and without background as an answer."""
+"""What an exploration run leaves: the share of cells named right after each gaze shift, counted in three ways."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -30,6 +30,7 @@ SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
 ANSWERS = {
     "all classes": ("right", "as published: the answer is the most probable of all classes, background among them"),
     "without background": ("right_without_background", "the answer is the most probable class but background"),
+    "whole grid": ("right_everywhere", "all cells count: background is right where there is no object"),
 }
 """What counts as an answer: the records' field, and in words."""
 
@@ -39,7 +40,9 @@ def report(run: ExploreRun) -> None:
     records, seconds = collect(run)
     if not records:
         raise DataError("data: no scene has an object; lower data.min_instances or raise data.limit")
-    curves = {answer: success(records, list(run.policies), answer) for answer in ANSWERS}
+    # What one sharp look gives comes after the policies.
+    names = dict.fromkeys([*run.policies, *(record["policy"] for record in records)])
+    curves = {answer: success(records, list(names), answer) for answer in ANSWERS}
     summary = summary_markdown(curves, run.config.protocol.shifts, sensing(run))
     tables = {"summary.md": summary, "summary.csv": curves_csv(curves, ("answers", "success_rate"))}
     written = write_files(run, "eval.explore", tables, records, seconds)
@@ -64,7 +67,7 @@ def success(records: list[Record], policies: Sequence[str], answer: str) -> dict
 
 
 def _rate(record: Record, field: str) -> Array:
-    return success_rate(record[field], record["object_cells"])
+    return success_rate(record[field], record["grid_cells" if field == "right_everywhere" else "object_cells"])
 
 
 def summary_markdown(curves: dict[str, dict[str, Curve]], last: int, sensing: str) -> str:
@@ -76,8 +79,8 @@ def summary_markdown(curves: dict[str, dict[str, Curve]], last: int, sensing: st
         first = next(iter(policies.values()))
         lines += [
             f"**{ANSWERS[answer][1]}** ({sensing}; {first.images} images, {first.episodes} explorations per policy; "
-            "% of the cells with objects that are given the class of one after n gaze shifts, ± standard error over "
-            "images)",
+            "% of the cells that are given a right answer after n gaze shifts, of those with objects unless all count, "
+            "± standard error over images)",
             "",
             *table([head, *curve_rows(policies, shifts)]),
             "",

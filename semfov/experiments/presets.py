@@ -38,9 +38,14 @@ def presets(task: Task) -> dict[str, PolicyConfig]:
         scored = {name: PolicyConfig(name) for name in policy_names("search") if name not in alone}
     else:
         alone = {}
-        best, published = PolicyConfig("closer-look", tempering=0.5), PolicyConfig("kl", "calibrated")
-        scored = {name: PolicyConfig(name) for name in policy_names("exploration")}
+        best, published = PolicyConfig("closer-look", "learned"), PolicyConfig("kl", "calibrated")
+        scored = {name: PolicyConfig(name) for name in policy_names("exploration") if not POLICIES[name].needs_map}
         scored |= {name: PolicyConfig(SALIENCY, saliency=name) for name in SALIENCY_MODELS}
+        alone = {
+            f"{name}-learned": PolicyConfig(policy.policy, "learned", saliency=policy.saliency)
+            for name, policy in {**scored, "expected-gain": PolicyConfig("expected-gain")}.items()
+            if policy.policy not in POLICIES or not POLICIES[policy.policy].needs_model
+        }
     both = {
         f"{name}-{scores}": PolicyConfig(policy.policy, scores, saliency=policy.saliency)
         for name, policy in scored.items()
@@ -69,9 +74,12 @@ def resolve(choice: Choice, task: Task) -> PolicyConfig:
             lookup(getattr(choice, setting), get_args(words), setting)
     if choice.tempering is not None:
         check(choice.tempering > 0, "tempering", "a positive number", choice.tempering)
-    if choice.scores == "calibrated" and not _scored(choice, task):
-        raise InputError(f"scores: expected 'raw' for policy {choice.policy!r}, got 'calibrated'")
-    if choice.policy == TARGET_EVIDENCE or (choice.policy in POLICIES and POLICIES[choice.policy].needs_gaze):
+    scores = [scores for scores in get_args(Scores) if _scored(choice, task, scores)] or ["raw"]
+    if choice.scores not in scores:
+        expected = " or ".join(map(repr, scores))
+        raise InputError(f"scores: expected {expected} for policy {choice.policy!r}, got {choice.scores!r}")
+    own = choice.scores == "learned" or choice.policy == TARGET_EVIDENCE
+    if own or (choice.policy in POLICIES and POLICIES[choice.policy].needs_gaze):
         given = next((setting for setting in OF_THE_MAP if getattr(choice, setting) is not None), None)
         if given is not None:
             raise InputError(f"{given}: expected none, for policy {choice.policy!r} comes with its own belief")
@@ -97,7 +105,7 @@ def label(choice: Choice, task: Task) -> str:
     return ", ".join([base, *differs])
 
 
-def _scored(policy: PolicyConfig, task: Task) -> bool:
-    """Whether presets of this policy say which scores it takes."""
+def _scored(policy: PolicyConfig, task: Task, scores: Scores) -> bool:
+    """Whether a preset of this policy takes such scores."""
     saliency = policy.saliency if policy.policy == SALIENCY else None
-    return PolicyConfig(policy.policy, "calibrated", saliency=saliency) in presets(task).values()
+    return PolicyConfig(policy.policy, scores, saliency=saliency) in presets(task).values()

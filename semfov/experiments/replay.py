@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import torch
 
-from semfov.belief.observers import Semantic
+from semfov.belief.observers import LearnedMap, Observer, Semantic
 from semfov.episode import StoredLooks, rollout
-from semfov.experiments.candidates import make_strategy
+from semfov.errors import InputError
 from semfov.experiments.parts import Record
-from semfov.experiments.presets import resolve
 from semfov.experiments.run import Run
+from semfov.experiments.setup import make_map_evidence
 from semfov.gaze.choice import Given
 from semfov.scanpath import Scanpath, trace
 
@@ -17,8 +17,8 @@ from semfov.scanpath import Scanpath, trace
 def replay(run: Run, index: int, record: Record) -> Scanpath:
     """The scanpath of a recorded episode.
 
-    A belief about the target alone tells nothing of other classes: the recommended map is kept beside it, as the agent
-    does.
+    A belief about the target alone tells nothing of other classes: the recommended agent's map is kept beside it, or,
+    where none is learned for the eye, one by Kaplan's rule from tempered scores.
 
     Args:
         run: that the record is of.
@@ -37,14 +37,18 @@ def replay(run: Run, index: int, record: Record) -> Scanpath:
         Given(cells),
         most=cells.shape[1],
     )
-    beside = None
-    if not isinstance(candidate.observer, Semantic):
-        components, fovea = len(run.scenes.classes) + 1, run.config.sensor.fovea
-        # Whatever the run adds to its searches.
-        recommended = replace(resolve("recommended", "exploration"), misses=False, context="none")
-        beside = make_strategy(recommended, "exploration", run.config.belief, components, run.models, fovea).observer
+    beside: Observer | None = None
+    if not isinstance(candidate.observer, Semantic | LearnedMap):
+        beside = _map_beside(run)
     with torch.no_grad():
         scanpath = trace(steps, grid, ("background", *run.scenes.classes), cue, beside)
     found = record.get("found_at", -1) >= 0
     # How long it takes to read a store is no time of the eye's.
     return replace(scanpath, target=record.get("target"), found=found, seconds=())
+
+
+def _map_beside(run: Run) -> Observer:
+    try:
+        return LearnedMap(make_map_evidence(run.config.belief.map_model, run.eye))
+    except InputError:
+        return Semantic(len(run.scenes.classes) + 1, tempering=0.5)

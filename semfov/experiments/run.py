@@ -72,6 +72,8 @@ class Run(ABC):
             )
         }
         fitted["context"] = None if models.context is None else models.context.digest()
+        if models.map is not None:
+            fitted["map"] = checksum(models.map.state_dict())
         belief = {name: value for name, value in asdict(config.belief).items() if not name.endswith("model")}
         protocol = {name: value for name, value in asdict(config.protocol).items() if name != "batch"}
         saliency = {name: [store.key, config.saliency.weight] for name, store in self.saliency_stores.items()}

@@ -77,7 +77,7 @@ def choose_episodes(records: list[Record], policies: Sequence[str], count: int) 
     order = {policy: number for number, policy in enumerate(policies)}
     groups: dict[Any, list[Record]] = defaultdict(list)
     for record in records:
-        if record["repetition"] == 0 and record.get("commonest", True):
+        if record["repetition"] == 0 and record.get("commonest", True) and record["policy"] in order:
             groups[record["scene"]].append(record)
     chosen: list[Record] = []
     for group in groups.values():

@@ -6,17 +6,20 @@ from dataclasses import asdict
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from semfov.episode import Stopwatch
 from semfov.experiments.config import ExploreConfig, SearchConfig
 from semfov.experiments.exploration_protocol import (
     Exploration,
     Progress,
+    counts_of,
     explorations_of,
     explore_noise,
     run_explorations,
 )
 from semfov.experiments.parts import Record
+from semfov.experiments.references import sharp_maps
 from semfov.experiments.run import Run
 from semfov.experiments.search_protocol import Episode, Outcome, episodes_of, run_episodes, tie_noise
 from semfov.gaze.policies import Task
@@ -91,18 +94,25 @@ class ExploreRun(Run):
                     episodes, candidate, detections, grid, answers, noise, shifts=protocol.shifts, batch=protocol.batch
                 )
             watch.lap(name)
-            objects = int(answers.any(-1).sum())
-            records += [self._record(name, objects, *pair) for pair in zip(episodes, outcomes, strict=True)]
+            records += [self._record(name, answers, *pair) for pair in zip(episodes, outcomes, strict=True)]
+        with torch.inference_mode():
+            sharp = self.eye.detector(self.scenes[index].image[None])
+            for name, known in sharp_maps(sharp, grid).items():
+                counts = [tuple(each.tolist()) * (protocol.shifts + 1) for each in counts_of(known, answers)]
+                records += [self._record(name, answers, episode, Progress((), *counts)) for episode in episodes]
+        watch.lap("sharp look")
         return records, watch.seconds
 
-    def _record(self, policy: str, objects: int, episode: Exploration, progress: Progress) -> Record:
+    def _record(self, policy: str, answers: Tensor, episode: Exploration, progress: Progress) -> Record:
         return {
             "policy": policy,
             "scene": self.scenes.ids[episode.scene],
             "repetition": episode.repetition,
             "start": episode.start,
             "cells": list(progress.cells),
-            "object_cells": objects,
+            "object_cells": int(answers.any(-1).sum()),
+            "grid_cells": len(answers),
             "right": list(progress.right),
             "right_without_background": list(progress.right_without_background),
+            "right_everywhere": list(progress.right_everywhere),
         }

@@ -10,14 +10,14 @@ from typing import Any
 
 import torch
 
-from semfov.belief import ContextPrior, TargetEvidence
+from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
 from semfov.data.scene import Scenes
 from semfov.detection.load import load_detector
 from semfov.errors import DataError, InputError
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.eye import Eye
 from semfov.gaze.learned import LearnedGaze
-from semfov.io.compatibility import recommended
+from semfov.io.compatibility import learned_for, recommended
 from semfov.observation.foveal import FovealObservationModel
 
 
@@ -78,8 +78,15 @@ def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
 
 
 def make_target_evidence(name: str | None, eye: Eye) -> TargetEvidence:
-    """The learned evidence for a target of that name, or the one for this detector; checked to belong to it."""
-    model = TargetEvidence.from_pretrained(name or eye.detector.name)
+    """The learned evidence for a target of that name, or the one for this eye; checked to belong to it."""
+    model = TargetEvidence.from_pretrained(name or learned_for(eye.detector.name, float(eye.sensor.growth)))
+    model.check_compatible(eye.settings())
+    return model.requires_grad_(False)
+
+
+def make_map_evidence(name: str | None, eye: Eye) -> MapEvidence:
+    """The learned map of that name, or the one for this eye; checked to belong to it."""
+    model = MapEvidence.from_pretrained(name or learned_for(eye.detector.name, float(eye.sensor.growth)))
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
 

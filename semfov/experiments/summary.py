@@ -72,7 +72,7 @@ def collect(run: Run) -> tuple[list[Record], dict[str, float]]:
     """Records of all scenes, those of a policy together, and the seconds spent by stage."""
     records, seconds = gather(run)
     order = {policy: number for number, policy in enumerate(run.policies)}
-    records.sort(key=lambda record: order[record["policy"]])
+    records.sort(key=lambda record: order.get(record["policy"], len(order)))
     return records, seconds
 
 

@@ -31,6 +31,15 @@ def recommended(detector: str, growth: float) -> str:
     return f"{detector}-sharp" if growth == 1 else detector
 
 
+def learned_for(detector: str, growth: float) -> str:
+    """Name of learned evidence and maps for a detector behind a sensor of this growth.
+
+    >>> learned_for("yolov3-tiny", 2.0), learned_for("yolov3-tiny", 1.0)
+    ('yolov3-tiny', 'yolov3-tiny-published')
+    """
+    return f"{detector}-published" if growth == 1 else detector
+
+
 def check_classes(fitted: Sequence[str], classes: Sequence[str] | None, what: str) -> None:
     """Raise `InputError` unless the class lists are the same."""
     if classes is None or tuple(classes) == tuple(fitted):

@@ -1,6 +1,8 @@
 """How well probabilities agree with what happens: scoring rules and calibration errors."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -41,8 +43,7 @@ def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Cal
     confidence, predicted = p.max(1)
     return Calibration(
         count=len(labels),
-        # A probability that has underflowed to 0 costs what the smallest number costs, not infinity.
-        nll=float(-true.clamp(min=torch.finfo(torch.float32).tiny).log().mean()),
+        nll=float(surprisal(true).mean()),
         brier=float((p.square().sum(1) - 2 * true + 1).mean()),
         ece=float(calibration_error(confidence, predicted == labels, bins)),
         classwise_ece=float(
@@ -50,6 +51,11 @@ def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Cal
         ),
         accuracy=float((predicted == labels).double().mean()),
     )
+
+
+def surprisal(probability: Tensor) -> Tensor:
+    """Negative log, in nats; of a probability that has underflowed to 0, that of the smallest number, not infinity."""
+    return -probability.clamp(min=torch.finfo(torch.float32).tiny).log()
 
 
 def calibration_error(confidence: Tensor, correct: Tensor, bins: int = 15) -> Tensor:
@@ -62,14 +68,133 @@ def calibration_error(confidence: Tensor, correct: Tensor, bins: int = 15) -> Te
         correct: `(M,)` boolean, whether the prediction came true.
         bins: number of bins.
     """
-    count, confident, right = reliability(confidence, correct, bins)
+    return error_of(reliability(confidence, correct, bins))
+
+
+def error_of(bins: Tensor) -> Tensor:
+    """The expected calibration error from what `reliability` counts, `(3, bins)`."""
+    count, confident, right = bins
     return (confident - right).abs().sum() / count.sum().clamp(min=1)
 
 
-def reliability(confidence: Tensor, correct: Tensor, bins: int = 15) -> tuple[Tensor, Tensor, Tensor]:
-    """For every bin `(b/bins, (b+1)/bins]` of confidence: count, sum of confidence, number of correct predictions."""
-    index = (confidence.double() * bins).ceil().long().sub(1).clamp(0, bins - 1)
-    total = torch.zeros(3, bins, dtype=torch.float64)
-    values = torch.stack([torch.ones_like(confidence), confidence, correct.to(confidence)]).double()
-    total.index_add_(1, index, values)
-    return total[0], total[1], total[2]
+def reliability(confidence: Tensor, correct: Tensor, bins: int | Tensor = 15) -> Tensor:
+    """Count, sum of confidence and number of correct predictions of every bin of confidence, `(3, bins)`, float64.
+
+    Args:
+        confidence: `(M,)`, predicted probabilities.
+        correct: `(M,)` boolean, whether the prediction came true.
+        bins: number of equally wide bins, or the edges between bins, ascending; a bin has its upper edge, but not its
+            lower one.
+    """
+    edges = torch.arange(1, bins, dtype=torch.float64) / bins if isinstance(bins, int) else bins
+    p = confidence.detach().to("cpu", torch.float64).contiguous()
+    values = torch.stack([torch.ones_like(p), p, correct.to(p)])
+    return torch.zeros(3, len(edges) + 1, dtype=torch.float64).index_add_(1, torch.bucketize(p, edges), values)
+
+
+_WIDE = torch.arange(1, 15, dtype=torch.float64) / 15
+_RARE = torch.tensor([1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class BinarySums:
+    r"""Sums over predictions of what is so or not, from which their figures follow; the sums of parts add up.
+
+    For probabilities :math:`p_i` and outcomes :math:`y_i \in \{0, 1\}` the mean negative log likelihood and the mean
+    Brier score (Brier, 1950; here without the other class's half, from 0 to 1) are
+
+    .. math:: -\frac1n \sum_i \ln \left( y_i p_i + (1 - y_i)(1 - p_i) \right), \qquad
+              \frac1n \sum_i (p_i - y_i)^2
+
+    Where nearly all probabilities are small, the first of 15 equally wide bins holds nearly all predictions: it is kept
+    in 7 parts, for reliability diagrams.
+
+    Attributes:
+        bins: `(3, 21)`, float64: count, sum of probabilities, and number that came true, by bin of probability.
+        surprisal: sum of negative log likelihoods, in nats.
+        square: sum of squared errors.
+
+    >>> sums = BinarySums.of(torch.tensor([0.9, 0.2]), torch.tensor([True, False]))
+    >>> (sums + sums).count, round(sums.brier, 3)
+    (4, 0.025)
+    """
+
+    bins: Tensor
+    surprisal: float
+    square: float
+
+    EDGES: ClassVar[Tensor] = torch.cat([_RARE, _WIDE])
+    """Edges between the bins."""
+
+    @classmethod
+    def of(cls, probability: Tensor, outcome: Tensor) -> Self:
+        """Sums over predictions.
+
+        Args:
+            probability: `(M,)`.
+            outcome: `(M,)` boolean, whether it was so.
+        """
+        check_shape(probability, "probability", None)
+        check_shape(outcome, "outcome", len(probability))
+        p = probability.detach().double()
+        cost = surprisal(torch.where(outcome, p, 1 - p))
+        square = (p - outcome.double()).square()
+        return cls(reliability(p, outcome, cls.EDGES), float(cost.sum()), float(square.sum()))
+
+    @classmethod
+    def nothing(cls) -> Self:
+        """Sums over no prediction."""
+        return cls(torch.zeros(3, len(cls.EDGES) + 1, dtype=torch.float64), 0.0, 0.0)
+
+    def __add__(self, other: Self) -> Self:
+        """Sums over the predictions of both."""
+        return type(self)(self.bins + other.bins, self.surprisal + other.surprisal, self.square + other.square)
+
+    @property
+    def count(self) -> int:
+        """How many predictions."""
+        return int(self.bins[0].sum())
+
+    @property
+    def probability(self) -> float:
+        """Mean probability; this and all means are NaN where there is no prediction."""
+        return self._mean(float(self.bins[1].sum()))
+
+    @property
+    def rate(self) -> float:
+        """Share that came true."""
+        return self._mean(float(self.bins[2].sum()))
+
+    @property
+    def nll(self) -> float:
+        """Mean negative log likelihood, in nats."""
+        return self._mean(self.surprisal)
+
+    @property
+    def brier(self) -> float:
+        """Mean squared error."""
+        return self._mean(self.square)
+
+    @property
+    def ece(self) -> float:
+        """Expected calibration error over 15 equally wide bins (`calibration_error`)."""
+        first = self.bins[:, : len(_RARE) + 1].sum(1, keepdim=True)
+        error = float(error_of(torch.cat([first, self.bins[:, len(_RARE) + 1 :]], 1)))
+        return error if self.count else float("nan")
+
+    def _mean(self, total: float) -> float:
+        return total / self.count if self.count else float("nan")
+
+    def record(self) -> dict[str, Any]:
+        """As JSON values: bins without predictions are left out."""
+        filled = self.bins[0].nonzero()[:, 0].tolist()
+        bins = {str(number): self.bins[:, number].tolist() for number in filled}
+        return {"bins": bins, "surprisal": self.surprisal, "square": self.square}
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Self:
+        """From what `record` gave."""
+        sums = cls.nothing()
+        for number, column in record["bins"].items():
+            sums.bins[:, int(number)] = torch.tensor(column, dtype=torch.float64)
+        return cls(sums.bins, record["surprisal"], record["square"])

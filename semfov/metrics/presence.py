@@ -47,3 +47,16 @@ def hits_at(score: Tensor, present: Tensor, share: float) -> float:
     0.5
     """
     return float((score[present].double() >= threshold_for(score[~present], share)).double().mean())
+
+
+def roc(score: Tensor, present: Tensor) -> tuple[list[float], list[float]]:
+    """Shares of false alarms and of hits at every threshold, from none to all.
+
+    >>> roc(torch.tensor([0.9, 0.4, 0.5, 0.1]), torch.tensor([True, True, False, False]))
+    ([0.0, 0.0, 0.5, 0.5, 1.0], [0.0, 0.5, 0.5, 1.0, 1.0])
+    """
+    check(bool(present.any() and not present.all()), "present", "cases with and without the target", "one kind alone")
+    levels = score.unique(sorted=True).flip(0)[:, None]
+    told = score >= levels
+    shares = [(told[:, kind].double().mean(1)).tolist() for kind in (~present, present)]
+    return [0.0, *shares[0]], [0.0, *shares[1]]

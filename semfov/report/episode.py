@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 
 from semfov.detection.placement import resize
-from semfov.observation.dirichlet import mean
 from semfov.scanpath import Scanpath
 from semfov.viz.belief import class_posterior, entropy
 from semfov.viz.labels import place_labels
-from semfov.viz.scanpath import describe
+from semfov.viz.scanpath import describe, why_it_ended
 
 Data = dict[str, Any]
 
@@ -103,6 +102,8 @@ def episode_data(
     return {
         "name": name,
         "summary": describe(scanpath),
+        "outcome": outcome_data(scanpath),
+        "presence": None if scanpath.presence is None else [rounded(p) for p in scanpath.presence.tolist()],
         "size": size,
         "grid": [grid.columns, grid.rows],
         "image": pool.add(image, width * 3 // 2, quality),
@@ -112,6 +113,18 @@ def episode_data(
         "fixations": fixations,
         "maps": map_data(scanpath, classes),
         "entropy": quantised(entropy(scanpath)),
+    }
+
+
+def outcome_data(scanpath: Scanpath) -> Data:
+    """What came of the episode, why it ended, and the cell and box of a target that was found."""
+    decision = scanpath.decision
+    found = decision is not None and decision.outcome == "found"
+    box = decision.box if decision is not None and found else None
+    return {
+        "why": why_it_ended(scanpath),
+        "cell": decision.cell if decision is not None and found else None,
+        "box": None if box is None else [round(x, 1) for x in box.tolist()],
     }
 
 
@@ -139,16 +152,17 @@ def detection_data(scanpath: Scanpath, fixation: int, most: int = 10, scores: in
 
 
 def map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
-    """Probability maps `(n, X·Y)`: the target's first, those that are most probable anywhere, background at the end."""
-    probabilities = mean(scanpath.beliefs).detach().cpu()
+    """Probability maps `(n, X·Y)`: the target's first, those that are most probable anywhere, background at the end.
+
+    The target's is that of the search, where it has one.
+    """
+    probabilities = scanpath.probabilities.detach().cpu()
     order = (1 + probabilities[..., 1:].amax((0, 1)).argsort(descending=True, stable=True)).tolist()
     target, maps = scanpath.target, []
     if target is not None:
-        order = [target, *(index for index in order if index != target)]
-        if scanpath.posterior is not None:
-            searched = class_posterior(scanpath)
-            maps.append({"label": f"{scanpath.classes[target]} (as searched for)", **quantised(searched)})
-    kept = [*order[:classes], 0]
+        order = [index for index in order if index != target]
+        maps.append({"label": scanpath.classes[target], **quantised(class_posterior(scanpath))})
+    kept = [*order[: None if classes is None else classes - len(maps)], 0]
     return maps + [{"label": scanpath.classes[index], **quantised(probabilities[..., index])} for index in kept]
 
 

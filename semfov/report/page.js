@@ -70,6 +70,9 @@
     const visited = episode.fixations.slice(0, fixation + 1).map((each) => each.cell);
     const target = frame("path", episode.image, `Photograph with fixations 0 to ${fixation}, now at ${place(visited[fixation])}`);
     for (const truth of episode.truth) target.append(box(truth, { stroke: TRUTH, "stroke-width": 3 * unit(), "stroke-dasharray": `${8 * unit()} ${5 * unit()}` }));
+    if (episode.outcome.box !== null && fixation === episode.fixations.length - 1) {
+      target.append(box(episode.outcome.box, { stroke: "white", "stroke-width": 5 * unit() }), box(episode.outcome.box, { stroke: FOUND, "stroke-width": 3 * unit() }));
+    }
     const points = visited.map((cell) => middle(cell).join(",")).join(" ");
     target.append(svg("polyline", { points, fill: "none", stroke: "white", "stroke-width": 5 * unit() }));
     target.append(svg("polyline", { points, fill: "none", stroke: GAZE, "stroke-width": 3 * unit() }));
@@ -189,8 +192,9 @@
     listDetections();
     listSeconds();
     const seen = now.detections.slice(0, 3).map((detection) => detection.label).join(", ") || "nothing";
+    const sure = episode.presence === null ? "" : ` Probability that “${episode.target}” is in the picture: ${(episode.presence[fixation] ?? 0).toFixed(2)}.`;
     const end = fixation === last ? ` The end: ${episode.summary}.` : "";
-    find("status").textContent = `At ${place(now.cell)}, the eye saw: ${seen}. ${believed}${end}`;
+    find("status").textContent = `At ${place(now.cell)}, the eye saw: ${seen}. ${believed}${sure}${end}`;
   }
   function go(number) {
     const wanted = Math.min(Math.max(number, 0), episode.fixations.length - 1);
@@ -206,6 +210,8 @@
     find("fixation").max = episode.fixations.length - 1;
     find("class").replaceChildren(...episode.maps.map((map, index) => html("option", { value: index }, map.label)));
     find("class").value = chosenClass;
+    const where = episode.outcome.cell === null ? "" : ` It is at ${place(episode.outcome.cell)}.`;
+    find("outcome").textContent = `Outcome: ${episode.summary}.${where} ${episode.outcome.why}`;
     show();
   }
   function stop() {

@@ -14,6 +14,7 @@ from semfov.belief import TargetEvidence
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Target, TargetBelief
 from semfov.belief.target_evidence import Thresholds
+from semfov.decision import nearly_fixated
 from semfov.episode import Step, rollout
 from semfov.errors import DataError, check
 from semfov.experiments.config import BeliefConfig, DataConfig, DetectorConfig, SearchConfig, SensorConfig
@@ -187,11 +188,12 @@ def judge(
     """How well the model does on held-out searches after some looks, and the thresholds that they ask for."""
     generator = torch.Generator().manual_seed(config.seed)
     looks = max(*JUDGED, config.looks)
-    goal, visited, present, anywhere = examples.goal, [], [], []
+    goal, visited, present, anywhere, following = examples.goal, [], [], [], []
     for step in searches(model, examples, grid, looks, 0.0, generator):
         assert isinstance(step.belief, TargetBelief)
         present.append(step.belief.present)
         anywhere.append(step.belief.anywhere)
+        following.append(step.belief.following.masked_fill(step.visited, 0).amax(-1))
         visited.append(step.visited)
     there = goal.any(-1)
     judged = []
@@ -208,23 +210,22 @@ def judge(
                 "presence_ece": float(calibration_error(image, there)),
             }
         )
-    return judged, choose_thresholds(config, torch.stack(anywhere), torch.stack(present), torch.stack(visited), there)
+    looked = nearly_fixated(torch.stack(present), torch.stack(visited))
+    return judged, choose_thresholds(config, torch.stack(anywhere), looked, torch.stack(following), there)
 
 
 def choose_thresholds(
-    config: FitSearchConfig, anywhere: Tensor, present: Tensor, visited: Tensor, there: Tensor
+    config: FitSearchConfig, anywhere: Tensor, looked: Tensor, left: Tensor, there: Tensor
 ) -> Thresholds:
     """The least confirmation with so few false alarms, and the largest price of a look that loses so few targets.
 
     Args:
         config: of the fit.
         anywhere: `(n, E)`, probability of presence after each look of each search.
-        present: `(n, E, X·Y)`, that of every cell.
-        visited: `(n, E, X·Y)` boolean.
+        looked: `(n, E)` boolean, whether a cell about as probable as any was fixated.
+        left: `(n, E)`, greatest chance of a cell that was not.
         there: `(E,)` boolean, whether the target is there.
     """
-    looked = visited.gather(-1, present.argmax(-1, keepdim=True))[..., 0]
-    left = present.masked_fill(visited, 0).amax(-1)
 
     def found(confirm: float, give_up: float) -> Tensor:
         """Which searches end with the target found."""
@@ -239,7 +240,7 @@ def choose_thresholds(
             break
         confirm = candidate
     told = int(found(confirm, 0.0)[there].sum())
-    for give_up in (0.1, 0.07, 0.05, 0.03, 0.02, 0.01):
+    for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01):
         if told - int(found(confirm, give_up)[there].sum()) <= config.lost * int(there.sum()):
             return Thresholds(confirm, give_up)
     return Thresholds(confirm, 0.0)

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from semfov.errors import InputError, check
-from semfov.observation.dirichlet import mean
 from semfov.scanpath import Scanpath
 from semfov.viz.drawing import check_fixation, choose_fixations, draw_cells, draw_gaze, draw_grid, draw_image
 from semfov.viz.style import PROBABILITY, UNCERTAINTY, make_figure, styled
@@ -37,12 +36,16 @@ def class_posterior(scanpath: Scanpath, target: int | None = None) -> Tensor:
     check(0 <= index <= last, "target", f"a class index from 0 to {last}", index)
     if scanpath.posterior is not None and index == scanpath.target:
         return scanpath.posterior.detach().cpu()
-    return mean(scanpath.beliefs)[..., index].detach().cpu()
+    return scanpath.probabilities[..., index].detach().cpu()
 
 
 def entropy(scanpath: Scanpath) -> Tensor:
-    """Uncertainty about the class of every cell after each look, `-Σ p_k log2 p_k` in bits, `(n, X·Y)`."""
-    return torch.special.entr(mean(scanpath.beliefs)).sum(-1).detach().cpu() / math.log(2)
+    """Uncertainty about the class of every cell after each look, `-Σ p_k log2 p_k` in bits, `(n, X·Y)`.
+
+    Marginal probabilities, of a learned map, are scaled to sum to 1.
+    """
+    shares = scanpath.probabilities / scanpath.probabilities.sum(-1, keepdim=True)
+    return torch.special.entr(shares).sum(-1).detach().cpu() / math.log(2)
 
 
 @styled
@@ -147,14 +150,11 @@ def plot_semantic_map(scanpath: Scanpath, fixation: int = -1, *, image: Tensor |
 
 
 def draw_semantic_map(axes: Axes, scanpath: Scanpath, fixation: int, image: Tensor | None) -> None:
-    """The most probable object of every cell, on one scale for the whole episode.
-
-    A region is named where its object is more probable than background, and than thrice an even share or a half.
-    """
+    """The most probable object of every cell, on one scale for the whole episode, and the names of regions."""
     from matplotlib.patheffects import withStroke
 
     grid = scanpath.grid
-    probabilities = mean(scanpath.beliefs).detach().cpu()
+    probabilities = scanpath.probabilities.detach().cpu()
     objects = probabilities[..., 1:].amax(-1)
     highest = max(float(objects.max()), 1e-9)
     if image is not None:
@@ -162,15 +162,32 @@ def draw_semantic_map(axes: Axes, scanpath: Scanpath, fixation: int, image: Tens
     alpha = 0.65 if image is not None else 1
     draw_cells(axes, grid, objects[fixation], alpha=alpha, cmap=PROBABILITY, vmin=0, vmax=highest)
     draw_grid(axes, grid)
-    known = objects[fixation] > probabilities[fixation, :, 0].clamp(min=min(0.5, 3 / len(scanpath.classes)))
-    best = torch.where(known, probabilities[fixation, :, 1:].argmax(-1) + 1, 0)
-    for region in regions(best.reshape(grid.rows, grid.columns)):
+    for name, region, _ in named_regions(scanpath, fixation):
         centres = grid.centres[region] + 0.5
         x, y = centres[(centres - centres.mean(0)).norm(dim=-1).argmin()].tolist()
-        text = axes.text(x, y, scanpath.classes[int(best[region[0]])], color="black", fontsize=7, clip_on=True)
+        text = axes.text(x, y, name, color="black", fontsize=7, clip_on=True)
         text.set(ha="center", va="center", path_effects=[withStroke(linewidth=2, foreground="white")])
     draw_gaze(axes, scanpath, fixation)
     axes.set_title(f"what is where after fixation {fixation}")
+
+
+def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, list[int], float]]:
+    """What the map names after a fixation: class, cells that touch, and the greatest probability among them.
+
+    A cell is named where an object is more probable than background, and than thrice an even share or a half. The
+    regions that cover most are first.
+
+    Args:
+        scanpath: the episode.
+        fixation: its number; -1 is the last.
+    """
+    grid, probabilities = scanpath.grid, scanpath.probabilities[fixation].detach().cpu()
+    objects, label = probabilities[:, 1:].max(-1)
+    known = objects > probabilities[:, 0].clamp(min=min(0.5, 3 / len(scanpath.classes)))
+    best = torch.where(known, label + 1, 0)
+    found = regions(best.reshape(grid.rows, grid.columns))
+    named = [(scanpath.classes[int(best[cells[0]])], cells, float(objects[cells].max())) for cells in found]
+    return sorted(named, key=lambda region: -len(region[1]))
 
 
 def regions(labels: Tensor) -> list[list[int]]:

@@ -151,6 +151,23 @@ def draw_scanpath(
     axes.set_title(describe(scanpath) if last is None else f"fixation {last}")
 
 
+def why_it_ended(scanpath: Scanpath) -> str:
+    """Why an episode ended, in a sentence; nothing where that is not known."""
+    if scanpath.ending == "decision" and scanpath.decision is not None:
+        return {
+            "found": "The target is probable enough, and was looked at closely enough.",
+            "absent": "No cell is left that is worth a look, and the target is rather not there.",
+            "undecided": "No cell is left that is worth a look, but the target rather is there.",
+        }[scanpath.decision.outcome]
+    reasons = {
+        "box": "The gaze is on a box of the target.",
+        "price": "No look is expected to name enough more cells right.",
+        "shifts": f"All {scanpath.shifts} gaze shifts were made.",
+        "cells": "Every cell was fixated.",
+    }
+    return reasons.get(scanpath.ending or "", "")
+
+
 def describe(scanpath: Scanpath) -> str:
     """What came of an episode, in a line."""
     shifts = f"{scanpath.shifts} gaze shift{'s' if scanpath.shifts != 1 else ''}"

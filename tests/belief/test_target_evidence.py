@@ -10,10 +10,11 @@ import torch
 
 from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief import TargetEvidence
+from semfov.belief.evidence import Gathered, _peak, blur
 from semfov.belief.look_features import FEATURES, look_features
 from semfov.belief.observers import Target, TargetBelief
 from semfov.belief.observers.target import TargetLook
-from semfov.belief.target_evidence import Gathered, Thresholds, _blur, _peak
+from semfov.belief.target_evidence import Thresholds
 from semfov.errors import DataError, InputError
 from semfov.gaze.acquisition import KLDivergence
 from semfov.io.storage import write
@@ -91,7 +92,7 @@ def test_neighbourhoods_are_those_of_scipy():
     steps = np.arange(-3, 4)
     kernel = np.exp(-(steps**2) / (2 * 0.8**2))
     kernel /= kernel.sum()
-    for image, blurred, peak in zip(values, _blur(values, 6, 0.8), _peak(values, 6), strict=True):
+    for image, blurred, peak in zip(values, blur(values, 6, 0.8), _peak(values, 6), strict=True):
         grid = image.reshape(4, 6).numpy()
         expected = scipy.ndimage.convolve(grid, np.outer(kernel, kernel), mode="constant")
         np.testing.assert_allclose(blurred.reshape(4, 6), expected, atol=1e-12)

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from eval.decide import DecideConfig, main, mean, percent, search_and_decide, summary
+from eval.decide import DecideConfig, main, mean, percent, search_and_decide, summary, utility
 from semfov.belief import TargetEvidence
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES
@@ -13,7 +13,8 @@ from semfov.experiments.config import BeliefConfig, DataConfig, DetectorConfig, 
 from semfov.experiments.setup import make_eye
 from semfov.metrics.presence import area_under_roc, hits_at
 
-POLICIES = ["target-evidence", "random gaze"]
+POLICIES = ["target-evidence", "random gaze", "price 0.05"]
+SHARP = ["one sharp look, highest score", "sharp look and its quarters, highest score"]
 
 
 def rows_of(text):
@@ -35,7 +36,7 @@ def arguments(tmp_path_factory):
     return [
         "--data.limit", "2", "--data.max_target_area", "0.5", "--belief.columns", "4", "--belief.rows", "3",
         "--belief.target_model", str(folder / "model.safetensors"), "--protocol.shifts", "5",
-        "--cache", str(folder / "cache"),
+        "--cache", str(folder / "cache"), "--prices", "[0.05]",
     ]  # fmt: skip
 
 
@@ -55,19 +56,20 @@ def records_in(out):
 @pytest.mark.weights
 def test_run_leaves_table_and_records(finished):
     records = records_in(finished)
-    assert len(records) == 8
+    assert len(records) == 12
     for record in records:
         assert record["policy"] in POLICIES
         assert record["outcome"] in OUTCOMES
         assert 1 <= record["looks"] <= 6
         assert 0 < record["probability"] < 1
-    assert [record["present"] for record in records] == 2 * [True, True, False, False]
+    assert [record["present"] for record in records] == 2 * [*[True] * 3, *[False] * 3]
     text = (finished / "decisions.md").read_text()
     rows = rows_of(text)
-    assert [row[0] for row in rows] == [*POLICIES, "one sharp look, largest score", *POLICIES]
+    assert [row[0] for row in rows] == [*POLICIES, *SHARP, *POLICIES, "price of a look", "0.05"]
+    assert (finished / "roc.png").stat().st_size > 1000
     assert "4 searches" in text
     assert "2 for a class that is" in text
-    for row in rows[:2]:
+    for row in rows[:3]:
         group = [record for record in records if record["policy"] == row[0]]
         score = torch.tensor([record["probability"] for record in group])
         there = torch.tensor([record["present"] for record in group])
@@ -91,7 +93,7 @@ def test_finished_scenes_are_not_searched_again(finished, arguments, tmp_path):
     for name in ("episodes.jsonl", "decisions.md"):
         assert (out / name).read_bytes() == (finished / name).read_bytes()
     part = json.loads(second.read_text())
-    assert part["records"] == records_in(finished)[4:]
+    assert part["records"] == records_in(finished)[6:]
 
 
 @pytest.mark.weights
@@ -113,7 +115,7 @@ def test_help_and_defaults(capsys):
 
 
 def record(policy, present, outcome, probability, looks, **more):
-    base = {"right_place": None, "overlap": None, "landing": None, "sharp": probability / 2}
+    base = {"right_place": None, "overlap": None, "landing": None, "sharp": probability / 2, "tiled": probability / 4}
     return {"policy": policy, "present": present, "outcome": outcome, "probability": probability, "looks": looks} | (
         base | more
     )
@@ -130,9 +132,10 @@ def test_the_table_by_hand():
         record("a", False, "absent", 0.1, 3),
     ]
     second = [record("b", each["present"], "undecided", 0.5, 9) for each in first]
-    text = summary([*first, *second], "sensed")
+    third = [{**each, "policy": "price 0.1"} for each in first]
+    text = summary([*first, *second, *third], "sensed", [])
     assert "6 searches (sensed), 4 for a class that is." in text
-    area, other, sharp, a, b = rows_of(text)
+    area, other, _, sharp, tiled, a, b, _ = rows_of(text)
     there = torch.tensor([each["present"] for each in first])
     score = torch.tensor([each["probability"] for each in first])
     hits = [f"{100 * hits_at(score, there, share):.0f}" for share in (0.01, 0.02, 0.05)]
@@ -140,9 +143,24 @@ def test_the_table_by_hand():
     assert area == ["a", "0.625", *hits]
     assert hits == ["25", "25", "25"]
     assert other == ["b", "0.500", "0", "0", "0"]
-    assert sharp == ["one sharp look, largest score", "0.625", *hits]
+    assert sharp == [SHARP[0], "0.625", *hits]
+    assert tiled == [SHARP[1], "0.625", *hits]
     assert a == ["a", "50.0", "50.0", "16.7", "5.0", "2.5", "33.3", "0.50", "0.30 → 0.60"]
     assert b == ["b", "0.0", "0.0", "100.0", "9.0", "9.0", "-", "-", "-"]
+
+
+def test_the_worth_of_searches_by_hand():
+    """Right decisions count 1, undecided ones nothing, and every look its price."""
+    records = [
+        record("target-evidence", True, "found", 0.9, 3, right_place=True),
+        record("target-evidence", True, "undecided", 0.6, 5),
+        record("target-evidence", False, "found", 0.9, 2, right_place=False),
+        record("target-evidence", False, "absent", 0.1, 4),
+    ]
+    by_price = [{**each, "policy": "price 0.1", "looks": 1} for each in records]
+    assert utility(records, 0.1) == pytest.approx((2 - 0.1 * 14) / 4)
+    text = summary([*records, *by_price], "sensed", [0.1])
+    assert rows_of(text)[-1] == ["0.1", "0.1500", "0.4000"]
 
 
 def test_shares_and_means_of_nothing():

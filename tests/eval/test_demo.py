@@ -9,6 +9,8 @@ from PIL import Image
 
 import eval.demo as program
 from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, observers, policies, read_image
+from semfov.belief import MapEvidence
+from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import Picture, embedded_picture
 from semfov.detection import Candidates, Detector
@@ -176,7 +178,7 @@ def test_what_a_look_took_is_printed(agent, photo):
     lines = program.told("photo", scanpath).splitlines()
     assert lines[1].endswith("ms")
     milliseconds = [f"{1000 * sum(look.values()):.0f}" for look in scanpath.seconds]
-    assert [line.split()[-1] for line in lines[2:] if line] == milliseconds
+    assert [line.split()[-1] for line in lines[2 : lines.index("")]] == milliseconds
 
 
 @pytest.fixture(scope="module")
@@ -192,13 +194,13 @@ def cup(usual) -> Picture:
 
 def watched_and_plain(agent, picture, **how):
     """The scanpaths of the demonstration, which measures each stage, and of the agent alone."""
-    config = program.DemoConfig(start=0, shifts=2, **how)
+    config = program.DemoConfig(start=0, shifts=2, until=0, **how)
     watched = program.look_at(agent, picture, config)
     assert len(watched.seconds) == len(watched)
     assert all(set(look) == set(STAGES) for look in watched.seconds)
     with torch.inference_mode():
         if config.target is None:
-            return watched, agent.explore(picture.image, start=0, shifts=2)
+            return watched, agent.explore(picture.image, start=0, shifts=2, until=0)
         return watched, agent.search(picture.image, config.target, start=0, shifts=2)
 
 
@@ -207,15 +209,22 @@ def means(usual) -> Means:
     """What every policy can be made from."""
     name = usual.eye.detector.name
     model, gaze = FovealObservationModel.from_pretrained(name), LearnedGaze.from_pretrained(name)
-    return Means(model.requires_grad_(False), gaze.requires_grad_(False))
+    everything = MapEvidence.from_pretrained(name)
+    return Means(*(each.requires_grad_(False) for each in (model, gaze, everything)))
+
+
+@pytest.fixture(scope="module")
+def fused(usual):
+    """The map of policies that need Dirichlets."""
+    return Semantic(len(usual.classes), tempering=0.5)
 
 
 @pytest.mark.weights
 @pytest.mark.parametrize("name", policy_names("search"))
-def test_every_search_can_be_watched(name, usual, means, cup):
+def test_every_search_can_be_watched(name, usual, means, fused, cup):
     """By the map of all classes where a policy needs one, else by the belief that comes with the agent."""
     mapping = usual.exploring.observer, usual.exploring.policy
-    observer = mapping[0] if name in ("predictive", "neighbourhood", "learned") else usual.searching.observer
+    observer = fused if name in ("predictive", "neighbourhood", "learned") else usual.searching.observer
     agent = ActivePerception(usual.eye, (observer, named_policy(name, "search", means)), mapping).eval()
     watched, plain = watched_and_plain(agent, cup, target="cup")
     assert torch.equal(watched.cells, plain.cells)
@@ -224,9 +233,10 @@ def test_every_search_can_be_watched(name, usual, means, cup):
 
 @pytest.mark.weights
 @pytest.mark.parametrize("name", policy_names("exploration"))
-def test_every_exploration_can_be_watched(name, usual, means, cup):
+def test_every_exploration_can_be_watched(name, usual, means, fused, cup):
     seeking = usual.searching.observer, usual.searching.policy
-    mapping = usual.exploring.observer, named_policy(name, "exploration", means)
+    observer = usual.exploring.observer if name in ("random", "closer-look", "expected-gain") else fused
+    mapping = observer, named_policy(name, "exploration", means)
     agent = ActivePerception(usual.eye, seeking, mapping).eval()
     watched, plain = watched_and_plain(agent, cup, explore=True)
     assert torch.equal(watched.cells, plain.cells)

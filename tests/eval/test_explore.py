@@ -22,6 +22,7 @@ from semfov.experiments.config import (
     SaliencyConfig,
 )
 from semfov.experiments.presets import presets
+from semfov.experiments.references import FUSED, PAINTED
 from semfov.experiments.runs import ExploreRun
 from semfov.experiments.saliency_store import SaliencyStore, saliency_table
 from semfov.gaze.policies import POLICIES
@@ -61,48 +62,60 @@ def records_of(config: ExploreConfig) -> list[bytes]:
     return [(config.out / name).read_bytes() for name in RECORDS]
 
 
-def right_by_hand(run: ExploreRun, record: dict) -> tuple[list[int], list[int], int]:
+def right_by_hand(run: ExploreRun, record: dict) -> tuple[list[int], list[int], list[int], int]:
     """Right answers after each shift with an observer of its own and loops over cells and objects."""
     index = run.scenes.ids.index(record["scene"])
     scene, grid, looks = run.scenes[index], run.grid(index), run.detections(index)
     observation = run.models.observation if record["policy"].endswith("calibrated") else None
     observer = observers.Semantic(len(run.scenes.classes) + 1, observation)
     belief = observer.start(1, grid, looks.scores)
-    right, without = [], []
+    kinds: tuple[list[int], ...] = [], [], []
     holds = grid.footprint(scene.boxes)
     objects = [{int(label) for label, there in zip(scene.labels, holds[:, c], strict=True) if there} for c in range(12)]
     for cell in record["cells"]:
         belief = observer(belief, looks[torch.tensor([cell])], grid.centres[cell][None], grid)
-        counts = [0, 0]
+        counts = [0, 0, 0]
         for place, classes in enumerate(objects):
             p = belief.probabilities[0, place]
             known = bool((p != p[0]).any())
             counts[0] += known and int(p.argmax()) in classes
             counts[1] += known and int(p[1:].argmax()) + 1 in classes
-        right.append(counts[0])
-        without.append(counts[1])
-    return right, without, sum(map(bool, objects))
+            counts[2] += known and int(p.argmax()) in (classes or [0])
+        for kind, count in zip(kinds, counts, strict=True):
+            kind.append(count)
+    return *kinds, sum(map(bool, objects))
 
 
 def test_run_leaves_everything(finished):
     run = ExploreRun(finished)
     records = [json.loads(line) for line in (finished.out / "episodes.jsonl").read_text().splitlines()]
-    assert len(records) == 2 * 2 * 3
+    references = [record for record in records if record["policy"] in (FUSED, PAINTED)]
+    assert len(records) == 2 * 2 * (3 + 2)
+    assert len(references) == 2 * 2 * 2
+    for record in references:
+        assert record["cells"] == []
+        assert len({*record["right"]}) == 1
     for record in records:
+        if record in references:
+            continue
         assert record["start"] == record["cells"][0]
         assert len(set(record["cells"])) == 5
-        counted = record["right"], record["right_without_background"], record["object_cells"]
-        assert counted == right_by_hand(run, record)
+        counts = (record[name] for name in ("right", "right_without_background", "right_everywhere"))
+        assert (*counts, record["object_cells"]) == right_by_hand(run, record)
     with (finished.out / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 3 * 5
+    assert len(rows) == 3 * (3 + 2) * 5
     assert any(record["right"][-1] > 0 for record in records)
     for row in rows:
-        field = {"all classes": "right", "without background": "right_without_background"}[row["answers"]]
+        field, cells = {
+            "all classes": ("right", "object_cells"),
+            "without background": ("right_without_background", "object_cells"),
+            "whole grid": ("right_everywhere", "grid_cells"),
+        }[row["answers"]]
         by_scene = {}
         for record in records:
             if record["policy"] == row["policy"]:
-                rate = record[field][int(row["shifts"])] / record["object_cells"]
+                rate = record[field][int(row["shifts"])] / record[cells]
                 by_scene.setdefault(record["scene"], []).append(rate)
         expected = sum(sum(rates) / len(rates) for rates in by_scene.values()) / len(by_scene)
         assert float(row["success_rate"]) == pytest.approx(expected, abs=1e-6)
@@ -112,6 +125,7 @@ def test_run_leaves_everything(finished):
     assert {path.name for path in finished.out.glob("*.png")} == {
         "success_rate_all_classes.png",
         "success_rate_without_background.png",
+        "success_rate_whole_grid.png",
     }
     assert "kl-calibrated" in (finished.out / "summary.md").read_text()
 

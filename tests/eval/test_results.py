@@ -187,7 +187,7 @@ def test_first_fixations_are_central_or_at_the_border(tmp_path):
 
 
 def test_a_study_has_a_row_for_each_setting_and_policy(runs):
-    right = {"random-raw": (1, 2), "closer-look-raw, tempering 0.5": (3, 4)}
+    right = {"random-raw": (1, 2), "closer-look-learned": (3, 4)}
     records = [
         {"policy": policy, "scene": scene, "right": [counts[scene]] * 21, "object_cells": 4}
         for policy, counts in right.items()
@@ -197,7 +197,7 @@ def test_a_study_has_a_row_for_each_setting_and_policy(runs):
     rows = [cells_of(row) for row in fill("@@ explore-sensor\n", runs).splitlines()]
     assert rows[0] == ["setting", "policy", "0", "1", "2", "3", "4", "10", "20"]
     assert rows[2][:3] == ["fovea 50 px, growth 1", "random-raw", "37.5 ± 12.5"]
-    assert rows[3][1:3] == ["closer-look-raw, tempering 0.5", "87.5 ± 12.5"]
+    assert rows[3][1:3] == ["closer-look-learned", "87.5 ± 12.5"]
     assert len(rows) == 2 + 6 * 2
 
 

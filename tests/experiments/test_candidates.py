@@ -7,7 +7,7 @@ import torch
 
 from semfov import DirichletBelief, FovealObservationModel, Grid, TargetEvidence, observers, policies
 from semfov.agent import Strategy
-from semfov.belief import ContextPrior
+from semfov.belief import ContextPrior, MapEvidence
 from semfov.errors import InputError
 from semfov.experiments import candidates
 from semfov.experiments.candidates import Candidate, Models, load_models, make_strategy, needs_observation
@@ -58,15 +58,16 @@ def test_a_model_is_needed_to_predict_to_calibrate_and_for_misses():
     assert not needed(BeliefConfig(misses=True), PolicyConfig("non-predictive", misses=False))
     ahead = ("predictive", "neighbourhood", "foveal-hit", "place-information")
     assert all(needed(None, PolicyConfig(name)) for name in ahead)
-    without = {"random", "closer-look", "saliency"}
+    without = {"random", "closer-look", "saliency", "expected-gain"}
     for name in known_policies("exploration"):
-        given = PolicyConfig(name, saliency="vocus2" if name == "saliency" else None)
+        scores = "learned" if name == "expected-gain" else "raw"
+        given = PolicyConfig(name, scores, saliency="vocus2" if name == "saliency" else None)
         assert needed(None, given, task="exploration") == (name not in without)
 
 
 def test_a_model_is_needed_for_every_preset_that_cannot_be_made_without(model):
     """What is needed is what making it asks for, and nothing else."""
-    others = {"evidence": TargetEvidence(4, 4), "gaze": LearnedGaze(4)}
+    others = {"evidence": TargetEvidence(4, 4), "gaze": LearnedGaze(4), "map": MapEvidence(4, 4)}
     for task in ("search", "exploration"):
         for preset in presets(task).values():
             assert isinstance(strategy(preset, task, observation=model, **others), Strategy)
@@ -86,7 +87,7 @@ def test_what_a_policy_needs_does_not_hang_on_saliency():
 def asked(monkeypatch):
     """Which models a run would load, by the names that they are asked for."""
     asked = []
-    for kind in ("observation", "target_evidence", "context", "learned_gaze"):
+    for kind in ("observation", "target_evidence", "map_evidence", "context", "learned_gaze"):
 
         def make(name, eye, kind=kind):
             asked.append((kind, name))
@@ -99,8 +100,12 @@ def asked(monkeypatch):
 def test_a_run_loads_what_its_policies_need_and_nothing_else(asked):
     eye = SimpleNamespace()
     assert load_models(SearchConfig(policies=("random", "non-predictive-raw")), "search", eye) == Models()
-    assert load_models(ExploreConfig(policies=("recommended", "vocus2-raw")), "exploration", eye) == Models()
+    assert load_models(ExploreConfig(policies=("closer-look-raw", "vocus2-raw")), "exploration", eye) == Models()
     assert asked == []
+    learned = ExploreConfig(policies=("recommended", "vocus2-raw"), belief=BeliefConfig(map_model="everything"))
+    assert load_models(learned, "exploration", eye) == Models(map="map_evidence")
+    assert asked == [("map_evidence", "everything")]
+    asked.clear()
     guided = PolicyConfig("target-evidence", saliency="vocus2", context="place")
     every = SearchConfig(
         policies=("random", guided, "learned", "predictive-raw"),

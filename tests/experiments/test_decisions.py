@@ -11,17 +11,16 @@ from semfov import DirichletBelief
 from semfov.belief import TargetEvidence
 from semfov.belief.observers import Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import OUTCOMES, best_box, decide
+from semfov.decision import OUTCOMES, conclude, decide
 from semfov.episode import StoredLooks, rollout
 from semfov.experiments.config import (
     BeliefConfig,
     DataConfig,
     DetectorConfig,
     ProtocolConfig,
-    SearchConfig,
     SensorConfig,
 )
-from semfov.experiments.decisions import DecisionRun, landing, overlap
+from semfov.experiments.decisions import DecisionConfig, DecisionRun, landing, overlap, quarters
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.seeds import generator_for, noise_for
 from semfov.experiments.setup import make_eye
@@ -53,11 +52,10 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def config(folder):
-    return SearchConfig(
+    return DecisionConfig(
         data=DataConfig(limit=3, max_target_area=0.5),
         belief=BeliefConfig(columns=4, rows=3, target_model=str(write_evidence(folder / "model.safetensors", AT))),
         protocol=ProtocolConfig(shifts=6),
-        policies=("target-evidence",),
         cache=folder / "cache",
         out=folder / "out",
         workers=1,
@@ -67,6 +65,35 @@ def config(folder):
 @pytest.fixture(scope="module")
 def run(config):
     return DecisionRun(config)
+
+
+def in_quarters(run, index, target):
+    """Scores of the target in the four quarters of a scene."""
+    image = run.scenes[index].image
+    height, width = image.shape[-2] // 2, image.shape[-1] // 2
+    scores = []
+    for top, left in ((0, 0), (0, width), (height, 0), (height, width)):
+        bottom, right = (height if top == 0 else None), (width if left == 0 else None)
+        seen = run.eye.detector(image[None, :, top:bottom, left:right])
+        scores += [float(seen.scores[0, d, target]) for d in range(seen.scores.shape[1]) if seen.mask[0, d]]
+    return scores
+
+
+def test_quarters_cover_the_picture_once():
+    image = torch.arange(35.0).reshape(1, 1, 5, 7)
+    parts = quarters(image)
+    assert [tuple(part.shape[-2:]) for part in parts] == [(2, 3), (2, 4), (3, 3), (3, 4)]
+    assert sorted(value for part in parts for value in part.flatten().tolist()) == list(range(35))
+
+
+@pytest.mark.weights
+def test_searches_by_price_stand_beside_those_by_thresholds(config):
+    run = DecisionRun(replace(config, prices=(0.01, 0.2), confirm=0.6))
+    assert list(run.compared) == ["target-evidence", "random gaze", "price 0.01", "price 0.2"]
+    assert run.thresholds == Thresholds(0.6, AT.give_up)
+    records, _ = run.outcomes(0)
+    looks = {name: sum(r["looks"] for r in records if r["policy"] == name) for name in run.compared}
+    assert looks["price 0.2"] <= looks["price 0.01"]
 
 
 @pytest.mark.weights
@@ -90,6 +117,7 @@ def test_records_are_those_of_searches_by_hand(run):
             assert record["present"] == (target in annotation.labels.tolist())
             largest = [float(sharp.scores[0, d, target]) for d in range(sharp.scores.shape[1]) if sharp.mask[0, d]]
             assert record["sharp"] == pytest.approx(max(largest, default=0.0))
+            assert record["tiled"] == pytest.approx(max([*largest, *in_quarters(run, index, target)], default=0.0))
             start = torch.randint(12, (1,), generator=generator_for("start", 0, scene, target))
             noise = noise_for(run.config.protocol, 12, scene, target, 0)[None]
             acquisition = Uniform() if record["policy"] == "random gaze" else TargetPosterior(target)
@@ -108,12 +136,11 @@ def test_records_are_those_of_searches_by_hand(run):
             assert record["probability"] == pytest.approx(float(belief.anywhere), abs=1e-6)
             outcomes.add(record["outcome"])
             goal = grid.footprint(annotation.boxes)[annotation.labels == target].any(0)
-            best = int(belief.present.argmax())
             if record["outcome"] == "found":
-                assert best in seen
-                assert record["right_place"] == bool(goal[best])
-                box = best_box([detections[cell : cell + 1] for cell in seen], grid, best, target)
-                assert record["overlap"] == overlap(box, annotation.boxes[annotation.labels == target])
+                parts = [detections[cell : cell + 1] for cell in seen]
+                decision = conclude(ended, belief, parts, grid, target)
+                assert record["right_place"] == bool(goal[decision.cell])
+                assert record["overlap"] == overlap(decision.box, annotation.boxes[annotation.labels == target])
             else:
                 assert record["right_place"] is record["overlap"] is None
             hit = next((number for number, cell in enumerate(seen) if goal[cell]), 0)
@@ -137,12 +164,15 @@ def test_parts_are_of_what_decisions_depend_on(config, run, folder):
     assert set(same) == {run.key}
     others = [
         key(protocol=ProtocolConfig(shifts=7)),
+        key(confirm=0.52),
+        key(give_up=0.2),
+        key(prices=(0.01,)),
         key(data=DataConfig(limit=2, max_target_area=0.5)),
         with_model(write_evidence(folder / "seed.safetensors", AT, seed=1)),
         with_model(write_evidence(folder / "confirm.safetensors", Thresholds(0.51, 0.375))),
         with_model(write_evidence(folder / "none.safetensors", None)),
     ]
-    assert len({run.key, *others}) == 6
+    assert len({run.key, *others}) == 9
 
 
 @pytest.mark.weights

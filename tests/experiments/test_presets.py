@@ -17,7 +17,7 @@ from semfov.gaze.policies import Task, policy_names
 TASKS = get_args(Task)
 ALIASES = {
     "search": {"recommended": "target-evidence", "published": "predictive-calibrated"},
-    "exploration": {"recommended": "closer-look-raw, tempering 0.5", "published": "kl-calibrated"},
+    "exploration": {"recommended": "closer-look-learned", "published": "kl-calibrated"},
 }
 
 # One change each; together, every word that a setting can be.
@@ -49,7 +49,7 @@ def test_names_tell_policy_scores_and_saliency():
         "saliency", "calibrated", saliency="itti-koch"
     )
     assert resolve("recommended", "search") == PolicyConfig("target-evidence")
-    assert resolve("recommended", "exploration") == PolicyConfig("closer-look", tempering=0.5)
+    assert resolve("recommended", "exploration") == PolicyConfig("closer-look", "learned")
     assert resolve("published", "search") == PolicyConfig("predictive", "calibrated")
     assert resolve("published", "exploration") == PolicyConfig("kl", "calibrated")
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from semfov import ActivePerception
-from semfov.belief.observers import Semantic
+from semfov.belief import MapEvidence
+from semfov.belief.observers import LearnedMap
 from semfov.episode import rollout
 from semfov.experiments import exploration_protocol, search_protocol
 from semfov.experiments.config import (
@@ -94,7 +95,7 @@ def test_a_semantic_search_has_the_beliefs_and_values_that_it_had(run, searched)
             # A search that ends on its target does not look from there; its replay does.
             assert len(had) == len(path) - (record["found_at"] >= 0 or len(path) == 6)
             for shift, (belief, values) in enumerate(had):
-                torch.testing.assert_close(path.beliefs[shift], belief.beta[0])
+                torch.testing.assert_close(path.probabilities[shift], belief.probabilities[0])
                 torch.testing.assert_close(path.values[shift], values)
                 torch.testing.assert_close(path.posterior[shift], belief.probability(record["cue"])[0])
 
@@ -103,7 +104,7 @@ def test_a_semantic_search_has_the_beliefs_and_values_that_it_had(run, searched)
 def test_a_search_by_target_evidence_has_the_recommended_map_beside_it(run, searched, policy):
     records, steps = searched[policy]
     looks, grid = run.detections(0), run.grid(0)
-    mapper = Semantic(len(run.scenes.classes) + 1, tempering=0.5)
+    mapper = LearnedMap(MapEvidence.from_pretrained(run.eye.detector.name))
     for number, record in enumerate(records):
         path = replay(run, 0, record)
         for shift, (belief, values) in enumerate(steps_of(steps, number)):
@@ -112,7 +113,7 @@ def test_a_search_by_target_evidence_has_the_recommended_map_beside_it(run, sear
         known = mapper.start(1, grid, looks.scores)
         for shift, cell in enumerate(record["cells"]):
             known = mapper(known, looks[torch.tensor([cell])], grid.centres[[cell]], grid)
-            torch.testing.assert_close(path.beliefs[shift], known.beta[0])
+            torch.testing.assert_close(path.probabilities[shift], known.probabilities[0])
 
 
 def test_the_map_beside_target_evidence_is_the_one_that_the_recommended_agent_keeps(run):
@@ -134,7 +135,7 @@ def test_the_map_beside_target_evidence_is_the_one_that_the_recommended_agent_ke
     }
     path = replay(run, 0, record)
     assert (path.classes, path.target, path.found) == (kept.classes, kept.target, kept.found)
-    for name in ("cells", "fixations", "beliefs", "posterior", "values"):
+    for name in ("cells", "fixations", "probabilities", "posterior", "values"):
         torch.testing.assert_close(getattr(path, name), getattr(kept, name))
     for mine, theirs in zip(path.detections, kept.detections, strict=True):
         torch.testing.assert_close(mine.scores[mine.mask], theirs.scores[theirs.mask])
@@ -149,10 +150,10 @@ def test_what_a_run_adds_to_its_searches_does_not_change_the_map_beside_them(run
     without = SearchRun(SearchConfig(**{**settings, "belief": belief}, policies=(alone,)))
     assert without.models.observation is None
     record = searched[SOUGHT][0][0]
-    expected = replay(run, 0, record).beliefs
-    torch.testing.assert_close(replay(everywhere, 0, record).beliefs, expected)
+    expected = replay(run, 0, record).probabilities
+    torch.testing.assert_close(replay(everywhere, 0, record).probabilities, expected)
     (name,) = without.policies
-    torch.testing.assert_close(replay(without, 0, {**record, "policy": name}).beliefs, expected)
+    torch.testing.assert_close(replay(without, 0, {**record, "policy": name}).probabilities, expected)
 
 
 def test_a_search_for_another_class_is_replayed_as_it_believed(run, searched):
@@ -160,7 +161,7 @@ def test_a_search_for_another_class_is_replayed_as_it_believed(run, searched):
     record = {**searched["non-predictive-raw"][0][0], "cue": 7}
     path = replay(run, 0, record)
     assert path.target == record["target"] != 7
-    torch.testing.assert_close(path.posterior, path.beliefs[..., 7] / path.beliefs.sum(-1))
+    torch.testing.assert_close(path.posterior, path.probabilities[..., 7])
 
 
 def test_reading_a_store_is_no_time_of_the_eyes(run, searched):
@@ -178,5 +179,5 @@ def test_an_exploration_has_the_beliefs_and_values_that_it_had(settings):
             had = list(steps_of(steps, number))
             assert len(had) == len(path) == 6
             for shift, (belief, values) in enumerate(had):
-                torch.testing.assert_close(path.beliefs[shift], belief.beta[0])
+                torch.testing.assert_close(path.probabilities[shift], belief.probabilities[0])
                 torch.testing.assert_close(path.values[shift], values)

@@ -32,7 +32,9 @@ def explorations(policy="kl-raw"):
             "repetition": repetition,
             "right": [scene + repetition, scene + repetition + 1, scene + repetition + 2],
             "right_without_background": [4, 4, 4],
+            "right_everywhere": [5, 5, 10],
             "object_cells": 4,
+            "grid_cells": 10,
         }
         for scene in (0, 1)
         for repetition in (0, 1)
@@ -95,6 +97,7 @@ def test_exploration_tables_name_the_published_answer_first():
     curves = {answer: explore_report.success(explorations(), ("kl-raw",), answer) for answer in explore_report.ANSWERS}
     text = explore_report.summary_markdown(curves, 2, "an eye")
     published, other = text.split("**as published", 1)[1].split("**the answer", 1)
+    other, everywhere = other.split("**all cells count", 1)
     assert "most probable of all classes, background among them" in published
     assert "most probable class but background" in other
     head, _, row = cells_of(published)
@@ -102,6 +105,7 @@ def test_exploration_tables_name_the_published_answer_first():
     # Means 1/4, 2/4, 3/4; images and repetitions differ by a quarter, so both errors are an eighth.
     assert row == ["kl-raw", "25.0 ± 12.5", "50.0 ± 12.5", "75.0 ± 12.5", "12.50"]
     assert cells_of(other)[2] == ["kl-raw", *["100.0 ± 0.0"] * 3, "0.00"]
+    assert cells_of(everywhere)[2] == ["kl-raw", *["50.0 ± 0.0"] * 2, "100.0 ± 0.0", "0.00"]
 
 
 def test_csv_has_every_gaze_shift():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from semfov import FovealObservationModel
-from semfov.belief import DirichletBelief, Grid
+from semfov.belief import DirichletBelief, Grid, MapEvidence
 from semfov.errors import InputError
 from semfov.gaze import LearnedGaze, acquisition, policies
 from semfov.gaze.policies import POLICIES, Means, Policy, named_policy, policy_names
@@ -34,7 +34,8 @@ def means(model):
         torch.manual_seed(0)
         gaze = LearnedGaze(4).requires_grad_(False)
         torch.nn.init.normal_(gaze.network[-1].weight)
-    return Means(model, gaze)
+        everything = MapEvidence(4, 4, components=3).requires_grad_(False)
+    return Means(model, gaze, everything)
 
 
 def test_names_are_those_of_the_tasks():
@@ -58,6 +59,7 @@ def test_names_are_those_of_the_tasks():
             "probability-of-improvement",
             "expected-accuracy",
             "closer-look",
+            "expected-gain",
         ]
     )
 
@@ -75,9 +77,10 @@ def test_models_are_parts_of_the_policy(name, means):
     policy = POLICIES[name].make(means)
     assert isinstance(policy, Policy)
     part = means.model if policy.needs_model else means.gaze if policy.needs_gaze else None
+    part = means.map if policy.needs_map else part
     owned = list(policy.state_dict())
     assert owned == (
-        [] if part is None else [f"{'model' if policy.needs_model else 'gaze'}.{n}" for n in part.state_dict()]
+        [] if part is None else [f"{'gaze' if policy.needs_gaze else 'model'}.{n}" for n in part.state_dict()]
     )
     policy.double()
     moved = [tensor.dtype for tensor in policy.state_dict().values() if tensor.is_floating_point()]
@@ -139,7 +142,8 @@ def test_a_missing_model_is_told_at_once():
             if name in free:
                 named_policy(name, task)(1, GRID)
                 continue
-            needed = "a learned gaze policy" if name == "learned" else "an observation model"
+            learned = {"learned": "a learned gaze policy", "expected-gain": "a learned map"}
+            needed = learned.get(name, "an observation model")
             with pytest.raises(InputError, match=f"policy '{name}': expected {needed}"):
                 named_policy(name, task)
 

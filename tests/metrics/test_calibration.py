@@ -1,12 +1,16 @@
 """Calibration figures against loops, known cases and torch's own losses."""
 
+import json
 import math
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from semfov.errors import InputError
-from semfov.metrics.calibration import calibration, calibration_error, reliability
+from semfov.metrics.calibration import BinarySums, calibration, calibration_error, reliability
 
 
 def ece_by_loop(confidence, correct, bins):
@@ -52,6 +56,12 @@ def test_bins_are_open_below_and_closed_above():
     assert right.tolist() == [1, 1]
 
 
+def test_bins_may_have_any_edges():
+    p, right = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.9]), torch.tensor([1, 0, 1, 1, 1]).bool()
+    bins = reliability(p, right, torch.tensor([0.1, 0.5]))
+    torch.testing.assert_close(bins, torch.tensor([[2.0, 2, 1], [0.1, 0.5, 0.9], [1, 2, 1]], dtype=torch.float64))
+
+
 def test_certain_and_wrong_is_finite():
     assert math.isfinite(calibration(torch.tensor([[1.0, 0.0]]), torch.tensor([1])).nll)
 
@@ -63,3 +73,78 @@ def test_nothing_to_judge():
 def test_shapes_must_fit():
     with pytest.raises(InputError, match="labels"):
         calibration(torch.ones(3, 2) / 2, torch.zeros(2, dtype=torch.long))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_sums_equal_loops(dtype, device):
+    """Figures of rare events by numpy, prediction by prediction."""
+    generator = np.random.default_rng(0)
+    p = generator.beta(0.2, 2, 3000).astype(np.float32)
+    y = generator.random(3000) < p**1.3
+    sums = BinarySums.of(torch.tensor(p, dtype=dtype, device=device), torch.tensor(y, device=device))
+    q = p.astype(np.float64)
+    nll = [-math.log(max(b if so else 1 - b, np.finfo(np.float32).tiny)) for b, so in zip(q, y, strict=True)]
+    assert sums.count == 3000
+    assert sums.nll == pytest.approx(np.mean(nll))
+    assert sums.brier == pytest.approx(np.mean((q - y) ** 2))
+    assert sums.ece == pytest.approx(ece_by_loop(q.tolist(), y.tolist(), 15))
+    assert sums.ece == pytest.approx(float(calibration_error(torch.tensor(p), torch.tensor(y))))
+    assert (sums.probability, sums.rate) == pytest.approx((q.mean(), y.mean()))
+    # Both classes of a prediction of yes or no: the other one's half of the Brier score is as large.
+    both = calibration(torch.tensor(np.stack([1 - q, q], 1)), torch.tensor(y).long())
+    assert (sums.nll, 2 * sums.brier) == pytest.approx((both.nll, both.brier))
+    for number, (low, high) in enumerate(zip([-1, *sums.EDGES.tolist()], [*sums.EDGES.tolist(), 1], strict=True)):
+        inside = (q > low) & (q <= high)
+        assert sums.bins[:, number].tolist() == pytest.approx([inside.sum(), q[inside].sum(), y[inside].sum()])
+
+
+def test_the_wide_bins_are_among_the_bins():
+    edges = BinarySums.EDGES.tolist()
+    assert edges == sorted(edges)
+    assert edges[6:] == [b / 15 for b in range(1, 15)]
+    assert max(edges[:6]) < 1 / 15
+
+
+told = st.lists(st.tuples(st.floats(0, 1, width=32), st.booleans()), max_size=30)
+
+
+def sums_of(pairs):
+    p, y = torch.tensor([p for p, _ in pairs]), torch.tensor([y for _, y in pairs], dtype=torch.bool)
+    return BinarySums.of(p, y)
+
+
+def same(a, b):
+    assert a.bins[0].tolist() == b.bins[0].tolist()
+    torch.testing.assert_close(a.bins, b.bins)
+    assert (a.surprisal, a.square) == pytest.approx((b.surprisal, b.square))
+
+
+@given(told, told, told)
+def test_sums_of_parts_add_up(a, b, c):
+    whole = sums_of(a + b + c)
+    same((sums_of(a) + sums_of(b)) + sums_of(c), whole)
+    same(sums_of(c) + (sums_of(b) + sums_of(a)), whole)
+    same(whole + BinarySums.nothing(), whole)
+
+
+@given(told)
+def test_sums_come_back_from_json_to_the_bit(pairs):
+    sums = sums_of(pairs)
+    back = BinarySums.from_record(json.loads(json.dumps(sums.record())))
+    assert torch.equal(back.bins, sums.bins)
+    assert (back.surprisal, back.square) == (sums.surprisal, sums.square)
+
+
+def test_sums_over_nothing_have_no_figures():
+    nothing = BinarySums.nothing()
+    assert nothing.count == 0
+    for name in ("nll", "brier", "ece", "probability", "rate"):
+        assert math.isnan(getattr(nothing, name))
+
+
+def test_certain_and_wrong_has_finite_sums():
+    sums = BinarySums.of(torch.tensor([1.0, 0.0]), torch.tensor([False, True]))
+    assert math.isfinite(sums.nll)
+    assert (sums.brier, sums.ece) == (1, 1)
+    with pytest.raises(InputError, match="outcome"):
+        BinarySums.of(torch.rand(3), torch.ones(2).bool())

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu
 
 from semfov.errors import InputError
-from semfov.metrics.presence import area_under_roc, hits_at, threshold_for
+from semfov.metrics.presence import area_under_roc, hits_at, roc, threshold_for
 
 # Few values, so that many are tied.
 scores = st.lists(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.9, 1.0]) | st.floats(0, 1), min_size=1, max_size=25)
@@ -101,3 +102,21 @@ def test_a_score_in_single_precision_is_no_alarm_of_itself():
 def test_a_threshold_needs_a_case():
     with pytest.raises(InputError, match="absent: expected at least one case"):
         threshold_for(torch.zeros(0), 0.1)
+
+
+@given(st.lists(st.tuples(st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0]), st.booleans()), min_size=2, max_size=30))
+def test_roc_counts_at_every_threshold(cases):
+    """Against counting, and its area against the rank statistic."""
+    score, present = torch.tensor([s for s, _ in cases]), torch.tensor([p for _, p in cases])
+    if present.all() or not present.any():
+        with pytest.raises(InputError, match="present"):
+            roc(score, present)
+        return
+    alarms, hits = roc(score, present)
+    levels = sorted({s for s, _ in cases}, reverse=True)
+    for level, alarm, hit in zip(levels, alarms[1:], hits[1:], strict=True):
+        told = [p for s, p in cases if torch.tensor(s) >= torch.tensor(level)]
+        assert hit == pytest.approx(sum(told) / int(present.sum()))
+        assert alarm == pytest.approx((len(told) - sum(told)) / int((~present).sum()))
+    assert (alarms[0], hits[0], alarms[-1], hits[-1]) == (0, 0, 1, 1)
+    assert np.trapezoid(hits, alarms) == pytest.approx(area_under_roc(score, present))

@@ -36,7 +36,7 @@ def scanpath(hostile: str) -> Scanpath:
         cells=cells,
         fixations=grid.centres[cells],
         detections=tuple(looks[number : number + 1] for number in range(3)),
-        beliefs=torch.rand(3, 12, 4, generator=generator) + 0.1,
+        probabilities=torch.rand(3, 12, 4, generator=generator).add(0.1).softmax(-1),
         values=torch.rand(3, 12, generator=generator),
         found=True,
         posterior=torch.rand(3, 12, generator=generator),

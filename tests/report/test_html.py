@@ -12,10 +12,11 @@ import pytest
 import torch
 from PIL import Image
 
-from semfov.observation.dirichlet import mean
+from semfov.decision import Decision
 from semfov.report.curves import curves_html, table_html
 from semfov.report.episode import Pool, episode_data
 from semfov.report.page import write_page
+from semfov.viz import why_it_ended
 
 
 class Elements(HTMLParser):
@@ -98,11 +99,14 @@ def test_beliefs_come_through(page, scanpath):
     (episode,) = data_of(page)["episodes"]
     maps = {each["label"]: decoded(each, 3, 12) for each in episode["maps"]}
     first, *_, last = maps
-    assert (first, last) == (f"{scanpath.classes[2]} (as searched for)", "background")
+    # The target's is what the search believed.
+    assert (first, last) == (scanpath.classes[2], "background")
+    assert len(episode["maps"]) == len(scanpath.classes)
     np.testing.assert_allclose(maps[first], scanpath.posterior, atol=1 / 500)
-    probabilities = mean(scanpath.beliefs)
+    probabilities = scanpath.probabilities
     for index, name in enumerate(scanpath.classes):
-        np.testing.assert_allclose(maps[name], probabilities[..., index], atol=1 / 500)
+        if index != scanpath.target:
+            np.testing.assert_allclose(maps[name], probabilities[..., index], atol=1 / 500)
     entropy = -(probabilities * probabilities.log2()).sum(-1)
     np.testing.assert_allclose(decoded(episode["entropy"], 3, 12), entropy, atol=2 / 500)
 
@@ -154,3 +158,20 @@ def test_curves_are_the_numbers(hostile):
     assert rising[1] == flat[1]
     assert rising[0][1] - rising[1][1] == pytest.approx(rising[1][1] - rising[2][1], abs=0.2)
     assert text.count("<polygon") == 1
+
+
+def test_the_outcome_comes_through(scanpath, image):
+    """What was decided, why it ended, and how sure each look made the search."""
+    decision = Decision("found", 0.97, 6, torch.tensor([1.0, 2.0, 30.25, 40.0]))
+    presence = torch.tensor([0.25, 0.5, 0.97])
+    searched = replace(scanpath, decision=decision, ending="decision", presence=presence)
+    data = episode_data(searched, image, [image] * 3, Pool(), name="sought")
+    assert data["outcome"] == {"why": why_it_ended(searched), "cell": 6, "box": [1.0, 2.0, 30.2, 40.0]}
+    assert data["presence"] == [0.25, 0.5, 0.97]
+    assert data["outcome"]["why"] != why_it_ended(replace(searched, decision=Decision("absent", 0.1))) != ""
+    for ending in ("box", "price", "shifts", "cells"):
+        ended = replace(scanpath, ending=ending)
+        data = episode_data(ended, image, [image] * 3, Pool(), name="other")
+        assert data["outcome"] == {"why": why_it_ended(ended), "cell": None, "box": None}
+        assert data["outcome"]["why"].endswith(".")
+    assert why_it_ended(replace(scanpath, ending=None)) == ""

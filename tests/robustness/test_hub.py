@@ -71,7 +71,7 @@ def test_agents_search_and_explore(kind):
     assert 1 <= len(path) <= 3
     assert len(explored) == 2
     columns, rows = options.get("grid", (10, 10))
-    assert path.beliefs.shape[1:] == explored.beliefs.shape[1:] == (columns * rows, 81)
+    assert path.probabilities.shape[1:] == explored.probabilities.shape[1:] == (columns * rows, 81)
 
 
 @pytest.mark.weights

@@ -170,7 +170,7 @@ class Exploring(nn.Module):
         self.agent = ActivePerception(eye, strategy, strategy, grid=(GRID.columns, GRID.rows))
 
     def forward(self, image: Tensor) -> Tensor:
-        return self.agent.explore(image, start=5, shifts=2).beliefs
+        return self.agent.explore(image, start=5, shifts=2).probabilities
 
 
 def memory() -> tuple[Tensor, Tensor]:

@@ -2,13 +2,17 @@
 
 from semfov.belief.observers.base import Look, Observer
 from semfov.belief.observers.context import Context, ContextBelief
+from semfov.belief.observers.learned_map import LearnedMap, MapBelief, MapLook
 from semfov.belief.observers.semantic import Memory, Semantic, SemanticLook
 from semfov.belief.observers.target import Target, TargetBelief
 
 __all__ = [
     "Context",
     "ContextBelief",
+    "LearnedMap",
     "Look",
+    "MapBelief",
+    "MapLook",
     "Memory",
     "Observer",
     "Semantic",

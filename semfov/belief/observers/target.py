@@ -7,15 +7,13 @@ import torch
 from torch import Tensor
 
 from semfov.belief.belief import Belief, one_by_one
+from semfov.belief.evidence import Gathered, nearness
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
 from semfov.belief.observers.base import Look, Observer, own
-from semfov.belief.target_evidence import Gathered, TargetEvidence, Thresholds
+from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
-
-# Looks from farther than this, in longer sides of the image, count e times less in the mean of all.
-_REACH = 1 / 6
 
 
 @dataclass(frozen=True)
@@ -144,8 +142,8 @@ class Target(Observer):
         nearest = torch.where(closer, said.evidence, known.nearest)
         best = torch.maximum(said.evidence, known.best)
         closest = torch.minimum(said.distance, known.closest)
-        nearness = self._each(lambda distance: (-distance / _REACH).exp(), said.distance)
-        total, weight = known.total + nearness * said.evidence, known.weight + nearness
+        near = self._each(nearness, said.distance)
+        total, weight = known.total + near * said.evidence, known.weight + near
         score, looks = torch.maximum(said.score, known.score), known.looks + 1
 
         visited = known.visited.scatter(-1, said.fixated[:, None], True)

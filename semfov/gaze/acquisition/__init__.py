@@ -3,6 +3,7 @@
 from semfov.gaze.acquisition.accuracy import ExpectedAccuracy
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.closer_look import CloserLook
+from semfov.gaze.acquisition.expected_gain import ExpectedGain
 from semfov.gaze.acquisition.exploration import (
     BayesianSurprise,
     KLDivergence,
@@ -21,6 +22,7 @@ __all__ = [
     "BayesianSurprise",
     "CloserLook",
     "ExpectedAccuracy",
+    "ExpectedGain",
     "FovealHit",
     "KLDivergence",
     "NegativeEntropy",

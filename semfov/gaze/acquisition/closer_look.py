@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from semfov.belief.belief import Belief, dirichlet_belief, one_by_one
+from semfov.belief.belief import Belief, one_by_one, probabilities_of
 from semfov.belief.grid import Grid
 from semfov.errors import check
 from semfov.gaze.acquisition.base import AcquisitionFunction
@@ -45,13 +45,13 @@ class CloserLook(AcquisitionFunction):
         return (1 - distance / self.fovea).clamp(max=0).exp()
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(B, X·Y)` for a belief `(B, X·Y, K+1)`; where the fovea was is in `belief.closest`."""
-        return one_by_one(self._values, dirichlet_belief(belief).beta, belief.closest)
+        """Values `(B, X·Y)` for a belief about all classes; where the fovea was is in `belief.closest`."""
+        return one_by_one(self._values, probabilities_of(belief), belief.closest)
 
-    def _values(self, beta: Tensor, closest: Tensor) -> Tensor:
-        objects = beta[..., 1:]
+    def _values(self, probabilities: Tensor, closest: Tensor) -> Tensor:
+        objects = probabilities[..., 1:]
         unknown = 1 - objects.amax(-1) / objects.sum(-1)
-        gain = (self.seen.to(beta) - self.acuity(closest)[..., None]).clamp(min=0)
+        gain = (self.seen.to(objects) - self.acuity(closest)[..., None]).clamp(min=0)
         return (gain * unknown[..., None]).sum(-2)
 
     def extra_repr(self) -> str:

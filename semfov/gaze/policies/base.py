@@ -7,6 +7,7 @@ from typing import ClassVar, Literal, Protocol, Self
 from torch import Tensor, nn
 
 from semfov.belief.grid import Grid
+from semfov.belief.map_evidence import MapEvidence
 from semfov.errors import InputError, lookup
 from semfov.gaze.acquisition.accuracy import SightedModel
 from semfov.gaze.acquisition.base import AcquisitionFunction
@@ -28,12 +29,14 @@ class Means:
     Attributes:
         model: observation model, for the scores to expect and for miss rates.
         gaze: learned gaze policy.
+        map: learned map.
         fovea: width σ of the fovea in longer sides of the image.
         prior: Dirichlet parameter of every class before the first look.
     """
 
     model: GazeModel | None = None
     gaze: LearnedGaze | None = None
+    map: MapEvidence | None = None
     fovea: float = 100 / 640
     prior: float = 0.5
 
@@ -41,20 +44,22 @@ class Means:
 class Policy(nn.Module, ABC):
     """Base of all policies: how to choose where to look, for any target on any grid.
 
-    A subclass is registered under its `name` when it is defined, and can then be named in settings. `needs_model` and
-    `needs_gaze` say what it is made from, and `make` takes that from `Means`.
+    A subclass is registered under its `name` when it is defined, and can then be named in settings. `needs_model`,
+    `needs_gaze` and `needs_map` say what it is made from, and `make` takes that from `Means`.
 
     Attributes:
         name: that settings know it by.
         tasks: what it is for.
         needs_model: whether it is made from an observation model.
         needs_gaze: whether it is made from a learned gaze policy.
+        needs_map: whether it is made from a learned map, and goes by that.
     """
 
     name: ClassVar[str]
     tasks: ClassVar[tuple[Task, ...]]
     needs_model: ClassVar[bool] = False
     needs_gaze: ClassVar[bool] = False
+    needs_map: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
@@ -129,6 +134,8 @@ def named_policy(name: str, task: Task, means: Means | None = None) -> Policy:
         raise InputError(f"policy {name!r}: expected an observation model for the scores to expect, got none")
     if kind.needs_gaze and means.gaze is None:
         raise InputError(f"policy {name!r}: expected a learned gaze policy, got none")
+    if kind.needs_map and means.map is None:
+        raise InputError(f"policy {name!r}: expected a learned map, got none")
     return kind.make(means)
 
 

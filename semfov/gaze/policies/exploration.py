@@ -5,9 +5,11 @@ from typing import Self
 from torch import Tensor
 
 from semfov.belief.grid import Grid
+from semfov.belief.map_evidence import MapEvidence
 from semfov.gaze.acquisition.accuracy import ExpectedAccuracy
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.closer_look import CloserLook
+from semfov.gaze.acquisition.expected_gain import ExpectedGain
 from semfov.gaze.acquisition.exploration import (
     BayesianSurprise,
     KLDivergence,
@@ -133,3 +135,29 @@ class Closer(Policy):
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The acuity gained."""
         return CloserLook(grid, self.fovea)
+
+
+class Gain(Policy):
+    """Where a look is expected to name most cells right that are not yet (`semfov.acquisition.ExpectedGain`).
+
+    Args:
+        model: learned map.
+    """
+
+    name = "expected-gain"
+    tasks = ("exploration",)
+    needs_map = True
+
+    def __init__(self, model: MapEvidence) -> None:
+        super().__init__()
+        self.model = model
+
+    @classmethod
+    def make(cls, means: Means) -> Self:
+        """With the learned map."""
+        assert means.map is not None
+        return cls(means.map)
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
+        """The cells gained."""
+        return ExpectedGain(self.model, grid)

@@ -1,0 +1,204 @@
+"""How well beliefs in a target agree with where it is, cell by cell, along the same searches."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import ClassVar, TypeVar
+
+import torch
+from torch import Tensor
+
+from semfov.agent import PUBLISHED_SENSORS, confirms
+from semfov.belief.grid import Grid
+from semfov.belief.observers import LearnedMap, Observer, Target
+from semfov.detection.detections import Detections
+from semfov.episode import Looks, Sight, Step, Stopwatch, rollout
+from semfov.errors import InputError
+from semfov.experiments.config import DetectorConfig, PolicyConfig, SearchConfig, SensorConfig
+from semfov.experiments.decisions import landing
+from semfov.experiments.parts import Record
+from semfov.experiments.presets import label
+from semfov.experiments.run import Run
+from semfov.experiments.search_protocol import choose_classes
+from semfov.experiments.seeds import generator_for, noise_for
+from semfov.experiments.setup import make_map_evidence, make_target_evidence
+from semfov.eye import Eye
+from semfov.gaze.acquisition import AcquisitionFunction, Uniform
+from semfov.gaze.choice import Choice, Given, Greedy, drawn_from
+from semfov.gaze.policies import NonPredictive, Task
+from semfov.metrics.calibration import BinarySums
+from semfov.observation.foveal import FovealObservationModel
+
+LOOKS = (1, 5, 15)
+"""Looks after which beliefs are judged."""
+
+BANDS = (0.14, 0.24, 0.34)
+"""Edges between bands of eccentricity, in longer sides: in photographs of usual proportions no two of 10 × 10 cells are
+as far apart, so that rounding does not decide."""
+
+FIXATED, FARTHEST = "fixated", f"{BANDS[-1]:.2f} - …"
+CELLS = (FIXATED, *(f"{low:.2f} - {high:.2f}" for low, high in pairwise((0, *BANDS))), FARTHEST)
+"""Groups of cells: the fixated ones, then all others by the eccentricity of their closest look."""
+
+ALL_CLASSES = {
+    "raw": PolicyConfig("non-predictive"),
+    "published": PolicyConfig("non-predictive", "calibrated"),
+    "tempered": PolicyConfig("non-predictive", tempering=0.5),
+}
+"""Beliefs by Kaplan's rule: of raw scores, of calibrated ones, and of raw ones as likelihoods to the power of 1/2."""
+
+LEARNED, MAP = "learned", "learned map"
+
+Model = TypeVar("Model")
+
+
+class BeliefCalibrationRun(Run):
+    """Searches that do not end, one for a class that is there and one for a class that is not, in every scene.
+
+    The gaze goes by the learned evidence for the target, as the agent's does; where none is shipped, by the tempered
+    belief. All beliefs are told the same looks.
+
+    Args:
+        config: of the run; its policies have no say.
+
+    Attributes:
+        observers: what the beliefs come from, by what tables call them.
+        left_out: beliefs that no model is shipped for, and why.
+    """
+
+    task: ClassVar[Task] = "search"
+    config: SearchConfig
+
+    def __init__(self, config: SearchConfig) -> None:
+        super().__init__(replace(config, policies=tuple(ALL_CLASSES.values())))
+        self.left_out: dict[str, str] = {}
+        belief = self.config.belief
+        evidence = self._if_shipped(LEARNED, make_target_evidence, belief.target_model)
+        evidence_map = self._if_shipped(MAP, make_map_evidence, belief.map_model)
+        self.models = replace(self.models, evidence=evidence, map=evidence_map)
+        self.key = self._key()
+        self.observers: dict[str, Observer] = {
+            name: self.strategies[label(choice, self.task)].observer for name, choice in ALL_CLASSES.items()
+        }
+        if evidence is not None:
+            self.observers[LEARNED] = Target(evidence)
+        if evidence_map is not None:
+            self.observers[MAP] = LearnedMap(evidence_map)
+
+    def _if_shipped(self, name: str, make: Callable[[str | None, Eye], Model], model: str | None) -> Model | None:
+        """The model that is asked for; where none is, the one that is shipped, or None."""
+        try:
+            return make(model, self.eye)
+        except InputError as error:
+            if model is not None:
+                raise
+            self.left_out[name] = str(error)
+            return None
+
+    def _key(self) -> str:
+        what = ["belief calibration", super()._key(), LOOKS, BANDS, BinarySums.EDGES.tolist()]
+        return hashlib.sha256(json.dumps(what).encode()).hexdigest()
+
+    @property
+    def guide(self) -> str:
+        """The belief that the gaze goes by."""
+        return LEARNED if LEARNED in self.observers else "tempered"
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Records of both searches of a scene, and the seconds that they took."""
+        protocol, annotation, grid = self.config.protocol, self.scenes.annotation(index), self.grid(index)
+        watch = Stopwatch()
+        area = self.config.data.max_target_area or 1.0
+        classes = choose_classes(self.scenes, index, annotation, 1, area, protocol.seed)
+        if not classes:
+            return [], watch.seconds
+        covered = grid.footprint(annotation.boxes)
+        detections = self.detections(index)
+        watch.lap("look")
+        records: list[Record] = []
+        for target in classes:
+            scene = self.scenes.ids[index]
+            start = torch.randint(len(grid), (1,), generator=generator_for("start", protocol.seed, scene, target))
+            noise = noise_for(protocol, len(grid), scene, target, 0)[None]
+            goal = covered[annotation.labels == target].any(0)
+            with torch.inference_mode():
+                search = self._search(target, start, noise, goal, KnownLooks(detections, grid, target))
+            records.append({"scene": scene, "target": target, "present": bool(goal.any()), **search})
+        watch.lap("believe")
+        return records, watch.seconds
+
+    def _search(self, target: int, start: Tensor, noise: Tensor, goal: Tensor, looks: KnownLooks) -> Record:
+        most = min(self.config.protocol.shifts + 1, LOOKS[-1])
+
+        def walk(name: str, acquisition: AcquisitionFunction, choice: Choice) -> list[Step]:
+            return list(rollout(looks, self.observers[name], acquisition, start, choice, most=most))
+
+        led = walk(self.guide, NonPredictive()(target, looks.grid), Greedy(drawn_from(noise)))
+        path = torch.cat([step.cell for step in led])
+        beliefs: dict[str, Record] = {}
+        for name in self.observers:
+            steps = led if name == self.guide else walk(name, Uniform(), Given(path[None]))
+            judged = {str(n): judge_cells(steps[n - 1], target, goal) for n in LOOKS if n <= len(steps)}
+            beliefs[name] = {"looks": judged, "landing": landing([step.belief for step in steps], path, goal, target)}
+        return {"seen": seen_on_landing(led, path, goal, target, looks.grid), "beliefs": beliefs}
+
+
+class KnownLooks(Looks):
+    """Looks at one image from the centres of its cells, detected before; each is weighed when it comes.
+
+    Args:
+        detections: what is seen from every cell, a batch of X·Y.
+        grid: the cells.
+        target: class that is searched for.
+    """
+
+    def __init__(self, detections: Detections, grid: Grid, target: int) -> None:
+        self.detections, self.grid, self.target = detections, grid, target
+        self.like = detections.scores
+
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """What the store has of the cells; the fixations are their centres."""
+        detections = self.detections[cell]
+        return Sight(observer.weigh(detections, fixation, self.grid, self.target), lambda: detections, {})
+
+
+def published_model(detector: DetectorConfig, sensor: SensorConfig) -> str | None:
+    """Observation model of maximum likelihood for detector and sensor; None where none is shipped."""
+    name = f"{detector.name}-{sensor.name}"
+    shipped = (FovealObservationModel.shipped / f"{name}.safetensors").is_file()
+    return name if sensor.name in PUBLISHED_SENSORS and shipped else None
+
+
+def judge_cells(step: Step, target: int, goal: Tensor) -> Record:
+    """Sums (`BinarySums.record`) over the cells of a search after a step, by group (`CELLS`); none of empty groups.
+
+    Args:
+        step: of one search.
+        target: class 1..K.
+        goal: `(X·Y,)` boolean, the cells that it overlaps.
+    """
+    belief = step.belief
+    band = 1 + torch.bucketize(belief.closest[0].double(), torch.tensor(BANDS, dtype=torch.float64))
+    group = band.masked_fill(step.visited[0], 0)
+    probability = belief.probability(target)[0]
+    return {
+        name: BinarySums.of(probability[group == number], goal[group == number]).record()
+        for number, name in enumerate(CELLS)
+        if (group == number).any()
+    }
+
+
+def seen_on_landing(steps: list[Step], path: Tensor, goal: Tensor, target: int, grid: Grid) -> bool | None:
+    """Whether the look that lands on the target sees it: the best class of a detection over the fixated cell is it.
+
+    None where no look lands, or the first one is on the target already (`landing`).
+    """
+    hits = goal[path].nonzero()[:, 0].tolist()
+    if not hits or hits[0] == 0:
+        return None
+    step = steps[hits[0]]
+    return bool(confirms(step.detections, grid, step.cell, target, 0.0))

@@ -1,0 +1,177 @@
+"""What a run that judges beliefs leaves: tables, sums, and a reliability diagram."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from semfov.errors import DataError
+from semfov.experiments.belief_calibration import BANDS, CELLS, MAP, BeliefCalibrationRun
+from semfov.experiments.parts import Record
+from semfov.experiments.summary import gather, save_figure, sensing, table
+from semfov.io.files import write_text
+from semfov.metrics.calibration import BinarySums
+from semfov.viz import plot_cell_reliability
+
+Sums = dict[tuple[str, int, str], BinarySums]
+"""Sums over predictions by belief, number of looks, and group of cells."""
+
+HEAD = ("NLL", "Brier", "ECE", "mean probability", "share that hold it")
+
+
+def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
+    """Write tables, sums and figure of a finished run; returns the tables, and the files.
+
+    Raises:
+        DataError: nothing could be searched for.
+    """
+    records, _ = gather(run)
+    if not records:
+        raise DataError("data: no scene has a class that may be searched for; raise target_area")
+    sums = add_up(records)
+    text = summary(records, sums, run)
+    files = {"beliefs.md": text, "beliefs.csv": beliefs_csv(sums), "beliefs.json": beliefs_json(sums)}
+    for name, content in files.items():
+        write_text(run.config.out / name, content)
+    groups = f"distance of the closest look in longer sides, after {judged_after(sums)[-1]} looks"
+    figure = save_figure(plot_cell_reliability(*curves(sums), groups=groups), run.config.out / "beliefs.png")
+    return text, [*(run.config.out / name for name in files), figure]
+
+
+def add_up(records: Iterable[Record]) -> Sums:
+    """Sums over all searches."""
+    sums: Sums = defaultdict(BinarySums.nothing)
+    for record in records:
+        for belief, told in record["beliefs"].items():
+            for looks, groups in told["looks"].items():
+                for group, values in groups.items():
+                    sums[belief, int(looks), group] += BinarySums.from_record(values)
+    return dict(sums)
+
+
+def pooled(sums: Sums, belief: str, looks: int) -> BinarySums:
+    """Sums over all cells."""
+    return sum((sums[belief, looks, group] for group in CELLS if (belief, looks, group) in sums), BinarySums.nothing())
+
+
+def summary(records: Sequence[Record], sums: Sums, run: BeliefCalibrationRun) -> str:
+    """The tables, as Markdown."""
+    beliefs = list(run.observers)
+    there = sum(record["present"] for record in records)
+    by_looks = [["looks", "belief", "cells", *HEAD]]
+    for looks in judged_after(sums):
+        rows = [(belief, pooled(sums, belief, looks)) for belief in beliefs]
+        by_looks += [[str(looks), belief, str(each.count), *figures(each)] for belief, each in rows]
+    last = judged_after(sums)[-1]
+    by_distance = [["distance", "belief", "cells", *HEAD]]
+    for group in CELLS:
+        told = [(belief, sums[belief, last, group]) for belief in beliefs if (belief, last, group) in sums]
+        by_distance += [[group, belief, str(each.count), *figures(each)] for belief, each in told]
+    notes = [f"Left out for want of a fitted model: {name} ({reason})." for name, reason in run.left_out.items()]
+    if MAP in beliefs:
+        notes.append(
+            f"The {MAP} takes classes to be as frequent as they are in photographs. Here half of the classes are "
+            "there, so it is expected to tell too little."
+        )
+    every = pooled(sums, beliefs[0], last)
+    alone = BinarySums.of(torch.full((every.count,), every.rate), torch.arange(every.count) < every.bins[2].sum())
+    return "\n".join(
+        [
+            f"Does a cell hold the target? {len(records)} searches ({sensing(run)}), {there} for a class that is there."
+            f" The gaze goes by the {run.guide} belief and does not stop at the target; all beliefs are told the same "
+            f"looks. To tell of all cells alike that {every.rate:.4f} of them hold it would cost an NLL of "
+            f"{alone.nll:.4f} and a Brier score of {alone.brier:.4f}, without an ECE.",
+            "",
+            *table(by_looks),
+            "",
+            f"After {last} looks, by distance of the closest look in longer sides of the image; the fixated cells are "
+            "on their own.",
+            "",
+            *table(by_distance),
+            "",
+            "Probability of the target in the cell of the first look that lands on it, before and after that look. It "
+            "is seen where the best class of a detection over that cell is the target.",
+            "",
+            *table([["belief", "landings", "p", "seen", "p, seen", "not seen", "p, not seen"], *landings(records)]),
+            "",
+            *[line for note in notes for line in (note, "")],
+        ]
+    )
+
+
+def judged_after(sums: Sums) -> list[int]:
+    """Numbers of looks that there are sums for."""
+    return sorted({looks for _, looks, _ in sums})
+
+
+def figures(sums: BinarySums) -> list[str]:
+    """Figures as the cells of a table row."""
+    return [f"{value:.4f}" for value in (sums.nll, sums.brier, sums.ece, sums.probability, sums.rate)]
+
+
+def landings(records: Sequence[Record]) -> list[list[str]]:
+    """Rows of the table of landings."""
+    landed = [record for record in records if record["seen"] is not None]
+    groups = [landed, *([record for record in landed if record["seen"] is seen] for seen in (True, False))]
+    rows = []
+    for belief in records[0]["beliefs"]:
+        row = [belief]
+        for group in groups:
+            pairs = [record["beliefs"][belief]["landing"] for record in group]
+            means = [sum(column) / len(column) for column in zip(*pairs, strict=True)]
+            row += [str(len(pairs)), " → ".join(f"{value:.3f}" for value in means) or "-"]
+        rows.append(row)
+    return rows
+
+
+def beliefs_csv(sums: Sums) -> str:
+    """All figures, a row for each belief, number of looks and group of cells."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["belief", "looks", "cells", "count", "nll", "brier", "ece", "mean_probability", "rate"])
+    for belief, looks, group, each in named(sums):
+        values = each.nll, each.brier, each.ece, each.probability, each.rate
+        rows.writerow([belief, looks, group, each.count, *(f"{value:.6f}" for value in values)])
+    return text.getvalue()
+
+
+def beliefs_json(sums: Sums) -> str:
+    """All sums, which add up with those of other photographs (`BinarySums.from_record`)."""
+    told = [
+        {"belief": belief, "looks": looks, "cells": group, **each.record()}
+        for belief, looks, group, each in named(sums)
+    ]
+    return json.dumps({"edges": BinarySums.EDGES.tolist(), "bands": BANDS, "sums": told}) + "\n"
+
+
+def named(sums: Sums) -> Iterator[tuple[str, int, str, BinarySums]]:
+    """Sums with what they are of, those over all cells before those of a group."""
+    for belief, looks in dict.fromkeys((belief, looks) for belief, looks, _ in sums):
+        yield belief, looks, "all", pooled(sums, belief, looks)
+        for group in CELLS:
+            if (belief, looks, group) in sums:
+                yield belief, looks, group, sums[belief, looks, group]
+
+
+def curves(sums: Sums) -> tuple[dict[str, dict[str, Tensor]], dict[str, dict[str, float]]]:
+    """What `plot_cell_reliability` draws: bins by number of looks, and errors by group of cells after the last."""
+    beliefs, numbers = list(dict.fromkeys(belief for belief, _, _ in sums)), judged_after(sums)
+    panels = {
+        f"after {looks} looks" if looks > 1 else "after 1 look": {
+            belief: pooled(sums, belief, looks).bins for belief in beliefs
+        }
+        for looks in numbers
+    }
+    last = numbers[-1]
+    errors = {
+        belief: {group: sums[belief, last, group].ece for group in CELLS if (belief, last, group) in sums}
+        for belief in beliefs
+    }
+    return panels, errors

@@ -1,0 +1,285 @@
+"""Training the map of all classes on the looks of whole explorations."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+from tqdm import tqdm
+
+from semfov.belief import MapEvidence
+from semfov.belief.grid import Grid
+from semfov.belief.observers import LearnedMap, MapBelief
+from semfov.episode import Step, rollout
+from semfov.errors import DataError, check
+from semfov.experiments.config import BeliefConfig, DataConfig, DetectorConfig, SearchConfig, SensorConfig
+from semfov.experiments.parallel import rank
+from semfov.experiments.run import finish
+from semfov.experiments.summary import table
+from semfov.gaze.acquisition import CloserLook
+from semfov.gaze.choice import Exploratory
+from semfov.metrics.calibration import calibration_error
+from semfov.metrics.exploration import answers_of
+from semfov.training.evidence_examples import LookingRun
+from semfov.training.map_examples import MapExampleLooks, MapExamples, make_map_examples
+from semfov.training.outputs import training_of, write_outputs
+
+JUDGED = (1, 2, 3, 5, 10, 15)
+"""Looks after which a map is judged."""
+
+
+@dataclass(frozen=True)
+class FitMapConfig:
+    """Train the map of all classes.
+
+    Args:
+        data: photographs to learn from.
+        detector: which detector looks through the fovea.
+        sensor: the foveal sensor.
+        name: name of the model (None: the detector's).
+        classes: classes of a photograph to learn from: those that it holds and those that score highest.
+        others: how many of them are drawn from all the rest.
+        columns: cells in a row.
+        rows: cells in a column.
+        holdout: every n-th photograph is kept out and used to judge.
+        looks: of an exploration.
+        astray: share of the fixations that are drawn at random.
+        steps: steps of training.
+        gain_steps: steps in which it is learned what a look will bring.
+        batch: photographs in a step.
+        rate: highest learning rate.
+        seed: of the choice of classes, first parameters and training.
+        out: folder for the model and the report.
+        cache: folder for what was seen from every cell, shared with `eval.explore` (None: the user's cache).
+        workers: processes that look (None: one for each CPU core).
+    """
+
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    name: str | None = None
+    classes: int = 12
+    others: int = 3
+    columns: int = 10
+    rows: int = 10
+    holdout: int = 5
+    looks: int = 12
+    astray: float = 0.5
+    steps: int = 1000
+    gain_steps: int = 200
+    batch: int = 12
+    rate: float = 5e-3
+    seed: int = 0
+    out: Path = Path("runs/fit_map")
+    cache: Path | None = None
+    workers: int | None = None
+
+
+def fit_map(config: FitMapConfig) -> None:
+    """Look from every cell, train, judge on held-out photographs, and write everything."""
+    check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
+    check(config.looks >= 2, "looks", "2 or more", config.looks)
+    check(0 < config.others < config.classes, "others", f"from 1 to {config.classes - 1}", config.others)
+    run = LookingRun(
+        SearchConfig(
+            data=config.data,
+            detector=config.detector,
+            sensor=config.sensor,
+            belief=BeliefConfig(columns=config.columns, rows=config.rows),
+            policies=("random",),
+            out=config.out,
+            cache=config.cache,
+            workers=config.workers,
+        )
+    )
+    finish(run, "looking")
+    if rank() > 0:
+        return
+    examples = make_map_examples(run, config.classes, config.others, config.seed)
+    held_out = examples.scene % config.holdout == 0
+    if held_out.all() or not held_out.any():
+        raise DataError(f"data: too few photographs to train and to judge by ({len(examples)}); give more")
+    grid = Grid(config.columns, config.rows, (config.columns, config.rows))
+    metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        model = MapEvidence(components=len(run.scenes.classes) + 1, metadata=metadata)
+    with torch.no_grad():
+        model.prior.copy_(frequencies(run, config.holdout))
+    train(config, model, examples[~held_out], grid)
+    train_gain(config, model, examples[~held_out], grid)
+    judged = judge(config, model.eval(), examples[held_out], grid)
+    path = config.out / f"{config.name or run.eye.detector.name}.safetensors"
+    model.save(path)
+    text = report(judged, int((~held_out).sum()), int(held_out.sum()))
+    write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
+
+
+def frequencies(run: LookingRun, holdout: int) -> Tensor:
+    """How often a cell holds each class in the photographs to learn from, `(K+1,)`: its log odds, scaled to unit size.
+
+    Args:
+        run: of the photographs.
+        holdout: every n-th one is left out.
+    """
+    components, cells = len(run.scenes.classes) + 1, 0
+    count = torch.zeros(components)
+    for index in range(len(run.scenes)):
+        if index % holdout:
+            grid = run.grid(index)
+            count += answers_of(run.scenes.annotation(index), grid, components).sum(0)
+            cells += len(grid)
+    return ((count + 1) / (cells + 2)).logit() / 4 + 1
+
+
+def train(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> None:
+    """Train on explorations that go by the model, with fixations astray among them."""
+    generator = torch.Generator().manual_seed(config.seed)
+    optimiser = torch.optim.AdamW(model.parameters(), lr=config.rate, weight_decay=1e-2)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.rate, total_steps=config.steps)
+    bar = tqdm(range(config.steps), desc="training", unit="step", dynamic_ncols=True)
+    for number in bar:
+        chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
+        counted = torch.randint(2, config.looks + 1, (2,), generator=generator).tolist()
+        loss = chosen.score.new_zeros(())
+        for step in explorations(model, chosen, grid, max(counted), config.astray, generator):
+            if step.shift + 1 in (1, *counted):
+                loss = loss + objective(step, chosen)
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        if number % 25 == 0:
+            bar.set_postfix(loss=f"{float(loss.detach()):.3f}")
+
+
+def explorations(
+    model: MapEvidence, examples: MapExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
+) -> Iterator[Step]:
+    """An exploration of every example from a start at random."""
+    count = len(examples)
+    start = torch.randint(len(grid), (count,), generator=generator)
+    choice = Exploratory(lambda _, episodes: torch.rand(len(episodes), len(grid), generator=generator), astray)
+    observer = LearnedMap(model, together=True)
+    return rollout(MapExampleLooks(examples, grid), observer, CloserLook(grid), start, choice, most=looks)
+
+
+def objective(step: Step, examples: MapExamples) -> Tensor:
+    """Cross-entropy of every class, and of none, in every cell: summed over classes, those drawn for all they stand."""
+    belief = step.belief
+    assert isinstance(belief, MapBelief)
+    weight = torch.cat([torch.ones_like(examples.stands_for[:, :1]), examples.stands_for], 1)
+    answers = examples.answers.to(belief.probabilities)
+    each = F.binary_cross_entropy_with_logits(belief.probabilities.logit(eps=1e-7), answers, reduction="none")
+    return (each.mean(1) * weight).sum(-1).mean()
+
+
+def train_gain(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> None:
+    """Train what a look is expected to bring, by least squares on what looks have brought in each cell."""
+    generator = torch.Generator().manual_seed(config.seed + 1)
+    optimiser = torch.optim.AdamW(model.worth.parameters(), lr=config.rate, weight_decay=1e-2)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.rate, total_steps=config.gain_steps)
+    for _ in tqdm(range(config.gain_steps), desc="learning what looks bring", unit="step", dynamic_ncols=True):
+        chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
+        before: Step | None = None
+        loss = chosen.score.new_zeros(())
+        with torch.no_grad():
+            steps = list(explorations(model, chosen, grid, config.looks, config.astray, generator))
+        for step in steps:
+            if before is not None:
+                known = before.belief
+                assert isinstance(known, MapBelief)
+                brought = right(step, chosen.answers) - right(before, chosen.answers)
+                distance = chosen.distance[torch.arange(len(chosen)), step.cell][:, None]
+                expected = model.gain(known.probabilities, known.closest, known.looks, distance)[:, 0]
+                loss = loss + (expected - brought).square().mean() * 100
+            before = step
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+
+
+def right(step: Step, answers: Tensor) -> Tensor:
+    """Cells whose most probable answer is right, `(B, X·Y)`, 1 or 0."""
+    belief = step.belief
+    assert isinstance(belief, MapBelief)
+    best = belief.probabilities.argmax(-1, keepdim=True)
+    return answers.gather(-1, best)[..., 0].to(belief.closest)
+
+
+@torch.no_grad()
+def judge(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> list[dict[str, float]]:
+    """How well the model does on held-out explorations after some looks."""
+    generator = torch.Generator().manual_seed(config.seed)
+    judged = []
+    answers = examples.answers
+    some = ~answers[..., 0]
+    before: tuple[Tensor, Tensor] | None = None
+    for step in explorations(model, examples, grid, max(JUDGED), 0.0, generator):
+        belief = step.belief
+        assert isinstance(belief, MapBelief)
+        p, now = belief.probabilities, right(step, answers)
+        named = answers[..., 1:].gather(-1, p[..., 1:].argmax(-1, keepdim=True))[..., 0]
+        gained = (0.0, 0.0)
+        if before is not None:
+            distance = examples.distance[torch.arange(len(examples)), step.cell][:, None]
+            known, was = before
+            gained = float(known.sum(-1).mean()), float((now - was).sum(-1).mean())
+        if step.shift + 1 in JUDGED:
+            judged.append(
+                {
+                    "looks": step.shift + 1,
+                    "all": float(now.double().mean()),
+                    "objects": float(now[some].double().mean()),
+                    "objects_without_background": float(named[some].double().mean()),
+                    "nll": float(F.binary_cross_entropy(p.double(), answers.double())),
+                    "ece": float(calibration_error(p.flatten(), answers.flatten())),
+                    "ece_background": float(calibration_error(p[..., 0].flatten(), answers[..., 0].flatten())),
+                    "expected": gained[0],
+                    "brought": gained[1],
+                }
+            )
+        distance = examples.distance[torch.arange(len(examples)), step.next_cell][:, None]
+        before = model.gain(p, belief.closest, belief.looks, distance)[:, 0], now
+    return judged
+
+
+def report(judged: list[dict[str, float]], trained: int, held_out: int) -> str:
+    """How the model does, as Markdown."""
+    head = [
+        "looks",
+        "cells right, %",
+        "with objects, %",
+        "without background, %",
+        "NLL",
+        "ECE",
+        "ECE, background",
+        "expected of the last look, cells",
+        "brought by it",
+    ]
+    rows = [
+        [
+            str(int(row["looks"])),
+            *(f"{100 * row[name]:.1f}" for name in ("all", "objects", "objects_without_background")),
+            *(f"{row[name]:.4f}" for name in ("nll", "ece", "ece_background")),
+            *(f"{row[name]:.2f}" for name in ("expected", "brought")),
+        ]
+        for row in judged
+    ]
+    return "\n".join(
+        [
+            f"Trained on {trained} photographs, judged on {held_out} that were held out, in explorations by the closer "
+            "look: share of the cells whose most probable answer is right, background among the answers; of the cells "
+            "with objects, background an answer or not; negative log likelihood and expected calibration error of the "
+            "probabilities of the classes at hand and of background; and how many cells more the last look was "
+            "expected to name right, and did.",
+            "",
+            *table([head, *rows]),
+            "",
+        ]
+    )

@@ -1,0 +1,186 @@
+"""What the tests of learned evidence share: looks at random, and a twin of the networks in numpy."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.ndimage
+import scipy.special
+import torch
+
+from semfov import Detections, Grid
+from semfov.belief.evidence import Gathered
+from semfov.belief.map_evidence import MapEvidence
+
+
+def array(tensor):
+    return tensor.detach().cpu().double().numpy()
+
+
+def neural(network, inputs):
+    """A network with an activation after every layer but the last, on the last axis of an array, in float64."""
+    value = np.asarray(inputs, dtype=np.float64)
+    for number, layer in enumerate(network):
+        activated = number % 2
+        value = value * scipy.special.ndtr(value) if activated else value @ array(layer.weight).T + array(layer.bias)
+    return value[..., 0]
+
+
+def shrunk(odds):
+    return np.log(odds + 1e-3) / 2 + 1
+
+
+def blurred(values, columns, sigma):
+    """Gaussian average over the cells `(X·Y,)`, cut off beyond three cells."""
+    table = values.reshape(-1, columns)
+    return scipy.ndimage.gaussian_filter(table, sigma, mode="constant", radius=3).ravel()
+
+
+def peaks(values, columns):
+    return scipy.ndimage.maximum_filter(values.reshape(-1, columns), 3, mode="nearest").ravel()
+
+
+def described(nearest, best, mean, distance, looks, prior, columns):
+    """The 14 numbers that the looks say of every cell, `(X·Y, 14)`."""
+    cells, odds = len(nearest), scipy.special.expit(nearest)
+    down, right = np.divmod(np.arange(cells), columns)
+    rows = cells // columns
+    y = 2 * down / (rows - 1) - 1 if rows > 1 else 0 * down
+    x = 2 * right / (columns - 1) - 1 if columns > 1 else 0 * right
+    each = [
+        nearest / 2 + 1,
+        best / 2 + 1,
+        mean / 2 + 1,
+        4 * distance,
+        shrunk(blurred(odds, columns, 0.6)),
+        shrunk(blurred(odds, columns, 1.5)),
+        peaks(nearest, columns) / 2 + 1,
+        nearest.max() / 2,
+        best.max() / 2,
+        shrunk(odds.sum()),
+        x**2 + y**2,
+        y,
+        np.log(looks) / 2,
+        prior,
+    ]
+    return np.stack([np.broadcast_to(np.asarray(value, dtype=np.float64), (cells,)) for value in each], -1)
+
+
+def class_odds(model, nearest, best, mean, distance, looks, targets, columns):
+    """Log odds of T classes `(T, X·Y)`, each with the strongest of the others beside it."""
+    answer = []
+    for row in range(len(nearest)):
+        rival = np.delete(nearest, row, 0).max(0)
+        told = described(
+            nearest[row], best[row], mean[row], distance, looks, float(model.prior[targets[row]].detach()), columns
+        )
+        answer.append(nearest[row] + neural(model.read, np.concatenate([told, (rival / 2 + 1)[:, None]], -1)))
+    return np.stack(answer)
+
+
+def emptiness(model, odds, distance, looks, columns, stands_for=None):
+    """Log odds that each cell holds nothing, `(X·Y,)`, from those of the classes `(T, X·Y)`."""
+    share = np.ones(len(odds)) if stands_for is None else np.asarray(stands_for)
+    none = (share[:, None] * scipy.special.log_expit(-odds)).sum(0)
+    anything = 1 - np.exp(none)
+    second, first = np.sort(odds, 0)[-2:]
+    each = [
+        none / 2,
+        shrunk(anything),
+        first / 3,
+        second / 3,
+        shrunk(blurred(anything, columns, 0.6)),
+        shrunk(blurred(anything, columns, 1.5)),
+        shrunk(anything.mean()),
+        4 * distance,
+        np.log(looks) / 2,
+    ]
+    told = np.stack([np.broadcast_to(value, none.shape) for value in each], -1)
+    return none - np.log(np.maximum(anything, 1e-6)) + neural(model.void, told)
+
+
+def gain(model, probabilities, closest, looks, distance):
+    """Expected gain of one look in each cell `(X·Y,)`, cell by cell."""
+    answer = np.zeros(len(closest))
+    for cell, (p, before, now) in enumerate(zip(probabilities, closest, distance, strict=True)):
+        if now < before:
+            second, first = np.sort(p[1:])[-2:]
+            told = [*map(shrunk, (first, second, p[0])), 4 * before, 4 * now, 4 * (before - now), np.log(looks) / 2]
+            answer[cell] = neural(model.worth, told)
+    return answer
+
+
+@pytest.fixture(scope="session")
+def twin():
+    """The networks and what they read, in numpy and scipy."""
+    return SimpleNamespace(
+        array=array,
+        neural=neural,
+        shrunk=shrunk,
+        blurred=blurred,
+        peaks=peaks,
+        described=described,
+        class_odds=class_odds,
+        emptiness=emptiness,
+        gain=gain,
+    )
+
+
+@pytest.fixture
+def random_looks():
+    """Looks at a grid: boxes that overlap, some of them padding; the third look sees nothing."""
+
+    def make(grid=None, looks=4, most=5, components=5, seed=0, dtype=torch.float32):
+        generator = torch.Generator().manual_seed(seed)
+        width, height = (grid or Grid(6, 4, (90, 60))).extent.tolist()
+        size = torch.tensor([width, height], dtype=dtype)
+
+        def draw(*shape):
+            return torch.rand(shape, generator=generator, dtype=torch.float64).to(dtype)
+
+        corner = draw(looks, most, 2) * 0.7 * size
+        boxes = torch.cat([corner, corner + (0.02 + 0.35 * draw(looks, most, 2)) * size], -1)
+        mask = torch.arange(most) < torch.randint(1, most + 1, (looks, 1), generator=generator)
+        mask[2:3] = False
+        return Detections(boxes, (3 * draw(looks, most, components)).softmax(-1), mask)
+
+    return make
+
+
+@pytest.fixture
+def toy_map():
+    """A small model of map evidence, all of whose parameters are drawn at random."""
+
+    def make(components=5, widths=(8, 6), seed=1, metadata=None):
+        generator = torch.Generator().manual_seed(seed)
+        model = MapEvidence(*widths, components=components, metadata=metadata)
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter.copy_(0.6 * torch.randn(parameter.shape, generator=generator))
+        return model.eval()
+
+    return make
+
+
+@pytest.fixture
+def gathered():
+    """What looks say of some episodes and classes, at random; the rows of an episode share their looks."""
+
+    def make(episodes=2, classes=4, cells=24, seed=5, dtype=torch.float64):
+        generator = torch.Generator().manual_seed(seed)
+
+        def draw(*shape):
+            return torch.randn(*shape, generator=generator, dtype=dtype)
+
+        def of_class(values):
+            return values.repeat_interleave(classes, 0)
+
+        rows = episodes * classes
+        nearest = 2 * draw(rows, cells)
+        best, mean = nearest + draw(rows, cells).abs(), draw(rows, cells)
+        distance, looks = of_class(draw(episodes, cells).abs() / 4), of_class(torch.arange(1, episodes + 1).to(dtype))
+        visited = of_class(draw(episodes, cells) > 1)
+        targets = torch.arange(1, classes + 1).repeat(episodes)
+        return Gathered(nearest, best, mean, distance, draw(rows).sigmoid(), looks, visited, targets)
+
+    return make

@@ -1,0 +1,360 @@
+"""The learned map: what it gathers and believes against numpy, look by look; episodes, gradients, dtypes, devices."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import scipy.special
+import torch
+
+from semfov import Detections, FovealObservationModel, Grid
+from semfov.belief import TargetEvidence
+from semfov.belief.belief import probabilities_of
+from semfov.belief.look_features import class_features, highest_score
+from semfov.belief.map_evidence import MapEvidence
+from semfov.belief.observers import LearnedMap, MapBelief, MapLook, Semantic, Target
+from semfov.errors import InputError
+from semfov.gaze.acquisition import KLDivergence
+
+GRID = Grid(6, 4, (90, 60))
+FIXATED = [0, 9, 20, 5]
+FIXATIONS = GRID.centres[FIXATED]
+CLASSES = torch.arange(1, 5)
+
+
+def believe(observer, looks, order, grid=GRID, fixations=FIXATIONS):
+    """The belief of one episode after looks in some order."""
+    belief = observer.start(1, grid, looks.scores)
+    for look in order:
+        part = slice(look, look + 1)
+        belief = observer(belief, looks[part], fixations[part].to(looks.scores), grid)
+    return belief
+
+
+def remember(model, looks, order, twin):
+    """The same in numpy: what is gathered, and the probabilities that are read from it."""
+    fixations, cells = FIXATIONS.to(looks.scores), 24
+    features = class_features(looks, fixations, GRID, CLASSES)
+    said = twin.neural(model.look, twin.array(features))
+    shown = twin.array(highest_score(looks, CLASSES))
+    nearest, best, total = np.zeros((4, cells)), np.full((4, cells), -np.inf), np.zeros((4, cells))
+    closest, weight, score, visited = np.full(cells, np.inf), np.zeros(cells), np.zeros(4), [False] * cells
+    for look in order:
+        for cell in range(cells):
+            distance = float(np.hypot(*(twin.array(GRID.centres)[cell] - twin.array(fixations)[look]))) / 90
+            if distance < closest[cell]:
+                closest[cell], nearest[:, cell] = distance, said[look, :, cell]
+            best[:, cell] = np.maximum(best[:, cell], said[look, :, cell])
+            total[:, cell] += np.exp(-6 * distance) * said[look, :, cell]
+            weight[cell] += np.exp(-6 * distance)
+        score = np.maximum(score, shown[look])
+        visited[FIXATED[look]] = True
+    odds = twin.class_odds(model, nearest, best, total / weight, closest, len(order), [1, 2, 3, 4], 6)
+    nothing = twin.emptiness(model, odds, closest, len(order), 6)
+    probabilities = scipy.special.expit(np.concatenate([nothing[None], odds])).T
+    return {
+        "probabilities": probabilities,
+        "closest": closest,
+        "nearest": nearest,
+        "best": best,
+        "total": total,
+        "weight": weight,
+        "score": score,
+        "looks": float(len(order)),
+        "visited": visited,
+    }
+
+
+@pytest.mark.parametrize("order", [(0,), (2,), (1, 3), (0, 1, 2, 3), (3, 2, 1, 0), (1, 1, 0, 1)], ids=str)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_belief_equals_a_twin_in_numpy(random_looks, toy_map, twin, order, dtype, device):
+    looks, model = random_looks(dtype=dtype), toy_map().to(dtype=dtype)
+    with torch.no_grad():
+        belief = believe(LearnedMap(model).to(device), looks.to(device), order)
+    expected = remember(model.cpu(), looks, order, twin)
+    assert set(expected) == {part.name for part in fields(MapBelief)}
+    close = 2e-4 if dtype == torch.float32 else 1e-6
+    for name, value in expected.items():
+        tensor = getattr(belief, name)
+        assert tensor.device.type == device.type, name
+        assert tensor.dtype in (dtype, torch.bool), name
+        np.testing.assert_allclose(twin.array(tensor[0]), np.asarray(value), atol=close, rtol=close, err_msg=name)
+
+
+def test_belief_before_the_first_look(toy_map, device):
+    like = torch.empty(0, dtype=torch.float64, device=device)
+    belief = LearnedMap(toy_map()).start(2, GRID, like)
+    assert belief.probabilities.shape == (2, 24, 5)
+    assert bool((belief.probabilities == 0.2).all())
+    assert belief.probabilities.dtype == torch.float64
+    assert bool(belief.closest.isinf().all())
+    assert not belief.looks.any()
+    assert not belief.visited.any()
+    for part in fields(MapBelief):
+        assert getattr(belief, part.name).device.type == device.type
+        assert len(getattr(belief, part.name)) == 2
+
+
+def test_belief_tells_of_every_class(random_looks, toy_map):
+    with torch.no_grad():
+        belief = believe(LearnedMap(toy_map()), random_looks(), (0, 1, 3))[torch.tensor([0, 0, 0])]
+    assert probabilities_of(belief) is belief.probabilities
+    assert bool(((belief.probabilities > 0) & (belief.probabilities < 1)).all())
+    for target in range(5):
+        assert torch.equal(belief.probability(target), belief.probabilities[..., target])
+    several = belief.probability(torch.tensor([4, 0, 2]))
+    for row, target in enumerate((4, 0, 2)):
+        assert torch.equal(several[row], belief.probabilities[row, :, target])
+    assert torch.equal(belief.chance(2), belief.probability(2))
+    assert torch.equal(belief.presence(2), belief.probability(2).amax(-1))
+    with pytest.raises(InputError, match="target"):
+        belief.probability(5)
+
+
+def sequence(looks):
+    """Three looks of each of four episodes."""
+    for order in ([0, 1, 2, 3], [1, 2, 3, 0], [3, 3, 0, 2]):
+        index = torch.tensor(order)
+        yield looks[index], FIXATIONS[index]
+
+
+def run(observer, looks, rows=slice(None)):
+    count = len(range(4)[rows])
+    belief = observer.start(count, GRID, looks.scores)
+    for seen, fixation in sequence(looks):
+        belief = observer(belief, seen[rows], fixation[rows], GRID)
+    return belief
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_batch_is_its_episodes_one_by_one(random_looks, toy_map):
+    looks, model = random_looks(), toy_map(widths=(48, 24))
+    with torch.no_grad():
+        batch, joint = run(LearnedMap(model), looks), run(LearnedMap(model, together=True), looks)
+        for row in range(4):
+            alone = run(LearnedMap(model), looks, slice(row, row + 1))
+            for part in fields(MapBelief):
+                mine, one = getattr(batch, part.name)[row : row + 1], getattr(alone, part.name)
+                assert torch.equal(mine, one), part.name
+                torch.testing.assert_close(getattr(joint, part.name)[row : row + 1], one, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_looks_are_weighed_alike_alone_and_in_a_batch(random_looks, toy_map):
+    """To the bit, so that looks can be weighed once and used by many episodes."""
+    looks, model = random_looks(), toy_map(widths=(48, 24))
+    observer = LearnedMap(model)
+    with torch.no_grad():
+        batch = observer.weigh(looks, FIXATIONS, GRID)
+        apart = [observer.weigh(looks[n : n + 1], FIXATIONS[n : n + 1], GRID, target=2) for n in range(4)]
+        near = LearnedMap(model, together=True).weigh(looks, FIXATIONS, GRID)
+    joined = MapLook.join(apart)
+    for part in fields(MapLook):
+        if part.name == "columns":
+            assert batch.columns == joined.columns == 6
+            continue
+        tensor = getattr(batch, part.name)
+        assert torch.equal(tensor, getattr(joined, part.name)), part.name
+        torch.testing.assert_close(getattr(near, part.name), tensor, atol=1e-5, rtol=1e-4)
+        index = torch.tensor([3, 0])
+        assert torch.equal(getattr(batch[index], part.name), tensor[index]), part.name
+        assert torch.equal(getattr(batch[1:3], part.name), tensor[1:3]), part.name
+    assert torch.equal(batch.fixated, torch.tensor(FIXATED))
+    assert torch.equal(batch.targets, CLASSES.expand(4, -1))
+    assert bool((batch.stands_for == 1).all())
+    assert torch.equal(batch.score, highest_score(looks, CLASSES))
+    assert torch.equal(batch.distance, GRID.distance(FIXATIONS))
+
+
+def test_some_of_the_episodes_go_on(random_looks, toy_map):
+    """Beliefs are taken out of a batch, and map and detach reach every tensor."""
+    looks, observer, index = random_looks(), LearnedMap(toy_map()), torch.tensor([2, 0])
+    with torch.no_grad():
+        belief = run(observer, looks)
+        after = observer(belief[index], looks[index], FIXATIONS[index], GRID)
+        whole = observer(belief, looks, FIXATIONS, GRID)
+    for part in fields(MapBelief):
+        assert torch.equal(getattr(belief[index], part.name), getattr(belief, part.name)[index]), part.name
+        assert torch.equal(getattr(belief[1:3], part.name), getattr(belief, part.name)[1:3]), part.name
+        assert torch.equal(getattr(after, part.name), getattr(whole, part.name)[index]), part.name
+    moved = belief.map(lambda tensor: tensor.flip(0))
+    assert isinstance(moved, MapBelief)
+    for part in fields(MapBelief):
+        assert torch.equal(getattr(moved, part.name), getattr(belief, part.name).flip(0)), part.name
+    alive = run(observer, looks)
+    assert alive.probabilities.requires_grad
+    constant = alive.detach()
+    assert not any(getattr(constant, part.name).requires_grad for part in fields(MapBelief))
+    assert torch.equal(constant.probabilities, alive.probabilities)
+    # A belief from before the first look can be taken apart, too.
+    start = observer.start(4, GRID, looks.scores)[index]
+    with torch.no_grad():
+        first = observer(start, looks[index], FIXATIONS[index], GRID)
+    assert first.probabilities.shape == (2, 24, 5)
+
+
+def test_the_order_of_looks_from_other_places_does_not_matter(random_looks, toy_map):
+    looks, observer = random_looks(dtype=torch.float64), LearnedMap(toy_map().double())
+    distance = torch.cdist(GRID.centres.double(), FIXATIONS.double())
+    clear = distance.sort(-1).values.diff().abs()[:, 0] > 1e-6  # cells that are as far from two looks keep the first
+    with torch.no_grad():
+        one, other = believe(observer, looks, (0, 1, 3)), believe(observer, looks, (3, 0, 1))
+    for name in ("best", "total", "weight", "score", "closest", "looks"):
+        torch.testing.assert_close(getattr(one, name), getattr(other, name))
+    torch.testing.assert_close(one.nearest[..., clear], other.nearest[..., clear])
+
+
+def believer():
+    """A model whose evidence is the clipped score of each class, and nothing else."""
+    model = MapEvidence(4, 4, components=4).requires_grad_(False).eval()
+    for parameter in model.parameters():
+        parameter.zero_()
+    # The second feature is log(score · weight) / 4 + 1; GELU of large numbers is the identity, of -large ones nothing.
+    model.look[0].weight[0, 1] = 100
+    model.look[0].bias[0] = -60
+    model.look[2].weight[0, 0] = 1
+    model.look[4].weight[0, 0] = 0.25
+    model.look[4].bias[0] = -4
+    return model
+
+
+def test_several_classes_share_a_cell():
+    """A cup on a table: the cell holds both, and neither takes from the other."""
+    observer, cell = LearnedMap(believer()), 9
+    x, y = GRID.centres[cell].tolist()
+    boxes = torch.tensor([[[x - 7, y - 7, x + 7, y + 7], [x - 7, y - 7, x + 37, y + 7]]])
+    scores = torch.tensor([[[0.02, 0.94, 0.02, 0.02], [0.02, 0.02, 0.94, 0.02]]])
+    both = Detections(boxes, scores, torch.ones(1, 2, dtype=torch.bool))
+    one = Detections(boxes[:, :1], scores[:, :1], both.mask[:, :1])
+    beliefs = {}
+    for name, seen in (("both", both), ("one", one)):
+        belief = observer.start(1, GRID, boxes)
+        for _ in range(3):
+            belief = observer(belief, seen, GRID.centres[[cell]], GRID)
+        beliefs[name] = belief.probabilities[0, cell]
+    assert float(beliefs["both"][1]) > 0.9
+    assert float(beliefs["both"][2]) > 0.85
+    assert float(beliefs["both"].sum()) > 1.5
+    assert float(beliefs["both"][3]) < 0.1
+    assert float(beliefs["both"][0]) < 0.1
+    assert torch.equal(beliefs["one"][1], beliefs["both"][1])
+    assert float(beliefs["one"][2]) < 0.1
+    # A cell where nothing was seen is believed to be empty.
+    assert float(belief.probabilities[0, 23, 0]) > 0.9
+
+
+@pytest.mark.parametrize("grid", [Grid(1, 5, (60, 90)), Grid(5, 1, (90, 60)), Grid(1, 1, (10, 10))], ids=str)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_no_detection_at_all_and_a_single_row(toy_map, grid, dtype, device):
+    """Looks that hold not even padding."""
+    observer = LearnedMap(toy_map().to(device, dtype))
+    nothing = Detections.empty(2, 4, like=torch.empty(0, dtype=dtype, device=device))
+    belief = observer.start(2, grid, nothing.scores)
+    with torch.no_grad():
+        for cell in (0, len(grid) - 1):
+            belief = observer(belief, nothing, grid.centres[[cell, cell]].to(nothing.boxes), grid)
+    assert belief.probabilities.shape == (2, len(grid), 5)
+    assert belief.probabilities.dtype == dtype
+    assert torch.equal(belief.score, nothing.boxes.new_zeros(2, 4))
+    assert bool(((belief.probabilities > 0) & (belief.probabilities < 1)).all())
+
+
+def test_padding_says_nothing(random_looks, toy_map):
+    looks, observer = random_looks(), LearnedMap(toy_map())
+    wide = Detections(
+        torch.cat([looks.boxes, torch.full((4, 2, 4), 30.0)], 1),
+        torch.cat([looks.scores, torch.full((4, 2, 5), 0.9)], 1),
+        torch.cat([looks.mask, torch.zeros(4, 2, dtype=torch.bool)], 1),
+    )
+    with torch.no_grad():
+        assert torch.equal(
+            believe(observer, looks, (0, 2, 1)).probabilities, believe(observer, wide, (0, 2, 1)).probabilities
+        )
+        empty = believe(observer, looks, (2,))
+        none = observer(observer.start(1, GRID, looks.scores), Detections.empty(1, 4), FIXATIONS[2:3], GRID)
+    assert torch.equal(empty.probabilities, none.probabilities)
+
+
+def test_gradients_through_the_scores(toy_map):
+    """Two looks of two episodes at a grid of 3 × 2, on a tiny model."""
+    model, grid = toy_map(components=3, widths=(3, 3)).double().requires_grad_(False), Grid(3, 2, (30, 20))
+    generator = torch.Generator().manual_seed(0)
+    boxes = torch.tensor([[1.0, 2, 17, 18], [12, 1, 29, 13]]).double().expand(2, 2, 4)
+    scores = (2 * torch.randn(2, 2, 2, 3, generator=generator).double()).softmax(-1)
+    mask = torch.tensor([[True, True], [True, False]])
+    fixations = grid.centres[[0, 4]].double()
+
+    def map_of(scores):
+        observer = LearnedMap(model)
+        belief = observer.start(2, grid, scores)
+        for look in range(2):
+            belief = observer(belief, Detections(boxes, scores[look], mask), fixations.roll(look, 0), grid)
+        return belief.probabilities, belief.total
+
+    assert torch.autograd.gradcheck(map_of, scores.requires_grad_(), fast_mode=True)
+
+
+def test_gradients_reach_every_parameter(random_looks, toy_map):
+    model = toy_map().double()
+    looks = random_looks(dtype=torch.float64)
+    belief = LearnedMap(model, together=True).start(4, GRID, looks.scores)
+    for seen, fixation in sequence(looks):
+        belief = LearnedMap(model, together=True)(belief, seen, fixation.double(), GRID)
+    gain = model.gain(belief.probabilities, belief.closest, belief.looks, GRID.cell_distance.double())
+    (belief.probabilities.sum() + gain.sum()).backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        assert bool(parameter.grad.isfinite().all()), name
+        assert float(parameter.grad.abs().sum()) > 0, name
+    # Of the prior, that of the classes: background has none.
+    assert model.prior.grad.nonzero()[:, 0].tolist() == [1, 2, 3, 4]
+
+
+def test_the_prior_of_a_class(random_looks, toy_map):
+    """It changes the odds of its own class, and that nothing is there; no other class."""
+    looks, model = random_looks(), toy_map()
+    with torch.no_grad():
+        before = believe(LearnedMap(model), looks, (0, 1)).probabilities
+        model.prior[3] += 2
+        after = believe(LearnedMap(model), looks, (0, 1)).probabilities
+    same = torch.isclose(before, after, rtol=0, atol=0).all(1)[0]
+    assert same.tolist() == [False, True, True, False, True]
+
+
+def test_graphs(random_looks, toy_map):
+    """One graph, without a break, for the whole of a look; it computes what the eager code does."""
+    looks, observer = random_looks(), LearnedMap(toy_map().requires_grad_(False))
+
+    def look(boxes, scores, mask, fixation):
+        belief = observer.start(4, GRID, scores)
+        belief = observer(belief, Detections(boxes, scores, mask), fixation, GRID)
+        belief = observer(belief, Detections(boxes.flip(0), scores.flip(0), mask), fixation.flip(0), GRID)
+        return belief.probabilities, belief.nearest
+
+    rows = looks.boxes, looks.scores, looks.mask, FIXATIONS
+    torch.compiler.reset()
+    compiled = torch.compile(look, fullgraph=True, backend="eager")
+    for got, expected in zip(compiled(*rows), look(*rows), strict=True):
+        torch.testing.assert_close(got, expected, atol=1e-5, rtol=1e-4)
+    vectorised = torch.func.vmap(look, in_dims=(None, 0, None, None))(
+        looks.boxes, torch.stack([looks.scores, looks.scores.flip(1)]), looks.mask, FIXATIONS
+    )
+    for got, expected in zip(vectorised, look(*rows), strict=True):
+        torch.testing.assert_close(got[0], expected, atol=1e-5, rtol=1e-4)
+
+
+def test_others_have_another_belief(toy_map, random_looks):
+    looks, observer = random_looks(), LearnedMap(toy_map())
+    said, belief = observer.weigh(looks, FIXATIONS, GRID), observer.start(4, GRID, looks.scores)
+    semantic, target = Semantic(5), Target(TargetEvidence(4, 4, components=5))
+    with pytest.raises(InputError, match="belief: expected MapBelief, got DirichletBelief"):
+        observer.update(semantic.start(4, GRID, looks.scores), said)
+    with pytest.raises(InputError, match="look: expected MapLook, got SemanticLook"):
+        observer.update(belief, semantic.weigh(looks, FIXATIONS, GRID))
+    with pytest.raises(InputError, match="look"):
+        target.update(target.start(4, GRID, looks.scores), said)
+    observation = FovealObservationModel.identity(["a", "b", "c", "d"], [0.2])
+    with pytest.raises(InputError, match="belief: expected a belief about all classes \\(DirichletBelief\\)"):
+        KLDivergence(observation, GRID)(belief, torch.zeros(4, 24, dtype=torch.bool))
+    assert observer.thresholds is None
+    assert not observer.by_target

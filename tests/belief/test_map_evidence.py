@@ -1,0 +1,282 @@
+"""Learned evidence for a map: log odds, emptiness and gain against numpy, and files."""
+
+import numpy as np
+import pytest
+import torch
+
+from semfov import Grid
+from semfov.belief.look_features import class_features
+from semfov.belief.map_evidence import MapEvidence
+from semfov.errors import DataError, InputError
+from semfov.io.storage import write
+
+GRID = Grid(6, 4, (90, 60))
+
+
+def draw(*shape, seed=3):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_evidence_of_looks_is_a_network_of_their_features(random_looks, toy_map, twin):
+    model, looks, fixations = (
+        toy_map().double(),
+        random_looks(dtype=torch.float64),
+        GRID.centres[[0, 9, 20, 5]].double(),
+    )
+    targets = torch.tensor([4, 1])
+    got = model(looks, fixations, GRID, targets)
+    assert got.shape == (4, 2, 24)
+    features = class_features(looks, fixations, GRID, targets)
+    np.testing.assert_allclose(twin.array(got), twin.neural(model.look, twin.array(features)), atol=1e-12)
+
+
+@pytest.mark.parametrize("classes", [2, 4])
+@pytest.mark.parametrize("columns", [1, 6, 24])
+def test_every_class_is_read_beside_its_strongest_rival(toy_map, gathered, twin, classes, columns):
+    model, said = toy_map().double(), gathered(classes=classes)
+    got = model.log_odds(said, columns, classes)
+    assert got.shape == (2, classes, 24)
+    for episode in range(2):
+        rows = slice(episode * classes, (episode + 1) * classes)
+        expected = twin.class_odds(
+            model,
+            *(twin.array(getattr(said, name)[rows]) for name in ("nearest", "best", "mean")),
+            twin.array(said.distance[rows][0]),
+            float(said.looks[rows][0]),
+            said.target[rows].tolist(),
+            columns,
+        )
+        np.testing.assert_allclose(twin.array(got[episode]), expected, atol=1e-6)
+
+
+def test_a_rival_matters_in_its_own_cell_alone(toy_map, gathered):
+    """The strongest other class: raising the second changes the odds of the first; raising the third, nothing."""
+    model, said = toy_map().double(), gathered(episodes=1)
+    with torch.no_grad():
+        model.read[0].weight[:, :-1] = 0  # it reads the rival, and nothing else
+    before = model.log_odds(said, 6, 4)[0]
+    order = said.nearest[:, 7].argsort(descending=True)
+    changes = []
+    for rank in range(4):
+        changed = said.nearest.clone()
+        # The order of the classes stays.
+        changed[order[rank], 7] += 0.1 * (said.nearest[order[rank - 1], 7] - changed[order[rank], 7]) if rank else 0.1
+        after = model.log_odds(type(said)(changed, *[getattr(said, name) for name in REST]), 6, 4)[0]
+        moved = (after - changed - before + said.nearest).abs() > 1e-12
+        assert not moved[:, [c for c in range(24) if c != 7]].any()
+        changes.append({int(row) for row in moved[:, 7].nonzero()[:, 0]})
+    first, second, third, fourth = order.tolist()
+    assert changes == [{second, third, fourth}, {first}, set(), set()]
+
+
+REST = ("best", "mean", "distance", "score", "looks", "visited", "target")
+
+
+def test_rivals_that_are_equal(toy_map, gathered):
+    """Of two classes with the same evidence each is the other's rival."""
+    model, said = toy_map().double(), gathered(episodes=1, classes=2)
+    nearest = said.nearest[:1].expand(2, -1)
+    same = [getattr(said, name)[:1].expand(2, *getattr(said, name).shape[1:]) for name in REST]
+    odds = model.log_odds(type(said)(nearest, *same), 6, 2)[0]
+    torch.testing.assert_close(odds[0], odds[1])
+
+
+@pytest.mark.parametrize("columns", [1, 6, 24])
+@pytest.mark.parametrize("stands_for", [None, [1.0, 1, 9.5, 2]], ids=["all", "some"])
+def test_emptiness_equals_numpy(toy_map, twin, columns, stands_for):
+    model, odds, distance = toy_map().double(), 2 * draw(2, 4, 24) - 2, draw(2, 24, seed=4).abs() / 3
+    looks = torch.tensor([1.0, 7.0], dtype=torch.float64)
+    share = None if stands_for is None else torch.tensor([stands_for] * 2).double()
+    got = model.emptiness(odds, distance, looks, columns, share)
+    assert got.shape == (2, 24)
+    for row in range(2):
+        expected = twin.emptiness(
+            model, twin.array(odds[row]), twin.array(distance[row]), float(looks[row]), columns, stands_for
+        )
+        np.testing.assert_allclose(twin.array(got[row]), expected, atol=1e-6)
+
+
+def test_a_class_that_stands_for_several_counts_as_often(toy_map):
+    """The same as if it were given so many times, wherever it is not the most probable one."""
+    model, distance, looks = toy_map().double(), draw(2, 24, seed=4).abs(), torch.tensor([2.0, 5.0]).double()
+    odds = 2 * draw(2, 4, 24)
+    odds[:, 2:] -= 2
+    times = torch.tensor([1, 1, 4, 3])
+    repeated = odds.repeat_interleave(times, 1)
+    assert repeated.shape == (2, 9, 24)
+    got = model.emptiness(odds, distance, looks, 6, times.double().expand(2, -1))
+    expected = model.emptiness(repeated, distance, looks, 6)
+    one_for_all = odds.argmax(1) < 2
+    assert 0.5 < float(one_for_all.double().mean()) < 1
+    torch.testing.assert_close(got[one_for_all], expected[one_for_all])
+    assert torch.equal(
+        model.emptiness(odds, distance, looks, 6, torch.ones(2, 4)), model.emptiness(odds, distance, looks, 6)
+    )
+
+
+def test_emptiness_without_a_correction_is_that_no_class_is_there(toy_map):
+    model = toy_map().double()
+    with torch.no_grad():
+        model.void[-1].weight.zero_()
+        model.void[-1].bias.zero_()
+    odds = draw(2, 4, 24)
+    got = model.emptiness(odds, draw(2, 24).abs(), torch.ones(2).double(), 6).sigmoid()
+    torch.testing.assert_close(got, (1 - odds.sigmoid()).prod(1))
+
+
+def test_certain_cells_are_finite():
+    """Log odds as large as they come, in float32."""
+    model = MapEvidence(4, 4, components=4)
+    odds = torch.tensor([-200.0, -40, 0, 40, 200]).expand(1, 3, -1).requires_grad_()
+    got = model.emptiness(odds, torch.zeros(1, 5), torch.ones(1), 5)
+    assert bool(got.isfinite().all())
+    got.sum().backward()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("wide", [False, True], ids=["same for all", "of each"])
+def test_gain_equals_a_loop(toy_map, twin, dtype, wide, device):
+    model = toy_map().to(device, dtype)
+    generator = torch.Generator().manual_seed(0)
+    probabilities = torch.rand(3, 24, 5, generator=generator).to(device, dtype)
+    closest = torch.rand(3, 24, generator=generator).to(device, dtype) / 2
+    looks = torch.tensor([1.0, 4, 9], device=device, dtype=dtype)
+    distance = GRID.cell_distance[[3, 8, 17, 20]].to(device, dtype)
+    per_episode = torch.stack([distance, 2 * distance, distance.flip(0)])
+    got = model.gain(probabilities, closest, looks, per_episode if wide else distance)
+    assert got.shape == (3, 4, 24)
+    assert got.dtype == dtype
+    for episode in range(3):
+        for fixation in range(4):
+            where = per_episode[episode, fixation] if wide else distance[fixation]
+            expected = twin.gain(
+                model,
+                twin.array(probabilities[episode]),
+                twin.array(closest[episode]),
+                float(looks[episode]),
+                twin.array(where),
+            )
+            np.testing.assert_allclose(twin.array(got[episode, fixation]), expected, atol=1e-5)
+
+
+def test_no_gain_where_no_look_comes_nearer(toy_map):
+    model = toy_map().double()
+    probabilities, looks = torch.rand(1, 24, 5).double(), torch.ones(1).double()
+    distance = GRID.cell_distance.double()
+    closest = distance[[0, 13]].amin(0, keepdim=True)
+    got = model.gain(probabilities, closest, looks, distance)[0]
+    assert not got[[0, 13]].any()
+    assert torch.equal(got != 0, distance < closest)
+    assert not model.gain(probabilities, 0 * closest, looks, distance).any()
+
+
+def test_gradients(toy_map, gathered):
+    model, said = toy_map().double().requires_grad_(False), gathered()
+
+    def everything(nearest, best, mean, distance, closest):
+        odds = model.log_odds(type(said)(nearest, best, mean, distance, *late(said)), 6, 4)
+        nothing = model.emptiness(odds, closest, said.looks[::4], 6, torch.tensor([[1.0, 1, 2, 3]] * 2).double())
+        probabilities = torch.cat([nothing[:, None], odds], 1).sigmoid().transpose(1, 2)
+        return odds, nothing, model.gain(probabilities, closest, said.looks[::4], GRID.cell_distance[[2, 9]].double())
+
+    values = [said.nearest, said.best, said.mean, said.distance, said.distance[::4] + 0.01]
+    assert torch.autograd.gradcheck(everything, [value.clone().requires_grad_() for value in values], fast_mode=True)
+
+
+def late(said):
+    return said.score, said.looks, said.visited, said.target
+
+
+def test_saved_and_loaded_is_the_same(tmp_path, toy_map, gathered):
+    model = toy_map(widths=(7, 5), metadata={"detector": {"name": "toy"}, "sensor": {}, "training": {"steps": 3}})
+    path = tmp_path / "model.safetensors"
+    model.save(path)
+    loaded = MapEvidence.from_pretrained(path)
+    assert loaded.metadata == model.metadata
+    assert loaded.widths == (7, 5)
+    assert loaded.prior.shape == (5,)
+    assert not loaded.training
+    for name, tensor in model.state_dict().items():
+        assert torch.equal(tensor, loaded.state_dict()[name]), name
+    said = gathered(dtype=torch.float32)
+    with torch.no_grad():
+        assert torch.equal(model.log_odds(said, 6, 4), loaded.log_odds(said, 6, 4))
+    loaded.save(tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == path.read_bytes()
+    loaded.check_compatible({"detector": {"name": "toy"}, "sensor": {}})
+    with pytest.raises(InputError, match=r"model of map evidence.*fitted for 'toy'"):
+        loaded.check_compatible({"detector": {"name": "other"}, "sensor": {}})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda record, tensors: record.pop("components"),
+        lambda record, tensors: record.pop("widths"),
+        lambda record, tensors: record.pop("metadata"),
+        lambda record, tensors: record.update(components=9),
+        lambda record, tensors: record.update(components="many"),
+        lambda record, tensors: record.update(widths=[8, 7]),
+        lambda record, tensors: record.update(widths=8),
+        lambda record, tensors: tensors.pop("prior"),
+        lambda record, tensors: tensors.pop("void.0.weight"),
+        lambda record, tensors: tensors.pop("worth.4.bias"),
+        lambda record, tensors: tensors.update(more=torch.zeros(1)),
+    ],
+    ids=[
+        "no components",
+        "no widths",
+        "no metadata",
+        "classes",
+        "no number",
+        "widths",
+        "one width",
+        "no prior",
+        "no emptiness",
+        "no gain",
+        "one tensor more",
+    ],
+)
+def test_files_that_are_not_whole_are_refused(tmp_path, toy_map, change):
+    model = toy_map()
+    record = {"kind": model.kind, "version": "0", **model._record(), "metadata": {}}
+    tensors = {name: tensor.detach() for name, tensor in model.state_dict().items()}
+    change(record, tensors)
+    path = tmp_path / "old.safetensors"
+    write(path, tensors, record)
+    with pytest.raises(DataError, match=r"old\.safetensors: not a complete model of map evidence"):
+        MapEvidence.from_pretrained(path)
+
+
+def test_files_of_another_kind_and_damaged_ones_are_refused(tmp_path, toy_map):
+    model = toy_map()
+    tensors = {name: tensor.detach() for name, tensor in model.state_dict().items()}
+    other = tmp_path / "other.safetensors"
+    write(other, tensors, {"kind": "target-evidence", "version": "0", **model._record(), "metadata": {}})
+    with pytest.raises(DataError, match=r"other\.safetensors"):
+        MapEvidence.from_pretrained(other)
+    model.save(tmp_path / "whole.safetensors")
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes((tmp_path / "whole.safetensors").read_bytes()[:-40])
+    with pytest.raises(DataError, match=r"cut\.safetensors"):
+        MapEvidence.from_pretrained(cut)
+    with pytest.raises(DataError):
+        MapEvidence.from_pretrained(tmp_path / "none.safetensors")
+    with pytest.raises(InputError, match="yolox-nano"):
+        MapEvidence.from_pretrained("yolox-nan")
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in MapEvidence.shipped.glob("*.safetensors")))
+def test_shipped_maps_load(name):
+    model = MapEvidence.from_pretrained(name)
+    assert not model.training
+    assert name.startswith(model.metadata["detector"]["name"])
+    assert model.prior.shape == (81,)
+    assert {"detector", "sensor", "training"} <= set(model.metadata)
+    for key, tensor in model.state_dict().items():
+        assert bool(tensor.isfinite().all()), key
+        assert float(tensor.abs().sum()) > 0, key
+
+
+def test_a_map_is_shipped():
+    assert (MapEvidence.shipped / "yolox-nano.safetensors").is_file()

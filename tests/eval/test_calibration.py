@@ -1,0 +1,113 @@
+"""`python -m eval.calibration` as a user runs it: small, on the embedded scenes, with the real detector."""
+
+import csv
+import json
+
+import pytest
+import torch
+
+from eval.calibration import CalibrationConfig, main
+from semfov.belief import MapEvidence, TargetEvidence
+from semfov.experiments.config import DetectorConfig, SensorConfig
+from semfov.experiments.setup import make_eye
+from semfov.metrics.calibration import BinarySums
+
+BELIEFS = ["raw", "published", "tempered", "learned", "learned map"]
+FILES = ("beliefs.md", "beliefs.csv", "beliefs.json")
+
+
+@pytest.fixture(scope="module")
+def arguments(tmp_path_factory):
+    """Of a run of two scenes on 5 × 4 cells, by untrained models."""
+    folder = tmp_path_factory.mktemp("calibration")
+    settings = make_eye(DetectorConfig(), SensorConfig()).settings()
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        TargetEvidence(8, 6, metadata=settings).save(folder / "target.safetensors")
+        MapEvidence(8, 6, metadata=settings).save(folder / "map.safetensors")
+    return [
+        "--data.limit", "2", "--fixations", "1", "--grid", "[5,4]", "--target_area", "0.5",
+        "--target_model", str(folder / "target.safetensors"), "--map_model", str(folder / "map.safetensors"),
+        "--cache", str(folder / "cache"),
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def finished(arguments, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    threads = torch.get_num_threads()
+    assert main([*arguments, "--workers", "1", "--out", str(out)]) == 0
+    torch.set_num_threads(threads)
+    return out
+
+
+@pytest.mark.weights
+def test_run_leaves_tables_sums_and_figures(finished):
+    for name in ("calibration.md", "config.yaml", "reliability.png", "beliefs.png", *FILES):
+        assert (finished / name).stat().st_size > 200
+    rows = list(csv.DictReader((finished / "beliefs.csv").read_text().splitlines()))
+    whole = [row for row in rows if row["cells"] == "all"]
+    assert [(row["belief"], row["looks"]) for row in whole] == [(b, n) for b in BELIEFS for n in ("1", "5", "15")]
+    # Two scenes, a class that is there and one that is not: 4 searches of 20 cells.
+    assert {row["count"] for row in whole} == {"80"}
+    assert {row["count"] for row in rows if (row["looks"], row["cells"]) == ("15", "fixated")} == {"60"}
+    text = (finished / "beliefs.md").read_text()
+    assert "4 searches" in text
+    assert "2 for a class that is there" in text
+    assert "half of the classes are there" in text
+    by_looks = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|"]
+    for row in whole:
+        figures = [f"{float(row[name]):.4f}" for name in ("nll", "brier", "ece", "mean_probability", "rate")]
+        shown = next(line for line in by_looks if line[:2] == [row["looks"], row["belief"]])
+        assert [float(value) for value in shown[3:]] == pytest.approx([float(f) for f in figures], abs=1.01e-4)
+
+
+@pytest.mark.weights
+def test_sums_in_the_file_add_up_to_the_figures(finished):
+    told = json.loads((finished / "beliefs.json").read_text())
+    assert told["edges"] == BinarySums.EDGES.tolist()
+    rows = list(csv.DictReader((finished / "beliefs.csv").read_text().splitlines()))
+    assert len(rows) == len(told["sums"])
+    for row, each in zip(rows, told["sums"], strict=True):
+        assert (row["belief"], int(row["looks"]), row["cells"]) == (each["belief"], each["looks"], each["cells"])
+        sums = BinarySums.from_record(each)
+        assert (float(row["nll"]), float(row["ece"])) == pytest.approx((sums.nll, sums.ece), abs=1e-6)
+        parts = [s for s in told["sums"] if (s["belief"], s["looks"]) == (each["belief"], each["looks"])]
+        if each["cells"] == "all":
+            assert sums.count == sum(BinarySums.from_record(s).count for s in parts) / 2
+
+
+@pytest.mark.weights
+def test_finished_scenes_are_not_judged_again(finished, arguments, tmp_path):
+    """Workers change no bit; a damaged part is computed again."""
+    threads = torch.get_num_threads()
+    assert main([*arguments, "--workers", "2", "--out", str(tmp_path)]) == 0
+    for name in FILES:
+        assert (tmp_path / name).read_bytes() == (finished / name).read_bytes()
+    first, second = sorted(tmp_path.glob("parts/*/*.json"))
+    kept = first.stat().st_mtime_ns
+    second.write_text(second.read_text()[:-40])
+    assert main([*arguments, "--workers", "1", "--out", str(tmp_path)]) == 0
+    torch.set_num_threads(threads)
+    assert first.stat().st_mtime_ns == kept
+    for name in FILES:
+        assert (tmp_path / name).read_bytes() == (finished / name).read_bytes()
+
+
+@pytest.mark.weights
+def test_scores_may_be_judged_alone(arguments, tmp_path, capsys):
+    assert main([*arguments, "--beliefs", "false", "--workers", "1", "--out", str(tmp_path)]) == 0
+    assert "classwise ECE" in capsys.readouterr().out
+    assert not list(tmp_path.glob("beliefs*"))
+    assert not (tmp_path / "parts").exists()
+
+
+def test_help_and_defaults(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--help"])
+    assert stopped.value.code == 0
+    printed = capsys.readouterr().out
+    assert "--target_model" in printed
+    assert "how well beliefs say which cells hold the target" in printed.replace("\n", " ")
+    assert CalibrationConfig().beliefs
+    assert CalibrationConfig().grid == (10, 10)

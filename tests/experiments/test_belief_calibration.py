@@ -1,0 +1,206 @@
+"""Beliefs judged along searches: sums against loops over cells, beliefs followed by hand, models that are not there."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from semfov import DataError, InputError
+from semfov.belief import MapEvidence, TargetEvidence
+from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov.episode import StoredLooks, rollout
+from semfov.experiments.belief_calibration import BANDS, CELLS, LOOKS, BeliefCalibrationRun, published_model
+from semfov.experiments.belief_calibration_report import add_up, curves, landings, pooled, write_belief_report
+from semfov.experiments.config import (
+    BeliefConfig,
+    DataConfig,
+    DetectorConfig,
+    ProtocolConfig,
+    SearchConfig,
+    SensorConfig,
+)
+from semfov.experiments.run import finish
+from semfov.experiments.search_protocol import choose_classes
+from semfov.experiments.seeds import generator_for, noise_for
+from semfov.experiments.setup import make_eye
+from semfov.gaze.acquisition import TargetPosterior
+from semfov.gaze.choice import Greedy, drawn_from
+from semfov.metrics.calibration import BinarySums
+from semfov.observation.foveal import FovealObservationModel
+
+BELIEFS = ["raw", "published", "tempered", "learned", "learned map"]
+
+
+def write_models(folder):
+    """Untrained models that fit the default eye."""
+    settings = make_eye(DetectorConfig(), SensorConfig()).settings()
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        for kind, name in ((TargetEvidence, "target"), (MapEvidence, "map")):
+            kind(8, 6, metadata=settings).save(folder / f"{name}.safetensors")
+    return {f"{name}_model": str(folder / f"{name}.safetensors") for name in ("target", "map")}
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("beliefs")
+    return SearchConfig(
+        data=DataConfig(limit=2, max_target_area=0.5),
+        belief=BeliefConfig(columns=4, rows=3, **write_models(folder)),
+        protocol=ProtocolConfig(shifts=LOOKS[-1] - 1),
+        cache=folder / "cache",
+        out=folder / "out",
+        workers=1,
+    )
+
+
+@pytest.fixture(scope="module")
+def run(config):
+    return BeliefCalibrationRun(config)
+
+
+def by_hand(run, target, path, detections, grid):
+    """Probabilities `(looks, X·Y)` of each belief after every look of a path, without a loop of episodes."""
+    model = FovealObservationModel.from_pretrained("yolov3-tiny")
+    observers = {
+        "raw": Semantic(81),
+        "published": Semantic(81, model),
+        "tempered": Semantic(81, tempering=0.5),
+        "learned": Target(run.models.evidence),
+        "learned map": LearnedMap(run.models.map),
+    }
+    told = {}
+    for name, observer in observers.items():
+        belief, told[name] = observer.start(1, grid, detections.scores), []
+        for cell in path:
+            belief = observer(belief, detections[cell : cell + 1], grid.centres[cell : cell + 1], grid, target)
+            told[name].append(belief.probability(target)[0])
+    return told
+
+
+@pytest.mark.weights
+def test_sums_are_those_of_beliefs_followed_by_hand(run):
+    assert list(run.observers) == BELIEFS
+    assert run.left_out == {}
+    for index in range(2):
+        records, seconds = run.outcomes(index)
+        assert set(seconds) == {"look", "believe"}
+        annotation, grid, scene = run.scenes.annotation(index), run.grid(index), run.scenes.ids[index]
+        assert [r["target"] for r in records] == choose_classes(run.scenes, index, annotation, 1, 0.5, 0)
+        assert [r["present"] for r in records] == [True, False]
+        detections = run.detections(index)
+        for record in records:
+            target = record["target"]
+            goal = grid.footprint(annotation.boxes)[annotation.labels == target].any(0)
+            start = torch.randint(12, (1,), generator=generator_for("start", 0, scene, target))
+            noise = noise_for(run.config.protocol, 12, scene, target, 0)[None]
+            looks = StoredLooks(detections, grid, torch.tensor([target]))
+            with torch.inference_mode():
+                choice = Greedy(drawn_from(noise))
+                steps = rollout(looks, Target(run.models.evidence), TargetPosterior(target), start, choice, most=15)
+                path = [int(step.cell) for step in steps]
+                told = by_hand(run, target, path, detections, grid)
+            # All 12 cells are fixated before there are 15 looks.
+            assert sorted(path) == list(range(12))
+            for name in BELIEFS:
+                judged = record["beliefs"][name]
+                assert list(judged["looks"]) == ["1", "5"]
+                for looked in (1, 5):
+                    seen, p = path[:looked], told[name][looked - 1]
+                    groups = {cell: [] for cell in CELLS}
+                    for cell in range(12):
+                        closest = min(math.dist(grid.centres[cell], grid.centres[f]) for f in seen) / max(grid.size)
+                        band = sum(closest > edge for edge in BANDS)
+                        groups[CELLS[0 if cell in seen else 1 + band]].append((float(p[cell]), bool(goal[cell])))
+                    got = judged["looks"][str(looked)]
+                    assert set(got) == {name for name, cells in groups.items() if cells}
+                    for group, cells in groups.items():
+                        if cells:
+                            sums = BinarySums.from_record(got[group])
+                            assert sums.count == len(cells)
+                            assert sums.nll * len(cells) == pytest.approx(
+                                sum(-math.log(q if y else 1 - q) for q, y in cells), rel=1e-4
+                            )
+                            assert sums.brier * len(cells) == pytest.approx(
+                                sum((q - y) ** 2 for q, y in cells), rel=1e-4
+                            )
+                            assert sums.bins[2].sum() == sum(y for _, y in cells)
+                hit = next((number for number, cell in enumerate(path) if goal[cell]), 0)
+                if hit == 0:
+                    assert judged["landing"] is record["seen"] is None
+                else:
+                    pair = [float(told[name][number][path[hit]]) for number in (hit - 1, hit)]
+                    assert judged["landing"] == pytest.approx(pair, abs=1e-5)
+                    look = detections[path[hit] : path[hit] + 1]
+                    over = grid.footprint(look.boxes)[0, :, path[hit]] & look.mask[0]
+                    best = [int(scores.argmax()) for scores, there in zip(look.scores[0], over, strict=True) if there]
+                    assert record["seen"] == (target in best)
+
+
+@pytest.mark.weights
+def test_a_model_that_is_not_shipped_leaves_its_belief_out(config, run, tmp_path, monkeypatch):
+    for kind in (TargetEvidence, MapEvidence):
+        monkeypatch.setattr(kind, "shipped", tmp_path)
+    bare = BeliefCalibrationRun(replace(config, belief=BeliefConfig(columns=4, rows=3), out=tmp_path))
+    assert list(bare.observers) == BELIEFS[:3]
+    assert bare.guide == "tempered"
+    assert bare.key != run.key
+    finish(bare, "believing")
+    text, written = write_belief_report(bare)
+    assert all(path.stat().st_size > 200 for path in written)
+    assert "Left out for want of a fitted model: learned (unknown model of target evidence 'yolov3-tiny'" in text
+    assert "Left out for want of a fitted model: learned map (unknown model of map evidence 'yolov3-tiny'" in text
+    assert "The gaze goes by the tempered belief" in text
+    with pytest.raises(InputError, match="unknown model of map evidence 'mine'"):
+        BeliefCalibrationRun(replace(config, belief=replace(config.belief, map_model="mine")))
+
+
+@pytest.mark.weights
+def test_nothing_to_search_for_is_told(config, tmp_path):
+    empty = BeliefCalibrationRun(replace(config, data=DataConfig(limit=1, max_target_area=1e-9), out=tmp_path))
+    finish(empty, "believing")
+    with pytest.raises(DataError, match="raise target_area"):
+        write_belief_report(empty)
+
+
+def test_the_published_belief_has_the_model_of_its_sensor():
+    known, other = DetectorConfig("yolox-nano"), DetectorConfig("yolov3")
+    assert published_model(known, SensorConfig("published-narrow")) == "yolox-nano-published-narrow"
+    assert published_model(known, SensorConfig("gradual")) is None
+    assert published_model(other, SensorConfig("published")) is None
+
+
+def cells(*pairs):
+    """A record of cells with these probabilities, each with whether it holds the target."""
+    return BinarySums.of(torch.tensor([p for p, _ in pairs]), torch.tensor([y for _, y in pairs])).record()
+
+
+def test_searches_add_up_by_belief_looks_and_group():
+    searches = [
+        {
+            "seen": True,
+            "beliefs": {
+                "a": {"looks": {"1": {"fixated": cells((0.9, True)), CELLS[1]: cells((0.2, False))}}, "landing": [0, 1]}
+            },
+        },
+        {
+            "seen": False,
+            "beliefs": {"a": {"looks": {"1": {"fixated": cells((0.5, False), (0.7, True))}}, "landing": [0.5, 0.25]}},
+        },
+        {"seen": None, "beliefs": {"a": {"looks": {"1": {CELLS[2]: cells((0.1, False))}}, "landing": None}}},
+    ]
+    sums = add_up(searches)
+    assert {key: each.count for key, each in sums.items()} == {
+        ("a", 1, "fixated"): 3,
+        ("a", 1, CELLS[1]): 1,
+        ("a", 1, CELLS[2]): 1,
+    }
+    every = pooled(sums, "a", 1)
+    assert (every.count, every.rate) == (5, 0.4)
+    assert every.brier == pytest.approx((0.01 + 0.04 + 0.25 + 0.09 + 0.01) / 5)
+    panels, errors = curves(sums)
+    assert torch.equal(panels["after 1 look"]["a"], every.bins)
+    assert errors == {"a": {group: sums["a", 1, group].ece for group in CELLS[:3]}}
+    means = ["3", "0.250 → 0.625"]
+    assert landings(searches) == [["a", "2", means[1], "1", "0.000 → 1.000", "1", "0.500 → 0.250"]]

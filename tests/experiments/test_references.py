@@ -1,0 +1,115 @@
+"""What one sharp look gives: painted and fused maps against loops, and the counts of maps."""
+
+import numpy as np
+import pytest
+import torch
+
+from semfov import Detections, Grid
+from semfov.experiments.exploration_protocol import counts_of
+from semfov.experiments.references import FUSED, PAINTED, sharp_maps
+
+GRID = Grid(5, 4, (100, 60))
+
+
+def seen(seed=0, most=6, dtype=torch.float32, device=None):
+    generator = torch.Generator().manual_seed(seed)
+    corner = torch.rand(1, most, 2, generator=generator) * torch.tensor([75.0, 45])
+    boxes = torch.cat([corner, corner + 2 + torch.rand(1, most, 2, generator=generator) * 35], -1)
+    scores = (5 * torch.rand(1, most, 4, generator=generator)).softmax(-1)
+    mask = torch.rand(1, most, generator=generator) < 0.7
+    return Detections(boxes.to(device, dtype), scores.to(device, dtype), mask.to(device))
+
+
+def covers(box, cell):
+    left, top = cell % 5 * 20, cell // 5 * 15
+    return box[0] < left + 20 and box[2] > left and box[1] < top + 15 and box[3] > top
+
+
+def each_detection(sharp):
+    rows = zip(sharp.boxes[0].tolist(), sharp.scores[0].tolist(), sharp.mask[0].tolist(), strict=True)
+    return [(box, scores) for box, scores, real in rows if real]
+
+
+def kaplan(beta, likelihood):
+    """Equation 7 of Luzio, Bernardino and Moreno (2024)."""
+    expected = (beta * likelihood).sum()
+    return beta * (1 + likelihood / expected) / (1 + likelihood.min() / expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("seed", range(4))
+def test_maps_equal_loops(seed, dtype, device):
+    sharp = seen(seed, dtype=dtype, device=device)
+    maps = sharp_maps(sharp, GRID)
+    assert set(maps) == {FUSED, PAINTED}
+    for probabilities in maps.values():
+        assert probabilities.shape == (1, 20, 4)
+        assert probabilities.dtype == dtype
+        assert probabilities.device.type == device.type
+    for cell in range(20):
+        painted, beta = [0.2, 0.0, 0.0, 0.0], np.full(4, 0.5)
+        for box, scores in each_detection(sharp):
+            if covers(box, cell):
+                painted[1:] = [max(pair) for pair in zip(painted[1:], scores[1:], strict=True)]
+                beta = kaplan(beta, np.array(scores))
+        assert maps[PAINTED][0, cell].tolist() == pytest.approx(painted, abs=1e-6)
+        assert maps[FUSED][0, cell].tolist() == pytest.approx((beta / beta.sum()).tolist(), abs=1e-5)
+
+
+@pytest.mark.parametrize("most", [0, 3])
+def test_nothing_was_detected(most):
+    nothing = Detections(torch.zeros(1, most, 4), torch.rand(1, most, 4), torch.zeros(1, most, dtype=torch.bool))
+    maps = sharp_maps(nothing, GRID)
+    expected = torch.tensor([0.2, 0, 0, 0]).expand(1, 20, -1)
+    torch.testing.assert_close(maps[PAINTED], expected)
+    torch.testing.assert_close(maps[FUSED], torch.full((1, 20, 4), 0.25))
+
+
+def test_background_is_painted_where_no_score_is_higher():
+    box = torch.tensor([[[1.0, 1, 19, 14], [21, 1, 39, 14]]])
+    scores = torch.tensor([[[0.6, 0.19, 0.11, 0.1], [0.6, 0.21, 0.1, 0.09]]])
+    painted = sharp_maps(Detections(box, scores, torch.ones(1, 2, dtype=torch.bool)), GRID)[PAINTED][0]
+    assert painted.argmax(-1).tolist() == [0, 1] + [0] * 18
+
+
+def counted(probabilities, answers):
+    """Cell by cell: the most probable class, where there is one, is an object's; or background where nothing is."""
+    totals = [0, 0, 0]
+    for p, right in zip(probabilities.tolist(), answers.tolist(), strict=True):
+
+        def best(values):
+            return values.index(max(values)) if values.count(max(values)) == 1 else None
+
+        named, without = best(p), best(p[1:])
+        totals[0] += named is not None and right[named]
+        totals[1] += without is not None and right[without + 1]
+        totals[2] += named is not None and (right[named] if named else not any(right))
+    return totals
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_counts_equal_a_loop(seed, device):
+    """Ties among them: rounded probabilities often share the first place."""
+    generator = torch.Generator().manual_seed(seed)
+    probabilities = (torch.rand(6, 40, 4, generator=generator) * 4).round() / 4
+    probabilities[0] = torch.rand(40, 4, generator=generator)
+    answers = torch.rand(40, 4, generator=generator) < 0.3
+    answers[:, 0] = False
+    got = counts_of(probabilities.to(device), answers.to(device))
+    assert [tuple(each.shape) for each in got] == [(6,)] * 3
+    expected = [counted(rows, answers) for rows in probabilities]
+    assert torch.stack(got, 1).tolist() == expected
+    assert all(sum(column) > 0 for column in zip(*expected, strict=True))
+
+
+def test_counts_of_maps_that_know_all_and_nothing():
+    answers = torch.zeros(10, 4, dtype=torch.bool)
+    answers[:6, 1] = answers[4:7, 3] = True
+    perfect = answers.float()
+    perfect[:, 0] = (~answers.any(-1)).float()
+    perfect[4:6, 3] = 0.5  # two objects share these cells; either will do
+    empty = torch.zeros(10, 4)
+    empty[:, 0] = 1
+    even = torch.full((10, 4), 0.25)
+    got = torch.stack(counts_of(torch.stack([perfect, empty, even]), answers), 1)
+    assert got.tolist() == [[7, 7, 10], [0, 0, 3], [0, 0, 0]]

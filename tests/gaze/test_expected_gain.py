@@ -1,0 +1,197 @@
+"""Exploration by a learned map: expected gain against a loop, its policy, and the policies that a map can go with."""
+
+import pytest
+import torch
+
+from semfov import Detections, FovealObservationModel, Grid
+from semfov.agent import Strategy
+from semfov.belief import MapEvidence, TargetEvidence
+from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov.errors import InputError
+from semfov.experiments.candidates import Models, make_strategy
+from semfov.experiments.config import BeliefConfig, PolicyConfig
+from semfov.experiments.presets import label, presets, resolve
+from semfov.gaze.acquisition import CloserLook, ExpectedGain
+from semfov.gaze.policies import POLICIES, Closer, Gain, Means, Random, named_policy, policy_names
+
+GRID = Grid(5, 4, (50, 40))
+
+
+@pytest.fixture
+def model():
+    generator = torch.Generator().manual_seed(1)
+    model = MapEvidence(5, 4, components=4)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.copy_(0.6 * torch.randn(parameter.shape, generator=generator))
+    return model.requires_grad_(False).eval()
+
+
+def belief_of(model, dtype=torch.float32, device=None):
+    """What three episodes believe after two looks."""
+    generator = torch.Generator().manual_seed(0)
+    corner = torch.rand(3, 4, 2, generator=generator) * 30
+    boxes = torch.cat([corner, corner + 3 + torch.rand(3, 4, 2, generator=generator) * 15], -1)
+    scores = (3 * torch.rand(3, 4, 4, generator=generator)).softmax(-1)
+    seen = Detections(boxes.to(device, dtype), scores.to(device, dtype), torch.ones(3, 4, dtype=bool, device=device))
+    observer = LearnedMap(model)
+    belief, visited = observer.start(3, GRID, seen.scores), torch.zeros(3, 20, dtype=torch.bool, device=device)
+    for cells in ([0, 7, 19], [4, 8, 2]):
+        belief = observer(belief, seen, GRID.centres[cells].to(seen.boxes), GRID)
+        visited[[0, 1, 2], cells] = True
+    return belief, visited
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_gain_is_summed_over_all_cells(model, dtype, device):
+    model = model.to(device, dtype)
+    belief, visited = belief_of(model, dtype, device)
+    acquisition = ExpectedGain(model, GRID).to(device)
+    got = acquisition(belief, visited)
+    assert got.shape == (3, 20)
+    assert got.dtype == dtype
+    assert got.device.type == device.type
+    for episode in range(3):
+        one = belief[episode : episode + 1]
+        for fixation in range(20):
+            distance = GRID.distance(GRID.centres[fixation])[None].to(one.closest)
+            total = 0.0
+            for cell in range(20):
+                nearer = float(distance[0, cell]) < float(one.closest[0, cell]) - 1e-6
+                told = model.gain(one.probabilities, one.closest, one.looks, distance)[0, 0, cell]
+                assert nearer == (float(told) != 0)
+                total += float(told)
+            assert float(got[episode, fixation]) == pytest.approx(total, abs=1e-4)
+    # Another look from where the gaze has been brings nothing.
+    assert not got[visited].any()
+    assert bool((got[~visited] != 0).all())
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_gain_of_a_batch_is_that_of_its_episodes(model):
+    belief, visited = belief_of(model)
+    acquisition = ExpectedGain(model, GRID)
+    whole = acquisition(belief, visited)
+    for row in range(3):
+        assert torch.equal(acquisition(belief[row : row + 1], visited[row : row + 1])[0], whole[row])
+
+
+def test_other_beliefs_are_refused(model):
+    acquisition, visited = ExpectedGain(model, GRID), torch.zeros(1, 20, dtype=torch.bool)
+    like = torch.empty(0)
+    for observer in (Semantic(4), Target(TargetEvidence(4, 4, components=4))):
+        belief = observer.start(1, GRID, like)
+        with pytest.raises(InputError, match=f"belief: expected MapBelief, got {type(belief).__name__}"):
+            acquisition(belief, visited)
+
+
+def test_closer_looks_take_a_learned_map(model):
+    """What is not known of a cell is what its most probable object leaves of all objects."""
+    belief, visited = belief_of(model)
+    got = CloserLook(GRID, 0.2)(belief, visited)
+    for episode in range(3):
+        for fixation in range(20):
+            total = 0.0
+            for cell in range(20):
+                p = belief.probabilities[episode, cell, 1:].tolist()
+                away = float(GRID.cell_distance[fixation, cell])
+                before = float((1 - belief.closest[episode, cell] / 0.2).clamp(max=0).exp())
+                now = float((1 - torch.tensor(away) / 0.2).clamp(max=0).exp())
+                total += max(now - before, 0) * (1 - max(p) / sum(p))
+            assert float(got[episode, fixation]) == pytest.approx(total, abs=1e-5)
+
+
+def test_policy_is_registered(model):
+    assert POLICIES["expected-gain"] is Gain
+    assert "expected-gain" in policy_names("exploration")
+    assert "expected-gain" not in policy_names("search")
+    policy = named_policy("expected-gain", "exploration", Means(map=model))
+    assert isinstance(policy, Gain)
+    assert policy.model is model
+    acquisition = policy(None, GRID)
+    assert isinstance(acquisition, ExpectedGain)
+    belief, visited = belief_of(model)
+    assert torch.equal(acquisition(belief, visited), ExpectedGain(model, GRID)(belief, visited))
+    for means in (None, Means()):
+        with pytest.raises(InputError, match="policy 'expected-gain': expected a learned map, got none"):
+            named_policy("expected-gain", "exploration", means)
+    with pytest.raises(InputError, match="expected-gain"):
+        named_policy("expected-gain", "search", Means(map=model))
+    assert [name for name, kind in POLICIES.items() if kind.needs_map] == ["expected-gain"]
+
+
+LEARNED = {
+    "random-learned": PolicyConfig("random", "learned"),
+    "closer-look-learned": PolicyConfig("closer-look", "learned"),
+    "expected-gain-learned": PolicyConfig("expected-gain", "learned"),
+    "vocus2-learned": PolicyConfig("saliency", "learned", saliency="vocus2"),
+    "itti-koch-learned": PolicyConfig("saliency", "learned", saliency="itti-koch"),
+}
+
+
+def test_presets_of_learned_maps():
+    known = presets("exploration")
+    assert {name: known[name] for name in LEARNED} == LEARNED
+    assert resolve("recommended", "exploration") == LEARNED["closer-look-learned"]
+    for name, policy in LEARNED.items():
+        assert resolve(name, "exploration") == resolve(policy, "exploration") == policy
+        assert label(name, "exploration") == label(policy, "exploration") == name
+    assert not any(policy.scores == "learned" for policy in presets("search").values())
+    for name in policy_names("exploration"):
+        if POLICIES[name].needs_model:
+            assert f"{name}-learned" not in known
+
+
+@pytest.mark.parametrize("policy", ["kl", "negative-entropy", "surprise", "two-peaks"])
+def test_policies_that_are_about_dirichlets_are_refused_by_name(policy):
+    """They need an observation model of the scores, or a Dirichlet belief, and a learned map has neither."""
+    if f"{policy}-learned" in presets("exploration"):
+        pytest.fail(f"{policy} is about a Dirichlet belief")
+    with pytest.raises(
+        InputError, match=f"^scores: expected 'raw' or 'calibrated' for policy '{policy}', got 'learned'"
+    ):
+        resolve(PolicyConfig(policy, "learned"), "exploration")
+    with pytest.raises(InputError, match="policy"):
+        resolve(f"{policy}-learned", "exploration")
+
+
+@pytest.mark.parametrize("scores", ["raw", "calibrated"])
+def test_expected_gain_goes_by_a_learned_map_alone(scores):
+    with pytest.raises(InputError, match=f"^scores: expected 'learned' for policy 'expected-gain', got '{scores}'"):
+        resolve(PolicyConfig("expected-gain", scores), "exploration")
+    with pytest.raises(InputError, match="policy"):
+        resolve(f"expected-gain-{scores}", "exploration")
+
+
+def test_searches_have_no_learned_map():
+    for policy in ("random", "non-predictive", "target-evidence"):
+        with pytest.raises(InputError, match=f"^scores: .*'{policy}', got 'learned'"):
+            resolve(PolicyConfig(policy, "learned"), "search")
+    with pytest.raises(InputError, match="policy"):
+        resolve(PolicyConfig("expected-gain", "learned"), "search")
+
+
+@pytest.mark.parametrize(
+    "setting", [{"tempering": 0.5}, {"footprint": "soft"}, {"memory": "closest"}, {"misses": True}], ids=str
+)
+@pytest.mark.parametrize("policy", sorted(LEARNED))
+def test_settings_of_another_belief_are_refused(policy, setting):
+    own = LEARNED[policy]
+    with pytest.raises(InputError, match=f"^{next(iter(setting))}: expected none, .*comes with its own belief"):
+        resolve(PolicyConfig(own.policy, "learned", saliency=own.saliency, **setting), "exploration")
+
+
+def test_strategies_of_learned_maps(model):
+    def strategy(name, **models):
+        return make_strategy(resolve(name, "exploration"), "exploration", BeliefConfig(), 4, Models(**models), 0.15)
+
+    for name, kind in zip(LEARNED, (Random, Closer, Gain, Random, Random), strict=True):
+        made = strategy(name, map=model)
+        assert isinstance(made, Strategy)
+        assert isinstance(made.observer, LearnedMap)
+        assert made.observer.model is model
+        assert not made.observer.together
+        assert isinstance(made.policy, kind)
+        with pytest.raises(InputError, match="expected a learned map, got none"):
+            strategy(name, observation=FovealObservationModel.identity(["a", "b", "c"], [0.2]))
+    assert strategy("closer-look-learned", map=model).policy.fovea == 0.15

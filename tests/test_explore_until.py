@@ -1,0 +1,169 @@
+"""Explorations by a learned map that end when no look is worth its price."""
+
+import math
+
+import pytest
+import torch
+
+from semfov import ActivePerception, Foveation, Grid
+from semfov.agent import PRICE
+from semfov.belief import MapEvidence
+from semfov.belief.observers import LearnedMap, Semantic
+from semfov.detection import Candidates, Detector
+from semfov.errors import InputError
+from semfov.eye import Eye
+from semfov.gaze.policies import Closer, Gain, NonPredictive, Random
+
+SIZE = (160, 120)
+
+
+class Square(Detector):
+    """Detects the bounding box of what is red; its score is how saturated it is."""
+
+    def __init__(self) -> None:
+        super().__init__("square", ("red", "green"), SIZE)
+
+    def propose(self, canvas):
+        colour = canvas[0, 0] - canvas[0, 1]
+        ys, xs = (colour > 0.1).nonzero(as_tuple=True)
+        if not len(xs):
+            return Candidates(canvas.new_zeros(1, 0, 4), canvas.new_zeros(1, 0, 2))
+        box = torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas)
+        return Candidates(box[None, None], torch.stack([colour.max().clamp(0, 1), colour.new_tensor(0)])[None, None])
+
+
+@pytest.fixture
+def image():
+    picture = torch.full((3, 120, 160), 0.4)
+    picture[:, 8:28, 8:28] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
+    return picture
+
+
+@pytest.fixture
+def model():
+    """Evidence at random; a look gains 0.1 of a cell wherever it comes nearer."""
+    generator = torch.Generator().manual_seed(2)
+    model = MapEvidence(4, 4, components=3).requires_grad_(False).eval()
+    for parameter in model.parameters():
+        parameter.copy_(0.4 * torch.randn(parameter.shape, generator=generator))
+    model.worth[-1].weight.zero_()
+    model.worth[-1].bias.fill_(0.1)
+    return model
+
+
+def agent_of(model, policy=None, grid=(5, 4)):
+    eye, observer = Eye(Foveation(40.0), Square(), reference=160.0), LearnedMap(model)
+    return ActivePerception(eye, (Semantic(3), NonPredictive()), (observer, policy or Closer(0.25)), grid=grid)
+
+
+def worths(model, scanpath):
+    """After every look the most cells that another one is expected to gain, loop by loop."""
+    grid, answer = scanpath.grid, []
+    for number in range(len(scanpath)):
+        before = scanpath.cells[: number + 1].tolist()
+        best = -math.inf
+        for fixation in set(range(len(grid))) - set(before):
+            nearer = 0
+            for cell in range(len(grid)):
+                now = math.dist(grid.centres[cell].tolist(), grid.centres[fixation].tolist())
+                nearer += all(
+                    math.dist(grid.centres[cell].tolist(), grid.centres[f].tolist()) > now + 1e-3 for f in before
+                )
+            best = max(best, 0.1 * nearer)
+        answer.append(best)
+    return answer
+
+
+@pytest.mark.parametrize("policy", [None, Random()], ids=["closer-look", "random"])
+def test_exploration_ends_when_no_look_is_worth_its_price(model, image, policy):
+    agent = agent_of(model, policy)
+    whole = agent.explore(image, start=0, shifts=12, until=0, seed=1)
+    assert len(whole) == 13
+    assert whole.ending == "shifts"
+    expected = worths(model, whole)
+    assert max(expected) > 4 * min(expected)
+    lengths = set()
+    for price in (0.15, 0.25, 0.35, 0.55, 0.85, 5.0):
+        part = agent.explore(image, start=0, shifts=12, until=price, seed=1)
+        last = next((number for number, worth in enumerate(expected) if worth < price), None)
+        assert part.ending == ("shifts" if last is None else "price")
+        assert len(part) == (13 if last is None else last + 1)
+        assert torch.equal(part.cells, whole.cells[: len(part)])
+        assert torch.equal(part.probabilities, whole.probabilities[: len(part)])
+        assert part.target is None
+        assert part.decision is None
+        assert not part.found
+        lengths.add(len(part))
+    assert len(lengths) >= 4
+    assert 1 in lengths
+
+
+def test_going_by_the_gain_the_chosen_look_has_it(model, image):
+    """The values of the last look tell that none is worth it, those of the looks before that one is."""
+    agent = agent_of(model, Gain(model))
+    scanpath = agent.explore(image, start=7, shifts=19, until=0.25)
+    assert scanpath.ending == "price"
+    for number, values in enumerate(scanpath.values):
+        left = values.clone()
+        left[scanpath.cells[: number + 1]] = -math.inf
+        assert (float(left.max()) < 0.25) == (number == len(scanpath) - 1)
+        assert float(left.max()) == pytest.approx(worths(model, scanpath)[number], abs=1e-5)
+
+
+def test_a_price_of_none_is_the_default(model, image):
+    agent = agent_of(model)
+    model.worth[-1].bias.fill_(PRICE / 3.5)
+    free, default, same = (agent.explore(image, start=0, shifts=19, until=until, seed=3) for until in (0, None, PRICE))
+    assert free.ending == "cells"
+    assert default.ending == same.ending == "price"
+    assert torch.equal(default.cells, same.cells)
+    assert 1 < len(default) < len(free) == 20
+
+
+@pytest.mark.parametrize("gain", [0.0, -1.0])
+def test_a_price_of_nothing_never_ends_it(model, image, gain):
+    model.worth[-1].bias.fill_(gain)
+    agent = agent_of(model)
+    assert agent.explore(image, start=0, shifts=3, until=0).ending == "shifts"
+    assert len(agent.explore(image, start=0, shifts=30, until=0)) == 20
+    assert len(agent.explore(image, start=0, shifts=30, until=0.01)) == 1
+    assert len(agent.explore(image, start=0, shifts=30)) == 1
+
+
+@pytest.mark.parametrize("until", [0, 1e-6])
+def test_all_cells_were_fixated(model, image, until):
+    """That is why it ends, whatever a look costs: each of them was worth it."""
+    scanpath = agent_of(model, grid=(3, 2)).explore(image, shifts=30, until=until)
+    assert sorted(scanpath.cells.tolist()) == list(range(6))
+    assert scanpath.ending == "cells"
+
+
+def test_exploration_of_no_shift(model, image):
+    assert agent_of(model).explore(image, start=0, shifts=0, until=0.1).ending == "shifts"
+    assert agent_of(model).explore(image, start=0, shifts=0, until=1e3).ending == "price"
+
+
+def test_map_of_a_search_is_the_learned_one(model, image):
+    agent = agent_of(model)
+    scanpath = agent.search(image, "green", start=3, shifts=3)
+    grid, observer = Grid(5, 4, SIZE), LearnedMap(model)
+    belief = observer.start(1, grid, image)
+    for number, fixation in enumerate(scanpath.fixations):
+        belief = observer(belief, scanpath.detections[number], fixation[None], grid)
+        torch.testing.assert_close(belief.probabilities[0], scanpath.probabilities[number])
+    assert scanpath.ending == "shifts"
+
+
+def test_only_a_learned_map_tells_what_a_look_will_bring(image):
+    eye = Eye(Foveation(40.0), Square(), reference=160.0)
+    agent = ActivePerception(eye, (Semantic(3), NonPredictive()), (Semantic(3), Random()), grid=(5, 4))
+    with pytest.raises(InputError, match=r"^until: expected None, .*learned map"):
+        agent.explore(image, until=0.1)
+    assert agent.explore(image, shifts=2).ending == agent.explore(image, shifts=2, until=0).ending == "shifts"
+    assert agent.explore(image, shifts=50).ending == "cells"
+
+
+@pytest.mark.parametrize("until", [-0.1, math.inf, math.nan])
+def test_prices_that_make_no_sense_are_refused(model, image, until):
+    with pytest.raises(InputError, match="until: expected a price in cells, 0 or more"):
+        agent_of(model).explore(image, until=until)

@@ -1,0 +1,148 @@
+"""What a map names: regions against scipy, marginal probabilities, and the figure."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import scipy.ndimage
+import torch
+
+from eval import demo
+from semfov import Detections, Grid, Scanpath
+from semfov.viz import entropy, plot_semantic_map
+from semfov.viz.belief import named_regions, regions
+
+CLASSES = ("background", "cat", "cup", "dog")
+
+
+def scanpath_of(probabilities, columns, classes=CLASSES):
+    """An exploration whose map was `(n, X·Y, K+1)`."""
+    looks, cells = probabilities.shape[:2]
+    grid = Grid(columns, cells // columns, (10 * columns, 10 * (cells // columns)))
+    order = torch.arange(looks)
+    return Scanpath(
+        grid=grid,
+        classes=classes,
+        target=None,
+        cells=order,
+        fixations=grid.centres[order],
+        detections=(Detections.empty(1, len(classes) - 1),) * looks,
+        probabilities=probabilities,
+        values=torch.rand(looks, cells),
+        found=False,
+        seconds=({"detect": 0.001},) * looks,
+    )
+
+
+def labelled(table):
+    """Connected regions of each class, by scipy."""
+    found = set()
+    for label in set(table.ravel().tolist()) - {0}:
+        parts, count = scipy.ndimage.label(table == label)
+        found |= {(label, tuple(np.flatnonzero(parts == part).tolist())) for part in range(1, count + 1)}
+    return found
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (6, 7), (12, 10)], ids=str)
+@pytest.mark.parametrize("classes", [1, 2, 4])
+def test_regions_are_those_of_scipy(shape, classes):
+    for seed in range(6):
+        table = torch.randint(classes + 1, shape, generator=torch.Generator().manual_seed(seed))
+        found = regions(table)
+        assert {(int(table.flatten()[cells[0]]), tuple(cells)) for cells in found} == labelled(table.numpy())
+        assert all(cells == sorted(cells) for cells in found)
+        assert sorted(cell for cells in found for cell in cells) == table.flatten().nonzero()[:, 0].tolist()
+
+
+def test_regions_of_nothing_and_of_everything():
+    assert regions(torch.zeros(3, 4, dtype=torch.long)) == []
+    assert regions(torch.full((3, 4), 2)) == [list(range(12))]
+    snake = torch.tensor([[1, 1, 1], [0, 0, 1], [1, 1, 1], [1, 0, 0], [1, 1, 1]])
+    assert [len(cells) for cells in regions(snake)] == [11]
+
+
+@pytest.mark.parametrize("count", [2, 4, 12])
+@pytest.mark.parametrize("marginal", [True, False])
+def test_named_regions_equal_a_loop(count, marginal):
+    """An object that is more probable than background, and than the lesser of a half and thrice an even share."""
+    classes = ("background", *(f"class {number}" for number in range(1, count)))
+    for seed in range(5):
+        generator = torch.Generator().manual_seed(seed)
+        probabilities = torch.rand(2, 42, count, generator=generator) ** 3
+        if not marginal:
+            probabilities = probabilities / probabilities.sum(-1, keepdim=True)
+        scanpath = scanpath_of(probabilities, 7, classes)
+        for fixation in (0, 1, -1):
+            table = np.zeros(42, dtype=int)
+            for cell, (nothing, *objects) in enumerate(probabilities[fixation].tolist()):
+                if max(objects) > nothing and max(objects) > min(0.5, 3 / count):
+                    table[cell] = 1 + objects.index(max(objects))
+            expected = {
+                (classes[label], cells, max(float(probabilities[fixation, c, label]) for c in cells))
+                for label, cells in labelled(table.reshape(6, 7))
+            }
+            named = named_regions(scanpath, fixation)
+            assert {(name, tuple(cells), chance) for name, cells, chance in named} == expected
+            sizes = [len(cells) for _, cells, _ in named]
+            assert sizes == sorted(sizes, reverse=True)
+        assert named_regions(scanpath) == named_regions(scanpath, 1)
+
+
+def marginal_map():
+    """A cup on a table of cats: cells that hold two, cells that hold nothing; 6 × 4 cells after 3 looks."""
+    probabilities = torch.full((3, 24, 4), 0.02)
+    probabilities[..., 0] = 0.9
+    probabilities[-1, 7:11, 0] = 0.05
+    probabilities[-1, 7:11, 1] = torch.tensor([0.7, 0.8, 0.95, 0.6])
+    probabilities[-1, 8:10, 2] = torch.tensor([0.75, 0.9])
+    probabilities[-1, 23] = torch.tensor([0.3, 0.1, 0.1, 0.55])
+    probabilities[-1, 0] = torch.tensor([0.1, 0.1, 0.1, 0.52])
+    return scanpath_of(probabilities, 6)
+
+
+def test_figure_of_marginal_probabilities():
+    scanpath = marginal_map()
+    for image in (None, torch.rand(3, 40, 60)):
+        figure = plot_semantic_map(scanpath, image=image)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            figure.canvas.draw()
+        named, unsure = figure.axes[:2]
+        np.testing.assert_allclose(
+            named.images[-1].get_array(), scanpath.probabilities[-1, :, 1:].amax(-1).reshape(4, 6), rtol=1e-6
+        )
+        assert named.images[-1].get_clim() == pytest.approx((0, 0.95))
+        np.testing.assert_allclose(unsure.images[-1].get_array(), entropy(scanpath)[-1].reshape(4, 6), rtol=1e-6)
+        assert sorted(text.get_text() for text in named.texts if text.get_text() in CLASSES) == ["cat", "dog", "dog"]
+
+
+def test_entropy_of_marginal_probabilities_is_that_of_their_shares():
+    scanpath = marginal_map()
+    got = entropy(scanpath)
+    assert got.shape == (3, 24)
+    for look in range(3):
+        for cell in range(24):
+            p = scanpath.probabilities[look, cell].double().tolist()
+            expected = -sum(value / sum(p) * math.log2(value / sum(p)) for value in p)
+            assert float(got[look, cell]) == pytest.approx(expected, abs=1e-5)
+    assert float(got.max()) <= 2
+
+
+def test_demo_tells_what_is_where():
+    """A line for each class: all its cells, its highest probability and where that is."""
+    lines = demo.told("picture", marginal_map()).splitlines()
+    start = lines.index("what is where:")
+    assert lines[start + 1 : start + 3] == [
+        "  cat: 4 cells, p up to 0.95 at (3, 1)",
+        "  dog: 2 cells, p up to 0.55 at (5, 3)",
+    ]
+
+
+def test_demo_tells_that_nothing_is_there():
+    empty = torch.tensor([0.9, 0.3, 0.2, 0.1]).expand(2, 24, -1)
+    told = demo.told("picture", scanpath_of(empty, 6))
+    assert told.rstrip().endswith("what is where:\n  nothing that is more probable than background")
+    one = empty.clone()
+    one[-1, 5, 2] = 0.97
+    assert "  cup: 1 cell, p up to 0.97 at (5, 0)" in demo.told("picture", scanpath_of(one, 6)).splitlines()
