@@ -5,10 +5,13 @@ and started again; what it leaves is compared with what a run leaves that nobody
 
 - `store`: `eval.search` from the first look: what is seen from every cell is kept in a store;
 - `evaluation`: `eval.explore` with its store there, while it runs policies and writes its report;
-- `fit`: `train.fit_fom` from the first look to the fitted model.
+- `fit`: `train.fit_fom` from the first look to the fitted model;
+- `workers`: `store` with two worker processes;
+- `reports`: `evaluation` with all its outcomes there, while it writes its report.
 
-Runs are forked from one process that has imported everything, so that kills hit work and not the start of Python. A run
-that was faster than its kill does not count; the next is given another moment.
+After each kill no process of the run may be left. Runs are forked from one process that has imported everything, so
+that kills hit work and not the start of Python. A run that was faster than its kill does not count; the next is given
+another moment.
 
 python -m benchmarks.faults --kills 50
 """
@@ -24,6 +27,7 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,6 +53,11 @@ _FIT = [
 ]  # fmt: skip
 
 
+def _two(arguments: list[str]) -> list[str]:
+    """The arguments with two workers."""
+    return [*arguments, "--workers", "2"]
+
+
 @dataclass(frozen=True)
 class Command:
     """A command and what it must leave.
@@ -59,6 +68,7 @@ class Command:
         arguments: without folders.
         results: files of `out` that must be the same to the last bit.
         stored: whether the store is there already.
+        finished: whether the outcomes are there already, too.
     """
 
     name: str
@@ -66,6 +76,7 @@ class Command:
     arguments: tuple[str, ...]
     results: tuple[str, ...]
     stored: bool = False
+    finished: bool = False
 
     def run(self, folder: Path) -> None:
         """Run in this process, in silence; it does not return."""
@@ -93,6 +104,8 @@ COMMANDS = (
     Command("store", search, tuple(_SEARCH), (*_RECORDS, "cumulative_performance.png")),
     Command("evaluation", explore, tuple(_EXPLORE), (*_RECORDS, "success_rate_all_classes.png"), stored=True),
     Command("fit", fit, tuple(_FIT), ("yolov3-tiny.safetensors", "report.md", "counts.csv")),
+    Command("workers", search, tuple(_two(_SEARCH)), _RECORDS),
+    Command("reports", explore, tuple(_EXPLORE), (*_RECORDS, "report.html"), stored=True, finished=True),
 )
 
 
@@ -106,6 +119,7 @@ class Survived:
         progress: for each kill, files that were there, finished.
         remains: for each kill, unfinished files that were left behind.
         identical: kills after which the result is that of the undisturbed run.
+        left: processes of killed runs that were still there ten seconds later.
     """
 
     seconds: float
@@ -113,6 +127,7 @@ class Survived:
     progress: list[int]
     remains: list[int]
     identical: int
+    left: int
 
 
 def survive(command: Command, kills: int, seed: int = 0) -> Survived:
@@ -126,11 +141,14 @@ def survive(command: Command, kills: int, seed: int = 0) -> Survived:
         if command.stored:
             finish(fork.Process(target=command.run, args=(whole,)))
             (whole / "cache").rename(cache / "cache")
+            if command.finished:
+                (cache / "out").mkdir()
+                (whole / "out" / "parts").rename(cache / "out" / "parts")
             shutil.rmtree(whole)
         shutil.copytree(cache, whole)
         seconds = finish(fork.Process(target=command.run, args=(whole,)))
         expected = command.digest(whole)
-        spared, identical = 0, 0
+        spared, identical, left = 0, 0, 0
         progress: list[int] = []
         remains: list[int] = []
         while len(progress) < kills:
@@ -138,8 +156,10 @@ def survive(command: Command, kills: int, seed: int = 0) -> Survived:
             process = fork.Process(target=command.run, args=(here,))
             process.start()
             process.join(chance.random() * seconds)
+            children = descendants(process.pid or 0)
             process.kill()
             process.join()
+            left += still_there(children)
             if process.exitcode == -signal.SIGKILL:
                 files = [file for file in here.rglob("*") if file.is_file()]
                 parts = sum(file.suffix == ".part" for file in files)
@@ -150,7 +170,32 @@ def survive(command: Command, kills: int, seed: int = 0) -> Survived:
             else:
                 spared += 1
             shutil.rmtree(here)
-    return Survived(seconds, spared, progress, remains, identical)
+    return Survived(seconds, spared, progress, remains, identical, left)
+
+
+def descendants(number: int) -> list[int]:
+    """Processes that a process started, and those that they did (on Linux; elsewhere none are known)."""
+    found: list[int] = []
+    for path in Path("/proc").glob(f"{number}/task/*/children"):
+        with suppress(OSError):
+            for child in map(int, path.read_text().split()):
+                found += [child, *descendants(child)]
+    return found
+
+
+def still_there(numbers: list[int], seconds: float = 10.0) -> int:
+    """How many of these processes do not end within some time."""
+    deadline = time.monotonic() + seconds
+    while (alive := [number for number in numbers if _alive(number)]) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return len(alive)
+
+
+def _alive(number: int) -> bool:
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def finish(process: "multiprocessing.context.ForkProcess") -> float:
@@ -171,14 +216,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the figures here too")
     options = parser.parse_args()
-    print("| run | s | kills | finished files then | unfinished | same bits after |")
-    print("|---|---|---|---|---|---|", flush=True)
+    print("| run | s | kills | finished files then | unfinished | processes left | same bits after |")
+    print("|---|---|---|---|---|---|---|", flush=True)
     figures = {}
     for command in [c for c in COMMANDS if options.only is None or c.name in options.only]:
         came = survive(command, options.kills, options.seed)
         figures[command.name] = came.__dict__
         files = f"{min(came.progress)} to {max(came.progress)}"
-        cells = [f"{came.seconds:.1f}", options.kills, files, sum(came.remains), came.identical]
+        cells = [f"{came.seconds:.1f}", options.kills, files, sum(came.remains), came.left, came.identical]
         print(f"| {command.name} | {' | '.join(map(str, cells))} |", flush=True)
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + "\n")

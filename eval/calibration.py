@@ -35,6 +35,7 @@ from semfov.experiments.config import (
 from semfov.experiments.parallel import rank
 from semfov.experiments.run import finish
 from semfov.experiments.samples import Samples, SampleSettings, collect
+from semfov.experiments.settings import Count, Seed, Settings, Share, Side, Workers
 from semfov.experiments.setup import make_observation, plain
 from semfov.experiments.summary import announce, save_figure, table
 from semfov.io.files import write_text
@@ -43,7 +44,7 @@ from semfov.viz import plot_reliability
 
 
 @dataclass(frozen=True)
-class CalibrationConfig:
+class CalibrationConfig(Settings):
     """Judge how well scores, and beliefs in a target, agree with what is there.
 
     Args:
@@ -70,17 +71,17 @@ class CalibrationConfig:
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     model: str | None = None
-    fixations: int = 6
-    iou: float = 0.5
-    seed: int = 0
+    fixations: Count = 6
+    iou: Share = 0.5
+    seed: Seed = 0
     beliefs: bool = True
-    grid: tuple[int, int] = (10, 10)
+    grid: tuple[Side, Side] = (10, 10)
     target_model: str | None = None
     map_model: str | None = None
-    target_area: float = 0.2
+    target_area: Share = 0.2
     out: Path = Path("runs/calibration")
     cache: Path | None = None
-    workers: int | None = None
+    workers: Workers | None = None
 
 
 def judge(config: CalibrationConfig) -> None:

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ from semfov import ActivePerception, Scanpath, viz
 from semfov.data.sources import Picture, embedded_picture, open_pictures
 from semfov.errors import check, lookup
 from semfov.experiments.command import run_command
+from semfov.experiments.settings import Range, Seed, Settings, Share, Shifts, Weight, Whole
 from semfov.experiments.summary import save_figure
 from semfov.report.episode import Pool, episode_data
 from semfov.report.page import write_page
@@ -38,7 +39,7 @@ PHOTO = "photograph, folder of photographs or video (none: an embedded scene)"
 
 
 @dataclass(frozen=True)
-class DemoConfig:
+class DemoConfig(Settings):
     """Watch the agent search a photograph for a class, or explore it.
 
     Args:
@@ -69,18 +70,18 @@ class DemoConfig:
     photo: Path | None = None
     target: str | None = None
     explore: bool = False
-    camera: int | None = None
+    camera: Whole | None = None
     agent: Literal["recommended", "published", "raw"] = "recommended"
     detector: str = "yolov3-tiny"
     sensor: SensorName | None = None
-    start: int | None = None
-    shifts: int | None = None
-    confirm: float | None = None
-    give_up: float | None = None
-    price: float | None = None
-    until: float | None = None
-    seed: int = 0
-    frames: int = 4
+    start: Whole | None = None
+    shifts: Shifts | None = None
+    confirm: Share | None = None
+    give_up: Share | None = None
+    price: Weight | None = None
+    until: Weight | None = None
+    seed: Seed = 0
+    frames: Annotated[int, Range(1, 100_000)] = 4
     report: Path | None = None
     out: Path = Path("runs/demo")
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from eval.explore import explore
 from eval.page import paper
+from eval.page.curves import OBJECTS
 from eval.page.experiments import CENTRAL, STUDIES, ResultsConfig, experiments
 from eval.page.figures import draw_figures
 from eval.page.findings import findings
@@ -26,7 +27,7 @@ from eval.page.tables import (
     finished,
     first_fixations,
     paired,
-    paired_objects,
+    paired_maps,
     photographs,
     readings,
     study_table,
@@ -104,7 +105,8 @@ TABLES: dict[str, Callable[[Path], list[str]]] = {
     "paired-learned": partial(paired, baseline=label(CENTRAL, "search"), shifts=(1, 5, 10, 15, 30)),
     "paired-explore": partial(paired, baseline="random-raw", shifts=EXPLORED),
     "paired-explore-calibrated": partial(paired, baseline="random-calibrated", shifts=EXPLORED),
-    "paired-explore-objects": paired_objects,
+    "paired-map": paired_maps,
+    "paired-map-objects": partial(paired_maps, field=OBJECTS),
 }
 """Tables of one experiment."""
 

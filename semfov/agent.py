@@ -17,7 +17,7 @@ from semfov.decision import conclude, decide, decide_by_price
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.episode import LiveLooks, Step, rollout
-from semfov.errors import InputError, check, check_shape, lookup
+from semfov.errors import InputError, check, check_pixels, check_shape, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.acquisition import ExpectedGain
 from semfov.gaze.choice import Greedy, drawn_by
@@ -33,6 +33,10 @@ PUBLISHED_SENSORS = ("published", "published-narrow")
 
 PRICE = 0.1
 """How many more cells a look must be expected to name right, for an exploration by a learned map to go on."""
+
+
+MOST_SHIFTS = 10_000
+"""More gaze shifts than any episode has."""
 
 
 class Strategy(nn.Module):
@@ -295,6 +299,9 @@ class ActivePerception(nn.Module):
         """The image as a batch of one, and the grid over it."""
         image = image[None] if image.ndim == 3 else image
         check_shape(image, "image", 1, 3, None, None)
+        own = self.eye.sensor.sigma.dtype
+        check(image.dtype == own, "image", f"{own} as the agent is", image.dtype)
+        check_pixels(image, "image")
         return image, Grid(self.columns, self.rows, (image.shape[-1], image.shape[-2]))
 
     def _gaze(
@@ -309,10 +316,12 @@ class ActivePerception(nn.Module):
         outcome: Callable[[Step], Tensor] | None,
     ) -> tuple[Scanpath, int, Step]:
         """Move the gaze until there is an outcome, or no shift or cell is left; also the outcome and the last step."""
+        check_whole(shifts, "shifts", 0, MOST_SHIFTS)
+        check_whole(seed, "seed", 0, 2**63 - 1)
         generator = torch.Generator().manual_seed(seed)
         if start is None:
             start = int(torch.randint(len(grid), (1,), generator=generator))
-        check(0 <= start < len(grid), "start", f"a cell from 0 to {len(grid) - 1}", start)
+        check_whole(start, "start", 0, len(grid) - 1)
         looks = LiveLooks(self.eye, self.eye.open(image), grid, target)
         ended: tuple[int, Step] | None = None
 
@@ -341,7 +350,7 @@ class ActivePerception(nn.Module):
     def _target(self, target: str | int) -> int:
         if isinstance(target, str):
             return self.classes.index(lookup(target, self.classes[1:], "target class"))
-        check(1 <= target < len(self.classes), "target", f"a class from 1 to {len(self.classes) - 1}", target)
+        check_whole(target, "target", 1, len(self.classes) - 1)
         return target
 
 

@@ -1,11 +1,15 @@
 """Errors that a user can act on, and the checks that raise them."""
 
+import math
 from collections.abc import Iterable
 from difflib import get_close_matches
+from numbers import Integral, Real
 from typing import TypeVar
 
 import torch
 from torch import Tensor
+
+_ROUNDING = 1e-3
 
 Name = TypeVar("Name", bound=str)
 
@@ -61,6 +65,36 @@ def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
     # Only now: graphs with dynamic sizes cannot write them out.
     wanted = ", ".join("any" if s is None else str(s) for s in shape)
     check(False, argument, f"a tensor of shape (..., {wanted})", tuple(tensor.shape))
+
+
+def check_whole(value: object, argument: str, low: int, high: int) -> None:
+    """Raise `InputError` unless `value` is a whole number from `low` to `high`.
+
+    >>> check_whole(3, "shifts", 0, 10)
+    """
+    inside = isinstance(value, Integral) and not isinstance(value, bool) and low <= int(value) <= high
+    check(inside, argument, f"a whole number from {low:,} to {high:,}", repr(value))
+
+
+def check_number(value: object, argument: str, low: float, high: float) -> None:
+    """Raise `InputError` unless `value` is a number from `low` to `high`.
+
+    >>> check_number(0.5, "threshold", 0, 1)
+    """
+    inside = isinstance(value, Real) and not isinstance(value, bool) and low <= float(value) <= high
+    check(inside, argument, f"a number from {low:g} to {high:g}", repr(value))
+
+
+def check_pixels(image: Tensor, argument: str) -> None:
+    """Raise `InputError` where an image is not RGB in [0, 1] up to rounding: bytes, say, or NaN.
+
+    >>> check_pixels(torch.rand(1, 3, 4, 4), "image")
+    """
+    if not values_known(image) or not image.numel():
+        return
+    least, most = (float(bound) for bound in image.detach().aminmax())
+    inside = least >= -_ROUNDING and most <= 1 + _ROUNDING
+    check(inside, argument, "RGB in [0, 1]", "NaN" if math.isnan(least) else f"numbers from {least:g} to {most:g}")
 
 
 def check_finite(tensor: Tensor, argument: str) -> None:

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import Belief, probabilities_of
+from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Observer
 from semfov.decision import Decision
@@ -90,7 +90,7 @@ def trace(
         cells.append(step.cell)
         fixations.append(step.fixation)
         detections.append(step.detections)
-        maps.append(probabilities_of(known)[0])
+        maps.append(known.class_probabilities()[0])
         values.append(step.values[0])
         seconds.append(step.seconds)
         if target is not None:

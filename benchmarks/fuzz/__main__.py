@@ -1,13 +1,18 @@
 """Command line of the fuzzer."""
 
 import argparse
+import sys
 import time
+import traceback
 from collections import Counter
 
 import torch
 
 from benchmarks.fuzz import TARGETS
 from benchmarks.fuzz.runner import run
+
+CLASSES = {"result": "right", "missing": "right", "InputError": "refused by name", "DataError": "refused by name"}
+"""Classes of outcomes by what targets return; whatever else happens is a finding."""
 
 
 def main() -> None:
@@ -23,16 +28,24 @@ def main() -> None:
         if name not in TARGETS:
             parser.error(f"unknown target {name!r}; known: {', '.join(TARGETS)}")
     torch.set_num_threads(1)
-    print("| target | cases | results | InputError | DataError | s |\n|---|---|---|---|---|---|", flush=True)
+    print("| target | cases | right | refused by name | else | s |\n|---|---|---|---|---|---|", flush=True)
     total: Counter[str] = Counter()
     for name in options.targets or TARGETS:
         start = time.perf_counter()
-        outcomes = run(TARGETS[name], options.cases, options.seed)
+        outcomes = Counter({CLASSES[kind]: 0 for kind in CLASSES})
+        try:
+            for kind, count in run(TARGETS[name], options.cases, options.seed).items():
+                outcomes[CLASSES[kind]] += count
+        except Exception:
+            traceback.print_exc()
+            outcomes["else"] += 1
         seconds = time.perf_counter() - start
         total += outcomes
-        cells = [sum(outcomes.values()), *(outcomes[kind] for kind in ("result", "InputError", "DataError"))]
+        cells = [sum(outcomes.values()), *(outcomes[kind] for kind in ("right", "refused by name", "else"))]
         print(f"| {name} | {' | '.join(map(str, cells))} | {seconds:.0f} |", flush=True)
-    print(f"\n{sum(total.values())} cases, no finding")
+    told = ", ".join(f"{total[kind]} {kind}" for kind in ("right", "refused by name", "else"))
+    print(f"\n{sum(total.values())} cases: {told}")
+    sys.exit(1 if total["else"] else 0)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ WIDTH, HEIGHT = 40, 30
 _JUNK: list[Any] = [
     None, True, -1, 0, 7, 10**400, 1.5, "", "x", "../../etc/passwd", [], [1], [0, 0, -1, 1], [0, 0, "1", 1],
     [0, 0, 1], {}, {"id": 1}, float("nan"), float("inf"), [float("nan"), 0, 1, 1], "\0", [[[[]]]],
+    "/etc/passwd", "a\0b", "\ud800", "..", "\n",
 ]  # fmt: skip
 
 
@@ -50,6 +51,11 @@ def annotation_files(data: st.DataObject) -> str:
         result = attempt(lambda: CocoScenes(root, path, CLASSES, **options))
     if damage in ("cut", "repeated id"):
         assert failed(result), "a damaged file was read"
+    if damage == "value":
+        images = document["images"] if isinstance(document["images"], list) else []
+        strange = [image.get("file_name") for image in images if isinstance(image, dict)]
+        outside = any(isinstance(name, str) and ("/" in name or "\0" in name) for name in strange)
+        assert failed(result) or not outside, "a file outside of the root was taken"
     if failed(result):
         if damage == "none":
             assert not expected(document, **options) or not known_categories(document), result

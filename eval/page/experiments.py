@@ -18,6 +18,7 @@ from semfov.experiments.config import (
     SensorConfig,
 )
 from semfov.experiments.presets import Choice
+from semfov.experiments.settings import Count, Settings, Workers
 from semfov.sensor.named import SensorName
 
 DETECTORS = {"nano": "YOLOX-nano", "tiny": "YOLOv3-tiny"}
@@ -161,7 +162,7 @@ STUDIES = {
 
 
 @dataclass(frozen=True)
-class ResultsConfig:
+class ResultsConfig(Settings):
     """Which photographs, and where the page goes.
 
     Args:
@@ -188,15 +189,15 @@ class ResultsConfig:
     fit_root: Path | None = None
     fit_annotations: Path | None = None
     yolox: Path | None = None
-    limit: int | None = None
-    study: int = 30
+    limit: Count | None = None
+    study: Count = 30
     only: tuple[str, ...] | None = None
     page: Path = Path("docs/results.md")
     template: Path = Path("docs/results.template.md")
     pictures: Path = Path("docs/pictures")
     out: Path = Path("runs/results")
     cache: Path | None = None
-    workers: int | None = None
+    workers: Workers | None = None
 
 
 def experiments(config: ResultsConfig) -> dict[str, RunConfig]:

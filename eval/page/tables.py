@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from eval.page import paper
 from eval.page.curves import (
-    OBJECTS,
     behind,
     difference,
     per_image,
@@ -112,10 +111,11 @@ def summary(folder: Path, section: int | None = None) -> list[str]:
     return text.splitlines() if section is None else parts[section].splitlines()
 
 
-def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "right") -> list[str]:
-    """Differences of every policy to `baseline` over the same images, in points, with standard errors."""
+def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "right", *, ending: str = "") -> list[str]:
+    """Differences of every policy whose name ends so to `baseline` over the same images, in points, with errors."""
     last = max(shifts)
-    curves = {policy: per_image(records_of(folder, policy), last, field) for policy in policies_of(folder)}
+    names = [policy for policy in policies_of(folder) if policy.endswith(ending)]
+    curves = {policy: per_image(records_of(folder, policy), last, field) for policy in names}
     if baseline not in curves:
         raise DataError(f"{folder}: no policy {baseline!r} to compare with; run the experiment again")
     rows = [[f"difference to {baseline}", *(str(n) for n in shifts), "behind by two standard errors at"]]
@@ -128,9 +128,9 @@ def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "rig
     return table(rows)
 
 
-def paired_objects(folder: Path) -> list[str]:
-    """`paired` for explorations whose answer is never background."""
-    return paired(folder, "random-raw", (1, 2, 3, 4, 10, 20), OBJECTS)
+def paired_maps(folder: Path, field: str = "right") -> list[str]:
+    """`paired` for explorations by a learned map."""
+    return paired(folder, "random-learned", (1, 2, 3, 4, 10, 20), field, ending="-learned")
 
 
 def agreement(folder: Path) -> list[str]:

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, Self, runtime_checkable
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -43,6 +43,14 @@ class Belief(ABC):
         A belief that was not made to tell gives a bound: the probability of the most probable cell.
         """
         return self.probability(target).amax(-1)
+
+    def class_probabilities(self) -> Tensor:
+        """Probability of every class in every cell, background first, `(B, X·Y, K+1)`.
+
+        Raises:
+            InputError: the belief is about a target alone.
+        """
+        raise InputError(f"belief: expected a belief about all classes, got {type(self).__name__}")
 
     @abstractmethod
     def map(self, function: Callable[[Tensor], Tensor]) -> Self:
@@ -93,30 +101,13 @@ class DirichletBelief(Belief):
         r"""Posterior of every class, :math:`p_k = \beta_k / \sum_j \beta_j`, `(B, X·Y, K+1)`."""
         return dirichlet.mean(self.beta)
 
+    def class_probabilities(self) -> Tensor:
+        """The posterior of every class."""
+        return self.probabilities
+
     def probability(self, target: int | Tensor) -> Tensor:
         """Posterior of the target class in each cell, `(B, X·Y)`."""
         return pick(self.beta, torch.as_tensor(target)) / self.beta.sum(-1)
-
-
-@runtime_checkable
-class AllClasses(Protocol):
-    """A belief about all classes."""
-
-    @property
-    def probabilities(self) -> Tensor:
-        """Of every class, background first, `(B, X·Y, K+1)`."""
-        ...
-
-
-def probabilities_of(belief: Belief) -> Tensor:
-    """Probability of every class in every cell, background first, `(B, X·Y, K+1)`.
-
-    Raises:
-        InputError: the belief is about a target alone.
-    """
-    if not isinstance(belief, AllClasses):
-        raise InputError(f"belief: expected a belief about all classes, got {type(belief).__name__}")
-    return belief.probabilities
 
 
 def dirichlet_belief(belief: Belief) -> DirichletBelief:

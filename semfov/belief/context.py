@@ -16,6 +16,7 @@ from semfov.detection.detections import Detections
 from semfov.errors import check, check_shape, lookup, values_known
 from semfov.io import compatibility
 from semfov.io.pretrained import Pretrained
+from semfov.io.schema import CLASSES, Array, Field, Number, Object, Pair, Schema
 
 
 class ContextPrior(Pretrained):
@@ -51,6 +52,17 @@ class ContextPrior(Pretrained):
     kind: ClassVar[str] = "context-prior"
     title: ClassVar[str] = "context prior"
     shipped: ClassVar[Path] = Path(__file__).parent / "models" / "context"
+    schema: ClassVar[Schema] = Schema(
+        {
+            "place": Field(("K+1", "R", "R"), torch.float16, low=-1e3, high=1e3),
+            "cooccurrence": Field(("K+1", "K+1", "N"), torch.float16, low=-1e3, high=1e3),
+        },
+        {
+            "classes": CLASSES,
+            "edges": Array(Number(0, 100), "N-1", ascending=True),
+            "weights": Object(others=Pair((Number(-100, 100), Number(-100, 100)))),
+        },
+    )
     place: Tensor
     cooccurrence: Tensor
 

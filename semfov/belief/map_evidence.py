@@ -7,10 +7,11 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from semfov.belief.evidence import Evidence, Gathered, blur, logarithm, network
+from semfov.belief.evidence import READOUT, Evidence, Gathered, blur, logarithm, network
 from semfov.belief.grid import Grid
-from semfov.belief.look_features import class_features
+from semfov.belief.look_features import FEATURES, class_features
 from semfov.detection.detections import Detections
+from semfov.io.schema import Field, Number, Pair, Schema, perceptron
 
 _EMPTINESS = 9
 _GAIN = 7
@@ -45,6 +46,17 @@ class MapEvidence(Evidence):
     kind: ClassVar[str] = "map-evidence"
     title: ClassVar[str] = "model of map evidence"
     shipped: ClassVar[Path] = Path(__file__).parent / "models" / "maps"
+
+    schema: ClassVar[Schema] = Schema(
+        {
+            **perceptron("look", FEATURES, "L"),
+            **perceptron("read", READOUT + 1, "R"),
+            **perceptron("void", _EMPTINESS, "R"),
+            **perceptron("worth", _GAIN, "R"),
+            "prior": Field(("C",), low=-1e3, high=1e3),
+        },
+        {"widths": Pair((Number(size="L"), Number(size="R"))), "components": Number(size="C", low=3)},
+    )
 
     def __init__(
         self,

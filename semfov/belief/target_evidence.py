@@ -10,8 +10,9 @@ from torch import Tensor
 
 from semfov.belief.evidence import READOUT, Evidence, Gathered, blur, logarithm, network
 from semfov.belief.grid import Grid
-from semfov.belief.look_features import look_features
+from semfov.belief.look_features import FEATURES, look_features
 from semfov.detection.detections import Detections
+from semfov.io.schema import Field, Maybe, Number, Object, Pair, Schema, perceptron
 
 _PRESENCE = 9
 # Log odds of a cell that does not hold the target.
@@ -55,6 +56,22 @@ class TargetEvidence(Evidence):
     kind: ClassVar[str] = "target-evidence"
     title: ClassVar[str] = "model of target evidence"
     shipped: ClassVar[Path] = Path(__file__).parent / "models"
+    schema: ClassVar[Schema] = Schema(
+        {
+            **perceptron("look", FEATURES, "L"),
+            **perceptron("read", READOUT, "R"),
+            **perceptron("guide", READOUT + 1, "R"),
+            **perceptron("judge", _PRESENCE, "R"),
+            "prior": Field(("C",), low=-1e3, high=1e3),
+        },
+        {
+            "widths": Pair((Number(size="L"), Number(size="R"))),
+            "components": Number(size="C"),
+            "thresholds": Maybe(
+                Object({"confirm": Number(0, 1), "give_up": Number(0, 1)}, required=("confirm", "give_up"))
+            ),
+        },
+    )
 
     def __init__(
         self,

@@ -4,13 +4,14 @@ import contextlib
 import hashlib
 import io
 import json
-import math
 from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from semfov.errors import DataError
+from semfov.io.files import check_regular
+from semfov.io.schema import is_number, is_plain, shown
 
 _LARGEST = 2**24  # pixels of a side, up to which float32 boxes have whole pixels
 
@@ -57,6 +58,7 @@ class _Fault(Exception):
 
 
 def _read(path: str | PathLike[str], name: str) -> bytes:
+    check_regular(path, name)
     try:
         return Path(path).read_bytes()
     except FileNotFoundError:
@@ -84,14 +86,14 @@ def _check(data: dict[str, Any]) -> None:
         raise _Fault("images: expected ids of one kind, got integers and strings")
     for where, image in _entries(data, "images"):
         for key in ("width", "height"):
-            if not (_is_number(image.get(key)) and 1 <= image[key] <= _LARGEST and image[key] == int(image[key])):
+            if not (is_number(image.get(key)) and 1 <= image[key] <= _LARGEST and image[key] == int(image[key])):
                 raise _Fault(f"{where}: expected {key} to be a whole number of pixels, got {_show(image, key)}")
     _ids(data, "annotations", {})
     for where, annotation in _entries(data, "annotations"):
         _check_reference(where, annotation, "image_id", images, "images")
         _check_reference(where, annotation, "category_id", categories, "categories")
         box = annotation.get("bbox")
-        if not (isinstance(box, list) and len(box) == 4 and all(map(_is_number, box)) and min(box[2:]) >= 0):
+        if not (isinstance(box, list) and len(box) == 4 and all(map(is_number, box)) and min(box[2:]) >= 0):
             raise _Fault(
                 f"{where}: expected bbox to be [x, y, width, height] with finite numbers and a size of at least 0, "
                 f"got {_show(annotation, 'bbox')}"
@@ -117,12 +119,16 @@ def _ids(data: dict[str, Any], key: str, fields: dict[str, type]) -> set[int | s
         identity = entry.get("id")
         if not isinstance(identity, int | str) or isinstance(identity, bool):
             raise _Fault(f"{where}: expected id to be an integer or a string, got {_show(entry, 'id')}")
+        if isinstance(identity, str) and not is_plain(identity):
+            raise _Fault(f"{where}: expected id to have no control characters, got {_show(entry, 'id')}")
         if identity in seen:
             raise _Fault(f"{where}: id {_show(entry, 'id')} is there more than once")
         seen.add(identity)
         for field, kind in fields.items():
             if not isinstance(entry.get(field), kind) or not entry[field]:
                 raise _Fault(f"{where}: expected {field} to be a string, got {_show(entry, field)}")
+            if not is_plain(entry[field]):
+                raise _Fault(f"{where}: expected {field} to have no control characters, got {_show(entry, field)}")
     return seen
 
 
@@ -132,26 +138,11 @@ def _check_reference(where: str, entry: dict[str, Any], key: str, known: set[int
         raise _Fault(f"{where}: expected {key} to be the id of one of the {what}, got {_show(entry, key)}")
 
 
-def _is_number(value: object) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # an integer beyond the floats
-        return False
-
-
 def _kind(value: object) -> str:
     names = {dict: "an object", list: "a list", str: "a string", type(None): "null"}
-    return names.get(type(value), "a number" if _is_number(value) else type(value).__name__)
+    return names.get(type(value), "a number" if is_number(value) else type(value).__name__)
 
 
 def _show(entry: dict[str, Any], key: str) -> str:
     """A value as an error prints it: on one line and short."""
-    if key not in entry:
-        return "nothing"
-    try:
-        text = ascii(entry[key])
-    except (ValueError, RecursionError):  # integers too long to print, lists too deep
-        text = _kind(entry[key])
-    return text if len(text) <= 60 else text[:57] + "..."
+    return shown(entry[key]) if key in entry else "nothing"

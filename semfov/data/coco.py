@@ -6,6 +6,7 @@ Run as a program, it fetches the official files: `python -m semfov.data.coco val
 import hashlib
 import json
 import logging
+import os
 from collections import Counter
 from collections.abc import Collection, Sequence
 from os import PathLike
@@ -16,9 +17,10 @@ import torch
 
 from semfov.data.annotations import read_annotations
 from semfov.data.classes import canonical_name, class_indices
-from semfov.data.images import read_image
+from semfov.data.images import read_sized
 from semfov.data.scene import Annotation, Coverage, Scene, legal_targets
 from semfov.errors import DataError, check
+from semfov.io.files import check_regular, sha256
 
 _log = logging.getLogger(__name__)
 
@@ -55,7 +57,7 @@ class CocoScenes:
         fingerprint: sha256 of the annotation file, the settings, and the names and sizes of the image files.
 
     Raises:
-        DataError: a file is missing or damaged, or no image is left.
+        DataError: a file is missing, damaged, no regular file or not below `root`, or no image is left.
     """
 
     def __init__(
@@ -104,24 +106,15 @@ class CocoScenes:
         self.ids: list[Any] = [packed.ids[row] for row in self._rows]
         self._files = [Path(root, packed.names[row]) for row in self._rows]
         settings = [digest, self.classes, self.ids, max_target_area, coverage, crowd]
-        self.fingerprint = _sha256(settings, [packed.names[row] for row in self._rows], _file_sizes(self._files))
+        self.fingerprint = _sha256(settings, [packed.names[row] for row in self._rows], _file_sizes(root, self._files))
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def __getitem__(self, index: int) -> Scene:
         """Decode an image: upright, or as stored where only that has the recorded size."""
-        annotation, path = self.annotation(index), self._files[index]
-        width, height = annotation.size
-        image = read_image(path)
-        if image.shape[-2:] != (height, width):
-            shown = tuple(image.shape[-2:])
-            image = read_image(path, oriented=False)
-            if image.shape[-2:] != (height, width):
-                raise DataError(
-                    f"image {path}: expected {width} × {height} pixels as annotated, got {shown[1]} × {shown[0]}; "
-                    f"use the image that the annotations were made on"
-                )
+        annotation = self.annotation(index)
+        image = read_sized(self._files[index], annotation.size)
         name = self._packed.names[self._rows[index]]
         return Scene(self.ids[index], name, image, annotation.boxes, annotation.labels)
 
@@ -136,11 +129,12 @@ class CocoScenes:
     def digest(self, index: int) -> str:
         """sha256 of an image file and of the size that its annotations tell."""
         path = self._files[index]
+        check_regular(path, f"image {path}")
         try:
-            content = path.read_bytes()
+            content = sha256(path)
         except OSError as error:
             raise DataError(f"image {path}: cannot be read ({error.strerror}); check data.root") from None
-        return _sha256(hashlib.sha256(content).hexdigest(), self._packed.sizes[self._rows[index]])
+        return _sha256(content, self._packed.sizes[self._rows[index]])
 
 
 def _known_ids(ids: Collection[int | str], known: Sequence[Any], annotations: str | PathLike[str]) -> set[str]:
@@ -213,12 +207,23 @@ def _match(coco: Any, classes: tuple[str, ...], path: str | PathLike[str]) -> di
     return labels
 
 
-def _file_sizes(files: list[Path]) -> list[int]:
+def _file_sizes(root: str | PathLike[str], files: list[Path]) -> list[int]:
+    """Sizes of files, all of which are regular ones below `root`, also where a link is followed."""
     sizes, missing = [], []
+    base = os.path.realpath(root)
     for path in files:
         try:
-            sizes.append(path.stat().st_size)
+            below = Path(os.path.realpath(path)).is_relative_to(base) and ".." not in path.relative_to(root).parts
         except (OSError, ValueError):
+            below = False
+        if not below:
+            raise DataError(
+                f"image {path}: expected a file below data.root ({root}), got a file_name that leads out of it"
+            )
+        check_regular(path, f"image {path}")
+        try:
+            sizes.append(path.stat().st_size)
+        except OSError:
             missing.append(path)
     if missing:
         raise DataError(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.errors import DataError
+from semfov.io.files import check_regular
 
 MAX_PIXELS = 89_478_485
 """Largest picture that is read, in pixels (1 GiB as float32 RGB): Pillow's limit against decompression bombs."""
@@ -61,6 +62,7 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of damaged metadata and of large files; the limit below refuses the latter
         try:
+            check_regular(path, name)
             # By its name Pillow would map a plain TIFF into memory, and mix up its rows where it is to be turned.
             with Path(path).open("rb") as file, Image.open(file) as image:
                 _check_pixels(image.size, name)
@@ -72,8 +74,6 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
             raise
         except FileNotFoundError:
             raise DataError(f"{name}: no such file; check data.root and the file names of the annotations") from None
-        except IsADirectoryError:
-            raise DataError(f"{name}: expected a file, got a folder") from None
         except PermissionError:
             raise DataError(f"{name}: no permission to read it; check the file's mode and owner") from None
         except UnidentifiedImageError:
@@ -86,6 +86,29 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
                 f"{name}: truncated, damaged or of a kind that is not supported ({reason}); replace it"
             ) from error
     return torch.from_numpy(array).permute(2, 0, 1).contiguous()
+
+
+def read_sized(path: str | PathLike[str], size: tuple[int, int]) -> Tensor:
+    """Read an image file that annotations were made on: upright, or as stored where only that has the recorded size.
+
+    Args:
+        path: the file.
+        size: `(width, height)` that the annotations tell.
+
+    Raises:
+        DataError: as `read_image`, or the image has another size.
+    """
+    image = read_image(path)
+    if image.shape[-2:] == size[::-1]:
+        return image
+    height, width = image.shape[-2:]
+    image = read_image(path, oriented=False)
+    if image.shape[-2:] != size[::-1]:
+        raise DataError(
+            f"image {path}: expected {size[0]} × {size[1]} pixels as annotated, got {width} × {height}; "
+            f"use the image that the annotations were made on"
+        )
+    return image
 
 
 def _check_pixels(size: tuple[int, int], name: str) -> None:

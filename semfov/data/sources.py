@@ -13,6 +13,7 @@ from torch import Tensor
 from semfov.data.images import read_image
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError, InputError
+from semfov.io.files import check_regular
 
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
@@ -57,6 +58,7 @@ def open_pictures(source: Path | None, camera: int | None, frames: int) -> Itera
     elif not source.exists():
         raise DataError(f"{source}: no such file or folder")
     elif source.suffix.lower() in VIDEOS:
+        check_regular(source)
         yield from _record(str(source), source.name, frames)
     else:
         yield Picture(source.name, read_image(source))

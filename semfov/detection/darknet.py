@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from semfov.detection.darknet_builder import Builder
 from semfov.detection.darknet_config import Section
 from semfov.detection.darknet_layers import Head
+from semfov.detection.onnx_file import check_canvas
 from semfov.errors import DataError, check, check_shape
 
 
@@ -41,7 +42,8 @@ class Darknet(nn.Module):
             raise DataError("cfg: expected [net] as its first section")
         self.input_size = (sections[0].integer("width", 416), sections[0].integer("height", 416))
         self.channels = sections[0].integer("channels", 3)
-        builder = Builder(self.channels)
+        check_canvas(sections[0].where, self.input_size)
+        builder = Builder(self.channels, self.input_size)
         self.layers = nn.ModuleList([builder.add(section) for section in sections[1:]])
         self.heads = [layer for layer in self.layers if isinstance(layer, Head)]
         if not self.heads:

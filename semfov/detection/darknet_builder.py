@@ -10,8 +10,11 @@ from semfov.detection.darknet_config import Section
 from semfov.detection.darknet_layers import ACTIVATIONS, Convolution, Head, MaxPool, Route, Shortcut, Upsample
 from semfov.errors import DataError
 
-# The largest of YOLOv3's convolutions has 5 million; a typing error should not fill the memory.
-_MOST_PARAMETERS = 10**9
+# YOLOv3 has 62 million parameters, and a map of 12 million numbers; a typing error should not fill the memory.
+_MOST_PARAMETERS = 3 * 10**8
+_MOST_ELEMENTS = 2**28
+_MOST_LAYERS = 2000
+_LARGEST_KERNEL = 255
 
 # Keys that would change what a layer computes, with the only value that is implemented.
 _NEUTRAL = {
@@ -34,7 +37,9 @@ class Shape:
 class Builder:
     """Turns sections into layers, and keeps track of shapes and of what each layer reads."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, size: tuple[int, int]) -> None:
+        self._pixels = size[0] * size[1]
+        self._parameters = 0
         self.shapes: list[Shape] = []
         self.sources: list[tuple[int, ...]] = []
         self._image = Shape(channels, Fraction(1))
@@ -49,6 +54,8 @@ class Builder:
         }
 
     def add(self, section: Section) -> nn.Module:
+        if len(self.shapes) >= _MOST_LAYERS:
+            raise DataError(f"{section.where}: expected at most {_MOST_LAYERS} layers")
         if section.kind not in self._makers:
             known = ", ".join(self._makers)
             raise DataError(f"{section.where}: layer [{section.kind}] is not supported; supported: {known}")
@@ -62,16 +69,27 @@ class Builder:
         return self.shapes[-1] if self.shapes else self._image
 
     def _note(self, channels: int, step: Fraction, *sources: int) -> None:
-        self.sources.append((len(self.shapes) - 1, *sources))
-        self.shapes.append(Shape(channels, step))
+        self._append(Shape(channels, step), (len(self.shapes) - 1, *sources))
+
+    def _append(self, shape: Shape, sources: tuple[int, ...]) -> None:
+        """Keep what is known of an output, unless it would be too large at the size that the cfg asks for."""
+        if shape.channels * self._pixels > _MOST_ELEMENTS * shape.step**2:
+            raise DataError(
+                f"cfg: layer {len(self.shapes)} has a map of more than {_MOST_ELEMENTS:,} numbers; check the cfg"
+            )
+        self.sources.append(sources)
+        self.shapes.append(shape)
 
     def _convolution(self, section: Section) -> nn.Module:
         here, filters, groups = self._here, section.integer("filters", 1), section.integer("groups", 1)
         if here.channels % groups or filters % groups:
             raise DataError(f"{section.where}: groups={groups} divides not both {here.channels} and {filters} channels")
         size, stride = section.integer("size", 1), section.integer("stride", 1)
-        if here.channels // groups * filters * size**2 > _MOST_PARAMETERS:
-            raise DataError(f"{section.where}: a convolution of more than {_MOST_PARAMETERS} parameters; check the cfg")
+        # Counted before the layer is made, which allocates them.
+        self._parameters += here.channels // groups * filters * size**2 + 4 * filters
+        if self._parameters > _MOST_PARAMETERS:
+            raise DataError(f"{section.where}: more than {_MOST_PARAMETERS:,} parameters up to here; check the cfg")
+        _check_kernel(section, size, stride, section.integer("padding", 0, minimum=0))
         same = section.integer("pad", 0, minimum=0)
         self._note(filters, here.step * stride)
         return Convolution(
@@ -88,8 +106,10 @@ class Builder:
     def _maxpool(self, section: Section) -> nn.Module:
         stride = section.integer("stride", 1)
         size = section.integer("size", stride)
+        padding = section.integer("padding", size - 1, minimum=0)
+        _check_kernel(section, size, stride, padding)
         self._note(self._here.channels, self._here.step * stride)
-        return MaxPool(size, stride, section.integer("padding", size - 1, minimum=0))
+        return MaxPool(size, stride, padding)
 
     def _upsample(self, section: Section) -> nn.Module:
         stride = section.integer("stride", 2)
@@ -104,8 +124,7 @@ class Builder:
             raise DataError(f"{section.where}: [route] expected layers of one size, got {section.text('layers')}")
         if group >= groups or any(shape.channels % groups for shape in shapes):
             raise DataError(f"{section.where}: [route] has no part {group} of {groups} equal groups of channels")
-        self.sources.append(sources)
-        self.shapes.append(Shape(sum(shape.channels for shape in shapes) // groups, shapes[0].step))
+        self._append(Shape(sum(shape.channels for shape in shapes) // groups, shapes[0].step), sources)
         return Route(groups, group)
 
     def _shortcut(self, section: Section) -> nn.Module:
@@ -137,6 +156,14 @@ class Builder:
         if not 0 <= index < len(self.shapes):
             raise DataError(f"{section.where}: [{section.kind}] {key}={number} points to no earlier layer")
         return index
+
+
+def _check_kernel(section: Section, size: int, stride: int, padding: int) -> None:
+    if size > _LARGEST_KERNEL or stride > _LARGEST_KERNEL or padding > size:
+        raise DataError(
+            f"{section.where}: [{section.kind}] expected size and stride up to {_LARGEST_KERNEL} and no more padding "
+            f"than size, got {size}, {stride} and {padding}"
+        )
 
 
 def _activation(section: Section, default: str) -> str:

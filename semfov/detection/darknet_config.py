@@ -1,11 +1,16 @@
 """Darknet configuration files: the sections that describe a network, layer by layer."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 
 from semfov.errors import DataError
+from semfov.io.files import check_regular
+from semfov.io.schema import shown
+
+_MOST_BYTES = 2**20
 
 
 @dataclass(frozen=True)
@@ -42,9 +47,12 @@ class Section:
     def numbers(self, key: str, default: str | None = None) -> tuple[float, ...]:
         """The value of `key` as a list of numbers."""
         try:
-            return tuple(float(part) for part in self._parts(key, default))
+            numbers = tuple(float(part) for part in self._parts(key, default))
         except ValueError as error:
             raise self._refuse(key, "numbers") from error
+        if not all(map(math.isfinite, numbers)):
+            raise self._refuse(key, "finite numbers")
+        return numbers
 
     def integer(self, key: str, default: int | None = None, *, minimum: int = 1) -> int:
         """The value of `key` as one whole number, at least `minimum`."""
@@ -57,7 +65,7 @@ class Section:
         return [part for part in self.text(key, default).split(",") if part.strip()]
 
     def _refuse(self, key: str, expected: str) -> DataError:
-        return DataError(f"{self.where}: [{self.kind}] {key}: expected {expected}, got {self.options.get(key)!r}")
+        return DataError(f"{self.where}: [{self.kind}] {key}: expected {expected}, got {shown(self.options.get(key))}")
 
 
 def parse_cfg(text: str, source: str = "cfg") -> list[Section]:
@@ -89,7 +97,10 @@ def parse_cfg(text: str, source: str = "cfg") -> list[Section]:
 
 def read_cfg(path: str | PathLike[str]) -> list[Section]:
     """Sections of a cfg file."""
+    check_regular(path)
     try:
+        if Path(path).stat().st_size > _MOST_BYTES:
+            raise DataError(f"{str(path)!r}: expected a cfg of at most {_MOST_BYTES:,} bytes")
         return parse_cfg(Path(path).read_text(encoding="utf-8"), str(path))
     except OSError as error:
         raise DataError(f"cannot read the cfg {str(path)!r}: {error.strerror}") from error

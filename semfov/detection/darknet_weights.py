@@ -12,6 +12,7 @@ from torch import Tensor
 from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_layers import Convolution
 from semfov.errors import DataError
+from semfov.io.files import check_regular
 
 EPSILON = 1e-5
 """Added to the variance by batch norm."""
@@ -30,16 +31,21 @@ def read_weights(network: Darknet, path: str | PathLike[str]) -> str:
     Raises:
         DataError: the file cannot be read, or its length or its numbers do not fit the network.
     """
+    layers = [layer for layer in network.layers if isinstance(layer, Convolution)]
+    check_regular(path, f"weights {str(path)!r}")
     try:
-        data = bytearray(Path(path).read_bytes())
+        length = Path(path).stat().st_size
+        longest = 20 + 4 * sum(_count(layer) for layer in layers)
+        # What is longer is refused below by what it says; that much is not worth reading.
+        with Path(path).open("rb") as file:
+            data = bytearray(file.read(longest + 1))
     except OSError as error:
         raise DataError(f"cannot read the weights {str(path)!r}: {error.strerror}") from error
-    layers = [layer for layer in network.layers if isinstance(layer, Convolution)]
     start = _header(data)
     needed = start + 4 * sum(_count(layer) for layer in layers)
-    if len(data) != needed:
-        fault = "truncated" if len(data) < needed else "too long"
-        found = f"expected {needed} bytes for this network, got {len(data)}"
+    if length != needed or len(data) != needed:
+        fault = "truncated" if length < needed else "too long"
+        found = f"expected {needed} bytes for this network, got {length}"
         raise DataError(f"weights {str(path)!r}: {found}; {fault}, or of another network")
     numbers = torch.frombuffer(data, dtype=torch.float32, offset=start)
     if not bool(torch.isfinite(numbers).all()):

@@ -9,7 +9,9 @@ from semfov.detection.detections import Detections
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection, select
-from semfov.errors import check
+from semfov.errors import check, check_pixels, check_whole
+
+_LARGEST = 65_536  # pixels of a side
 
 
 class Detector(nn.Module, ABC):
@@ -45,6 +47,10 @@ class Detector(nn.Module, ABC):
         digest: str = "",
     ) -> None:
         super().__init__()
+        for side in input_size:
+            check_whole(side, "input_size", 1, _LARGEST)
+        if stride is not None:
+            check_whole(stride, "stride", 1, _LARGEST)
         self.name = name
         self.classes = classes
         self.input_size = input_size
@@ -96,3 +102,4 @@ def check_images(images: Tensor) -> None:
     fits = images.ndim == 4 and images.shape[1] == 3 and images.numel() > 0 and images.is_floating_point()
     what = "floating-point RGB in [0, 1] of shape (B, 3, H, W), at least one image and one pixel"
     check(fits, "images", what, f"{images.dtype} of shape {tuple(images.shape)}")
+    check_pixels(images, "images")

@@ -19,6 +19,7 @@ from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.detection.yolo import YoloV3
 from semfov.errors import DataError, InputError, lookup
+from semfov.io.files import check_regular
 
 
 def load_detector(name_or_path: str | PathLike[str], **options: Any) -> Detector:
@@ -111,6 +112,7 @@ def _names(classes: Sequence[str] | str | PathLike[str] | None) -> tuple[str, ..
     """Class names from a list, from the lines of a file, or COCO's."""
     if not isinstance(classes, str | PathLike):
         return COCO_CLASSES if classes is None else tuple(classes)
+    check_regular(classes)
     try:
         lines = Path(classes).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -12,6 +12,7 @@ from torch import Tensor
 from semfov.detection.class_names import keep_classes, named
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.detection.detector import Detector, check_images
+from semfov.detection.onnx_file import check_canvas, check_elements
 from semfov.detection.onnx_recognition import HEADS, Signature, recognise
 from semfov.detection.onnx_session import OnnxSession
 from semfov.detection.onnx_settings import read_settings
@@ -22,6 +23,7 @@ from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.errors import DataError, InputError, check, check_shape, lookup
 from semfov.io.files import sha256
+from semfov.io.schema import shown
 
 ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.endswith(".onnx"))
 """Published models that `load_onnx` knows by name."""
@@ -190,7 +192,12 @@ def load_onnx(
     if not isinstance(preprocessing, Preprocessing):
         wanted = known.preprocessing.merged(stored["preprocessing"])
         preprocessing = wanted.merged({} if preprocessing is None else preprocessing)
-    scores = known.decode(outputs, size).classes.shape[-1]
+    try:
+        scores = known.decode(outputs, size).classes.shape[-1]
+    except (KeyError, IndexError, RuntimeError, TypeError, StopIteration) as error:
+        told = ", ".join(f"{output} {tuple(tensor.shape)}" for output, tensor in outputs.items())
+        raise InputError(f"head: {chosen['head']!r} does not fit the outputs {told[:300]}") from error
+    check(scores > 0, "outputs", "at least one score", f"{scores} with head {chosen['head']!r}")
     names = coco_names(scores) if names is None else names
     check(len(names) == scores, "classes", f"{scores} names, one for each score", len(names))
     return OnnxDetector(
@@ -214,10 +221,12 @@ def canvas_size(session: OnnxSession, wanted: int | Sequence[int] | None) -> tup
     if wanted is None:
         if height is None or width is None:
             raise InputError(f"input_size: expected (width, height), as {session.path.name} takes any size, got None")
+        check_canvas(session.path.name, (width, height))
         return width, height
     sizes = (wanted, wanted) if isinstance(wanted, int) else tuple(wanted)
     whole = len(sizes) == 2 and all(isinstance(n, int) and n > 0 for n in sizes)
-    check(whole, "input_size", "(width, height) in pixels", sizes)
+    check(whole, "input_size", "(width, height) in pixels", shown(sizes))
+    check_canvas("input_size", (sizes[0], sizes[1]))
     fits = width in (None, sizes[0]) and height in (None, sizes[1])
     check(fits, "input_size", f"the model's own, {width} x {height}", sizes)
     return sizes[0], sizes[1]
@@ -226,7 +235,9 @@ def canvas_size(session: OnnxSession, wanted: int | Sequence[int] | None) -> tup
 def probe(session: OnnxSession, size: tuple[int, int]) -> dict[str, Tensor]:
     """Outputs in the shapes that they have for one canvas: zeros where the model states them, else from a run."""
     stated = {name: [n for n in shape[1:] if n is not None] for name, shape in session.outputs}
-    if all(len(stated[name]) == len(shape) - 1 for name, shape in session.outputs):
+    for name, sizes in stated.items():
+        check_elements(f"{session.path.name}: output {name!r}", sizes)
+    if all(shape and len(stated[name]) == len(shape) - 1 for name, shape in session.outputs):
         return {name: torch.zeros(1, *sizes) for name, sizes in stated.items()}
     return session(torch.zeros(1, 3, size[1], size[0]))
 

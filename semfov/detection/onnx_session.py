@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from semfov.detection.onnx_file import MOST_BATCH, check_file
 from semfov.errors import DataError, InputError, check
 
 FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
@@ -30,6 +31,7 @@ class OnnxSession:
         threads: threads of an operation; None follows `torch.get_num_threads()`.
         device: `"cpu"`, or `"cuda"` where onnxruntime has the CUDA provider.
         spinning: let idle threads spin; for measurements only.
+        checked: whether the file is looked at before it is opened (`semfov.detection.onnx_file`).
 
     Attributes:
         image: name of the input that takes the image.
@@ -50,6 +52,7 @@ class OnnxSession:
         threads: int | None = None,
         device: torch.device | str = "cpu",
         spinning: bool = False,
+        checked: bool = True,
     ) -> None:
         import onnxruntime as ort
 
@@ -62,17 +65,32 @@ class OnnxSession:
         options.inter_op_num_threads = 1
         options.log_severity_level = 3  # some exporters leave a warning for every initialiser
         options.add_session_config_entry("session.intra_op.allow_spinning", str(int(spinning)))
-        if not self.path.is_file():
-            raise DataError(f"no ONNX model {str(path)!r}")
+        if checked:
+            check_file(self.path)
         try:
-            self._session = ort.InferenceSession(fspath(path), options, providers=_providers(self.device))
+            providers = _providers(self.device)
+            # Its fallback prints, and tries the same once more.
+            self._session = ort.InferenceSession(fspath(path), options, providers=providers, disable_fallback=1)
         except InputError:
             raise
         except Exception as error:  # onnxruntime's own exceptions share no base class
-            raise DataError(f"cannot load the ONNX model {str(path)!r}: {error}") from error
+            reason = " ".join(str(error).split())[:300]
+            raise DataError(f"cannot load the ONNX model {str(path)!r}: {reason}") from error
+        try:
+            self._describe()
+        except UnicodeDecodeError as error:
+            raise DataError(f"cannot load the ONNX model {str(path)!r}: its names are no text ({error})") from None
+        check((self.shape[0] or 1) <= MOST_BATCH, "batch", f"at most {MOST_BATCH} images at once", self.shape[0])
+
+    def _describe(self) -> None:
+        """Read what the model says of itself."""
         meta = self._session.get_modelmeta()
         self.metadata: dict[str, str] = dict(meta.custom_metadata_map)
         self.producer: str = meta.producer_name
+        for output in self._session.get_outputs():
+            if output.type not in FLOATS:
+                what = f"{self.path.name}: output {output.name!r}"
+                raise InputError(f"{what}: expected numbers of floating point, got {output.type}")
         self.outputs = tuple((o.name, _sizes(o.shape)) for o in self._session.get_outputs())
         self.image, self.shape, self._dtype, self._extra = self._inputs()
 
@@ -101,12 +119,7 @@ class OnnxSession:
         if short:
             source = torch.cat([source, source[-1:].expand(short, -1, -1, -1)])
         runs = [self._run(part.contiguous()) for part in source.split(size)]
-        return {
-            name: torch.cat([run[name] for run in runs])[:batch].to(image)
-            if runs[0][name].is_floating_point()
-            else torch.cat([run[name] for run in runs])[:batch].to(image.device)
-            for name, _ in self.outputs
-        }
+        return {name: torch.cat([run[name] for run in runs])[:batch].to(image) for name, _ in self.outputs}
 
     def _run(self, image: Tensor) -> dict[str, Tensor]:
         feed = {self.image: image.numpy()} | {name: EXTRA_INPUTS[name](image).numpy() for name in self._extra}
@@ -114,7 +127,14 @@ class OnnxSession:
         try:
             arrays = self._session.run(names, feed)
         except Exception as error:  # as above
-            raise DataError(f"{self.path.name} fails on images of shape {tuple(image.shape)}: {error}") from error
+            reason = " ".join(str(error).split())[:300]
+            raise DataError(f"{self.path.name} fails on images of shape {tuple(image.shape)}: {reason}") from error
+        for name, array in zip(names, arrays, strict=True):
+            if array.ndim < 1 or array.shape[0] != len(image):
+                raise InputError(
+                    f"{self.path.name}: output {name!r}: expected a row for each of {len(image)} images, got shape "
+                    f"{tuple(array.shape)}"
+                )
         return dict(zip(names, map(torch.from_numpy, arrays), strict=True))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -122,7 +142,7 @@ class OnnxSession:
 
 
 def _reopen(path: Path, threads: int, device: torch.device, spinning: bool) -> OnnxSession:
-    return OnnxSession(path, threads=threads, device=device, spinning=spinning)
+    return OnnxSession(path, threads=threads, device=device, spinning=spinning, checked=False)
 
 
 def _providers(device: torch.device) -> list[Any]:

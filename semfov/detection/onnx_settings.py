@@ -6,7 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from semfov.detection.onnx_file import MOST_METADATA
 from semfov.errors import DataError
+from semfov.io.files import check_regular
+from semfov.io.schema import is_number, is_plain, shown
 
 METADATA_KEY = "semfov"
 """Key of the model's metadata under which an export by semfov keeps its settings, as JSON."""
@@ -36,12 +39,15 @@ def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     """
     beside = path.with_suffix(".json")
     inside = _parse(metadata[METADATA_KEY], f"metadata of {path.name}") if METADATA_KEY in metadata else {}
-    outside = _parse(_read(beside), str(beside)) if beside.is_file() else {}
+    outside = _parse(_read(beside), str(beside)) if beside.exists() else {}
     preprocessing = {**inside.get("preprocessing", {}), **outside.get("preprocessing", {})}
     return {**_ultralytics(metadata), **inside, **outside, "preprocessing": preprocessing}
 
 
 def _read(path: Path) -> str:
+    check_regular(path)
+    if path.stat().st_size > MOST_METADATA:
+        raise DataError(f"{path}: expected at most {MOST_METADATA:,} bytes")
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -53,15 +59,23 @@ def _parse(text: str, where: str) -> dict[str, Any]:
         settings = json.loads(text)
     except json.JSONDecodeError as error:
         raise DataError(f"{where}: expected JSON, got an error in line {error.lineno}: {error.msg}") from error
+    except (ValueError, RecursionError):  # integers too long, lists too deep
+        raise DataError(f"{where}: expected JSON of ordinary numbers and depth") from None
     if not isinstance(settings, dict):
-        raise DataError(f"{where}: expected an object, got {settings!r}")
+        raise DataError(f"{where}: expected an object, got {shown(settings)}")
     unknown = sorted(set(settings) - set(KEYS))
     if unknown:
-        raise DataError(f"{where}: unknown {', '.join(unknown)}; known: {', '.join(KEYS)}")
+        raise DataError(f"{where}: unknown {', '.join(unknown)[:80]!a}; known: {', '.join(KEYS)}")
     for key, value in settings.items():
         if not isinstance(value, KEYS[key]):
             kinds = " or ".join(kind.__name__ for kind in KEYS[key])
-            raise DataError(f"{where}: {key}: expected {kinds}, got {value!r}")
+            raise DataError(f"{where}: {key}: expected {kinds}, got {shown(value)}")
+    names, size = settings.get("classes", []), settings.get("input_size", 1)
+    if not all(isinstance(name, str) and is_plain(name) for name in names):
+        raise DataError(f"{where}: classes: expected names without control characters, got {shown(names)}")
+    for number in size if isinstance(size, list) else [size]:
+        if not is_number(number, whole=True):
+            raise DataError(f"{where}: input_size: expected whole numbers, got {shown(size)}")
     return settings
 
 
@@ -71,10 +85,12 @@ def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:
     try:
         if "names" in metadata:
             names = ast.literal_eval(metadata["names"])
-            found["classes"] = [str(names[i]) for i in range(len(names))]
+            found["classes"] = [names[i] for i in range(len(names))]
+            if not all(isinstance(name, str) and is_plain(name) for name in found["classes"]):
+                return {}
         if "imgsz" in metadata:
             height, width = ast.literal_eval(metadata["imgsz"])
             found["input_size"] = [int(width), int(height)]
-    except (ValueError, SyntaxError, TypeError, KeyError, IndexError):
+    except (ValueError, SyntaxError, TypeError, KeyError, IndexError, RecursionError, MemoryError, OverflowError):
         return {}  # somebody else's keys of the same name
     return found

@@ -91,8 +91,8 @@ class OnnxTwin:
             path = exported(network, cache_folder() / "exported")
         except DataError:  # nothing can be written there
             with tempfile.TemporaryDirectory() as folder:
-                return OnnxSession(exported(network, Path(folder)))
-        return OnnxSession(path)
+                return OnnxSession(exported(network, Path(folder)), checked=False)
+        return OnnxSession(path, checked=False)
 
 
 def network_digest(network: Darknet) -> str:

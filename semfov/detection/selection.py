@@ -8,7 +8,7 @@ from torch import Tensor
 from semfov.detection.detections import Detections
 from semfov.detection.placement import Placement
 from semfov.detection.scores import BackgroundPolicy, Candidates, score_vectors
-from semfov.errors import check, check_finite, values_known
+from semfov.errors import check, check_finite, check_number, check_whole, values_known
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,11 @@ class Selection:
     iou: float = 0.5
     limit: int = 100
     per_class: bool = False
+
+    def __post_init__(self) -> None:
+        check_number(self.threshold, "threshold", 0, 1)
+        check_number(self.iou, "iou", 0, 1)
+        check_whole(self.limit, "limit", 0, 10**9)
 
 
 def select(

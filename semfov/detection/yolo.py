@@ -89,7 +89,8 @@ class YoloV3(Detector):
         size = network.input_size if input_size is None else input_size
         multiple = f"a multiple of {network.stride}"
         check(all(n > 0 and n % network.stride == 0 for n in size), "input_size", f"{multiple} in both axes", size)
-        check(stride is None or (stride > 0 and stride % network.stride == 0), "stride", f"None or {multiple}", stride)
+        fits = stride is None or (isinstance(stride, int) and stride > 0 and stride % network.stride == 0)
+        check(fits, "stride", f"None or {multiple}", repr(stride))
         for head in network.heads:
             check(head.classes == len(classes), "classes", f"{head.classes} names", len(classes))
         super().__init__(name, classes, size, background=background, selection=selection, stride=stride, digest=digest)

@@ -1,15 +1,24 @@
 """Command lines from dataclasses: help, YAML files, dotted overrides, exit codes."""
 
+import os
+import re
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 from jsonargparse import ArgumentParser, set_parsing_settings
 
 from semfov.errors import SemfovError
+from semfov.experiments.settings import check_settings
+from semfov.io.files import discard_unfinished
 
 Config = TypeVar("Config")
+
+_GOES_ON = "the same command goes on where this one stopped"
 
 
 def make_parser(
@@ -39,7 +48,10 @@ def _formatter() -> Any:
     from jsonargparse import DefaultHelpFormatter
 
     class Formatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
-        """Keeps the line breaks of the description."""
+        """Keeps the line breaks of the description, and tells ranges as people do."""
+
+        def _expand_help(self, action: argparse.Action) -> str:
+            return re.sub(r"Annotated\[(\w+), ([^]]*)\]", r"\1 \2", super()._expand_help(action))
 
     return Formatter
 
@@ -55,18 +67,54 @@ def run_command(
     """Parse `arguments` into a `config` and call `main` with it.
 
     Returns:
-        0, or 1 after a `SemfovError` (printed in one line), or 130 after Ctrl-C; usage errors exit with 2.
+        0, or 1 after a `SemfovError` (printed in one line), or 130 after Ctrl-C, or 143 after SIGTERM; usage errors
+        exit with 2.
     """
-    parser = make_parser(config, description, positional)
-    parsed = parser.parse_args(arguments)
-    parsed.pop("config", None)
-    settings = parser.instantiate(parsed)
     try:
-        main(config(**settings.as_dict()))
+        with _signals():
+            parser = make_parser(config, description, positional)
+            parsed = parser.parse_args(arguments)
+            parsed.pop("config", None)
+            check_settings(config, parsed)
+            settings = parser.instantiate(parsed)
+            main(config(**settings.as_dict()))
     except SemfovError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("interrupted; the same command goes on where this one stopped", file=sys.stderr)
-        return 130
+        print(f"interrupted; {_GOES_ON}", file=sys.stderr)
+        return 128 + signal.SIGINT
+    except _Terminated:
+        print(f"terminated; {_GOES_ON}", file=sys.stderr)
+        return 128 + signal.SIGTERM
     return 0
+
+
+class _Terminated(BaseException):
+    """Somebody wants this process to end; what is under way is cleared up first."""
+
+
+@contextmanager
+def _signals() -> Iterator[None]:
+    """SIGINT and SIGTERM end the command in good order, the second time at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, _: object) -> None:
+        signal.signal(signal.SIGINT, _leave)
+        signal.signal(signal.SIGTERM, _leave)
+        raise KeyboardInterrupt if number == signal.SIGINT else _Terminated
+
+    wanted = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, end) for number in wanted}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _leave(number: int, _: object) -> None:
+    discard_unfinished()
+    os._exit(128 + number)

@@ -2,12 +2,25 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import Memory
 from semfov.detection.onnx_twin import Runtime
 from semfov.detection.scores import BackgroundPolicy
+from semfov.experiments.settings import (
+    Count,
+    Positive,
+    Range,
+    Seed,
+    Settings,
+    Share,
+    Shifts,
+    Side,
+    Weight,
+    Whole,
+    Workers,
+)
 from semfov.gaze.saliency.cells import Reduction
 from semfov.sensor import SENSORS, Foveation, named_sensor
 from semfov.sensor.named import SensorName
@@ -18,7 +31,7 @@ Scores = Literal["raw", "calibrated", "learned"]
 
 
 @dataclass(frozen=True)
-class DataConfig:
+class DataConfig(Settings):
     """Which scenes to search.
 
     Args:
@@ -34,15 +47,15 @@ class DataConfig:
 
     root: Path | None = None
     annotations: Path | None = None
-    limit: int | None = None
+    limit: Count | None = None
     ids: Path | None = None
-    min_instances: int = 8
-    max_target_area: float | None = 0.2
-    scene_seed: int = 0
+    min_instances: Whole = 8
+    max_target_area: Positive | None = 0.2
+    scene_seed: Seed = 0
 
 
 @dataclass(frozen=True)
-class DetectorConfig:
+class DetectorConfig(Settings):
     """Which detector looks through the fovea.
 
     Args:
@@ -62,16 +75,16 @@ class DetectorConfig:
     name: str = "yolov3-tiny"
     weights: Path | None = None
     background: BackgroundPolicy = "residual"
-    threshold: float = 0.02
-    iou: float = 0.5
-    limit: int = 100
-    stride: int | Literal["auto"] | None = "auto"
-    input_size: int | None = None
+    threshold: Share = 0.02
+    iou: Share = 0.5
+    limit: Count = 100
+    stride: Annotated[int, Range(1, 4096)] | Literal["auto"] | None = "auto"
+    input_size: Annotated[int, Range(1, 65_536)] | None = None
     runtime: Runtime = "auto"
 
 
 @dataclass(frozen=True)
-class SensorConfig:
+class SensorConfig(Settings):
     """The foveal sensor.
 
     Args:
@@ -85,11 +98,11 @@ class SensorConfig:
     """
 
     name: SensorName = "gradual"
-    sigma: float | None = None
-    growth: float | None = None
-    levels: int = 5
+    sigma: Positive | None = None
+    growth: Positive | None = None
+    levels: Annotated[int, Range(1, 30)] = 5
     convention: Literal["kornia", "opencv"] = "kornia"
-    reference: float = 640.0
+    reference: Positive = 640.0
 
     def make(self) -> Foveation:
         """The sensor."""
@@ -104,7 +117,7 @@ class SensorConfig:
 
 
 @dataclass(frozen=True)
-class BeliefConfig:
+class BeliefConfig(Settings):
     """The grid of beliefs.
 
     Args:
@@ -125,12 +138,12 @@ class BeliefConfig:
         context_model: fitted context, by name or file.
     """
 
-    columns: int = 10
-    rows: int = 10
-    prior: float = 0.5
+    columns: Side = 10
+    rows: Side = 10
+    prior: Positive = 0.5
     fusion: Literal["kaplan", "product", "sum"] = "kaplan"
     footprint: Footprint = "overlap"
-    tempering: float = 1.0
+    tempering: Positive = 1.0
     memory: Memory = "all"
     misses: bool = False
     model: str | None = None
@@ -141,7 +154,7 @@ class BeliefConfig:
 
 
 @dataclass(frozen=True)
-class SaliencyConfig:
+class SaliencyConfig(Settings):
     """The saliency baselines, `vocus2` and `itti-koch`.
 
     Args:
@@ -153,11 +166,11 @@ class SaliencyConfig:
 
     view: Literal["foveated", "picture"] = "foveated"
     reduction: Reduction = "max"
-    weight: float = 1.0
+    weight: Weight = 1.0
 
 
 @dataclass(frozen=True)
-class PolicyConfig:
+class PolicyConfig(Settings):
     """A policy under comparison: where it looks, and what it believes. What is null is as `belief` has it for the run.
 
     Args:
@@ -175,7 +188,7 @@ class PolicyConfig:
 
     policy: str
     scores: Scores = "raw"
-    tempering: float | None = None
+    tempering: Positive | None = None
     footprint: Footprint | None = None
     memory: Memory | None = None
     misses: bool | None = None
@@ -184,7 +197,7 @@ class PolicyConfig:
 
 
 @dataclass(frozen=True)
-class ProtocolConfig:
+class ProtocolConfig(Settings):
     """The experiment.
 
     Args:
@@ -198,16 +211,16 @@ class ProtocolConfig:
         batch: episodes that are run as one tensor (no influence on the result).
     """
 
-    starts: int = 10
-    shifts: int = 30
+    starts: Annotated[int, Range(1, 10_000)] = 10
+    shifts: Shifts = 30
     ties: Literal["random", "first"] = "random"
     control: Literal["none", "wrong-class", "permuted"] = "none"
-    seed: int = 0
-    batch: int = 1024
+    seed: Seed = 0
+    batch: Count = 1024
 
 
 @dataclass(frozen=True)
-class SearchConfig:
+class SearchConfig(Settings):
     """Visual search: find a target class by moving a fovea, and count the gaze shifts that it takes.
 
     Args:
@@ -248,12 +261,12 @@ class SearchConfig:
     out: Path = Path("runs/search")
     cache: Path | None = None
     store: bool = True
-    workers: int | None = None
-    scanpaths: int = 3
+    workers: Workers | None = None
+    scanpaths: Whole = 3
 
 
 @dataclass(frozen=True)
-class ExploreConfig:
+class ExploreConfig(Settings):
     """Scene exploration: learn what is where by moving a fovea, and count the cells whose class is right.
 
     Args:
@@ -297,7 +310,7 @@ class ExploreConfig:
     out: Path = Path("runs/explore")
     cache: Path | None = None
     store: bool = True
-    workers: int | None = None
+    workers: Workers | None = None
 
 
 RunConfig = SearchConfig | ExploreConfig

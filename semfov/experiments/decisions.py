@@ -25,6 +25,7 @@ from semfov.experiments.parts import Record
 from semfov.experiments.run import Run
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.seeds import generator_for, noise_for
+from semfov.experiments.settings import Positive, Share
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import NonPredictive, Random, Task
 from semfov.observation.matching import box_iou
@@ -44,9 +45,9 @@ class DecisionConfig(SearchConfig):
     """
 
     policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
-    confirm: float | None = None
-    give_up: float | None = None
-    prices: tuple[float, ...] = ()
+    confirm: Share | None = None
+    give_up: Share | None = None
+    prices: tuple[Positive, ...] = ()
 
 
 class DecisionRun(Run):
@@ -77,10 +78,13 @@ class DecisionRun(Run):
             "random gaze": (random, by_thresholds),
             **{f"price {price:g}": (learned, partial(decide_by_price, price=price)) for price in config.prices},
         }
-        # The key is asked for once more, now that it is known what is compared.
-        self.key = hashlib.sha256(
-            json.dumps(["decisions", self.key, asdict(self.thresholds), list(self.compared)]).encode()
-        ).hexdigest()
+
+    def _key(self) -> str:
+        evidence, config = self.models.evidence, self.config
+        assert evidence is not None
+        chosen = asdict(evidence.thresholds) if evidence.thresholds else None
+        what = ["decisions", super()._key(), chosen, config.confirm, config.give_up, config.prices]
+        return hashlib.sha256(json.dumps(what).encode()).hexdigest()
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
         """Records of all searches of a scene, and the seconds that they took."""

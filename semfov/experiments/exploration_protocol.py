@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import probabilities_of
 from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
@@ -101,7 +100,7 @@ def run_explorations(
             choice,
             most=shifts + 1,
         ):
-            known = probabilities_of(step.belief)
+            known = step.belief.class_probabilities()
             visits.append(step.cell)
             counts.append(counts_of(known, answers))
         # All episodes have made as many shifts, and so all run out of cells at once: nothing changes after that.

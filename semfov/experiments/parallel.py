@@ -1,18 +1,24 @@
 """Work cut into tasks, shared by processes on this machine and, under torchrun, by machines."""
 
+import logging
 import multiprocessing
 import os
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from typing import TypeVar
 
-import torch
-import torch.distributed
 from tqdm import tqdm
 
 from semfov.errors import SemfovError
+from semfov.io.files import discard_unfinished
+
+_log = logging.getLogger(__name__)
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -33,13 +39,25 @@ def mine(tasks: Sequence[Task]) -> list[Task]:
     return list(tasks[rank() :: world()])
 
 
-def wait_for_all() -> None:
-    """Wait until every rank has come here; nothing without torchrun."""
+def wait_for_others(tasks: Sequence[Task], finished: Callable[[Task], bool], *, seconds: float = 1.0) -> None:
+    """Wait until the tasks of all ranks are finished, however long that takes; nothing without torchrun.
+
+    Ranks see each other's results in the folder that they share, and know each other by nothing else. (torchrun ends
+    all of them when one fails.)
+
+    Args:
+        tasks: all of them.
+        finished: whether the result of a task is there.
+        seconds: between two looks at the folder.
+    """
     if world() == 1:
         return
-    if not torch.distributed.is_initialized():
-        torch.distributed.init_process_group("gloo")
-    torch.distributed.barrier()
+    left = [task for task in tasks if not finished(task)]
+    if left:
+        _log.info("waiting for %d tasks of other ranks", len(left))
+    while left:
+        time.sleep(seconds)
+        left = [task for task in left if not finished(task)]
 
 
 def available_cores() -> int:
@@ -85,7 +103,9 @@ def run_tasks(
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(min(workers, len(tasks)), context, _prepare, (setup, settings)) as pool:
             try:
-                for done in as_completed([pool.submit(function, task) for task in tasks]):
+                with _deaf_children():
+                    submitted = [pool.submit(function, task) for task in tasks]
+                for done in as_completed(submitted):
                     yield done.result()
                     bar.update()
             except BaseException as error:
@@ -100,7 +120,41 @@ def run_tasks(
                 ) from None
 
 
+@contextmanager
+def _deaf_children() -> Iterator[None]:
+    """Processes that are started here never hear of Ctrl-C, which reaches all of a terminal: the first ends the others.
+
+    They inherit the mask, and so are deaf from their first moment on, before any code of theirs has run.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # it would lift the mask when it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _prepare(setup: Callable[..., None], settings: tuple[object, ...]) -> None:
-    # Ctrl-C reaches every process of a terminal; the first one ends the others.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _leave)
+    threading.Thread(target=_outlive_nobody, daemon=True).start()
     setup(*settings)
+
+
+def _leave(*_: object) -> None:
+    """End now and leave no unfinished file behind."""
+    discard_unfinished()
+    os._exit(128 + signal.SIGTERM)
+
+
+def _outlive_nobody() -> None:
+    """End this worker when the process that started it does, however that came about."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(2)  # a long operation may keep the handler from running
+        _leave()

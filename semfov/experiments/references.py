@@ -5,7 +5,6 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import probabilities_of
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Semantic
 from semfov.detection.detections import Detections
@@ -35,4 +34,4 @@ def sharp_maps(sharp: Detections, grid: Grid) -> Mapping[str, Tensor]:
     each = cells[..., None] * scores[:, :, None]
     highest = each.amax(1) if each.shape[1] else each.sum(1)
     background = torch.full_like(highest[..., :1], _SURE)
-    return {FUSED: probabilities_of(fused), PAINTED: torch.cat([background, highest], -1)}
+    return {FUSED: fused.class_probabilities(), PAINTED: torch.cat([background, highest], -1)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from abc import ABC, abstractmethod
 from dataclasses import asdict
 from pathlib import Path
@@ -14,17 +15,21 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
-from semfov.errors import DataError, lookup
+from semfov.errors import DataError, check, lookup
 from semfov.experiments.candidates import Candidate, load_models, make_strategy
 from semfov.experiments.config import RunConfig, SaliencyModel
-from semfov.experiments.parallel import available_cores, mine, run_tasks, wait_for_all
+from semfov.experiments.looks import see_all
+from semfov.experiments.parallel import available_cores, mine, run_tasks, wait_for_others
 from semfov.experiments.parts import Parts, Record
 from semfov.experiments.presets import SALIENCY, label, resolve
 from semfov.experiments.saliency_store import SaliencyStore, saliency_table
 from semfov.experiments.setup import make_eye, make_scenes, prepare_worker
-from semfov.experiments.store import DetectionStore, see_all
-from semfov.gaze.policies import Task
+from semfov.experiments.store import DetectionStore, versions
+from semfov.gaze.policies import POLICIES, Task
+from semfov.io.code import class_digest, package_digest
 from semfov.io.storage import checksum
+
+_log = logging.getLogger(__name__)
 
 
 class Run(ABC):
@@ -33,14 +38,19 @@ class Run(ABC):
     Attributes:
         task: what episodes are for.
         policies: settings of the policies under comparison, by what tables call them.
-        key: sha256 of everything that the outcomes depend on; parts of another run are never mixed in.
+        settings_key: sha256 of all settings, models and scenes that the outcomes depend on.
+        code: sha256 of all code that they depend on.
+        key: of both; parts of another run are never mixed in.
     """
 
     task: ClassVar[Task]
 
     def __init__(self, config: RunConfig) -> None:
         self.config = config
-        self.policies = {label(choice, self.task): resolve(choice, self.task) for choice in config.policies}
+        labels = [label(choice, self.task) for choice in config.policies]
+        for name in labels:
+            check(labels.count(name) == 1, "policies", "each of them once", f"{name!r} {labels.count(name)} times")
+        self.policies = {name: resolve(choice, self.task) for name, choice in zip(labels, config.policies, strict=True)}
         self.eye = make_eye(config.detector, config.sensor)
         self.scenes: Scenes = make_scenes(config.data, self.eye.detector.classes)
         if not len(self.scenes):
@@ -53,13 +63,25 @@ class Run(ABC):
         }
         settings, cache = self.eye.settings(), cache_folder(config)
         size = config.belief.columns, config.belief.rows
-        self.store = DetectionStore(cache / "looks", settings, *size)
+        self.store = DetectionStore(cache / "looks", settings, *size, components)
         self.saliency_stores = {
             name: SaliencyStore(cache / "saliency", name, config.saliency, settings["sensor"], size)
             for name in dict.fromkeys(policy.saliency for policy in self.policies.values())
             if name is not None
         }
-        self.key = self._key()
+        self.make_key()
+        self._digests: dict[int, str] = {}
+
+    def make_key(self) -> None:
+        """Set the keys from what the run is made of; asked for again where a subclass makes more of it."""
+        self.settings_key, self.code = self._key(), self._code()
+        self.key = f"{self.settings_key[:16]}-{self.code[:16]}"
+
+    def _code(self) -> str:
+        """Of the whole package and the libraries below it, and of policies that the user registered."""
+        chosen = {policy.policy for policy in self.policies.values()} & POLICIES.keys()
+        foreign = [name for name in sorted(chosen) if not POLICIES[name].__module__.startswith("semfov.")]
+        return _sha256([package_digest(), versions(), [class_digest(POLICIES[name]) for name in foreign]])
 
     def _key(self) -> str:
         config, models = self.config, self.models
@@ -76,15 +98,21 @@ class Run(ABC):
             fitted["map"] = checksum(models.map.state_dict())
         belief = {name: value for name, value in asdict(config.belief).items() if not name.endswith("model")}
         protocol = {name: value for name, value in asdict(config.protocol).items() if name != "batch"}
-        saliency = {name: [store.key, config.saliency.weight] for name, store in self.saliency_stores.items()}
+        saliency = asdict(config.saliency) if self.saliency_stores else None
         policies = {name: asdict(policy) for name, policy in self.policies.items()}
-        what = [self.task, self.store.key, self.scenes.fingerprint, belief, fitted, protocol, policies, saliency]
-        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+        seen = [self.eye.settings(), self.scenes.fingerprint]
+        return _sha256([self.task, seen, belief, fitted, protocol, policies, saliency])
 
     @property
     def parts(self) -> Parts:
         """Outcomes of finished scenes."""
-        return Parts(self.config.out / "parts", self.key)
+        return Parts(self.config.out / "parts", self.key, self.digest)
+
+    def digest(self, index: int) -> str:
+        """sha256 of what the pixels of a scene depend on."""
+        if index not in self._digests:
+            self._digests[index] = self.scenes.digest(index)
+        return self._digests[index]
 
     @abstractmethod
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
@@ -104,7 +132,7 @@ class Run(ABC):
 
     def detections(self, index: int) -> Detections:
         """What is seen from every cell of a scene, from the store or computed (and kept)."""
-        digest = self.scenes.digest(index)
+        digest = self.digest(index)
         seen = self.store.load(digest) if self.config.store else None
         if seen is None:
             seen = see_all(self.eye, self.scenes[index].image, self.grid(index))
@@ -114,7 +142,7 @@ class Run(ABC):
 
     def saliency(self, name: SaliencyModel, index: int) -> Tensor:
         """Saliency of the cells of a scene (`saliency_table`), from the store or computed (and kept)."""
-        digest, store = self.scenes.digest(index), self.saliency_stores[name]
+        digest, store = self.digest(index), self.saliency_stores[name]
         saliency = store.load(digest) if self.config.store else None
         if saliency is None:
             image = self.scenes[index].image
@@ -138,6 +166,14 @@ def finish(run: Run, title: str) -> None:
     """Run all scenes that have no part yet, this rank its share of them, and wait for the other ranks."""
     parts = run.parts
     todo = [index for index in mine(range(len(run.scenes))) if parts.load(index) is None]
+    older = parts.by_other_code()
+    if todo and older:
+        _log.warning(
+            "%s: %d scenes were finished with these settings by other code (this package or a library has changed "
+            "since); they are not used, and computed anew",
+            run.config.out,
+            older,
+        )
     done = run_tasks(
         finish_scene,
         todo,
@@ -149,7 +185,11 @@ def finish(run: Run, title: str) -> None:
     )
     for _ in done:
         pass
-    wait_for_all()
+    wait_for_others(range(len(run.scenes)), lambda index: parts.load(index) is not None)
+
+
+def _sha256(what: object) -> str:
+    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
 
 _process: dict[str, Run] = {}

@@ -12,11 +12,16 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.detection.placement import resize
 from semfov.experiments.config import SaliencyConfig
-from semfov.experiments.store import SceneStore, code_digest
+from semfov.experiments.looks import one_thread
+from semfov.experiments.store import SceneStore, looks_digest
 from semfov.gaze.saliency import VOCUS2, IttiKoch, cell_saliency
+from semfov.io.schema import Field, Schema
 from semfov.sensor import Bands, Foveation
 
 Model = Callable[[Tensor], Tensor]
+
+SOURCES = ("semfov.gaze.saliency", "semfov.belief.grid", __name__)
+"""Modules that saliency depends on beside those of a look."""
 
 SALIENCY_MODELS: dict[str, Callable[[], Model]] = {"vocus2": VOCUS2, "itti-koch": IttiKoch}
 
@@ -42,12 +47,15 @@ class SaliencyStore(SceneStore):
             "sensor": sensor if saliency.view == "foveated" else None,
             "grid": list(grid),
         }
-        super().__init__(folder, what, code_digest("gaze/saliency/*.py"))
+        cells = grid[0] * grid[1]
+        schema = Schema({"saliency": Field(("F", cells), low=0)})
+        super().__init__(folder, what, looks_digest(*SOURCES), schema)
+        self.fixations = cells if saliency.view == "foveated" else 1
 
     def load(self, digest: str) -> Tensor | None:
         """Saliency of a scene, or None if the store does not have it whole."""
         tensors = self.read(digest)
-        return None if tensors is None else tensors["saliency"]
+        return None if tensors is None or len(tensors["saliency"]) != self.fixations else tensors["saliency"]
 
     def save(self, digest: str, saliency: Tensor) -> None:
         """Keep the saliency of a scene."""
@@ -70,7 +78,7 @@ def saliency_table(
         grid: the grid over it.
     """
     model = SALIENCY_MODELS[name]()
-    with torch.inference_mode():
+    with one_thread(), torch.inference_mode():
         if saliency.view == "picture":
             return cells_of(model, image[None], grid, saliency)
         bands, fixations = seen_by(sensor, reference, image, grid.centres)

@@ -17,12 +17,14 @@ from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.experiments.parallel import available_cores, mine, run_tasks, wait_for_all
+from semfov.experiments.looks import look_from
+from semfov.experiments.parallel import available_cores, mine, run_tasks, wait_for_others
 from semfov.experiments.seeds import generator_for
 from semfov.experiments.setup import make_eye, make_scenes, prepare_worker
-from semfov.experiments.store import code_digest
+from semfov.experiments.store import looks_digest, versions
 from semfov.eye import Eye
 from semfov.io.cached import read_tensors, write_tensors
+from semfov.io.schema import Field, Schema
 from semfov.observation.matching import match
 
 
@@ -83,6 +85,9 @@ class Samples:
 _DETECTIONS = ("boxes", "scores", "distance", "labels", "look")
 _NAMES = (*_DETECTIONS, "scenes", "fixations")
 
+SOURCES = ("semfov.observation.matching", "semfov.belief.grid", "semfov.experiments.seeds")
+"""Modules that samples depend on beside those of a look."""
+
 
 @dataclass(frozen=True)
 class SampleSettings:
@@ -124,8 +129,20 @@ class Sampler:
         self.eye: Eye = make_eye(settings.detector, settings.sensor)
         self.scenes: Scenes = make_scenes(settings.data, self.eye.detector.classes)
         what = [self.eye.settings(), self.scenes.fingerprint, settings.fixations, settings.iou, settings.seed]
-        what += [settings.shard, torch.__version__, code_digest()]
+        what += [settings.shard, versions(), looks_digest(*SOURCES)]
         self.key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+        components = len(self.scenes.classes) + 1
+        self._schema = Schema(
+            {
+                "boxes": Field(("M", 4)),
+                "scores": Field(("M", components), low=0, high=1),
+                "distance": Field(("M",), low=0),
+                "labels": Field(("M",), torch.int64, low=0, high=components - 1),
+                "look": Field(("M",), torch.int64, low=0),
+                "scenes": Field(("R",), torch.int64, low=0, high=len(self.scenes) - 1),
+                "fixations": Field(("R", 2)),
+            }
+        )
 
     @property
     def shards(self) -> range:
@@ -138,28 +155,35 @@ class Sampler:
 
     def load(self, folder: Path, shard: int) -> Samples | None:
         """Samples of a shard, or None if they are not there whole."""
-        tensors = read_tensors(self.path(folder, shard), self.key)
+        tensors = read_tensors(self.path(folder, shard), self._shard_key(shard), self._schema)
         return None if tensors is None else Samples(**tensors)
 
     def save(self, folder: Path, shard: int, samples: Samples) -> None:
         """Keep the samples of a shard."""
-        write_tensors(self.path(folder, shard), self.key, {name: getattr(samples, name) for name in _NAMES})
+        tensors = {name: getattr(samples, name) for name in _NAMES}
+        write_tensors(self.path(folder, shard), self._shard_key(shard), tensors)
+
+    def scenes_of(self, shard: int) -> range:
+        """The photographs of a shard."""
+        first = shard * self.settings.shard
+        return range(first, min(first + self.settings.shard, len(self.scenes)))
+
+    def _shard_key(self, shard: int) -> str:
+        """Of what a shard depends on, the pixels of its photographs among it."""
+        digests = [self.scenes.digest(index) for index in self.scenes_of(shard)]
+        return hashlib.sha256(json.dumps([self.key, digests]).encode()).hexdigest()
 
     def sample(self, shard: int) -> Samples:
         """Look at the photographs of a shard."""
-        first = shard * self.settings.shard
-        scenes = range(first, min(first + self.settings.shard, len(self.scenes)))
-        return Samples.join([self._look(index) for index in scenes])
+        return Samples.join([self._look(index) for index in self.scenes_of(shard)])
 
     def _look(self, index: int) -> Samples:
         settings, scene = self.settings, self.scenes[index]
         grid = Grid(1, 1, scene.size)
         generator = generator_for("fixations", settings.seed, scene.id)
         points = torch.rand(settings.fixations, 2, generator=generator) * grid.extent - 0.5
+        seen = look_from(self.eye, scene.image, points)
         with torch.inference_mode():
-            view = self.eye.open(scene.image[None])
-            # One view at a time: the bits then do not depend on which views share a batch.
-            seen = Detections.stack([self.eye.look(view, point[None]) for point in points])
             distance = grid.box_distance(seen.boxes, points)
             labels = [
                 match(boxes[mask], scene.boxes, scene.labels, iou=settings.iou)
@@ -208,7 +232,7 @@ def collect(settings: SampleSettings, folder: Path, workers: int | None, title: 
     )
     for _ in done:
         pass
-    wait_for_all()
+    wait_for_others(sampler.shards, lambda shard: sampler.load(folder, shard) is not None)
     parts = []
     for shard in sampler.shards:
         part = sampler.load(folder, shard)

@@ -27,6 +27,7 @@ from semfov.experiments.summary import (
     table,
     write_files,
 )
+from semfov.io.files import clean, inside
 from semfov.metrics.search import cumulative_performance, random_search
 from semfov.viz.views import foveated_views
 
@@ -133,6 +134,8 @@ def draw_scanpaths(run: SearchRun, records: list[Record]) -> list[Path]:
         scanpath = replay(run, index, record)
         views = foveated_views(run.eye, scene.image, scanpath.fixations)
         boxes = scene.boxes[scene.labels == record["target"]]
-        name = f"scanpath_{record['scene']}_{record['target_name'].replace(' ', '-')}.png"
-        paths.append(save_figure(plot_episode(scanpath, scene.image, views, boxes=boxes), run.config.out / name))
+        # An id is whatever the annotations say; its number tells cleaned ones apart.
+        told = record["scene"] if isinstance(record["scene"], int) else f"{index}-{clean(record['scene'])}"
+        path = inside(run.config.out, f"scanpath_{told}_{clean(record['target_name'])}.png")
+        paths.append(save_figure(plot_episode(scanpath, scene.image, views, boxes=boxes), path))
     return paths

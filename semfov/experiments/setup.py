@@ -15,9 +15,11 @@ from semfov.data.scene import Scenes
 from semfov.detection.load import load_detector
 from semfov.errors import DataError, InputError
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.experiments.looks import one_thread
 from semfov.eye import Eye
 from semfov.gaze.learned import LearnedGaze
 from semfov.io.compatibility import learned_for, recommended
+from semfov.io.files import check_regular
 from semfov.observation.foveal import FovealObservationModel
 
 
@@ -44,6 +46,7 @@ def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
 
 def read_ids(path: Path) -> list[str]:
     """Ids of photographs, one a line."""
+    check_regular(path)
     try:
         return path.read_text(encoding="utf-8").split()
     except (OSError, UnicodeDecodeError) as error:
@@ -66,7 +69,9 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
         options["input_size"] = detector.input_size
     if detector.runtime != "auto":
         options["runtime"] = detector.runtime
-    model = load_detector(detector.name, **options)
+    # A session of onnxruntime keeps the threads that it is opened with.
+    with one_thread():
+        model = load_detector(detector.name, **options)
     return Eye(sensor.make(), model, reference=sensor.reference).eval().requires_grad_(False)
 
 

@@ -18,46 +18,31 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
-from semfov.eye import Eye
+from semfov.experiments.looks import SOURCES
 from semfov.io.cached import read_tensors, write_tensors
+from semfov.io.code import modules_digest
+from semfov.io.schema import Field, Schema
 from semfov.version import __version__
-
-
-def see_all(eye: Eye, image: Tensor, grid: Grid) -> Detections:
-    """Detections in `image` `(3, H, W)` from the centre of every cell, a batch of X·Y.
-
-    Views go through the detector one at a time: the bits then do not depend on which views share a batch.
-    """
-    view = eye.open(image[None])
-    with torch.inference_mode():
-        looks = [eye.look(view, centre[None]) for centre in grid.centres.to(image)]
-        return Detections.stack(looks)
 
 
 class SceneStore:
     """A folder of tensors, one file for each scene.
 
-    Files are written atomically and carry a checksum; one that is damaged, cut short or of another version counts
-    as missing and is computed again.
+    Files are written atomically and carry a checksum; one that is damaged, cut short, of another version or not of
+    this store's schema counts as missing and is computed again.
 
     Args:
         folder: where the store lies; several runs and processes may share it.
         what: settings that the tensors depend on.
         code: sha256 of the sources that they depend on.
+        schema: what a file holds.
     """
 
-    def __init__(self, folder: Path, what: Mapping[str, object], code: str) -> None:
-        versions = {
-            "semfov": __version__,
-            "torch": torch.__version__,
-            "torchvision": torchvision.__version__,
-            "kornia": kornia.__version__,
-            "machine": [platform.machine(), torch.backends.cpu.get_cpu_capability()],
-            "code": code,
-        }
-        described = json.dumps({**what, "versions": versions}, sort_keys=True)
+    def __init__(self, folder: Path, what: Mapping[str, object], code: str, schema: Schema) -> None:
+        described = json.dumps({**what, "versions": {**versions(), "code": code}}, sort_keys=True)
         self.key = hashlib.sha256(described.encode()).hexdigest()
         self.folder = folder / self.key[:16]
+        self.schema = schema
 
     def path(self, digest: str) -> Path:
         """File for the scene whose image has this sha256."""
@@ -65,7 +50,7 @@ class SceneStore:
 
     def read(self, digest: str) -> dict[str, Tensor] | None:
         """Tensors of a scene, or None if the store does not have them whole."""
-        return read_tensors(self.path(digest), self.key)
+        return read_tensors(self.path(digest), self.key, self.schema)
 
     def write(self, digest: str, tensors: Mapping[str, Tensor]) -> None:
         """Keep the tensors of a scene."""
@@ -80,32 +65,55 @@ class DetectionStore(SceneStore):
         settings: `Eye.settings()`.
         columns: cells in a row.
         rows: cells in a column.
+        components: length of the score vectors; None where it is not known.
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, object], columns: int, rows: int) -> None:
-        super().__init__(folder, {"settings": settings, "grid": [columns, rows]}, code_digest())
+    def __init__(
+        self, folder: Path, settings: Mapping[str, object], columns: int, rows: int, components: int | None = None
+    ) -> None:
+        # Where the cells of a picture of odd sizes have their centres stands for how a grid is laid.
+        centres = Grid(columns, rows, (641, 479)).centres.tolist()
+        what = {"settings": settings, "grid": [columns, rows], "centres": centres}
+        schema = Schema(
+            {
+                "boxes": Field(("M", 4)),
+                "scores": Field(("M", "C" if components is None else components), low=0, high=1),
+                "count": Field((columns * rows,), torch.int64, low=0),
+            }
+        )
+        super().__init__(folder, what, looks_digest(), schema)
 
     def load(self, digest: str) -> Detections | None:
         """Detections from every cell of a scene, or None if the store does not have them whole."""
         tensors = self.read(digest)
-        return None if tensors is None else unpack(tensors)
+        if tensors is None or int(tensors["count"].sum()) != len(tensors["boxes"]):
+            return None
+        return unpack(tensors)
 
     def save(self, digest: str, detections: Detections) -> None:
         """Keep the detections of a scene."""
         self.write(digest, pack(detections))
 
 
+def versions() -> dict[str, object]:
+    """Of everything besides this package that numbers depend on."""
+    return {
+        "semfov": __version__,
+        "torch": torch.__version__,
+        "torchvision": torchvision.__version__,
+        "kornia": kornia.__version__,
+        "machine": [platform.machine(), torch.backends.cpu.get_cpu_capability()],
+    }
+
+
 @cache
-def code_digest(*more: str) -> str:
+def looks_digest(*more: str) -> str:
     """sha256 over the sources that turn an image into detections: a store never outlives a change of them.
 
     Args:
-        more: patterns of further files of the package.
+        more: dotted names of further modules.
     """
-    package = Path(__file__).parents[1]
-    patterns = ("sensor/*.py", "detection/*.py", "eye.py", *more)
-    files = sorted(file for pattern in patterns for file in package.glob(pattern))
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    return modules_digest(*SOURCES, *more)
 
 
 def pack(detections: Detections) -> dict[str, Tensor]:

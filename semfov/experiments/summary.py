@@ -22,7 +22,7 @@ from semfov.experiments.parts import Record
 from semfov.experiments.run import Run
 from semfov.experiments.setup import plain
 from semfov.io.compatibility import recommended
-from semfov.io.files import replacing, write_text
+from semfov.io.files import inside, replacing, write_text
 from semfov.io.storage import checksum
 from semfov.metrics.averages import standard_error
 from semfov.version import __version__
@@ -105,7 +105,7 @@ def write_files(
         "manifest.json": json.dumps(manifest(run, program, seconds), indent=2) + "\n",
     }
     for name, text in files.items():
-        write_text(run.config.out / name, text)
+        write_text(inside(run.config.out, name), text)
     return [run.config.out / name for name in files]
 
 
@@ -180,6 +180,7 @@ def manifest(run: Run, program: str, seconds: dict[str, float]) -> dict[str, obj
         },
         "machine": platform.machine(),
         "run_key": run.key,
+        "code_sha256": run.code,
         "store_key": run.store.key,
         "saliency_keys": {name: store.key for name, store in run.saliency_stores.items()},
         "scenes_sha256": run.scenes.fingerprint,

@@ -3,16 +3,17 @@
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, get_args
 
 import torch
 from torch import Tensor, nn
 
 from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief, one_by_one, pick
-from semfov.belief.grid import Grid
-from semfov.belief.observers.semantic import Semantic
+from semfov.belief.grid import Footprint, Grid
+from semfov.belief.observers.semantic import Memory, Semantic
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.io.pretrained import PretrainedForEye
+from semfov.io.schema import Field, Number, Object, Schema, Text, convolution
 
 FEATURES = 12
 
@@ -40,6 +41,26 @@ class LearnedGaze(PretrainedForEye):
     kind: ClassVar[str] = "learned-gaze"
     title: ClassVar[str] = "learned gaze policy"
     shipped: ClassVar[Path] = Path(__file__).parent / "models"
+    schema: ClassVar[Schema] = Schema(
+        {
+            "log_scale": Field((), low=-20, high=20),
+            **convolution("network.0", FEATURES, "W", 3),
+            **convolution("network.2", "W", "W", 3),
+            **convolution("network.4", "W", 1, 1),
+        },
+        {
+            "width": Number(size="W"),
+            "belief": Object(
+                {
+                    "prior": Number(above=0, high=1e6),
+                    "tempering": Number(above=0, high=100),
+                    "fusion": Text(("kaplan", "product", "sum")),
+                    "footprint": Text(get_args(Footprint)),
+                    "memory": Text(get_args(Memory)),
+                }
+            ),
+        },
+    )
 
     def __init__(
         self, width: int = 8, *, belief: Mapping[str, Any] | None = None, metadata: Mapping[str, Any] | None = None

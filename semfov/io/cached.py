@@ -5,7 +5,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from semfov.errors import DataError
+from semfov.io.schema import Schema
 from semfov.io.storage import read, write
 
 _KIND = "cached-tensors"
@@ -16,13 +16,21 @@ def write_tensors(path: Path, key: str, tensors: Mapping[str, Tensor]) -> None:
     write(path, tensors, {"kind": _KIND, "key": key, "file": path.name})
 
 
-def read_tensors(path: Path, key: str) -> dict[str, Tensor] | None:
+def read_tensors(path: Path, key: str, schema: Schema | None = None) -> dict[str, Tensor] | None:
     """Tensors that `write_tensors` wrote to this file under this key; None where they are missing or damaged.
 
-    A file that was written under another key or by another name, such as that of another scene, counts as missing.
+    A file that was written under another key or by another name, such as that of another scene, counts as missing, and
+    so does one that holds something else.
+
+    Args:
+        path: the file.
+        key: of what the tensors depend on.
+        schema: what the file must hold.
     """
     try:
         tensors, record = read(path, _KIND)
-    except DataError:
+        if schema is not None:
+            schema.check(tensors)
+    except Exception:  # whatever is wrong with it, it can be made again
         return None
     return tensors if (record.get("key"), record.get("file")) == (key, path.name) else None

@@ -8,10 +8,14 @@ from typing import Any, ClassVar, Self
 
 from torch import Tensor, nn
 
-from semfov.errors import DataError, InputError
+from semfov.errors import DataError, InputError, check
 from semfov.io.compatibility import check_detector, check_sensor
+from semfov.io.schema import METADATA, Schema, Text
 from semfov.io.storage import find, read, write
 from semfov.version import __version__
+
+_COMMON = ("kind", "version", "metadata")
+_ENVELOPE = Schema({}, {"version": Text(), "metadata": METADATA})
 
 
 class Pretrained(nn.Module):
@@ -21,12 +25,15 @@ class Pretrained(nn.Module):
         kind: of file, as its record says.
         title: what messages call it.
         shipped: folder of the models that come with the package.
+        schema: names, shapes, types and ranges of the tensors and of the JSON values of `_record`; a file that is not
+            so is refused.
         metadata: JSON values kept with the model.
     """
 
     kind: ClassVar[str]
     title: ClassVar[str]
     shipped: ClassVar[Path]
+    schema: ClassVar[Schema]
     metadata: dict[str, Any]
 
     @abstractmethod
@@ -58,9 +65,15 @@ class Pretrained(nn.Module):
         path = find(name_or_path, cls.shipped, cls.title)
         tensors, record = read(path, cls.kind)
         try:
+            own = {name: value for name, value in record.items() if name not in _COMMON}
+            _ENVELOPE.check({}, record)
+            cls.schema.check(tensors, own)
+            unknown = own.keys() - cls.schema.record.keys()
+            check(not unknown, "record", f"no other values than {', '.join(cls.schema.record)}", sorted(unknown))
             model = cls._restore(record, tensors)
         except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, InputError) as error:
-            raise DataError(f"{path}: not a complete {cls.title} ({error})") from None
+            reason = " ".join(str(error).split())
+            raise DataError(f"{path}: not a complete {cls.title} ({reason})") from None
         return model.eval()
 
 

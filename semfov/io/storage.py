@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import DataError, lookup
-from semfov.io.files import replacing
+from semfov.io.files import check_regular, replacing
 
 # One key only: the order of several would differ from one write to the next.
 _KEY = "semfov"
@@ -47,13 +47,14 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
     """
     from safetensors import SafetensorError, safe_open
 
+    check_regular(path)
     try:
         with safe_open(path, framework="pt") as file:
-            record = json.loads((file.metadata() or {})[_KEY])
+            record = json.loads((file.metadata() or {})[_KEY], parse_constant=_refuse_constant)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     except FileNotFoundError:
         raise DataError(f"{path}: no such file") from None
-    except (OSError, SafetensorError, ValueError) as error:
+    except (OSError, SafetensorError, ValueError, RecursionError, TypeError, AttributeError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise DataError(f"{path}: not a readable safetensors file ({reason}); write or fetch it again") from None
     except KeyError:
@@ -61,11 +62,16 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
     if not isinstance(record, dict) or record.get("kind") != kind:
         found = record.get("kind") if isinstance(record, dict) else type(record).__name__
         raise DataError(f"{path}: expected {kind}, got {found}")
-    # Files of before there were checksums have none to compare with.
     told = record.pop(_CHECKSUM, None)
-    if told is not None and told != checksum(tensors, record):
+    if told is None:
+        raise DataError(f"{path}: expected a file with the sha256 of its content, got one without; write it again")
+    if told != checksum(tensors, record):
         raise DataError(f"{path}: damaged, its content does not have the sha256 it was written with; fetch it again")
     return tensors, record
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no JSON")
 
 
 def find(name_or_path: str | PathLike[str], shipped: Path, kind: str) -> Path:

@@ -14,10 +14,13 @@ from semfov.detection.detector import Detector
 from semfov.errors import InputError, check, check_finite, check_shape, lookup, values_known
 from semfov.io import compatibility
 from semfov.io.pretrained import Pretrained
+from semfov.io.schema import CLASSES, Field, Number, Schema
 from semfov.observation.dirichlet import floor, log_normaliser
 from semfov.observation.fitting import estimate_prior, expected_table, fit_table
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
+
+_MOST_TEMPERING = 100
 
 
 class FovealObservationModel(Pretrained):
@@ -65,6 +68,17 @@ class FovealObservationModel(Pretrained):
     kind: ClassVar[str] = "foveal-observation-model"
     title: ClassVar[str] = "observation model"
     shipped: ClassVar[Path] = Path(__file__).parent / "models"
+    schema: ClassVar[Schema] = Schema(
+        {
+            "log_alpha": Field(("K+1", "N", "K+1"), low=-30, high=30),
+            "edges": Field(("N-1",), above=0, high=100, ascending=True),
+            "log_prior": Field(("K+1", "N"), low=-1e4, high=1e4),
+            "tempering": Field((), above=0, high=_MOST_TEMPERING),
+            "expected": Field(("K+1", "N", "K+1"), low=0, high=1, simplex=True, optional=True),
+            "miss_rate": Field(("K+1", "N"), low=0, high=1, optional=True),
+        },
+        {"classes": CLASSES, "epsilon": Number(above=0, high=1)},
+    )
     edges: Tensor
     log_prior: Tensor
     tempering: Tensor
@@ -95,7 +109,7 @@ class FovealObservationModel(Pretrained):
         check_finite(alpha, "alpha")
         check(bool((alpha > 0).all()), "alpha", "positive numbers", float(alpha.detach().min()))
         check(0 < epsilon < 1, "epsilon", "a number between 0 and 1", epsilon)
-        check(tempering > 0, "tempering", "a positive number", tempering)
+        check(0 < tempering <= _MOST_TEMPERING, "tempering", f"a number above 0, up to {_MOST_TEMPERING}", tempering)
         self.classes = tuple(classes)
         self.epsilon = epsilon
         self.metadata = dict(metadata or {})
@@ -109,6 +123,8 @@ class FovealObservationModel(Pretrained):
             if table is not None:
                 check(tuple(table.shape) == size, name, f"shape {size}", tuple(table.shape))
                 check_finite(table, name)
+                unlikely = name == "miss_rate" and not bool(((table >= 0) & (table <= 1)).all())
+                check(not unlikely, name, "probabilities", "numbers outside [0, 1]")
                 table = table.detach().to(alpha).clone()
             elif name == "log_prior":
                 table = alpha.new_zeros(size)
@@ -220,7 +236,7 @@ class FovealObservationModel(Pretrained):
         components, levels = self.log_alpha.shape[:2]
         wanted, got = ((components, levels), self.epsilon), (statistics.shape, statistics.epsilon)
         check(got == wanted, "statistics", f"shape and epsilon {wanted}", got)
-        check(tempering > 0, "tempering", "a positive number", tempering)
+        check(0 < tempering <= _MOST_TEMPERING, "tempering", f"a number above 0, up to {_MOST_TEMPERING}", tempering)
         lookup(expected, ["dirichlet", "empirical"], "kind of expected scores")
         alpha, fallback = fit_table(statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough)
         if fallback:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from semfov.errors import DataError, InputError, check, check_finite, check_shape
+from semfov.io.schema import Field, Number, Schema
 from semfov.io.storage import read, write
 
 # Sums count quanta of 2^-32. Integers add exactly, so any order and any split of the samples give the same bits.
@@ -133,9 +134,17 @@ class DirichletStatistics:
         """
         tensors, record = read(path, "dirichlet-statistics")
         count, sums = tensors.get("count"), tensors.get("sums")
-        if count is None or sums is None or sums.shape[:-1] != (3, *count.shape):
+        if count is None or sums is None or count.ndim < 1 or sums.shape[:-1] != (3, *count.shape):
             shapes = {name: tuple(t.shape) for name, t in tensors.items()}
             raise DataError(f"{path}: expected tensors count and sums that fit together, got {shapes}")
+        whole = Field(tuple(count.shape), torch.int64, low=0)
+        try:
+            Schema(
+                {"count": whole, "sums": Field(tuple(sums.shape), torch.int64)},
+                {"epsilon": Number(above=0, high=1)},
+            ).check(tensors, record)
+        except InputError as error:
+            raise DataError(f"{path}: not a complete file of statistics ({error})") from None
         if record.get("fraction_bits") != FRACTION_BITS:
             raise DataError(f"{path}: expected sums in units of 2^-{FRACTION_BITS}, got {record.get('fraction_bits')}")
         statistics = cls(tuple(count.shape), sums.shape[-1], epsilon=record["epsilon"])

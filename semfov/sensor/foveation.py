@@ -156,7 +156,8 @@ def _windows(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tens
     """Gaussian windows `(B, G, w_k)` across and `(B, G, h_k)` down every band, all from one exponential."""
     sizes = tuple((band.shape[-2], band.shape[-1]) for band in bands.details)
     place, power, axis, level = _layout(sizes, bands.convention, sigma.dtype, sigma.device)
-    widths = (sigma[..., None] * growth**power).flatten(1)
+    least = torch.finfo(sigma.dtype).tiny  # a width that vanishes is that of a point, and 0 / 0 no number
+    widths = (sigma[..., None] * (growth**power).clamp(min=least)).clamp(min=least).flatten(1)
     offset = (place - fixation.index_select(-1, axis)) / widths.index_select(-1, level)[:, None]
     pieces = offset.square().mul(-0.5).exp().split([n for size in sizes for n in reversed(size)], -1)
     return list(zip(pieces[0::2], pieces[1::2], strict=True))

@@ -15,7 +15,7 @@ from semfov.experiments.samples import SampleSettings, collect
 from semfov.experiments.setup import make_scenes
 from semfov.experiments.summary import table
 from semfov.training.context_weights import fit_weights, make_cases
-from semfov.training.outputs import training_of, write_outputs
+from semfov.training.outputs import model_path, training_of, write_outputs
 from semfov.training.places import FitContextConfig, Places, read_places
 
 
@@ -46,7 +46,7 @@ def fit_context(config: FitContextConfig) -> None:
     model = ContextPrior(
         scenes.classes, prior.place, prior.cooccurrence, config.edges, weights=weights, metadata=metadata
     )
-    path = config.out / f"{config.name}.safetensors"
+    path = model_path(config, "context")
     model.save(path)
     text = report(judged, weights, len(known), config)
     write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)

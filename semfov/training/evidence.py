@@ -4,11 +4,11 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-from tqdm import tqdm
 
 from semfov.belief import TargetEvidence
 from semfov.belief.grid import Grid
@@ -16,24 +16,25 @@ from semfov.belief.observers import Target, TargetBelief
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import nearly_fixated
 from semfov.episode import Step, rollout
-from semfov.errors import DataError, check
-from semfov.experiments.config import BeliefConfig, DataConfig, DetectorConfig, SearchConfig, SensorConfig
+from semfov.errors import DataError
+from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.parallel import rank
-from semfov.experiments.run import finish
+from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Weight, Workers
 from semfov.experiments.summary import table
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Exploratory
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
-from semfov.training.evidence_examples import ExampleLooks, Examples, LookingRun, make_examples
-from semfov.training.outputs import training_of, write_outputs
+from semfov.training.descent import descend
+from semfov.training.evidence_examples import ExampleLooks, Examples, looking, make_examples
+from semfov.training.outputs import model_path, training_of, write_outputs
 
 JUDGED = (1, 5, 15)
 """Looks after which a belief is judged."""
 
 
 @dataclass(frozen=True)
-class FitSearchConfig:
+class FitSearchConfig(Settings):
     """Train the evidence for a target.
 
     Args:
@@ -64,44 +65,30 @@ class FitSearchConfig:
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
-    name: str | None = None
-    classes: int = 2
-    columns: int = 10
-    rows: int = 10
-    max_target_area: float = 0.2
-    holdout: int = 5
-    looks: int = 16
-    astray: float = 0.3
-    landing: float = 1.0
-    presence: float = 0.5
-    false_alarms: float = 0.015
-    lost: float = 0.02
-    steps: int = 500
-    batch: int = 48
-    rate: float = 5e-3
-    seed: int = 0
+    name: Name | None = None
+    classes: Count = 2
+    columns: Side = 10
+    rows: Side = 10
+    max_target_area: Positive = 0.2
+    holdout: Annotated[int, Range(2, 10**9)] = 5
+    looks: Annotated[int, Range(2, 10_000)] = 16
+    astray: Share = 0.3
+    landing: Weight = 1.0
+    presence: Weight = 0.5
+    false_alarms: Share = 0.015
+    lost: Share = 0.02
+    steps: Count = 500
+    batch: Count = 48
+    rate: Positive = 5e-3
+    seed: Seed = 0
     out: Path = Path("runs/fit_search")
     cache: Path | None = None
-    workers: int | None = None
+    workers: Workers | None = None
 
 
 def fit_search(config: FitSearchConfig) -> None:
     """Look from every cell, train, judge on held-out photographs, and write everything."""
-    check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
-    check(config.looks >= 2, "looks", "2 or more", config.looks)
-    run = LookingRun(
-        SearchConfig(
-            data=config.data,
-            detector=config.detector,
-            sensor=config.sensor,
-            belief=BeliefConfig(columns=config.columns, rows=config.rows),
-            policies=("random",),
-            out=config.out,
-            cache=config.cache,
-            workers=config.workers,
-        )
-    )
-    finish(run, "looking")
+    run = looking(config)
     if rank() > 0:
         return
     examples = make_examples(run, config.classes, config.max_target_area, config.seed)
@@ -112,7 +99,7 @@ def fit_search(config: FitSearchConfig) -> None:
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
     model = train(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
     judged, model.thresholds = judge(config, model, examples[held_out], grid)
-    path = config.out / f"{config.name or run.eye.detector.name}.safetensors"
+    path = model_path(config, run.eye.detector.name)
     model.save(path)
     text = report(judged, model.thresholds, int((~held_out).sum()), int(held_out.sum()))
     write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
@@ -126,10 +113,8 @@ def train(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         model = TargetEvidence(components=components, metadata=metadata)
-    optimiser = torch.optim.AdamW(model.parameters(), lr=config.rate, weight_decay=1e-2)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.rate, total_steps=config.steps)
-    bar = tqdm(range(config.steps), desc="training", unit="step", dynamic_ncols=True)
-    for number in bar:
+
+    def loss_of(number: int) -> Tensor:
         chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
         # At first the model knows nothing, and where it would look does not matter.
         astray = 1.0 if number < config.steps // 20 else config.astray * (number % 2)
@@ -138,13 +123,9 @@ def train(
         for step in searches(model, chosen, grid, config.looks, astray, generator):
             if step.shift + 1 in (1, *counted):
                 loss = loss + objective(config, step, chosen.goal)
-        optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        if number % 25 == 0:
-            bar.set_postfix(loss=f"{float(loss.detach()):.3f}")
+        return loss
+
+    descend(model.parameters(), loss_of, config.steps, config.rate)
     return model.eval()
 
 

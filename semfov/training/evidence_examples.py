@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -17,8 +17,9 @@ from semfov.belief.observers.target import Target, TargetLook
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight
 from semfov.errors import DataError
+from semfov.experiments.config import BeliefConfig, SearchConfig
 from semfov.experiments.parts import Record
-from semfov.experiments.run import Run
+from semfov.experiments.run import Run, finish
 from semfov.experiments.search_protocol import choose_classes
 from semfov.gaze.policies import Task
 
@@ -32,6 +33,28 @@ class LookingRun(Run):
         """No records."""
         self.detections(index)
         return [], {}
+
+
+def looking(config: Any) -> LookingRun:
+    """A run that has looked at all photographs of a fit from every cell.
+
+    Args:
+        config: settings of the fit: data, detector, sensor, columns, rows, out, cache and workers.
+    """
+    run = LookingRun(
+        SearchConfig(
+            data=config.data,
+            detector=config.detector,
+            sensor=config.sensor,
+            belief=BeliefConfig(columns=config.columns, rows=config.rows),
+            policies=("random",),
+            out=config.out,
+            cache=config.cache,
+            workers=config.workers,
+        )
+    )
+    finish(run, "looking")
+    return run
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,12 @@
 
 import hashlib
 import json
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -15,19 +17,25 @@ from semfov.data.scene import Scenes
 from semfov.errors import DataError, check
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.seeds import generator_for
+from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Weight
 from semfov.experiments.setup import make_eye, make_scenes, prepare_worker
+from semfov.experiments.store import versions
 from semfov.experiments.summary import table
 from semfov.eye import Eye
 from semfov.gaze.learned import LearnedGaze
 from semfov.io import storage
+from semfov.io.code import package_digest
+from semfov.io.schema import Array, Field, Number, Schema
 from semfov.training.gaze_episodes import Relaxation, backpropagate, draw_searches, found_at
-from semfov.training.outputs import training_of, write_outputs
+from semfov.training.outputs import model_path, training_of, write_outputs
+
+_log = logging.getLogger(__name__)
 
 _CHECKPOINT = "gaze-checkpoint"
 
 
 @dataclass(frozen=True)
-class FitGazeConfig:
+class FitGazeConfig(Settings):
     """Train a gaze policy end to end.
 
     Args:
@@ -59,25 +67,25 @@ class FitGazeConfig:
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=4))
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
-    name: str | None = None
-    columns: int = 10
-    rows: int = 10
-    width: int = 8
+    name: Name | None = None
+    columns: Side = 10
+    rows: Side = 10
+    width: Annotated[int, Range(1, 4096)] = 8
     learn_sigma: bool = False
-    shifts: int = 9
-    window: int = 3
-    temperature: float = 1.0
-    discount: float = 0.9
-    posterior: float = 0.3
-    others: float = 1.0
-    steps: int = 200
-    photographs: int = 4
-    searches: int = 1
-    rate: float = 5e-3
-    holdout: int = 10
-    judged: int = 120
-    seed: int = 0
-    save_every: int = 5
+    shifts: Annotated[int, Range(1, 10_000)] = 9
+    window: Count = 3
+    temperature: Positive = 1.0
+    discount: Share = 0.9
+    posterior: Weight = 0.3
+    others: Weight = 1.0
+    steps: Count = 200
+    photographs: Count = 4
+    searches: Count = 1
+    rate: Positive = 5e-3
+    holdout: Annotated[int, Range(2, 10**9)] = 10
+    judged: Count = 120
+    seed: Seed = 0
+    save_every: Count = 5
     out: Path = Path("runs/fit_gaze")
 
     @property
@@ -106,7 +114,7 @@ def fit_gaze(config: FitGazeConfig) -> None:
     eye.requires_grad_(False)
     gaze.metadata.update(eye.settings())
     judged["learned"] = judge(config, gaze, eye, scenes, held_out, "judging")
-    path = config.out / f"{config.name or eye.detector.name}.safetensors"
+    path = model_path(config, eye.detector.name)
     gaze.save(path)
     text = report(config, judged, losses, len(trained_on), len(held_out), (width, float(eye.sensor.sigma)))
     found = {name: found.tolist() for name, found in judged.items()}
@@ -132,7 +140,8 @@ def train(
     if config.learn_sigma:
         parameters["log_sigma"] = eye.sensor.log_sigma
     optimiser = torch.optim.AdamW(parameters.values(), lr=config.rate, weight_decay=1e-2)
-    checkpoint = Checkpoint(config.out / "checkpoint.safetensors", metadata)
+    code = json.dumps([package_digest(), versions()])
+    checkpoint = Checkpoint(config.out / "checkpoint.safetensors", metadata, hashlib.sha256(code.encode()).hexdigest())
     losses = checkpoint.load(parameters, optimiser)
     todo, done = range(len(losses), config.steps), len(losses)
     bar = tqdm(todo, desc="training", unit="step", initial=done, total=config.steps, dynamic_ncols=True)
@@ -185,10 +194,11 @@ class Checkpoint:
     Args:
         path: the file.
         settings: what the training depends on; a checkpoint of other settings is refused.
+        code: sha256 of the code that it depends on; what other code left is told of, and not gone on from.
     """
 
-    def __init__(self, path: Path, settings: dict[str, object]) -> None:
-        self.path = path
+    def __init__(self, path: Path, settings: dict[str, object], code: str) -> None:
+        self.path, self.code = path, code
         self.key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
     def save(self, parameters: Mapping[str, Tensor], optimiser: torch.optim.Optimizer, losses: list[float]) -> None:
@@ -196,21 +206,38 @@ class Checkpoint:
         tensors = {f"parameter.{name}": parameter for name, parameter in parameters.items()}
         for name, parameter in parameters.items():
             tensors |= {f"{key}.{name}": torch.as_tensor(v) for key, v in optimiser.state[parameter].items()}
-        storage.write(self.path, tensors, {"kind": _CHECKPOINT, "key": self.key, "losses": losses})
+        storage.write(self.path, tensors, {"kind": _CHECKPOINT, "key": self.key, "code": self.code, "losses": losses})
 
     def load(self, parameters: Mapping[str, Tensor], optimiser: torch.optim.Optimizer) -> list[float]:
         """Put back what `save` kept, in place; returns the losses so far, none where there is no file."""
         if not self.path.exists():
             return []
         tensors, record = storage.read(self.path, _CHECKPOINT)
-        if record["key"] != self.key:
+        if record.get("key") != self.key:
             raise DataError(f"{self.path}: a checkpoint of other settings; remove it, or give another --out")
+        if record.get("code") != self.code:
+            _log.warning(
+                "%s: made by other code (this package or a library has changed since); training starts anew", self.path
+            )
+            return []
+        _checkpoint_schema(parameters).check(tensors, record)
         with torch.no_grad():
             for name, parameter in parameters.items():
                 parameter.copy_(tensors[f"parameter.{name}"])
                 kept = {key: f"{key}.{name}" for key in ("step", "exp_avg", "exp_avg_sq")}
                 optimiser.state[parameter] = {key: tensors[place] for key, place in kept.items() if place in tensors}
         return list(record["losses"])
+
+
+def _checkpoint_schema(parameters: Mapping[str, Tensor]) -> Schema:
+    """What a checkpoint holds: parameters, and of those that a step has moved the optimiser's averages."""
+    tensors = {}
+    for name, parameter in parameters.items():
+        tensors[f"parameter.{name}"] = Field(tuple(parameter.shape))
+        tensors[f"step.{name}"] = Field((), low=0, optional=True)
+        for average in ("exp_avg", "exp_avg_sq"):
+            tensors[f"{average}.{name}"] = Field(tuple(parameter.shape), optional=True)
+    return Schema(tensors, {"losses": Array(Number())})
 
 
 def judge(

@@ -4,35 +4,36 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-from tqdm import tqdm
 
 from semfov.belief import MapEvidence
 from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap, MapBelief
 from semfov.episode import Step, rollout
 from semfov.errors import DataError, check
-from semfov.experiments.config import BeliefConfig, DataConfig, DetectorConfig, SearchConfig, SensorConfig
+from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.parallel import rank
-from semfov.experiments.run import finish
+from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Workers
 from semfov.experiments.summary import table
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.choice import Exploratory
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.exploration import answers_of
-from semfov.training.evidence_examples import LookingRun
+from semfov.training.descent import descend
+from semfov.training.evidence_examples import LookingRun, looking
 from semfov.training.map_examples import MapExampleLooks, MapExamples, make_map_examples
-from semfov.training.outputs import training_of, write_outputs
+from semfov.training.outputs import model_path, training_of, write_outputs
 
 JUDGED = (1, 2, 3, 5, 10, 15)
 """Looks after which a map is judged."""
 
 
 @dataclass(frozen=True)
-class FitMapConfig:
+class FitMapConfig(Settings):
     """Train the map of all classes.
 
     Args:
@@ -60,42 +61,28 @@ class FitMapConfig:
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
-    name: str | None = None
-    classes: int = 12
-    others: int = 3
-    columns: int = 10
-    rows: int = 10
-    holdout: int = 5
-    looks: int = 12
-    astray: float = 0.5
-    steps: int = 1000
-    gain_steps: int = 200
-    batch: int = 12
-    rate: float = 5e-3
-    seed: int = 0
+    name: Name | None = None
+    classes: Annotated[int, Range(2, 10_000)] = 12
+    others: Count = 3
+    columns: Side = 10
+    rows: Side = 10
+    holdout: Annotated[int, Range(2, 10**9)] = 5
+    looks: Annotated[int, Range(2, 10_000)] = 12
+    astray: Share = 0.5
+    steps: Count = 1000
+    gain_steps: Count = 200
+    batch: Count = 12
+    rate: Positive = 5e-3
+    seed: Seed = 0
     out: Path = Path("runs/fit_map")
     cache: Path | None = None
-    workers: int | None = None
+    workers: Workers | None = None
 
 
 def fit_map(config: FitMapConfig) -> None:
     """Look from every cell, train, judge on held-out photographs, and write everything."""
-    check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
-    check(config.looks >= 2, "looks", "2 or more", config.looks)
-    check(0 < config.others < config.classes, "others", f"from 1 to {config.classes - 1}", config.others)
-    run = LookingRun(
-        SearchConfig(
-            data=config.data,
-            detector=config.detector,
-            sensor=config.sensor,
-            belief=BeliefConfig(columns=config.columns, rows=config.rows),
-            policies=("random",),
-            out=config.out,
-            cache=config.cache,
-            workers=config.workers,
-        )
-    )
-    finish(run, "looking")
+    check(config.others < config.classes, "others", f"from 1 to {config.classes - 1}", config.others)
+    run = looking(config)
     if rank() > 0:
         return
     examples = make_map_examples(run, config.classes, config.others, config.seed)
@@ -112,7 +99,7 @@ def fit_map(config: FitMapConfig) -> None:
     train(config, model, examples[~held_out], grid)
     train_gain(config, model, examples[~held_out], grid)
     judged = judge(config, model.eval(), examples[held_out], grid)
-    path = config.out / f"{config.name or run.eye.detector.name}.safetensors"
+    path = model_path(config, run.eye.detector.name)
     model.save(path)
     text = report(judged, int((~held_out).sum()), int(held_out.sum()))
     write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
@@ -138,23 +125,17 @@ def frequencies(run: LookingRun, holdout: int) -> Tensor:
 def train(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> None:
     """Train on explorations that go by the model, with fixations astray among them."""
     generator = torch.Generator().manual_seed(config.seed)
-    optimiser = torch.optim.AdamW(model.parameters(), lr=config.rate, weight_decay=1e-2)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.rate, total_steps=config.steps)
-    bar = tqdm(range(config.steps), desc="training", unit="step", dynamic_ncols=True)
-    for number in bar:
+
+    def loss_of(_: int) -> Tensor:
         chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
         counted = torch.randint(2, config.looks + 1, (2,), generator=generator).tolist()
         loss = chosen.score.new_zeros(())
         for step in explorations(model, chosen, grid, max(counted), config.astray, generator):
             if step.shift + 1 in (1, *counted):
                 loss = loss + objective(step, chosen)
-        optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        if number % 25 == 0:
-            bar.set_postfix(loss=f"{float(loss.detach()):.3f}")
+        return loss
+
+    descend(model.parameters(), loss_of, config.steps, config.rate)
 
 
 def explorations(
@@ -181,9 +162,8 @@ def objective(step: Step, examples: MapExamples) -> Tensor:
 def train_gain(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> None:
     """Train what a look is expected to bring, by least squares on what looks have brought in each cell."""
     generator = torch.Generator().manual_seed(config.seed + 1)
-    optimiser = torch.optim.AdamW(model.worth.parameters(), lr=config.rate, weight_decay=1e-2)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.rate, total_steps=config.gain_steps)
-    for _ in tqdm(range(config.gain_steps), desc="learning what looks bring", unit="step", dynamic_ncols=True):
+
+    def loss_of(_: int) -> Tensor:
         chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
         before: Step | None = None
         loss = chosen.score.new_zeros(())
@@ -198,10 +178,10 @@ def train_gain(config: FitMapConfig, model: MapEvidence, examples: MapExamples, 
                 expected = model.gain(known.probabilities, known.closest, known.looks, distance)[:, 0]
                 loss = loss + (expected - brought).square().mean() * 100
             before = step
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        schedule.step()
+        return loss
+
+    title = "learning what looks bring"
+    descend(model.worth.parameters(), loss_of, config.gain_steps, config.rate, clip=None, title=title)
 
 
 def right(step: Step, answers: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from semfov.observation.statistics import DirichletStatistics
 from semfov.training.misses import count_misses
 from semfov.training.observation_report import write_report
 from semfov.training.observation_settings import FitConfig
+from semfov.training.outputs import model_path
 
 
 def fit_fom(config: FitConfig) -> None:
@@ -28,7 +29,7 @@ def fit_fom(config: FitConfig) -> None:
     model = fit_model(config, sampler, samples[~held_out])
     fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
     model.miss_rate = count_misses(sampler, samples, fitted_on, model.edges).rates().to(model.edges)
-    path = config.out / f"{config.name or sampler.eye.detector.name}.safetensors"
+    path = model_path(config, sampler.eye.detector.name)
     model.save(path)
     written = write_report(config, model, fit_all(config, sampler, samples[~held_out], model), samples, held_out)
     print("written:")

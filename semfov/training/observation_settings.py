@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Weight, Whole, Workers
 
 
 @dataclass(frozen=True)
-class FitConfig:
+class FitConfig(Settings):
     """Fit p(scores | class, distance to the fovea) on photographs with boxes.
 
     Args:
@@ -39,21 +40,21 @@ class FitConfig:
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
-    name: str | None = None
+    name: Name | None = None
     method: Literal["newton", "fixed_point", "gradient", "discriminative"] = "discriminative"
-    fixations: int = 8
-    levels: int = 8
-    width: float = 50.0
-    minimum: int = 100
-    shrinkage: float = 10.0
-    enough: int | None = None
-    holdout: int = 10
-    iou: float = 0.5
-    seed: int = 0
-    shard: int = 32
+    fixations: Count = 8
+    levels: Annotated[int, Range(1, 1000)] = 8
+    width: Positive = 50.0
+    minimum: Whole = 100
+    shrinkage: Weight = 10.0
+    enough: Whole | None = None
+    holdout: Annotated[int, Range(2, 10**9)] = 10
+    iou: Share = 0.5
+    seed: Seed = 0
+    shard: Count = 32
     out: Path = Path("runs/fit_fom")
     cache: Path | None = None
-    workers: int | None = None
+    workers: Workers | None = None
 
     @property
     def edges(self) -> list[float]:

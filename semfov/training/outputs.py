@@ -8,7 +8,7 @@ import yaml
 
 from semfov.data.scene import Scenes
 from semfov.experiments.setup import plain
-from semfov.io.files import write_text
+from semfov.io.files import inside, write_text
 
 
 def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
@@ -24,6 +24,11 @@ def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
     left_out = {"out", "cache", "workers", "data", "detector", "sensor", *besides}
     settings = {name: value for name, value in plain(asdict(config)).items() if name not in left_out}
     return {"data": scenes.fingerprint, "training": settings}
+
+
+def model_path(config: Any, detector: str) -> Path:
+    """Where a fitted model is written: under its name in the settings, or the detector's, in `config.out`."""
+    return inside(config.out, f"{config.name or detector}.safetensors")
 
 
 def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Path | None = None) -> None:
@@ -42,6 +47,6 @@ def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Pat
     }
     print(report)
     for name, text in files.items():
-        write_text(config.out / name, text)
+        write_text(inside(config.out, name), text)
     written = [*([] if model is None else [model]), *(config.out / name for name in files)]
     print("written:", *(f"  {path}" for path in written), sep="\n")

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -9,10 +10,23 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes, legal_targets
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.experiments.settings import (
+    Count,
+    Name,
+    Positive,
+    Range,
+    Seed,
+    Settings,
+    Share,
+    Side,
+    Weight,
+    Whole,
+    Workers,
+)
 
 
 @dataclass(frozen=True)
-class FitContextConfig:
+class FitContextConfig(Settings):
     """Fit the context of searches.
 
     Args:
@@ -40,26 +54,26 @@ class FitContextConfig:
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    name: str = "coco"
-    resolution: int = 10
-    edges: tuple[float, ...] = (0.0, 0.15, 0.35)
-    max_target_area: float = 0.2
-    place_smoothing: float = 10.0
-    class_smoothing: float = 100.0
-    pair_smoothing: float = 20.0
-    holdout: int = 10
-    weigh: int = 0
+    name: Name = "coco"
+    resolution: Side = 10
+    edges: tuple[Weight, ...] = (0.0, 0.15, 0.35)
+    max_target_area: Positive = 0.2
+    place_smoothing: Positive = 10.0
+    class_smoothing: Positive = 100.0
+    pair_smoothing: Positive = 20.0
+    holdout: Annotated[int, Range(2, 10**9)] = 10
+    weigh: Whole = 0
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
-    fixations: int = 8
-    iou: float = 0.5
-    seed: int = 0
-    shard: int = 32
-    folds: int = 5
-    min_objects: int = 4
+    fixations: Count = 8
+    iou: Share = 0.5
+    seed: Seed = 0
+    shard: Count = 32
+    folds: Annotated[int, Range(2, 1000)] = 5
+    min_objects: Whole = 4
     out: Path = Path("runs/fit_context")
     cache: Path | None = None
-    workers: int | None = None
+    workers: Workers | None = None
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from semfov.errors import DataError, check
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.parallel import rank
 from semfov.experiments.samples import Sampler, Samples, SampleSettings, collect
+from semfov.experiments.settings import Count, Positive, Range, Seed, Settings, Share, Side, Whole, Workers
 from semfov.experiments.setup import make_observation
 from semfov.experiments.summary import table
 from semfov.observation.foveal import FovealObservationModel
@@ -23,7 +25,7 @@ from semfov.training.outputs import write_outputs
 
 
 @dataclass(frozen=True)
-class FitTemperingConfig:
+class FitTemperingConfig(Settings):
     """Find the exponent of the likelihoods.
 
     Args:
@@ -53,20 +55,20 @@ class FitTemperingConfig:
     sensor: SensorConfig = field(default_factory=SensorConfig)
     calibrated: bool = False
     footprint: Footprint = "box_centre"
-    exponents: tuple[float, ...] = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
-    photographs: int | None = None
-    fixations: int = 8
-    iou: float = 0.5
-    seed: int = 0
-    shard: int = 32
-    columns: int = 10
-    rows: int = 10
-    min_objects: int = 4
-    max_target_area: float = 0.2
-    holdout: int = 4
+    exponents: tuple[Positive, ...] = (0.05, 0.1, 0.15, 0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
+    photographs: Count | None = None
+    fixations: Count = 8
+    iou: Share = 0.5
+    seed: Seed = 0
+    shard: Count = 32
+    columns: Side = 10
+    rows: Side = 10
+    min_objects: Whole = 4
+    max_target_area: Positive = 0.2
+    holdout: Annotated[int, Range(2, 10**9)] = 4
     out: Path = Path("runs/fit_tempering")
     cache: Path | None = None
-    workers: int | None = None
+    workers: Workers | None = None
 
 
 def fit_tempering(config: FitTemperingConfig) -> None:

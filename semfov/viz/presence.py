@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from semfov.metrics.presence import area_under_roc, roc
-from semfov.viz.style import COLOURS, make_figure, styled
+from semfov.viz.style import COLOURS, LINES, make_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,10 +25,12 @@ def plot_roc(scores: Mapping[str, Tensor], present: Tensor) -> Figure:
     """
     figure, panels = make_figure(1, 2, width=10, height=4.6, layout="compressed")
     for axes, widest in zip(panels, (1.0, 0.1), strict=True):
-        for (name, score), colour in zip(scores.items(), COLOURS * len(scores), strict=False):
+        for (name, score), colour, line in zip(
+            scores.items(), COLOURS * len(scores), LINES * len(scores), strict=False
+        ):
             alarms, hits = roc(score, present)
             label = f"{name} ({area_under_roc(score, present):.3f})"
-            axes.plot(torch.tensor(alarms), torch.tensor(hits), color=colour, label=label, drawstyle="steps-post")
+            axes.plot(torch.tensor(alarms), torch.tensor(hits), line, color=colour, label=label, drawstyle="steps-post")
         axes.set(xlim=(0, widest), ylim=(0, 1), xlabel="false alarms", ylabel="hits")
         axes.grid(alpha=0.3)
     panels[0].legend(title="area under the curve", loc="lower right", fontsize=7)

@@ -32,7 +32,7 @@ def test_string_ids(make_coco, coco_dict):
 def test_missing_file(tmp_path):
     with pytest.raises(DataError, match=r"no\.json: no such file; check data\.annotations"):
         read_annotations(tmp_path / "no.json")
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match="expected a file, got a folder"):
         read_annotations(tmp_path)
 
 

@@ -206,7 +206,7 @@ def test_simplex_and_shapes(detector):
 
 
 def test_nothing_found(detector):
-    detector.selection = Selection(threshold=1.1)
+    detector.selection = Selection(threshold=1.0)
     found = detector(photographs(2, 40, 50))
     assert found.boxes.shape == (2, 0, 4)
     assert found.scores.shape == (2, 0, len(detector.classes) + 1)

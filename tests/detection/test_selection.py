@@ -98,7 +98,7 @@ def test_boxes_outside_the_image_are_dropped():
 
 @pytest.mark.parametrize("count", [0, 5])
 def test_nothing_is_found(count):
-    found = select(make(count), None, Selection(threshold=2.0), "residual")
+    found = select(make(count), None, Selection(threshold=1.0), "residual")
     assert found.boxes.shape == (2, 0, 4)
     assert found.scores.shape == (2, 0, 4)
     assert found.count.tolist() == [0, 0]

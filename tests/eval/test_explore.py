@@ -211,7 +211,8 @@ def test_errors_are_one_line(capsys, tmp_path):
     assert main(["--policies", '["random"]', "--out", str(tmp_path)]) == 1
     assert "random-raw" in capsys.readouterr().err
     assert main(["--policies", "[{policy: kl, tempering: 0}]", "--out", str(tmp_path)]) == 1
-    assert capsys.readouterr().err == "error: tempering: expected a positive number, got 0.0\n"
+    expected = "error: policies[0].tempering: expected a number above 0, up to 1,000,000,000, got 0.0\n"
+    assert capsys.readouterr().err == expected
 
 
 def test_help_names_every_preset(capsys):

@@ -15,9 +15,10 @@ import yaml
 
 from eval.search import main, search
 from semfov.experiments.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig, SearchConfig
+from semfov.experiments.looks import see_all
 from semfov.experiments.presets import label, presets
 from semfov.experiments.runs import SearchRun
-from semfov.experiments.store import DetectionStore, see_all
+from semfov.experiments.store import DetectionStore
 from semfov.gaze.policies import POLICIES
 
 pytestmark = pytest.mark.weights

@@ -128,7 +128,7 @@ def test_saliency_without_a_model_is_refused(task):
 
 @pytest.mark.parametrize("tempering", [0.0, -0.5, float("nan")])
 def test_an_exponent_out_of_range_is_refused(tempering):
-    with pytest.raises(InputError, match=r"^tempering: expected a positive number"):
+    with pytest.raises(InputError, match=r"^tempering: expected a number above 0"):
         resolve(PolicyConfig("kl", tempering=tempering), "exploration")
 
 

@@ -35,7 +35,7 @@ def config(tmp_path):
 
 def test_policies_are_called_by_their_labels(config):
     central = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
-    run = SearchRun(replace(config, policies=("random", central, "recommended", "target-evidence")))
+    run = SearchRun(replace(config, policies=("random", central, "recommended")))
     assert run.policies == {
         "random": PolicyConfig("random"),
         "non-predictive-raw, tempering 0.25, footprint box_centre": central,

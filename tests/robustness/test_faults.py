@@ -1,5 +1,6 @@
 """Kills, full disks, damaged and shared files: a run ends in one line, and goes on to the undisturbed result."""
 
+import errno
 import json
 import os
 import resource
@@ -68,13 +69,14 @@ def whole(tmp_path_factory) -> Path:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("command", ["store", "evaluation", "fit"])
+@pytest.mark.parametrize("command", ["store", "evaluation", "fit", "workers", "reports"])
 def test_killed_runs_resume_to_the_same_bits(command, tmp_path):
     figures = tmp_path / "figures.json"
     call = [sys.executable, "-m", "benchmarks.faults", "--only", command, "--kills", "3", "--json", str(figures)]
     subprocess.run(call, cwd=ROOT, check=True, capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
     came = json.loads(figures.read_text())[command]
     assert len(came["progress"]) == came["identical"] == 3
+    assert came["left"] == 0
 
 
 @pytest.mark.long
@@ -103,7 +105,8 @@ def test_one_misfortune_after_another(whole, tmp_path):
     assert not list(tmp_path.rglob("*.part"))
 
 
-def test_full_disk(whole, tmp_path):
+@pytest.mark.parametrize("full", ["cache", "out"])
+def test_full_disk(whole, tmp_path, full):
     """A file system of 8 kB: the error names the file, nothing half-written counts, and space is all it needs."""
     disk = tmp_path / "disk"
     disk.mkdir()
@@ -111,13 +114,15 @@ def test_full_disk(whole, tmp_path):
     if mount.returncode != 0:
         pytest.skip("may not mount a file system")
     try:
-        message = ends(start(tmp_path / "out", disk, "--workers", "1"), 1)
+        other = tmp_path / "other"
+        out, cache = (disk, other) if full == "out" else (other, disk)
+        message = ends(start(out, cache, "--workers", "1"), 1)
         assert message.startswith(f"error: cannot write {disk}")
         assert "No space left" in message
         assert not list(disk.rglob("*.part"))
         subprocess.run(["mount", "-o", "remount,size=64m", disk], check=True)
-        ends(start(tmp_path / "out", disk, "--workers", "1"), 0)
-        assert bits(tmp_path / "out") == bits(whole / "out")
+        ends(start(out, cache, "--workers", "1"), 0)
+        assert bits(out) == bits(whole / "out")
     finally:
         subprocess.run(["umount", disk], check=True)
 
@@ -128,6 +133,44 @@ def test_two_processes_share_a_cache(whole, tmp_path):
         ends(process, 0)
     assert bits(tmp_path / "first") == bits(tmp_path / "second") == bits(whole / "out")
     assert not list(tmp_path.rglob("*.part"))
+
+
+@pytest.mark.parametrize("full", ["cache", "out"])
+def test_full_disk_while_writing(whole, tmp_path, monkeypatch, capsys, full):
+    """No space from some write on: one line that names the file, and the same command goes on once there is space."""
+    from semfov.io import files
+
+    out, cache, replace = tmp_path / "out", tmp_path / "cache", files.Path.replace
+    filled = out if full == "out" else cache
+
+    def no_space(path, target):
+        if Path(target).is_relative_to(filled):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return replace(path, target)
+
+    monkeypatch.setattr(files.Path, "replace", no_space)
+    assert run_in(out, cache) == 1
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith(f"error: cannot write {filled}")
+    assert error.endswith("No space left on device")
+    assert not list(tmp_path.rglob("*.part"))
+    monkeypatch.undo()
+    assert run_in(out, cache) == 0
+    assert bits(out) == bits(whole / "out")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
+def test_two_runs_on_one_cache_while_one_is_killed(whole, tmp_path):
+    killed, other = (start(tmp_path / name, tmp_path / "cache", "--workers", "2") for name in ("killed", "other"))
+    wait_for(lambda: list((tmp_path / "cache").rglob("*.safetensors")) or killed.poll() is not None)
+    workers = workers_of(killed) if killed.poll() is None else []
+    killed.kill()
+    killed.communicate(timeout=300)
+    ends(other, 0)
+    wait_for(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
+    ends(start(tmp_path / "killed", tmp_path / "cache", "--workers", "2"), 0)
+    assert bits(tmp_path / "killed") == bits(tmp_path / "other") == bits(whole / "out")
 
 
 def test_damaged_and_swapped_files_are_computed_again(whole, tmp_path):
@@ -154,13 +197,18 @@ def test_damaged_and_swapped_files_are_computed_again(whole, tmp_path):
 
 def run_here(folder: Path) -> int:
     """The small search in this process."""
+    return run_in(folder / "out", folder / "cache")
+
+
+def run_in(out: Path, cache: Path) -> int:
+    """The same in other folders."""
     import torch
 
     from eval.search import main
 
     threads = torch.get_num_threads()
     try:
-        return main([*SEARCH[3:], "--out", str(folder / "out"), "--cache", str(folder / "cache"), "--workers", "1"])
+        return main([*SEARCH[3:], "--out", str(out), "--cache", str(cache), "--workers", "1"])
     finally:
         torch.set_num_threads(threads)
 

@@ -63,7 +63,7 @@ def test_agents_search_and_explore(kind):
     agent = load("yolov3_tiny_agent", kind=kind, **options)
     assert type(agent.searching.observer) is observer
     assert type(agent.searching.policy) is search
-    assert type(agent.exploring.observer) is observers.Semantic
+    assert type(agent.exploring.observer) is (observers.LearnedMap if kind == "recommended" else observers.Semantic)
     assert type(agent.exploring.policy) is explore
     with torch.inference_mode():
         path = agent.search(scene.image, "cat", shifts=2)

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 import semfov
 from semfov import Eye, FovealObservationModel, Foveation, Grid, acquisition, fusion, policies, saliency
 from semfov.agent import ActivePerception
-from semfov.belief import ContextPrior, DirichletBelief, TargetEvidence
-from semfov.belief.observers import Context, Observer, Semantic, Target
+from semfov.belief import ContextPrior, DirichletBelief, MapEvidence, TargetEvidence
+from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.gaze import LearnedGaze, Policy, select_fixation
 from semfov.observation import FoldedObservationModel
@@ -82,6 +82,17 @@ class Watching(nn.Module):
         for point in (fixation, fixation + 15):
             belief = self.part(belief, seen, point, GRID, 2)
         return belief.probability(2)
+
+
+class Expecting(Looking):
+    """What a further look is expected to bring, after one."""
+
+    def forward(self, scores: Tensor, boxes: Tensor, fixation: Tensor) -> Tensor:
+        seen = Detections(boxes, scores, torch.ones(scores.shape[:2], dtype=torch.bool, device=scores.device))
+        mapper = LearnedMap(self.part.model)
+        belief = mapper(mapper.start(len(scores), GRID, scores), seen, fixation, GRID)
+        function = self.part(None, GRID) if isinstance(self.part, Policy) else self.part
+        return function(belief, belief.visited)
 
 
 class WholeMap(Watching):
@@ -200,6 +211,10 @@ def model() -> FovealObservationModel:
     return FovealObservationModel(alpha, [0.2, 0.5], CLASSES, miss_rate=0.1 + 0.8 * rand(4, 3)).eval()
 
 
+def mapping() -> MapEvidence:
+    return MapEvidence(4, 4, components=4).eval()
+
+
 def observing() -> Semantic:
     return Semantic(4, model().requires_grad_(False))
 
@@ -245,6 +260,10 @@ OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]
         lambda: (rand(5, 6, 4).softmax(-1), rand(5, 6)),
     ),
     "TargetEvidence": (lambda: Looking(TargetEvidence(4, 4).eval(), GRID, 2), look),
+    "MapEvidence": (lambda: Looking(mapping(), GRID, torch.tensor([1, 2, 3])), look),
+    "LearnedMap": (lambda: Watching(LearnedMap(mapping())), look),
+    "ExpectedGain": (lambda: Expecting(acquisition.ExpectedGain(mapping(), GRID)), look),
+    "Gain": (lambda: Expecting(policies.Gain(mapping())), look),
     "Semantic": (lambda: Watching(observing()), look),
     "Semantic, whole map": (lambda: WholeMap(observing()), look),
     "Semantic, misses": (lambda: Watching(Semantic(4, misses=model().requires_grad_(False), memory="closest")), look),

@@ -159,10 +159,10 @@ def test_training_repeats_itself(examples):
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("holdout", 1, "2 or more"),
-        ("looks", 1, "2 or more"),
+        ("holdout", 1, "a whole number from 2 to 1,000,000,000"),
+        ("looks", 1, "a whole number from 2 to 10,000"),
         ("others", 12, "from 1 to 11"),
-        ("others", 0, "from 1 to 11"),
+        ("others", 0, "a whole number from 1 to 1,000,000,000"),
     ],
 )
 def test_settings_that_make_no_sense_are_told(name, value, expected, capsys, tmp_path):

@@ -273,7 +273,7 @@ def test_training_learns_and_judging_tells(examples):
 @pytest.mark.parametrize("name", ["holdout", "looks"])
 def test_settings_that_make_no_sense_are_told(name, capsys, tmp_path):
     assert main([f"--{name}", "1", "--out", str(tmp_path)]) == 1
-    assert f"{name}: expected 2 or more, got 1" in capsys.readouterr().err
+    assert f"{name}: expected a whole number from 2 to" in capsys.readouterr().err
 
 
 SMALL = [

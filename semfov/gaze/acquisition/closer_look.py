@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from semfov.belief.belief import Belief, one_by_one, probabilities_of
+from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.grid import Grid
 from semfov.errors import check
 from semfov.gaze.acquisition.base import AcquisitionFunction
@@ -46,7 +46,7 @@ class CloserLook(AcquisitionFunction):
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(B, X·Y)` for a belief about all classes; where the fovea was is in `belief.closest`."""
-        return one_by_one(self._values, probabilities_of(belief), belief.closest)
+        return one_by_one(self._values, belief.class_probabilities(), belief.closest)
 
     def _values(self, probabilities: Tensor, closest: Tensor) -> Tensor:
         objects = probabilities[..., 1:]

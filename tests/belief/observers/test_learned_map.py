@@ -9,7 +9,6 @@ import torch
 
 from semfov import Detections, FovealObservationModel, Grid
 from semfov.belief import TargetEvidence
-from semfov.belief.belief import probabilities_of
 from semfov.belief.look_features import class_features, highest_score
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, MapBelief, MapLook, Semantic, Target
@@ -98,7 +97,7 @@ def test_belief_before_the_first_look(toy_map, device):
 def test_belief_tells_of_every_class(random_looks, toy_map):
     with torch.no_grad():
         belief = believe(LearnedMap(toy_map()), random_looks(), (0, 1, 3))[torch.tensor([0, 0, 0])]
-    assert probabilities_of(belief) is belief.probabilities
+    assert belief.class_probabilities() is belief.probabilities
     assert bool(((belief.probabilities > 0) & (belief.probabilities < 1)).all())
     for target in range(5):
         assert torch.equal(belief.probability(target), belief.probabilities[..., target])

@@ -1,0 +1,100 @@
+"""ONNX files: detectors with odd shapes, types and metadata, whole or damaged."""
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from hypothesis import strategies as st
+from onnx import TensorProto, helper, numpy_helper
+
+from benchmarks.fuzz.models import changed
+from benchmarks.fuzz.runner import attempt, choose, draw_rng, failed, outcome
+from semfov.detection import Detections, Detector
+from semfov.detection.onnx import load_onnx
+
+SIDES = (1, 7, 48, 100_000, 2**40, 0, -1, "w")
+TYPES = (TensorProto.DOUBLE, TensorProto.INT64, TensorProto.BOOL, TensorProto.STRING)
+FAULTS = ("height", "width", "batch", "channels", "rank", "type", "classes", "metadata", "file", "options")
+METADATA: tuple[dict[str, str], ...] = (
+    {},
+    {"names": "{0: 'cup', 1: 'cat'}"},
+    {"names": "[" * 5000},
+    {"names": "{0: 'a', 2: 'b'}"},
+    {"imgsz": "[32, 32]"},
+    {"imgsz": "[1e9]"},
+    {"semfov": "[" * 20_000},
+    {"semfov": json.dumps({"classes": ["cup", "cat"], "head": "yolov5"})},
+    {"semfov": json.dumps({"classes": [1]})},
+    {"semfov": json.dumps({"input_size": [10**9, 10**9]})},
+    {"semfov": json.dumps({"head": "nothing"})},
+    {"semfov": "{" + "}" * 9},
+    {"noise": "x" * (2**20 + 1)},
+)
+
+
+def onnx_files(data: st.DataObject) -> str:
+    """`load_onnx`: a detector that gives finite boxes and scores of the simplex, or an error that names the fault."""
+    rng = draw_rng(data)
+    faults = data.draw(st.sets(st.sampled_from(FAULTS), max_size=2), label="faults")
+    shape = [1, 3, 32, 32]
+    for place, (name, odd) in enumerate(
+        (("batch", ("b", 2, 10**9, 0)), ("channels", (1, 4, "c")), ("height", SIDES), ("width", SIDES))
+    ):
+        if name in faults:
+            shape[place] = choose(data, odd, name)
+    rank = choose(data, (2, 1, 0), "rank") if "rank" in faults else 3
+    kind = choose(data, TYPES, "type") if "type" in faults else TensorProto.FLOAT
+    classes = choose(data, (0, 1, 3), "classes") if "classes" in faults else 2
+    options: dict[str, Any] = {"head": "yolov5", "classes": ["cup", "cat"]}
+    if "options" in faults:
+        del options[choose(data, list(options), "left out")]
+        options |= choose(data, ({}, {"input_size": (32, 32)}, {"input_size": 10**9}, {"threshold": 2}), "option")
+    model = network(shape, rank, classes, kind, rng)
+    if "metadata" in faults:
+        for key, value in choose(data, METADATA, "metadata").items():
+            model.metadata_props.add(key=key, value=value)
+    damage = choose(data, ("cut", "bytes", "bit", "text", "longer"), "damage") if "file" in faults else "none"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "model.onnx")
+        path.write_bytes(changed(model.SerializeToString(), damage, rng))
+
+        def detect() -> tuple[Detector, Detections]:
+            detector = load_onnx(path, threads=1, **options)
+            return detector, detector(torch.rand(1, 3, 40, 30))
+
+        result = attempt(detect)
+    if failed(result):
+        assert faults, result
+        return outcome(result)
+    assert isinstance(result, tuple)
+    detector, found = result
+    assert bool(found.boxes.isfinite().all())
+    assert found.scores.shape[-1] == len(detector.classes) + 1
+    assert bool(((found.scores.sum(-1) - 1).abs() < 1e-3)[found.mask].all())
+    return "result"
+
+
+def network(image: list[Any], rank: int, classes: int, kind: int, rng: np.random.Generator) -> onnx.ModelProto:
+    """YOLOv5-style rows that do not depend on the image, cast and cut to the rank and type."""
+    rows = rng.random((1, 6, 5 + classes)).astype(np.float32)
+    rows[..., :4] *= 30
+    rows = rows.reshape(rows.shape if rank == 3 else {2: (6, -1), 1: (-1,), 0: (-1,)}[rank])
+    last = helper.make_node("Identity", ["sum"], ["cut"])
+    if rank == 0:
+        last = helper.make_node("ReduceMean", ["sum"], ["cut"], keepdims=0)
+    nodes = [
+        helper.make_node("ReduceMean", ["image"], ["mean"], keepdims=0),
+        helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
+        helper.make_node("Add", ["rows", "nothing"], ["sum"]),
+        last,
+        helper.make_node("Cast", ["cut"], ["output"], to=kind),
+    ]
+    stored = [numpy_helper.from_array(rows, "rows"), numpy_helper.from_array(np.zeros((), np.float32), "zero")]
+    inputs = [helper.make_tensor_value_info("image", TensorProto.FLOAT, image)]
+    outputs = [helper.make_tensor_value_info("output", kind, None)]
+    graph = helper.make_graph(nodes, "graph", inputs, outputs, stored)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)

@@ -1,0 +1,104 @@
+"""Parts and stores: what can be made again is there whole, or counts as missing."""
+
+import copy
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from hypothesis import strategies as st
+
+from benchmarks.fuzz.models import changed
+from benchmarks.fuzz.runner import choose, draw_rng
+from semfov.experiments.parts import Parts
+from semfov.experiments.store import DetectionStore
+from semfov.io import storage
+
+RECORDS = [{"policy": "random", "cells": [1, 2], "found_at": -1}, {"policy": "kl", "cells": [0], "found_at": 0}]
+SECONDS = {"look": 0.5, "random": 1.25}
+JUNK: list[Any] = [None, True, -1, 10**400, 0.5, float("nan"), "", "x", [], [None], {}, {"look": None}, [[[[]]]], "\0"]
+
+PART_DAMAGES = ("none", "value", "signed value", "missing", "deep", "bytes", "bit", "cut", "text")
+LOOK_DAMAGES = ("none", "type", "value", "shape", "missing", "more", "key", "bytes", "bit", "cut")
+
+
+def part_files(data: st.DataObject) -> str:
+    """`Parts.load`: the outcomes that were kept, to the last value, or None."""
+    rng = draw_rng(data)
+    with tempfile.TemporaryDirectory() as folder:
+        parts = Parts(Path(folder), "1-2", lambda index: "digest")
+        parts.save(0, RECORDS, SECONDS)
+        path = parts.path(0)
+        damage = choose(
+            data, ("none", "value", "signed value", "missing", "deep", "bytes", "bit", "cut", "text"), "how"
+        )
+        part = json.loads(path.read_text())
+        if damage in ("value", "signed value", "missing"):
+            key = choose(data, list(part), "key")
+            part[key] = copy.deepcopy(choose(data, JUNK, "junk"))
+            if damage == "signed value":
+                part["sha256"] = parts._sha256(0, part["records"], part["seconds"])
+            if damage == "missing":
+                del part[key]
+            path.write_text(json.dumps(part))
+        elif damage == "deep":
+            path.write_text("[" * 10_000 + "]" * 10_000)
+        elif damage != "none":
+            path.write_bytes(changed(path.read_bytes(), damage, rng))
+        found = parts.load(0)
+    if found is None:
+        assert damage != "none"
+        return "missing"
+    kept = found["records"] == RECORDS and found["seconds"] == SECONDS
+    forged = damage == "signed value" and (found["records"] in ([], {}) or found["records"] == RECORDS)
+    assert kept or (forged and isinstance(found["records"], list) and isinstance(found["seconds"], dict)), found
+    return "result"
+
+
+def look_files(data: st.DataObject) -> str:
+    """`DetectionStore.load`: the detections that were kept, to the bit, or None."""
+    rng = draw_rng(data)
+    with tempfile.TemporaryDirectory() as folder:
+        store = DetectionStore(Path(folder), {"detector": "toy"}, 2, 1, 3)
+        generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+        whole = {
+            "boxes": torch.rand(3, 4, generator=generator) * 30,
+            "scores": torch.rand(3, 3, generator=generator).softmax(-1),
+            "count": torch.tensor([1, 2]),
+        }
+        store.write("a" * 64, whole)
+        path = store.path("a" * 64)
+        tensors, record = storage.read(path, "cached-tensors")
+        damage = choose(
+            data, ("none", "type", "value", "shape", "missing", "more", "key", "bytes", "bit", "cut"), "how"
+        )
+        name = choose(data, list(tensors), "tensor")
+        if damage == "type":
+            kinds = (torch.bfloat16, torch.float16, torch.float64, torch.int32, torch.uint8, torch.bool)
+            tensors[name] = tensors[name].to(choose(data, kinds, "dtype"))
+        elif damage == "value":
+            wrong = (-1, 10**6) if name == "count" else (torch.nan, torch.inf, *([-1, 2] if name == "scores" else []))
+            tensors[name].view(-1)[0] = choose(data, wrong, "number")
+        elif damage == "shape":
+            shapes = (tensors[name][:1].clone(), tensors[name][None], tensors[name].new_zeros(0))
+            tensors[name] = choose(data, shapes, "tensor of another shape")
+        elif damage == "missing":
+            del tensors[name]
+        elif damage == "more":
+            tensors["more"] = torch.zeros(1)
+        elif damage == "key":
+            record[choose(data, ("key", "file", "kind"), "of record")] = choose(data, (None, 1, "x", []), "junk")
+        if damage in ("bytes", "bit", "cut"):
+            path.write_bytes(changed(path.read_bytes(), damage, rng))
+        elif damage != "none":
+            storage.write(path, tensors, record)
+        found = store.load("a" * 64)
+    if found is None:
+        assert damage != "none"
+        return "missing"
+    mask = found.mask
+    assert torch.equal(found.boxes[mask], whole["boxes"]), damage
+    assert torch.equal(found.scores[mask], whole["scores"]), damage
+    assert found.count.tolist() == [1, 2], damage
+    return "result"

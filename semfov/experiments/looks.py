@@ -1,0 +1,44 @@
+"""The one way in which a look that is kept is computed: the same bits on any number of threads and processes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.detection.detections import Detections
+from semfov.eye import Eye
+
+SOURCES = ("semfov.eye", "semfov.detection.load", "semfov.sensor.named", "semfov.data.images", __name__)
+"""Modules that turn an image into detections, with all that they import."""
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Compute on one thread: sums of several differ in their last bits with the number of threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
+    """Detections in `image` `(3, H, W)` from each of the `points` `(F, 2)`, a batch of F.
+
+    Views go through the detector one at a time and on one thread: the bits then depend neither on which views share a
+    batch nor on the machine's processors. The eye must have been made on one thread, too (`setup.make_eye`): a
+    session of onnxruntime keeps the threads that it was opened with.
+    """
+    with one_thread(), torch.inference_mode():
+        view = eye.open(image[None])
+        return Detections.stack([eye.look(view, point[None]) for point in points])
+
+
+def see_all(eye: Eye, image: Tensor, grid: Grid) -> Detections:
+    """Detections in `image` `(3, H, W)` from the centre of every cell, a batch of X·Y (`look_from`)."""
+    return look_from(eye, image, grid.centres.to(image))

@@ -1,0 +1,126 @@
+"""Settings whose ranges are part of their types."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+from semfov.errors import check
+from semfov.io.schema import interval, is_number, shown
+
+
+@dataclass(frozen=True)
+class Range:
+    """Which numbers a setting may be, in an annotation: `Annotated[int, Range(1, 100)]`.
+
+    Attributes:
+        low: least.
+        high: largest.
+        above: it is larger than this.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    above: float = -math.inf
+
+    def __repr__(self) -> str:
+        return interval(self.low, self.high, self.above).removeprefix("numbers ")
+
+    def holds(self, value: object, *, whole: bool) -> bool:
+        """Whether a value is such a number."""
+        return is_number(value, whole=whole) and self.low <= value <= self.high and value > self.above  # type: ignore[operator]
+
+
+@dataclass(frozen=True)
+class FileName:
+    """Text that a file may be called by, in an annotation."""
+
+    def __repr__(self) -> str:
+        return "that a file may be called by"
+
+    def holds(self, value: object, *, whole: bool) -> bool:
+        """Whether a value is such a text."""
+        return isinstance(value, str) and re.fullmatch(r"\w[\w .+-]{0,99}", value) is not None
+
+
+Name = Annotated[str, FileName()]
+"""Name of a model to write."""
+Seed = Annotated[int, Range(0, 2**63 - 1)]
+"""What a generator is seeded with."""
+Count = Annotated[int, Range(1, 10**9)]
+"""How many of something, at least one."""
+Whole = Annotated[int, Range(0, 10**9)]
+"""How many of something, or none."""
+Share = Annotated[float, Range(0, 1)]
+"""A share or a probability."""
+Positive = Annotated[float, Range(above=0, high=10**9)]
+"""A number above 0."""
+Weight = Annotated[float, Range(0, 10**9)]
+"""A number from 0."""
+Shifts = Annotated[int, Range(0, 10_000)]
+"""Gaze shifts of an episode."""
+Side = Annotated[int, Range(1, 200)]
+"""Cells in a row or in a column."""
+Workers = Annotated[int, Range(1, 1024)]
+"""Processes."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Base of dataclasses of settings: whoever makes one is told of values that cannot be."""
+
+    def __post_init__(self) -> None:
+        """Check all values; see `check_settings`."""
+        check_settings(type(self), vars(self), nested=False)
+
+
+_WORDS = {int: "a whole number", float: "a number", str: "a name"}
+
+
+def check_settings(config: type[Any], values: Any, prefix: str = "", *, nested: bool = True) -> None:
+    """Raise `InputError` where a setting is out of the range that its type tells: its dotted name and the range.
+
+    Args:
+        config: dataclass of the settings.
+        values: by name.
+        prefix: before the names.
+        nested: also check settings that are dataclasses themselves.
+    """
+    hints = get_type_hints(config, include_extras=True)
+    for field in fields(config):
+        if field.name not in values:
+            continue
+        value, hint = values[field.name], hints[field.name]
+        if is_dataclass(hint):
+            if nested and not is_dataclass(value) and value is not None:
+                check_settings(hint, value, f"{prefix}{field.name}.")  # type: ignore[arg-type]
+        else:
+            _check(hint, value, prefix + field.name)
+
+
+def _check(hint: Any, value: Any, name: str) -> None:
+    origin, options = get_origin(hint), get_args(hint)
+    if value is None or isinstance(value, Mapping):
+        return
+    if isinstance(value, str | Path):
+        check("\0" not in str(value), name, "text without NUL", shown(str(value)))
+    if origin is Annotated:
+        base, *more = options
+        for allowed in more:
+            if isinstance(allowed, Range | FileName):
+                what = f"{_WORDS[base]} {allowed}"
+                check(allowed.holds(value, whole=base is int), name, what, shown(value))
+    elif origin is tuple and isinstance(value, list | tuple):
+        for place, item in enumerate(value):
+            _check(options[0 if options[-1] is Ellipsis else place], item, f"{name}[{place}]")
+    else:
+        # Words among numbers are checked where they are read.
+        for option in options:
+            if is_dataclass(option) and not is_dataclass(value) and hasattr(value, "__dict__"):
+                check_settings(option, vars(value), f"{name}.")  # type: ignore[arg-type]
+            elif get_origin(option) is Annotated and isinstance(value, str) == (get_args(option)[0] is str):
+                _check(option, value, name)

@@ -1,0 +1,42 @@
+"""The loop of training small networks: one cycle of the learning rate, by a loss that is made anew in each step."""
+
+from collections.abc import Callable, Iterable
+
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+
+def descend(
+    parameters: Iterable[nn.Parameter],
+    loss_of: Callable[[int], Tensor],
+    steps: int,
+    rate: float,
+    *,
+    clip: float | None = 1.0,
+    title: str = "training",
+) -> None:
+    """Train by AdamW, with one cycle of the learning rate (Smith and Topin, 2019).
+
+    Args:
+        parameters: to train.
+        loss_of: the loss of a step, by its number.
+        steps: how many.
+        rate: highest learning rate.
+        clip: norm that gradients are cut to; None leaves them.
+        title: label of the progress bar.
+    """
+    trained = list(parameters)
+    optimiser = torch.optim.AdamW(trained, lr=rate, weight_decay=1e-2)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
+    bar = tqdm(range(steps), desc=title, unit="step", dynamic_ncols=True)
+    for number in bar:
+        loss = loss_of(number)
+        optimiser.zero_grad()
+        loss.backward()
+        if clip is not None:
+            torch.nn.utils.clip_grad_norm_(trained, clip)
+        optimiser.step()
+        schedule.step()
+        if number % 25 == 0:
+            bar.set_postfix(loss=f"{float(loss.detach()):.3f}")

@@ -1,0 +1,103 @@
+"""Annotations of others name files: only regular ones below the root are read, and none is written elsewhere."""
+
+import json
+import os
+
+import pytest
+from PIL import Image
+
+from semfov.data.coco import CocoScenes
+from semfov.data.images import read_image
+from semfov.errors import DataError, SemfovError
+from semfov.io.files import check_regular, clean, inside, replacing
+
+
+@pytest.fixture
+def data(tmp_path):
+    """Writes annotations of one image and opens them."""
+    root = tmp_path / "root"
+    root.mkdir()
+    Image.new("RGB", (40, 30)).save(root / "a.png")
+    Image.new("RGB", (40, 30)).save(tmp_path / "outside.png")
+
+    def scenes(file_name="a.png", identity=1, category="cat"):
+        document = {
+            "images": [{"id": identity, "file_name": file_name, "width": 40, "height": 30}],
+            "categories": [{"id": 1, "name": "cat"}, {"id": 2, "name": category}],
+            "annotations": [{"id": 1, "image_id": identity, "category_id": 1, "bbox": [1, 1, 9, 9]}],
+        }
+        path = tmp_path / "instances.json"
+        path.write_text(json.dumps(document))
+        return CocoScenes(root, path, ("cat",), min_instances=0)
+
+    return root, scenes
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../outside.png", "sub/../../outside.png", "link.png", "folder/outside.png", "/absolute", "./../outside.png"],
+)
+def test_files_outside_of_the_root_are_refused(data, name):
+    root, scenes = data
+    (root / "link.png").symlink_to(root.parent / "outside.png")
+    (root / "folder").symlink_to(root.parent)
+    absolute = str(root.parent / "outside.png")
+    with pytest.raises(DataError, match=r"expected a file below data\.root"):
+        scenes(absolute if name == "/absolute" else name)
+
+
+def test_links_inside_of_the_root_and_to_the_root_are_followed(data, tmp_path):
+    root, scenes = data
+    (root / "link.png").symlink_to("a.png")
+    assert scenes("link.png")[0].size == (40, 30)
+    (tmp_path / "moved").symlink_to(root)
+    found = CocoScenes(tmp_path / "moved", tmp_path / "instances.json", ("cat",), min_instances=0)
+    assert found[0].size == (40, 30)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+def test_what_is_no_regular_file_is_refused_before_it_is_read(data, tmp_path, kind):
+    root, scenes = data
+    path = root / "odd.png"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path = root / "zero"
+        try:
+            os.mknod(path, 0o600 | 0o020000, os.makedev(1, 5))
+        except PermissionError:
+            pytest.skip("may not make devices")
+    with pytest.raises(DataError, match=f"expected a file, got a {kind}"):
+        scenes(path.name)
+    with pytest.raises(DataError, match=f"expected a file, got a {kind}"):
+        read_image(path)
+    with pytest.raises(DataError, match=f"expected a file, got a {kind}"):
+        check_regular(path)
+
+
+@pytest.mark.parametrize("text", ["a\0b", "a\ud800", "a\nb", "\x1b[31m"])
+def test_text_that_cannot_be_written_is_refused_at_once(data, text):
+    _, scenes = data
+    for arguments in ({"identity": text}, {"file_name": text}, {"category": text}):
+        with pytest.raises(DataError, match=r"expected (id|file_name|name) to have no control characters, got '"):
+            scenes(**arguments)
+
+
+@pytest.mark.parametrize("name", ["../a", "/a", "b/../../a", "", ".", "..", "a\0", "link/a", "x" * 5000])
+def test_no_name_leads_out_of_a_folder(tmp_path, name):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "link").symlink_to(tmp_path)
+    with pytest.raises(SemfovError), replacing(inside(folder, name)) as temporary:
+        temporary.write_text("")
+    assert [path.name for path in tmp_path.rglob("*")] == ["out", "link"]
+
+
+@pytest.mark.parametrize("text", ["/../../../x/evil", "..", "", "a" * 1000, "ä/ö", "con\0", "-rf", ".hidden", "a\\b"])
+def test_cleaned_names_are_those_of_files_in_the_folder(tmp_path, text):
+    path = inside(tmp_path, f"{clean(text)}.png")
+    assert path.parent == tmp_path
+    path.write_text("")
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,154 @@
+"""Files of others ask for no more memory than there is any use for; what is no detector is refused by name."""
+
+import json
+import os
+import tracemalloc
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+
+from semfov.detection.darknet import Darknet
+from semfov.detection.darknet_config import parse_cfg, read_cfg
+from semfov.detection.darknet_weights import read_weights
+from semfov.detection.onnx import load_onnx
+from semfov.detection.onnx_session import OnnxSession
+from semfov.errors import DataError, InputError, SemfovError
+
+NET = "[net]\nwidth=32\nheight=32\nchannels=3\n"
+HEAD = "[convolutional]\nfilters=7\nsize=1\n[yolo]\nmask=0\nanchors=4,6\nclasses=2\n"
+DEEP = "".join("[convolutional]\nfilters=8000\nsize=3\npad=1\n" for _ in range(3))
+
+
+@pytest.mark.parametrize(
+    "cfg",
+    [
+        NET + "[convolutional]\nfilters=100000000\nsize=3\n" + HEAD,
+        NET + DEEP + HEAD,
+        NET + "[maxpool]\nsize=99999\nstride=1\n" + HEAD,
+        NET + "[convolutional]\nfilters=7\nsize=1\npadding=1000000000\n" + HEAD,
+        NET + "[upsample]\nstride=10000\n" + HEAD,
+        NET + "[upsample]\nstride=100\n[upsample]\nstride=100\n" + HEAD,
+        NET + "[convolutional]\nfilters=4\nsize=1\n" + "[route]\nlayers=-1,-1,-1,-1\n" * 40 + HEAD,
+        NET.replace("32", "99999999") + HEAD,
+        NET.replace("channels=3", "channels=" + "9" * 400) + HEAD,
+        NET + HEAD.replace("4,6", "nan,6"),
+        NET + HEAD.replace("4,6", "inf,6"),
+        NET + HEAD.replace("classes=2", "classes=1000000000"),
+        NET + "[dropout]\n" * 5000 + HEAD,
+    ],
+)
+def test_networks_that_are_too_large_are_refused_before_they_are_made(cfg):
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError) as caught:
+            Darknet(parse_cfg(cfg))
+        assert "\n" not in str(caught.value)
+        assert len(str(caught.value)) < 400
+        assert tracemalloc.get_traced_memory()[1] < 2**26
+    finally:
+        tracemalloc.stop()
+
+
+def test_files_that_are_none_or_too_long(tmp_path):
+    path = tmp_path / "long.cfg"
+    path.write_text("#" * 2**21)
+    with pytest.raises(DataError, match="at most"):
+        read_cfg(path)
+    os.mkfifo(tmp_path / "pipe")
+    network = Darknet(parse_cfg(NET + HEAD))
+    for read in (read_cfg, lambda path: read_weights(network, path), OnnxSession):
+        with pytest.raises(DataError, match="expected a file, got a pipe"):
+            read(tmp_path / "pipe")
+    with (tmp_path / "sparse.weights").open("wb") as file:
+        file.truncate(2**40)
+    with pytest.raises(DataError, match="too long"):
+        read_weights(network, tmp_path / "sparse.weights")
+
+
+def save(path, nodes, outputs, *, inputs=None, initialisers=(), metadata=None):
+    """Write a model with one image input."""
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, 32, 32] if inputs is None else inputs)
+    values = [helper.make_tensor_value_info(name, kind, shape) for name, kind, shape in outputs]
+    graph = helper.make_graph(nodes, "graph", [image], values, list(initialisers))
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    for key, value in (metadata or {}).items():
+        model.metadata_props.add(key=key, value=value)
+    onnx.save(model, path)
+    return path
+
+
+def constant(name, values):
+    return numpy_helper.from_array(np.asarray(values), name)
+
+
+def test_outputs_of_integers_or_of_no_rank_are_refused_by_name(tmp_path):
+    cast = helper.make_node("Cast", ["image"], ["label"], to=TensorProto.INT64)
+    with pytest.raises(InputError, match=r"output 'label': expected numbers of floating point, got tensor\(int64\)"):
+        load_onnx(save(tmp_path / "integers.onnx", [cast], [("label", TensorProto.INT64, [1, 3, 32, 32])]))
+    mean = helper.make_node("ReduceMean", ["image"], ["score"], keepdims=0)
+    path = save(tmp_path / "scalar.onnx", [mean], [("score", TensorProto.FLOAT, [])])
+    with pytest.raises(InputError, match=r"output 'score': expected a row for each of 1 images, got shape \(\)"):
+        load_onnx(path)
+
+
+@pytest.mark.parametrize("side", [100_000, 2**40])
+def test_tensors_that_are_too_large_are_refused_before_they_are_made(tmp_path, side):
+    identity = helper.make_node("Identity", ["image"], ["out"])
+    big = [1, 3, side, side]
+    with pytest.raises(SemfovError, match="at most"):
+        load_onnx(save(tmp_path / "canvas.onnx", [identity], [("out", TensorProto.FLOAT, big)], inputs=big))
+    fill = helper.make_node("ConstantOfShape", ["shape"], ["out"])
+    shape = constant("shape", np.array([1, side, side]))
+    with pytest.raises(DataError, match=r"tensor 'out': expected at most"):
+        load_onnx(save(tmp_path / "fill.onnx", [fill], [("out", TensorProto.FLOAT, None)], initialisers=[shape]))
+    batch = [side, 3, 32, 32]
+    with pytest.raises(SemfovError, match="at most"):
+        load_onnx(save(tmp_path / "batch.onnx", [identity], [("out", TensorProto.FLOAT, batch)], inputs=batch))
+
+
+def test_weights_outside_of_the_models_folder_are_refused(tmp_path):
+    (tmp_path / "secret").write_bytes(bytes(4))
+    folder = tmp_path / "model"
+    folder.mkdir()
+    tensor = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[1], data_location=TensorProto.EXTERNAL)
+    tensor.external_data.add(key="location", value="../secret")
+    add = helper.make_node("Add", ["image", "w"], ["out"])
+    path = folder / "model.onnx"
+    save(path, [add], [("out", TensorProto.FLOAT, [1, 3, 32, 32])], initialisers=[tensor])
+    with pytest.raises(DataError, match="leads out of it"):
+        load_onnx(path)
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        {"names": "[" * 10_000},
+        {"names": "{0: 'a\x00'}"},
+        {"names": "{0: " + "9" * 10_000 + "}"},
+        {"imgsz": "[" * 5000 + "]" * 5000},
+        {"semfov": "[" * 100_000},
+        {"semfov": '{"classes": [1, 2]}'},
+        {"semfov": '{"classes": ["\\u0000"]}'},
+        {"semfov": '{"input_size": [1e400, 2]}'},
+        {"semfov": json.dumps({"surplus" * 1000: 1})},
+        {"noise": "x" * 2**21},
+    ],
+)
+def test_metadata_is_bounded(tmp_path, metadata):
+    reshape = helper.make_node("Reshape", ["image", "shape"], ["out"])
+    shape = constant("shape", np.array([1, 384, 8]))
+    outputs = [("out", TensorProto.FLOAT, [1, 384, 8])]
+    path = save(tmp_path / "model.onnx", [reshape], outputs, initialisers=[shape], metadata=metadata)
+    with pytest.raises(SemfovError) as caught:
+        load_onnx(path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_an_ordinary_model_still_loads(tmp_path):
+    with torch.random.fork_rng(devices=[]):
+        network = Darknet(parse_cfg(NET + HEAD))
+    assert [tuple(each.shape) for each in network(torch.zeros(1, 3, 32, 32))] == [(1, 7, 32, 32)]

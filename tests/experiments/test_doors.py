@@ -1,0 +1,187 @@
+"""Values that cannot be are refused at the doors: one line that names the argument and its range, before any work."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from semfov import ActivePerception, Eye, Foveation, load_detector, observers, policies
+from semfov.data.scenes import EmbeddedScenes
+from semfov.detection import Candidates, Detector, Selection
+from semfov.errors import InputError
+from semfov.experiments import config as settings
+from semfov.experiments.settings import Range, check_settings
+
+
+class Quiet(Detector):
+    """Sees one cup."""
+
+    def __init__(self, **options):
+        super().__init__("quiet", ("cup", "cat"), (32, 32), **options)
+
+    def propose(self, canvas):
+        box = canvas.new_tensor([[4.0, 4, 20, 20]]).expand(len(canvas), 1, 4)
+        return Candidates(box, canvas.new_tensor([[0.9, 0.1]]).expand(len(canvas), 1, 2), None)
+
+
+@pytest.fixture
+def agent():
+    observer = observers.Semantic(3)
+    eye = Eye(Foveation(10.0), Quiet(), reference=64.0)
+    return ActivePerception(eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(4, 3))
+
+
+IMAGE = torch.rand(3, 40, 50, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize(
+    ("image", "told"),
+    [
+        (IMAGE * 255, r"^image: expected RGB in \[0, 1\], got numbers from .* to 25"),
+        (IMAGE - 0.5, r"^image: expected RGB in \[0, 1\], got numbers from -0\."),
+        (IMAGE.double(), r"^image: expected torch\.float32 as the agent is, got torch\.float64"),
+        (IMAGE.half(), r"^image: expected torch\.float32 as the agent is, got torch\.float16"),
+        ((IMAGE * 255).byte(), r"^image: expected torch\.float32 as the agent is, got torch\.uint8"),
+        (IMAGE.masked_fill(IMAGE > 0.99, torch.nan), r"^image: expected RGB in \[0, 1\], got NaN"),
+        (IMAGE.masked_fill(IMAGE > 0.99, torch.inf), r"^image: expected RGB in \[0, 1\], got numbers"),
+    ],
+)
+def test_images_that_are_none(agent, image, told):
+    for look in (lambda: agent.search(image, "cup"), lambda: agent.explore(image)):
+        with pytest.raises(InputError, match=told):
+            look()
+
+
+@pytest.mark.parametrize("image", [IMAGE * 255, IMAGE - 0.5, IMAGE.masked_fill(IMAGE > 0.99, torch.nan)])
+def test_images_that_are_none_before_a_detector(agent, image):
+    for look in (lambda: agent.eye.detector(image[None]), lambda: agent.eye.open(image[None])):
+        with pytest.raises(InputError, match=r"^images: expected RGB in \[0, 1\]"):
+            look()
+
+
+def test_rounding_beyond_the_ends_is_let_through(agent):
+    agent.eye.open(IMAGE[None].clamp(0, 1) * (1 + 2e-7))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("shifts", -1, "from 0 to 10,000, got -1"),
+        ("shifts", 10**9, "from 0 to 10,000, got 1000000000"),
+        ("shifts", 1.5, "a whole number"),
+        ("seed", -1, "from 0 to 9,223,372,036,854,775,807, got -1"),
+        ("seed", 2**64, "from 0 to"),
+        ("seed", None, "a whole number"),
+        ("start", -1, "from 0 to 11, got -1"),
+        ("start", 12, "from 0 to 11, got 12"),
+        ("start", True, "a whole number"),
+    ],
+)
+def test_arguments_of_the_agent(agent, name, value, told):
+    for look in (lambda: agent.search(IMAGE, "cup", **{name: value}), lambda: agent.explore(IMAGE, **{name: value})):
+        with pytest.raises(InputError, match=rf"^{name}: expected .*{told}"):
+            look()
+
+
+def test_confirm_and_target(agent):
+    with pytest.raises(InputError, match=r"^confirm: expected a probability, got 50"):
+        agent.search(IMAGE, "cup", confirm=50)
+    for target in (0, 3, -1, 10**12):
+        with pytest.raises(InputError, match=f"^target: expected a whole number from 1 to 2, got {target}"):
+            agent.search(IMAGE, target)
+
+
+@pytest.mark.parametrize("wrong", [{"threshold": 2}, {"threshold": float("nan")}, {"iou": -0.1}, {"limit": -1}])
+def test_selections(wrong):
+    with pytest.raises(InputError, match=f"^{next(iter(wrong))}: expected a (whole )?number from 0 to "):
+        Selection(**wrong)
+
+
+@pytest.mark.parametrize("stride", ["auto", 0, -32, 1.5, True])
+def test_strides(stride):
+    with pytest.raises(InputError, match=r"^stride: expected a whole number from 1"):
+        Quiet(stride=stride)
+
+
+@pytest.mark.weights
+def test_a_stride_that_only_settings_know():
+    with pytest.raises(InputError, match=r"^stride: expected None or a multiple of 32, got 'auto'"):
+        load_detector("yolov3-tiny", stride="auto")
+    with pytest.raises(InputError, match=r"^threshold: expected a number from 0 to 1, got 2"):
+        load_detector("yolov3-tiny", threshold=2)
+
+
+def test_embedded_scenes():
+    for wrong in ({"seed": -1}, {"count": 0}):
+        with pytest.raises(InputError, match=f"^{next(iter(wrong))}: "):
+            EmbeddedScenes(("cup",), **wrong)
+
+
+CONFIGS = [value for value in vars(settings).values() if dataclasses.is_dataclass(value) and isinstance(value, type)]
+
+
+def ranges():
+    """Every setting with a range, with values just outside of it."""
+    from typing import Annotated, get_args, get_origin, get_type_hints
+
+    for config in CONFIGS:
+        for name, hint in get_type_hints(config, include_extras=True).items():
+            for option in (hint, *get_args(hint)):
+                if get_origin(option) is Annotated:
+                    base, allowed = get_args(option)[:2]
+                    if isinstance(allowed, Range):
+                        yield config, name, base, allowed
+
+
+def test_there_are_ranges():
+    assert len(list(ranges())) > 25
+
+
+@pytest.mark.parametrize(("config", "name", "base", "allowed"), list(ranges()), ids=str)
+def test_settings_out_of_their_range_are_refused_by_name(config, name, base, allowed):
+    required = {"policy": "random"} if config is settings.PolicyConfig else {}
+    wrong = [allowed.high + 1, float("nan"), float("inf"), True, [1]]
+    wrong.append(allowed.above if allowed.above > -1e300 else allowed.low - 1)
+    wrong += [1.5] if base is int else []
+    for value in wrong:
+        with pytest.raises(InputError, match=f"^{name}: expected a (whole )?number "):
+            config(**required, **{name: value})
+        with pytest.raises(InputError, match=f"^before.{name}: expected "):
+            check_settings(config, {name: value}, "before.")
+    config(**required, **{name: base(allowed.high)})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--protocol.batch", "0"], "protocol.batch: expected a whole number from 1 to 1,000,000,000, got 0"),
+        (["--protocol.batch", "-1"], "protocol.batch: expected a whole number from 1 to 1,000,000,000, got -1"),
+        (["--protocol.starts", "0"], "protocol.starts: expected a whole number from 1 to 10,000, got 0"),
+        (["--protocol.seed", "-1"], "protocol.seed: expected a whole number from 0 to"),
+        (["--protocol.shifts", "-1"], "protocol.shifts: expected a whole number from 0 to 10,000, got -1"),
+        (["--detector.threshold", "2"], "detector.threshold: expected a number from 0 to 1, got 2"),
+        (["--detector.iou", "-0.1"], "detector.iou: expected a number from 0 to 1, got -0.1"),
+        (["--belief.columns", "0"], "belief.columns: expected a whole number from 1 to 200, got 0"),
+        (["--sensor.sigma", "0"], "sensor.sigma: expected a number above 0"),
+        (["--workers", "0"], "workers: expected a whole number from 1 to 1,024, got 0"),
+    ],
+)
+def test_command_lines(arguments, told, capsys, tmp_path):
+    from eval.search import main
+
+    assert main([*arguments, "--out", str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {told}")
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir()), "before any work"
+
+
+def test_help_tells_ranges(capsys):
+    from eval.search import main
+
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "(type: int from 1 to 10,000, default: 10)" in text
+    assert "(type: float from 0 to 1, default: 0.02)" in text
+    assert "Annotated" not in text

@@ -1,0 +1,248 @@
+"""Models whose fields cannot be are refused by name, whatever their checksum says; whole ones come back to the bit."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from semfov import DirichletStatistics, FovealObservationModel, TargetEvidence
+from semfov.belief import ContextPrior
+from semfov.errors import DataError, InputError
+from semfov.gaze.learned import LearnedGaze
+from semfov.io import storage
+from semfov.io.cached import read_tensors, write_tensors
+from semfov.io.schema import Array, Field, Maybe, Number, Object, Pair, Schema, Text, is_number, is_plain
+
+CLASSES = ["cup", "cat"]
+
+
+def observation():
+    settings = {"expected": torch.full((3, 2, 3), 1 / 3), "miss_rate": torch.full((3, 2), 0.25), "tempering": 0.5}
+    return FovealObservationModel.identity(CLASSES, [0.2], **settings)
+
+
+def evidence():
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return TargetEvidence(3, 2, components=3, metadata={"detector": {"name": "toy"}})
+
+
+def context():
+    return ContextPrior(CLASSES, torch.zeros(3, 2, 2), torch.zeros(3, 3, 2), [0.1], weights={"map": (1.0, 0.5)})
+
+
+def gaze():
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return LearnedGaze(2)
+
+
+MODELS = {make.__name__: make for make in (observation, evidence, context, gaze)}
+LOADERS = {name: type(make()) for name, make in MODELS.items()}
+
+
+def parts(model):
+    """Tensors and record as they are written."""
+    record = {"kind": model.kind, "version": "0", **model._record(), "metadata": model.metadata}
+    return dict(model._tensors()), json.loads(json.dumps(record))
+
+
+def refused(name, tmp_path, tensors, record):
+    path = tmp_path / "model.safetensors"
+    storage.write(path, tensors, record)
+    with pytest.raises(DataError) as caught:
+        LOADERS[name].from_pretrained(path)
+    message = str(caught.value)
+    assert message.startswith(str(path))
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_whole_models_come_back_to_the_bit(name, tmp_path):
+    model, path = MODELS[name](), tmp_path / "model.safetensors"
+    model.save(path)
+    again = LOADERS[name].from_pretrained(path)
+    assert {k: v.tolist() for k, v in again.state_dict().items()} == {
+        k: v.tolist() for k, v in model.state_dict().items()
+    }
+    assert again._record() == json.loads(json.dumps(model._record())) or again._record() == model._record()
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_numbers_that_are_none_are_refused(name, value, tmp_path):
+    for key in parts(MODELS[name]())[0]:
+        tensors, record = parts(MODELS[name]())
+        spoiled = tensors[key].detach().clone()
+        spoiled.view(-1)[-1] = value
+        assert f"{key}: expected finite numbers" in refused(name, tmp_path, {**tensors, key: spoiled}, record)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_tensors_of_another_shape_type_or_none_are_refused(name, tmp_path):
+    optional = {key for key, each in LOADERS[name].schema.tensors.items() if each.optional}
+    for key in parts(MODELS[name]())[0]:
+        tensors, record = parts(MODELS[name]())
+        whole = tensors.pop(key).detach()
+        if key not in optional:
+            assert f"{key}: expected a tensor, got nothing" in refused(name, tmp_path, tensors, record)
+        for other in (torch.int64, torch.bool, torch.bfloat16, torch.uint8):
+            assert key in refused(name, tmp_path, {**tensors, key: whole.to(other)}, record)
+        if whole.dtype == torch.float32:
+            assert "type" in refused(name, tmp_path, {**tensors, key: whole.double()}, record)
+        for other in (whole[None], whole.new_zeros(0), whole.repeat(*(2,) * whole.ndim) if whole.ndim else whole[None]):
+            refused(name, tmp_path, {**tensors, key: other.clone()}, record)
+    tensors, record = parts(MODELS[name]())
+    assert "surplus" in refused(name, tmp_path, {**tensors, "surplus": torch.zeros(1)}, record)
+
+
+JUNK = [None, True, "x", -1, 0.5, 10**400, [], {}, [None], {"a": 1}, [[1, 2], [3, 4]], "\0", ["cup", "cup"], 10**9]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_records_that_say_something_else_are_refused_or_hold(name, tmp_path):
+    """A value is refused by its name, or what is loaded has it."""
+    for key in parts(MODELS[name]())[1]:
+        tensors, record = parts(MODELS[name]())
+        if key in ("kind", "metadata", "version"):
+            continue
+        del record[key]
+        missing = storage_result(name, tmp_path, tensors, record)
+        assert missing is None or key == "thresholds"
+        for junk in JUNK:
+            tensors, record = parts(MODELS[name]())
+            loaded = storage_result(name, tmp_path, tensors, {**record, key: junk})
+            if loaded is not None:
+                assert json.loads(json.dumps(loaded._record()))[key] == junk
+    tensors, record = parts(MODELS[name]())
+    assert storage_result(name, tmp_path, tensors, {**record, "surplus": 1}) is None
+    for metadata in (None, 1, [], "x", {"detector": 1}, {"sensor": []}, {"detector": "x"}):
+        assert "metadata" in refused(name, tmp_path, tensors, {**record, "metadata": metadata})
+
+
+def storage_result(name, tmp_path, tensors, record):
+    path = tmp_path / "model.safetensors"
+    storage.write(path, tensors, record)
+    try:
+        return LOADERS[name].from_pretrained(path)
+    except DataError:
+        return None
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("tempering", 0.0, "above 0"),
+        ("tempering", -1.0, "above 0"),
+        ("tempering", 1e9, "up to 100"),
+        ("miss_rate", 1.5, "from 0 to 1"),
+        ("miss_rate", -0.1, "from 0 to 1"),
+        ("expected", 0.9, "sum to 1"),
+        ("edges", -0.1, "above 0"),
+        ("log_alpha", 500.0, "from -30 to 30"),
+    ],
+)
+def test_fields_of_an_observation_model_out_of_range(key, value, told, tmp_path):
+    tensors, record = parts(observation())
+    message = refused("observation", tmp_path, {**tensors, key: torch.full_like(tensors[key], value)}, record)
+    assert f"{key}: expected" in message
+    assert told in message
+
+
+def test_an_observation_model_is_checked_when_it_is_made_too():
+    for wrong in ({"tempering": float("nan")}, {"tempering": float("inf")}, {"miss_rate": torch.full((3, 2), 2.0)}):
+        with pytest.raises(InputError, match=f"^{next(iter(wrong))}: "):
+            FovealObservationModel.identity(CLASSES, [0.2], **wrong)
+
+
+def test_the_checksum_is_required(tmp_path):
+    tensors, record = parts(observation())
+    path = tmp_path / "model.safetensors"
+    save_file({k: v.detach().contiguous() for k, v in tensors.items()}, path, {"semfov": json.dumps(record)})
+    with pytest.raises(DataError, match="expected a file with the sha256 of its content, got one without"):
+        FovealObservationModel.from_pretrained(path)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "NaN", '{"kind": Infinity}', "1", "[]", "null", ""])
+def test_headers_of_every_other_kind_are_refused(tmp_path, text):
+    path = tmp_path / "model.safetensors"
+    save_file({"a": torch.zeros(1)}, path, {"semfov": text})
+    with pytest.raises(DataError, match=r"model\.safetensors: (not a readable|expected)"):
+        FovealObservationModel.from_pretrained(path)
+    assert read_tensors(path, "key") is None
+
+
+def test_deep_metadata_is_refused(tmp_path):
+    tensors, record = parts(observation())
+    deep = "[" * 5000 + "]" * 5000
+    text = json.dumps({**record, "sha256": "0" * 64}).replace('"metadata": {}', f'"metadata": {{"x": {deep}}}')
+    path = tmp_path / "model.safetensors"
+    save_file({k: v.detach().contiguous() for k, v in tensors.items()}, path, {"semfov": text})
+    with pytest.raises(DataError):
+        FovealObservationModel.from_pretrained(path)
+
+
+def test_statistics_out_of_range_are_refused(tmp_path):
+    statistics = DirichletStatistics((2,), 3).update(torch.tensor([[0.2, 0.3, 0.5]]), torch.tensor([1]))
+    path = tmp_path / "statistics.safetensors"
+    statistics.save(path)
+    assert DirichletStatistics.load(path)[0] == statistics
+    tensors, record = storage.read(path, "dirichlet-statistics")
+    wrong = [
+        ({**tensors, "count": -tensors["count"]}, record),
+        ({**tensors, "count": tensors["count"].double()}, record),
+        ({**tensors, "sums": tensors["sums"].float()}, record),
+        (tensors, {**record, "epsilon": 0}),
+        (tensors, {**record, "epsilon": None}),
+        (tensors, {key: value for key, value in record.items() if key != "epsilon"}),
+        ({**tensors, "more": torch.zeros(1)}, record),
+    ]
+    for content in wrong:
+        storage.write(path, *content)
+        with pytest.raises(DataError):
+            DirichletStatistics.load(path)
+
+
+def test_cached_tensors_of_another_schema_count_as_missing(tmp_path):
+    schema = Schema({"a": Field(("M", 4)), "n": Field(("M",), torch.int64, low=0)})
+    path = tmp_path / "x.safetensors"
+    whole = {"a": torch.zeros(3, 4), "n": torch.arange(3)}
+    write_tensors(path, "key", whole)
+    assert read_tensors(path, "key", schema).keys() == whole.keys()
+    for wrong in (
+        {**whole, "a": whole["a"].bfloat16()},
+        {**whole, "a": torch.full((3, 4), torch.nan)},
+        {**whole, "n": torch.arange(4)},
+        {**whole, "n": -torch.arange(3)},
+        {"a": whole["a"]},
+        {},
+    ):
+        write_tensors(path, "key", wrong)
+        assert read_tensors(path, "key", schema) is None
+
+
+def test_what_schemas_say_of_single_values():
+    sizes = {}
+    Array(Text(), "K").check("classes", ["a", "b"], sizes)
+    assert sizes == {"K": 2}
+    Field(("K+1", "N-1")).check("t", torch.zeros(3, 4), sizes)
+    assert sizes == {"K": 2, "N": 5}
+    wrong = [
+        (Number(0, 1), 2),
+        (Number(size="K"), 0),
+        (Number(), True),
+        (Number(), float("nan")),
+        (Array(Number(), ascending=True), [1, 1]),
+        (Pair((Number(), Number())), [1]),
+        (Text(("a",)), "b"),
+        (Object({"a": Number()}), {"b": 1}),
+        (Object({"a": Number()}, required=("a",)), {}),
+        (Maybe(Number()), "x"),
+    ]
+    for kind, value in wrong:
+        with pytest.raises(InputError, match=r"^name"):
+            kind.check("name", value, {})
+    assert not is_number(10**400)
+    assert not is_plain("\x85")
