@@ -21,6 +21,7 @@ MODULES = (
     "semfov.gaze.acquisition",
     "semfov.gaze.saliency",
     "semfov.episode",
+    "semfov.zoom",
     "semfov.data",
     "semfov.errors",
 )

@@ -8,7 +8,8 @@
     python -m eval.demo PHOTO.jpg --target cup --report cup.html
 
 It prints what was seen and believed at each fixation, and writes pictures and an animation to the folder `out`.
-Each picture of a folder, a video or a camera is looked at on its own.
+Each picture of a folder, a video or a camera is looked at on its own. A picture that is four times as large as the
+detector's input, or larger, is looked at in windows: the agent chooses where, and how close.
 """
 
 import re
@@ -34,6 +35,8 @@ from semfov.sensor import SENSORS
 from semfov.sensor.named import SensorName
 from semfov.viz.animation import render, save_animation
 from semfov.viz.views import foveated_views
+from semfov.viz.zoom import describe_zoom, plot_zoom_path
+from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye
 
 PHOTO = "photograph, folder of photographs or video (none: an embedded scene)"
 
@@ -60,7 +63,8 @@ class DemoConfig(Settings):
         give_up: probability below which a cell is not worth a look (none: the one chosen).
         price: price of a look in right decisions: a search ends when looking on is not worth it (none: by thresholds).
         until: price of a look in cells: an exploration ends when none is expected to name so many more right (none: 0.1
-            where the map was learned; 0: never).
+            where the map was learned; 0: never). Of a large picture in objects: when no window is expected to show so
+            many new ones (none: 0.01).
         seed: of the start, of ties and of the embedded scene.
         frames: how many frames of a video or camera to look at.
         report: write a page to step through in a browser to this file.
@@ -99,7 +103,12 @@ def demo(config: DemoConfig) -> None:
         lookup(config.target, agent.classes[1:], "target class")
     written, pool, episodes = [], Pool(), []
     several = config.camera is not None or (config.photo is not None and is_many(config.photo))
+    zooming = zoom_agent(config, agent)
     for number, picture in enumerate(pictures(config, agent)):
+        if zooming is not None and zooming.pays(picture.image):
+            folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
+            written += zoom_in(zooming, picture, config, folder)
+            continue
         scanpath = look_at(agent, picture, config)
         print(told(picture.name, scanpath))
         views = foveated_views(agent.eye, picture.image, scanpath.fixations)
@@ -108,7 +117,7 @@ def demo(config: DemoConfig) -> None:
         if config.report is not None:
             shown = episode_data(scanpath, picture.image, views, pool, name=picture.name, boxes=picture.boxes)
             episodes.append(shown)
-    if config.report is not None:
+    if config.report is not None and episodes:
         title = "exploration" if config.target is None else f"search for “{config.target}”"
         written.append(write_page(config.report, f"semfov: {title}", episodes, pool))
     print("written:")
@@ -123,6 +132,42 @@ def make_agent(config: DemoConfig) -> ActivePerception:
         return ActivePerception.recommended(config.detector, sigma=sensor["sigma"], growth=sensor["growth"])
     make = ActivePerception.published if config.agent == "published" else ActivePerception.raw
     return make(config.detector, sensor=config.sensor or "published")
+
+
+def zoom_agent(config: DemoConfig, agent: ActivePerception) -> ZoomAgent | None:
+    """The agent for large pictures, with the same detector; none where no evidence is shipped for it."""
+    name = agent.eye.detector.name
+    if config.agent != "recommended" or not (GlimpseEvidence.shipped / f"{name}.safetensors").is_file():
+        return None
+    zooming = ZoomAgent(ZoomEye(agent.eye.detector), GlimpseEvidence.from_pretrained(name))
+    return zooming.eval().requires_grad_(False)
+
+
+def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig, folder: Path) -> list[Path]:
+    """Search or explore a picture larger than the detector's input, print where it was looked at, and draw that."""
+    passes = 24 if config.shifts is None else config.shifts + 1
+    if config.target is None:
+        given = {"worth": config.until}
+        path = agent.explore(picture.image, passes=passes, **chosen(given))
+    else:
+        given = {"confirm": config.confirm, "give_up": config.give_up}
+        path = agent.search(picture.image, config.target, passes=passes, **chosen(given))
+    width, height = path.lattice.size
+    print(f"{picture.name}, {width} × {height} px, looked at in windows: {describe_zoom(path)}")
+    unused = [name for name in ("sensor", "start", "price", "report") if getattr(config, name) is not None]
+    if unused:
+        print(f"  not used for a picture of this size: {', '.join(unused)}")
+    for number, glance in enumerate(path.glances):
+        x, y, magnification = glance.window.fixation
+        count = int((glance.detections.confidence >= viz.CONFIDENT).sum())
+        where = f"at ({x:.0f}, {y:.0f})" if number else "the whole picture"
+        print(f"  {number:2d}  {where} × {magnification:.2f}: {count} detection{'s' if count != 1 else ''}")
+    return [save_figure(plot_zoom_path(path, small(picture.image)), folder / "zoom.png")]
+
+
+def chosen(values: dict[str, float | None]) -> dict[str, Any]:
+    """Those that were given."""
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def is_many(photo: Path) -> bool:

@@ -15,6 +15,7 @@ from semfov.observation import DirichletStatistics, FovealObservationModel, diri
 from semfov.scanpath import Scanpath
 from semfov.sensor import Foveation, foveate
 from semfov.version import __version__
+from semfov.zoom import ZoomAgent, ZoomEye
 
 if TYPE_CHECKING:
     from semfov.data import CocoScenes
@@ -39,6 +40,8 @@ __all__ = [
     "Selection",
     "SemfovError",
     "TargetEvidence",
+    "ZoomAgent",
+    "ZoomEye",
     "__version__",
     "acquisition",
     "dirichlet",

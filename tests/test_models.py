@@ -11,10 +11,12 @@ from semfov.agent import PUBLISHED_SENSORS
 from semfov.belief import ContextPrior, DirichletBelief
 from semfov.io.compatibility import learned_for, recommended
 from semfov.sensor import SENSORS
+from semfov.zoom import GlimpseEvidence
 
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
 TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
 MAPS = sorted(semfov.MapEvidence.shipped.glob("*.safetensors"))
+ZOOM = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
 GAZE = sorted(semfov.gaze.LearnedGaze.shipped.glob("*.safetensors"))
 
 
@@ -113,6 +115,26 @@ def test_learned_gaze():
         closest = (torch.arange(100) - 50.0).abs()[None] / 100
         with torch.no_grad():
             assert gaze(DirichletBelief(beta, closest), visited, 7, 10).argmax() == cell
+
+
+@pytest.mark.parametrize("path", ZOOM, ids=lambda path: path.stem)
+def test_glimpse_evidence(path):
+    model = GlimpseEvidence.from_pretrained(path.stem)
+    assert path.stat().st_size < 100_000
+    assert model.metadata["detector"]["name"] == path.stem
+    assert "/" not in json.dumps(model.metadata)
+    assert f"`{path.stem}`" in (path.parent / "README.md").read_text(encoding="utf-8")
+    # The stronger the hint of a class, the more probable is it that a closer look shows it.
+    scores = torch.zeros(5, model.classes)
+    scores[:, 6] = torch.tensor([0.0, 0.01, 0.05, 0.2, 0.7])
+    summary = torch.stack([scores.sum(1), torch.full((5,), 0.01), (scores > 0.02).sum(1).float()], 1)
+    with torch.no_grad():
+        odds = model.presence(scores, summary, torch.ones(5), target=7)
+        taper = model.taper(16)
+    assert bool((odds.diff() > 0).all())
+    # What lies in the middle of a window is found, what lies at its border may be cut.
+    assert taper[8] > taper[0]
+    torch.testing.assert_close(taper, taper.flip(0))
 
 
 def test_both_kinds_exist_for_every_detector():

@@ -66,9 +66,9 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
             # By its name Pillow would map a plain TIFF into memory, and mix up its rows where it is to be turned.
             with Path(path).open("rb") as file, Image.open(file) as image:
                 _check_pixels(image.size, name)
-                stored = _orientation(image)
+                stored = orientation(image)
                 image.load()
-                picture = _turned(image, stored, _orientation(image), upright=oriented)
+                picture = turned(image, stored, orientation(image), upright=oriented)
                 array = _rgb(picture, name)
         except DataError:
             raise
@@ -117,7 +117,7 @@ def _check_pixels(size: tuple[int, int], name: str) -> None:
         raise DataError(f"{name}: expected 1 to {MAX_PIXELS:,} pixels, got {width} × {height}; reduce or replace it")
 
 
-def _orientation(image: Any) -> int:
+def orientation(image: Any) -> int:
     """The EXIF orientation, 1 to 8; 1, as stored, where the data are damaged or say something else."""
     try:
         orientation = image.getexif().get(_ORIENTATION_TAG, 1)
@@ -126,7 +126,7 @@ def _orientation(image: Any) -> int:
     return orientation if orientation in _MOVES else 1
 
 
-def _turned(image: Any, stored: int, left: int, *, upright: bool) -> Any:
+def turned(image: Any, stored: int, left: int, *, upright: bool) -> Any:
     """A picture upright, or as stored.
 
     Args:

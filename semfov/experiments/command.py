@@ -67,8 +67,8 @@ def run_command(
     """Parse `arguments` into a `config` and call `main` with it.
 
     Returns:
-        0, or 1 after a `SemfovError` (printed in one line), or 130 after Ctrl-C, or 143 after SIGTERM; usage errors
-        exit with 2.
+        0, or 1 after a `SemfovError` (printed in one line), or 130 after Ctrl-C, or 143 after SIGTERM, or 141 where
+        nobody reads the output any more; usage errors exit with 2.
     """
     try:
         with _signals():
@@ -78,9 +78,14 @@ def run_command(
             check_settings(config, parsed)
             settings = parser.instantiate(parsed)
             main(config(**settings.as_dict()))
+            sys.stdout.flush()
     except SemfovError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except BrokenPipeError:
+        # Whoever read the output, such as `head`, has gone; what is still in the buffer has nowhere to go.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except KeyboardInterrupt:
         print(f"interrupted; {_GOES_ON}", file=sys.stderr)
         return 128 + signal.SIGINT

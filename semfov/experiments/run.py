@@ -6,9 +6,10 @@ import hashlib
 import json
 import logging
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, Protocol
 
 from torch import Tensor
 
@@ -61,7 +62,7 @@ class Run(ABC):
             name: make_strategy(policy, self.task, config.belief, components, self.models, fovea)
             for name, policy in self.policies.items()
         }
-        settings, cache = self.eye.settings(), cache_folder(config)
+        settings, cache = self.eye.settings(), cache_folder(config.cache)
         size = config.belief.columns, config.belief.rows
         self.store = DetectionStore(cache / "looks", settings, *size, components)
         self.saliency_stores = {
@@ -81,7 +82,7 @@ class Run(ABC):
         """Of the whole package and the libraries below it, and of policies that the user registered."""
         chosen = {policy.policy for policy in self.policies.values()} & POLICIES.keys()
         foreign = [name for name in sorted(chosen) if not POLICIES[name].__module__.startswith("semfov.")]
-        return _sha256([package_digest(), versions(), [class_digest(POLICIES[name]) for name in foreign]])
+        return digest_of([package_digest(), versions(), [class_digest(POLICIES[name]) for name in foreign]])
 
     def _key(self) -> str:
         config, models = self.config, self.models
@@ -101,7 +102,7 @@ class Run(ABC):
         saliency = asdict(config.saliency) if self.saliency_stores else None
         policies = {name: asdict(policy) for name, policy in self.policies.items()}
         seen = [self.eye.settings(), self.scenes.fingerprint]
-        return _sha256([self.task, seen, belief, fitted, protocol, policies, saliency])
+        return digest_of([self.task, seen, belief, fitted, protocol, policies, saliency])
 
     @property
     def parts(self) -> Parts:
@@ -153,16 +154,30 @@ class Run(ABC):
         return saliency
 
 
-def cache_folder(config: RunConfig) -> Path:
-    """Folder of the stores."""
-    if config.cache is not None:
-        return config.cache
+def cache_folder(chosen: Path | None) -> Path:
+    """Folder of the stores: the chosen one, or the user's cache."""
+    if chosen is not None:
+        return chosen
     from semfov.detection.weights import cache_folder as user_cache
 
     return user_cache()
 
 
-def finish(run: Run, title: str) -> None:
+class Resumable(Protocol):
+    """An experiment that is made of its settings alone, in any process, and whose scenes are finished one by one."""
+
+    config: Any
+    scenes: Scenes
+
+    @property
+    def parts(self) -> Parts:
+        """Outcomes of finished scenes."""
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Records of a scene, and the seconds that they took."""
+
+
+def finish(run: Resumable, title: str) -> None:
     """Run all scenes that have no part yet, this rank its share of them, and wait for the other ranks."""
     parts = run.parts
     todo = [index for index in mine(range(len(run.scenes))) if parts.load(index) is None]
@@ -188,14 +203,15 @@ def finish(run: Run, title: str) -> None:
     wait_for_others(range(len(run.scenes)), lambda index: parts.load(index) is not None)
 
 
-def _sha256(what: object) -> str:
+def digest_of(what: object) -> str:
+    """sha256 of JSON values."""
     return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
 
-_process: dict[str, Run] = {}
+_process: dict[str, Resumable] = {}
 
 
-def prepare_process(make: type[Run], config: RunConfig) -> None:
+def prepare_process(make: Callable[[Any], Resumable], config: Any) -> None:
     """Build the run once in this process."""
     prepare_worker()
     _process["run"] = make(config)

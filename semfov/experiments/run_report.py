@@ -21,6 +21,9 @@ from semfov.report.episode import Data, Pool, episode_data
 from semfov.report.page import write_page
 from semfov.viz.views import foveated_views
 
+WHERE = ("out", "cache", "workers")
+"""Settings of where and how a run was made, on which nothing on the page depends."""
+
 LIMIT = 4_500_000
 """No further episode is added to a page that is as large as this, in bytes."""
 
@@ -61,7 +64,8 @@ def write_run_report(
         title = escape(titles[average])
         sections.append(f"<section><h2>{title[:1].upper()}{title[1:]}</h2>")
         sections.append(curves_html(means, errors, label) + table_html(rows, caption) + "</section>")
-    settings = escape(yaml.safe_dump(plain(asdict(run.config)), sort_keys=False))
+    told = {name: value for name, value in plain(asdict(run.config)).items() if name not in WHERE}
+    settings = escape(yaml.safe_dump(told, sort_keys=False))
     sections.append(f'<details><summary>Settings</summary><pre class="wide">{settings}</pre></details>')
     pool = Pool()
     data = _episodes(run, choose_episodes(records, list(run.policies), episodes), pool)

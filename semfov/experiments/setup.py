@@ -12,6 +12,7 @@ import torch
 
 from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
 from semfov.data.scene import Scenes
+from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
 from semfov.errors import DataError, InputError
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
@@ -53,8 +54,8 @@ def read_ids(path: Path) -> list[str]:
         raise DataError(f"{path}: cannot be read as a list of ids ({error})") from None
 
 
-def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
-    """The foveal sensor and the detector behind it."""
+def make_detector(detector: DetectorConfig) -> Detector:
+    """The detector that the settings name."""
     options: dict[str, object] = {
         "background": detector.background,
         "threshold": detector.threshold,
@@ -71,7 +72,12 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
         options["runtime"] = detector.runtime
     # A session of onnxruntime keeps the threads that it is opened with.
     with one_thread():
-        model = load_detector(detector.name, **options)
+        return load_detector(detector.name, **options)
+
+
+def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
+    """The foveal sensor and the detector behind it."""
+    model = make_detector(detector)
     return Eye(sensor.make(), model, reference=sensor.reference).eval().requires_grad_(False)
 
 

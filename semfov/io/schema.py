@@ -248,9 +248,9 @@ class Schema:
         check(len(free) <= 1, "tensors", "one floating-point type for all", ", ".join(sorted(map(str, free))))
 
 
-def perceptron(name: str, inputs: int, hidden: Size, *, largest: float = 1e6) -> dict[str, Field]:
-    """Tensors of a network of two hidden layers and one output, an `nn.Sequential` with an activation after each."""
-    layers: Sequence[tuple[Size, Size]] = ((hidden, inputs), (hidden, hidden), (1, hidden))
+def perceptron(name: str, inputs: int, hidden: Size, outputs: int = 1, *, largest: float = 1e6) -> dict[str, Field]:
+    """Tensors of a network of two hidden layers, an `nn.Sequential` with an activation after each."""
+    layers: Sequence[tuple[Size, Size]] = ((hidden, inputs), (hidden, hidden), (outputs, hidden))
     tensors = {}
     for number, (out, into) in enumerate(layers):
         tensors[f"{name}.{2 * number}.weight"] = Field((out, into), low=-largest, high=largest)

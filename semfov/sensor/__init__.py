@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from semfov.sensor.foveation import Foveation, foveate
+from semfov.sensor.glimpse import Glimpse, glimpse
 from semfov.sensor.named import SENSORS, named_sensor
 from semfov.sensor.pyramid import Bands, laplacian_pyramid, pyrdown, pyrup
 
@@ -13,8 +14,10 @@ __all__ = [
     "SENSORS",
     "Bands",
     "Foveation",
+    "Glimpse",
     "RandomFoveation",
     "foveate",
+    "glimpse",
     "laplacian_pyramid",
     "named_sensor",
     "pyrdown",

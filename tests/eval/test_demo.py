@@ -17,6 +17,7 @@ from semfov.detection import Candidates, Detector
 from semfov.episode import STAGES
 from semfov.gaze import LearnedGaze
 from semfov.gaze.policies import Means, named_policy, policy_names
+from semfov.zoom import GlimpseEvidence
 
 
 class Squares(Detector):
@@ -74,6 +75,49 @@ def test_search(run, photo, tmp_path):
         assert f"out/{name}" in printed.out
     assert "<!DOCTYPE html>" in (tmp_path / "page.html").read_text(encoding="utf-8")
     assert str(tmp_path / "page.html") in printed.out
+
+
+@pytest.fixture
+def large(tmp_path):
+    picture = Image.new("RGB", (1280, 960), (100, 100, 100))
+    picture.paste((230, 20, 20), (1000, 700, 1040, 740))
+    path = tmp_path / "large" / "field.png"
+    path.parent.mkdir()
+    picture.save(path)
+    return path
+
+
+@pytest.fixture
+def zooming(tmp_path, monkeypatch):
+    """Evidence that is shipped for the detector."""
+    monkeypatch.setattr(GlimpseEvidence, "shipped", tmp_path / "shipped")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        GlimpseEvidence(2, 8).save(tmp_path / "shipped" / "squares.safetensors")
+
+
+def test_a_large_picture_is_looked_at_in_windows(run, large, zooming, tmp_path):
+    code, printed = run(large, "--target", "red", "--shifts", 5, "--start", 3, "--report", tmp_path / "page.html")
+    assert code == 0
+    assert "field.png, 1280 × 960 px, looked at in windows: red: found" in printed.out
+    assert "not used for a picture of this size: start, report" in printed.out
+    assert "   0  the whole picture × 0.12: 1 detection" in printed.out
+    with Image.open(tmp_path / "out" / "zoom.png") as picture:
+        picture.verify()
+    assert not (tmp_path / "page.html").exists()
+    code, printed = run(large, "--target", "red", "--confirm", 1, "--give_up", 0, "--shifts", 3)
+    assert "red: undecided" in printed.out
+    assert "in 4 passes" in printed.out
+    code, printed = run(large, "--explore", "--until", 1000)
+    assert "in 1 pass\n" in printed.out
+
+
+def test_small_and_large_pictures_of_a_folder(run, photo, large, zooming, tmp_path):
+    photo.rename(large.with_name(photo.name))
+    code, _ = run(large.parent, "--target", "red", "--start", 47)
+    assert code == 0
+    assert (tmp_path / "out" / "000-field.png" / "zoom.png").is_file()
+    assert (tmp_path / "out" / "001-my-photo.png" / "scanpath.png").is_file()
 
 
 def test_explore_a_folder(run, photo, tmp_path):

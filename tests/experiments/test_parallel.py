@@ -160,3 +160,15 @@ def test_there_is_nobody_to_wait_for_alone(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "3")
     monkeypatch.setenv("RANK", "1")
     assert mine(range(7)) == [1, 4]
+
+
+@pytest.mark.weights
+def test_a_reader_that_leaves_is_no_traceback():
+    """As `python -m eval.demo | head -0`."""
+    call = [sys.executable, "-m", "eval.demo"]
+    with started(call, cwd=ROOT, stdout=subprocess.PIPE) as process:
+        process.stdout.close()
+        process.stdout = None
+        error = process.communicate(timeout=120)[1]
+        assert process.returncode == 141, error
+        assert error == ""

@@ -13,6 +13,7 @@ from semfov.gaze.learned import LearnedGaze
 from semfov.io import storage
 from semfov.io.cached import read_tensors, write_tensors
 from semfov.io.schema import Array, Field, Maybe, Number, Object, Pair, Schema, Text, is_number, is_plain
+from semfov.zoom import GlimpseEvidence
 
 CLASSES = ["cup", "cat"]
 
@@ -38,7 +39,13 @@ def gaze():
         return LearnedGaze(2)
 
 
-MODELS = {make.__name__: make for make in (observation, evidence, context, gaze)}
+def glimpses():
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return GlimpseEvidence(3, 2, patience=1.5, foresight=0.25)
+
+
+MODELS = {make.__name__: make for make in (observation, evidence, context, gaze, glimpses)}
 LOADERS = {name: type(make()) for name, make in MODELS.items()}
 
 

@@ -1,0 +1,267 @@
+"""Pictures that are read by windows: in memory, mapped from a file, tiled TIFF, or decoded when first needed."""
+
+import warnings
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from semfov.data.images import orientation, read_image, turned
+from semfov.errors import DataError, InputError, SemfovError, check, check_pixels, check_shape
+from semfov.io.files import check_regular
+
+Box = tuple[int, int, int, int]
+
+_PLAIN = ("RGB", "L", "CMYK", "YCbCr")  # of 8 bits, and nothing is transparent
+_STRIP = 1 << 24  # pixels that are read at once for a reduced view
+
+
+class LargePicture(ABC):
+    """A picture of bytes that gives its windows.
+
+    Attributes:
+        size: `(width, height)` in pixels.
+    """
+
+    size: tuple[int, int]
+
+    @abstractmethod
+    def pixels(self, box: Box) -> NDArray[np.uint8]:
+        """Pixels `(h, w, 3)`, RGB, of a window `(x1, y1, x2, y2)` inside the picture."""
+
+    def read(self, box: Box, reduction: int = 1) -> Tensor:
+        """A window, reduced by a power of two where that keeps memory small.
+
+        Large windows are read in strips, each averaged over squares of `reduction` pixels, so that nothing larger than
+        a strip of 16 million pixels (48 MB) is held, whatever the window.
+
+        Args:
+            box: `(x1, y1, x2, y2)` in whole pixels, inside the picture.
+            reduction: how far it may be reduced.
+
+        Returns:
+            `(3, h, w)` bytes, channels last in memory.
+        """
+        x1, y1, x2, y2 = box
+        width, height = self.size
+        check(0 <= x1 < x2 <= width and 0 <= y1 < y2 <= height, "box", f"inside {width} × {height}", box)
+        if reduction <= 1 or (x2 - x1) * (y2 - y1) <= _STRIP:
+            return _tensor(self.pixels(box))
+        from PIL import Image
+
+        rows = max(1, _STRIP // (x2 - x1) // reduction) * reduction
+        strips = []
+        for top in range(y1, y2, rows):
+            strip = self.pixels((x1, top, x2, min(y2, top + rows)))
+            strips.append(np.asarray(Image.fromarray(strip).reduce(reduction)))
+        return _tensor(np.concatenate(strips))
+
+
+class ArrayPicture(LargePicture):
+    """An array `(H, W, 3)` or `(H, W)` of bytes, in memory or a `numpy.memmap`, of which only windows are touched."""
+
+    def __init__(self, array: NDArray[np.uint8]) -> None:
+        fits = array.dtype == np.uint8 and (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3))
+        check(fits and array.size > 0, "array", "bytes of shape (H, W, 3) or (H, W)", f"{array.dtype} {array.shape}")
+        self._array = array
+        self.size = array.shape[1], array.shape[0]
+
+    def pixels(self, box: Box) -> NDArray[np.uint8]:
+        """A window."""
+        x1, y1, x2, y2 = box
+        window = self._array[y1:y2, x1:x2]
+        return np.repeat(window[..., None], 3, -1) if window.ndim == 2 else window
+
+
+class TensorPicture(ArrayPicture):
+    """An image tensor, RGB in [0, 1], kept as bytes.
+
+    Args:
+        image: `(3, H, W)` or `(1, 3, H, W)`; bytes are taken as they are.
+    """
+
+    def __init__(self, image: Tensor) -> None:
+        image = image[None] if image.ndim == 3 else image
+        check_shape(image, "image", 1, 3, None, None)
+        check(image.ndim == 4, "image", "a tensor of shape (3, H, W) or (1, 3, H, W)", tuple(image.shape))
+        known = image.is_floating_point() or image.dtype == torch.uint8
+        check(known, "image", "RGB in [0, 1], or bytes", image.dtype)
+        super().__init__(to_bytes(image[0].detach()))
+
+
+def to_bytes(image: Tensor) -> NDArray[np.uint8]:
+    """Pixels `(H, W, 3)` of an image `(3, H, W)`, RGB in [0, 1] or bytes already."""
+    if image.dtype != torch.uint8:
+        check_pixels(image, "image")
+        image = image.clamp(0, 1).mul(255).round()
+    pixels: NDArray[np.uint8] = image.permute(1, 2, 0).to("cpu", torch.uint8).contiguous().numpy()
+    return pixels
+
+
+class PhotographPicture(LargePicture):
+    """A file that Pillow reads.
+
+    Formats such as JPEG have no windows: the whole is decoded when a window is first needed (three bytes a pixel), and
+    kept. The overview of a JPEG comes before that from its own coarse decoding (`Image.draft`), in a small part of the
+    memory and of the time.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        DataError: there is no such file, or it is no picture.
+    """
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        from PIL import Image
+
+        self.path = Path(path)
+        self._array: NDArray[np.uint8] | None = None
+        with _opening(self.path, "opened"), Image.open(self.path) as image:
+            self.size = image.size
+            upright = orientation(image) == 1
+            self._drafts = image.format == "JPEG" and image.mode in ("RGB", "L")
+        if not upright:
+            # Upright it may have another size; its windows are those of the upright picture.
+            self.size = self._whole().shape[1::-1]
+
+    def pixels(self, box: Box) -> NDArray[np.uint8]:
+        """A window."""
+        x1, y1, x2, y2 = box
+        return self._whole()[y1:y2, x1:x2]
+
+    def read(self, box: Box, reduction: int = 1) -> Tensor:
+        """A window; the whole of a JPEG that was not decoded yet at the coarsest draft that the reduction allows."""
+        whole = box == (0, 0, *self.size)
+        if not (whole and reduction > 1 and self._drafts and self._array is None):
+            return super().read(box, reduction)
+        from PIL import Image
+
+        with _opening(self.path, "decoded"), Image.open(self.path) as image:
+            image.draft("RGB", (-(-self.size[0] // reduction), -(-self.size[1] // reduction)))
+            return _tensor(np.asarray(image.convert("RGB")))
+
+    def _whole(self) -> NDArray[np.uint8]:
+        if self._array is None:
+            from PIL import Image
+
+            # By its name Pillow would map a plain TIFF into memory, and mix up its rows where it is to be turned.
+            with _opening(self.path, "decoded"), self.path.open("rb") as file, Image.open(file) as image:
+                if image.mode in _PLAIN and "transparency" not in image.info:
+                    stored = orientation(image)
+                    image.load()
+                    self._array = np.asarray(turned(image, stored, orientation(image), upright=True).convert("RGB"))
+                else:
+                    self._array = to_bytes(read_image(self.path))
+        return self._array
+
+
+class TiffPicture(LargePicture):
+    """A TIFF of bytes, read tile by tile (or strip by strip) through `tifffile`.
+
+    Only the tiles that a window touches are decoded, one at a time.
+
+    Args:
+        path: of the file; its first page is taken.
+
+    Raises:
+        DataError: `tifffile` is not installed, or the page is not grey or RGB of 8 bits.
+    """
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        try:
+            import tifffile
+        except ImportError:
+            raise DataError(f"{path}: tiled TIFFs need tifffile; pip install tifffile") from None
+        self.path = Path(path)
+        with _opening(self.path, "opened"):
+            self._file = tifffile.TiffFile(path)
+            weakref.finalize(self, self._file.close)
+            page: Any = self._file.pages[0]
+            shape = page.shape
+        fits = page.dtype == np.uint8 and (len(shape) == 2 or (len(shape) == 3 and shape[2] in (3, 4)))
+        if not fits or page.planarconfig not in (None, 1):
+            raise DataError(f"{path}: expected grey or RGB of 8 bits, pixel by pixel, got {page.dtype} {shape}")
+        self._page = page
+        self.size = shape[1], shape[0]
+
+    def pixels(self, box: Box) -> NDArray[np.uint8]:
+        """A window."""
+        with _opening(self.path, "decoded"):
+            return self._tiles(box)
+
+    def _tiles(self, box: Box) -> NDArray[np.uint8]:
+        x1, y1, x2, y2 = box
+        page = self._page
+        wide, high = (page.tilewidth, page.tilelength) if page.is_tiled else (self.size[0], page.rowsperstrip)
+        across = -(-self.size[0] // wide)
+        window = np.zeros((y2 - y1, x2 - x1, 3), np.uint8)
+        numbers = [
+            row * across + column
+            for row in range(y1 // high, -(-y2 // high))
+            for column in range(x1 // wide, -(-x2 // wide))
+        ]
+        for number in numbers:
+            offset, count = page.dataoffsets[number], page.databytecounts[number]
+            if not count:
+                continue  # a tile that the file leaves out is empty
+            self._file.filehandle.seek(offset)
+            data = self._file.filehandle.read(count)
+            tile = page.decode(data, number, jpegtables=page.jpegtables)[0][0]
+            top, left = number // across * high, number % across * wide
+            tile = tile[: self.size[1] - top, : self.size[0] - left]
+            rows = slice(max(y1 - top, 0), min(y2 - top, tile.shape[0]))
+            columns = slice(max(x1 - left, 0), min(x2 - left, tile.shape[1]))
+            at = slice(top + rows.start - y1, top + rows.stop - y1)
+            along = slice(left + columns.start - x1, left + columns.stop - x1)
+            window[at, along] = tile[rows, columns, : min(3, tile.shape[-1])]
+        return window
+
+
+def open_large(source: LargePicture | Tensor | NDArray[np.uint8] | str | PathLike[str]) -> LargePicture:
+    """A picture that gives its windows, from a tensor, an array, or a file (`.tif` and `.tiff` tile by tile).
+
+    >>> open_large(torch.rand(3, 20, 30)).read((10, 5, 30, 15)).shape
+    torch.Size([3, 10, 20])
+    """
+    if isinstance(source, LargePicture):
+        return source
+    if isinstance(source, Tensor):
+        return TensorPicture(source)
+    if isinstance(source, np.ndarray):
+        return ArrayPicture(source)
+    if not isinstance(source, str | PathLike):
+        raise InputError(f"picture: expected a tensor, an array of bytes or a file, got {type(source).__name__}")
+    if Path(source).suffix.lower() in (".tif", ".tiff"):
+        return TiffPicture(source)
+    return PhotographPicture(source)
+
+
+@contextmanager
+def _opening(path: Path, what: str) -> Iterator[None]:
+    """Tell of a file that cannot be read as a picture, whatever a decoder raises."""
+    check_regular(path, f"image {path}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of damaged metadata and of large files
+        try:
+            yield
+        except FileNotFoundError:
+            raise DataError(f"image {path}: no such file") from None
+        except SemfovError:
+            raise
+        except Exception as error:  # damaged files raise nearly anything in decoders
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise DataError(f"image {path}: cannot be {what} ({reason}); replace it") from None
+
+
+def _tensor(pixels: NDArray[np.uint8]) -> Tensor:
+    """Bytes `(h, w, 3)` as `(3, h, w)` without a copy where memory may be shared."""
+    return torch.from_numpy(pixels if pixels.flags.writeable else pixels.copy()).permute(2, 0, 1)

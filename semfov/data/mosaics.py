@@ -1,0 +1,130 @@
+"""Pictures larger than a detector's input, composed of photographs by seed: every object's box is known."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
+from semfov.errors import check
+
+_VERSION = 1  # raise it whenever the same seed would give another picture
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A photograph's place in a mosaic.
+
+    Attributes:
+        index: of the photograph among its scenes.
+        slot: `(x1, y1, x2, y2)` of the slot that it lies in, in pixels of the mosaic.
+        box: `(x1, y1, x2, y2)` that the photograph itself fills, in the middle of its slot.
+    """
+
+    index: int
+    slot: tuple[int, int, int, int]
+    box: tuple[int, int, int, int]
+
+
+class Mosaics:
+    """Mosaics of `columns` × `rows` photographs, each as large as fits its slot with its proportions kept.
+
+    Mosaic `i` of a seed depends on the seed, on `i` and on the photographs only. No photograph is in a mosaic twice,
+    unless there are fewer than slots. What the photographs leave free of a slot is grey.
+
+    Args:
+        scenes: the photographs with their boxes, a COCO-format set or embedded scenes.
+        columns: photographs in a row.
+        rows: photographs in a column.
+        tile: `(width, height)` of a slot in pixels.
+        count: number of mosaics.
+        seed: of the compositions.
+        fill: value of what lies beside the photographs.
+
+    >>> from semfov.data import EmbeddedScenes
+    >>> mosaics = Mosaics(EmbeddedScenes(("person", "cat"), count=3), 2, 2, tile=(320, 240), count=1)
+    >>> mosaics[0].size
+    (640, 480)
+    """
+
+    def __init__(
+        self,
+        scenes: Scenes,
+        columns: int = 4,
+        rows: int = 4,
+        *,
+        tile: tuple[int, int] = (640, 480),
+        count: int = 100,
+        seed: int = 0,
+        fill: float = 114 / 255,
+    ) -> None:
+        check(columns >= 1 and rows >= 1, "columns, rows", "at least 1", (columns, rows))
+        check(min(tile) >= 1, "tile", "a width and a height in pixels", tile)
+        check(count >= 1, "count", "at least 1", count)
+        check(seed >= 0, "seed", "at least 0", seed)
+        self.scenes, self.columns, self.rows, self.tile, self.fill = scenes, columns, rows, tile, fill
+        self.classes = scenes.classes
+        self.ids = list(range(count))
+        self.size = columns * tile[0], rows * tile[1]
+        self._seed = seed
+        what = [_VERSION, scenes.fingerprint, columns, rows, tile, count, seed, fill]
+        self.fingerprint = hashlib.sha256(json.dumps(what).encode()).hexdigest()
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def tiles(self, index: int) -> list[Tile]:
+        """The photographs of a mosaic, row by row."""
+        generator = np.random.Generator(np.random.PCG64([self._seed, self.ids[index]]))
+        slots, known = self.columns * self.rows, len(self.scenes)
+        rounds = -(-slots // known)
+        order = np.concatenate([generator.permutation(known) for _ in range(rounds)])[:slots]
+        return [self._tile(int(scene), slot) for slot, scene in enumerate(order)]
+
+    def _tile(self, scene: int, slot: int) -> Tile:
+        (wide, high), (width, height) = self.tile, self.scenes.annotation(scene).size
+        scale = min(wide / width, high / height)
+        width, height = (max(1, round(side * scale)) for side in (width, height))
+        left, top = slot % self.columns * wide, slot // self.columns * high
+        x, y = left + (wide - width) // 2, top + (high - height) // 2
+        return Tile(scene, (left, top, left + wide, top + high), (x, y, x + width, y + height))
+
+    def __getitem__(self, index: int) -> Scene:
+        """Compose a mosaic."""
+        canvas = torch.full((3, self.size[1], self.size[0]), self.fill)
+        for tile in self.tiles(index):
+            x1, y1, x2, y2 = tile.box
+            image = self.scenes[tile.index].image[None]
+            if image.shape[-2:] != (y2 - y1, x2 - x1):
+                image = F.interpolate(image, (y2 - y1, x2 - x1), mode="bilinear", antialias=True)
+            canvas[:, y1:y2, x1:x2] = image[0]
+        annotation = self.annotation(index)
+        name = f"mosaic {self.ids[index]}, seed {self._seed}"
+        return Scene(self.ids[index], name, canvas, annotation.boxes, annotation.labels)
+
+    def annotation(self, index: int) -> Annotation:
+        """The objects of a mosaic, without composing its image."""
+        parts = [(tile, self.scenes.annotation(tile.index)) for tile in self.tiles(index)]
+        boxes = torch.cat([_moved(part, tile) for tile, part in parts])
+        labels = torch.cat([part.labels for _, part in parts])
+        return Annotation(boxes, labels, torch.cat([part.crowd for _, part in parts]), self.size)
+
+    def targets(self, index: int) -> list[int]:
+        """Classes of a mosaic that may be searched for, ascending: none that covers more than a fifth of it."""
+        return legal_targets(self.annotation(index))
+
+    def digest(self, index: int) -> str:
+        """sha256 of what the pixels of a mosaic depend on."""
+        parts = [(self.scenes.digest(tile.index), tile.box) for tile in self.tiles(index)]
+        return hashlib.sha256(json.dumps([_VERSION, self.size, self.fill, parts]).encode()).hexdigest()
+
+
+def _moved(part: Annotation, tile: Tile) -> Tensor:
+    """Boxes of a photograph `(M, 4)` in pixels of the mosaic."""
+    x1, y1, x2, y2 = tile.box
+    scale = part.boxes.new_tensor([(x2 - x1) / part.size[0], (y2 - y1) / part.size[1]] * 2)
+    return part.boxes * scale + part.boxes.new_tensor([x1, y1] * 2)

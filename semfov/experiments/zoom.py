@@ -1,0 +1,240 @@
+"""Pictures larger than the detector's input: what is found after so many passes, and where looking first pays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Annotation, Scenes
+from semfov.episode import Stopwatch
+from semfov.errors import DataError, lookup
+from semfov.experiments.config import DataConfig, DetectorConfig
+from semfov.experiments.parts import Parts, Record
+from semfov.experiments.run import cache_folder, digest_of
+from semfov.experiments.settings import Range, Seed, Settings, Side, Whole, Workers
+from semfov.experiments.setup import make_detector, make_scenes
+from semfov.experiments.store import versions
+from semfov.experiments.zoom_orders import oracle, quad_tree, ranked, raster, shuffled, slices
+from semfov.experiments.zoom_store import GlanceStore, StoredGlances
+from semfov.io.code import package_digest
+from semfov.io.storage import checksum
+from semfov.observation.matching import box_iou
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import Cut, ZoomEye
+from semfov.zoom.gist import FOUND
+from semfov.zoom.glances import Glance, Glances, LiveGlances, Window, around, half_steps
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.objects import merge
+from semfov.zoom.search import find_everything, look_for
+
+SHOWN = 0.3
+"""Score with which a look confirms a class."""
+
+
+Tile = Annotated[int, Range(16, 16_384)]
+"""Side in pixels of a part of a picture."""
+
+
+@dataclass(frozen=True)
+class ZoomConfig(Settings):
+    """Large pictures: recall against passes of the detector, and passes to the first confirmed hit.
+
+    Args:
+        data: photographs; none uses the embedded scenes.
+        detector: which detector looks.
+        mosaics: number of mosaics to compose of the photographs; 0 takes the photographs as they are.
+        columns: photographs in a row of a mosaic.
+        rows: photographs in a column of a mosaic.
+        tile: width of a photograph's slot; three quarters of it is the height.
+        target: class to find all objects of (None: of any class).
+        slice: side in pixels of the slices of photographs; those of mosaics are their photographs.
+        overlap: of neighbouring slices.
+        passes: of the detector, at most.
+        cut: what becomes of boxes at a window's border.
+        model: fitted evidence by magnification, by name or file (None: the one shipped for the detector).
+        seed: of mosaics and random orders.
+        out: folder for tables, records and figures.
+        cache: folder for looks, shared between runs (None: the user's cache).
+        store: keep looks on disk; false recomputes them (the result is the same).
+        workers: processes (None: one for each CPU core).
+    """
+
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
+    detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
+    mosaics: Whole = 100
+    columns: Side = 4
+    rows: Side = 4
+    tile: Tile = 640
+    target: str | None = None
+    slice: Tile = 640
+    overlap: Annotated[float, Range(0, 0.9)] = 0.2
+    passes: Annotated[int, Range(2, 100_000)] = 24
+    cut: Cut = "keep"
+    model: str | None = None
+    seed: Seed = 0
+    out: Path = Path("runs/zoom")
+    cache: Path | None = None
+    store: bool = True
+    workers: Workers | None = None
+
+
+class ZoomRun:
+    """Everything that a run is made of, built from its settings in each process.
+
+    Attributes:
+        scenes: mosaics or photographs.
+        settings_key: sha256 of all settings, models and pictures that the outcomes depend on.
+        code: sha256 of all code that they depend on.
+        key: of both; parts of another run are never mixed in.
+    """
+
+    def __init__(self, config: ZoomConfig) -> None:
+        self.config = config
+        detector = make_detector(config.detector)
+        self.eye = ZoomEye(detector, cut=config.cut).eval().requires_grad_(False)
+        self.evidence = GlimpseEvidence.from_pretrained(config.model or detector.name).requires_grad_(False)
+        self.evidence.check_compatible(self.eye.settings())
+        photographs = make_scenes(config.data, detector.classes)
+        if not len(photographs):
+            raise DataError("data: no photograph passes the selection; lower data.min_instances or raise data.limit")
+        self.scenes: Scenes = photographs
+        if config.mosaics:
+            size = config.tile, config.tile * 3 // 4
+            self.scenes = Mosaics(
+                photographs, config.columns, config.rows, tile=size, count=config.mosaics, seed=config.seed
+            )
+        names = detector.classes
+        self.target = None if config.target is None else names.index(lookup(config.target, names, "target class")) + 1
+        self.store = GlanceStore(cache_folder(config.cache) / "glances", self.eye.settings(), len(names))
+        self.settings_key, self.code = self._key(), digest_of([package_digest(), versions()])
+        self.key = f"{self.settings_key[:16]}-{self.code[:16]}"
+
+    def _key(self) -> str:
+        settings = asdict(self.config)
+        besides = ("out", "cache", "store", "workers", "data", "detector", "model")
+        protocol = {name: value for name, value in settings.items() if name not in besides}
+        model = [checksum(self.evidence.state_dict()), self.evidence.patience, self.evidence.foresight]
+        return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, model])
+
+    @property
+    def parts(self) -> Parts:
+        """Outcomes of finished scenes."""
+        return Parts(self.config.out / "parts", self.key, self.scenes.digest)
+
+    def glances(self, index: int) -> StoredGlances:
+        """Looks at a scene."""
+        size = self.scenes.annotation(index).size
+        lattice = Lattice.over(size, self.eye.detector.input_size, finest=self.eye.finest)
+
+        def live() -> Glances:
+            return LiveGlances(self.eye, self.eye.open(self.scenes[index].image))
+
+        store = self.store if self.config.store else None
+        return StoredGlances(lattice, live, store, self.scenes.digest(index))
+
+    def slices(self, index: int, lattice: Lattice) -> list[Window]:
+        """What slicing looks at: the photographs of a mosaic, or squares of a picture."""
+        if isinstance(self.scenes, Mosaics):
+            boxes = [tile.slot for tile in self.scenes.tiles(index)]
+            return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
+        return slices(lattice, self.config.slice, self.config.overlap)
+
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Records of a scene: recall after each pass, and passes to the first hit, for every way of looking."""
+        watch = Stopwatch()
+        glances = self.glances(index)
+        records = [self._recall(name, index, looks) for name, looks in self._finding(index, glances)]
+        watch.lap("recall")
+        if self.config.mosaics:
+            records += self._first_hits(index, glances)
+        watch.lap("first hit")
+        glances.save()
+        return records, watch.seconds
+
+    def _finding(self, index: int, glances: Glances) -> Iterator[tuple[str, Iterator[Glance]]]:
+        """Every way of looking for all objects, by its name in tables."""
+        cut = self.slices(index, glances.lattice)
+        annotation, target = self.annotation(index), self.target
+        yield "slices, raster", raster(glances, cut)
+        yield "slices, random", shuffled(glances, cut, [self.config.seed, index])
+        yield "slices, ranked by the overview", ranked(glances, cut, target, most=False)
+        yield "quad-tree, best first", quad_tree(glances, target, most=False)
+        yield "ours", (glance for glance, _ in find_everything(glances, self.evidence, target))
+        yield "ours, four at a time", (g for g, _ in find_everything(glances, self.evidence, target, batch=4))
+        found: Callable[[Glance], Tensor] = lambda glance: self.found([glance], annotation)  # noqa: E731
+        every = [*half_steps(glances.lattice)][1:]
+        yield "oracle", oracle(glances, [*every, *cut], found, self.config.passes)
+
+    def annotation(self, index: int) -> Annotation:
+        """Objects that count."""
+        annotation = self.scenes.annotation(index)
+        if self.target is None:
+            return annotation
+        kept = annotation.labels == self.target
+        return Annotation(annotation.boxes[kept], annotation.labels[kept], annotation.crowd[kept], annotation.size)
+
+    def found(self, looks: list[Glance], annotation: Annotation) -> Tensor:
+        """Which objects some looks find, `(M,)`: their merged boxes with a score of 0.1 and an overlap of 0.5."""
+        objects = merge(looks, self.target, score=FOUND)
+        if not len(objects):
+            return torch.zeros(len(annotation.boxes), dtype=torch.bool)
+        hits = (box_iou(objects.boxes, annotation.boxes) >= 0.5) & (objects.labels[:, None] == annotation.labels)
+        return hits.any(0)
+
+    def _recall(self, name: str, index: int, looks: Iterator[Glance]) -> Record:
+        annotation, seen, counts = self.annotation(index), [], []
+        for glance in islice(looks, self.config.passes):
+            seen.append(glance)
+            counts.append(int(self.found(seen, annotation).sum()))
+        boxes = len(merge(seen, self.target, score=FOUND))
+        return {
+            "measure": "recall",
+            "way": name,
+            "scene": self.scenes.ids[index],
+            "objects": len(annotation.boxes),
+            "found": counts,
+            "boxes": boxes,
+            "windows": [list(glance.window.fixation) for glance in seen],
+        }
+
+    def _first_hits(self, index: int, glances: Glances) -> list[Record]:
+        """Passes until a class that a slice shows is first seen in a window as close as a slice."""
+        cut = self.slices(index, glances.lattice)
+        shown = torch.stack([glance.show for glance in glances.see(cut)]) >= SHOWN
+        closest = min(window.level for window in cut)
+        limit = len(cut) + 1
+        records: list[Record] = []
+        for target in (shown.any(0).nonzero()[:, 0] + 1).tolist():
+            ways = {
+                "slices, raster": raster(glances, cut),
+                "slices, random": shuffled(glances, cut, [self.config.seed, index, target]),
+                "slices, ranked by the overview": ranked(glances, cut, target, most=True),
+                "quad-tree, best first": quad_tree(glances, target, most=True),
+                "ours": (glance for glance, *_ in look_for(glances, self.evidence, target, slices=cut)),
+                "ours, free windows": (g for g, *_ in look_for(glances, self.evidence, target, closest=True)),
+            }
+            for name, looks in ways.items():
+                passes, hit = 0, False
+                for glance in islice(looks, limit):
+                    passes += 1
+                    hit = glance.window.level >= closest and float(glance.show[target - 1]) >= SHOWN
+                    if hit:
+                        break
+                records.append(
+                    {
+                        "measure": "first hit",
+                        "way": name,
+                        "scene": self.scenes.ids[index],
+                        "target": self.scenes.classes[target - 1],
+                        "passes": passes if hit else limit,
+                        "hit": hit,
+                    }
+                )
+        return records

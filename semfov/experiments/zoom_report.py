@@ -1,0 +1,93 @@
+"""Finishing an experiment with large pictures, and its tables."""
+
+import json
+from collections import defaultdict
+from statistics import mean, median
+
+from semfov.errors import DataError
+from semfov.experiments.parallel import rank
+from semfov.experiments.parts import Record
+from semfov.experiments.run import finish
+from semfov.experiments.summary import announce, save_figure, table
+from semfov.experiments.zoom import ZoomConfig, ZoomRun
+from semfov.io.files import write_text
+
+
+def zoom(config: ZoomConfig) -> None:
+    """Run all scenes that have no part yet, and write tables, records and curves."""
+    run = ZoomRun(config)
+    finish(run, "zooming")
+    if rank() > 0:
+        return
+    records: list[Record] = []
+    for index in range(len(run.scenes)):
+        part = run.parts.load(index)
+        if part is None:
+            raise DataError(f"{run.parts.path(index)}: this part is gone; give the same command again")
+        records += part["records"]
+    text = summary(records, run)
+    write_text(config.out / "zoom.md", text)
+    write_text(config.out / "records.jsonl", "".join(json.dumps(record) + "\n" for record in records))
+    written = [config.out / "zoom.md", config.out / "records.jsonl", _curves(records, run)]
+    announce(text, written)
+
+
+def curve(records: list[Record], passes: int) -> list[float]:
+    """Share of all objects that are found after each pass; a way that ended before keeps what it has."""
+    total = sum(record["objects"] for record in records)
+    counts = [sum(r["found"][min(n, len(r["found"])) - 1] for r in records) for n in range(1, passes + 1)]
+    return [count / max(total, 1) for count in counts]
+
+
+def summary(records: list[Record], run: ZoomRun) -> str:
+    """Tables as Markdown."""
+    passes = run.config.passes
+    at = sorted({n for n in (1, 4, 8, 12, 16, 24) if n <= passes} | {passes})
+    groups: dict[tuple[str, str], list[Record]] = defaultdict(list)
+    for record in records:
+        groups[record["measure"], record["way"]].append(record)
+    finding = {way: group for (measure, way), group in groups.items() if measure == "recall"}
+    pixels = run.eye.detector.input_size[0] * run.eye.detector.input_size[1] / 1e6
+    rows = [["", *map(str, at), "area under the curve", "boxes for each object"]]
+    for way, group in finding.items():
+        line = curve(group, passes)
+        boxes = sum(r["boxes"] for r in group) / max(sum(r["objects"] for r in group), 1)
+        rows.append([way, *(f"{line[n - 1]:.3f}" for n in at), f"{mean(line):.3f}", f"{boxes:.2f}"])
+    what = "objects" if run.config.target is None else run.config.target
+    objects = sum(record["objects"] for record in next(iter(finding.values())))
+    lines = [
+        f"Recall of {objects} {what} in {len(run.scenes)} pictures after so many passes of the detector, overview "
+        f"included (score 0.1, IoU 0.5); a pass sees {pixels:.3f} million pixels.",
+        "",
+        *table(rows),
+        "",
+    ]
+    hits = {way: group for (measure, way), group in groups.items() if measure == "first hit"}
+    if hits:
+        rows = [["", "mean", "median", "failures at the cap"]]
+        for way, group in hits.items():
+            counts = [record["passes"] for record in group]
+            failed = sum(not record["hit"] for record in group) / len(group)
+            rows.append([way, f"{mean(counts):.2f}", f"{median(counts):g}", f"{100 * failed:.1f} %"])
+        count = len(next(iter(hits.values())))
+        lines += [
+            f"Passes to the first confirmed hit, overview included, in {count} searches for a class that one of the "
+            "slices shows with a score of 0.3.",
+            "",
+            *table(rows),
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def _curves(records: list[Record], run: ZoomRun):  # type: ignore[no-untyped-def]
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    for way in dict.fromkeys(record["way"] for record in records if record["measure"] == "recall"):
+        group = [record for record in records if record["way"] == way and record["measure"] == "recall"]
+        axes.plot(range(1, run.config.passes + 1), curve(group, run.config.passes), label=way)
+    axes.set(xlabel="passes of the detector", ylabel="recall", ylim=(0, None))
+    axes.legend(fontsize="small")
+    return save_figure(figure, run.config.out / "recall.png")

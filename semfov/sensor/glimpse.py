@@ -1,0 +1,171 @@
+"""Glimpses: windows of a picture at a chosen magnification, resampled without aliasing."""
+
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+
+from semfov.errors import check, check_finite, check_shape, lookup, values_known
+
+Padding = Literal["zeros", "border", "fill"]
+
+
+def glimpse(
+    image: Tensor,
+    boxes: Tensor,
+    size: tuple[int, int],
+    *,
+    padding_mode: Padding = "zeros",
+    fill_value: float = 0.0,
+) -> Tensor:
+    r"""Resample windows of an image to one size.
+
+    Canvas pixel i of a window that starts at a and is s picture pixels wide for each canvas pixel is a mean of picture
+    pixels j with the weights of a triangle as wide as a canvas pixel, but never narrower than a picture pixel (the
+    antialiased bilinear filter of Pillow and torch):
+
+    .. math:: c_i = \frac{\sum_j t_{ij} I_j}{\sum_j t_{ij}}, \qquad
+              t_{ij} = \max\left(0, 1 - \frac{|a + (i + ½) s - (j + ½)|}{\max(s, 1)}\right)
+
+    along x and along y. Pixels beyond the window's border are seen where the triangles of its outer pixels reach them.
+    It is differentiable in the image and in the boxes: in their place and in their size.
+
+    Args:
+        image: `(B, C, H, W)`.
+        boxes: windows `(B, G, 4)`, or `(B, 4)` for one in each image: `(x1, y1, x2, y2)`, edges between pixels, where 0
+            is the left (top) border of the image. They may reach beyond the image. (Those of Kornia:
+            `kornia.geometry.boxes.Boxes.to_tensor(mode="xyxy")`.)
+        size: `(width, height)` of the canvas.
+        padding_mode: what lies beyond the image, as in Kornia: `zeros`, the `border` pixels, or `fill` for
+            `fill_value`.
+        fill_value: see there.
+
+    Returns:
+        `(B, G, C, height, width)`, or `(B, C, height, width)`.
+
+    Raises:
+        InputError: a shape does not fit, or a window is empty or not finite.
+
+    >>> image = torch.rand(1, 3, 40, 60)
+    >>> glimpse(image, torch.tensor([[[0.0, 0, 60, 40], [20, 10, 50, 30]]]), (30, 20)).shape
+    torch.Size([1, 2, 3, 20, 30])
+    """
+    check_shape(image, "image", None, None, None, None)
+    check_shape(boxes, "boxes", 4)
+    batch = image.shape[0]
+    fits = boxes.ndim in (2, 3) and boxes.shape[0] == batch
+    check(fits, "boxes", f"shape ({batch}, G, 4) or ({batch}, 4)", tuple(boxes.shape))
+    check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
+    lookup(padding_mode, get_args(Padding), "padding mode")
+    check(image.is_floating_point(), "image", "floating-point pixels", image.dtype)
+    if values_known(boxes):
+        check_finite(boxes.detach(), "boxes")
+        full = bool(((boxes[..., 2:] - boxes[..., :2]) > 0).all())
+        check(full, "boxes", "windows with a positive width and height", "one without")
+    windows = boxes.to(image) if boxes.ndim == 3 else boxes[:, None].to(image)
+    value = 0.0 if padding_mode == "zeros" else fill_value
+    views = [
+        torch.stack([_window(image[b], windows[b, g], size, padding_mode, value) for g in range(windows.shape[1])])
+        if windows.shape[1]
+        else image.new_zeros(0, image.shape[1], size[1], size[0])
+        for b in range(batch)
+    ]
+    result = torch.stack(views) if views else image.new_zeros(*windows.shape[:2], image.shape[1], size[1], size[0])
+    return result if boxes.ndim == 3 else result[:, 0]
+
+
+def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> Tensor:
+    r"""Windows that are centred at points and fill a canvas, `(..., 4)`.
+
+    .. math:: (x_1, y_1, x_2, y_2) = (p + ½) \mp \frac{(w, h)}{2 m}
+
+    Args:
+        points: `(..., 2)`, pixel centres at integers.
+        magnification: m, canvas pixels for each picture pixel, `(...)`.
+        size: `(w, h)` of the canvas.
+
+    >>> windows_at(torch.tensor([[9.5, 9.5]]), torch.tensor([2.0]), (10, 20))
+    tensor([[ 7.5000,  5.0000, 12.5000, 15.0000]])
+    """
+    check_shape(points, "points", 2)
+    half = points.new_tensor(size) / (2 * magnification[..., None])
+    return torch.cat([points + 0.5 - half, points + 0.5 + half], -1)
+
+
+def ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1.0) -> tuple[float, ...]:
+    """Magnifications one octave apart: from the whole picture up to the last that is not above `finest`.
+
+    Args:
+        picture: `(width, height)`.
+        size: `(width, height)` of the canvas.
+        finest: canvas pixels for each picture pixel, 1 for native pixels.
+
+    >>> ladder((2560, 1920), (416, 416))
+    (0.1625, 0.325, 0.65)
+    """
+    check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
+    check(finest > 0, "finest", "a positive magnification", finest)
+    whole = min(size[0] / picture[0], size[1] / picture[1])
+    steps = [whole]
+    while steps[-1] * 2 <= finest * (1 + 1e-9):
+        steps.append(steps[-1] * 2)
+    return tuple(steps)
+
+
+class Glimpse(nn.Module):
+    """A sensor that shows a window of the picture at a magnification, see `glimpse`.
+
+    Args:
+        size: `(width, height)` of the canvas, a detector's input.
+        padding_mode: what lies beyond the picture.
+        fill_value: value of `fill`.
+
+    >>> sensor = Glimpse((32, 32))
+    >>> sensor(torch.rand(1, 3, 64, 96), torch.tensor([[[20.0, 20.0]]]), torch.tensor([[0.5]])).shape
+    torch.Size([1, 1, 3, 32, 32])
+    """
+
+    def __init__(self, size: tuple[int, int], *, padding_mode: Padding = "fill", fill_value: float = 114 / 255) -> None:
+        super().__init__()
+        check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
+        self.size = size
+        self.padding_mode: Padding = lookup(padding_mode, get_args(Padding), "padding mode")
+        self.fill_value = fill_value
+
+    def forward(self, image: Tensor, points: Tensor, magnification: Tensor) -> Tensor:
+        """Views `(B, G, C, h, w)` of images `(B, C, H, W)` at points `(B, G, 2)` and magnifications `(B, G)`."""
+        boxes = windows_at(points, magnification, self.size)
+        return glimpse(image, boxes, self.size, padding_mode=self.padding_mode, fill_value=self.fill_value)
+
+    def extra_repr(self) -> str:
+        """Settings, for `repr`."""
+        return f"size={self.size}, padding_mode={self.padding_mode!r}, fill_value={self.fill_value:g}"
+
+
+def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: Padding, value: float) -> Tensor:
+    """One window of an image `(C, H, W)`: two products with banded weights, over the pixels that it shows alone."""
+    across, (left, right) = _weights(box[0], box[2], size[0], image.shape[-1], border=padding == "border")
+    down, (top, bottom) = _weights(box[1], box[3], size[1], image.shape[-2], border=padding == "border")
+    part = image[:, top:bottom, left:right]
+    if value:
+        return down @ (part - value) @ across.mT + value
+    return down @ part @ across.mT
+
+
+def _weights(low: Tensor, high: Tensor, count: int, length: int, *, border: bool) -> tuple[Tensor, tuple[int, int]]:
+    """Weights `(count, n)` of picture pixels in every canvas pixel along one axis, and which n pixels these are."""
+    step = (high - low) / count
+    reach = step.clamp(min=1.0)
+    middle = low + (torch.arange(count).to(low) + 0.5) * step
+    around = float(reach.detach())
+    first = int((low.detach() - around).floor())
+    last = int((high.detach() + around).ceil()) + 1
+    pixel = torch.arange(first, last, device=low.device)
+    weight = (1 - (middle[:, None] - (pixel.to(low) + 0.5)).abs() / reach).clamp(min=0)
+    weight = weight / weight.sum(-1, keepdim=True)
+    if border:
+        start, stop = min(max(first, 0), length - 1), max(min(last, length), 1)
+        place = pixel.clamp(0, length - 1) - start
+        return weight.new_zeros(count, stop - start).index_add(1, place, weight), (start, stop)
+    start, stop = min(max(first, 0), length), min(max(last, 0), length)
+    return weight[:, start - first : max(stop, start) - first], (start, max(stop, start))

@@ -1,0 +1,96 @@
+"""Where an eye zoomed in on a large picture, and what it found."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from semfov.viz.style import FOUND, GAZE, TARGET, make_figure, styled
+from semfov.zoom.search import ZoomPath
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def describe_zoom(path: ZoomPath) -> str:
+    """What came of it, in a sentence."""
+    count = sum(1 for score in path.objects.scores.tolist() if score >= 0.1)
+    what = "objects" if path.target is None else path.classes[path.target]
+    passes = f"{path.passes} pass{'es' if path.passes != 1 else ''}"
+    if path.decision is None:
+        named = f"{count} object{'s' if count != 1 else ''}" if path.target is None else f"{count} × {what}"
+        return f"{named} in {passes}"
+    return f"{what}: {path.decision.outcome} ({path.decision.probability:.2f}) in {passes}"
+
+
+@styled
+def plot_zoom_path(path: ZoomPath, image: Tensor, *, score: float = 0.1) -> Figure:
+    """The windows that were looked at, numbered in their order, and the objects that were found.
+
+    A number stands in a corner of its window where none stands yet. Objects are named where all classes were looked
+    for.
+
+    Args:
+        path: of a search or an exploration.
+        image: `(3, h, w)`, RGB in [0, 1], the picture at any size.
+        score: objects with a lower one are not drawn.
+    """
+    from matplotlib.patches import Rectangle
+
+    width, height = path.lattice.size
+    figure, (axes,) = make_figure(1, 1, width=7.2, height=7.2 * height / width + 0.3, layout="compressed")
+    pixels = image.detach().cpu().clamp(0, 1).permute(1, 2, 0).numpy()
+    axes.imshow(pixels, extent=(0, width, height, 0), interpolation="bilinear")
+    taken: list[tuple[float, float]] = []
+    for number, glance in enumerate(path.glances):
+        if number == 0:
+            continue
+        box = _shown(path, number)
+        x1, y1, x2, y2 = box
+        line: dict[str, Any] = {"fill": False, "edgecolor": GAZE, "linewidth": 0.8 + 0.5 * (glance.window.level == 1)}
+        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, **line))
+        place = _free(box, taken, 0.025 * width)
+        taken.append(place)
+        axes.text(*place, str(number), color="white", fontsize=6, ha="center", va="center",
+                  bbox={"facecolor": GAZE, "edgecolor": "none", "pad": 0.8})  # fmt: skip
+    kept = path.objects.above(score)
+    for (x1, y1, x2, y2), label in zip(kept.boxes.tolist(), kept.labels.tolist(), strict=True):
+        colour = TARGET if label == path.target else FOUND
+        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, edgecolor=colour, linewidth=1.0))
+        if path.target is None:
+            axes.text(x1, y2, path.classes[label], color="white", fontsize=5, parse_math=False, va="top", clip_on=True,
+                      bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.5})  # fmt: skip
+    axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
+    axes.set_title(describe_zoom(path), parse_math=False)
+    return figure
+
+
+def _free(box: tuple[float, float, float, float], taken: list[tuple[float, float]], room: float) -> tuple[float, float]:
+    """Where the number of a window stands: in the corner of it that is farthest from other numbers, or in its middle.
+
+    Args:
+        box: of the window.
+        taken: where numbers stand.
+        room: that a number needs across.
+    """
+    x1, y1, x2, y2 = box
+    left, right, top, bottom = x1 + room / 2, x2 - room / 2, y1 + room / 2, y2 - room / 2
+    places = [(left, top), (right, top), (left, bottom), (right, bottom), ((x1 + x2) / 2, (y1 + y2) / 2)]
+
+    def far(place: tuple[float, float]) -> float:
+        # As far as a number needs is enough: then it is the first such corner.
+        return min([room, *(max(abs(place[0] - x), abs(place[1] - y)) for x, y in taken)])
+
+    return max(places, key=far)
+
+
+def _shown(path: ZoomPath, number: int) -> tuple[float, float, float, float]:
+    """What of the picture a look showed."""
+    window, (width, height) = path.glances[number].window, path.lattice.size
+    if window.within is not None:
+        return window.within
+    (x, y, magnification), (wide, high) = window.fixation, path.lattice.canvas
+    across, down = wide / magnification / 2, high / magnification / 2
+    x, y = x + 0.5, y + 0.5
+    return max(x - across, 0.0), max(y - down, 0.0), min(x + across, float(width)), min(y + down, float(height))

@@ -1,0 +1,136 @@
+"""An agent for pictures larger than its detector's input."""
+
+from os import PathLike
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from semfov.data.large import LargePicture
+from semfov.detection.load import load_detector
+from semfov.errors import check, check_number, check_whole, lookup
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.eye import Cut, ZoomEye
+from semfov.zoom.glances import LiveGlances
+from semfov.zoom.search import ZoomPath, find_all, search
+
+MOST = 1_000_000
+"""More passes than any picture has windows worth a look."""
+
+Picture = LargePicture | Tensor | NDArray[np.uint8] | str | PathLike[str]
+
+
+class ZoomAgent(nn.Module):
+    """Looks at a large picture where, and as close as, a pass of the detector pays most.
+
+    Args:
+        eye: glimpses and detects.
+        evidence: what glances say of closer ones.
+
+    Example::
+
+        agent = ZoomAgent.recommended("yolox-nano")
+        path = agent.find_all("harbour.tif", "person", passes=16)
+        print(path.objects.boxes, path.passes)
+    """
+
+    def __init__(self, eye: ZoomEye, evidence: GlimpseEvidence) -> None:
+        super().__init__()
+        kinds = len(eye.detector.classes)
+        check(evidence.classes == kinds, "evidence", f"one for the detector's {kinds} classes", evidence.classes)
+        evidence.check_compatible(eye.settings())
+        self.eye = eye
+        self.evidence = evidence
+
+    @classmethod
+    def recommended(cls, name: str = "yolox-nano", *, finest: float = 1.0, cut: Cut = "keep", **options: Any) -> Self:
+        """The agent with the evidence that is shipped for a detector.
+
+        Args:
+            name: of the detector.
+            finest: largest magnification, in canvas pixels for each picture pixel.
+            cut: what becomes of boxes at a window's border (`ZoomEye`).
+            options: of `semfov.load_detector`.
+
+        Raises:
+            InputError: no evidence is shipped for a detector of this name.
+            DataError: the weights cannot be had, or are damaged.
+        """
+        eye = ZoomEye(load_detector(name, **options), finest=finest, cut=cut)
+        evidence = GlimpseEvidence.from_pretrained(eye.detector.name)
+        return cls(eye, evidence).eval().requires_grad_(False)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes, background first."""
+        return ("background", *self.eye.detector.classes)
+
+    def pays(self, picture: Picture) -> bool:
+        """Whether a picture has two octaves or more to zoom in: its longer side is four times the detector's input."""
+        return self.eye.open(picture).lattice.levels >= 3
+
+    def search(
+        self, picture: Picture, target: str | int, *, passes: int = 24, confirm: float = 0.3, give_up: float = 0.005
+    ) -> ZoomPath:
+        """Search for one object of a class, and decide; see `semfov.zoom.search.search`.
+
+        Args:
+            picture: an image `(3, H, W)`, an array of bytes, a file, or a `LargePicture`.
+            target: name or index (1..K) of the class.
+            passes: of the detector, at most.
+            confirm: score from which on it is found.
+            give_up: probability below which no window is worth a look.
+
+        Raises:
+            InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
+            DataError: the file cannot be read.
+        """
+        check_whole(passes, "passes", 1, MOST)
+        check_number(confirm, "confirm", 0, 1)
+        check_number(give_up, "give_up", 0, 1)
+        index = self._target(target)
+        with torch.inference_mode():
+            return search(
+                self._open(picture), self.evidence, self.classes, index, passes=passes, confirm=confirm, give_up=give_up
+            )
+
+    def find_all(
+        self, picture: Picture, target: str | int, *, passes: int = 24, batch: int = 1, worth: float = 0.01
+    ) -> ZoomPath:
+        """Find all objects of a class; see `semfov.zoom.search.find_all`.
+
+        Args:
+            picture: as for `search`.
+            target: name or index (1..K) of the class.
+            passes: of the detector, at most.
+            batch: glimpses that are chosen jointly and go through the detector together.
+            worth: new objects that a pass must be expected to find.
+
+        Raises:
+            InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
+            DataError: the file cannot be read.
+        """
+        return self._find(picture, self._target(target), passes, batch, worth)
+
+    def explore(self, picture: Picture, *, passes: int = 24, batch: int = 1, worth: float = 0.01) -> ZoomPath:
+        """Find all objects of all classes; arguments as for `find_all`."""
+        return self._find(picture, None, passes, batch, worth)
+
+    def _find(self, picture: Picture, target: int | None, passes: int, batch: int, worth: float) -> ZoomPath:
+        check_whole(passes, "passes", 1, MOST)
+        check_whole(batch, "batch", 1, MOST)
+        check_number(worth, "worth", 0, float("inf"))
+        return find_all(
+            self._open(picture), self.evidence, self.classes, target, passes=passes, batch=batch, worth=worth
+        )
+
+    def _open(self, picture: Picture) -> LiveGlances:
+        return LiveGlances(self.eye, self.eye.open(picture))
+
+    def _target(self, target: str | int) -> int:
+        if isinstance(target, str):
+            return self.classes.index(lookup(target, self.classes[1:], "target class"))
+        check_whole(target, "target", 1, len(self.classes) - 1)
+        return target

@@ -1,0 +1,272 @@
+"""Learned evidence by magnification: what a look at a window says of closer looks at its parts."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from semfov.errors import check, check_number, check_whole
+from semfov.io.compatibility import check_detector
+from semfov.io.pretrained import Pretrained
+from semfov.io.schema import Field, Number, Schema, perceptron
+from semfov.zoom.gist import Gist
+
+STEPS = 3
+"""Octaves between a look and the closer looks that it is taken to say something of."""
+
+_SUMMARY = 3
+_SHAPE, _SHAPE_WIDTH = 7, 24
+_RATE, _RATE_WIDTH = 14, 32
+_FLOOR = 1e-4
+_LARGEST = 1e6
+
+
+class GlimpseEvidence(Pretrained):
+    r"""What a look at a window says of looks at its parts, one to three octaves closer.
+
+    Two questions are asked of a part w, for a class t, and answered by two small networks that are fitted on mosaics of
+    photographs with boxes:
+
+    - does a closer look at w show t, with a score of 0.3 or more? Its log odds go by the strongest hint in w of t and
+      of every other class, for things keep company:
+
+      .. math:: \operatorname{logit} P(t \in w) = a_t \phi_t(w) + b_t + f_t(\phi(w)) + g(\phi_t(w), \ldots), \qquad
+                \phi_k(w) = \ln(\max_{x \in w} s_k(x) + \epsilon)
+
+    - how many objects of t does it find that were not found before? Their expected number is a sum over cells, with
+      weights that fall off at the border of w, which cuts what lies there:
+
+      .. math:: E[n(w)] = \sum_{x \in w} r(x) \lambda(x)
+
+    with f, g and λ networks. Class 0 of the second question stands for any class.
+
+    Args:
+        classes: of the detector, background not counted.
+        width: hidden units of the networks.
+        patience: how much more, in expected hits, a window that is not close enough to confirm anything must hold than
+            the best window that is, to be looked at first.
+        foresight: share of what still closer looks would find in a window that counts towards its value.
+        metadata: JSON values kept with the model.
+    """
+
+    kind: ClassVar[str] = "glimpse-evidence"
+    title: ClassVar[str] = "model of evidence by magnification"
+    shipped: ClassVar[Path] = Path(__file__).parent / "models"
+    schema: ClassVar[Schema] = Schema(
+        {
+            "slope": Field(("K",), low=-_LARGEST, high=_LARGEST),
+            "offset": Field(("K",), low=-_LARGEST, high=_LARGEST),
+            "company.0.weight": Field(("W", f"K+{_SUMMARY + 1}"), low=-_LARGEST, high=_LARGEST),
+            "company.0.bias": Field(("W",), low=-_LARGEST, high=_LARGEST),
+            "company.3.weight": Field(("K", "W"), low=-_LARGEST, high=_LARGEST),
+            "company.3.bias": Field(("K",), low=-_LARGEST, high=_LARGEST),
+            **perceptron("shape", _SHAPE, _SHAPE_WIDTH),
+            **perceptron("rate", _RATE, _RATE_WIDTH, STEPS),
+            "prior": Field(("K+1", 2), low=-1e3, high=1e3),
+            "border": Field((4,), low=-1e3, high=1e3),
+        },
+        {
+            "classes": Number(size="K"),
+            "width": Number(size="W"),
+            "patience": Number(above=0, high=_LARGEST),
+            "foresight": Number(0, 1),
+        },
+    )
+
+    def __init__(
+        self,
+        classes: int = 80,
+        width: int = 64,
+        *,
+        patience: float = 2.3,
+        foresight: float = 0.0,
+        metadata: Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        check_whole(classes, "classes", 1, 100_000)
+        check_whole(width, "width", 1, 100_000)
+        check(patience > 0, "patience", "a number above 0", patience)
+        check_number(foresight, "foresight", 0, 1)
+        self.classes, self.width = classes, width
+        self.patience, self.foresight = patience, foresight
+        self.metadata = dict(metadata or {})
+        self.slope = nn.Parameter(torch.full((classes,), 2.0))
+        self.offset = nn.Parameter(torch.full((classes,), -2.0))
+        self.company = nn.Sequential(
+            nn.Linear(classes + _SUMMARY + 1, width), nn.GELU(), nn.Dropout(0.4), nn.Linear(width, classes)
+        )
+        self.shape = _network(_SHAPE, _SHAPE_WIDTH, 1)
+        self.rate = _network(_RATE, _RATE_WIDTH, STEPS)
+        self.prior = nn.Parameter(torch.zeros(classes + 1, 2))
+        self.border = nn.Parameter(torch.tensor([0.0, 1.0, 2.0, 2.0]))
+
+    def presence(
+        self, scores: Tensor, summary: Tensor, steps: Tensor, target: int | None = None, before: Tensor | None = None
+    ) -> Tensor:
+        """Log odds that a closer look at a window shows a class with a score of 0.3 or more.
+
+        Args:
+            scores: `(N, K)`, strongest hint of each class in each window (`pool`).
+            summary: `(N, 3)`, of all hints in it (`pool`).
+            steps: `(N,)`, octaves between the look and the closer one.
+            target: class 1..K; None for all.
+            before: log odds that the look before this one, from farther off, gave; None for a first look.
+
+        Returns:
+            `(N,)`, or `(N, K)` for all classes.
+        """
+        hints = features(scores)
+        octaves = (steps[:, None] - 1.5).to(hints)
+        crowd = (summary + 0.01).log() / 3
+        inputs = torch.cat([hints, crowd, octaves], -1)
+        own, slope, offset = hints, torch.as_tensor(self.slope), torch.as_tensor(self.offset)
+        if target is None:
+            company = self.company(inputs)
+        else:
+            one = slice(target - 1, target)
+            own, slope, offset = own[:, one], slope[one], offset[one]
+            last = self.company[3]
+            assert isinstance(last, nn.Linear)
+            company = F.linear(self.company[:3](inputs), last.weight[one], last.bias[one])
+        top = hints.amax(-1, keepdim=True).expand_as(own)
+        known = torch.zeros_like(own) if before is None else before.view_as(own) / 3
+        first = torch.full_like(own, float(before is not None))
+        parts = [own, top, own - top, octaves.expand_as(own), crowd[:, 2:].expand_as(own), known, first]
+        value: Tensor = slope * own + offset + company + self.shape(torch.stack(parts, -1))[..., 0]
+        return value if target is None else value[:, 0]
+
+    def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
+        """Expected number of objects centred in each cell that closer looks find, and this one did not.
+
+        Args:
+            look: what was seen.
+            targets: `(T,)`, classes 1..K, or 0 for any.
+            before: `(T, rows, columns)`, logarithm of the rates that the look before this one, from farther off, gave
+                for looks one octave closer than this one; None for a first look.
+
+        Returns:
+            `(T, 3, rows, columns)`, for looks one, two and three octaves closer; logarithms.
+        """
+        hints = features(look.scores)
+        best = hints.amax(-1)
+        own = _of(hints, best, targets)
+        found = _of(look.found.to(hints), look.found.any(-1).to(hints), targets)
+        shape = own.shape
+
+        def wide(values: Tensor) -> Tensor:
+            return values.expand(shape)
+
+        peak, crowd = _peak(own, 3), _mean(best[None], 9)
+        about, bias = self.prior[targets].unbind(-1)
+        parts = [
+            own,
+            wide(best),
+            peak,
+            _peak(peak, 7),
+            _mean(own, 5),
+            wide(crowd),
+            wide(look.size / 4 - 1),
+            wide((look.size > 0).to(own)),
+            found,
+            _peak(found, 3),
+            wide(own.amax((-1, -2), keepdim=True)),
+            wide(about[:, None, None]),
+            torch.full_like(own, -1.0) if before is None else before / 4,
+            torch.full_like(own, float(before is not None)),
+        ]
+        value: Tensor = self.rate(torch.stack(parts, -1)) + bias[:, None, None, None] - 6
+        return value.clamp(max=3).movedim(-1, 1)
+
+    def taper(self, span: int) -> Tensor:
+        """Weights r of the cells along a side of a window, `(span,)`: what lies at its border is cut."""
+        cell = torch.arange(span, device=self.border.device)
+        ring = torch.minimum(cell, span - 1 - cell) * 8 // span
+        return self.border.sigmoid()[ring.clamp(max=3)]
+
+    def check_compatible(self, settings: Mapping[str, Any]) -> None:
+        """Raise `InputError` beside another detector than it was fitted for.
+
+        Args:
+            settings: `ZoomEye.settings()`.
+        """
+        check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
+
+    def _record(self) -> dict[str, Any]:
+        """Sizes and what was chosen."""
+        return {
+            "classes": self.classes,
+            "width": self.width,
+            "patience": self.patience,
+            "foresight": self.foresight,
+        }
+
+    @classmethod
+    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """The networks from what was kept."""
+        model = cls(
+            record["classes"],
+            record["width"],
+            patience=record["patience"],
+            foresight=record["foresight"],
+            metadata=record["metadata"],
+        )
+        model.load_state_dict(tensors)
+        return model
+
+
+def features(scores: Tensor) -> Tensor:
+    """Logarithms of scores, shifted and scaled to about [-1, 1.5]."""
+    return (scores + _FLOOR).log() / 4 + 1.5
+
+
+def pool(scores: Tensor, box: tuple[int, int, int, int]) -> tuple[Tensor, Tensor]:
+    """Strongest hint of each class in a window of cells, `(K,)`, and a summary `(3,)` of all hints in it.
+
+    Args:
+        scores: `(rows, columns, K)`.
+        box: `(x1, y1, x2, y2)` in cells, cut to what there is.
+    """
+    x1, y1, x2, y2 = box
+    cells = scores[max(y1, 0) : y2, max(x1, 0) : x2].flatten(0, 1)
+    return cells.amax(0), _summary(cells.amax(-1))
+
+
+def pool_all(scores: Tensor, span: int) -> tuple[Tensor, Tensor]:
+    """`pool` of all windows of `span` × `span` cells that lie in `(rows, columns, K)`, row by row.
+
+    A side shorter than that is one window.
+    """
+    high, wide = (min(span, n) for n in scores.shape[:2])
+    image = scores.movedim(-1, 0)
+    top = F.max_pool2d(F.max_pool2d(image, (1, wide), 1), (high, 1), 1)
+    best = scores.amax(-1)
+    parts = torch.stack([best, (best > 0).to(best), (best > 0.02).to(best)])
+    area = torch.tensor([1.0, 1 / (high * wide), 1.0])[:, None, None]
+    sums = F.avg_pool2d(parts, (high, wide), 1) * (high * wide) * area
+    return top.flatten(1).mT, sums.flatten(1).mT
+
+
+def _summary(best: Tensor) -> Tensor:
+    return torch.stack([best.sum(), (best > 0).to(best).mean(), (best > 0.02).to(best).sum()])
+
+
+def _of(values: Tensor, anything: Tensor, targets: Tensor) -> Tensor:
+    """Maps `(T, rows, columns)` of some classes, 0 for any, from `(rows, columns, K)`."""
+    return torch.cat([anything[..., None], values], -1)[..., targets].movedim(-1, 0)
+
+
+def _peak(values: Tensor, side: int) -> Tensor:
+    return F.max_pool2d(values[:, None], side, 1, side // 2)[:, 0]
+
+
+def _mean(values: Tensor, side: int) -> Tensor:
+    return F.avg_pool2d(values[:, None], side, 1, side // 2)[:, 0]
+
+
+def _network(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU(), nn.Linear(width, outputs)
+    )

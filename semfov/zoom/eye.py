@@ -1,0 +1,223 @@
+"""An eye for pictures larger than a detector's input: a look is a choice of where and how close."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from semfov.data.large import LargePicture, open_large
+from semfov.detection.detections import Detections
+from semfov.detection.detector import Detector
+from semfov.detection.selection import Selection, select
+from semfov.errors import check, check_finite, check_number, check_shape, lookup
+from semfov.sensor.glimpse import windows_at
+from semfov.zoom.lattice import Lattice
+
+Cut = Literal["keep", "drop", "background"]
+Limit = tuple[float, float, float, float]
+
+HINTS = Selection(threshold=0.002, iou=0.95, limit=300)
+"""Candidates that are too weak to be detections, but tell where a closer look pays."""
+
+_REDUCE = 2  # a window is reduced in the source as long as it keeps this many pixels for each canvas pixel
+_BORDER = 2.0  # canvas pixels; a box that comes as near to the window's border is cut by it
+
+
+@dataclass(frozen=True)
+class ZoomView:
+    """A picture as the eye holds it: nothing is read yet.
+
+    Attributes:
+        picture: gives its windows.
+        lattice: the cells over it, and the windows of every level.
+    """
+
+    picture: LargePicture
+    lattice: Lattice
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a few looks show.
+
+    Attributes:
+        detections: boxes in picture pixels, a batch of F.
+        hints: weak candidates, overlapping ones among them, likewise.
+        windows: `(F, 4)`, what was looked at, cut to the picture.
+        cut: `(F, L)`, which detections the border of their window cuts.
+    """
+
+    detections: Detections
+    hints: Detections
+    windows: Tensor
+    cut: Tensor
+
+
+class ZoomEye(nn.Module):
+    """Looks at windows of a picture, each at a magnification and resampled to the detector's input.
+
+    A look costs one pass of the detector, whatever the size of the picture. Windows are rounded to whole pixels and
+    resampled by the antialiased filter of `semfov.sensor.glimpse`, from bytes, within their own border.
+
+    An object that the border of a window cuts shows a part of itself there, and its box is the part's. Such a box can
+    be kept (`keep`), left out (`drop`), or keep its place with the scores of a background (`background`). A border of
+    the picture cuts nothing.
+
+    Args:
+        detector: any detector.
+        finest: largest magnification, in canvas pixels for each picture pixel; 1 ends at native pixels.
+        cut: what becomes of boxes at a window's border.
+
+    Example::
+
+        eye = ZoomEye(load_detector("yolox-nano"))
+        view = eye.open("harbour.tif")
+        eye.look(view, torch.tensor([[2000.0, 1500.0, 0.5]])).boxes
+    """
+
+    def __init__(self, detector: Detector, *, finest: float = 1.0, cut: Cut = "keep") -> None:
+        super().__init__()
+        check_number(finest, "finest", 0, 64)
+        check(finest > 0, "finest", "a positive magnification", finest)
+        self.detector = detector
+        self.finest = finest
+        self.cut: Cut = lookup(cut, get_args(Cut), "treatment of cut boxes")
+
+    def open(self, picture: LargePicture | Tensor | NDArray[np.uint8] | str | PathLike[str]) -> ZoomView:
+        """Hold a picture: an image `(3, H, W)` or `(1, 3, H, W)`, an array of bytes, a file, or a `LargePicture`."""
+        source = open_large(picture)
+        return ZoomView(source, Lattice.over(source.size, self.detector.input_size, finest=self.finest))
+
+    def look(self, view: ZoomView, fixations: Tensor) -> Detections:
+        """Detections from fixations `(F, 3)`, `(x, y, magnification)`: a batch of F, boxes in picture pixels.
+
+        Points of two numbers `(F, 2)` are looked at at the largest magnification.
+        """
+        return self.glance(view, fixations).detections
+
+    def glance(self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None) -> Seen:
+        """Detections with their hints.
+
+        Args:
+            view: of `open`.
+            fixations: as for `look`.
+            within: box of the picture that each look shows no more than; None for all that fits the canvas.
+        """
+        canvas, frames = self.glimpse(view, fixations, within)
+        candidates = self.detector.propose(canvas)
+        policy = self.detector.background
+        detections = select(candidates, None, self.detector.selection, policy)
+        hints = select(candidates, None, HINTS, policy)
+        cut = _at_border(detections, frames, view.picture.size) & detections.mask
+        mapped = self._treat(_to_picture(detections, frames), cut)
+        return Seen(mapped, _to_picture(hints, frames), frames[:, :4], cut)
+
+    def glimpse(
+        self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Canvases `(F, 3, h, w)`, and `(F, 8)`: the window in the picture and the same on the canvas.
+
+        Arguments as for `glance`.
+        """
+        if fixations.shape[-1] == 2:
+            closest = fixations.new_full((*fixations.shape[:-1], 1), view.lattice.magnifications[-1])
+            fixations = torch.cat([fixations, closest], -1)
+        check_shape(fixations, "fixations", None, 3)
+        check_finite(fixations, "fixations")
+        check(bool((fixations[:, 2] > 0).all()), "fixations", "positive magnifications", fixations[:, 2].tolist())
+        windows = windows_at(fixations[:, :2].double(), fixations[:, 2].double(), self.detector.input_size)
+        limits = [None] * len(fixations) if within is None else within
+        shown = [
+            self._show(view.picture, window, m, limit)
+            for window, m, limit in zip(windows.tolist(), fixations[:, 2].tolist(), limits, strict=True)
+        ]
+        return torch.stack([canvas for canvas, _ in shown]), torch.tensor([frame for _, frame in shown])
+
+    def _show(
+        self, picture: LargePicture, window: list[float], magnification: float, limit: Limit | None
+    ) -> tuple[Tensor, list[float]]:
+        """One canvas, and where it lies in the picture."""
+        wide, high = self.detector.input_size
+        low, right = (0.0, 0.0), (float(picture.size[0]), float(picture.size[1]))
+        if limit is not None:
+            low = max(low[0], limit[0]), max(low[1], limit[1])
+            right = min(right[0], limit[2]), min(right[1], limit[3])
+        left, top = round(window[0]), round(window[1])
+        x1, y1 = (min(max(edge, round(a)), round(b) - 1) for edge, a, b in zip((left, top), low, right, strict=True))
+        x2, y2 = (
+            min(max(round(edge), start + 1), round(b))
+            for edge, start, b in zip(window[2:], (x1, y1), right, strict=True)
+        )
+        u1, v1 = (
+            min(round((low - edge) * magnification), n - 1) for low, edge, n in ((x1, left, wide), (y1, top, high))
+        )
+        u2, v2 = (
+            min(max(start + round((stop - first) * magnification), start + 1), n)
+            for start, first, stop, n in ((u1, x1, x2, wide), (v1, y1, y2, high))
+        )
+        reduction = 1
+        while min((x2 - x1) // (u2 - u1), (y2 - y1) // (v2 - v1)) >= 2 * _REDUCE * reduction:
+            reduction *= 2
+        pixels = picture.read((x1, y1, x2, y2), reduction)[None]
+        if pixels.shape[-2:] != (v2 - v1, u2 - u1):
+            pixels = F.interpolate(pixels, (v2 - v1, u2 - u1), mode="bilinear", antialias=True)
+        canvas = torch.full((3, high, wide), self._fill())
+        canvas[:, v1:v2, u1:u2] = pixels[0].float() / 255
+        return canvas, [float(n) for n in (x1, y1, x2, y2, u1, v1, u2, v2)]
+
+    def _fill(self) -> float:
+        return float(self.detector.fill)
+
+    def _treat(self, detections: Detections, cut: Tensor) -> Detections:
+        if self.cut == "keep" or not bool(cut.any()):
+            return detections
+        if self.cut == "drop":
+            kept = [detections[n : n + 1] for n in range(len(cut))]
+            return Detections.stack(
+                [Detections(d.boxes[:, ~c], d.scores[:, ~c], d.mask[:, ~c]) for d, c in zip(kept, cut, strict=True)]
+            )
+        nothing = torch.zeros_like(detections.scores[..., :1, :])
+        nothing[..., 0] = 1
+        return Detections(detections.boxes, torch.where(cut[..., None], nothing, detections.scores), detections.mask)
+
+    def forward(self, picture: Tensor, fixations: Tensor) -> Detections:
+        """`look` at an image from fixations."""
+        return self.look(self.open(picture), fixations)
+
+    def settings(self) -> dict[str, Any]:
+        """What the detections depend on, for the keys of caches and the metadata of fitted models."""
+        sensor = {"glimpse": "antialiased bilinear", "finest": self.finest, "cut": self.cut}
+        return {"sensor": sensor, "detector": self.detector.settings()}
+
+
+def _to_picture(detections: Detections, frames: Tensor) -> Detections:
+    """Canvas boxes as boxes in picture pixels, cut to their windows."""
+    window, canvas = frames[:, None, :4].to(detections.boxes), frames[:, None, 4:].to(detections.boxes)
+    scale = (window[..., 2:] - window[..., :2]) / (canvas[..., 2:] - canvas[..., :2])
+    boxes = (detections.boxes - canvas[..., :2].repeat(1, 1, 2)) * scale.repeat(1, 1, 2) + window[..., :2].repeat(
+        1, 1, 2
+    )
+    low, high = window[..., :2].repeat(1, 1, 2), window[..., 2:].repeat(1, 1, 2)
+    boxes = torch.minimum(torch.maximum(boxes, low), high) * detections.mask[..., None]
+    return Detections(boxes, detections.scores, detections.mask)
+
+
+def _at_border(detections: Detections, frames: Tensor, size: tuple[int, int]) -> Tensor:
+    """Which boxes touch a border of their window that lies inside the picture, `(F, L)`."""
+    window, canvas = frames[:, None, :4], frames[:, None, 4:].to(detections.boxes)
+    limit = torch.tensor([0.0, 0.0, *size])
+    inside = torch.cat([window[..., :2] > limit[:2], window[..., 2:] < limit[2:]], -1)
+    near = torch.cat(
+        [
+            detections.boxes[..., :2] <= canvas[..., :2] + _BORDER,
+            detections.boxes[..., 2:] >= canvas[..., 2:] - _BORDER,
+        ],
+        -1,
+    )
+    return (inside & near).any(-1)

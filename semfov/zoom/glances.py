@@ -1,0 +1,121 @@
+"""Glances: windows of a picture, and what a look at one shows."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.detection.detections import Detections
+from semfov.zoom.eye import Seen, ZoomEye, ZoomView
+from semfov.zoom.gist import Gist, gist
+from semfov.zoom.lattice import Lattice
+
+
+@dataclass(frozen=True)
+class Window:
+    """Where to look, and how close.
+
+    Attributes:
+        fixation: `(x, y, magnification)`.
+        level: of the lattice; for a window that is not on it, that of the nearest magnification.
+        cells: `(x1, y1, x2, y2)`, cells of the lattice that it shows.
+        within: `(x1, y1, x2, y2)` in picture pixels, to show no more than that; None for all that fits the canvas.
+    """
+
+    fixation: tuple[float, float, float]
+    level: int
+    cells: tuple[int, int, int, int]
+    within: tuple[float, float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Glance:
+    """What a look shows.
+
+    Attributes:
+        window: that was looked at.
+        detections: a batch of one, boxes in picture pixels.
+        cut: `(L,)`, which of them the window's border cuts.
+        show: `(K,)`, highest score of each class.
+        gist: cell by cell, of windows that can be looked at closer; None for the closest ones.
+    """
+
+    window: Window
+    detections: Detections
+    cut: Tensor
+    show: Tensor
+    gist: Gist | None
+
+
+def on_lattice(lattice: Lattice, action: tuple[int, int, int]) -> Window:
+    """The window of an action: level, column and row."""
+    level, column, row = action
+    x, y, magnification = lattice.fixations(torch.tensor(action)).tolist()
+    span = lattice.span(level)
+    return Window((x, y, magnification), level, (column, row, column + span, row + span))
+
+
+def around(lattice: Lattice, box: tuple[float, float, float, float]) -> Window:
+    """A window that shows a box of the picture and nothing beyond it, as large as fits the canvas."""
+    x1, y1, x2, y2 = box
+    magnification = min(lattice.canvas[0] / (x2 - x1), lattice.canvas[1] / (y2 - y1))
+    level = min(range(lattice.levels), key=lambda k: abs(lattice.magnifications[k] / magnification - 1))
+    wide, high = lattice.pitch
+    cells = round(x1 / wide), round(y1 / high), round(x2 / wide), round(y2 / high)
+    return Window(((x1 + x2) / 2 - 0.5, (y1 + y2) / 2 - 0.5, magnification), level, cells, box)
+
+
+def half_steps(lattice: Lattice) -> Iterator[Window]:
+    """Windows of all levels, half a window apart, those at the far borders among them."""
+    for level in range(lattice.levels):
+        half = max(1, lattice.span(level) // 2)
+        across, down = lattice.places(level)
+        for row in sorted({*range(0, down, half), down - 1}):
+            for column in sorted({*range(0, across, half), across - 1}):
+                yield on_lattice(lattice, (level, column, row))
+
+
+class Glances(ABC):
+    """Base of what shows windows of one picture.
+
+    Attributes:
+        lattice: of the picture.
+    """
+
+    lattice: Lattice
+
+    @abstractmethod
+    def see(self, windows: Sequence[Window]) -> list[Glance]:
+        """Look at windows, all in one batch where there is an accelerator to use."""
+
+
+class LiveGlances(Glances):
+    """Looks of an eye at a picture.
+
+    Args:
+        eye: sensor and detector.
+        view: the picture, as the eye holds it.
+    """
+
+    def __init__(self, eye: ZoomEye, view: ZoomView) -> None:
+        self.eye, self.view, self.lattice = eye, view, view.lattice
+
+    def see(self, windows: Sequence[Window]) -> list[Glance]:
+        """Glimpse and detect."""
+        fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
+        seen = self.eye.glance(self.view, fixations, [window.within for window in windows])
+        return [glance(seen, n, window, self.lattice) for n, window in enumerate(windows)]
+
+
+def glance(seen: Seen, number: int, window: Window, lattice: Lattice) -> Glance:
+    """One of the looks of an eye."""
+    hints, detections = seen.hints[number : number + 1], seen.detections[number : number + 1]
+    kept = detections.mask[0]
+    detections = Detections(detections.boxes[:, kept], detections.scores[:, kept], detections.mask[:, kept])
+    scores = (hints.scores[0, :, 1:] * hints.mask[0, :, None]).float()
+    show = scores.amax(0) if len(scores) else scores.new_zeros(scores.shape[-1])
+    whole = window.within is None and window.level < lattice.levels - 1
+    told = gist(hints, detections, lattice, (window.level, *window.cells[:2])) if whole else None
+    return Glance(window, detections, seen.cut[number, kept], show, told)

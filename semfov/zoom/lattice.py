@@ -1,0 +1,117 @@
+"""Where and how close an eye can look at a picture: cells of one size, and windows of them one octave apart."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from semfov.errors import check
+from semfov.sensor.glimpse import ladder
+
+CELLS = 8
+"""Cells along a side of the closest window."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Cells over a picture, and the windows of every level that lie on them.
+
+    Level 0 is one window with the whole picture in its upper left corner. A window of level k is half as wide as one of
+    level k - 1, and the closest is `CELLS` cells wide. Windows start at cell borders, at most at the last place where
+    they still lie in the picture (up to a cell).
+
+    Attributes:
+        size: `(width, height)` of the picture in pixels.
+        canvas: `(width, height)` of the detector's input.
+        magnifications: of the levels, canvas pixels for each picture pixel.
+    """
+
+    size: tuple[int, int]
+    canvas: tuple[int, int]
+    magnifications: tuple[float, ...]
+
+    @classmethod
+    def over(cls, size: tuple[int, int], canvas: tuple[int, int], *, finest: float = 1.0) -> "Lattice":
+        """The lattice of a picture, up to the last magnification that is not above `finest`.
+
+        >>> lattice = Lattice.over((2560, 1920), (416, 416))
+        >>> lattice.levels, lattice.columns, lattice.rows, len(lattice)
+        (3, 32, 24, 579)
+        """
+        return cls(size, canvas, ladder(size, canvas, finest=finest))
+
+    def __post_init__(self) -> None:
+        check(len(self.magnifications) >= 1, "magnifications", "at least one", self.magnifications)
+
+    @property
+    def levels(self) -> int:
+        """Number of magnifications."""
+        return len(self.magnifications)
+
+    @property
+    def pitch(self) -> tuple[float, float]:
+        """`(width, height)` of a cell in picture pixels."""
+        wide, high = self.window(self.levels - 1)
+        return wide / CELLS, high / CELLS
+
+    @property
+    def columns(self) -> int:
+        """Cells in a row."""
+        return _up(self.size[0] / self.pitch[0])
+
+    @property
+    def rows(self) -> int:
+        """Cells in a column."""
+        return _up(self.size[1] / self.pitch[1])
+
+    def window(self, level: int) -> tuple[float, float]:
+        """`(width, height)` of a window in picture pixels."""
+        magnification = self.magnifications[level]
+        return self.canvas[0] / magnification, self.canvas[1] / magnification
+
+    def span(self, level: int) -> int:
+        """Cells along a side of a window."""
+        return CELLS << (self.levels - 1 - level)
+
+    def places(self, level: int) -> tuple[int, int]:
+        """How many places windows of a level have along a row and down a column."""
+        span = self.span(level)
+        return max(self.columns - span, 0) + 1, max(self.rows - span, 0) + 1
+
+    @cached_property
+    def actions(self) -> Tensor:
+        """Every window, `(N, 3)`: level, column and row of its first cell; those of a level row by row."""
+        parts = []
+        for level in range(self.levels):
+            across, down = self.places(level)
+            row, column = torch.meshgrid(torch.arange(down), torch.arange(across), indexing="ij")
+            parts.append(torch.stack([torch.full_like(row, level), column, row], -1).reshape(-1, 3))
+        return torch.cat(parts)
+
+    def __len__(self) -> int:
+        """Number of windows of all levels."""
+        return sum(across * down for across, down in map(self.places, range(self.levels)))
+
+    def boxes(self, actions: Tensor) -> Tensor:
+        """Windows `(..., 4)` in picture pixels of actions `(..., 3)`; they may reach beyond the picture."""
+        pitch = torch.tensor(self.pitch, dtype=torch.float64)
+        low = actions[..., 1:] * pitch
+        wide = torch.tensor([self.window(level) for level in range(self.levels)], dtype=torch.float64)
+        return torch.cat([low, low + wide[actions[..., 0]]], -1).float()
+
+    def fixations(self, actions: Tensor) -> Tensor:
+        """Centres and magnifications `(..., 3)`, `(x, y, m)`, of actions `(..., 3)`."""
+        boxes = self.boxes(actions).double()
+        magnification = torch.tensor(self.magnifications, dtype=torch.float64)[actions[..., 0]]
+        return torch.cat([(boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5, magnification[..., None]], -1).float()
+
+    def number(self, level: int, column: int, row: int) -> int:
+        """Place of a window in `actions`."""
+        before = sum(across * down for across, down in map(self.places, range(level)))
+        return before + row * self.places(level)[0] + column
+
+
+def _up(ratio: float) -> int:
+    """The next whole number, but for rounding."""
+    return max(1, -int(-(ratio - 1e-6) // 1))

@@ -1,0 +1,159 @@
+"""Pictures read by windows: every source gives the same pixels, within its memory."""
+
+import os
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from semfov.data.images import read_image
+from semfov.data.large import ArrayPicture, PhotographPicture, TensorPicture, TiffPicture, open_large
+from semfov.errors import DataError, InputError
+
+
+def pixels(height=150, width=230, seed=0):
+    return np.random.default_rng(seed).integers(256, size=(height, width, 3), dtype=np.uint8)
+
+
+BOXES = [(0, 0, 230, 150), (17, 33, 99, 120), (190, 100, 230, 150), (64, 64, 65, 65)]
+
+
+@pytest.mark.parametrize("box", BOXES)
+def test_every_source_gives_the_same_window(tmp_path, box):
+    tifffile = pytest.importorskip("tifffile")
+    array = pixels()
+    np.save(tmp_path / "a.npy", array)
+    Image.fromarray(array).save(tmp_path / "a.png")
+    tifffile.imwrite(tmp_path / "tiles.tif", array, tile=(64, 48), photometric="rgb", compression="zlib")
+    tifffile.imwrite(tmp_path / "strips.tif", array, rowsperstrip=7, photometric="rgb")
+    x1, y1, x2, y2 = box
+    expected = torch.from_numpy(array[y1:y2, x1:x2].copy()).permute(2, 0, 1)
+    for source in (
+        array,
+        np.load(tmp_path / "a.npy", mmap_mode="r"),
+        torch.from_numpy(array).permute(2, 0, 1).float() / 255,
+        tmp_path / "a.png",
+        tmp_path / "tiles.tif",
+        str(tmp_path / "strips.tif"),
+    ):
+        picture = open_large(source)
+        assert picture.size == (230, 150)
+        assert torch.equal(picture.read(box), expected)
+
+
+def test_grey_has_three_channels(tmp_path):
+    array = pixels()[..., 0]
+    Image.fromarray(array).save(tmp_path / "grey.png")
+    for source in (array, tmp_path / "grey.png"):
+        assert np.array_equal(open_large(source).pixels((3, 4, 9, 8)), np.repeat(array[4:8, 3:9, None], 3, -1))
+
+
+def test_turned_photographs_stand_upright(tmp_path):
+    array = pixels()
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(array).save(tmp_path / "turned.png", exif=exif)
+    picture = open_large(tmp_path / "turned.png")
+    assert picture.size == (150, 230)
+    assert np.array_equal(picture.pixels((0, 0, 150, 230)), np.rot90(array, -1))
+
+
+def test_reduced_windows_are_means_of_squares(monkeypatch):
+    monkeypatch.setattr("semfov.data.large._STRIP", 2000)
+    array = pixels(128, 192)
+    got = ArrayPicture(array).read((0, 0, 192, 128), 4).permute(1, 2, 0).double()
+    expected = torch.from_numpy(array.reshape(32, 4, 48, 4, 3).mean((1, 3)))
+    assert float((got - expected).abs().max()) <= 0.5 + 1e-9
+
+
+def test_overview_of_a_jpeg_is_drafted(tmp_path):
+    smooth = Image.fromarray(pixels(8, 8)).resize((1600, 1200), Image.Resampling.BICUBIC)
+    smooth.save(tmp_path / "a.jpg", quality=95)
+    picture = PhotographPicture(tmp_path / "a.jpg")
+    tracemalloc.start()
+    draft = picture.read((0, 0, 1600, 1200), 4)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert draft.shape == (3, 300, 400)
+    assert peak < 1600 * 1200 * 3 / 4
+    whole = torch.from_numpy(np.array(smooth.reduce(4))).permute(2, 0, 1)
+    assert float((draft.double() - whole.double()).abs().mean()) < 3
+
+
+def test_windows_of_a_mapped_file_need_no_more_than_themselves(tmp_path):
+    side = 6000
+    mapped = np.lib.format.open_memmap(tmp_path / "large.npy", mode="w+", dtype=np.uint8, shape=(side, side, 3))
+    mapped[2000:2100, 3000:3100] = 200
+    picture = ArrayPicture(mapped)
+    tracemalloc.start()
+    window = picture.read((2900, 1900, 3316, 2316))
+    overview = picture.read((0, 0, side, side), 8)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert overview.shape == (3, side // 8, side // 8)
+    assert int(window.max()) == 200
+    assert peak < 120e6 < side * side * 3 * 4
+
+
+def test_tiles_are_decoded_one_at_a_time(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    array = np.zeros((4096, 4096, 3), np.uint8)
+    array[1000:1100, 2000:2100] = 77
+    tifffile.imwrite(tmp_path / "large.tif", array, tile=(256, 256), photometric="rgb", compression="zlib")
+    del array
+    picture = TiffPicture(tmp_path / "large.tif")
+    tracemalloc.start()
+    window = picture.read((1900, 900, 2316, 1316))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert int(window.sum()) == 77 * 3 * 100 * 100
+    assert peak < 4e6
+
+
+def test_errors(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"no picture")
+    with pytest.raises(DataError, match="cannot be opened"):
+        open_large(tmp_path / "a.jpg")
+    with pytest.raises(DataError, match="no such file"):
+        open_large(tmp_path / "b.jpg")
+    for suffix in ("jpg", "tif"):
+        (tmp_path / f"folder.{suffix}").mkdir()
+        with pytest.raises(DataError, match="expected a file, got a folder"):
+            open_large(tmp_path / f"folder.{suffix}")
+        os.mkfifo(tmp_path / f"pipe.{suffix}")
+        with pytest.raises(DataError, match="expected a file, got a pipe"):
+            open_large(tmp_path / f"pipe.{suffix}")
+    with pytest.raises(InputError, match="picture: expected"):
+        open_large(3)
+    with pytest.raises(InputError, match="array: expected bytes"):
+        open_large(np.zeros((4, 4, 3), np.float32))
+    with pytest.raises(InputError, match="box: expected inside"):
+        TensorPicture(torch.zeros(3, 4, 4)).read((0, 0, 5, 4))
+
+
+def test_files_that_end_early_are_told(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    Image.fromarray(pixels()).save(tmp_path / "a.jpg")
+    tifffile.imwrite(tmp_path / "a.tif", pixels(), tile=(64, 48), photometric="rgb", compression="zlib")
+    for name in ("a.jpg", "a.tif"):
+        whole = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(whole[: len(whole) // 2])
+        with pytest.raises(DataError, match=r"a\.(jpg|tif): cannot be"):
+            open_large(tmp_path / name).pixels((0, 0, 230, 150))
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "I;16", "1", "P", "CMYK"])
+def test_modes_are_read_as_of_small_pictures(tmp_path, mode):
+    """16 bits keep their range, and what is transparent is white."""
+    if mode == "I;16":
+        image = Image.fromarray(np.linspace(0, 65535, 150 * 230).reshape(150, 230).astype(np.uint16))
+    elif mode == "RGBA":
+        image = Image.fromarray(np.dstack([pixels(), pixels(seed=1)[..., 0]]))
+    else:
+        image = Image.fromarray(pixels()).convert(mode)
+    path = tmp_path / ("a.jpg" if mode == "CMYK" else "a.png")
+    image.save(path)
+    got = open_large(path).read((0, 0, 230, 150))
+    assert torch.equal(got, (read_image(path) * 255).round().byte())

@@ -1,0 +1,55 @@
+"""Mosaics: what is where, by seed, and boxes that fit the pixels."""
+
+import torch
+
+from semfov.data import EmbeddedScenes
+from semfov.data.mosaics import Mosaics
+
+SCENES = EmbeddedScenes(("person", "cat", "cup"), count=5, seed=3)
+
+
+def make(**changes):
+    return Mosaics(SCENES, **({"columns": 2, "rows": 2, "tile": (320, 256), "count": 3, "seed": 1} | changes))
+
+
+def test_seed_and_number_decide():
+    assert torch.equal(make()[1].image, make(count=9)[1].image)
+    assert make().fingerprint != make(seed=2).fingerprint
+    assert [tile.index for tile in make().tiles(0)] != [tile.index for tile in make(seed=2).tiles(0)]
+    assert make().digest(0) == make().digest(0) != make().digest(1)
+
+
+def test_photographs_are_there_once_where_there_are_enough():
+    for index in range(3):
+        numbers = [tile.index for tile in make().tiles(index)]
+        assert len(set(numbers)) == 4
+    assert sorted(tile.index for tile in make(columns=5, rows=2).tiles(0)) == sorted([*range(5)] * 2)
+
+
+def test_pixels_and_boxes_move_together():
+    mosaics = make(tile=(640, 500))
+    scene = mosaics[0]
+    assert scene.size == (1280, 1000)
+    start = 0
+    for tile in mosaics.tiles(0):
+        x1, y1, x2, y2 = tile.box
+        part = SCENES[tile.index]
+        assert (x2 - x1, y2 - y1) == part.size
+        assert torch.equal(scene.image[:, y1:y2, x1:x2], part.image)
+        stop = start + len(part.boxes)
+        torch.testing.assert_close(scene.boxes[start:stop] - torch.tensor([x1, y1] * 2), part.boxes, rtol=0, atol=1e-3)
+        assert torch.equal(scene.labels[start:stop], part.labels)
+        start = stop
+    assert start == len(scene.boxes)
+
+
+def test_scaled_boxes_hold_what_the_photographs_do():
+    mosaics = make()
+    annotation = mosaics.annotation(0)
+    limit = torch.tensor([640.0, 512, 640, 512])
+    assert (annotation.boxes >= 0).all()
+    assert (annotation.boxes <= limit).all()
+    tile = mosaics.tiles(0)[0]
+    count = len(SCENES.annotation(tile.index).boxes)
+    corner = torch.tensor([*tile.box[:2], *tile.box[:2]])
+    torch.testing.assert_close(annotation.boxes[:count], SCENES.annotation(tile.index).boxes / 2 + corner)

@@ -1,0 +1,146 @@
+"""The experiment with large pictures: the same with and without a store, resumed, and its orders."""
+
+import json
+
+import pytest
+import torch
+
+from semfov.detection.detector import Detector
+from semfov.detection.scores import Candidates
+from semfov.errors import InputError
+from semfov.experiments import zoom_report
+from semfov.experiments.config import DataConfig
+from semfov.experiments.zoom import ZoomConfig, ZoomRun
+from semfov.experiments.zoom_orders import quad_tree, ranked, raster, shuffled, slices
+from semfov.experiments.zoom_store import pack, unpack
+from semfov.zoom import GlimpseEvidence
+from semfov.zoom.lattice import Lattice
+
+
+class Textures(Detector):
+    """Boxes of 16 px whose scores follow the colours under them."""
+
+    def __init__(self):
+        super().__init__("textures", ("person", "cat", "cup"), (96, 96))
+
+    def propose(self, canvas):
+        means = torch.nn.functional.avg_pool2d(canvas, 16)
+        rows, columns = means.shape[-2:]
+        y, x = torch.meshgrid(torch.arange(rows) * 16.0, torch.arange(columns) * 16.0, indexing="ij")
+        boxes = torch.stack([x, y, x + 16, y + 16], -1).reshape(1, -1, 4).expand(len(canvas), -1, -1)
+        classes = means.flatten(2).mT.clamp(0, 1) ** 2
+        return Candidates(boxes, classes, classes.amax(-1))
+
+
+@pytest.fixture
+def config(tmp_path, monkeypatch):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Textures())
+    torch.manual_seed(0)
+    GlimpseEvidence(3, 8).save(tmp_path / "model.safetensors")
+    return ZoomConfig(
+        data=DataConfig(limit=5, min_instances=0, max_target_area=None),
+        mosaics=2,
+        columns=2,
+        rows=2,
+        tile=320,
+        passes=6,
+        model=str(tmp_path / "model.safetensors"),
+        out=tmp_path / "out",
+        cache=tmp_path / "cache",
+        workers=1,
+    )
+
+
+def test_the_store_changes_nothing(config):
+    from dataclasses import replace
+
+    fresh = ZoomRun(replace(config, store=False)).outcomes(0)[0]
+    written = ZoomRun(config).outcomes(0)[0]
+    run = ZoomRun(config)
+    run.eye.detector.propose = None  # nothing is looked at again
+    assert run.outcomes(0)[0] == written == fresh
+
+
+def test_tables_and_resuming(config, capsys):
+    zoom_report.zoom(config)
+    text = (config.out / "zoom.md").read_text()
+    assert text in capsys.readouterr().out
+    for way in ("slices, raster", "quad-tree, best first", "ours", "oracle"):
+        assert f"| {way} " in text
+    records = [json.loads(line) for line in (config.out / "records.jsonl").read_text().splitlines()]
+    for record in records:
+        if record["measure"] == "recall":
+            assert len(record["found"]) <= config.passes
+            assert max(record["found"]) <= record["objects"]
+        else:
+            assert 1 <= record["passes"] <= 5
+    parts = sorted((config.out / "parts").rglob("*.json"))
+    before = [part.stat().st_mtime_ns for part in parts]
+    parts[0].unlink()
+    zoom_report.zoom(config)
+    assert [part.stat().st_mtime_ns for part in parts[1:]] == before[1:]
+    assert (config.out / "zoom.md").read_text() == text
+
+
+def test_a_damaged_store_is_looked_at_again(config):
+    written = ZoomRun(config).outcomes(0)[0]
+    store = ZoomRun(config).store
+    (file,) = store.folder.glob("*.safetensors")
+    digest = ZoomRun(config).scenes.digest(0)
+    tensors = store.read(digest)
+    for name, spoiled in (("windows", tensors["windows"] * torch.nan), ("scores", tensors["scores"] + 1)):
+        store.write(digest, {**tensors, name: spoiled})
+        assert store.load(digest) == []
+        assert ZoomRun(config).outcomes(0)[0] == written
+    file.write_bytes(file.read_bytes()[:-1])
+    assert store.load(digest) == []
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"passes": 1}, "passes: expected a whole number from 2"),
+        ({"overlap": 1.0}, "overlap: expected a number from 0 to 0.9"),
+        ({"tile": 0}, "tile: expected a whole number from 16"),
+        ({"seed": -1}, "seed: expected"),
+        ({"mosaics": -1}, "mosaics: expected"),
+    ],
+)
+def test_settings_have_ranges(settings, told):
+    with pytest.raises(InputError, match=told):
+        ZoomConfig(**settings)
+
+
+def test_glances_come_back_from_a_file(config):
+    glances = ZoomRun(config).glances(1)
+    windows = [*ZoomRun(config).slices(1, glances.lattice)]
+    seen = [*glances.see(windows), *raster(glances, [])]
+    for one, same in zip(seen, unpack(pack(seen)), strict=True):
+        assert one.window == same.window
+        assert torch.equal(one.detections.scores, same.detections.scores)
+        assert torch.equal(one.cut, same.cut)
+        if one.gist is not None:
+            assert torch.equal(one.gist.scores, same.gist.scores)
+            assert torch.equal(one.gist.found, same.gist.found)
+
+
+def test_orders_look_at_every_slice_once(config):
+    run = ZoomRun(config)
+    glances = run.glances(0)
+    cut = run.slices(0, glances.lattice)
+    for looks in (raster(glances, cut), shuffled(glances, cut, [1]), ranked(glances, cut, None, most=False)):
+        windows = [glance.window for glance in looks]
+        assert windows[0].level == 0
+        assert set(windows[1:]) == set(cut)
+        assert len(windows) == len(cut) + 1
+    tree = [glance.window for glance in quad_tree(glances, 1, most=True)]
+    assert len(tree) == len(set(tree))
+
+
+def test_slices_are_those_of_sahi():
+    lattice = Lattice.over((3840, 2160), (416, 416))
+    windows = slices(lattice, 640, 0.2)
+    assert len(windows) == 32
+    corners = [window.within for window in windows]
+    assert corners[0] == (0, 0, 640, 640)
+    assert corners[-1] == (3200, 1520, 3840, 2160)

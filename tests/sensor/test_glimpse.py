@@ -1,0 +1,127 @@
+"""Glimpses against Pillow, torch and Kornia, their gradients, borders and errors."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.nn import functional as F
+
+from semfov.errors import InputError
+from semfov.sensor.glimpse import Glimpse, glimpse, ladder, windows_at
+
+
+def picture(height=47, width=61, channels=3, dtype=torch.float64, seed=0):
+    return torch.rand(1, channels, height, width, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+@pytest.mark.parametrize("size", [(61, 47), (30, 23), (17, 9), (90, 80), (1, 1)])
+def test_whole_picture_is_torchs_antialiased_resize_away_from_its_border(device, size):
+    image = picture().to(device)
+    boxes = torch.tensor([[0.0, 0.0, 61.0, 47.0]], dtype=image.dtype, device=device)
+    expected = F.interpolate(image, size[::-1], mode="bilinear", antialias=True)
+    got = glimpse(image, boxes, size, padding_mode="border")
+    inner = [slice(n // 2, n // 2 + 1) if n < 3 else slice(1, n - 1) for n in size[::-1]]
+    if min(size) >= 3:
+        torch.testing.assert_close(got[..., inner[0], inner[1]], expected[..., inner[0], inner[1]])
+    assert got.shape == expected.shape
+
+
+@pytest.mark.parametrize("box", [(10.0, 8.0, 40.0, 32.0), (10.25, 8.5, 43.75, 29.125), (20.5, 20.5, 30.0, 26.0)])
+@pytest.mark.parametrize("size", [(12, 9), (40, 33)])
+def test_windows_are_those_of_pillow(box, size):
+    grey = np.random.default_rng(0).random((47, 61), dtype=np.float32)
+    expected = np.asarray(Image.fromarray(grey).resize(size, Image.Resampling.BILINEAR, box=box))
+    got = glimpse(torch.from_numpy(grey)[None, None], torch.tensor([box]), size)[0, 0]
+    torch.testing.assert_close(got, torch.from_numpy(expected.copy()), rtol=1e-5, atol=1e-5)
+
+
+def test_enlarged_windows_are_those_of_kornia():
+    from kornia.geometry.transform import crop_and_resize
+
+    image = picture()
+    # Kornia's corners are pixel centres of the first and the last canvas pixel.
+    corners = torch.tensor([[[12.0, 10.0], [24.0, 10.0], [24.0, 19.0], [12.0, 19.0]]], dtype=image.dtype)
+    expected = crop_and_resize(image, corners, (19, 25))
+    step = 0.5
+    edges = torch.tensor([[12 + 0.5 - step / 2, 10 + 0.5 - step / 2, 24.5 + step / 2, 19.5 + step / 2]]).double()
+    torch.testing.assert_close(glimpse(image, edges, (25, 19)), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("padding", ["zeros", "border"])
+def test_beyond_the_border_it_is_kornias_padding(padding):
+    from kornia.geometry.transform import warp_affine
+
+    image = picture()
+    shift = torch.tensor([[[1.0, 0.0, 7.25], [0.0, 1.0, 5.5]]], dtype=image.dtype)
+    expected = warp_affine(image, shift, (60, 70), padding_mode=padding, align_corners=True)
+    box = torch.tensor([[-7.25, -5.5, 70 - 7.25, 60 - 5.5]], dtype=image.dtype)
+    torch.testing.assert_close(glimpse(image, box, (70, 60), padding_mode=padding), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_fill_is_seen_beyond_the_border():
+    view = glimpse(picture(), torch.tensor([[-200.0, -200, -100, -100]]).double(), (8, 8), padding_mode="fill",
+                   fill_value=0.4)  # fmt: skip
+    torch.testing.assert_close(view, torch.full_like(view, 0.4))
+
+
+def test_many_windows_are_each_alone():
+    image = torch.cat([picture(seed=1), picture(seed=2)])
+    boxes = torch.tensor([[[0.0, 0, 30, 20], [5, 5, 50, 40], [-9, 3, 12, 70]]] * 2).double()
+    boxes[1] += 1.5
+    together = glimpse(image, boxes, (16, 12))
+    assert together.shape == (2, 3, 3, 12, 16)
+    for b in range(2):
+        for g in range(3):
+            torch.testing.assert_close(together[b, g], glimpse(image[b : b + 1], boxes[b, g][None], (16, 12))[0])
+
+
+def test_fine_stripes_vanish_instead_of_aliasing():
+    stripes = (torch.arange(256) % 2).double().expand(1, 1, 256, 256)
+    view = glimpse(stripes, torch.tensor([[0.0, 0, 256, 256]]).double(), (29, 29), padding_mode="border")
+    assert float((view[..., 1:-1, 1:-1] - 0.5).abs().max()) < 0.02
+    aliased = F.interpolate(stripes, (29, 29), mode="bilinear", align_corners=False)
+    assert float((aliased[..., 1:-1, 1:-1] - 0.5).abs().max()) > 0.3
+
+
+def test_gradients_in_image_place_and_magnification():
+    image = picture(12, 14, 1).requires_grad_()
+    points = torch.tensor([[[5.13, 4.37], [8.71, 6.29]]], dtype=torch.float64, requires_grad=True)
+    magnification = torch.tensor([[0.73, 1.61]], dtype=torch.float64, requires_grad=True)
+    sensor = Glimpse((6, 5), fill_value=0.3)
+    assert torch.autograd.gradcheck(sensor, (image, points, magnification))
+
+
+def test_dtype_follows_the_image(device):
+    for dtype in (torch.float32, torch.float64):
+        view = glimpse(picture(dtype=dtype).to(device), torch.tensor([[0.0, 0, 20, 20]]), (7, 7))
+        assert view.dtype == dtype
+        assert view.device.type == device.type
+
+
+def test_windows_at_and_ladder():
+    box = windows_at(torch.tensor([99.5, 49.5]), torch.tensor(0.5), (416, 208))
+    assert box.tolist() == [100 - 416, 50 - 208, 100 + 416, 50 + 208]
+    steps = ladder((20000, 15000), (416, 416))
+    assert steps[0] == 416 / 20000
+    assert all(finer == 2 * coarser for coarser, finer in pairwise(steps))
+    assert steps[-1] <= 1 < 2 * steps[-1]
+    assert ladder((100, 80), (416, 416)) == (4.16,)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"boxes": torch.tensor([[3.0, 3.0, 3.0, 9.0]])}, "boxes: expected windows with a positive width"),
+        ({"boxes": torch.tensor([[3.0, 3.0, float("nan"), 9.0]])}, "boxes: expected finite"),
+        ({"boxes": torch.zeros(2, 4)}, "boxes: expected shape"),
+        ({"size": (0, 3)}, "size: expected"),
+        ({"padding_mode": "mirror"}, "unknown padding mode"),
+        ({"image": torch.zeros(1, 3, 4, 4, dtype=torch.uint8)}, "image: expected floating-point"),
+    ],
+)
+def test_errors_name_the_argument(change, message):
+    call = {"image": torch.rand(1, 3, 8, 8), "boxes": torch.tensor([[0.0, 0, 4, 4]]), "size": (4, 4)} | change
+    with pytest.raises(InputError, match=message):
+        glimpse(**call)

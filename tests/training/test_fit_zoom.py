@@ -1,0 +1,76 @@
+"""`python -m train.fit_zoom`: small on the embedded scenes, and its examples there and back."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from semfov.data.mosaics import Mosaics
+from semfov.data.scenes import EmbeddedScenes
+from semfov.detection.detector import Detector
+from semfov.detection.scores import Candidates
+from semfov.errors import InputError
+from semfov.experiments.config import DataConfig
+from semfov.training.zoom import FitZoomConfig, fit_zoom
+from semfov.training.zoom_examples import MosaicStore, look_at_mosaic, pack, unpack
+from semfov.zoom import GlimpseEvidence, ZoomEye
+
+
+class Bright(Detector):
+    """Boxes of 16 px whose scores follow the colours under them."""
+
+    def __init__(self):
+        super().__init__("bright", ("person", "cat", "cup"), (96, 96))
+
+    def propose(self, canvas):
+        means = torch.nn.functional.avg_pool2d(canvas, 16)
+        rows, columns = means.shape[-2:]
+        y, x = torch.meshgrid(torch.arange(rows) * 16.0, torch.arange(columns) * 16.0, indexing="ij")
+        boxes = torch.stack([x, y, x + 16, y + 16], -1).reshape(1, -1, 4).expand(len(canvas), -1, -1)
+        classes = means.flatten(2).mT.clamp(0, 1) ** 2
+        return Candidates(boxes, classes, classes.amax(-1))
+
+
+def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Bright())
+    config = FitZoomConfig(
+        data=DataConfig(limit=4, min_instances=0, max_target_area=None),
+        mosaics=1, far=1, judged=1, tile=96, steps=3, out=tmp_path / "out", cache=tmp_path / "cache", workers=1,
+    )  # fmt: skip
+    fit_zoom(config)
+    model = GlimpseEvidence.from_pretrained(tmp_path / "out" / "bright.safetensors")
+    model.check_compatible(ZoomEye(Bright()).settings())
+    assert model.metadata["training"]["steps"] == 3
+    figures = json.loads((tmp_path / "out" / "figures.json").read_text())
+    assert all(map(math.isfinite, figures.values()))
+    assert (tmp_path / "out" / "report.md").read_text() in capsys.readouterr().out
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    # Looks come from the store, and a fit of the same seed is the same.
+    monkeypatch.setattr(Bright, "propose", None)
+    fit_zoom(config)
+    again = GlimpseEvidence.from_pretrained(tmp_path / "out" / "bright.safetensors")
+    assert all(torch.equal(before[name], tensor) for name, tensor in again.state_dict().items())
+
+
+def test_examples_come_back_from_a_file(tmp_path):
+    eye = ZoomEye(Bright())
+    mosaics = Mosaics(EmbeddedScenes(("person", "cat", "cup"), count=3), 2, 2, tile=(96, 72), count=1)
+    example = look_at_mosaic(eye, mosaics, 0)
+    store = MosaicStore(tmp_path, eye.settings(), 3)
+    store.write(mosaics.digest(0), pack(example))
+    slots = [tuple(map(float, tile.slot)) for tile in mosaics.tiles(0)]
+    same = unpack(store.read(mosaics.digest(0)), example.lattice, slots)
+    assert torch.equal(same.labels, example.labels)
+    for one, other in zip(example.looks, same.looks, strict=True):
+        assert one.window == other.window
+        assert torch.equal(one.found, other.found)
+        assert (one.gist is None) == (other.gist is None)
+        if one.gist is not None:
+            torch.testing.assert_close(other.gist.scores, one.gist.scores, rtol=1e-3, atol=1e-4)
+            assert torch.equal(other.gist.found, one.gist.found)
+
+
+def test_settings_have_ranges():
+    with pytest.raises(InputError, match="steps: expected a whole number from 1"):
+        FitZoomConfig(steps=0)

@@ -1,0 +1,111 @@
+"""Belief and policy: sums against plain loops, what was seen is not looked at again, joint batches."""
+
+import pytest
+import torch
+
+from semfov.zoom import GlimpseEvidence, ZoomEye
+from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.evidence import pool, pool_all
+from semfov.zoom.glances import LiveGlances, on_lattice
+from semfov.zoom.policy import best_find, best_hit, jointly
+
+
+@pytest.fixture
+def glances(detector, picture):
+    eye = ZoomEye(detector)
+    return LiveGlances(eye, eye.open(picture))
+
+
+@pytest.fixture
+def evidence():
+    torch.manual_seed(3)
+    return GlimpseEvidence(3, 8).eval().requires_grad_(False)
+
+
+@pytest.fixture
+def belief(glances, evidence):
+    known = ZoomBelief(glances.lattice, evidence, 1)
+    known.add(glances.see([on_lattice(glances.lattice, (0, 0, 0))])[0])
+    return known
+
+
+def test_finds_are_tapered_sums(belief, evidence):
+    lattice = belief.lattice
+    for level in range(1, lattice.levels):
+        span, values, cells = lattice.span(level), belief.finds(level), belief.expected(level)
+        taper = evidence.taper(span)
+        assert values.shape == lattice.places(level)[::-1]
+        for row, column in ((0, 0), (values.shape[0] - 1, values.shape[1] // 2)):
+            part = cells[row : row + span, column : column + span]
+            weight = taper[: part.shape[0], None] * taper[None, : part.shape[1]]
+            torch.testing.assert_close(values[row, column], (part * weight).sum())
+
+
+def test_pooling_of_all_windows_is_pooling_of_each():
+    scores = torch.rand(9, 11, 4, generator=torch.Generator().manual_seed(0)) ** 8
+    top, summary = pool_all(scores, 3)
+    assert top.shape == (63, 4)
+    for number, (row, column) in enumerate((r, c) for r in range(7) for c in range(9)):
+        one, told = pool(scores, (column, row, column + 3, row + 3))
+        torch.testing.assert_close(top[number], one)
+        torch.testing.assert_close(summary[number], told)
+
+
+def test_odds_of_a_window_of_the_lattice_are_those_of_the_table(belief):
+    lattice = belief.lattice
+    table = belief.odds(lattice.levels - 1)
+    # The picture ends within a cell of the overview: windows that lie on whole cells of it are compared.
+    for row, column in ((0, 0), (6, 8), (12, 4)):
+        window = on_lattice(lattice, (lattice.levels - 1, column, row))
+        assert belief.odds_of(window) == pytest.approx(float(table[row, column]), abs=1e-4)
+
+
+def test_a_window_that_was_seen_is_worth_less(belief, glances):
+    lattice = belief.lattice
+    window, value = best_find(belief, set())
+    finest = on_lattice(lattice, (lattice.levels - 1, *window.cells[:2]))
+    before = belief.finds(lattice.levels - 1)[window.cells[1], window.cells[0]].clone()
+    belief.add(glances.see([finest])[0])
+    assert belief.finds(lattice.levels - 1)[window.cells[1], window.cells[0]] < before
+    assert value > 0
+
+
+def test_no_window_is_chosen_twice(belief):
+    done = set()
+    for _ in range(20):
+        window, _ = best_hit(belief, done, closest=True)
+        assert window not in done
+        done.add(window)
+
+
+def test_batches_are_chosen_jointly(belief):
+    left = belief.left.clone()
+    chosen = jointly(lambda taken: best_find(belief, taken), belief, set(), 4)
+    assert len({window for window, _ in chosen}) == 4
+    assert torch.equal(belief.left, left)
+    first, _ = best_find(belief, set())
+    assert chosen[0][0] == first
+    values = [value for _, value in chosen]
+    assert values == sorted(values, reverse=True)
+
+
+def test_closer_looks_replace_what_the_overview_said(belief, glances):
+    lattice = belief.lattice
+    belief.add(glances.see([on_lattice(lattice, (1, 0, 0))])[0])
+    span = lattice.span(1)
+    assert (belief.source[:span, :span] == 1).all()
+    assert (belief.source[:, span:] == 0).all()
+    assert float(belief.expected(1)[:span, :span].sum()) == 0
+
+
+def test_model_comes_back_from_its_file(tmp_path, evidence):
+    evidence.patience, evidence.foresight = 3.5, 0.25
+    evidence.save(tmp_path / "a.safetensors")
+    same = GlimpseEvidence.from_pretrained(tmp_path / "a.safetensors")
+    assert (same.patience, same.foresight) == (3.5, 0.25)
+    scores, summary = torch.rand(5, 3), torch.rand(5, 3)
+    every = same.presence(scores, summary, torch.tensor([1, 1, 2, 2, 3]))
+    torch.testing.assert_close(every, evidence.presence(scores, summary, torch.tensor([1, 1, 2, 2, 3])))
+    for target in (1, 2, 3):
+        one = same.presence(scores, summary, torch.tensor([1, 1, 2, 2, 3]), target)
+        torch.testing.assert_close(one, every[:, target - 1])

@@ -1,0 +1,133 @@
+"""Searches and explorations of large pictures, and merging."""
+
+import pytest
+import torch
+
+from semfov.detection.detections import Detections
+from semfov.errors import InputError
+from semfov.viz.zoom import describe_zoom, plot_zoom_path
+from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye, merge
+from semfov.zoom.glances import Glance, on_lattice
+from semfov.zoom.lattice import Lattice
+
+
+@pytest.fixture
+def agent(detector):
+    torch.manual_seed(0)
+    return ZoomAgent(ZoomEye(detector), GlimpseEvidence(3, 8)).eval()
+
+
+def test_search_finds_what_is_there(agent, picture):
+    path = agent.search(picture, "red")
+    assert path.decision.outcome == "found"
+    assert path.decision.probability >= 0.3
+    x1, y1, x2, y2 = path.decision.box.tolist()
+    assert max(x1, 640) < min(x2, 672)
+    assert max(y1, 320) < min(y2, 352)
+    assert path.passes == len(path.glances)
+
+
+def test_search_without_a_target_ends(agent, picture):
+    path = agent.search(picture, "green", passes=7)
+    assert path.decision.outcome in ("absent", "undecided")
+    assert path.passes <= 7
+    assert path.decision.box is None
+
+
+def test_find_all_and_explore(agent, picture):
+    path = agent.find_all(picture, "blue", passes=12, worth=0.0)
+    assert path.target == 3
+    assert (path.objects.labels == 3).all()
+    assert len(path.objects.above(0.3))
+    everything = agent.explore(picture, passes=12, batch=3, worth=0.0)
+    assert set(everything.objects.above(0.3).labels.tolist()) == {1, 3}
+    assert everything.target is None
+    assert everything.passes <= 12
+
+
+def test_it_ends_where_no_look_is_worth_its_price(agent, picture):
+    assert agent.find_all(picture, "blue", worth=1e9).passes == 1
+
+
+def test_pays_for_large_pictures_alone(agent, picture):
+    assert agent.pays(picture)
+    assert not agent.pays(picture[:, :200, :300])
+
+
+def test_figure(agent, picture):
+    path = agent.search(picture, "red", passes=4)
+    figure = plot_zoom_path(path, picture)
+    assert len(figure.axes) == 1
+    assert describe_zoom(path).startswith("red: ")
+
+
+def test_errors(agent, picture):
+    with pytest.raises(InputError, match="did you mean 'red'"):
+        agent.search(picture, "rad")
+    with pytest.raises(InputError, match="passes: expected a whole number from 1"):
+        agent.explore(picture, passes=0)
+    with pytest.raises(InputError, match="batch: expected a whole number from 1"):
+        agent.find_all(picture, 1, batch=0)
+    for wrong, told in (
+        ({"passes": 2.5}, "passes: expected a whole number"),
+        ({"passes": True}, "passes: expected a whole number"),
+        ({"confirm": 1.5}, "confirm: expected a number from 0 to 1, got 1.5"),
+        ({"give_up": float("nan")}, "give_up: expected a number from 0 to 1"),
+    ):
+        with pytest.raises(InputError, match=told):
+            agent.search(picture, "red", **wrong)
+    for worth in (-1, float("nan"), "much"):
+        with pytest.raises(InputError, match="worth: expected a number"):
+            agent.explore(picture, worth=worth)
+    for target in (0, 4, 1.0, True, None):
+        with pytest.raises(InputError, match="target: expected a whole number from 1 to 3"):
+            agent.find_all(picture, target)
+    for image, told in (
+        (picture * 255, "image: expected RGB in"),
+        (picture * torch.nan, "image: expected RGB in .*NaN"),
+        (picture.long(), "image: expected RGB in .*or bytes"),
+        (picture[:2], "image: expected a tensor of shape"),
+        (picture[:, :0], "array: expected bytes"),
+        (7, "picture: expected a tensor"),
+    ):
+        with pytest.raises(InputError, match=told):
+            agent.explore(image)
+
+
+def test_evidence_belongs_to_the_detector(detector):
+    with pytest.raises(InputError, match="evidence: expected one for the detector's 3 classes, got 5"):
+        ZoomAgent(ZoomEye(detector), GlimpseEvidence(5, 8))
+    for wrong, told in (({"patience": 0}, "patience"), ({"foresight": 2}, "foresight"), ({"classes": 0}, "classes")):
+        with pytest.raises(InputError, match=told):
+            GlimpseEvidence(**wrong)
+
+
+def looked(level, column, row, boxes, scores, cut):
+    lattice = Lattice.over((1024, 768), (128, 128))
+    vectors = torch.zeros(1, len(boxes), 3)
+    vectors[0, :, 1] = torch.tensor(scores)
+    vectors[0, :, 0] = 1 - vectors[0, :, 1]
+    detections = Detections(torch.tensor(boxes)[None], vectors, torch.ones(1, len(boxes), dtype=torch.bool))
+    return Glance(on_lattice(lattice, (level, column, row)), detections, torch.tensor(cut), torch.zeros(2), None)
+
+
+def test_the_closer_look_wins():
+    far = looked(0, 0, 0, [[100.0, 100, 200, 200]], [0.9], [False])
+    near = looked(2, 0, 0, [[105.0, 102, 198, 199]], [0.6], [False])
+    objects = merge([far, near])
+    assert objects.boxes.tolist() == [[105.0, 102, 198, 199]]
+    assert objects.passes.tolist() == [1]
+
+
+def test_a_cut_box_gives_way_to_the_whole():
+    far = looked(0, 0, 0, [[100.0, 100, 200, 200]], [0.4], [False])
+    near = looked(2, 0, 0, [[100.0, 100, 140, 200]], [0.9], [True])
+    assert merge([far, near]).boxes.tolist() == [[100.0, 100, 200, 200]]
+    assert merge([near]).boxes.tolist() == [[100.0, 100, 140, 200]]
+
+
+def test_small_things_in_front_of_large_ones_stay():
+    look = looked(1, 0, 0, [[0.0, 0, 200, 200], [50.0, 50, 90, 90]], [0.9, 0.8], [False, False])
+    assert len(merge([look])) == 2
+    assert len(merge([look], score=0.85)) == 1
+    assert len(merge([])) == 0
