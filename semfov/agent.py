@@ -23,6 +23,7 @@ from semfov.gaze.acquisition import ExpectedGain
 from semfov.gaze.choice import Greedy, drawn_by
 from semfov.gaze.policies import KL, Closer, NonPredictive, Policy, Predictive, Random
 from semfov.io.compatibility import learned_for
+from semfov.io.schema import is_number
 from semfov.observation.foveal import FovealObservationModel
 from semfov.scanpath import Ending, Scanpath, trace
 from semfov.sensor.foveation import Foveation
@@ -80,6 +81,9 @@ class ActivePerception(nn.Module):
         self.eye = eye
         self.searching = Strategy(*search)
         self.exploring = Strategy(*explore)
+        check(len(grid) == 2, "grid", "(columns, rows)", grid)
+        for side in grid:
+            check_whole(side, "grid", 1, 200)
         self.columns, self.rows = grid
 
     @classmethod
@@ -231,7 +235,8 @@ class ActivePerception(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
         """
         for name, value in (("confirm", confirm), ("give_up", give_up)):
-            check(value is None or 0 <= value <= 1, name, "a probability", value)
+            check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability", value)
+        check(price is None or (is_number(price) and price >= 0), "price", "0 or more right decisions", price)
         image, grid = self._frame(image)
         index = self._target(target)
         goal = None if boxes is None else grid.footprint(boxes.to(image)).any(-2)
@@ -279,7 +284,7 @@ class ActivePerception(nn.Module):
         Raises:
             InputError: an argument does not fit, or only a learned map could tell what a look will bring.
         """
-        check(until is None or 0 <= until < math.inf, "until", "a price in cells, 0 or more", until)
+        check(until is None or (is_number(until) and until >= 0), "until", "a price in cells, 0 or more", until)
         image, grid = self._frame(image)
         observer = self.exploring.observer
         if not isinstance(observer, LearnedMap):

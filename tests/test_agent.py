@@ -342,3 +342,9 @@ def test_view_shows_what_the_sensor_shows_of_a_reference_image(growth):
     # With growth 1 both are one picture, and may differ by a rounding.
     assert error <= other * (1 + 1e-4)
     assert growth == 1 or error < other / 2
+
+
+@pytest.mark.parametrize("grid", [(0, 5), (5, -1), (5, 1.5), (5,), (5, 5, 5), (201, 1)])
+def test_a_grid_that_cannot_be_is_refused(grid):
+    with pytest.raises(InputError, match=r"^grid: expected"):
+        ActivePerception(squares_eye(), (Semantic(3), Random()), (Semantic(3), Random()), grid=grid)

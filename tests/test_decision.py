@@ -367,6 +367,9 @@ def test_a_search_may_end_by_price(image):
     script = [(cells(c5=0.9), 0.6), (cells(c5=0.99), 0.97)]
     assert agent(Scripted(*script)).search(image, "red", start=0, price=0.02).cells.tolist() == [0, 5]
     assert agent(Scripted(*script)).search(image, "red", start=0, price=0.9).decision.outcome == "found"
+    for price in ("a", -0.1, True):
+        with pytest.raises(InputError, match="price: expected 0 or more"):
+            agent(Scripted(*script)).search(image, "red", price=price)
     for observer, options in ((Scripted(*script), {"confirm": 0.5}), (Semantic(3), {})):
         with pytest.raises(InputError, match="price: expected None"):
             agent(observer).search(image, "red", price=0.1, **options)

@@ -163,7 +163,7 @@ def test_only_a_learned_map_tells_what_a_look_will_bring(image):
     assert agent.explore(image, shifts=50).ending == "cells"
 
 
-@pytest.mark.parametrize("until", [-0.1, math.inf, math.nan])
+@pytest.mark.parametrize("until", [-0.1, math.inf, math.nan, "0.1", True, [0.1], 10**400])
 def test_prices_that_make_no_sense_are_refused(model, image, until):
     with pytest.raises(InputError, match="until: expected a price in cells, 0 or more"):
         agent_of(model).explore(image, until=until)

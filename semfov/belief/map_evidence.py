@@ -11,6 +11,7 @@ from semfov.belief.evidence import READOUT, Evidence, Gathered, blur, logarithm,
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import FEATURES, class_features
 from semfov.detection.detections import Detections
+from semfov.errors import check_whole
 from semfov.io.schema import Field, Number, Pair, Schema, perceptron
 
 _EMPTINESS = 9
@@ -66,6 +67,12 @@ class MapEvidence(Evidence):
         components: int = 81,
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
+        for name, value, least in (
+            ("look_width", look_width, 1),
+            ("readout_width", readout_width, 1),
+            ("components", components, 3),
+        ):
+            check_whole(value, name, least, 10_000)
         super().__init__(look_width, readout_width, components=components, more=1, metadata=metadata)
         self.void = network(_EMPTINESS, readout_width)
         self.worth = network(_GAIN, readout_width)

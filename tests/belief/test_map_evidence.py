@@ -280,3 +280,11 @@ def test_shipped_maps_load(name):
 
 def test_a_map_is_shipped():
     assert (MapEvidence.shipped / "yolox-nano.safetensors").is_file()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("look_width", 0), ("readout_width", 0), ("components", 2), ("components", 3.0)]
+)
+def test_sizes_that_cannot_be_are_refused(name, value):
+    with pytest.raises(InputError, match=f"{name}: expected a whole number"):
+        MapEvidence(**{name: value})
