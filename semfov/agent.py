@@ -12,7 +12,7 @@ from semfov.belief.context import ContextPrior
 from semfov.belief.grid import Grid
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
-from semfov.belief.target_evidence import TargetEvidence, Thresholds
+from semfov.belief.target_evidence import TargetEvidence
 from semfov.decision import conclude, decide, decide_by_price
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
@@ -243,11 +243,7 @@ class ActivePerception(nn.Module):
         chosen = self.searching.observer.thresholds
         if price is not None and (chosen is None or confirm is not None or give_up is not None):
             raise InputError("price: expected None, with thresholds or for a belief that tells no presence")
-        thresholds = None
-        if chosen is not None:
-            thresholds = Thresholds(
-                chosen.confirm if confirm is None else confirm, chosen.give_up if give_up is None else give_up
-            )
+        thresholds = None if chosen is None else chosen.changed(confirm, give_up)
 
         def outcome(step: Step) -> Tensor:
             if goal is not None:

@@ -33,6 +33,10 @@ class Thresholds:
     confirm: float
     give_up: float
 
+    def changed(self, confirm: float | None, give_up: float | None) -> "Thresholds":
+        """The same with those that are given in their place."""
+        return Thresholds(self.confirm if confirm is None else confirm, self.give_up if give_up is None else give_up)
+
 
 class TargetEvidence(Evidence):
     r"""Probability that a cell, and the image, holds the target: learned from looks at photographs with boxes.

@@ -67,11 +67,10 @@ class DecisionRun(Run):
         evidence = self.models.evidence
         assert evidence is not None
         chosen = evidence.thresholds or Thresholds(0.9, 0.05)
-        self.thresholds = Thresholds(
-            chosen.confirm if config.confirm is None else config.confirm,
-            chosen.give_up if config.give_up is None else config.give_up,
-        )
-        learned, random = Strategy(Target(evidence), NonPredictive()), Strategy(Target(evidence), Random())
+        self.thresholds = chosen.changed(config.confirm, config.give_up)
+        # One observer, so that all weigh the looks once.
+        observer = Target(evidence)
+        learned, random = Strategy(observer, NonPredictive()), Strategy(observer, Random())
         by_thresholds = partial(decide, thresholds=self.thresholds)
         self.compared: dict[str, tuple[Strategy, Rule]] = {
             "target-evidence": (learned, by_thresholds),
@@ -114,8 +113,8 @@ class DecisionRun(Run):
                 "sharp": float(highest_score(sharp, target)),
                 "tiled": max(float(highest_score(seen, target)) for seen in (sharp, *tiles)),
             }
+            looks = StoredLooks(detections, grid, torch.tensor([target]))
             for name, (strategy, rule) in self.compared.items():
-                looks = StoredLooks(detections, grid, torch.tensor([target]))
                 with torch.inference_mode():
                     steps = self._search(strategy, rule, looks, cell, noise, target)
                 last, seen = steps[-1], torch.cat([step.cell for step in steps])

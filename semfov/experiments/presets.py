@@ -37,7 +37,6 @@ def presets(task: Task) -> dict[str, PolicyConfig]:
         best, published = PolicyConfig(TARGET_EVIDENCE), PolicyConfig("predictive", "calibrated")
         scored = {name: PolicyConfig(name) for name in policy_names("search") if name not in alone}
     else:
-        alone = {}
         best, published = PolicyConfig("closer-look", "learned"), PolicyConfig("kl", "calibrated")
         scored = {name: PolicyConfig(name) for name in policy_names("exploration") if not POLICIES[name].needs_map}
         scored |= {name: PolicyConfig(SALIENCY, saliency=name) for name in SALIENCY_MODELS}

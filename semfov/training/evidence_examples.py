@@ -109,10 +109,11 @@ class ExampleLooks(Looks):
             known.target[episodes],
             self.grid.columns,
         )
-        return Sight(look, _no_detections, {})
+        return Sight(look, no_detections, {})
 
 
-def _no_detections() -> Detections:
+def no_detections() -> Detections:
+    """What examples have of detections: none, only what was made of them."""
     raise NotImplementedError("examples keep no detections")
 
 

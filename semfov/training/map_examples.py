@@ -12,12 +12,11 @@ from semfov.belief.grid import Grid
 from semfov.belief.look_features import class_features, highest_score
 from semfov.belief.observers import LearnedMap, MapLook, Observer
 from semfov.belief.observers.base import own
-from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight
 from semfov.errors import DataError
 from semfov.experiments.seeds import generator_for
 from semfov.metrics.exploration import answers_of
-from semfov.training.evidence_examples import LookingRun
+from semfov.training.evidence_examples import LookingRun, no_detections
 
 
 @dataclass(frozen=True)
@@ -74,11 +73,7 @@ class MapExampleLooks(Looks):
             self.grid.columns,
             known.stands_for[episodes],
         )
-        return Sight(look, _no_detections, {})
-
-
-def _no_detections() -> Detections:
-    raise NotImplementedError("examples keep no detections")
+        return Sight(look, no_detections, {})
 
 
 def make_map_examples(run: LookingRun, classes: int, others: int, seed: int) -> MapExamples:

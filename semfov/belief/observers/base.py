@@ -1,12 +1,12 @@
 """What an observer is: it turns looks into a belief."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar, Self, TypeVar
 
 from torch import Tensor, nn
 
-from semfov.belief.belief import Belief
+from semfov.belief.belief import Belief, one_by_one
 from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
@@ -69,6 +69,22 @@ class Observer(nn.Module, ABC):
     ) -> Belief:
         """`update` by what `weigh` makes of the looks."""
         return self.update(belief, self.weigh(detections, fixation, grid, target))
+
+
+class Gatherer(Observer):
+    """Base of the observers that weigh what all looks say by networks.
+
+    Args:
+        together: compute all episodes of a batch at once: faster, but how figures are rounded depends on the batch.
+    """
+
+    def __init__(self, together: bool) -> None:
+        super().__init__()
+        self.together = together
+
+    def each(self, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
+        """`function` of the rows of tensors `(B, ...)`, each alone (`one_by_one`) or all at once."""
+        return function(*rows) if self.together else one_by_one(function, *rows)
 
 
 def own(value: object, kind: type[Kind], argument: str) -> Kind:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import Belief, one_by_one, pick
+from semfov.belief.belief import Belief, pick
 from semfov.belief.evidence import Gathered, nearness
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
 from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.observers.base import Look, Observer, own
+from semfov.belief.observers.base import Gatherer, Look, own
 from semfov.detection.detections import Detections
 
 
@@ -90,7 +90,7 @@ class MapBelief(Belief):
         return MapBelief(*map(function, (self.probabilities, self.closest, *gathered)))
 
 
-class LearnedMap(Observer):
+class LearnedMap(Gatherer):
     """Gathers evidence for all classes as `MapEvidence` learned to: the closest look at each cell counts most.
 
     Args:
@@ -99,9 +99,8 @@ class LearnedMap(Observer):
     """
 
     def __init__(self, model: MapEvidence, *, together: bool = False) -> None:
-        super().__init__()
+        super().__init__(together)
         self.model = model
-        self.together = together
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> MapBelief:
         """The same for every class in every cell, and nothing gathered."""
@@ -121,7 +120,7 @@ class LearnedMap(Observer):
             return self.model(Detections(boxes, scores, mask), point, grid, targets)
 
         rows = detections.boxes, detections.scores, detections.mask, fixation
-        said = evidence(*rows) if self.together else one_by_one(evidence, *rows)
+        said = self.each(evidence, *rows)
         every = targets.expand(len(fixation), -1)
         where = grid.distance(fixation), highest_score(detections, targets), grid.cell_of(fixation)
         return MapLook(said, *where, every, grid.columns, torch.ones_like(every))
@@ -132,13 +131,13 @@ class LearnedMap(Observer):
         nearest = torch.where((said.distance < known.closest)[:, None], said.evidence, known.nearest)
         best = torch.maximum(said.evidence, known.best)
         closest = torch.minimum(said.distance, known.closest)
-        near = self._each(nearness, said.distance)
+        near = self.each(nearness, said.distance)
         total, weight = known.total + near[:, None] * said.evidence, known.weight + near
         score, looks = torch.maximum(said.score, known.score), known.looks + 1
         visited = known.visited.scatter(-1, said.fixated[:, None], True)
         mean = total / weight[:, None]
         gathered = nearest, best, mean, closest, score, looks, visited, said.targets, said.stands_for
-        probabilities = self._each(lambda *rows: self._read(*rows, columns=said.columns), *gathered)
+        probabilities = self.each(lambda *rows: self._read(*rows, columns=said.columns), *gathered)
         return MapBelief(probabilities, closest, nearest, best, total, weight, score, looks, visited)
 
     def _read(
@@ -174,6 +173,3 @@ class LearnedMap(Observer):
         cells = self.model.log_odds(rows, columns, classes)
         nothing = self.model.emptiness(cells, closest, looks, columns, stands_for)
         return torch.cat([nothing[:, None], cells], 1).sigmoid().transpose(1, 2)
-
-    def _each(self, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-        return function(*rows) if self.together else one_by_one(function, *rows)

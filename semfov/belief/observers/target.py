@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import Belief, one_by_one
+from semfov.belief.belief import Belief
 from semfov.belief.evidence import Gathered, nearness
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
-from semfov.belief.observers.base import Look, Observer, own
+from semfov.belief.observers.base import Gatherer, Look, own
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
@@ -99,7 +99,7 @@ class TargetBelief(Belief):
         return TargetBelief(*map(function, (*told, *gathered)))
 
 
-class Target(Observer):
+class Target(Gatherer):
     """Gathers evidence for the target as `TargetEvidence` learned to: the closest look at each cell counts most.
 
     Args:
@@ -110,9 +110,8 @@ class Target(Observer):
     by_target = True
 
     def __init__(self, model: TargetEvidence, *, together: bool = False) -> None:
-        super().__init__()
+        super().__init__(together)
         self.model = model
-        self.together = together
 
     @property
     def thresholds(self) -> Thresholds | None:
@@ -142,7 +141,7 @@ class Target(Observer):
         nearest = torch.where(closer, said.evidence, known.nearest)
         best = torch.maximum(said.evidence, known.best)
         closest = torch.minimum(said.distance, known.closest)
-        near = self._each(nearness, said.distance)
+        near = self.each(nearness, said.distance)
         total, weight = known.total + near * said.evidence, known.weight + near
         score, looks = torch.maximum(said.score, known.score), known.looks + 1
 
@@ -156,10 +155,7 @@ class Target(Observer):
             return torch.cat([cells, self.model.chance(what, columns), image], -1).sigmoid()
 
         gathered = nearest, best, total / weight, closest, score, looks, visited, said.target
-        told = self._each(probabilities, *gathered)
+        told = self.each(probabilities, *gathered)
         number = nearest.shape[-1]
         present, following, anywhere = told[:, :number], told[:, number:-1], told[:, -1]
         return TargetBelief(present, following, anywhere, closest, nearest, best, total, weight, score, looks, visited)
-
-    def _each(self, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-        return function(*rows) if self.together else one_by_one(function, *rows)
