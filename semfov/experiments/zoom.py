@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -168,7 +168,7 @@ class ZoomRun:
         yield "quad-tree, best first", quad_tree(glances, target, most=False)
         yield "ours", (glance for glance, _ in find_everything(glances, self.evidence, target))
         yield "ours, four at a time", (g for g, _ in find_everything(glances, self.evidence, target, batch=4))
-        found: Callable[[Glance], Tensor] = lambda glance: self.found([glance], annotation)  # noqa: E731
+        found: Callable[[Glance], Tensor] = lambda glance: found_in([glance], annotation, target)  # noqa: E731
         every = [*half_steps(glances.lattice)][1:]
         yield "oracle", oracle(glances, [*every, *cut], found, self.config.passes)
 
@@ -180,19 +180,11 @@ class ZoomRun:
         kept = annotation.labels == self.target
         return Annotation(annotation.boxes[kept], annotation.labels[kept], annotation.crowd[kept], annotation.size)
 
-    def found(self, looks: list[Glance], annotation: Annotation) -> Tensor:
-        """Which objects some looks find, `(M,)`: their merged boxes with a score of 0.1 and an overlap of 0.5."""
-        objects = merge(looks, self.target, score=FOUND)
-        if not len(objects):
-            return torch.zeros(len(annotation.boxes), dtype=torch.bool)
-        hits = (box_iou(objects.boxes, annotation.boxes) >= 0.5) & (objects.labels[:, None] == annotation.labels)
-        return hits.any(0)
-
     def _recall(self, name: str, index: int, looks: Iterator[Glance]) -> Record:
         annotation, seen, counts = self.annotation(index), [], []
         for glance in islice(looks, self.config.passes):
             seen.append(glance)
-            counts.append(int(self.found(seen, annotation).sum()))
+            counts.append(int(found_in(seen, annotation, self.target).sum()))
         boxes = len(merge(seen, self.target, score=FOUND))
         return {
             "measure": "recall",
@@ -238,3 +230,12 @@ class ZoomRun:
                     }
                 )
         return records
+
+
+def found_in(looks: Sequence[Glance], annotation: Annotation, target: int | None = None) -> Tensor:
+    """Which objects some looks find, `(M,)`: their merged boxes with a score of 0.1 and an overlap of 0.5."""
+    objects = merge(looks, target, score=FOUND)
+    if not len(objects):
+        return torch.zeros(len(annotation.boxes), dtype=torch.bool)
+    hits = (box_iou(objects.boxes, annotation.boxes) >= 0.5) & (objects.labels[:, None] == annotation.labels)
+    return hits.any(0)

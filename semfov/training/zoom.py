@@ -20,17 +20,17 @@ from semfov.experiments.parallel import available_cores, run_tasks
 from semfov.experiments.run import cache_folder
 from semfov.experiments.settings import Count, Seed, Settings, Workers
 from semfov.experiments.setup import make_detector, prepare_worker
-from semfov.experiments.zoom import Tile
+from semfov.experiments.summary import table as table_of
+from semfov.experiments.zoom import SHOWN, Tile
+from semfov.experiments.zoom_store import GlanceStore
 from semfov.io.files import inside
 from semfov.training.outputs import training_of, write_outputs
+from semfov.training.zoom_choice import choose
 from semfov.training.zoom_examples import LookedAt, MosaicStore, ZoomExample, look_at_mosaic, pack, unpack
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
 from semfov.zoom.eye import ZoomEye
 from semfov.zoom.lattice import Lattice
-
-SHOWN = 0.3
-"""Score from which on a look shows a class."""
 
 _log = logging.getLogger(__name__)
 
@@ -44,7 +44,8 @@ class FitZoomConfig(Settings):
         detector: which detector looks.
         mosaics: mosaics of 4 × 4 photographs.
         far: mosaics of 8 × 6 photographs, in which objects are half as large.
-        judged: mosaics of 4 × 4 photographs that were held out.
+        judged: mosaics of 4 × 4 photographs that were held out, to judge the fit and to choose by.
+        judged_far: mosaics of 8 × 6 photographs that were held out, to choose by.
         tile: width of a photograph's slot in pixels; three quarters of it is the height.
         steps: of each fit.
         seed: of mosaics and fit.
@@ -58,6 +59,7 @@ class FitZoomConfig(Settings):
     mosaics: Count = 400
     far: Count = 40
     judged: Count = 80
+    judged_far: Count = 4
     tile: Tile = 480
     steps: Count = 800
     seed: Seed = 0
@@ -102,6 +104,7 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
         "near": Mosaics(kept, 4, 4, tile=tile, count=config.mosaics, seed=config.seed),
         "far": Mosaics(kept, 8, 6, tile=tile, count=config.far, seed=config.seed + 1),
         "judged": Mosaics(held, 4, 4, tile=tile, count=config.judged, seed=config.seed + 2),
+        "judged far": Mosaics(held, 8, 6, tile=tile, count=config.judged_far, seed=config.seed + 3),
     }
 
 
@@ -311,7 +314,8 @@ def fit_zoom(config: FitZoomConfig) -> None:
     eye = make_eye(config)
     mosaics = make_mosaics(config, eye.detector.classes)
     store = make_store(config, eye)
-    todo = [(kind, n) for kind, some in mosaics.items() for n in range(len(some)) if store.read(some.digest(n)) is None]
+    looked = {kind: some for kind, some in mosaics.items() if kind != "judged far"}
+    todo = [(kind, n) for kind, some in looked.items() for n in range(len(some)) if store.read(some.digest(n)) is None]
     workers = config.workers or available_cores()
     for _ in run_tasks(look, todo, workers=workers, setup=prepare_process, settings=(config,), title="looking",
                        unit="mosaic"):  # fmt: skip
@@ -319,16 +323,20 @@ def fit_zoom(config: FitZoomConfig) -> None:
     prepare_worker()
     torch.manual_seed(config.seed)
     random.seed(config.seed)
-    examples = {kind: read_examples(some, store, eye) for kind, some in mosaics.items()}
+    examples = {kind: read_examples(some, store, eye) for kind, some in looked.items()}
     metadata = {**eye.settings(), **training_of(config, mosaics["near"], "judged")}
     model = GlimpseEvidence(len(eye.detector.classes), metadata=metadata)
     known = examples["near"] + examples["far"]
     fit_presence(model, table(known), config.steps)
     fit_rates(model, known, config.steps)
-    model.eval()
+    model.eval().requires_grad_(False)
+    glances = GlanceStore(cache_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
+    tried = choose(model, eye, mosaics["judged"], mosaics["judged far"], glances)
     path = inside(config.out, f"{eye.detector.name}.safetensors")
     model.save(path)
     text, figures = judge(model, examples["judged"])
+    chosen = f"Chosen: foresight {model.foresight:g}, patience {model.patience:g}."
+    text = "\n".join([text, chosen, "", *table_of(tried), ""])
     write_outputs(config, text, ("figures.json", figures), path)
 
 

@@ -1,5 +1,7 @@
 """What looks at a picture say of where closer looks pay."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -9,7 +11,26 @@ from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 
-_LEFT = 0.05  # of what was expected in the middle of a window stays after it was looked at as closely
+
+@dataclass(frozen=True)
+class _Table:
+    """What a look says of the windows of a level, and what that was computed from.
+
+    Attributes:
+        left: `(rows, columns)`, what was left to see in the cells of the look.
+        pooled: `(N, K)`, strongest hints in each window.
+        summary: `(N, 3)`, of all hints in it.
+        before: `(N, 1)`, what looks from farther off said.
+        odds: `(N,)`.
+        changes: that were known of.
+    """
+
+    left: Tensor
+    pooled: Tensor
+    summary: Tensor
+    before: Tensor | None
+    odds: Tensor
+    changes: int
 
 
 class ZoomBelief:
@@ -34,33 +55,42 @@ class ZoomBelief:
         self.left = torch.ones(shape)
         self.gists: list[Gist] = []
         self._odds: dict[int, Tensor] = {}
+        self._changes: list[tuple[int, int, int, int]] = []
+        self._tables: dict[tuple[int, tuple[int, int], int], _Table] = {}
         self._told: dict[Window, float] = {}
 
-    def forget(self) -> None:
-        """Compute odds anew: what was looked at has changed."""
+    def restore(self, left: Tensor) -> None:
+        """Go back to what was left to see before windows were discounted."""
+        rows, columns = ((left != self.left).any(axis).nonzero()[:, 0] for axis in (1, 0))
+        if len(rows):
+            self._touch(int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
+        self.left = left
+
+    def _touch(self, x1: int, y1: int, x2: int, y2: int) -> None:
+        """Something has changed in these cells."""
         self._odds.clear()
+        self._changes.append((x1, y1, x2, y2))
 
     def add(self, glance: Glance) -> None:
         """Take account of a look."""
         window, look = glance.window, glance.gist
-        self.forget()
         if look is not None:
             self._spread(look)
             self.gists.append(look)
             self._told.clear()
+            self._touch(*window.cells)
         else:
             self.discount(window)
 
     def discount(self, window: Window) -> None:
-        """Expect no more of what a window shows well: it was looked at, or is about to be."""
+        """Expect no more of what a window shows: it was looked at, or is about to be.
+
+        That holds to its borders. What they cut is centred in the next window as often as in this one, and windows that
+        look at borders again find less than windows where nobody looked.
+        """
         x1, y1, x2, y2 = window.cells
-        rows, columns = slice(max(y1, 0), max(y2, 0)), slice(max(x1, 0), max(x2, 0))
-        across, down = self.evidence.taper(x2 - x1).detach(), self.evidence.taper(y2 - y1).detach()
-        seen = down[max(-y1, 0) :, None] * across[None, max(-x1, 0) :]
-        left = self.left[rows, columns]
-        share = 1 - (1 - _LEFT) * seen[: left.shape[0], : left.shape[1]]
-        self.left[rows, columns] = torch.minimum(left, share) if window.within is None else left * _LEFT
-        self.forget()
+        self.left[max(y1, 0) : max(y2, 0), max(x1, 0) : max(x2, 0)] = 0
+        self._touch(x1, y1, x2, y2)
 
     def _spread(self, look: Gist) -> None:
         """Rates of a look on the cells that were not looked at as closely before."""
@@ -107,15 +137,15 @@ class ZoomBelief:
             left, top = look.first
             shape = look.scores.shape[:2]
             high, wide = (max(n - span, 0) + 1 for n in shape)
-            scores = look.scores * self._left_of(look)[..., None]
-            pooled, summary = pool_all(scores, span)
             row = (top + torch.arange(high) * look.scale).clamp(max=down - 1)
             column = (left + torch.arange(wide) * look.scale).clamp(max=across - 1)
-            known = result[row[:, None], column]
-            before = None if look.level == 0 else known.reshape(-1, 1).nan_to_num(neginf=-4.0)
-            with torch.no_grad():
-                told = self.evidence.presence(pooled, summary, torch.full((high * wide,), steps), self.target, before)
-            table = told.view(high, wide)
+            kept = self._tables.get((look.level, look.first, level))
+            if kept is None or self._touched(look, kept.changes):
+                known = result[row[:, None], column]
+                before = None if look.level == 0 else known.reshape(-1, 1).nan_to_num(neginf=-4.0)
+                kept = self._tell(look, level, before, kept)
+                self._tables[look.level, look.first, level] = kept
+            table = kept.odds.view(high, wide)
             if look.scale > 1:
                 # Windows between the places that a coarse look tells go by the place before them.
                 table = table.repeat_interleave(look.scale, 0).repeat_interleave(look.scale, 1)
@@ -125,6 +155,41 @@ class ZoomBelief:
                 result[row[:, None], column] = table
         self._odds[level] = result
         return result
+
+    def _touched(self, look: Gist, since: int) -> bool:
+        """Whether something has changed in the cells of a look, after so many changes."""
+        left, top = look.first
+        bottom, right = (n * look.scale + low for n, low in zip(look.scores.shape[:2], (top, left), strict=True))
+        return any(x1 < right and y1 < bottom and x2 > left and y2 > top for x1, y1, x2, y2 in self._changes[since:])
+
+    @torch.no_grad()
+    def _tell(self, look: Gist, level: int, before: Tensor | None, kept: _Table | None) -> _Table:
+        """What a look says of all windows of a level in it; anew only of those in which something changed."""
+        part, span = self._left_of(look), self.lattice.span(level) // look.scale
+        steps, changes = torch.tensor([level - look.level]), len(self._changes)
+        if kept is None:
+            pooled, summary = pool_all(look.scores * part[..., None], span)
+            odds = self.evidence.presence(pooled, summary, steps.expand(len(pooled)), self.target, before)
+            return _Table(part, pooled, summary, before, odds, changes)
+        pooled, summary, odds = kept.pooled, kept.summary, kept.odds
+        stale = torch.zeros(len(odds), dtype=torch.bool)
+        changed = part != kept.left
+        if bool(changed.any()):
+            high, wide = (max(n - span, 0) + 1 for n in part.shape)
+            rows, columns = _reach(changed.any(1), span, high), _reach(changed.any(0), span, wide)
+            here = slice(rows.start, rows.stop + span - 1), slice(columns.start, columns.stop + span - 1)
+            best, crowd = pool_all((look.scores * part[..., None])[here], span)
+            shape = rows.stop - rows.start, columns.stop - columns.start
+            for whole, new in ((pooled, best), (summary, crowd)):
+                whole.view(high, wide, -1)[rows, columns] = new.reshape(*shape, -1)
+            stale.view(high, wide)[rows, columns] = True
+        if before is not None and kept.before is not None:
+            stale |= (before != kept.before)[:, 0]
+        if bool(stale.any()):
+            some = None if before is None else before[stale]
+            times = steps.expand(int(stale.sum()))
+            odds[stale] = self.evidence.presence(pooled[stale], summary[stale], times, self.target, some)
+        return _Table(part, pooled, summary, before, odds, changes)
 
     def _left_of(self, look: Gist) -> Tensor:
         """What is left to see in the cells of a look, `(rows, columns)`: 0 where they were looked at closely."""
@@ -161,6 +226,12 @@ class ZoomBelief:
                 )  # fmt: skip
         self._told[window] = float("-inf") if value is None else float(value)
         return self._told[window]
+
+
+def _reach(changed: Tensor, span: int, most: int) -> slice:
+    """Which of `most` places along a line hold a changed cell, each `span` cells wide."""
+    places = changed.nonzero()[:, 0]
+    return slice(max(int(places[0]) - span + 1, 0), min(int(places[-1]) + 1, most))
 
 
 def before_of(rate: Tensor, source: Tensor, look: Gist) -> Tensor:

@@ -82,7 +82,7 @@ class GlimpseEvidence(Pretrained):
         width: int = 64,
         *,
         patience: float = 2.3,
-        foresight: float = 0.0,
+        foresight: float = 0.35,
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
@@ -240,13 +240,23 @@ def pool_all(scores: Tensor, span: int) -> tuple[Tensor, Tensor]:
     A side shorter than that is one window.
     """
     high, wide = (min(span, n) for n in scores.shape[:2])
-    image = scores.movedim(-1, 0)
-    top = F.max_pool2d(F.max_pool2d(image, (1, wide), 1), (high, 1), 1)
+    top = _slide(_slide(scores, 0, high), 1, wide)
     best = scores.amax(-1)
     parts = torch.stack([best, (best > 0).to(best), (best > 0.02).to(best)])
     area = torch.tensor([1.0, 1 / (high * wide), 1.0])[:, None, None]
     sums = F.avg_pool2d(parts, (high, wide), 1) * (high * wide) * area
-    return top.flatten(1).mT, sums.flatten(1).mT
+    return top.flatten(0, 1), sums.flatten(1).mT
+
+
+def _slide(values: Tensor, axis: int, width: int) -> Tensor:
+    """Largest of every `width` neighbours along an axis, by windows that double: many times faster than pooling."""
+    have = 1
+    while have < width:
+        step = min(have, width - have)
+        length = values.shape[axis] - step
+        values = torch.maximum(values.narrow(axis, 0, length), values.narrow(axis, step, length))
+        have += step
+    return values
 
 
 def _summary(best: Tensor) -> Tensor:

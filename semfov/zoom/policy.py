@@ -19,7 +19,8 @@ def best_find(belief: ZoomBelief, done: set[Window], foresight: float = 0.0) -> 
 
     .. math:: v(w) = E[n_k(w)] + \\kappa \\, E[n_{k+1}(w)]
 
-    for windows w of all levels k but the first; κ is the `foresight`.
+    for windows w of all levels k but the first; κ is the `foresight`. The second term counts cells alone that were not
+    looked at from level k yet: a look at the others tells nothing new of where to look closer.
     """
     lattice = belief.lattice
     best: Choice | None = None
@@ -34,7 +35,7 @@ def best_find(belief: ZoomBelief, done: set[Window], foresight: float = 0.0) -> 
 def _deeper(belief: ZoomBelief, level: int) -> Tensor:
     """What looks one octave closer would find in each window of a level."""
     span = belief.lattice.span(level)
-    image = belief.expected(level + 1)[None, None]
+    image = (belief.expected(level + 1) * (belief.source < level))[None, None]
     wide, high = (max(span - n, 0) for n in (belief.lattice.columns, belief.lattice.rows))
     line = torch.ones(1, 1, 1, span)
     return F.conv2d(F.conv2d(F.pad(image, (0, wide, 0, high)), line), line.mT)[0, 0]
@@ -161,6 +162,5 @@ def jointly(
         chosen.append(choice)
         taken.add(choice[0])
         belief.discount(choice[0])
-    belief.left = left
-    belief.forget()
+    belief.restore(left)
     return chosen

@@ -45,12 +45,23 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
     figures = json.loads((tmp_path / "out" / "figures.json").read_text())
     assert all(map(math.isfinite, figures.values()))
     assert (tmp_path / "out" / "report.md").read_text() in capsys.readouterr().out
+    recalls, passes = tried((tmp_path / "out" / "report.md").read_text())
+    near, far = (max(max(values), 1e-9) for values in zip(*recalls.values(), strict=True))
+    assert model.foresight == max(recalls, key=lambda value: recalls[value][0] / near + recalls[value][1] / far)
+    assert model.patience == min(passes, key=passes.get)
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     # Looks come from the store, and a fit of the same seed is the same.
     monkeypatch.setattr(Bright, "propose", None)
     fit_zoom(config)
     again = GlimpseEvidence.from_pretrained(tmp_path / "out" / "bright.safetensors")
     assert all(torch.equal(before[name], tensor) for name, tensor in again.state_dict().items())
+
+
+def tried(report):
+    """Recalls by foresight, and passes by patience, from the table of a report."""
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line.startswith("|")]
+    recalls = {float(row[1]): (float(row[2]), float(row[3])) for row in rows if row[0] == "foresight"}
+    return recalls, {float(row[1]): float(row[4]) for row in rows if row[0] == "patience"}
 
 
 def test_examples_come_back_from_a_file(tmp_path):

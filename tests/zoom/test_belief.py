@@ -7,6 +7,7 @@ from semfov.zoom import GlimpseEvidence, ZoomEye
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.evidence import pool, pool_all
 from semfov.zoom.glances import LiveGlances, on_lattice
+from semfov.zoom.lattice import CELLS
 from semfov.zoom.policy import best_find, best_hit, jointly
 
 
@@ -67,6 +68,49 @@ def test_a_window_that_was_seen_is_worth_less(belief, glances):
     before = belief.finds(lattice.levels - 1)[window.cells[1], window.cells[0]].clone()
     belief.add(glances.see([finest])[0])
     assert belief.finds(lattice.levels - 1)[window.cells[1], window.cells[0]] < before
+    assert value > 0
+
+
+def test_nothing_is_expected_where_the_eye_looked_closest(belief, glances):
+    """To the borders: what they cut is expected of the next window."""
+    lattice = belief.lattice
+    finest = lattice.levels - 1
+    belief.add(glances.see([on_lattice(lattice, (finest, 5, 7))])[0])
+    expected = belief.expected(finest)
+    assert (expected[7 : 7 + CELLS, 5 : 5 + CELLS] == 0).all()
+    assert (expected[7 : 7 + CELLS, 5 + CELLS : -1] > 0).all()
+
+
+def test_odds_that_are_kept_are_those_computed_anew(belief, glances, evidence):
+    """After looks of all levels in any order, and plans that were dropped."""
+    lattice, generator = belief.lattice, torch.Generator().manual_seed(5)
+    seen = glances.see([on_lattice(lattice, (0, 0, 0))])
+    for turn in range(25):
+        action = lattice.actions[int(torch.randint(len(lattice), (1,), generator=generator))].tolist()
+        seen += glances.see([on_lattice(lattice, tuple(action))])
+        belief.add(seen[-1])
+        jointly(lambda taken: best_hit(belief, taken), belief, set(), 1 + turn % 3)
+        if turn % 4 == 0:
+            anew = ZoomBelief(lattice, evidence, 1)
+            for glance in seen:
+                anew.add(glance)
+            for level in range(1, lattice.levels):
+                torch.testing.assert_close(belief.odds(level), anew.odds(level))
+
+
+def test_foresight_counts_cells_alone_that_were_not_looked_at_as_closely(belief, glances):
+    lattice = belief.lattice
+    done = {on_lattice(lattice, (0, 0, 0))}
+    # All of the first level was looked at: a look at it again promises nothing beyond what it finds itself.
+    across, down = lattice.places(1)
+    for row in range(0, down, lattice.span(1) // 2):
+        for column in range(0, across, lattice.span(1) // 2):
+            window = on_lattice(lattice, (1, column, row))
+            belief.add(glances.see([window])[0])
+            done.add(window)
+    assert (belief.source >= 1).all()
+    window, value = best_find(belief, done, foresight=1.0)
+    assert window.level > 1
     assert value > 0
 
 
