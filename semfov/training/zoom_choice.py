@@ -1,17 +1,19 @@
 """Choosing how evidence by magnification is gone by, on mosaics that were held out: `foresight` and `patience`."""
 
-from collections.abc import Iterator
+from collections.abc import Sequence
+from functools import partial
 from itertools import islice
 
 import torch
 from tqdm import tqdm
 
 from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Annotation
 from semfov.experiments.zoom import SHOWN, found_in
 from semfov.experiments.zoom_store import GlanceStore, StoredGlances
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import ZoomEye
-from semfov.zoom.glances import Glances, LiveGlances, around
+from semfov.zoom.glances import Glance, Glances, LiveGlances, Window, around
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.search import find_everything, look_for
 
@@ -37,62 +39,70 @@ def choose(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, far: Mosaics, st
     Returns:
         A table of what was tried.
     """
+    kinds = near, far
+    opened = [open_all(eye, mosaics, store) for mosaics in kinds]
+    objects = [[mosaics.annotation(n) for n in range(len(mosaics))] for mosaics in kinds]
     rows = [["setting", "value", "recall, near", "recall, far", "passes to the first hit"]]
     recalls: dict[float, list[float]] = {}
     for value in tqdm(FORESIGHTS, desc="choosing foresight", unit="value", dynamic_ncols=True):
         model.foresight = value
-        recalls[value] = [_recall(model, eye, mosaics, store) for mosaics in (near, far)]
+        recalls[value] = [
+            mean_recall(model, looks, annotations, len(mosaics.tiles(0)) + 1)
+            for looks, annotations, mosaics in zip(opened, objects, kinds, strict=True)
+        ]
         rows.append(["foresight", f"{value:g}", *(f"{recall:.4f}" for recall in recalls[value]), ""])
-    most = [max(values) for values in zip(*recalls.values(), strict=True)]
-    model.foresight = max(
-        recalls, key=lambda value: sum(r / max(m, 1e-9) for r, m in zip(recalls[value], most, strict=True))
-    )
+        for glances in (*opened[0], *opened[1]):
+            glances.save()
+    most = [max(*values, 1e-9) for values in zip(*recalls.values(), strict=True)]
+    share = {value: sum(r / m for r, m in zip(told, most, strict=True)) for value, told in recalls.items()}
+    model.foresight = max(share, key=share.__getitem__)
+    slots = [[around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened[0])]
     passes: dict[float, float] = {}
     for value in tqdm(PATIENCES, desc="choosing patience", unit="value", dynamic_ncols=True):
         model.patience = value
-        passes[value] = _first_hit(model, eye, near, store)
+        passes[value] = mean_passes(model, opened[0], slots)
         rows.append(["patience", f"{value:g}", "", "", f"{passes[value]:.3f}"])
+        for glances in opened[0]:
+            glances.save()
     model.patience = min(passes, key=passes.__getitem__)
     return rows
 
 
-def looks_at(eye: ZoomEye, mosaics: Mosaics, store: GlanceStore) -> Iterator[tuple[int, StoredGlances]]:
-    """Looks at each mosaic, kept when they were used."""
+def open_all(eye: ZoomEye, mosaics: Mosaics, store: GlanceStore) -> list[StoredGlances]:
+    """Looks at each mosaic."""
     lattice = Lattice.over(mosaics.size, eye.detector.input_size, finest=eye.finest)
-    for index in range(len(mosaics)):
 
-        def live(index: int = index) -> Glances:
-            return LiveGlances(eye, eye.open(mosaics[index].image))
+    def live(index: int) -> Glances:
+        return LiveGlances(eye, eye.open(mosaics[index].image))
 
-        glances = StoredGlances(lattice, live, store, mosaics.digest(index))
-        yield index, glances
-        glances.save()
+    return [StoredGlances(lattice, partial(live, n), store, mosaics.digest(n)) for n in range(len(mosaics))]
 
 
-def _recall(model: GlimpseEvidence, eye: ZoomEye, mosaics: Mosaics, store: GlanceStore) -> float:
+def mean_recall(
+    model: GlimpseEvidence, glances: Sequence[Glances], objects: Sequence[Annotation], passes: int
+) -> float:
     """Mean share of the objects of all mosaics that were found, over the passes."""
-    found, objects = 0, 0
-    passes = len(mosaics.tiles(0)) + 1
-    for index, glances in looks_at(eye, mosaics, store):
-        annotation, seen, count = mosaics.annotation(index), [], 0
-        looks = find_everything(glances, model)
-        for turn in range(passes):
-            for glance, _ in islice(looks, 1):
-                seen.append(glance)
+    found = 0
+    for looks, annotation in zip(glances, objects, strict=True):
+        seen: list[Glance] = []
+        path = find_everything(looks, model)
+        count = 0
+        for _ in range(passes):
+            glance = next(path, None)
+            if glance is not None:
+                seen.append(glance[0])
                 count = int(found_in(seen, annotation).sum())
             # Where nothing is left to look at, what was found stays.
             found += count
-            objects += len(annotation.boxes) if turn == 0 else 0
-    return found / max(objects * passes, 1)
+    return found / max(passes * sum(len(annotation.boxes) for annotation in objects), 1)
 
 
-def _first_hit(model: GlimpseEvidence, eye: ZoomEye, mosaics: Mosaics, store: GlanceStore) -> float:
+def mean_passes(model: GlimpseEvidence, glances: Sequence[Glances], slots: Sequence[Sequence[Window]]) -> float:
     """Mean passes until a photograph is looked at that shows a class, over the classes that one shows."""
     counts = []
-    for index, glances in looks_at(eye, mosaics, store):
-        slots = [around(glances.lattice, tuple(map(float, t.slot))) for t in mosaics.tiles(index)]  # type: ignore[arg-type]
-        shown = torch.stack([glance.show for glance in glances.see(slots)]) >= SHOWN
+    for looks, photographs in zip(glances, slots, strict=True):
+        shown = torch.stack([glance.show for glance in looks.see(photographs)]) >= SHOWN
         for target in (shown.any(0).nonzero()[:, 0] + 1).tolist():
-            looks = look_for(glances, model, target, slices=slots)
-            counts.append(sum(1 for _ in islice(looks, len(slots) + 1)))
+            path = look_for(looks, model, target, slices=photographs)
+            counts.append(sum(1 for _ in islice(path, len(photographs) + 1)))
     return sum(counts) / max(len(counts), 1)

@@ -36,7 +36,8 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Bright())
     config = FitZoomConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
-        mosaics=1, far=1, judged=1, tile=96, steps=3, out=tmp_path / "out", cache=tmp_path / "cache", workers=1,
+        mosaics=1, far=1, judged=1, judged_far=1, tile=96, steps=3,
+        out=tmp_path / "out", cache=tmp_path / "cache", workers=1,
     )  # fmt: skip
     fit_zoom(config)
     model = GlimpseEvidence.from_pretrained(tmp_path / "out" / "bright.safetensors")
@@ -46,7 +47,7 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
     assert all(map(math.isfinite, figures.values()))
     assert (tmp_path / "out" / "report.md").read_text() in capsys.readouterr().out
     recalls, passes = tried((tmp_path / "out" / "report.md").read_text())
-    near, far = (max(max(values), 1e-9) for values in zip(*recalls.values(), strict=True))
+    near, far = (max(*values, 1e-9) for values in zip(*recalls.values(), strict=True))
     assert model.foresight == max(recalls, key=lambda value: recalls[value][0] / near + recalls[value][1] / far)
     assert model.patience == min(passes, key=passes.get)
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
