@@ -45,12 +45,17 @@ def select(
     )
 
 
-def _check(image: int, confidence: Tensor, kept: Candidates) -> None:
-    """Raise `InputError` where a detector returns NaN, or for a box that is kept what is no score or no place."""
-    if not values_known(confidence, kept.boxes, kept.classes):
+def _check(image: int, confidence: Tensor, boxes: Tensor) -> None:
+    """Raise `InputError` where a detector returns NaN or infinity."""
+    if values_known(confidence, boxes):
+        check_finite(confidence.detach(), f"detector: confidence in image {image}")
+        check_finite(boxes.detach(), f"detector: boxes in image {image}")
+
+
+def _check_scores(image: int, kept: Candidates) -> None:
+    """Raise `InputError` where a box that is kept has a score outside [0, 1]."""
+    if not values_known(kept.classes):
         return
-    check_finite(confidence.detach(), f"detector: confidence in image {image}")
-    check_finite(kept.boxes.detach(), f"detector: boxes in image {image}")
     for name, scores in (("class scores", kept.classes), ("objectness", kept.objectness)):
         inside = scores is None or bool(((scores.detach() >= 0) & (scores.detach() <= 1)).all())
         check(inside, f"detector: {name} in image {image}", "numbers in [0, 1]", "some outside")
@@ -64,11 +69,15 @@ def _select_one(
     policy: BackgroundPolicy,
 ) -> Detections:
     confidence = candidates.confidence[image]
-    rows = candidates.take(image, (confidence >= selection.threshold).nonzero()[:, 0])
-    _check(image, confidence, rows)
-    boxes = rows.boxes if placement is None else placement.boxes_to_image(rows.boxes)
-    keep = suppress(boxes, rows.confidence, rows.classes.argmax(-1), selection)
-    scores = score_vectors(rows, policy)[keep]
+    index = (confidence >= selection.threshold).nonzero()[:, 0]
+    boxes = candidates.boxes[image, index]
+    _check(image, confidence, boxes)
+    boxes = boxes if placement is None else placement.boxes_to_image(boxes)
+    labels = candidates.classes[image, index].argmax(-1) if selection.per_class else index
+    keep = suppress(boxes, confidence[index], labels, selection)
+    rows = candidates.take(image, index[keep])
+    _check_scores(image, rows)
+    scores = score_vectors(rows, policy)
     # Suppression ranks by objectness times class; the shares of a vector can rank otherwise.
     order = scores[:, 1:].detach().amax(-1).argsort(descending=True, stable=True)
     return Detections(boxes[keep[order]][None], scores[order][None], torch.ones_like(keep, dtype=torch.bool)[None])

@@ -1,0 +1,100 @@
+"""What looking at a large picture costs beside the detector: `python -m benchmarks.zoom --weights yolox_nano_416.onnx`.
+
+Mosaics of embedded scenes are searched for a class and looked over for all objects. The detector alone, its boxes
+selected, then sees the same windows again, in the same repetition. What is left of a pass is reading and resampling the
+window, merging boxes and choosing where to look next.
+"""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from benchmarks.images import use_threads
+from benchmarks.machine import describe
+from benchmarks.tables import RESULTS, number, spread, table, write
+from benchmarks.timing import Clock, Run, Spread, clock_for, interleaved
+from semfov import EmbeddedScenes, ZoomAgent
+from semfov.data.large import to_bytes
+from semfov.data.mosaics import Mosaics
+from semfov.detection.selection import select
+from semfov.zoom.search import ZoomPath
+
+PASSES = 17
+SIZES = {"2560 × 1920 px": (4, 4), "3840 × 2880 px": (6, 6)}
+
+
+def programs(agent: ZoomAgent, columns: int, rows: int) -> dict[str, tuple[Run, Run, int]]:
+    """Every task: the agent's program, the detector's, and their passes."""
+    scenes = EmbeddedScenes(agent.classes[1:], count=16)
+    picture = to_bytes(Mosaics(scenes, columns, rows, tile=(640, 480), count=1)[0].image)
+    eye, detector = agent.eye, agent.eye.detector
+    view = eye.open(picture)
+
+    def alone(path: ZoomPath) -> Run:
+        fixations = torch.tensor([glance.window.fixation for glance in path.glances], dtype=torch.float64)
+        canvases = eye.glimpse(view, fixations)[0]
+
+        def run() -> object:
+            return [
+                select(detector.propose(canvas[None]), None, detector.selection, detector.background)
+                for canvas in canvases
+            ]
+
+        return run
+
+    tasks = {
+        "explore": lambda: agent.explore(picture, passes=PASSES, worth=0.0),
+        "search": lambda: agent.search(picture, "person", passes=PASSES, confirm=1.0, give_up=0.0),
+    }
+    return {name: (task, alone(path := task()), path.passes) for name, task in tasks.items()}
+
+
+def share(task: Run, detector: Run, seconds: float, clock: Clock) -> tuple[Spread, Spread, Spread]:
+    """Milliseconds of the task and of its detector, and what share of the task is not the detector."""
+    found = interleaved({"task": task, "detector": detector}, seconds, clock)
+    rest = [1 - theirs / ours for ours, theirs in zip(found["task"], found["detector"], strict=True)]
+    return Spread.of(found["task"]), Spread.of(found["detector"]), Spread.of(rest)
+
+
+@torch.inference_mode()
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure all rows and write the table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.zoom", description=__doc__.splitlines()[0])
+    parser.add_argument("--weights", help="ONNX file of YOLOX-nano")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=10.0, help="for each task, at least")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    options = parser.parse_args(arguments)
+    use_threads(options.threads)
+    clock, times = clock_for(options.threads)
+    agent = ZoomAgent.recommended("yolox-nano", weights=options.weights)
+    rows, figures = [], {}
+    for size, (columns, lines) in SIZES.items():
+        for name, (task, detector, passes) in programs(agent, columns, lines).items():
+            whole, alone, rest = share(task, detector, options.seconds, clock)
+            rows.append([f"{name}, {size}", number(whole.middle / passes), number(alone.middle / passes), spread(rest)])
+            figures[f"{name}, {size}"] = {"task": asdict(whole), "detector": asdict(alone), "rest": asdict(rest)}
+            print(" | ".join(rows[-1]), flush=True)
+    about = describe() | {"times": times}
+    head = ["task", "pass, ms", "detector, ms", "share of a pass that is not the detector"]
+    text = "\n".join(
+        [
+            "# Large pictures",
+            "",
+            f"Written by `python -m benchmarks.zoom`. YOLOX-nano, {PASSES} passes over mosaics of embedded scenes.",
+            "Medians over repetitions; shares with quartiles.",
+            "",
+            *(f"- {key}: {value}" for key, value in about.items()),
+            "",
+            table(head, rows),
+            "",
+        ]
+    )
+    write(options.out, "zoom", text, {"machine": about, "milliseconds": figures})
+
+
+if __name__ == "__main__":
+    main()
