@@ -100,8 +100,9 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
 
     # A box is suppressed by more confident ones alone, so the first survivors are those of the first boxes. Time grows
     # with the square of their number.
-    order, most = confidence.argsort(descending=True, stable=True), selection.limit
-    keep = survivors(order[: 2 * most])
-    if len(keep) < most and len(order) > 2 * most:
-        keep = survivors(order)
-    return full[keep[:most]]
+    order, first = confidence.argsort(descending=True, stable=True), 2 * selection.limit
+    keep = survivors(order[:first])
+    while len(keep) < selection.limit and first < len(order):
+        first *= 2
+        keep = survivors(order[:first])
+    return full[keep[: selection.limit]]
