@@ -300,7 +300,7 @@ class ActivePerception(nn.Module):
         """The image as a batch of one, and the grid over it."""
         image = image[None] if image.ndim == 3 else image
         check_shape(image, "image", 1, 3, None, None)
-        own = self.eye.sensor.sigma.dtype
+        own = self.eye.sensor.dtype
         check(image.dtype == own, "image", f"{own} as the agent is", image.dtype)
         check_pixels(image, "image")
         return image, Grid(self.columns, self.rows, (image.shape[-1], image.shape[-2]))

@@ -66,14 +66,14 @@ class LiveLooks(Looks):
 
     def __init__(self, eye: Eye, view: View, grid: Grid, target: int | None = None) -> None:
         self.eye, self.view, self.grid, self.target = eye, view, grid, target
-        self.like = view.bands.base
+        self.like = view.canvas
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """Foveate, detect and weigh."""
         watch = Stopwatch()
         canvases = self.eye.foveated(self.view, fixation)
         watch.lap("foveate")
-        detections = self.eye.detector.detect(canvases, self.view.placement)
+        detections = self.eye.detect(self.view, fixation, canvases)
         watch.lap("detect")
         look = observer.weigh(detections, fixation, self.grid, self.target)
         watch.lap("weigh")

@@ -336,7 +336,7 @@ def test_view_shows_what_the_sensor_shows_of_a_reference_image(growth):
     view = eye.open(picture)
     got = eye.foveated(view, gaze)
     shown, _ = eye.detector.fit(Foveation(60.0, growth=growth)(picture, gaze[None])[0])
-    scaled = foveate(view.bands, view.placement.points_to_canvas(gaze)[None], sigma=15.0, growth=growth)[0]
+    scaled = foveate(view.state.bands, view.placement.points_to_canvas(gaze)[None], sigma=15.0, growth=growth)[0]
     error, other = ((each - shown).square().mean().sqrt() for each in (got, scaled))
     assert error < 0.02
     # With growth 1 both are one picture, and may differ by a rounding.

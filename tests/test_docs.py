@@ -32,6 +32,12 @@ def test_guides_run(guide, tmp_path, monkeypatch):
         exec(compile(block, guide.name, "exec"), namespace)
 
 
+@pytest.mark.parametrize("what", ["policy", "observer", "sensor"])
+def test_guides_to_ones_own_show_the_whole_example(what):
+    example = (DOCS.parent / "examples" / f"own_{what}.py").read_text(encoding="utf-8")
+    assert f"```python\n{example}```" in (DOCS / "guides" / f"write_your_own_{what}.md").read_text(encoding="utf-8")
+
+
 def test_there_is_a_guide_for_every_room():
     rooms = {"sensor", "detection", "observation", "belief", "gaze", "evaluation"}
     assert {guide.stem for guide in GUIDES} >= rooms

@@ -1,7 +1,8 @@
 """The interface that every detector keeps."""
 
 from abc import ABC, abstractmethod
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, replace
 
 from torch import Tensor, nn
 
@@ -70,13 +71,25 @@ class Detector(nn.Module, ABC):
         check_images(images)
         return letterbox(images, self.input_size, fill=self.fill, stride=self.stride, stretch=self.stretch)
 
-    def detect(self, canvas: Tensor, placement: Placement | None = None) -> Detections:
+    def detect(
+        self,
+        canvas: Tensor,
+        placement: Placement | None = None,
+        *,
+        back: Callable[[Tensor], Tensor] | None = None,
+    ) -> Detections:
         """Detections on a canvas from `fit`, boxes in pixels of the image that `placement` tells.
 
-        Without a placement, boxes stay in canvas pixels.
+        Args:
+            canvas: `(B, 3, H, W)`, RGB in [0, 1].
+            placement: where the image lies on the canvas; without one, boxes stay in canvas pixels.
+            back: leads boxes `(B, N, 4)` of a canvas whose pixels were moved back to where they were on that of `fit`.
         """
         check(len(canvas) > 0, "canvas", "at least one image", 0)
-        return select(self.propose(canvas), placement, self.selection, self.background)
+        candidates = self.propose(canvas)
+        if back is not None:
+            candidates = replace(candidates, boxes=back(candidates.boxes))
+        return select(candidates, placement, self.selection, self.background)
 
     def forward(self, images: Tensor) -> Detections:
         """Detections in images `(B, 3, H, W)`, RGB in [0, 1], boxes in pixels of those images."""

@@ -18,7 +18,7 @@ IR_VERSION = 8
 OUTPUTS = ("boxes", "objectness", "classes")
 
 
-class _Graph:
+class Graph:
     """Nodes and constants of a graph under construction; every method returns the name of its output."""
 
     def __init__(self) -> None:
@@ -26,6 +26,7 @@ class _Graph:
         self.constants: dict[str, Any] = {}
 
     def add(self, op: str, *inputs: str, outputs: int = 1, **attributes: Any) -> Any:
+        """A node, and the name of its output, or the names of several."""
         from onnx import helper
 
         start = f"{op.lower()}_{len(self.nodes)}"
@@ -38,13 +39,19 @@ class _Graph:
         self.nodes[-1].output[0] = name
 
     def constant(self, values: Tensor | list[int] | list[float] | int | float) -> str:
+        """A constant; floating-point numbers have single precision unless they are a tensor of double precision."""
         from onnx import numpy_helper
 
         tensor = torch.as_tensor(values)
-        tensor = tensor.float() if tensor.is_floating_point() else tensor
+        single = tensor.is_floating_point() and not isinstance(values, Tensor)
+        tensor = tensor.float() if single or tensor.dtype == torch.float16 else tensor
         name = f"constant_{len(self.constants)}"
         self.constants[name] = numpy_helper.from_array(tensor.detach().cpu().contiguous().numpy(), name)
         return name
+
+
+class _NetworkGraph(Graph):
+    """The graph of a Darknet network."""
 
     def activation(self, kind: str, source: str) -> str:
         """An activation of Darknet."""
@@ -88,8 +95,8 @@ class _Graph:
         return self.add(
             "Conv",
             source,
-            self.constant(layer.weight),
-            self.constant(layer.bias),  # type: ignore[arg-type]
+            self.constant(layer.weight.float()),
+            self.constant(layer.bias.float()),  # type: ignore[union-attr]
             strides=list(layer.stride),
             pads=[vertical, horizontal, vertical, horizontal],
             group=layer.groups,
@@ -161,9 +168,9 @@ def network_model(network: Darknet, name: str, size: tuple[int, int] | None = No
     )
 
 
-def _build(network: Darknet) -> _Graph:
+def _build(network: Darknet) -> _NetworkGraph:
     """The whole graph, from `images` to `OUTPUTS`."""
-    graph = _Graph()
+    graph = _NetworkGraph()
     names = {-1: "images"}
     found = []
     for index, layer in enumerate(network.layers):

@@ -21,7 +21,7 @@ from semfov.detection.preprocessing import Preprocessing
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
-from semfov.errors import DataError, InputError, check, check_shape, lookup
+from semfov.errors import DataError, InputError, check, check_shape, lookup, values_known
 from semfov.io.files import sha256
 from semfov.io.schema import shown
 
@@ -100,15 +100,20 @@ class OnnxDetector(Detector):
         if not canvas.is_floating_point():
             raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
         outputs = self.session(self.preprocessing(canvas.detach()))
-        candidates = HEADS[self.head].decode(outputs, (canvas.shape[-1], canvas.shape[-2]))
-        return keep_classes(self._checked(candidates), self._places, self._scores)
+        return self.decode(outputs, (canvas.shape[-1], canvas.shape[-2]))
 
-    def _checked(self, candidates: Candidates) -> Candidates:
-        """Candidates as they should be: a wrong head or a missing sigmoid shows in the numbers."""
-        objectness = candidates.objectness
+    def decode(self, outputs: dict[str, Tensor], size: tuple[int, int]) -> Candidates:
+        """Candidates from the outputs of the network by name, for a canvas of `(width, height)`."""
+        candidates = HEADS[self.head].decode(outputs, size)
         if self.logits:
-            objectness = None if objectness is None else objectness.sigmoid()
+            objectness = None if candidates.objectness is None else candidates.objectness.sigmoid()
             candidates = replace(candidates, classes=candidates.classes.sigmoid(), objectness=objectness)
+        if values_known(candidates.boxes):
+            self._check(candidates)
+        return keep_classes(candidates, self._places, self._scores)
+
+    def _check(self, candidates: Candidates) -> None:
+        """Raise `DataError` where a wrong head or a missing sigmoid shows in the numbers."""
         if not bool(torch.isfinite(candidates.boxes).all()):
             raise DataError(f"{self.name}: head {self.head!r} gives boxes that are not finite; is it another head?")
         for scores in (candidates.classes, candidates.objectness):
@@ -118,7 +123,6 @@ class OnnxDetector(Detector):
                     f"{self.name}: expected scores in [0, 1], got [{low:.3g}, {high:.3g}]; "
                     f"say logits=True if they lack their sigmoid, or is {self.head!r} the wrong head?"
                 )
-        return candidates
 
     def settings(self) -> dict[str, object]:
         """What the detections depend on."""

@@ -24,7 +24,7 @@ from semfov.experiments.parallel import available_cores, mine, run_tasks, wait_f
 from semfov.experiments.parts import Parts, Record
 from semfov.experiments.presets import SALIENCY, label, resolve
 from semfov.experiments.saliency_store import SaliencyStore, saliency_table
-from semfov.experiments.setup import make_eye, make_scenes, prepare_worker
+from semfov.experiments.setup import fovea_of, make_eye, make_scenes, prepare_worker
 from semfov.experiments.store import DetectionStore, versions
 from semfov.gaze.policies import POLICIES, Task
 from semfov.io.code import class_digest, package_digest
@@ -147,7 +147,7 @@ class Run(ABC):
         saliency = store.load(digest) if self.config.store else None
         if saliency is None:
             image = self.scenes[index].image
-            sensor, reference = self.eye.sensor, self.config.sensor.reference
+            sensor, reference = fovea_of(self.eye), self.config.sensor.reference
             saliency = saliency_table(name, self.config.saliency, sensor, reference, image, self.grid(index))
             if self.config.store:
                 store.save(digest, saliency)

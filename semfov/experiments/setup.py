@@ -22,6 +22,7 @@ from semfov.gaze.learned import LearnedGaze
 from semfov.io.compatibility import learned_for, recommended
 from semfov.io.files import check_regular
 from semfov.observation.foveal import FovealObservationModel
+from semfov.sensor import Foveation
 
 
 def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
@@ -81,23 +82,31 @@ def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
     return Eye(sensor.make(), model, reference=sensor.reference).eval().requires_grad_(False)
 
 
+def fovea_of(eye: Eye) -> Foveation:
+    """The foveal sensor of an eye: fitted models are shipped for no other."""
+    sensor = eye.sensor
+    if not isinstance(sensor, Foveation):
+        raise InputError(f"sensor: expected a Foveation, which models are named after, got {type(sensor).__name__}")
+    return sensor
+
+
 def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
     """The observation model of that name, or the one for this eye; checked to belong to detector and class list."""
-    model = FovealObservationModel.from_pretrained(name or recommended(eye.detector.name, eye.sensor.growth))
+    model = FovealObservationModel.from_pretrained(name or recommended(eye.detector.name, fovea_of(eye).growth))
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)
 
 
 def make_target_evidence(name: str | None, eye: Eye) -> TargetEvidence:
     """The learned evidence for a target of that name, or the one for this eye; checked to belong to it."""
-    model = TargetEvidence.from_pretrained(name or learned_for(eye.detector.name, float(eye.sensor.growth)))
+    model = TargetEvidence.from_pretrained(name or learned_for(eye.detector.name, float(fovea_of(eye).growth)))
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
 
 
 def make_map_evidence(name: str | None, eye: Eye) -> MapEvidence:
     """The learned map of that name, or the one for this eye; checked to belong to it."""
-    model = MapEvidence.from_pretrained(name or learned_for(eye.detector.name, float(eye.sensor.growth)))
+    model = MapEvidence.from_pretrained(name or learned_for(eye.detector.name, float(fovea_of(eye).growth)))
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from semfov.errors import DataError
 from semfov.experiments.parts import Record
 from semfov.experiments.run import Run
-from semfov.experiments.setup import plain
+from semfov.experiments.setup import fovea_of, plain
 from semfov.io.compatibility import recommended
 from semfov.io.files import inside, replacing, write_text
 from semfov.io.storage import checksum
@@ -208,7 +208,7 @@ def commit() -> str | None:
 def sensing(run: Run) -> str:
     """Detector, sensor and observation model of a run, for titles."""
     sensor, model = run.config.sensor, run.config.belief.model
-    spread = run.eye.sensor
+    spread = fovea_of(run.eye)
     what = f"{run.eye.detector.name}, {sensor.name} fovea (σ {float(spread.sigma):g} px, growth {spread.growth:g})"
     if run.models.observation is None:
         return what

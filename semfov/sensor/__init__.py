@@ -1,11 +1,13 @@
-"""The foveal sensor."""
+"""Foveal sensors: what an image looks like when it is fixated at a point."""
 
 from typing import TYPE_CHECKING, Any
 
+from semfov.sensor.base import Sensor
 from semfov.sensor.foveation import Foveation, foveate
 from semfov.sensor.glimpse import Glimpse, glimpse
+from semfov.sensor.log_polar import LogPolar, from_log_polar, log_polar
 from semfov.sensor.named import SENSORS, named_sensor
-from semfov.sensor.pyramid import Bands, laplacian_pyramid, pyrdown, pyrup
+from semfov.sensor.pyramid import Bands, gaussian_pyramid, laplacian_pyramid, pyrdown, pyrup
 
 if TYPE_CHECKING:
     from semfov.sensor.augmentation import RandomFoveation
@@ -15,10 +17,15 @@ __all__ = [
     "Bands",
     "Foveation",
     "Glimpse",
+    "LogPolar",
     "RandomFoveation",
+    "Sensor",
     "foveate",
+    "from_log_polar",
+    "gaussian_pyramid",
     "glimpse",
     "laplacian_pyramid",
+    "log_polar",
     "named_sensor",
     "pyrdown",
     "pyrup",

@@ -1,11 +1,13 @@
 """The foveal sensor: an image that is sharp around a fixation and ever coarser away from it."""
 
-from typing import get_args
+from dataclasses import dataclass
+from typing import Any, get_args
 
 import torch
 from torch import Tensor, nn
 
-from semfov.errors import check, check_finite, check_shape, lookup, values_known
+from semfov.errors import check, lookup, values_known
+from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.lines import constant
 from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, places
 
@@ -58,23 +60,36 @@ def foveate(
     torch.Size([1, 7, 3, 48, 64])
     """
     bands = image if isinstance(image, Bands) else laplacian_pyramid(image, levels, convention)
-    batch = bands.base.shape[0]
-    check_shape(gaze, "gaze", 2)
-    many = gaze.ndim == 3
-    check(
-        gaze.ndim <= 3 and gaze.shape[0] == (2 if gaze.ndim == 1 else batch),
-        "gaze",
-        _shapes(batch),
-        tuple(gaze.shape),
-    )
-    _check_values(gaze, sigma, growth)
-    fixation = gaze.to(bands.base) if many else gaze.to(bands.base).expand(batch, 2)[:, None]
-    width = _widths(sigma, bands.base)
-    return _collapse(bands, fixation, width, growth) if many else _collapse(bands, fixation, width, growth)[:, 0]
+    fixation, many = fixations(gaze, bands.base)
+    _check_values(sigma, growth)
+    result = _collapse(bands, fixation, _widths(sigma, bands.base), growth)
+    return result if many else result[:, 0]
 
 
-class Foveation(nn.Module):
-    """A foveal sensor, see `foveate`.
+@dataclass(frozen=True)
+class Opened:
+    """A canvas as `Foveation` holds it.
+
+    Attributes:
+        bands: Laplacian pyramid of the canvas, computed once.
+        sigma: width of the fovea in canvas pixels along x and y, `(1, 2)`.
+    """
+
+    bands: Bands
+    sigma: Tensor
+
+
+class Foveation(Sensor):
+    r"""A foveal sensor, see `foveate`.
+
+    On a canvas s times as large as the image that σ is meant for, windows shrink by s, and a band of the canvas holds
+    what is :math:`\log_2 s` bands finer there, so that
+
+    .. math:: \sigma_k' = s \, \sigma \, \mathrm{growth}^{k - \log_2 s}, \qquad
+              \sigma' = \sigma \, s^{1 - \log_2 \mathrm{growth}}
+
+    keeps the same detail at the same distance from the fovea. (With growth 2 acuity is a function of eccentricity
+    that has no scale, and σ' = σ.)
 
     Args:
         sigma: width of the fovea in image pixels.
@@ -116,6 +131,24 @@ class Foveation(nn.Module):
     def pyramid(self, image: Tensor) -> Bands:
         """The part of the work that does not depend on the gaze, for an image `(B, C, H, W)`."""
         return laplacian_pyramid(image, self.levels, self.convention)
+
+    def open(self, canvas: Tensor, scale: Tensor) -> Opened:
+        """Build the pyramid of a canvas, and scale the width of the fovea."""
+        shrink = scale[None].pow(1 - torch.as_tensor(self.growth).to(scale).log2())
+        return Opened(self.pyramid(canvas), self.sigma * shrink)
+
+    def look(self, state: Opened, gaze: Tensor) -> Tensor:
+        """Canvases `(F, 3, H, W)` foveated around fixations `(F, 2)`."""
+        return foveate(state.bands, gaze[None], sigma=state.sigma, growth=self.growth)[0]
+
+    def settings(self) -> dict[str, Any]:
+        """What its views depend on."""
+        return {
+            "sigma": float(self.sigma),
+            "levels": self.levels,
+            "growth": float(self.growth),
+            "convention": self.convention,
+        }
 
     def forward(self, image: Tensor | Bands, gaze: Tensor) -> Tensor:
         """Foveate an image or a pyramid around `gaze`; shapes as for `foveate`."""
@@ -190,14 +223,9 @@ def _widths(sigma: float | Tensor, like: Tensor) -> Tensor:
     return (width[:, None] if width.ndim == 1 else width).expand(batch, 2)
 
 
-def _check_values(gaze: Tensor, sigma: float | Tensor, growth: float | Tensor) -> None:
-    if not values_known(gaze, *(value for value in (sigma, growth) if isinstance(value, Tensor))):
+def _check_values(sigma: float | Tensor, growth: float | Tensor) -> None:
+    if not values_known(*(value for value in (sigma, growth) if isinstance(value, Tensor))):
         return
-    check_finite(gaze, "gaze")
     for name, value in (("sigma", sigma), ("growth", growth)):
         positive = bool((torch.as_tensor(value) > 0).all())
         check(positive, name, "a positive number", value if isinstance(value, float | int) else value.tolist())
-
-
-def _shapes(batch: int) -> str:
-    return f"a tensor of shape (2,), ({batch}, 2) or ({batch}, G, 2)"

@@ -115,6 +115,26 @@ def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tens
     return separable(image, down, across)
 
 
+def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> tuple[Tensor, ...]:
+    """An image and its ever coarser levels, `G_0..G_K`, each blurred and halved from the one before (`pyrdown`).
+
+    Args:
+        image: `(B, C, H, W)`.
+        levels: K, how often it is halved.
+
+    >>> [tuple(level.shape[-2:]) for level in gaussian_pyramid(torch.rand(1, 3, 64, 48), 2)]
+    [(64, 48), (32, 24), (16, 12)]
+    """
+    check(levels >= 0, "levels", "0 or more", levels)
+    _check_image(image)
+    check(min(image.shape[-2:]) > 0, "image", "at least one pixel", tuple(image.shape))
+    lookup(convention, get_args(Convention), "pyramid convention")
+    found = [image]
+    for _ in range(levels):
+        found.append(reduce(found[-1], convention))
+    return tuple(found)
+
+
 def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> Bands:
     r"""Split an image into bands of decreasing frequency (Burt and Adelson, 1983).
 

@@ -18,7 +18,7 @@ from semfov.errors import DataError, check
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.seeds import generator_for
 from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Weight
-from semfov.experiments.setup import make_eye, make_scenes, prepare_worker
+from semfov.experiments.setup import fovea_of, make_eye, make_scenes, prepare_worker
 from semfov.experiments.store import versions
 from semfov.experiments.summary import table
 from semfov.eye import Eye
@@ -107,16 +107,17 @@ def fit_gaze(config: FitGazeConfig) -> None:
     if not trained_on:
         raise DataError(f"data: too few photographs to train and to judge by ({len(scenes)})")
     metadata = {**eye.settings(), **training_of(config, scenes, "save_every", "judged")}
-    start, width = first_model(config, metadata), float(eye.sensor.sigma)
+    fovea = fovea_of(eye)
+    start, width = first_model(config, metadata), float(fovea.sigma)
     judged = {"start": judge(config, start, eye, scenes, held_out, "judging the start")}
-    eye.sensor.log_sigma.requires_grad_(config.learn_sigma)
+    fovea.log_sigma.requires_grad_(config.learn_sigma)
     gaze, losses = train(config, eye, scenes, trained_on, metadata)
     eye.requires_grad_(False)
     gaze.metadata.update(eye.settings())
     judged["learned"] = judge(config, gaze, eye, scenes, held_out, "judging")
     path = model_path(config, eye.detector.name)
     gaze.save(path)
-    text = report(config, judged, losses, len(trained_on), len(held_out), (width, float(eye.sensor.sigma)))
+    text = report(config, judged, losses, len(trained_on), len(held_out), (width, float(fovea.sigma)))
     found = {name: found.tolist() for name, found in judged.items()}
     write_outputs(config, text, ("judged.json", json.dumps({"found_at": found, "losses": losses}) + "\n"), path)
 
@@ -138,7 +139,7 @@ def train(
     gaze = first_model(config, metadata)
     parameters = dict(gaze.named_parameters())
     if config.learn_sigma:
-        parameters["log_sigma"] = eye.sensor.log_sigma
+        parameters["log_sigma"] = fovea_of(eye).log_sigma
     optimiser = torch.optim.AdamW(parameters.values(), lr=config.rate, weight_decay=1e-2)
     code = json.dumps([package_digest(), versions()])
     checkpoint = Checkpoint(config.out / "checkpoint.safetensors", metadata, hashlib.sha256(code.encode()).hexdigest())

@@ -130,7 +130,7 @@ def unroll(
     terms is added, without a gradient through the fovea, which is not moved for them.
     """
     count = len(searches.targets)
-    loss = searches.view.bands.base.new_zeros(())
+    loss = searches.view.canvas.new_zeros(())
     choice = Relaxed(
         lambda shift, episodes: noise[shift, episodes],
         searches.grid.cell_of,

@@ -26,7 +26,8 @@ HINTS = Selection(threshold=0.002, iou=0.95, limit=300)
 """Candidates that are too weak to be detections, but tell where a closer look pays."""
 
 _REDUCE = 2  # a window is reduced in the source as long as it keeps this many pixels for each canvas pixel
-_BORDER = 2.0  # canvas pixels; a box that comes as near to the window's border is cut by it
+BORDER = 2.0
+"""Canvas pixels; a box that comes as near to the window's border is cut by it."""
 
 
 @dataclass(frozen=True)
@@ -215,8 +216,8 @@ def _at_border(detections: Detections, frames: Tensor, size: tuple[int, int]) ->
     inside = torch.cat([window[..., :2] > limit[:2], window[..., 2:] < limit[2:]], -1)
     near = torch.cat(
         [
-            detections.boxes[..., :2] <= canvas[..., :2] + _BORDER,
-            detections.boxes[..., 2:] >= canvas[..., 2:] - _BORDER,
+            detections.boxes[..., :2] <= canvas[..., :2] + BORDER,
+            detections.boxes[..., 2:] >= canvas[..., 2:] - BORDER,
         ],
         -1,
     )

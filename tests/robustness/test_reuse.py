@@ -22,7 +22,7 @@ from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Tar
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.gaze import LearnedGaze, Policy, select_fixation
 from semfov.observation import FoldedObservationModel
-from semfov.sensor import Glimpse, RandomFoveation
+from semfov.sensor import Glimpse, LogPolar, RandomFoveation
 from semfov.zoom import GlimpseEvidence
 
 CLASSES = ("cat", "cup", "person")
@@ -266,6 +266,7 @@ OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]
         lambda: Foveation(9.0, convention="opencv"),
         lambda: (rand(1, 3, 33, 47), torch.tensor([[5.0, 6.0]])),
     ),
+    "LogPolar": (lambda: LogPolar(9.0), lambda: (rand(2, 3, 48, 64), torch.tensor([20.0, 30.5]))),
     "FovealObservationModel": (model, lambda: (rand(5, 6, 4).softmax(-1), rand(5, 6))),
     "FoldedObservationModel": (
         lambda: FoldedObservationModel(model()),

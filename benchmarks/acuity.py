@@ -1,0 +1,199 @@
+"""What sensors keep at each distance from the fixation, and what a detector sees through them.
+
+    python -m benchmarks.acuity                                               # embedded scenes
+    python -m benchmarks.acuity --root DIR --annotations FILE --count 60 --detector yolox-nano --weights FILE
+
+The first table has the finest grating that keeps half of its contrast. The second has the round trip: the
+signal-to-noise ratio of what the detector is shown of photographs, beside what it would be shown without a sensor. The
+third has the recall of objects by the distance of their centre from the fixation. Distances and wavelengths are in
+pixels of a picture whose longer side is 640.
+"""
+
+import argparse
+import math
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from benchmarks.tables import table
+from semfov.data.coco import CocoScenes
+from semfov.data.scene import Scenes
+from semfov.data.scenes import EmbeddedScenes
+from semfov.detection.detector import Detector
+from semfov.detection.load import load_detector
+from semfov.eye import Eye
+from semfov.observation.matching import box_iou
+from semfov.sensor import Foveation, LogPolar, Sensor, named_sensor
+
+SIDE = 640
+EDGES = (0, 25, 50, 100, 150, 200, 300, 400)
+WAVELENGTHS = tuple(2.0 * 2 ** (n / 2) for n in range(2, 15))
+SCORE, OVERLAP = 0.1, 0.5
+
+
+def sensors(fovea: float, spacing: float, pooling: float) -> dict[str, Sensor]:
+    """Sensors by their name in tables."""
+    return {
+        "none": Foveation(1e9),
+        **{name: named_sensor(name) for name in ("published", "published-narrow", "gradual")},
+        "log-polar": LogPolar(fovea, spacing, pooling),
+    }
+
+
+def contrasts(sensor: Sensor, wavelength: float) -> list[float]:
+    """Share of the contrast of a grating that a sensor keeps between two of `EDGES`."""
+    place = torch.arange(2 * EDGES[-1], dtype=torch.float32) - EDGES[-1]
+    phase = place * (2 * math.pi / wavelength)
+    wave = torch.stack([phase.cos(), phase.sin(), phase.cos()])[:, None].expand(-1, len(place), -1)
+    # Upright waves and lying ones; a third channel is there for the sensor alone.
+    both = torch.stack([wave, wave.mT])
+    shown = torch.cat(
+        [sensor.look(sensor.open(one[None], torch.ones(2)), torch.full((1, 2), EDGES[-1])) for one in both]
+    )
+    # What is weakened alone keeps its phase: so much of it is what was shown times what is.
+    kept = (shown * both)[:, :2].sum(1).mean(0)
+    distance = torch.hypot(place[:, None], place)
+    return [float(kept[(distance >= low) & (distance < high)].mean()) for low, high in pairwise(EDGES)]
+
+
+def finest(sensor: Sensor) -> list[str]:
+    """Shortest wavelength that keeps half of its contrast, and all longer ones do, between two of `EDGES`."""
+    kept = [contrasts(sensor, wavelength) for wavelength in WAVELENGTHS]
+    found = []
+    for place in range(len(EDGES) - 1):
+        lost = [n for n in range(len(WAVELENGTHS)) if kept[n][place] < 0.5]
+        if not lost:
+            found.append(f"≤ {WAVELENGTHS[0]:.0f}")
+            continue
+        above = lost[-1] + 1
+        if above == len(WAVELENGTHS):
+            found.append(f"> {WAVELENGTHS[-1]:.0f}")
+            continue
+        low, high = kept[above - 1][place], kept[above][place]
+        share = (0.5 - low) / (high - low)
+        found.append(f"{WAVELENGTHS[above - 1] * (WAVELENGTHS[above] / WAVELENGTHS[above - 1]) ** share:.1f}")
+    return found
+
+
+def looks(scenes: Scenes, count: int, fixations: int) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Photographs `(1, 3, H, W)`, fixations in them `(F, 2)`, boxes `(M, 4)` and labels `(M,)` of their objects."""
+    generator = torch.Generator().manual_seed(0)
+    for index in range(min(count, len(scenes))):
+        scene = scenes[index]
+        size = torch.tensor(scene.size)
+        points = torch.rand(fixations, 2, generator=generator) * size - 0.5
+        yield scene.image[None], points, scene.boxes, scene.labels
+
+
+class Tally:
+    """Errors and finds by distance.
+
+    Attributes:
+        error: sum of squared differences from what is shown without a sensor.
+        pixels: how many values they are of.
+        found: objects that were found.
+        objects: how many there are.
+        seconds: of the processor, in looks.
+        looks: how many there were.
+    """
+
+    def __init__(self) -> None:
+        bins = len(EDGES) - 1
+        self.error, self.pixels, self.found, self.objects = (torch.zeros(bins, dtype=torch.float64) for _ in range(4))
+        self.seconds, self.looks = 0.0, 0
+
+    def add(self, eye: Eye, image: Tensor, points: Tensor, boxes: Tensor, labels: Tensor) -> None:
+        """Look at a photograph."""
+        edges = torch.tensor(EDGES[1:-1], dtype=torch.float32)
+        view, scale = eye.open(image), SIDE / max(image.shape[-2:])
+        middle = (boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5
+        left, top = view.placement.offset
+        wide, high = (round(n * s) for n, s in zip(view.placement.size, view.placement.scale, strict=True))
+        x = (torch.arange(wide) + 0.5) / view.placement.scale[0] - 0.5
+        y = (torch.arange(high) + 0.5) / view.placement.scale[1] - 0.5
+        for point in points:
+            start = time.process_time()
+            canvas = eye.foveated(view, point[None])
+            self.seconds += time.process_time() - start
+            self.looks += 1
+            where = torch.hypot(x - point[0], y[:, None] - point[1]).flatten() * scale
+            change = (canvas - view.canvas)[0, :, top : top + high, left : left + wide].square().mean(0).flatten()
+            place = torch.bucketize(where, edges, right=True)
+            near = where < EDGES[-1]
+            self.error.index_add_(0, place[near], change[near].double())
+            self.pixels.index_add_(0, place[near], torch.ones_like(change[near], dtype=torch.float64))
+            seen = eye.detect(view, point[None], canvas)
+            hits = box_iou(boxes, seen.boxes[0]) >= OVERLAP
+            hits &= seen.scores[0][:, labels].mT >= SCORE
+            hits &= (seen.labels[0] == labels[:, None]) & seen.mask[0]
+            away = torch.hypot(*(middle - point).unbind(-1)) * scale
+            place, near = torch.bucketize(away, edges, right=True), away < EDGES[-1]
+            self.found.index_add_(0, place[near], hits.any(-1)[near].double())
+            self.objects.index_add_(0, place[near], torch.ones_like(away[near], dtype=torch.float64))
+
+
+def report(chosen: dict[str, Sensor], detector: Detector, scenes: Scenes, count: int, fixations: int) -> str:
+    """All tables as Markdown."""
+    bins = [f"{low}–{high}" for low, high in pairwise(EDGES)]
+    acuity = [[name, *finest(sensor)] for name, sensor in chosen.items() if name != "none"]
+    tallies = {name: Tally() for name in chosen}
+    eyes = {name: Eye(sensor, detector).eval().requires_grad_(False) for name, sensor in chosen.items()}
+    for image, points, boxes, labels in looks(scenes, count, fixations):
+        for name, eye in eyes.items():
+            tallies[name].add(eye, image, points, boxes, labels)
+    noise = [
+        [name, *(f"{-10 * math.log10(value):.1f}" for value in (tally.error / tally.pixels).tolist())]
+        for name, tally in tallies.items()
+        if name != "none"
+    ]
+    recall = []
+    for name, tally in tallies.items():
+        shares = [f"{value:.2f}" for value in (tally.found / tally.objects).tolist()]
+        every, cost = float(tally.found.sum() / tally.objects.sum()), 1e3 * tally.seconds / tally.looks
+        recall.append([name, *shares, f"{every:.3f}", f"{cost:.1f}"])
+    objects = next(iter(tallies.values())).objects.long().tolist()
+    return "\n\n".join(
+        [
+            "Wavelength of the finest grating that keeps half of its contrast, by distance from the fixation:",
+            table(["", *bins], acuity),
+            f"Signal-to-noise ratio of the round trip in dB, {detector.name}'s input, by distance from the fixation:",
+            table(["", *bins], noise),
+            f"Recall (score {SCORE}, IoU {OVERLAP}) by distance of the object from the fixation, in "
+            f"{min(count, len(scenes))} photographs with {fixations} fixations each ({sum(objects)} objects: "
+            f"{', '.join(map(str, objects))}); the sensor's milliseconds of a processor for each look:",
+            table(["", *bins, "all", "ms"], recall),
+        ]
+    )
+
+
+@torch.inference_mode()
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.acuity", description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("--root", type=Path, help="folder of photographs; none takes the embedded scenes")
+    parser.add_argument("--annotations", type=Path, help="their boxes, in COCO's format")
+    parser.add_argument("--count", type=int, default=8, help="photographs")
+    parser.add_argument("--fixations", type=int, default=5, help="in each")
+    parser.add_argument("--detector", default="yolov3-tiny")
+    parser.add_argument("--weights", help="file of the detector's weights, where they are not to be downloaded")
+    parser.add_argument("--fovea", type=float, default=60.0, help="of the log-polar sensor, as for the next two")
+    parser.add_argument("--spacing", type=float, default=1.0)
+    parser.add_argument("--pooling", type=float, default=1.0)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    detector = load_detector(options.detector, **({} if options.weights is None else {"weights": options.weights}))
+    scenes: Scenes = EmbeddedScenes(detector.classes, count=options.count)
+    if options.root is not None:
+        scenes = CocoScenes(options.root, options.annotations, detector.classes, min_instances=0, max_target_area=None)
+    chosen = sensors(options.fovea, options.spacing, options.pooling)
+    rings, wedges = LogPolar(options.fovea, options.spacing).retina.receptors((SIDE, SIDE * 3 // 4))
+    print(f"log-polar: {rings} rings of {wedges} receptors, {rings * wedges:,} for {SIDE * SIDE * 3 // 4:,} pixels\n")
+    print(report(chosen, detector, scenes, options.count, options.fixations))
+
+
+if __name__ == "__main__":
+    main()

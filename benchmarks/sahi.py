@@ -1,0 +1,178 @@
+"""SAHI, which cuts pictures into slices, on the same detector and the same pictures as `eval.zoom`.
+
+    python -m benchmarks.sahi --mosaics 20
+    python -m benchmarks.sahi --data.root DIR --data.annotations FILE --mosaics 0 --target person
+
+SAHI (Akyon, Altinuc and Temizel, 2022) looks at every slice and at the whole picture, and merges what they show by its
+own rules (`GREEDYNMM`, its default). It has no order and no end before the last slice, so what it gives is one point:
+recall after all of its passes. Beside it are the same slices, merged by `semfov.zoom.merge`, and windows of our choice.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from benchmarks.tables import table
+from semfov.data.scene import Annotation
+from semfov.detection.detector import Detector
+from semfov.experiments.command import run_command
+from semfov.experiments.looks import one_thread
+from semfov.experiments.zoom import ZoomConfig, ZoomRun
+from semfov.experiments.zoom_orders import raster, slices
+from semfov.observation.matching import box_iou
+from semfov.zoom.gist import FOUND
+from semfov.zoom.objects import merge
+from semfov.zoom.search import find_everything
+
+try:
+    from sahi.models.base import DetectionModel
+    from sahi.predict import get_sliced_prediction
+    from sahi.prediction import ObjectPrediction
+except ImportError as error:
+    # SAHI asks for opencv-python, whose files are those of opencv-python-headless; it runs with either.
+    raise ModuleNotFoundError(
+        "benchmarks.sahi needs SAHI: pip install 'semfov[peers]' && pip install --no-deps sahi"
+    ) from error
+
+
+class Slicing(DetectionModel):
+    """A detector as SAHI takes it.
+
+    Args:
+        detector: any detector.
+        target: class 1..K, by its own score as in `merge`; None for the best class of each box.
+        score: boxes with a lower one are left out.
+    """
+
+    def __init__(self, detector: Detector, target: int | None, score: float) -> None:
+        names = {str(number): name for number, name in enumerate(detector.classes, 1)}
+        self.target, self.passes = target, 0
+        super().__init__(model=detector, device="cpu", confidence_threshold=score, category_mapping=names)
+
+    def set_model(self, model: Any, **kwargs: Any) -> None:
+        """Take the detector."""
+        self.model = model
+
+    def perform_inference(self, image: NDArray[np.uint8]) -> None:
+        """Detect in a slice `(H, W, 3)`."""
+        self.passes += 1
+        pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float() / 255
+        with torch.inference_mode():
+            self._original_predictions = self.model(pixels)
+
+    def _create_object_prediction_list_from_original_predictions(
+        self,
+        shift_amount_list: list[list[int | float]] | None = None,
+        full_shape_list: list[list[int | float]] | None = None,
+    ) -> None:
+        seen: Any = self._original_predictions
+        # One image's may come without the list around it.
+        shift, shape = (
+            given[0] if given and isinstance(given[0], list) else given
+            for given in (shift_amount_list, full_shape_list)
+        )
+        labels = seen.labels[0] if self.target is None else torch.full_like(seen.labels[0], self.target)
+        scores = seen.confidence[0] if self.target is None else seen.scores[0, :, self.target]
+        names = self.category_mapping or {}
+        self._object_prediction_list_per_image = [
+            [
+                ObjectPrediction(
+                    bbox=box,
+                    category_id=label,
+                    category_name=names[str(label)],
+                    score=score,
+                    shift_amount=shift or [0, 0],
+                    full_shape=shape,
+                )
+                for box, label, score in zip(seen.boxes[0].tolist(), labels.tolist(), scores.tolist(), strict=True)
+                if score >= self.confidence_threshold
+            ]
+        ]
+
+
+@dataclass
+class Outcome:
+    """What a way of looking found in all pictures.
+
+    Attributes:
+        found: objects that were found.
+        objects: how many there are.
+        boxes: that were given for them.
+        passes: of the detector.
+    """
+
+    found: int = 0
+    objects: int = 0
+    boxes: int = 0
+    passes: int = 0
+
+    def add(self, boxes: Tensor, labels: Tensor, annotation: Annotation, passes: int) -> None:
+        """Count a picture: boxes with a score of 0.1, found where they overlap by a half, as `eval.zoom` counts."""
+        hits = (box_iou(boxes, annotation.boxes) >= 0.5) & (labels[:, None] == annotation.labels)
+        self.found += int(hits.any(0).sum())
+        self.objects += len(annotation.boxes)
+        self.boxes += len(boxes)
+        self.passes += passes
+
+
+def sliced(run: ZoomRun, index: int) -> tuple[Tensor, Tensor, int]:
+    """Boxes and labels that SAHI gives for a picture, and its passes."""
+    config = run.config
+    model = Slicing(run.eye.detector, run.target, FOUND)
+    picture = (run.scenes[index].image * 255).round().byte().permute(1, 2, 0).numpy()
+    result = get_sliced_prediction(
+        picture,
+        model,
+        slice_height=config.slice,
+        slice_width=config.slice,
+        overlap_height_ratio=config.overlap,
+        overlap_width_ratio=config.overlap,
+        verbose=0,
+    )
+    kept = result.object_prediction_list
+    boxes = torch.tensor([each.bbox.to_xyxy() for each in kept], dtype=torch.float32).view(-1, 4)
+    return boxes, torch.tensor([each.category.id for each in kept], dtype=torch.long), model.passes
+
+
+def compare(config: ZoomConfig) -> None:
+    """Look at every picture in each way, and print the table."""
+    run = ZoomRun(config)
+    names = "SAHI", "the same slices, merged here", "ours, as many passes", "ours, half as many"
+    outcomes = {name: Outcome() for name in names}
+    with one_thread():
+        for index in range(len(run.scenes)):
+            annotation, glances = run.annotation(index), run.glances(index)
+            boxes, labels, passes = sliced(run, index)
+            outcomes["SAHI"].add(boxes, labels, annotation, passes)
+            same = raster(glances, slices(glances.lattice, config.slice, config.overlap))
+            chosen = list(islice((look for look, _ in find_everything(glances, run.evidence, run.target)), passes))
+            ways = {names[1]: list(same), names[2]: chosen, names[3]: chosen[: passes // 2]}
+            for name, looks in ways.items():
+                found = merge(looks, run.target, score=FOUND)
+                outcomes[name].add(found.boxes, found.labels, annotation, len(looks))
+            glances.save()
+            print(f"{run.scenes.ids[index]}: {outcomes['SAHI'].found} of {outcomes['SAHI'].objects} so far", flush=True)
+    count = len(run.scenes)
+    rows = [
+        [name, f"{o.passes / count:.1f}", f"{o.found / max(o.objects, 1):.3f}", f"{o.boxes / max(o.objects, 1):.2f}"]
+        for name, o in outcomes.items()
+    ]
+    what = "objects" if config.target is None else config.target
+    print(f"\n{outcomes['SAHI'].objects} {what} in {count} pictures, slices of {config.slice} px:\n")
+    print(table(["", "passes", "recall", "boxes for each object"], rows))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    return run_command(compare, ZoomConfig, __doc__, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,257 @@
+"""A look as one ONNX graph: window, detector, selection and evidence, for robots and cameras.
+
+python -m semfov.zoom.export yolox-nano look.onnx
+"""
+
+import argparse
+import json
+import tempfile
+import warnings
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from semfov.detection.detector import Detector
+from semfov.detection.load import load_detector
+from semfov.detection.onnx import OnnxDetector, probe
+from semfov.detection.scores import Candidates, score_vectors
+from semfov.errors import InputError, check
+from semfov.io.files import replacing
+from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool_all
+from semfov.zoom.export_graph import IR_VERSION, OPSET, LookGraph
+from semfov.zoom.eye import HINTS, ZoomEye
+from semfov.zoom.gist import FINEST, Gist
+
+METADATA_KEY = "semfov.look"
+
+
+def export_look(
+    eye: ZoomEye, path: str | PathLike[str], evidence: GlimpseEvidence | None = None, *, cells: int = FINEST
+) -> None:
+    """Write a look of an eye as one ONNX model, which needs neither torch nor semfov to run.
+
+    Inputs:
+
+    - `picture`: `(H, W, 3)`, bytes, RGB, of any size;
+    - `fixation`: `(3,)`, float32, `(x, y, magnification)` as for `ZoomEye.look`.
+
+    Outputs:
+
+    - `boxes` `(L, 4)` in picture pixels and `scores` `(L, K+1)`, background first, most certain first;
+    - `cut` `(L,)`, which boxes the border of the window cuts;
+    - `window` `(4,)`, what of the picture was seen;
+    - with evidence: `rates` `(K+1, 3, c, c)`, logarithms of how many objects of any class (0) and of each class looks
+      one, two and three octaves closer are expected to find in each cell of the window, which this one did not;
+    - with evidence: `odds_1`, `odds_2` and `odds_3`, `(K, p, p)`, log odds that windows so many octaves closer show
+      each class, for the windows that start at each of the first p cells down a column and along a row.
+
+    Windows are rounded to whole pixels, resampled with antialiasing as bytes, and cut to the picture, as the eye does.
+    (Of windows reduced more than four times the eye first takes means of squares of pixels; the graph does not, and its
+    canvas differs slightly.) A detector that is an ONNX file stays as it is, converted to opset 18, and any other is
+    exported by torch. Boxes that the window's border cuts are kept, whatever the eye's `cut` is.
+
+    Args:
+        eye: whose detector looks.
+        path: where the model goes.
+        evidence: what a look says of closer ones; None leaves it out.
+        cells: c, cells along a side of the window for the evidence: 32, or 16 for windows one octave coarser than the
+            closest.
+
+    Raises:
+        InputError: the evidence is for other classes, or the detector cannot be exported.
+        ModuleNotFoundError: the packages onnx and onnxscript are not there.
+        DataError: the file cannot be written.
+    """
+    try:
+        import onnxscript  # noqa: F401 (what torch exports with)
+        from onnx import TensorProto, checker, helper
+    except ImportError as error:
+        raise ModuleNotFoundError("exporting a look needs two packages: pip install onnx onnxscript") from error
+    detector = eye.detector
+    kinds = len(detector.classes)
+    check(cells >= 8 and cells % 8 == 0, "cells", "a multiple of 8", cells)
+    if evidence is not None:
+        check(evidence.classes == kinds, "evidence", f"one for {kinds} classes", evidence.classes)
+        evidence.check_compatible(eye.settings())
+    graph = LookGraph(detector)
+    canvas, frame, start = graph.window("picture", "fixation")
+    boxes, confidence, vectors = _propose(graph, detector, canvas)
+    shown, scores = graph.selection(boxes, confidence, vectors, detector.selection)
+    placed, cut = graph.placed(shown, frame, "picture")
+    window = graph.add("Slice", frame, graph.constant([0]), graph.constant([4]))
+    outputs = {
+        "boxes": (placed, ["found", 4]),
+        "scores": (scores, ["found", kinds + 1]),
+        "cut": (cut, ["found"]),
+        "window": (graph.add("Cast", window, to=TensorProto.FLOAT), [4]),
+    }
+    if evidence is not None:
+        hints, values = graph.selection(boxes, confidence, vectors, HINTS)
+        seen = graph.gist((graph.placed(hints, frame, "picture")[0], values), (placed, scores), start, cells, kinds)
+        said = graph.append(_exported(_Saying(evidence, cells), *_examples(cells, kinds)), "evidence/", _named(seen))
+        parts = [cells - (cells >> step) + 1 for step in range(1, STEPS + 1)]
+        shapes = [[kinds + 1, STEPS, cells, cells], *([kinds, part, part] for part in parts)]
+        names = ["rates", *(f"odds_{step}" for step in range(1, STEPS + 1))]
+        outputs |= dict(zip(names, zip(said, shapes, strict=True), strict=True))
+    for name, (value, _) in outputs.items():
+        graph.add("Identity", value)
+        graph.name_last(name)
+    described = [
+        helper.make_tensor_value_info(name, TensorProto.BOOL if name == "cut" else TensorProto.FLOAT, shape)
+        for name, (_, shape) in outputs.items()
+    ]
+    inputs = [
+        helper.make_tensor_value_info("picture", TensorProto.UINT8, ["height", "width", 3]),
+        helper.make_tensor_value_info("fixation", TensorProto.FLOAT, [3]),
+    ]
+    model = helper.make_model(
+        helper.make_graph(graph.nodes, "look", inputs, described, list(graph.constants.values())),
+        producer_name="semfov",
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+    )
+    told = {"classes": list(detector.classes), "input_size": list(detector.input_size), "cells": cells}
+    model.metadata_props.add(key=METADATA_KEY, value=json.dumps(told))
+    checker.check_model(model)
+    with replacing(Path(path)) as temporary:
+        temporary.write_bytes(model.SerializeToString())
+
+
+class _Proposing(nn.Module):
+    """Boxes, confidence and score vectors of every candidate of a torch detector."""
+
+    def __init__(self, detector: Detector) -> None:
+        super().__init__()
+        self.detector = detector
+
+    def forward(self, canvas: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return _columns(self.detector.propose(canvas), self.detector)
+
+
+class _Decoding(nn.Module):
+    """The same from the outputs of the network of an `OnnxDetector`."""
+
+    def __init__(self, detector: OnnxDetector, names: list[str]) -> None:
+        super().__init__()
+        self.detector, self.names = detector, names
+
+    def forward(self, *outputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        given = dict(zip(self.names, outputs, strict=True))
+        return _columns(self.detector.decode(given, self.detector.input_size), self.detector)
+
+
+class _Saying(nn.Module):
+    """What evidence says of a gist."""
+
+    def __init__(self, evidence: GlimpseEvidence, cells: int) -> None:
+        super().__init__()
+        self.evidence, self.cells = evidence, cells
+
+    def forward(self, strongest: Tensor, size: Tensor, found: Tensor) -> tuple[Tensor, ...]:
+        look = Gist(0, (0, 0), 1, strongest, size, found > 0)
+        said = [self.evidence.rates(look, torch.arange(self.evidence.classes + 1))]
+        for step in range(1, STEPS + 1):
+            span = self.cells >> step
+            scores, summary = pool_all(strongest, span)
+            odds = self.evidence.presence(scores, summary, torch.full((len(scores),), step))
+            side = self.cells - span + 1
+            said.append(odds.mT.unflatten(-1, (side, side)))
+        return tuple(said)
+
+
+def _columns(found: Candidates, detector: Detector) -> tuple[Tensor, Tensor, Tensor]:
+    return found.boxes, found.confidence, score_vectors(found, detector.background)
+
+
+def _propose(graph: LookGraph, detector: Detector, canvas: str) -> tuple[str, str, str]:
+    """Boxes `(1, N, 4)`, confidence `(1, N)` and score vectors `(1, N, K+1)` of a canvas."""
+    wide, high = detector.input_size
+    if isinstance(detector, OnnxDetector):
+        outputs = _network(graph, detector, canvas)
+        raw = probe(detector.session, detector.input_size)
+        decoding = _exported(_Decoding(detector, list(raw)), *raw.values())
+        found = graph.append(decoding, "head/", _named(outputs))
+    else:
+        found = graph.append(
+            _exported(_Proposing(detector), torch.zeros(1, 3, high, wide)), "detector/", {"x_0": canvas}
+        )
+    boxes, confidence, vectors = found
+    return boxes, confidence, vectors
+
+
+def _network(graph: LookGraph, detector: OnnxDetector, canvas: str) -> list[str]:
+    """Outputs of the file of a detector for a canvas."""
+    import onnx
+    from onnx import version_converter
+
+    wanted = detector.preprocessing
+    if wanted.channels == "bgr":
+        canvas = graph.add("Gather", canvas, graph.constant([2, 1, 0]), axis=1)
+    factor, shift = (
+        torch.tensor([value / std for value, std in zip(values, wanted.std, strict=True)]).view(1, 3, 1, 1)
+        for values in ([wanted.scale] * 3, wanted.mean)
+    )
+    image = graph.add("Sub", graph.add("Mul", canvas, graph.constant(factor)), graph.constant(shift))
+    model = onnx.load(detector.session.path)
+    constants = {constant.name for constant in model.graph.initializer}
+    inputs = [value for value in model.graph.input if value.name not in constants]
+    if len(inputs) != 1 or detector.session.dtype != torch.float32:
+        names = ", ".join(value.name for value in inputs)
+        raise InputError(f"detector: expected one input of single precision, got {names}; export a simpler model")
+    try:
+        model = version_converter.convert_version(model, OPSET)
+    except Exception as error:  # of many kinds, for operators that it cannot convert
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"detector: expected a model that converts to opset {OPSET}, got {reason}") from error
+    return graph.append(model, "network/", {inputs[0].name: image})
+
+
+def _exported(module: nn.Module, *inputs: Tensor) -> Any:
+    """The ONNX model of a torch module, whose inputs are `x_0`, `x_1` and so on."""
+    import onnx
+
+    names = [f"x_{number}" for number in range(len(inputs))]
+    with warnings.catch_warnings(), torch.no_grad(), tempfile.TemporaryDirectory() as folder:
+        warnings.simplefilter("ignore")  # of the exporter's own doing
+        path = Path(folder) / "part.onnx"
+        torch.onnx.export(
+            module.eval().requires_grad_(False),
+            inputs,
+            path,
+            input_names=names,
+            opset_version=OPSET,
+            dynamo=True,
+            verbose=False,
+            external_data=False,
+        )
+        return onnx.load(path)
+
+
+def _named(values: Any) -> dict[str, str]:
+    return {f"x_{number}": value for number, value in enumerate(values)}
+
+
+def _examples(cells: int, classes: int) -> tuple[Tensor, Tensor, Tensor]:
+    return torch.zeros(cells, cells, classes), torch.zeros(cells, cells), torch.zeros(cells, cells, classes)
+
+
+def main() -> None:
+    """Command line of the export."""
+    parser = argparse.ArgumentParser(prog="python -m semfov.zoom.export", description="a look as one ONNX graph")
+    parser.add_argument("detector", help="a name, or an ONNX file")
+    parser.add_argument("output", type=Path, help="the ONNX file to write")
+    parser.add_argument("--weights", help="file of the detector's weights, where they are not to be downloaded")
+    parser.add_argument("--evidence", help="fitted evidence by magnification, by name or file")
+    parser.add_argument("--cells", type=int, default=FINEST, help="along a side of the window, for the evidence")
+    options = parser.parse_args()
+    detector = load_detector(options.detector, **({} if options.weights is None else {"weights": options.weights}))
+    evidence = None if options.evidence is None else GlimpseEvidence.from_pretrained(options.evidence)
+    export_look(ZoomEye(detector).eval(), options.output, evidence, cells=options.cells)
+    print(f"written: {options.output}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,223 @@
+"""The parts of a look as an ONNX graph: window, selection, gist."""
+
+from typing import Any
+
+import torch
+
+from semfov.detection.detector import Detector
+from semfov.detection.export_graph import Graph
+from semfov.detection.selection import Selection
+from semfov.zoom.eye import BORDER
+from semfov.zoom.gist import FOUND
+
+OPSET = 18
+"""The first whose `Resize` knows antialiasing."""
+
+IR_VERSION = 8
+
+_DOUBLE, _FLOAT, _INT64, _BOOL = 11, 1, 7, 9  # of onnx.TensorProto
+
+
+class LookGraph(Graph):
+    """Nodes of a look.
+
+    Args:
+        detector: whose input is the canvas.
+    """
+
+    def __init__(self, detector: Detector) -> None:
+        super().__init__()
+        self.wide, self.high = detector.input_size
+        self.fill = float(detector.fill)
+
+    def double(self, value: float) -> str:
+        """A constant of double precision, in which windows are computed."""
+        return self.constant(torch.tensor(value, dtype=torch.float64))
+
+    def append(self, model: Any, prefix: str, inputs: dict[str, str]) -> list[str]:
+        """Add a whole model, whose inputs are named values of this graph; returns its outputs' names."""
+        from onnx import compose, inliner
+
+        model = compose.add_prefix(inliner.inline_local_functions(model), prefix)
+        given = {prefix + name: value for name, value in inputs.items()}
+        for node in model.graph.node:
+            for place, name in enumerate(node.input):
+                node.input[place] = given.get(name, name)
+        self.nodes += list(model.graph.node)
+        self.constants |= {constant.name: constant for constant in model.graph.initializer}
+        return [output.name for output in model.graph.output]
+
+    def window(self, picture: str, fixation: str) -> tuple[str, str, str]:
+        """The canvas `(1, 3, h, w)` of a window of a picture `(H, W, 3)` of bytes, as `ZoomEye` shows it.
+
+        Also the window in the picture and on the canvas, `(8,)`, and where the window would start if it were not cut
+        and rounded, with the magnification, `(3,)`; both of double precision.
+        """
+        point = self.add("Cast", fixation, to=_DOUBLE)
+        x, y, m = (self.add("Gather", point, self.constant(n)) for n in range(3))
+        shape = self.add("Cast", self.add("Shape", picture), to=_DOUBLE)
+        width, height = (self.add("Gather", shape, self.constant(n)) for n in (1, 0))
+        axes = [self._axis(x, m, width, self.wide), self._axis(y, m, height, self.high)]
+        (left, x1, x2, u1, u2), (top, y1, y2, v1, v2) = axes
+        start = self._whole(y1, x1)
+        part = self.add("Slice", picture, start, self._whole(y2, x2), self.constant([0, 1]))
+        pixels = self.add("Cast", self.add("Unsqueeze", part, self.constant([0])), to=_FLOAT)
+        pixels = self.add("Transpose", pixels, perm=[0, 3, 1, 2])
+        # One axis after the other, with bytes in between, as Pillow and torch resample bytes.
+        rows = self._whole(self.add("Sub", y2, y1))
+        columns, lines = self._whole(self.add("Sub", u2, u1)), self._whole(self.add("Sub", v2, v1))
+        lead = self.constant([1, 3])
+        for size in ([lead, rows, columns], [lead, lines, columns]):
+            # Weights beyond the border are left out, as Pillow and torch leave them out.
+            how = {"mode": "linear", "antialias": 1, "exclude_outside": 1}
+            resized = self.add("Resize", pixels, "", "", self.add("Concat", *size, axis=0), **how)
+            pixels = self.add("Clip", self.add("Round", resized), self.constant(0.0), self.constant(255.0))
+        pixels = self.add("Div", pixels, self.constant(255.0))
+        none = self.constant([0, 0])
+        right = self._whole(self.add("Sub", self.double(self.high), v2), self.add("Sub", self.double(self.wide), u2))
+        pads = self.add("Concat", none, self._whole(v1, u1), none, right, axis=0)
+        canvas = self.add("Pad", pixels, pads, self.constant(self.fill))
+        return canvas, self._vector(x1, y1, x2, y2, u1, v1, u2, v2), self._vector(left, top, m)
+
+    def _axis(self, point: str, m: str, length: str, canvas: int) -> tuple[str, str, str, str, str]:
+        """Along one axis: start of the window, and start and stop of what is shown in the picture and on the canvas."""
+        one, zero, side = self.double(1.0), self.double(0.0), self.double(float(canvas))
+        half = self.add("Div", side, self.add("Mul", self.double(2.0), m))
+        middle = self.add("Add", point, self.double(0.5))
+        low, high = self.add("Sub", middle, half), self.add("Add", middle, half)
+        edge = self.add("Round", low)
+        start = self.add("Min", self.add("Max", edge, zero), self.add("Sub", length, one))
+        stop = self.add("Min", self.add("Max", self.add("Round", high), self.add("Add", start, one)), length)
+        offset = self.add("Round", self.add("Mul", self.add("Sub", start, edge), m))
+        first = self.add("Min", offset, self.add("Sub", side, one))
+        extent = self.add("Round", self.add("Mul", self.add("Sub", stop, start), m))
+        last = self.add("Max", self.add("Add", first, extent), self.add("Add", first, one))
+        return low, start, stop, first, self.add("Min", last, side)
+
+    def selection(self, boxes: str, confidence: str, vectors: str, chosen: Selection) -> tuple[str, str]:
+        """Boxes `(L, 4)` on the canvas and score vectors `(L, K+1)` that are kept of `(1, N, …)`, as `select` does."""
+        x1, y1, x2, y2 = self.add("Split", boxes, self.constant([1, 1, 1, 1]), outputs=4, axis=2)
+        full = self.add("And", self.add("Greater", x2, x1), self.add("Greater", y2, y1))
+        full = self.add("Squeeze", full, self.constant([2]))
+        sure = self.add("GreaterOrEqual", confidence, self.constant(chosen.threshold))
+        ranked = self.add("Where", self.add("And", full, sure), confidence, self.constant(0.0))
+        apart = boxes
+        if chosen.per_class:
+            # Boxes of different classes are moved so far from each other that none overlap.
+            classes = self.add("Slice", vectors, self.constant([1]), self.constant([2**31 - 1]), self.constant([2]))
+            label = self.add("Cast", self.add("ArgMax", classes, axis=2, keepdims=1), to=_FLOAT)
+            apart = self.add("Add", boxes, self.add("Mul", label, self.constant(4.0 * max(self.wide, self.high))))
+        kept = self.add(
+            "NonMaxSuppression",
+            apart,
+            self.add("Unsqueeze", ranked, self.constant([1])),
+            self.constant([chosen.limit]),
+            self.constant([chosen.iou]),
+            self.constant([0.0]),
+        )
+        index = self.add("Gather", kept, self.constant(2), axis=1)
+        box, vector = (
+            self.add("Gather", self.add("Squeeze", each, self.constant([0])), index) for each in (boxes, vectors)
+        )
+        best = self._best(vector)
+        count = self.add("Shape", best)
+        _, order = self.add("TopK", best, count, outputs=2, axis=0)
+        return self.add("Gather", box, order), self.add("Gather", vector, order)
+
+    def placed(self, boxes: str, frame: str, picture: str) -> tuple[str, str]:
+        """Boxes `(L, 4)` of the canvas in picture pixels, cut to the window, and which of them its border cuts."""
+        window, canvas = self.add("Split", frame, self.constant([4, 4]), outputs=2, axis=0)
+        single = [self.add("Cast", each, to=_FLOAT) for each in (window, canvas)]
+        (low, high), (first, last) = (self.add("Split", n, self.constant([2, 2]), outputs=2, axis=0) for n in single)
+        scale = self.add("Div", self.add("Sub", high, low), self.add("Sub", last, first))
+        twice = {name: self.add("Concat", value, value, axis=0) for name, value in
+                 {"scale": scale, "first": first, "low": low, "high": high}.items()}  # fmt: skip
+        moved = self.add("Mul", self.add("Sub", boxes, twice["first"]), twice["scale"])
+        mapped = self.add("Add", moved, twice["low"])
+        mapped = self.add("Min", self.add("Max", mapped, twice["low"]), twice["high"])
+        upper, lower = self.add("Split", boxes, self.constant([2, 2]), outputs=2, axis=1)
+        border = self.constant(float(BORDER))
+        shape = self.add("Cast", self.add("Gather", self.add("Shape", picture), self.constant([1, 0])), to=_FLOAT)
+        near = self.add(
+            "Concat",
+            self.add("And", self.add("LessOrEqual", upper, self.add("Add", first, border)),
+                     self.add("Greater", low, self.constant(0.0))),
+            self.add("And", self.add("GreaterOrEqual", lower, self.add("Sub", last, border)),
+                     self.add("Less", high, shape)),
+            axis=1,
+        )  # fmt: skip
+        any_side = self.add("ReduceMax", self.add("Cast", near, to=_FLOAT), self.constant([1]), keepdims=0)
+        return mapped, self.add("Cast", any_side, to=_BOOL)
+
+    def gist(
+        self, hints: tuple[str, str], detections: tuple[str, str], start: str, cells: int, classes: int
+    ) -> tuple[str, str, str]:
+        """Strongest hint of each class `(c, c, K)`, size `(c, c)` and what is found `(c, c, K)`, as `gist` tells.
+
+        Args:
+            hints: boxes in picture pixels and score vectors.
+            detections: likewise.
+            start: of `window`.
+            cells: c, cells along a side of the window.
+            classes: K.
+        """
+        boxes, vectors = hints
+        at, scores = self._cells(boxes, start, cells), self._scores(vectors)
+        nothing = self.constant(torch.zeros(cells * cells, classes))
+        strongest = self._strongest(nothing, at, scores, classes)
+        best = self._best(vectors)
+        alone = self.constant(torch.zeros(cells * cells))
+        top = self.add("ScatterElements", alone, at, best, axis=0, reduction="max")
+        # The size is that of the most confident hint of a cell.
+        leads = self.add("GreaterOrEqual", best, self.add("Gather", top, at))
+        corner, opposite = self.add("Split", boxes, self.constant([2, 2]), outputs=2, axis=1)
+        extent = self.add("Clip", self.add("Sub", opposite, corner), self.constant(1e-3))
+        m = self.add("Cast", self.add("Gather", start, self.constant([2])), to=_FLOAT)
+        log2 = self.constant(float(1 / torch.tensor(2.0).log()))
+        octaves = self.add("ReduceMean", self.add("Log", extent), self.constant([1]), keepdims=0)
+        size = self.add("Mul", self.add("Add", octaves, self.add("Log", m)), log2)
+        size = self.add("Where", leads, self.add("Max", size, self.constant(0.0)), self.constant(0.0))
+        size = self.add("ScatterElements", alone, at, size, axis=0, reduction="max")
+        there, vector = detections
+        seen = self._scores(vector)
+        own = self.add("Equal", seen, self.add("ReduceMax", seen, self.constant([1]), keepdims=1))
+        sure = self.add("GreaterOrEqual", seen, self.constant(FOUND))
+        found = self.add("Cast", self.add("And", own, sure), to=_FLOAT)
+        found = self._strongest(nothing, self._cells(there, start, cells), found, classes)
+        shapes = [cells, cells, classes], [cells, cells], [cells, cells, classes]
+        said = zip((strongest, size, found), shapes, strict=True)
+        strongest, size, found = (self.add("Reshape", value, self.constant(shape)) for value, shape in said)
+        return strongest, size, found
+
+    def _cells(self, boxes: str, start: str, cells: int) -> str:
+        """Number of the cell in which the middle of each box lies, `(L,)`."""
+        corner = self.add("Cast", self.add("Slice", start, self.constant([0]), self.constant([2])), to=_FLOAT)
+        m = self.add("Cast", self.add("Gather", start, self.constant([2])), to=_FLOAT)
+        pitch = self.add("Div", self.constant([self.wide / cells, self.high / cells]), m)
+        upper, lower = self.add("Split", boxes, self.constant([2, 2]), outputs=2, axis=1)
+        middle = self.add("Div", self.add("Add", upper, lower), self.constant(2.0))
+        place = self.add("Floor", self.add("Div", self.add("Sub", middle, corner), pitch))
+        place = self.add("Clip", place, self.constant(0.0), self.constant(float(cells - 1)))
+        column, row = self.add("Split", place, self.constant([1, 1]), outputs=2, axis=1)
+        number = self.add("Add", self.add("Mul", row, self.constant(float(cells))), column)
+        return self.add("Cast", self.add("Squeeze", number, self.constant([1])), to=_INT64)
+
+    def _strongest(self, start: str, at: str, values: str, classes: int) -> str:
+        """Highest of the rows `(L, K)` of each cell."""
+        index = self.add("Expand", self.add("Unsqueeze", at, self.constant([1])), self.constant([1, classes]))
+        return self.add("ScatterElements", start, index, values, axis=0, reduction="max")
+
+    def _scores(self, vectors: str) -> str:
+        """Scores of the classes alone, `(L, K)`."""
+        return self.add("Slice", vectors, self.constant([1]), self.constant([2**31 - 1]), self.constant([1]))
+
+    def _best(self, vectors: str) -> str:
+        """Confidence, `(L,)`."""
+        return self.add("ReduceMax", self._scores(vectors), self.constant([1]), keepdims=0)
+
+    def _whole(self, *values: str) -> str:
+        """Scalars of double precision as a vector of whole numbers."""
+        return self.add("Cast", self._vector(*values), to=_INT64)
+
+    def _vector(self, *values: str) -> str:
+        return self.add("Concat", *(self.add("Unsqueeze", value, self.constant([0])) for value in values), axis=0)

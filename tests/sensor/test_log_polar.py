@@ -1,0 +1,284 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.errors import InputError
+from semfov.eye import Eye
+from semfov.sensor import LogPolar, from_log_polar, gaussian_pyramid, log_polar
+from tests.robustness.test_reuse import Blobs
+
+
+def draw(*shape, dtype=torch.float64, device=None, seed=0):
+    generator = torch.Generator().manual_seed(seed + sum(shape))
+    return torch.rand(shape, dtype=dtype, generator=generator).to(device)
+
+
+def close(a, b, tolerance=1e-12):
+    torch.testing.assert_close(a, torch.as_tensor(b, dtype=a.dtype, device=a.device), rtol=0, atol=tolerance)
+
+
+def cubic(t):
+    """Keys' kernel with a = -3/4."""
+    t, a = abs(t), -0.75
+    if t <= 1:
+        return (a + 2) * t**3 - (a + 3) * t**2 + 1
+    return a * (t**3 - 5 * t**2 + 8 * t - 4) if t < 2 else 0.0
+
+
+def read(plane, x, y):
+    """A plane between its pixels, whose border goes on."""
+    height, width = plane.shape
+    total = 0.0
+    for j in range(math.floor(y) - 1, math.floor(y) + 3):
+        for i in range(math.floor(x) - 1, math.floor(x) + 3):
+            total += cubic(x - i) * cubic(y - j) * plane[min(max(j, 0), height - 1), min(max(i, 0), width - 1)]
+    return total
+
+
+def cortical_twin(levels, gaze, a, spacing, pooling, rings, wedges):
+    """`(M, N)` of a pyramid `[(h, w), ...]`, one receptor at a time."""
+    (height, width), result = levels[0].shape, np.zeros((rings, wedges))
+    # The pyramid ends where no receptor within the diagonal needs more.
+    top = math.ceil(max(math.log2(pooling * spacing * (1 + math.hypot(width, height) / a)), 0))
+    for i in range(rings):
+        radius = a * (math.exp((i + 0.5) * spacing / a) - 1)
+        level = min(max(math.log2(pooling * spacing * (1 + radius / a)), 0.0), top)
+        for j in range(wedges):
+            x = gaze[0] + radius * math.cos(2 * math.pi * j / wedges)
+            y = gaze[1] + radius * math.sin(2 * math.pi * j / wedges)
+            for k in {math.floor(level), math.ceil(level)}:
+                rows, columns = levels[k].shape
+                weight = 1 - abs(level - k)
+                u, v = (x + 0.5) * columns / width - 0.5, (y + 0.5) * rows / height - 0.5
+                result[i, j] += weight * read(levels[k], u, v)
+    return result
+
+
+@pytest.mark.parametrize("pooling", [1.0, 0.6])
+@pytest.mark.parametrize("size", [(16, 24), (17, 13), (1, 1), (1, 6)])
+def test_receptors_one_at_a_time(twin, size, pooling):
+    image, gaze = draw(1, 1, *size), (3.2, 5.5)
+    point = torch.tensor(gaze, dtype=torch.float64)
+    seen = log_polar(image, point, fovea=3.0, spacing=0.8, pooling=pooling)[0, 0]
+    levels = [image[0].numpy()]
+    for _ in range(4):
+        levels.append(twin.pyrdown(levels[-1], "kornia"))
+    planes = [level[0] for level in levels]
+    close(seen, cortical_twin(planes, gaze, 3.0, 0.8, pooling, *seen.shape), 1e-9)
+
+
+def test_back_projection_one_pixel_at_a_time():
+    a, spacing, gaze, size = 3.0, 0.8, (4.0, 2.3), (9, 7)
+    image = draw(1, 1, *size[::-1])
+    point = torch.tensor(gaze, dtype=torch.float64)
+    seen = log_polar(image, point, fovea=a, spacing=spacing)
+    view = from_log_polar(seen, point, size, fovea=a, spacing=spacing)[0, 0]
+    plane = seen[0, 0].numpy()
+    rings, wedges = plane.shape
+
+    def receptor(i, j):
+        if i < 0:
+            i, j = -1 - i, j + wedges // 2
+        return plane[min(i, rings - 1), j % wedges]
+
+    for y in range(size[1]):
+        for x in range(size[0]):
+            radius = math.hypot(x - gaze[0], y - gaze[1])
+            u = a * math.log(1 + radius / a) / spacing - 0.5
+            v = math.atan2(y - gaze[1], x - gaze[0]) * wedges / (2 * math.pi)
+            expected = sum(
+                cubic(u - i) * cubic(v - j) * receptor(i, j)
+                for i in range(math.floor(u) - 1, math.floor(u) + 3)
+                for j in range(math.floor(v) - 1, math.floor(v) + 3)
+            )
+            assert float(view[y, x]) == pytest.approx(expected, abs=1e-9)
+
+
+def test_turning_the_image_turns_the_wedges():
+    image, middle = draw(1, 3, 41, 41), torch.tensor([20.0, 20.0])
+    seen = log_polar(image, middle, fovea=6.0)
+    quarter = seen.shape[-1] // 4
+    turned = log_polar(image.rot90(-1, (-2, -1)), middle, fovea=6.0)  # clockwise, as wedges run
+    close(turned, seen.roll(quarter, -1), 1e-9)
+    views = LogPolar(6.0)(torch.cat([image, image.rot90(-1, (-2, -1))]), middle)
+    # The fixated pixel itself lies in no direction, and is given that of the x-axis.
+    views[..., 20, 20] = 0
+    close(views[1], views[0].rot90(-1, (-2, -1)), 1e-9)
+
+
+@given(
+    size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    gaze=st.tuples(st.floats(-50, 80), st.floats(-50, 80)),
+    fovea=st.floats(1, 100),
+    spacing=st.floats(0.5, 3),
+)
+def test_a_constant_stays_constant(size, gaze, fovea, spacing):
+    image = torch.full((1, 2, *size), 0.3, dtype=torch.float64)
+    sensor = LogPolar(fovea, spacing)
+    seen = sensor.cortical(image, torch.tensor(gaze))
+    close(seen, torch.full_like(seen, 0.3), 1e-9)
+    close(sensor(image, torch.tensor(gaze)), image, 1e-9)
+
+
+@given(a=st.floats(-3, 3), b=st.floats(-3, 3), height=st.integers(1, 20), width=st.integers(1, 20))
+def test_linear_in_the_image(a, b, height, width):
+    first, second = draw(1, 2, height, width), draw(1, 2, height, width, seed=1)
+    gaze, sensor = torch.tensor([width / 3, height / 2]), LogPolar(4.0)
+    close(sensor(a * first + b * second, gaze), a * sensor(first, gaze) + b * sensor(second, gaze), 1e-10)
+
+
+def contrast(wavelength, fovea, size=801):
+    """What is left of a grating's contrast at each eccentricity along the x-axis, `(size // 2,)`."""
+    phase = torch.arange(size, dtype=torch.float64) * (2 * math.pi / wavelength)
+    waves = torch.stack([phase.cos(), phase.sin()])[None, :, None].expand(1, 2, 65, size)
+    shown = LogPolar(fovea)(waves, torch.tensor([size // 2, 32.0]))[0, :, 32]
+    # A wave that is weakened alone keeps its phase: so much of it is what was shown times what is.
+    return (shown * waves[0, :, 32]).sum(0)[size // 2 :]
+
+
+def test_acuity_falls_off_as_the_formula_says():
+    """Receptors twice as far apart show half as fine a grating: where 1 + r / a has doubled."""
+    fovea = 40.0
+    half = {}
+    for wavelength in (8, 16, 32):
+        kept = torch.nn.functional.avg_pool1d(contrast(wavelength, fovea)[None, None], wavelength, 1)[0, 0]
+        half[wavelength] = int((kept < 0.5).nonzero()[0]) + wavelength / 2
+    spread = {wavelength: 1 + place / fovea for wavelength, place in half.items()}
+    assert spread[16] / spread[8] == pytest.approx(2, rel=0.1)
+    assert spread[32] / spread[16] == pytest.approx(2, rel=0.1)
+
+
+def test_nothing_is_lost_at_the_fixation():
+    assert float(contrast(4, 40.0)[:8].min()) > 0.75
+    assert float(contrast(8, 40.0)[:8].min()) > 0.9
+
+
+def test_receptors_pool_what_is_finer_than_they_are():
+    """A board of single pixels is grey to the periphery, and not some of its pixels."""
+    place = torch.arange(256)
+    board = ((place[:, None] + place) % 2).double()[None, None]
+    seen = log_polar(board, torch.tensor([3.3, 3.7]), fovea=10.0)[0, 0]
+    # Receptors of this ring are 8 pixels apart.
+    ring = round(10 * math.log(8))
+    assert float((seen[ring : ring + 5] - 0.5).abs().max()) < 0.02
+    assert float((seen[:3] - 0.5).abs().max()) > 0.2
+
+
+def test_fewer_receptors_than_pixels():
+    sensor = LogPolar(60.0)
+    rings, wedges = sensor.retina.receptors((640, 480))
+    assert sensor.cortical(draw(1, 1, 480, 640), torch.tensor([9.0, 9.0])).shape[-2:] == (rings, wedges)
+    assert wedges == pytest.approx(2 * math.pi * 60, abs=2)
+    assert rings == pytest.approx(60 * math.log(1 + 800 / 60), abs=3)
+    assert rings * wedges < 640 * 480 / 5
+
+
+@pytest.mark.parametrize("which", ["cortical", "back", "both"])
+def test_gradients(which):
+    image, gaze = draw(1, 1, 7, 6).requires_grad_(), (4 * draw(1, 2, 2) + 0.123).requires_grad_()
+    sensor = LogPolar(2.0, 1.1)
+    if which == "both":
+        assert torch.autograd.gradcheck(sensor, (image, gaze))
+    elif which == "cortical":
+        assert torch.autograd.gradcheck(sensor.cortical, (image, gaze))
+    else:
+        seen = sensor.cortical(image, gaze).detach().requires_grad_()
+        assert torch.autograd.gradcheck(lambda seen, gaze: sensor.back(seen, gaze, (6, 7)), (seen, gaze))
+
+
+def test_a_fixation_on_a_pixel_has_a_gradient():
+    gaze = torch.tensor([4.0, 3.0], requires_grad=True)
+    LogPolar(3.0)(draw(1, 1, 9, 9, dtype=torch.float32), gaze).square().sum().backward()
+    assert torch.isfinite(gaze.grad).all()
+    assert gaze.grad.abs().sum() > 0
+
+
+def test_many_fixations_are_the_loop_over_them(device):
+    image, gaze, sensor = draw(2, 3, 20, 27, device=device), 30 * draw(2, 4, 2, device=device), LogPolar(6.0)
+    many, seen = sensor(image, gaze), sensor.cortical(image, gaze)
+    assert many.shape == (2, 4, 3, 20, 27)
+    assert seen.shape[:3] == (2, 4, 3)
+    levels = sensor.pyramid(image)
+    for g in range(4):
+        close(many[:, g], sensor(levels, gaze[:, g]))
+        close(seen[:, g], sensor.cortical(image, gaze[:, g]))
+        close(many[1, g], sensor(image[1:], gaze[1, g])[0])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_dtype_and_device_follow_the_image(dtype, device):
+    image, sensor = draw(1, 3, 60, 83, device=device), LogPolar(12.0)
+    expected = sensor(image, torch.tensor([9.0, 8.0], device=device))
+    result = sensor(image.to(dtype), torch.tensor([9, 8], device=device))
+    assert (result.dtype, result.device.type) == (dtype, device.type)
+    torch.testing.assert_close(result, expected.to(dtype), rtol=0, atol=2e-4 if dtype == torch.float32 else 1e-12)
+
+
+def test_module_is_the_functions():
+    image, gaze = draw(2, 3, 33, 40), torch.tensor([[4.0, 9.0], [30.0, 2.0]])
+    sensor = LogPolar(6.0, 0.8, 0.9)
+    seen = log_polar(image, gaze, fovea=6.0, spacing=0.8, pooling=0.9)
+    close(sensor.cortical(gaussian_pyramid(image, 5), gaze), seen)
+    close(sensor(image, gaze), from_log_polar(seen, gaze, (40, 33), fovea=6.0, spacing=0.8))
+    assert repr(sensor) == "LogPolar(fovea=6, spacing=0.8, pooling=0.9)"
+    assert sensor.settings() == {"kind": "log-polar", "fovea": 6.0, "spacing": 0.8, "pooling": 0.9}
+
+
+@pytest.mark.parametrize("stretch", [False, True])
+def test_an_eye_shows_what_the_sensor_shows_of_the_picture(stretch):
+    """At the detector's resolution, whatever that is, and stretched or not."""
+    detector = Blobs()
+    detector.stretch = stretch
+    eye, sensor = Eye(LogPolar(8.0), detector, reference=256.0), LogPolar(8.0)
+    coarse = draw(1, 3, 40, 25, dtype=torch.float32)
+    picture = torch.nn.functional.interpolate(coarse, (256, 160), mode="bicubic").clamp(0, 1)
+    gaze = torch.tensor([[100.0, 60.0], [20.0, 200.0]])
+    view = eye.open(picture)
+    shown = eye.foveated(view, gaze)
+    expected = torch.cat([detector.fit(sensor(picture, one).clamp(0, 1))[0] for one in gaze])
+    left, top = view.placement.offset
+    inner = shown[..., top : 48 - top, left : 64 - left], expected[..., top : 48 - top, left : 64 - left]
+    other = torch.cat([detector.fit(sensor(picture, one).clamp(0, 1))[0] for one in gaze.flip(0)])
+    error = (inner[0] - inner[1])[..., 2:-2, 2:-2].square().mean().sqrt()
+    moved = (inner[0] - other[..., top : 48 - top, left : 64 - left])[..., 2:-2, 2:-2].square().mean().sqrt()
+    assert error < 0.03
+    assert moved > 2 * error
+    assert eye.look(view, gaze).boxes.shape[0] == 2
+    assert eye.settings()["sensor"] == sensor.settings() | {"reference": 256.0}
+
+
+IMAGE = torch.rand(2, 3, 8, 8)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"gaze": torch.tensor([4.0, math.nan])}, "gaze: expected finite numbers"),
+        ({"gaze": torch.rand(3, 2)}, "gaze: expected a tensor of shape"),
+        ({"image": torch.rand(3, 8, 8)}, "image: expected a tensor of shape"),
+        ({"image": torch.rand(1, 3, 0, 8)}, "image: expected at least one pixel"),
+        ({"fovea": 0.0}, "fovea: expected a positive number, got 0.0"),
+        ({"fovea": math.inf}, "fovea: expected a positive number, got inf"),
+        ({"spacing": -1.0}, "spacing: expected a positive number, got -1.0"),
+        ({"spacing": 1e-4}, "spacing: expected one that leaves no more than 67,108,864 receptors, got 0.0001"),
+        ({"pooling": math.nan}, "pooling: expected a positive number, got nan"),
+    ],
+)
+def test_bad_input(arguments, message):
+    arguments = {"image": IMAGE, "gaze": torch.tensor([4.0, 4.0]), "fovea": 3.0} | arguments
+    with pytest.raises(InputError, match=message.replace("(", r"\(")):
+        log_polar(**arguments)
+
+
+def test_a_cortical_image_of_another_retina():
+    seen = log_polar(IMAGE, torch.tensor([4.0, 4.0]), fovea=3.0)
+    with pytest.raises(InputError, match="cortical: expected a tensor of shape"):
+        from_log_polar(seen, torch.tensor([4.0, 4.0]), (8, 8), fovea=4.0)
+    with pytest.raises(InputError, match="cortical: expected 5 dimensions"):
+        from_log_polar(seen, torch.rand(2, 3, 2), (8, 8), fovea=3.0)
+    with pytest.raises(InputError, match="size: expected"):
+        from_log_polar(seen, torch.tensor([4.0, 4.0]), (0, 8), fovea=3.0)
