@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from semfov.data.inputs import ImageLike, PointLike, as_image, as_points
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.placement import Placement
@@ -57,27 +58,31 @@ class Eye(nn.Module):
         self.detector = detector
         self.reference = reference
 
-    def open(self, image: Tensor) -> View:
-        """Fit an image `(1, 3, H, W)`, RGB in [0, 1], into the input and build its pyramid."""
+    def open(self, image: ImageLike) -> View:
+        """Fit an image of any common kind (`semfov.as_image`) into the input and build its pyramid."""
+        if not (isinstance(image, Tensor) and image.ndim == 4 and image.is_floating_point()):
+            image = as_image(image, like=self.sensor.sigma)[None]
         check_shape(image, "image", 1, 3, None, None)
         canvas, placement = self.detector.fit(image)
         scale = canvas.new_tensor([placement.scale]) * (max(placement.size) / self.reference)
         shrink = scale.pow(1 - torch.as_tensor(self.sensor.growth).to(scale).log2())
         return View(self.sensor.pyramid(canvas), placement, self.sensor.sigma * shrink)
 
-    def foveated(self, view: View, fixations: Tensor) -> Tensor:
-        """What the sensor gives for fixations `(F, 2)` in image pixels: canvases `(F, 3, h, w)`."""
+    def foveated(self, view: View, fixations: PointLike) -> Tensor:
+        """What the sensor gives for fixations `(F, 2)` in image pixels, or one `(x, y)`: canvases `(F, 3, h, w)`."""
+        points = as_points(fixations, "fixations").to(view.bands.base)
+        fixations = points[None] if points.ndim == 1 else points
         check_shape(fixations, "fixations", None, 2)
         gaze = view.placement.points_to_canvas(fixations)
         sensor = self.sensor
         return foveate(view.bands, gaze[None], sigma=view.sigma, growth=sensor.growth)[0]
 
-    def look(self, view: View, fixations: Tensor) -> Detections:
+    def look(self, view: View, fixations: PointLike) -> Detections:
         """Detections seen from fixations `(F, 2)`, a batch of F, boxes in pixels of the image."""
         return self.detector.detect(self.foveated(view, fixations), view.placement)
 
-    def forward(self, image: Tensor, fixations: Tensor) -> Detections:
-        """`look` at an image `(1, 3, H, W)` from fixations `(F, 2)`."""
+    def forward(self, image: ImageLike, fixations: PointLike) -> Detections:
+        """`look` at an image from fixations `(F, 2)`."""
         return self.look(self.open(image), fixations)
 
     def settings(self) -> dict[str, Any]:

@@ -39,6 +39,7 @@ SURFACE = {
     "ZoomEye",
     "__version__",
     "acquisition",
+    "as_image",
     "dirichlet",
     "foveate",
     "fusion",
