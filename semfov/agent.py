@@ -22,10 +22,11 @@ from semfov.episode import LiveLooks, Step, rollout
 from semfov.errors import InputError, check, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.acquisition import ExpectedGain
-from semfov.gaze.choice import Greedy, drawn_by
+from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.gaze.policies import KL, Closer, NonPredictive, Policy, Predictive, Random
 from semfov.io.compatibility import check_shipped_sensor, learned_for
 from semfov.io.schema import is_number
+from semfov.live import RATE, LivePerception
 from semfov.observation.foveal import FovealObservationModel
 from semfov.scanpath import Ending, Scanpath, trace
 from semfov.sensor.foveation import Foveation
@@ -238,8 +239,7 @@ class ActivePerception(nn.Module):
             DataError: the image's file cannot be read.
         """
         index = class_index(target, self.classes[1:], "target")
-        for name, value in (("confirm", confirm), ("give_up", give_up)):
-            check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability from 0 to 1", value)
+        _check_thresholds(confirm, give_up)
         check(price is None or (is_number(price) and price >= 0), "price", "0 or more right decisions", price)
         image, grid = self._frame(image)
         goal = None if boxes is None else grid.footprint(boxes.to(image)).any(-2)
@@ -299,6 +299,38 @@ class ActivePerception(nn.Module):
         scanpath, ended, _ = self._gaze(image, grid, self.exploring, None, start, shifts, seed, spent)
         return replace(scanpath, ending="price") if ended else scanpath
 
+    def live(
+        self,
+        target: str | int | None = None,
+        *,
+        rate: float = RATE,
+        start: int | None = None,
+        seed: int = 0,
+        confirm: float | None = None,
+        give_up: float | None = None,
+    ) -> LivePerception:
+        """Search a camera or a video, or explore it: a look at every frame, by a belief that goes on and fades.
+
+        `target` is a name or an index, None to explore. The other arguments are those of `semfov.live.LivePerception`,
+        and `confirm` and `give_up` those of `search`.
+        """
+        index = None if target is None else class_index(target, self.classes[1:], "target")
+        _check_thresholds(confirm, give_up)
+        strategy = self.exploring if index is None else self.searching
+        chosen = strategy.observer.thresholds
+        return LivePerception(
+            self.eye,
+            strategy.observer,
+            strategy.policy,
+            self.classes,
+            (self.columns, self.rows),
+            target=index,
+            rate=rate,
+            start=start,
+            seed=seed,
+            thresholds=None if chosen is None else chosen.changed(confirm, give_up),
+        )
+
     def _frame(self, picture: ImageLike) -> tuple[Tensor, Grid]:
         """The image as a batch of one, and the grid over it."""
         image = as_image(picture, like=self.eye.sensor.sigma)[None]
@@ -317,11 +349,7 @@ class ActivePerception(nn.Module):
     ) -> tuple[Scanpath, int, Step]:
         """Move the gaze until there is an outcome, or no shift or cell is left; also the outcome and the last step."""
         check_whole(shifts, "shifts", 0, MOST_SHIFTS)
-        check_whole(seed, "seed", 0, 2**63 - 1)
-        generator = torch.Generator().manual_seed(seed)
-        if start is None:
-            start = int(torch.randint(len(grid), (1,), generator=generator))
-        check_whole(start, "start", 0, len(grid) - 1)
+        first, generator = first_cell(start, seed, len(grid))
         looks = LiveLooks(self.eye, self.eye.open(image), grid, target)
         ended: tuple[int, Step] | None = None
 
@@ -335,7 +363,7 @@ class ActivePerception(nn.Module):
             looks,
             strategy.observer,
             strategy.policy(target, grid),
-            torch.tensor([start], device=image.device),
+            torch.tensor([first], device=image.device),
             Greedy(drawn_by(generator, len(grid), image)),
             most=shifts + 1,
             ends=ends,
@@ -346,6 +374,12 @@ class ActivePerception(nn.Module):
         assert ended is not None
         ending: Ending = "cells" if bool(ended[1].visited.all()) else "shifts"
         return replace(scanpath, ending=ending), *ended
+
+
+def _check_thresholds(confirm: float | None, give_up: float | None) -> None:
+    """Raise `InputError` unless the thresholds that are given are probabilities."""
+    for name, value in (("confirm", confirm), ("give_up", give_up)):
+        check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability from 0 to 1", value)
 
 
 def _check_cells(grid: tuple[int, int]) -> None:

@@ -67,6 +67,7 @@ ROOMS = [
     "decision",
     "scanpath",
     "zoom",
+    "live",
     "agent",
     "metrics",
     "viz",
