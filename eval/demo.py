@@ -116,13 +116,8 @@ def demo(config: DemoConfig) -> None:
     watched = opened(pictures(config, classes)) if stream is None else iter(())
     agent = make_agent(config) if agent is None else agent
     if stream is not None:
-        rest: dict[str, Any] = {
-            "start": config.start,
-            "seed": config.seed,
-            "confirm": config.confirm,
-            "give_up": config.give_up,
-        }
-        path = watch(agent.live(config.target, rate=config.rate, **rest), stream, config.out / "live")
+        given = {name: getattr(config, name) for name in ("rate", "start", "seed", "confirm", "give_up")}
+        path = watch(agent.live(config.target, **given), stream, config.out / "live")
         print(f"written:\n  {path}")
         return
     written, pool, episodes = [], Pool(), []
