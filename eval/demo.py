@@ -4,18 +4,20 @@
     python -m eval.demo --target cup                     # an embedded scene, no photograph needed
     python -m eval.demo PHOTO.jpg --target "wine glass"  # your own photograph; a folder or a video will do, too
     python -m eval.demo PHOTO.jpg --explore              # no target: learn what is where
-    python -m eval.demo --camera 0 --target cup          # a picture from a camera
+    python -m eval.demo --camera 0 --target cup          # live, from a camera, until Ctrl-C
     python -m eval.demo PHOTO.jpg --target cup --report cup.html
 
 It prints what was seen and believed at each fixation, and writes pictures and an animation to the folder `out`.
-Each picture of a folder, a video or a camera is looked at on its own. A picture that is four times as large as the
+Each picture of a folder is looked at on its own. The frames of a video or a camera are looked at as they come, one gaze
+shift a frame: belief goes on from frame to frame and fades at a rate. A picture that is four times as large as the
 detector's input, or larger, is looked at in windows: the agent chooses where, and how close.
 """
 
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,12 +25,16 @@ import torch
 from torch import Tensor
 
 import semfov
+from eval.stream import watch
 from semfov import ActivePerception, Scanpath, viz
-from semfov.data.sources import Picture, embedded_picture, open_pictures
-from semfov.errors import check, lookup
+from semfov.data.classes import class_index
+from semfov.data.sources import Picture, Stream, embedded_picture, is_video, open_pictures, open_stream
+from semfov.detection.load import check_detector
+from semfov.errors import check
 from semfov.experiments.command import run_command
 from semfov.experiments.settings import Range, Seed, Settings, Share, Shifts, Weight, Whole
 from semfov.experiments.summary import save_figure
+from semfov.live import RATE
 from semfov.report.episode import Pool, episode_data
 from semfov.report.page import write_page
 from semfov.sensor import SENSORS
@@ -49,7 +55,7 @@ class DemoConfig(Settings):
         photo: photograph, folder of photographs or video (none: an embedded scene).
         target: class to search for; none, and no --explore, lists the classes.
         explore: look around without a target.
-        camera: take pictures from the camera of this number.
+        camera: look at what the camera of this number shows.
         agent: `recommended` (learned models, where they are shipped for the detector), `published` (the paper's:
             calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
             no model: scores as they are, looks where the target is most probable).
@@ -66,7 +72,8 @@ class DemoConfig(Settings):
             where the map was learned; 0: never). Of a large picture in objects: when no window is expected to show so
             many new ones (none: 0.01).
         seed: of the start, of ties and of the embedded scene.
-        frames: how many frames of a video or camera to look at.
+        frames: how many frames of a video or camera to look at (none: all of a video, of a camera until Ctrl-C).
+        rate: at which the belief about a video or camera fades from frame to frame (0: never).
         report: write a page to step through in a browser to this file.
         out: folder for pictures and animations.
     """
@@ -85,26 +92,38 @@ class DemoConfig(Settings):
     price: Weight | None = None
     until: Weight | None = None
     seed: Seed = 0
-    frames: Annotated[int, Range(1, 100_000)] = 4
+    frames: Annotated[int, Range(1, 10**9)] | None = None
+    rate: Annotated[float, Range(0, 100)] = RATE
     report: Path | None = None
     out: Path = Path("runs/demo")
 
 
 def demo(config: DemoConfig) -> None:
     """Look at every picture, print what was done, and draw it."""
-    check(config.frames >= 1, "frames", "at least 1", config.frames)
     check(config.target is None or not config.explore, "target", "none with --explore", config.target)
-    agent = make_agent(config)
+    check(config.photo is None or config.camera is None, "photo", "none with --camera", config.photo)
+    # What can be told of the arguments is told before anything is loaded.
+    classes = known_classes(config)
+    agent = None if classes is not None else make_agent(config)
+    classes = agent.classes[1:] if agent is not None else classes or ()
     if config.target is None and not config.explore:
-        print(f"Choose a class with --target, or --explore. {agent.eye.detector.name} knows:\n")
-        print(columns(agent.classes[1:]))
+        print(f"Choose a class with --target, or --explore. {config.detector} knows:\n")
+        print(columns(classes))
         return
     if config.target is not None:
-        lookup(config.target, agent.classes[1:], "target class")
+        config = replace(config, target=classes[class_index(config.target, classes, "target") - 1])
+    stream = open_live(config)
+    watched = opened(pictures(config, classes)) if stream is None else iter(())
+    agent = make_agent(config) if agent is None else agent
+    if stream is not None:
+        given = {name: getattr(config, name) for name in ("rate", "start", "seed", "confirm", "give_up")}
+        path = watch(agent.live(config.target, **given), stream, config.out / "live")
+        print(f"written:\n  {path}")
+        return
     written, pool, episodes = [], Pool(), []
-    several = config.camera is not None or (config.photo is not None and is_many(config.photo))
+    several = config.photo is not None and config.photo.is_dir()
     zooming = zoom_agent(config, agent)
-    for number, picture in enumerate(pictures(config, agent)):
+    for number, picture in enumerate(watched):
         if zooming is not None and zooming.pays(picture.image):
             folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
             written += zoom_in(zooming, picture, config, folder)
@@ -170,19 +189,34 @@ def chosen(values: dict[str, float | None]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def is_many(photo: Path) -> bool:
-    """Whether this is a source of several pictures."""
-    from semfov.data.sources import VIDEOS
-
-    return photo.is_dir() or photo.suffix.lower() in VIDEOS
+def known_classes(config: DemoConfig) -> tuple[str, ...] | None:
+    """Classes of the detector, where they are known before it is loaded."""
+    return check_detector(config.detector)
 
 
-def pictures(config: DemoConfig, agent: ActivePerception) -> Iterator[Picture]:
+def open_live(config: DemoConfig) -> Stream | None:
+    """The video or the camera that the settings name, if they do."""
+    source = config.camera if config.photo is None else config.photo if is_video(config.photo) else None
+    if source is None:
+        return None
+    for name in ("shifts", "price", "until", "report"):
+        value = getattr(config, name)
+        check(value is None, name, "none for a video or a camera, which ends with its --frames", value)
+    return open_stream(source, config.frames)
+
+
+def pictures(config: DemoConfig, classes: Sequence[str]) -> Iterator[Picture]:
     """The pictures that the settings name."""
-    if config.photo is None and config.camera is None:
-        yield embedded_picture(agent.classes[1:], config.target, config.seed)
+    if config.photo is None:
+        yield embedded_picture(classes, config.target, config.seed)
     else:
-        yield from open_pictures(config.photo, config.camera, config.frames)
+        yield from open_pictures(config.photo)
+
+
+def opened(pictures: Iterator[Picture]) -> Iterator[Picture]:
+    """The same pictures, of which the first is read at once."""
+    first = next(pictures)
+    return chain([first], pictures)
 
 
 def look_at(agent: ActivePerception, picture: Picture, config: DemoConfig) -> Scanpath:

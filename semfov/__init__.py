@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from semfov.agent import ActivePerception
 from semfov.belief import Belief, DirichletBelief, Grid, MapEvidence, TargetEvidence, fusion, observers
-from semfov.data import EmbeddedScenes, read_image
+from semfov.data import EmbeddedScenes, as_image, read_image
 from semfov.detection import Detections, Detector, Selection
 from semfov.detection.load import load_detector
 from semfov.episode import rollout
@@ -44,6 +44,7 @@ __all__ = [
     "ZoomEye",
     "__version__",
     "acquisition",
+    "as_image",
     "dirichlet",
     "foveate",
     "fusion",

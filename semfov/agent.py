@@ -13,17 +13,20 @@ from semfov.belief.grid import Grid
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
 from semfov.belief.target_evidence import TargetEvidence
+from semfov.data.classes import class_index
+from semfov.data.inputs import ImageLike, as_image
 from semfov.decision import conclude, decide, decide_by_price
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.episode import LiveLooks, Step, rollout
-from semfov.errors import InputError, check, check_pixels, check_shape, check_whole, lookup
+from semfov.errors import InputError, check, check_whole, lookup
 from semfov.eye import Eye
 from semfov.gaze.acquisition import ExpectedGain
-from semfov.gaze.choice import Greedy, drawn_by
+from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.gaze.policies import KL, Closer, NonPredictive, Policy, Predictive, Random
-from semfov.io.compatibility import learned_for
+from semfov.io.compatibility import check_shipped_sensor, learned_for
 from semfov.io.schema import is_number
+from semfov.live import RATE, LivePerception
 from semfov.observation.foveal import FovealObservationModel
 from semfov.scanpath import Ending, Scanpath, trace
 from semfov.sensor.foveation import Foveation
@@ -81,9 +84,7 @@ class ActivePerception(nn.Module):
         self.eye = eye
         self.searching = Strategy(*search)
         self.exploring = Strategy(*explore)
-        check(len(grid) == 2, "grid", "(columns, rows)", grid)
-        for side in grid:
-            check_whole(side, "grid", 1, 200)
+        _check_cells(grid)
         self.columns, self.rows = grid
 
     @classmethod
@@ -103,21 +104,23 @@ class ActivePerception(nn.Module):
             name: a detector for which models are shipped, `yolov3-tiny` or `yolox-nano`.
             sigma: width of the fovea in pixels of an image of 640; the models are fitted for 100.
             growth: see `Foveation`; models are fitted for 2, and for 1 as published.
-            grid: `(columns, rows)` of the belief.
+            grid: `(columns, rows)` of the belief; models are fitted on 10 x 10 cells.
             context: whether search also goes by the usual places and company of the target (`ContextPrior`).
             options: of `semfov.load_detector`.
 
         Raises:
-            InputError: no models are shipped for a detector of this name.
+            InputError: no models are shipped for a detector of this name, for such a sensor or on such a grid.
             DataError: the weights cannot be had, or are damaged.
         """
+        check_shipped_sensor(sigma, growth)
+        _check_cells(grid)
         detector = load_detector(name, **options)
         eye = Eye(Foveation(sigma, growth=growth), detector)
         name = learned_for(detector.name, growth)
         evidence = TargetEvidence.from_pretrained(name)
-        evidence.check_compatible(eye.settings())
+        evidence.check_compatible(eye.settings(), grid)
         everything = MapEvidence.from_pretrained(name)
-        everything.check_compatible(eye.settings())
+        everything.check_compatible(eye.settings(), grid)
         observer: Observer = Target(evidence)
         if context:
             prior = ContextPrior.from_pretrained()
@@ -195,7 +198,7 @@ class ActivePerception(nn.Module):
 
     def search(
         self,
-        image: Tensor,
+        image: ImageLike,
         target: str | int,
         *,
         start: int | None = None,
@@ -219,7 +222,7 @@ class ActivePerception(nn.Module):
         protocol of the paper).
 
         Args:
-            image: `(3, H, W)` or `(1, 3, H, W)`, RGB in [0, 1].
+            image: a picture of any common kind (`semfov.as_image`): a path, an image of Pillow's, an array or a tensor.
             target: name or index (1..K) of the class.
             start: first cell; None draws one.
             shifts: most gaze shifts to make.
@@ -233,12 +236,12 @@ class ActivePerception(nn.Module):
 
         Raises:
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
+            DataError: the image's file cannot be read.
         """
-        for name, value in (("confirm", confirm), ("give_up", give_up)):
-            check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability", value)
+        index = class_index(target, self.classes[1:], "target")
+        _check_thresholds(confirm, give_up)
         check(price is None or (is_number(price) and price >= 0), "price", "0 or more right decisions", price)
         image, grid = self._frame(image)
-        index = self._target(target)
         goal = None if boxes is None else grid.footprint(boxes.to(image)).any(-2)
         chosen = self.searching.observer.thresholds
         if price is not None and (chosen is None or confirm is not None or give_up is not None):
@@ -265,7 +268,7 @@ class ActivePerception(nn.Module):
         return replace(scanpath, decision=conclude(ended, last.belief, scanpath.detections, grid, index, cell))
 
     def explore(
-        self, image: Tensor, *, start: int | None = None, shifts: int = 20, seed: int = 0, until: float | None = None
+        self, image: ImageLike, *, start: int | None = None, shifts: int = 20, seed: int = 0, until: float | None = None
     ) -> Scanpath:
         """Explore an image: build up the belief about the whole map, with no target.
 
@@ -296,13 +299,41 @@ class ActivePerception(nn.Module):
         scanpath, ended, _ = self._gaze(image, grid, self.exploring, None, start, shifts, seed, spent)
         return replace(scanpath, ending="price") if ended else scanpath
 
-    def _frame(self, image: Tensor) -> tuple[Tensor, Grid]:
+    def live(
+        self,
+        target: str | int | None = None,
+        *,
+        rate: float = RATE,
+        start: int | None = None,
+        seed: int = 0,
+        confirm: float | None = None,
+        give_up: float | None = None,
+    ) -> LivePerception:
+        """Search a camera or a video, or explore it: a look at every frame, by a belief that goes on and fades.
+
+        `target` is a name or an index, None to explore. The other arguments are those of `semfov.live.LivePerception`,
+        and `confirm` and `give_up` those of `search`.
+        """
+        index = None if target is None else class_index(target, self.classes[1:], "target")
+        _check_thresholds(confirm, give_up)
+        strategy = self.exploring if index is None else self.searching
+        chosen = strategy.observer.thresholds
+        return LivePerception(
+            self.eye,
+            strategy.observer,
+            strategy.policy,
+            self.classes,
+            (self.columns, self.rows),
+            target=index,
+            rate=rate,
+            start=start,
+            seed=seed,
+            thresholds=None if chosen is None else chosen.changed(confirm, give_up),
+        )
+
+    def _frame(self, picture: ImageLike) -> tuple[Tensor, Grid]:
         """The image as a batch of one, and the grid over it."""
-        image = image[None] if image.ndim == 3 else image
-        check_shape(image, "image", 1, 3, None, None)
-        own = self.eye.sensor.dtype
-        check(image.dtype == own, "image", f"{own} as the agent is", image.dtype)
-        check_pixels(image, "image")
+        image = as_image(picture, like=self.eye.sensor.like)[None]
         return image, Grid(self.columns, self.rows, (image.shape[-1], image.shape[-2]))
 
     def _gaze(
@@ -318,11 +349,7 @@ class ActivePerception(nn.Module):
     ) -> tuple[Scanpath, int, Step]:
         """Move the gaze until there is an outcome, or no shift or cell is left; also the outcome and the last step."""
         check_whole(shifts, "shifts", 0, MOST_SHIFTS)
-        check_whole(seed, "seed", 0, 2**63 - 1)
-        generator = torch.Generator().manual_seed(seed)
-        if start is None:
-            start = int(torch.randint(len(grid), (1,), generator=generator))
-        check_whole(start, "start", 0, len(grid) - 1)
+        first, generator = first_cell(start, seed, len(grid))
         looks = LiveLooks(self.eye, self.eye.open(image), grid, target)
         ended: tuple[int, Step] | None = None
 
@@ -336,7 +363,7 @@ class ActivePerception(nn.Module):
             looks,
             strategy.observer,
             strategy.policy(target, grid),
-            torch.tensor([start], device=image.device),
+            torch.tensor([first], device=image.device),
             Greedy(drawn_by(generator, len(grid), image)),
             most=shifts + 1,
             ends=ends,
@@ -348,11 +375,18 @@ class ActivePerception(nn.Module):
         ending: Ending = "cells" if bool(ended[1].visited.all()) else "shifts"
         return replace(scanpath, ending=ending), *ended
 
-    def _target(self, target: str | int) -> int:
-        if isinstance(target, str):
-            return self.classes.index(lookup(target, self.classes[1:], "target class"))
-        check_whole(target, "target", 1, len(self.classes) - 1)
-        return target
+
+def _check_thresholds(confirm: float | None, give_up: float | None) -> None:
+    """Raise `InputError` unless the thresholds that are given are probabilities."""
+    for name, value in (("confirm", confirm), ("give_up", give_up)):
+        check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability from 0 to 1", value)
+
+
+def _check_cells(grid: tuple[int, int]) -> None:
+    """Raise `InputError` unless this is a grid."""
+    check(len(grid) == 2, "grid", "(columns, rows)", grid)
+    for side in grid:
+        check_whole(side, "grid", 1, 200)
 
 
 def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:

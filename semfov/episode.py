@@ -1,5 +1,6 @@
 """The loop of active perception: look, weigh what was seen, update the belief, choose where to look next."""
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Look, Observer
 from semfov.detection.detections import Detections
+from semfov.errors import check_number
 from semfov.eye import Eye, View
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.choice import Choice
@@ -118,6 +120,43 @@ class StoredLooks(Looks):
 
 
 @dataclass(frozen=True)
+class Forgetting:
+    r"""How a scene that changes is forgotten, from one look to the next.
+
+    Evidence is discounted by :math:`e^{-r}` a look (`Observer.fade`), and a cell is kept from the gaze as long as half
+    of what was seen from it is left, for :math:`\ln 2 / r` looks. Where all cells are, the one that was fixated longest
+    ago is free.
+
+    Attributes:
+        rate: r, 0 or more; 0 forgets nothing.
+
+    >>> round(Forgetting(0.1).keep, 3), round(Forgetting(0.1).span, 1)
+    (0.905, 6.9)
+    """
+
+    rate: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_number(self.rate, "rate", 0, 100)
+
+    @property
+    def keep(self) -> float:
+        """Share of the evidence that is left after a look."""
+        return math.exp(-self.rate)
+
+    @property
+    def span(self) -> float:
+        """For how many looks a cell is kept from the gaze."""
+        return math.log(2) / self.rate if self.rate else math.inf
+
+    def visited(self, age: Tensor) -> Tensor:
+        """Which cells the gaze is kept from, of those fixated so many looks ago, `(A, X·Y)`; infinity for never."""
+        recent = (age <= self.span) & age.isfinite()
+        oldest = age == age.amax(-1, keepdim=True)
+        return recent & ~(recent.all(-1, keepdim=True) & oldest)
+
+
+@dataclass(frozen=True)
 class Step:
     """One cycle of the A episodes that go on.
 
@@ -163,6 +202,7 @@ def rollout(
     most: int,
     ends: Callable[[Step], Tensor] | None = None,
     window: int | None = None,
+    forgetting: Forgetting | None = None,
 ) -> Iterator[Step]:
     """Episodes of active perception in one image, a step of all of them at a time.
 
@@ -178,6 +218,8 @@ def rollout(
         ends: which of the episodes of a step end with it, `(A,)` boolean.
         window: looks that a gradient flows through; at the border of two windows belief and fixation become constants
             (truncated backpropagation through time), once the step was used.
+        forgetting: how belief and inhibition of return fade, where the scene changes from look to look; None for scenes
+            that stand still.
 
     Example::
 
@@ -192,12 +234,19 @@ def rollout(
     episodes, cell, fixation = torch.arange(len(start), device=start.device), start, centres[start]
     belief = observer.start(len(start), looks.grid, looks.like)
     visited = torch.zeros(len(start), len(looks.grid), dtype=torch.bool, device=start.device)
+    age = torch.full(visited.shape, torch.inf, device=start.device)
     for shift in range(most):
         sight = looks.see(observer, episodes, cell, fixation)
         watch = Stopwatch(sight.seconds)
+        if forgetting is not None:
+            age = age + 1
+            belief = observer.fade(belief, sight.look, forgetting.keep, forgetting.visited(age))
         belief = observer.update(belief, sight.look)
         watch.lap("update belief")
         visited = visited.scatter(-1, cell[:, None], True)
+        if forgetting is not None:
+            age = age.scatter(-1, cell[:, None], 0)
+            visited = forgetting.visited(age)
         values = acquire(episodes, cell)(belief, visited)
         next_fixation, next_cell = choice(shift, episodes, values, visited, centres)
         watch.lap("choose")
@@ -224,7 +273,7 @@ def rollout(
         cell, fixation = next_cell, next_fixation
         if not going.all():
             episodes, cell, fixation = episodes[going], cell[going], fixation[going]
-            belief, visited = belief[going], visited[going]
+            belief, visited, age = belief[going], visited[going], age[going]
 
 
 class Stopwatch:

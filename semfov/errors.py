@@ -94,7 +94,22 @@ def check_pixels(image: Tensor, argument: str) -> None:
         return
     least, most = (float(bound) for bound in image.detach().aminmax())
     inside = least >= -_ROUNDING and most <= 1 + _ROUNDING
-    check(inside, argument, "RGB in [0, 1]", "NaN" if math.isnan(least) else f"numbers from {least:g} to {most:g}")
+    got = "NaN" if math.isnan(least) else f"numbers from {least:g} to {most:g}"
+    check(inside, argument, "RGB in [0, 1]", f"{got}; {_to_unit(least, most)}")
+
+
+def _to_unit(least: float, most: float) -> str:
+    """What to do with pixels of such a range."""
+    if not math.isfinite(least + most):
+        return "replace what is no number (torch.nan_to_num)"
+    if least >= -0.25 and most <= 1.25:
+        return "clamp to [0, 1] what resampling has carried beyond"
+    if least < 0:
+        return (
+            "undo the normalisation: image * std + mean, for ImageNet's with mean (0.485, 0.456, 0.406) and std "
+            "(0.229, 0.224, 0.225), or (image + 1) / 2 where it was to [-1, 1]"
+        )
+    return "divide by 255" if most <= 255.5 else "divide by the value of white"
 
 
 def check_finite(tensor: Tensor, argument: str) -> None:

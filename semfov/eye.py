@@ -6,6 +6,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from semfov.data.inputs import ImageLike, PointLike, as_image, as_points
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.placement import Placement
@@ -50,17 +51,18 @@ class Eye(nn.Module):
         self.detector = detector
         self.reference = reference
 
-    def open(self, image: Tensor) -> View:
-        """Fit an image `(1, 3, H, W)`, RGB in [0, 1], into the input, and open the sensor on it."""
+    def open(self, image: ImageLike) -> View:
+        """Fit an image of any common kind (`semfov.as_image`) into the input, and open the sensor on it."""
+        if not (isinstance(image, Tensor) and image.ndim == 4 and image.is_floating_point()):
+            image = as_image(image, like=self.sensor.like)[None]
         check_shape(image, "image", 1, 3, None, None)
         canvas, placement = self.detector.fit(image)
         scale = canvas.new_tensor(placement.scale) * (max(placement.size) / self.reference)
         return View(canvas, placement, self.sensor.open(canvas, scale))
 
-    def foveated(self, view: View, fixations: Tensor) -> Tensor:
-        """What the sensor gives for fixations `(F, 2)` in image pixels: canvases `(F, 3, h, w)`."""
-        check_shape(fixations, "fixations", None, 2)
-        return self.sensor.look(view.state, view.placement.points_to_canvas(fixations))
+    def foveated(self, view: View, fixations: PointLike) -> Tensor:
+        """What the sensor gives for fixations `(F, 2)` in image pixels, or one `(x, y)`: canvases `(F, 3, h, w)`."""
+        return self.sensor.look(view.state, view.placement.points_to_canvas(_points(fixations, view)))
 
     def detect(self, view: View, fixations: Tensor, canvases: Tensor) -> Detections:
         """Detections on what `foveated` gave for the fixations, boxes in pixels of the image."""
@@ -68,15 +70,24 @@ class Eye(nn.Module):
         back = partial(self.sensor.boxes_to_canvas, view.state, gaze)
         return self.detector.detect(canvases, view.placement, back=back)
 
-    def look(self, view: View, fixations: Tensor) -> Detections:
+    def look(self, view: View, fixations: PointLike) -> Detections:
         """Detections seen from fixations `(F, 2)`, a batch of F, boxes in pixels of the image."""
-        return self.detect(view, fixations, self.foveated(view, fixations))
+        points = _points(fixations, view)
+        return self.detect(view, points, self.foveated(view, points))
 
-    def forward(self, image: Tensor, fixations: Tensor) -> Detections:
-        """`look` at an image `(1, 3, H, W)` from fixations `(F, 2)`."""
+    def forward(self, image: ImageLike, fixations: PointLike) -> Detections:
+        """`look` at an image from fixations `(F, 2)`."""
         return self.look(self.open(image), fixations)
 
     def settings(self) -> dict[str, Any]:
         """What the detections depend on, for the keys of caches and the metadata of fitted models."""
         sensor = self.sensor.settings() | {"reference": self.reference}
         return {"sensor": sensor, "detector": self.detector.settings()}
+
+
+def _points(fixations: PointLike, view: View) -> Tensor:
+    """Fixations `(F, 2)`; one `(x, y)` is one."""
+    points = as_points(fixations, "fixations").to(view.canvas)
+    points = points[None] if points.ndim == 1 else points
+    check_shape(points, "fixations", None, 2)
+    return points

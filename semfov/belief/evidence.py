@@ -1,5 +1,6 @@
 """Learned evidence: what one look says of a class in a cell, and what all looks together say."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -8,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semfov.belief.look_features import FEATURES
+from semfov.belief.look_features import FEATURES, nothing_seen
 from semfov.io.pretrained import PretrainedForEye
 
 READOUT = 14
@@ -87,6 +88,10 @@ class Evidence(PretrainedForEye):
         value: Tensor = self.look(features)
         return value[..., 0]
 
+    def unseen(self, like: Tensor) -> Tensor:
+        """Evidence `()` of a look from a whole longer side away that shows nothing; dtype and device as `like`."""
+        return self.evidence(nothing_seen(like.new_ones(1)))[0]
+
     def read_out(self, reader: nn.Module, nearest: Tensor, gathered: Gathered, columns: int, *more: Tensor) -> Tensor:
         """`nearest` corrected by a network that reads all that was gathered, `(B, X·Y)`."""
         odds = nearest.sigmoid()
@@ -122,6 +127,11 @@ def network(inputs: int, width: int) -> nn.Sequential:
 def nearness(distance: Tensor) -> Tensor:
     """How much looks from a distance, in longer sides of the image, count in the mean of all."""
     return (-distance / _REACH).exp()
+
+
+def farther(keep: float) -> float:
+    """How much farther away a look is, in longer sides of the image, whose nearness is `keep` times as great."""
+    return -math.log(keep) * _REACH
 
 
 def logarithm(odds: Tensor) -> Tensor:

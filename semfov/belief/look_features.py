@@ -82,5 +82,18 @@ def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets
     return torch.stack([each.expand(batch, len(targets), len(grid)) for each in told], -1)
 
 
+def nothing_seen(distance: Tensor) -> Tensor:
+    """`look_features` `(..., 10)` of cells at distances `(...)` that no detection touches, in a look without any.
+
+    >>> nothing_seen(torch.tensor([0.5])).shape
+    torch.Size([1, 10])
+    """
+    none = torch.zeros_like(distance)
+    least = _log(none)
+    objectness = 2 * none
+    told = [4 * distance, least, least, objectness, none, none, none, objectness, objectness, none + 1]
+    return torch.stack(told, -1)
+
+
 def _log(score: Tensor) -> Tensor:
     return score.clamp(min=_FLOOR).log() / 4 + 1

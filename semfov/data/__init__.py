@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from semfov.data.classes import canonical_name, class_index
 from semfov.data.images import read_image
+from semfov.data.inputs import as_image
 from semfov.data.scene import Annotation, Scene, Scenes, box_coverage, legal_targets
 from semfov.data.scenes import EmbeddedScenes
 
@@ -16,6 +17,7 @@ __all__ = [
     "EmbeddedScenes",
     "Scene",
     "Scenes",
+    "as_image",
     "box_coverage",
     "canonical_name",
     "class_index",

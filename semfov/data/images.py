@@ -66,14 +66,13 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
             # By its name Pillow would map a plain TIFF into memory, and mix up its rows where it is to be turned.
             with Path(path).open("rb") as file, Image.open(file) as image:
                 _check_pixels(image.size, name)
-                stored = orientation(image)
-                image.load()
-                picture = turned(image, stored, orientation(image), upright=oriented)
-                array = _rgb(picture, name)
+                array = _pixels(image, name, upright=oriented)
         except DataError:
             raise
         except FileNotFoundError:
-            raise DataError(f"{name}: no such file; check data.root and the file names of the annotations") from None
+            raise DataError(
+                f"{name}: no such file; check data.root and the file names of the annotations, or its path"
+            ) from None
         except PermissionError:
             raise DataError(f"{name}: no permission to read it; check the file's mode and owner") from None
         except UnidentifiedImageError:
@@ -85,6 +84,29 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
             raise DataError(
                 f"{name}: truncated, damaged or of a kind that is not supported ({reason}); replace it"
             ) from error
+    return torch.from_numpy(array).permute(2, 0, 1).contiguous()
+
+
+def from_pillow(image: Any, name: str) -> Tensor:
+    """An image of Pillow's as `read_image` gives it: upright, RGB in [0, 1], `(3, H, W)`.
+
+    Args:
+        image: of any mode.
+        name: what messages call it.
+
+    Raises:
+        DataError: it has no pixels, too many, or its file is damaged.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of damaged metadata
+        try:
+            _check_pixels(image.size, name)
+            array = _pixels(image, name, upright=True)
+        except DataError:
+            raise
+        except Exception as error:  # damaged files raise nearly anything in Pillow's decoders
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise DataError(f"{name}: truncated, damaged or closed ({reason}); open it again or replace it") from error
     return torch.from_numpy(array).permute(2, 0, 1).contiguous()
 
 
@@ -139,6 +161,13 @@ def turned(image: Any, stored: int, left: int, *, upright: bool) -> Any:
 
     orientation = left if upright else _INVERSE.get(stored, stored) if left != stored else 1
     return image if orientation == 1 else image.transpose(Transpose[_MOVES[orientation]])
+
+
+def _pixels(image: Any, name: str, *, upright: bool) -> NDArray[np.float32]:
+    """Pixels `(H, W, 3)` in [0, 1], upright or as stored."""
+    stored = orientation(image)
+    image.load()
+    return _rgb(turned(image, stored, orientation(image), upright=upright), name)
 
 
 def _rgb(image: Any, name: str) -> NDArray[np.float32]:

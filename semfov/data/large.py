@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.data.images import orientation, read_image, turned
-from semfov.errors import DataError, InputError, SemfovError, check, check_pixels, check_shape
+from semfov.data.inputs import ImageLike, as_image, channels_first, pixels_of
+from semfov.errors import DataError, SemfovError, check, check_pixels
 from semfov.io.files import check_regular
 
 Box = tuple[int, int, int, int]
@@ -81,20 +82,17 @@ class ArrayPicture(LargePicture):
         return np.repeat(window[..., None], 3, -1) if window.ndim == 2 else window
 
 
-class TensorPicture(ArrayPicture):
-    """An image tensor, RGB in [0, 1], kept as bytes.
+class MemoryPicture(ArrayPicture):
+    """A picture of any common kind (`semfov.as_image`), kept as bytes."""
 
-    Args:
-        image: `(3, H, W)` or `(1, 3, H, W)`; bytes are taken as they are.
-    """
-
-    def __init__(self, image: Tensor) -> None:
-        image = image[None] if image.ndim == 3 else image
-        check_shape(image, "image", 1, 3, None, None)
-        check(image.ndim == 4, "image", "a tensor of shape (3, H, W) or (1, 3, H, W)", tuple(image.shape))
-        known = image.is_floating_point() or image.dtype == torch.uint8
-        check(known, "image", "RGB in [0, 1], or bytes", image.dtype)
-        super().__init__(to_bytes(image[0].detach()))
+    def __init__(self, image: ImageLike) -> None:
+        if isinstance(image, Tensor | np.ndarray) and image.dtype in (torch.uint8, np.dtype(np.uint8)):
+            # Bytes are not made floats in between: a large picture would take four times the memory.
+            pixels = channels_first(pixels_of(image, "picture"), "picture", choose=isinstance(image, Tensor))
+            check(len(pixels) == 1, "picture", "one picture", f"a batch of {len(pixels)}; give them one by one")
+            super().__init__(to_bytes(pixels[0]))
+        else:
+            super().__init__(to_bytes(as_image(image, argument="picture").detach()))
 
 
 def to_bytes(image: Tensor) -> NDArray[np.uint8]:
@@ -226,23 +224,29 @@ class TiffPicture(LargePicture):
         return window
 
 
-def open_large(source: LargePicture | Tensor | NDArray[np.uint8] | str | PathLike[str]) -> LargePicture:
-    """A picture that gives its windows, from a tensor, an array, or a file (`.tif` and `.tiff` tile by tile).
+def open_large(source: LargePicture | ImageLike) -> LargePicture:
+    """A picture that gives its windows, from any common kind (`semfov.as_image`; `.tif` and `.tiff` tile by tile).
+
+    Arrays of bytes `(H, W, 3)` and `(H, W)` stay where they are: of a `numpy.memmap` only windows are read.
 
     >>> open_large(torch.rand(3, 20, 30)).read((10, 5, 30, 15)).shape
     torch.Size([3, 10, 20])
     """
     if isinstance(source, LargePicture):
         return source
-    if isinstance(source, Tensor):
-        return TensorPicture(source)
-    if isinstance(source, np.ndarray):
+    if isinstance(source, np.ndarray) and source.dtype == np.uint8 and source.size and _by_rows(source.shape):
         return ArrayPicture(source)
     if not isinstance(source, str | PathLike):
-        raise InputError(f"picture: expected a tensor, an array of bytes or a file, got {type(source).__name__}")
+        return MemoryPicture(source)
+    check("://" not in str(source), "picture", "a file on this machine", f"{str(source)!r}; download it first")
     if Path(source).suffix.lower() in (".tif", ".tiff"):
         return TiffPicture(source)
     return PhotographPicture(source)
+
+
+def _by_rows(shape: tuple[int, ...]) -> bool:
+    """Whether an array of this shape is `(H, W)` or `(H, W, 3)`, and cannot be `(3, H, W)`."""
+    return len(shape) == 2 or (len(shape) == 3 and shape[2] == 3 and shape[0] != 3)
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -34,34 +35,38 @@ class Picture:
     boxes: Tensor | None = None
 
 
-def open_pictures(source: Path | None, camera: int | None, frames: int) -> Iterator[Picture]:
-    """Pictures from a photograph, a folder or a video, or from a camera.
+def open_pictures(source: Path) -> Iterator[Picture]:
+    """Pictures from a photograph or a folder.
 
     Args:
         source: a file, or a folder whose photographs are taken in the order of their names.
-        camera: number of a camera, in place of a source.
-        frames: how many frames to take from a video, evenly spaced, or from a camera, one after another.
 
     Raises:
-        InputError: neither or both are given, or the file is of an unknown kind.
         DataError: there is nothing to read.
     """
-    if (source is None) == (camera is None):
-        raise InputError("photo: expected a photograph, a folder, a video, or --camera, got both or none of them")
-    if source is None:
-        yield from _record(camera, f"camera {camera}", frames)
-    elif source.is_dir():
+    if source.is_dir():
         files = sorted(path for path in source.iterdir() if path.suffix.lower() in PHOTOGRAPHS)
         if not files:
-            raise DataError(f"{source}: expected photographs ({', '.join(PHOTOGRAPHS)}), found none")
+            raise DataError(f"photo: expected photographs ({', '.join(PHOTOGRAPHS)}) in {source}, found none")
         yield from (Picture(path.name, read_image(path)) for path in files)
-    elif not source.exists():
-        raise DataError(f"{source}: no such file or folder")
-    elif source.suffix.lower() in VIDEOS:
-        check_regular(source)
-        yield from _record(str(source), source.name, frames)
     else:
+        check_there(source)
         yield Picture(source.name, read_image(source))
+
+
+def check_there(source: Path) -> None:
+    """Raise `DataError` where there is no such file or folder."""
+    if not source.exists():
+        raise DataError(f"photo: no such file or folder: {source}; check the path")
+
+
+def is_video(source: Path) -> bool:
+    """Whether this is a video, by its name.
+
+    >>> is_video(Path("holiday.MP4"))
+    True
+    """
+    return source.suffix.lower() in VIDEOS and not source.is_dir()
 
 
 def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scenes: int = 16) -> Picture:
@@ -77,29 +82,66 @@ def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scen
     raise InputError(f"target: the embedded scenes hold {', '.join(held)}; give a photograph to search for {target!r}")
 
 
-def _record(source: Any, name: str, frames: int) -> Iterator[Picture]:
-    """Frames of a video or of a camera."""
+@dataclass(frozen=True)
+class Stream:
+    """A video or a camera.
+
+    Attributes:
+        name: what to call it.
+        rate: frames per second; None where it is not known.
+        frames: one after the other, as they come.
+    """
+
+    name: str
+    rate: float | None
+    frames: Iterator[Picture]
+
+
+def open_stream(source: Path | int, most: int | None = None) -> Stream:
+    """Open a video by its file, or a camera by its number.
+
+    Args:
+        source: of the frames.
+        most: how many frames to take; None takes all.
+
+    Raises:
+        DataError: it cannot be opened or has no frame, or OpenCV is not installed.
+    """
+    name = f"camera {source}" if isinstance(source, int) else source.name
     try:
         import cv2
     except ImportError:
         raise DataError(f"{name}: videos and cameras need OpenCV; pip install opencv-python-headless") from None
-    recorder = cv2.VideoCapture(source)
+    if isinstance(source, Path):
+        check_there(source)
+        check_regular(source)
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # it is told below
     try:
-        if not recorder.isOpened():
-            raise DataError(f"{name}: cannot be opened; check that it is there and of a kind that OpenCV reads")
-        count = int(recorder.get(cv2.CAP_PROP_FRAME_COUNT)) if isinstance(source, str) else 0
-        wanted = [(2 * order + 1) * count // (2 * frames) for order in range(frames)] if count > 0 else range(frames)
-        taken = 0
-        for number in sorted(set(wanted)):
-            if count > 0:
-                recorder.set(cv2.CAP_PROP_POS_FRAMES, number)
+        recorder = cv2.VideoCapture(source if isinstance(source, int) else str(source))
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    if not recorder.isOpened():
+        what = "is connected and free" if isinstance(source, int) else "is of a kind that OpenCV reads"
+        raise DataError(f"{name}: cannot be opened; check that it {what}")
+    rate = float(recorder.get(cv2.CAP_PROP_FPS))
+    frames = _record(recorder, name, most)
+    first = next(frames)
+    return Stream(name, rate if 0 < rate < 1000 else None, chain([first], frames))
+
+
+def _record(recorder: Any, name: str, most: int | None) -> Iterator[Picture]:
+    """Frames as they come, RGB in [0, 1]."""
+    try:
+        for number in count():
+            if number == most:
+                return
             whole, pixels = recorder.read()
             if not whole:
-                break
-            taken += 1
+                if not number:
+                    raise DataError(f"{name}: no frame could be read; check that it is whole")
+                return
             rgb = torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1)
             yield Picture(f"{name}, frame {number}", rgb.float() / 255)
-        if not taken:
-            raise DataError(f"{name}: no frame could be read")
     finally:
         recorder.release()

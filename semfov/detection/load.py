@@ -21,6 +21,8 @@ from semfov.detection.yolo import YoloV3
 from semfov.errors import DataError, InputError, lookup
 from semfov.io.files import check_regular
 
+_WEIGHTS_ALONE = "detector: expected a cfg and its weights, load_detector('x.cfg', weights='{}')"
+
 
 def load_detector(name_or_path: str | PathLike[str], **options: Any) -> Detector:
     """A detector by its name or its file, ready for inference.
@@ -47,10 +49,34 @@ def load_detector(name_or_path: str | PathLike[str], **options: Any) -> Detector
 
         return load_torchvision(name, **options)
     if name.endswith(".weights"):
-        raise InputError(f"name_or_path: expected a cfg and its weights, load_detector('x.cfg', weights={name!r})")
+        raise InputError(_WEIGHTS_ALONE.format(name))
     if not name.endswith(".cfg"):
         lookup(name, WEIGHTS, "detector")
     return load_yolo(name, **options)
+
+
+def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
+    """Whether this names a detector, told without loading it: its classes, or None where only the model knows them.
+
+    Raises:
+        InputError: no detector has this name.
+        DataError: there is no such file.
+
+    >>> check_detector("yolox-nano")[:2]
+    ('person', 'bicycle')
+    """
+    name = fspath(name_or_path)
+    if name.endswith((".onnx", ".cfg")):
+        if not Path(name).exists():
+            raise DataError(f"detector: no such file: {name}; check the path")
+        check_regular(name)
+        return None
+    if name.startswith("torchvision:"):
+        return None
+    if name.endswith(".weights"):
+        raise InputError(_WEIGHTS_ALONE.format(name))
+    lookup(name, WEIGHTS, "detector")
+    return COCO_CLASSES
 
 
 def load_yolo(

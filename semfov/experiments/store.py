@@ -11,9 +11,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
-import kornia
 import torch
-import torchvision
 from torch import Tensor
 
 from semfov.belief.grid import Grid
@@ -97,6 +95,9 @@ class DetectionStore(SceneStore):
 
 def versions() -> dict[str, object]:
     """Of everything besides this package that numbers depend on."""
+    import kornia
+    import torchvision
+
     return {
         "semfov": __version__,
         "torch": torch.__version__,

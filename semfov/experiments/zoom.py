@@ -11,10 +11,11 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scenes
 from semfov.episode import Stopwatch
-from semfov.errors import DataError, lookup
+from semfov.errors import DataError
 from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.parts import Parts, Record
 from semfov.experiments.run import cache_folder, digest_of
@@ -111,7 +112,7 @@ class ZoomRun:
                 photographs, config.columns, config.rows, tile=size, count=config.mosaics, seed=config.seed
             )
         names = detector.classes
-        self.target = None if config.target is None else names.index(lookup(config.target, names, "target class")) + 1
+        self.target = None if config.target is None else class_index(config.target, names, "target")
         self.store = GlanceStore(cache_folder(config.cache) / "glances", self.eye.settings(), len(names))
         self.settings_key, self.code = self._key(), digest_of([package_digest(), versions()])
         self.key = f"{self.settings_key[:16]}-{self.code[:16]}"

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from semfov.errors import check_whole
 from semfov.gaze.relaxation import soft_fixation
 from semfov.gaze.selection import select_fixation
 
@@ -113,6 +114,25 @@ class Given(Choice):
         """The next cell of the scanpath; its last one at the end."""
         cell = self.cells[episodes, min(shift + 1, self.cells.shape[1] - 1)]
         return centres[cell], cell
+
+
+def first_cell(start: int | None, seed: int, cells: int) -> tuple[int, torch.Generator]:
+    """The cell that an episode fixates first, and the generator that breaks its ties.
+
+    Args:
+        start: the cell; None draws one.
+        seed: of the generator.
+        cells: how many there are.
+
+    >>> first_cell(3, 0, 100)[0]
+    3
+    """
+    check_whole(seed, "seed", 0, 2**63 - 1)
+    generator = torch.Generator().manual_seed(int(seed))
+    if start is None:
+        return int(torch.randint(cells, (1,), generator=generator)), generator
+    check_whole(start, "start", 0, cells - 1)
+    return int(start), generator
 
 
 def drawn_from(noise: Tensor) -> Noise:

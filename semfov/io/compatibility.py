@@ -17,6 +17,13 @@ CONVERSIONS = (
 )
 """sha256 of files that are conversions of one checkpoint: here YOLOX-nano's, by Kazuhito00 and by its authors."""
 
+SHIPPED_SIGMA = 100.0
+"""Width of the fovea, in pixels of an image of 640, that learned models are shipped for."""
+SHIPPED_GROWTHS = (1.0, 2.0)
+"""Growths of the fovea that learned models are shipped for."""
+
+_FIT = "take that, ActivePerception.raw with any sensor, or fit models for this one (python -m train.fit_search)"
+
 # Keys that are compared otherwise, and those of how a network is computed: its numbers are the same up to rounding.
 # (`winograd` is in models that were fitted before there was `runtime`.)
 _ALIKE = {"name", "digest", "background", "winograd", "runtime", "dtype"}
@@ -83,6 +90,34 @@ def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str
     """Warn where the sensor has other settings."""
     if sensor and fitted:
         _warn_of_others("sensor", fitted, sensor, set(), what)
+
+
+def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> None:
+    """Raise `InputError` unless the model was fitted on a grid like this.
+
+    A cell that is smaller or larger holds an object less or more often, and a network has learned how often.
+
+    Args:
+        fitted: settings of its training; without `columns` and `rows` it may stand on any grid.
+        grid: `(columns, rows)`.
+        what: title of the model.
+    """
+    known = fitted.get("columns"), fitted.get("rows")
+    if None not in known and known != tuple(grid):
+        raise InputError(
+            f"grid: the {what} was fitted on {known[0]} × {known[1]} cells, got {grid[0]} × {grid[1]}; take "
+            f"grid={known}, or fit models on such a grid (python -m train.fit_search and train.fit_map, with "
+            f"--columns {grid[0]} --rows {grid[1]})"
+        )
+
+
+def check_shipped_sensor(sigma: float, growth: float) -> None:
+    """Raise `InputError` for a fovea that no learned models are shipped for."""
+    if growth not in SHIPPED_GROWTHS:
+        known = " and ".join(f"{value:g}" for value in SHIPPED_GROWTHS)
+        raise InputError(f"growth: models are shipped for {known}, got {growth}; {_FIT}")
+    if sigma != SHIPPED_SIGMA:
+        raise InputError(f"sigma: models are shipped for {SHIPPED_SIGMA:g} pixels of 640, got {sigma}; {_FIT}")
 
 
 def _warn_of_others(part: str, fitted: Mapping[str, Any], used: Mapping[str, Any], known: set[str], what: str) -> None:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 from torch import Tensor, nn
 
 from semfov.errors import DataError, InputError, check
-from semfov.io.compatibility import check_detector, check_sensor
+from semfov.io.compatibility import check_detector, check_grid, check_sensor
 from semfov.io.schema import METADATA, Schema, Text
 from semfov.io.storage import find, read, write
 from semfov.version import __version__
@@ -80,11 +80,14 @@ class Pretrained(nn.Module):
 class PretrainedForEye(Pretrained):
     """Base of the models that are trained behind one eye, whose `metadata` tells `detector` and `sensor`."""
 
-    def check_compatible(self, settings: Mapping[str, Any]) -> None:
-        """Raise `InputError` beside another detector than it was trained for, warn of other settings.
+    def check_compatible(self, settings: Mapping[str, Any], grid: tuple[int, int] | None = None) -> None:
+        """Raise `InputError` beside another detector than it was trained for or on a grid for others; warn of the rest.
 
         Args:
             settings: `Eye.settings()`.
+            grid: `(columns, rows)` of the belief; None leaves it unchecked.
         """
+        if grid is not None:
+            check_grid(self.metadata.get("training", {}), grid, self.title)
         check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
         check_sensor(self.metadata.get("sensor", {}), settings["sensor"], self.title)

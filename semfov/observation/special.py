@@ -52,10 +52,13 @@ def _evaluate(coefficients: tuple[float, ...], x: Tensor) -> Tensor:
     return value.add_(coefficients[0])
 
 
-@torch.compiler.assume_constant_result
 def _polynomials(c: float, shift: int, terms: int) -> tuple[tuple[float, ...], ...]:
     """Coefficients of (P - 1) / g, (1 - g) P' and Q."""
     return _expand(c, shift, terms)
+
+
+# What `torch.compiler.assume_constant_result` does, which imports the compiler: a second for whoever compiles nothing.
+_polynomials._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 @lru_cache

@@ -23,9 +23,9 @@ class Sensor(nn.Module, ABC):
         self.register_buffer("_like", torch.empty(0), persistent=False)
 
     @property
-    def dtype(self) -> torch.dtype:
-        """Type of the images that it takes."""
-        return torch.as_tensor(self._like).dtype
+    def like(self) -> Tensor:
+        """An empty tensor of the type, and on the device, of the images that it takes."""
+        return torch.as_tensor(self._like)
 
     @abstractmethod
     def open(self, canvas: Tensor, scale: Tensor) -> Any:

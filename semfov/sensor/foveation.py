@@ -6,6 +6,7 @@ from typing import Any, get_args
 import torch
 from torch import Tensor, nn
 
+from semfov.data.inputs import ImageLike, PointLike, as_images, as_points, is_batch
 from semfov.errors import check, lookup, values_known
 from semfov.sensor.base import Sensor, fixations
 from semfov.sensor.lines import constant
@@ -13,8 +14,8 @@ from semfov.sensor.pyramid import Bands, Convention, expand, laplacian_pyramid, 
 
 
 def foveate(
-    image: Tensor | Bands,
-    gaze: Tensor,
+    image: ImageLike | Bands,
+    gaze: PointLike,
     *,
     sigma: float | Tensor,
     levels: int = 5,
@@ -37,9 +38,9 @@ def foveate(
 
     Args:
         image: `(B, C, H, W)`, or a pyramid of it from `Foveation.pyramid`, which any number of fixations can share
-            (`levels` and `convention` are then the pyramid's).
-        gaze: fixation `(x, y)` in image pixels, inside or outside: `(2,)` for all images, `(B, 2)` one for each, or
-            `(B, G, 2)` G for each.
+            (`levels` and `convention` are then the pyramid's); or one picture of any common kind (`semfov.as_image`).
+        gaze: fixation `(x, y)` in image pixels, inside or outside, as a tensor, an array, a tuple or a list: `(2,)` for
+            all images, `(B, 2)` one for each, or `(B, G, 2)` G for each; of one picture `(2,)`, or `(G, 2)` G of them.
         sigma: width σ of the fovea in image pixels: a number, `()`, `(B,)`, or `(B, 2)` for widths along x and y.
             Infinity gives the image back.
         levels: number of bands, K.
@@ -48,18 +49,26 @@ def foveate(
         convention: `kornia` or `opencv` (`semfov.sensor.pyramid`).
 
     Returns:
-        `(B, C, H, W)`, or `(B, G, C, H, W)` for G fixations.
+        `(B, C, H, W)`, or `(B, G, C, H, W)` for G fixations; of one picture `(3, H, W)` or `(G, 3, H, W)`.
 
     Raises:
-        InputError: a shape does not fit, the gaze is not finite, or σ or growth is not positive.
+        InputError: a shape does not fit, the gaze is not finite, σ or growth is not positive, or it is no picture.
+        DataError: a file cannot be read.
 
     >>> image = torch.rand(1, 3, 48, 64)
     >>> foveate(image, torch.tensor([32.0, 24.0]), sigma=10.0).shape
     torch.Size([1, 3, 48, 64])
     >>> foveate(image, torch.rand(1, 7, 2), sigma=10.0).shape
     torch.Size([1, 7, 3, 48, 64])
+    >>> foveate(image[0], (32, 24), sigma=10.0).shape
+    torch.Size([3, 48, 64])
     """
-    bands = image if isinstance(image, Bands) else laplacian_pyramid(image, levels, convention)
+    gaze = as_points(gaze)
+    if not (isinstance(image, Bands) or is_batch(image)):
+        points = gaze[None] if gaze.ndim == 2 else gaze
+        bands = laplacian_pyramid(as_images(image), levels, convention)
+        return foveate(bands, points, sigma=sigma, growth=growth)[0]
+    bands = image if isinstance(image, Bands) else laplacian_pyramid(_batch(image), levels, convention)
     fixation, many = fixations(gaze, bands.base)
     _check_values(sigma, growth)
     result = _collapse(bands, fixation, _widths(sigma, bands.base), growth)
@@ -128,9 +137,9 @@ class Foveation(Sensor):
         """Width of the fovea in image pixels."""
         return self.log_sigma.exp()
 
-    def pyramid(self, image: Tensor) -> Bands:
-        """The part of the work that does not depend on the gaze, for an image `(B, C, H, W)`."""
-        return laplacian_pyramid(image, self.levels, self.convention)
+    def pyramid(self, image: ImageLike) -> Bands:
+        """The part of the work that does not depend on the gaze, for images `(B, C, H, W)` or one of any kind."""
+        return laplacian_pyramid(_batch(image), self.levels, self.convention)
 
     def open(self, canvas: Tensor, scale: Tensor) -> Opened:
         """Build the pyramid of a canvas, and scale the width of the fovea."""
@@ -150,7 +159,7 @@ class Foveation(Sensor):
             "convention": self.convention,
         }
 
-    def forward(self, image: Tensor | Bands, gaze: Tensor) -> Tensor:
+    def forward(self, image: ImageLike | Bands, gaze: PointLike) -> Tensor:
         """Foveate an image or a pyramid around `gaze`; shapes as for `foveate`."""
         return foveate(
             image, gaze, sigma=self.sigma, levels=self.levels, growth=self.growth, convention=self.convention
@@ -160,6 +169,13 @@ class Foveation(Sensor):
         """Settings, for `print`."""
         settings = f"levels={self.levels}, growth={self.growth:g}, convention={self.convention!r}"
         return f"sigma={float(self.sigma.detach()):g}, {settings}"
+
+
+def _batch(images: ImageLike) -> Tensor:
+    """Images `(B, C, H, W)`: batches of floats as they are, with any channels and of any range."""
+    if isinstance(images, Tensor) and images.ndim == 4 and images.is_floating_point():
+        return images
+    return as_images(images)
 
 
 def _collapse(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> Tensor:

@@ -1,16 +1,15 @@
 """An agent for pictures larger than its detector's input."""
 
-from os import PathLike
 from typing import Any, Self
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
+from semfov.data.classes import class_index
+from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture
 from semfov.detection.load import load_detector
-from semfov.errors import check, check_number, check_whole, lookup
+from semfov.errors import check, check_number, check_whole
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, ZoomEye
 from semfov.zoom.glances import LiveGlances
@@ -19,7 +18,7 @@ from semfov.zoom.search import ZoomPath, find_all, search
 MOST = 1_000_000
 """More passes than any picture has windows worth a look."""
 
-Picture = LargePicture | Tensor | NDArray[np.uint8] | str | PathLike[str]
+Picture = LargePicture | ImageLike
 
 
 class ZoomAgent(nn.Module):
@@ -77,7 +76,7 @@ class ZoomAgent(nn.Module):
         """Search for one object of a class, and decide; see `semfov.zoom.search.search`.
 
         Args:
-            picture: an image `(3, H, W)`, an array of bytes, a file, or a `LargePicture`.
+            picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
             target: name or index (1..K) of the class.
             passes: of the detector, at most.
             confirm: score from which on it is found.
@@ -90,7 +89,7 @@ class ZoomAgent(nn.Module):
         check_whole(passes, "passes", 1, MOST)
         check_number(confirm, "confirm", 0, 1)
         check_number(give_up, "give_up", 0, 1)
-        index = self._target(target)
+        index = class_index(target, self.classes[1:], "target")
         with torch.inference_mode():
             return search(
                 self._open(picture), self.evidence, self.classes, index, passes=passes, confirm=confirm, give_up=give_up
@@ -112,7 +111,7 @@ class ZoomAgent(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
             DataError: the file cannot be read.
         """
-        return self._find(picture, self._target(target), passes, batch, worth)
+        return self._find(picture, class_index(target, self.classes[1:], "target"), passes, batch, worth)
 
     def explore(self, picture: Picture, *, passes: int = 24, batch: int = 1, worth: float = 0.01) -> ZoomPath:
         """Find all objects of all classes; arguments as for `find_all`."""
@@ -128,9 +127,3 @@ class ZoomAgent(nn.Module):
 
     def _open(self, picture: Picture) -> LiveGlances:
         return LiveGlances(self.eye, self.eye.open(picture))
-
-    def _target(self, target: str | int) -> int:
-        if isinstance(target, str):
-            return self.classes.index(lookup(target, self.classes[1:], "target class"))
-        check_whole(target, "target", 1, len(self.classes) - 1)
-        return target

@@ -2,15 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from os import PathLike
 from typing import Any, Literal, get_args
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, open_large
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
@@ -90,8 +88,8 @@ class ZoomEye(nn.Module):
         self.finest = finest
         self.cut: Cut = lookup(cut, get_args(Cut), "treatment of cut boxes")
 
-    def open(self, picture: LargePicture | Tensor | NDArray[np.uint8] | str | PathLike[str]) -> ZoomView:
-        """Hold a picture: an image `(3, H, W)` or `(1, 3, H, W)`, an array of bytes, a file, or a `LargePicture`."""
+    def open(self, picture: LargePicture | ImageLike) -> ZoomView:
+        """Hold a picture: a file, another of any common kind (`semfov.as_image`), or a `LargePicture`."""
         source = open_large(picture)
         return ZoomView(source, Lattice.over(source.size, self.detector.input_size, finest=self.finest))
 

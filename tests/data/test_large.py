@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from semfov.data.images import read_image
-from semfov.data.large import ArrayPicture, PhotographPicture, TensorPicture, TiffPicture, open_large
+from semfov.data.large import ArrayPicture, MemoryPicture, PhotographPicture, TiffPicture, open_large
 from semfov.errors import DataError, InputError
 
 
@@ -127,10 +127,10 @@ def test_errors(tmp_path):
             open_large(tmp_path / f"pipe.{suffix}")
     with pytest.raises(InputError, match="picture: expected"):
         open_large(3)
-    with pytest.raises(InputError, match="array: expected bytes"):
-        open_large(np.zeros((4, 4, 3), np.float32))
+    with pytest.raises(InputError, match="picture: expected bytes, 16-bit numbers or floats"):
+        open_large(np.zeros((4, 4, 3), np.int64))
     with pytest.raises(InputError, match="box: expected inside"):
-        TensorPicture(torch.zeros(3, 4, 4)).read((0, 0, 5, 4))
+        MemoryPicture(torch.zeros(3, 4, 4)).read((0, 0, 5, 4))
 
 
 def test_files_that_end_early_are_told(tmp_path):

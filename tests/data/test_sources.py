@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from semfov.data.sources import embedded_picture, open_pictures
+from semfov.data.sources import embedded_picture, open_pictures, open_stream
 from semfov.errors import DataError, InputError
 
 SHADES = (20, 90, 160, 230)
@@ -30,35 +30,38 @@ def test_photograph_and_folder(tmp_path):
     for name in ("b.png", "a.jpg"):
         Image.new("RGB", (8, 6), "red").save(tmp_path / name)
     (tmp_path / "notes.txt").write_text("no picture")
-    (one,) = open_pictures(tmp_path / "b.png", None, 1)
+    (one,) = open_pictures(tmp_path / "b.png")
     assert one.name == "b.png"
     torch.testing.assert_close(one.image, torch.tensor([1.0, 0, 0])[:, None, None].expand(3, 6, 8))
-    assert [picture.name for picture in open_pictures(tmp_path, None, 1)] == ["a.jpg", "b.png"]
+    assert [picture.name for picture in open_pictures(tmp_path)] == ["a.jpg", "b.png"]
 
 
-def test_frames_of_a_video_are_evenly_spaced(video):
-    taken = list(open_pictures(video, None, 4))
-    assert len(taken) == 4
+def test_frames_of_a_video_come_one_after_the_other(video):
+    stream = open_stream(video)
+    taken = list(stream.frames)
+    assert (stream.name, stream.rate) == ("video.avi", 5.0)
     # Blue, which OpenCV puts first, is the last channel here.
     shades = [float(picture.image[2].mean() * 255) for picture in taken]
-    np.testing.assert_allclose(shades, SHADES, atol=6)
+    np.testing.assert_allclose(shades, np.repeat(SHADES, 2), atol=6)
     assert all(float(picture.image[0].mean()) < 0.1 for picture in taken)
-    assert taken[0].name == "video.avi, frame 1"
-
-
-def test_more_frames_than_there_are(video):
-    assert len(list(open_pictures(video, None, 100))) == 8
+    assert [picture.name for picture in taken] == [f"video.avi, frame {number}" for number in range(8)]
+    assert len(list(open_stream(video, 3).frames)) == 3
+    assert len(list(open_stream(video, 100).frames)) == 8
 
 
 def test_what_cannot_be_read(tmp_path, monkeypatch):
     with pytest.raises(DataError, match="no such file"):
-        list(open_pictures(tmp_path / "none.jpg", None, 1))
+        list(open_pictures(tmp_path / "none.jpg"))
     with pytest.raises(DataError, match="found none"):
-        list(open_pictures(tmp_path, None, 1))
-    with pytest.raises(InputError, match="both or none"):
-        list(open_pictures(tmp_path, 0, 1))
+        list(open_pictures(tmp_path))
     broken = tmp_path / "broken.mp4"
     broken.write_bytes(b"no video")
+    with pytest.raises(DataError, match=r"broken\.mp4: cannot be opened"):
+        open_stream(broken)
+    with pytest.raises(DataError, match="no such file or folder"):
+        open_stream(tmp_path / "none.mp4")
+    with pytest.raises(DataError, match="camera 99: cannot be opened; check that it is connected"):
+        open_stream(99)
     real = builtins.__import__
 
     def without_opencv(name, *rest, **options):
@@ -68,7 +71,7 @@ def test_what_cannot_be_read(tmp_path, monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", without_opencv)
     with pytest.raises(DataError, match="pip install opencv-python-headless"):
-        list(open_pictures(broken, None, 1))
+        open_stream(broken)
 
 
 def test_embedded_scene_holds_the_target():

@@ -55,6 +55,7 @@ def photo(tmp_path):
 @pytest.fixture
 def run(agent, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(program, "make_agent", lambda config: agent)
+    monkeypatch.setattr(program, "known_classes", lambda config: None)
 
     def call(*arguments):
         code = program.main([*map(str, arguments), "--out", str(tmp_path / "out")])
@@ -149,11 +150,11 @@ def test_no_target_lists_the_classes(run, photo, tmp_path):
 
 def test_mistakes_are_told_in_one_line(run, photo, tmp_path):
     for arguments, told in [
-        ((photo, "--target", "wineglass"), "did you mean 'wine glass'"),
+        ((photo, "--target", "goblet"), "did you mean 'wine glass'"),
         ((tmp_path / "none.jpg", "--target", "red"), "no such file"),
         ((photo, "--target", "red", "--explore"), "none with --explore"),
         ((photo, "--target", "red", "--start", 48), "start: expected a whole number from 0 to 47"),
-        ((photo, "--camera", 0, "--target", "red"), "got both"),
+        ((photo, "--camera", 0, "--target", "red"), "photo: expected none with --camera"),
         ((photo, "--target", "red", "--confirm", 50), "confirm: expected a number from 0 to 1"),
         ((photo, "--target", "red", "--give_up", -1), "give_up: expected a number from 0 to 1"),
     ]:

@@ -340,7 +340,7 @@ GAZE = torch.tensor([4.0, 4.0])
         ({"gaze": torch.rand(3, 2)}, "gaze: expected a tensor of shape"),
         ({"gaze": torch.rand(1, 4, 2)}, "gaze: expected a tensor of shape"),
         ({"gaze": torch.rand(1, 2, 4, 2)}, "gaze: expected a tensor of shape"),
-        ({"image": torch.rand(3, 8, 8)}, "image: expected a tensor of shape"),
+        ({"image": torch.rand(2, 8, 8)}, "image: expected a picture of shape"),
         ({"image": torch.rand(1, 3, 0, 8)}, "image: expected at least one pixel"),
         ({"levels": -1}, "levels: expected 0 or more, got -1"),
         ({"sigma": 0.0}, "sigma: expected a positive number, got 0.0"),

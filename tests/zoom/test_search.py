@@ -80,15 +80,15 @@ def test_errors(agent, picture):
         with pytest.raises(InputError, match="worth: expected a number"):
             agent.explore(picture, worth=worth)
     for target in (0, 4, 1.0, True, None):
-        with pytest.raises(InputError, match="target: expected a whole number from 1 to 3"):
+        with pytest.raises(InputError, match="target: expected a name, or a whole number from 1 to 3"):
             agent.find_all(picture, target)
     for image, told in (
-        (picture * 255, "image: expected RGB in"),
-        (picture * torch.nan, "image: expected RGB in .*NaN"),
-        (picture.long(), "image: expected RGB in .*or bytes"),
-        (picture[:2], "image: expected a tensor of shape"),
-        (picture[:, :0], "array: expected bytes"),
-        (7, "picture: expected a tensor"),
+        (picture * 255, "picture: expected RGB in .*; divide by"),
+        (picture * torch.nan, "picture: expected RGB in .*NaN"),
+        (picture.long(), "picture: expected bytes, 16-bit numbers or floats"),
+        (picture[:2], "picture: expected a picture of shape"),
+        (picture[:, :0], "picture: expected at least one pixel"),
+        (7, "picture: expected a path"),
     ):
         with pytest.raises(InputError, match=told):
             agent.explore(image)

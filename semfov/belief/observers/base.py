@@ -2,11 +2,13 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import ClassVar, Self, TypeVar
 
 from torch import Tensor, nn
 
 from semfov.belief.belief import Belief, one_by_one
+from semfov.belief.evidence import Evidence, farther
 from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
@@ -64,6 +66,23 @@ class Observer(nn.Module, ABC):
     def update(self, belief: Belief, look: Look) -> Belief:
         """The belief after one more look in each episode."""
 
+    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> Belief:
+        r"""The belief by the time of the next look at a scene that changes: what was gathered counts less.
+
+        .. math:: e \leftarrow e_0 + k \, (e - e_0)
+
+        with the evidence :math:`e` of all looks so far, what would be known without any, :math:`e_0`, and `keep`, k.
+        Subclasses say what that is of their own. Figures that are read from the evidence are those of before, until
+        `update` reads them anew.
+
+        Args:
+            belief: after the looks so far.
+            look: the next one, which is not taken in yet.
+            keep: share that is left, in (0, 1].
+            visited: `(B, X·Y)` boolean, cells that still count as fixated.
+        """
+        raise InputError(f"observer: expected one whose belief can fade, got {type(self).__name__}")
+
     def forward(
         self, belief: Belief, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None
     ) -> Belief:
@@ -78,9 +97,27 @@ class Gatherer(Observer):
         together: compute all episodes of a batch at once: faster, but how figures are rounded depends on the batch.
     """
 
+    model: Evidence
+
     def __init__(self, together: bool) -> None:
         super().__init__()
         self.together = together
+
+    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> Belief:
+        r"""What looks gathered counts less, and a closest look counts as one from farther away; see `Observer.fade`.
+
+        With r = -ln k, what is gathered for a cell moves by :math:`e \leftarrow e_0 + k (e - e_0)` towards the evidence
+        :math:`e_0` of a look from far away that shows nothing. Looks count by their nearness :math:`e^{-d/R}`
+        (`semfov.belief.evidence.nearness`), which fades with them: so does that of the closest look, by
+        :math:`d \leftarrow d + r R`, and a fresh look from farther takes its place in time.
+        """
+        if keep == 1:
+            return belief
+        known: dict[str, Tensor] = vars(belief)
+        unseen = self.model.unseen(belief.closest)
+        faded = {name: unseen + keep * (known[name] - unseen) for name in ("nearest", "best")}
+        faded |= {name: keep * known[name] for name in ("total", "weight", "score", "looks")}
+        return replace(belief, **faded, closest=known["closest"] + farther(keep), visited=visited)  # type: ignore[type-var]
 
     def each(self, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
         """`function` of the rows of tensors `(B, ...)`, each alone (`one_by_one`) or all at once."""

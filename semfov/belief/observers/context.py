@@ -123,6 +123,12 @@ class Context(Observer):
         wanted = torch.full((len(fixation),), target, device=fixation.device)
         return ContextLook(inner, presence_of(detections, grid), wanted, grid)
 
+    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> ContextBelief:
+        """The other observer's belief fades, and so do the scores that were shown."""
+        known, said = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")
+        inner = self.observer.fade(known.inner, said.inner, keep, visited)
+        return replace(known, inner=inner, closest=inner.closest, shown=keep * known.shown)
+
     def update(self, belief: Belief, look: Look) -> ContextBelief:
         """Belief after a look in each episode."""
         known, said = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")

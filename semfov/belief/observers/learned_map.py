@@ -98,6 +98,8 @@ class LearnedMap(Gatherer):
         together: compute all episodes of a batch at once: faster, but how figures are rounded depends on the batch.
     """
 
+    model: MapEvidence
+
     def __init__(self, model: MapEvidence, *, together: bool = False) -> None:
         super().__init__(together)
         self.model = model

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
+from semfov.belief.evidence import farther
 from semfov.belief.fusion import RULES, fuse
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.likelihood import Observation, likelihoods
@@ -134,6 +135,16 @@ class Semantic(Observer):
         fresh = self._fuse(torch.full_like(known.beta, self.prior), said)
         closer = said.distance < known.closest
         return DirichletBelief(torch.where(closer[..., None], fresh, known.beta), closest)
+
+    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> DirichletBelief:
+        r"""Dirichlet parameters return to the prior, :math:`\beta \leftarrow \beta_0 + k (\beta - \beta_0)`.
+
+        The closest look counts as one from farther away, as that of a learned belief does (`Gatherer.fade`).
+        """
+        known = dirichlet_belief(belief)
+        if keep == 1:
+            return known
+        return DirichletBelief(self.prior + keep * (known.beta - self.prior), known.closest + farther(keep))
 
     def _fuse(self, beta: Tensor, look: SemanticLook) -> Tensor:
         fused = fuse(beta, look.likelihood.to(beta.dtype), look.footprint, self.fusion)

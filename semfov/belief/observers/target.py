@@ -107,6 +107,7 @@ class Target(Gatherer):
         together: compute all episodes of a batch at once: faster, but how figures are rounded depends on the batch.
     """
 
+    model: TargetEvidence
     by_target = True
 
     def __init__(self, model: TargetEvidence, *, together: bool = False) -> None:

@@ -1,0 +1,71 @@
+"""The demonstration on a video or a camera: what is seen and believed at every frame, printed and drawn into it."""
+
+import time
+from pathlib import Path
+
+from semfov import viz
+from semfov.data.sources import Stream
+from semfov.live import LivePerception, Moment
+from semfov.viz.live import draw_moment, video, video_suffix
+
+UNKNOWN_RATE = 15.0
+"""Frames per second of what is written where the source tells none."""
+
+
+def watch(live: LivePerception, stream: Stream, path: Path) -> Path:
+    """Look at every frame, print what is seen and believed, and write a video of it; Ctrl-C ends it in good order.
+
+    Args:
+        live: the agent at work.
+        stream: of frames.
+        path: of the video to write, without its suffix.
+
+    Returns:
+        The video.
+    """
+    path = path.with_suffix(video_suffix())
+    began, looking, shown = time.perf_counter(), 0.0, 0
+    print(f"{stream.name}: {'exploring' if live.target is None else f'searching for “{live.classes[live.target]}”'}")
+    with video(path, stream.rate or UNKNOWN_RATE) as add:
+        try:
+            for picture in stream.frames:
+                moment = live.step(picture.image)
+                shown += 1
+                looking += sum(moment.seconds.values())
+                speed = f"{shown / (time.perf_counter() - began):.1f} frames/s"
+                print(f"  {told(moment, live)}  {speed}", flush=True)
+                add(draw_moment(picture.image, moment, f"{headline(moment, live)}   {speed}"))
+        except KeyboardInterrupt:
+            print("  stopped")
+    whole = time.perf_counter() - began
+    print(f"{shown} frames, {shown / whole:.1f} a second, {shown / max(looking, 1e-9):.1f} without reading and drawing")
+    return path
+
+
+def told(moment: Moment, live: LivePerception) -> str:
+    """What is seen and believed at a frame, in a line."""
+    best = int(moment.probability.argmax())
+    row, column = divmod(moment.cell, moment.grid.columns)
+    look = f"{moment.number:4d}  at ({column}, {row}): {seen(moment, live)}"
+    row, column = divmod(best, moment.grid.columns)
+    return f"{look:60s}  {headline(moment, live)}, most likely at ({column}, {row})"
+
+
+def headline(moment: Moment, live: LivePerception) -> str:
+    """What is believed at a frame, in a few words."""
+    highest = float(moment.probability.max())
+    if moment.target is None:
+        return f"p(object) up to {highest:.2f}"
+    name = live.classes[moment.target]
+    if moment.decision is None:
+        return f"p({name}) up to {highest:.2f}"
+    return f"{name}: {moment.decision.outcome}, p {moment.decision.probability:.2f}"
+
+
+def seen(moment: Moment, live: LivePerception, most: int = 2) -> str:
+    """The most confident detections of a look, in words."""
+    detections = moment.detections
+    pairs = zip(detections.labels[0].tolist(), detections.confidence[0].tolist(), strict=True)
+    sure = [f"{live.classes[label]} {score:.2f}" for label, score in pairs if score >= viz.CONFIDENT]
+    more = f" and {len(sure) - most} more" if len(sure) > most else ""
+    return ", ".join(sure[:most]) + more or "nothing"

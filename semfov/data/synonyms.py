@@ -1,0 +1,92 @@
+"""What people call the classes of COCO, for suggestions where a name is not known."""
+
+_TABLE = """
+person: man, men, woman, women, boy, girl, child, children, kid, baby, human, pedestrian, face, player, rider
+bicycle: bike, cycle, push bike, mountain bike, tricycle
+motorcycle: motor bike, bike, scooter, moped, vespa
+car: automobile, auto, taxi, cab, suv, sedan, jeep, vehicle, minivan
+truck: lorry, pickup, pickup truck, van, trailer, fire engine, vehicle
+bus: coach, minibus, double decker, school bus, vehicle
+airplane: plane, aircraft, jet, airliner, jumbo
+train: tram, locomotive, railway, subway, metro, streetcar
+boat: ship, sailboat, yacht, canoe, kayak, ferry, rowboat, vessel
+traffic light: traffic signal, stop light, signal, traffic lamp
+fire hydrant: hydrant
+stop sign: traffic sign, road sign, sign
+parking meter: meter
+bench: park bench, pew
+bird: pigeon, seagull, gull, duck, goose, parrot, eagle, crow, chicken, swan, sparrow, owl
+cat: kitten, kitty
+dog: puppy, hound, doggy
+horse: pony, foal, mare, stallion
+sheep: lamb, goat, ram, ewe
+cow: cattle, bull, calf, ox, bison
+bear: polar bear, grizzly, panda
+backpack: rucksack, knapsack, bag, school bag
+umbrella: parasol, sunshade
+handbag: purse, bag, tote, shopping bag, clutch
+tie: necktie, bow tie
+suitcase: luggage, baggage, trunk, trolley, bag, briefcase
+frisbee: disc, flying disc
+skis: ski
+snowboard: snow board
+sports ball: ball, football, soccer ball, tennis ball, basketball, baseball, volleyball
+surfboard: surf board
+tennis racket: racket, racquet, tennis racquet
+baseball glove: glove, mitt, baseball mitt
+baseball bat: bat
+bottle: water bottle, wine bottle, beer bottle, flask
+wine glass: glass, goblet, champagne glass, flute
+cup: mug, coffee cup, coffee mug, tea cup, glass, tumbler, beaker, paper cup
+knife: blade, cutlery
+fork: cutlery
+spoon: ladle, teaspoon, cutlery
+bowl: dish, basin
+sandwich: burger, hamburger, toast, sub
+orange: mandarin, tangerine, clementine
+hot dog: sausage, frankfurter, wiener
+donut: doughnut
+cake: cupcake, muffin, pie, gateau, birthday cake
+chair: seat, stool, armchair, office chair
+couch: settee, loveseat, divan, sofa bed
+potted plant: plant, house plant, flower pot, pot plant, flower
+bed: mattress, bunk
+dining table: table, desk, kitchen table, coffee table
+toilet: lavatory, loo, wc, commode
+tv: television, telly, monitor, screen, display, television set
+laptop: notebook, computer, notebook computer, macbook
+mouse: computer mouse
+remote: remote control, clicker, game controller
+keyboard: computer keyboard
+cell phone: phone, mobile, mobile phone, smartphone, iphone, telephone, handy
+microwave: microwave oven
+oven: stove, cooker, range
+sink: washbasin, basin, wash basin, tap, faucet
+refrigerator: fridge, freezer, icebox
+book: magazine, novel, paperback, notebook
+clock: watch, wall clock, alarm clock
+vase: urn, jar
+scissors: shears
+teddy bear: teddy, stuffed animal, plush, soft toy, toy
+hair drier: hair dryer, blow dryer, hairdryer, dryer
+toothbrush: tooth brush
+"""
+
+
+def _read(table: str) -> dict[str, tuple[str, ...]]:
+    """Classes by each of their other names, which are without spaces."""
+    found: dict[str, tuple[str, ...]] = {}
+    for line in table.strip().splitlines():
+        name, _, others = line.partition(": ")
+        for other in others.split(", "):
+            key = other.replace(" ", "")
+            found[key] = (*found.get(key, ()), name)
+    return found
+
+
+SYNONYMS = _read(_TABLE)
+"""Names of COCO's classes by what else they are called, in lower case and without spaces.
+
+>>> SYNONYMS["mug"], SYNONYMS["glass"]
+(('cup',), ('wine glass', 'cup'))
+"""

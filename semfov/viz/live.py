@@ -1,0 +1,126 @@
+"""What is seen and believed at a frame of a camera or a video, drawn into it, and the video that comes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from semfov.errors import DataError
+from semfov.io.files import replacing
+from semfov.live import Moment
+from semfov.viz.style import FOUND, GAZE, TARGET
+
+Frame = NDArray[np.uint8]
+
+_LONGEST = 640
+# Containers and codecs of OpenCV's, in the order they are tried; the last one comes with every build of it.
+_CODECS = ((".mp4", "mp4v"), (".avi", "MJPG"))
+
+
+def draw_moment(image: Tensor, moment: Moment, text: str) -> Frame:
+    """Draw belief, gaze and decision into a frame.
+
+    The colour over a cell is as strong as the probability that it holds the target (of an exploration: any object). The
+    circle is where the gaze is, and the line leads to where it goes for the next frame.
+
+    Args:
+        image: `(3, H, W)`, RGB in [0, 1].
+        moment: what is seen and believed.
+        text: for the upper edge.
+
+    Returns:
+        Pixels `(h, w, 3)`, the longer side at most 640 and both even, as video wants them.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    height, width = image.shape[-2:]
+    scale = min(1.0, _LONGEST / max(width, height))
+    size = max(2, round(width * scale / 2) * 2), max(2, round(height * scale / 2) * 2)
+    pixels = image.detach().clamp(0, 1).mul(255).byte().permute(1, 2, 0).cpu().numpy()
+    picture = Image.fromarray(pixels).resize(size)
+    grid = moment.grid
+    chance = moment.probability.detach().float().clamp(0, 1).reshape(grid.rows, grid.columns).cpu().numpy()
+    strength = Image.fromarray((chance * 160).astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
+    picture.paste(Image.new("RGB", size, TARGET), mask=strength)
+    draw = ImageDraw.Draw(picture)
+    across, down = size[0] / width, size[1] / height
+    x, y = ((c + 0.5) * s for c, s in zip(moment.fixation.tolist(), (across, down), strict=True))
+    u, v = ((c + 0.5) * s for c, s in zip(grid.centres[moment.next_cell].tolist(), (across, down), strict=True))
+    draw.line((x, y, u, v), fill=GAZE, width=2)
+    draw.ellipse((x - 9, y - 9, x + 9, y + 9), outline="white", width=5)
+    draw.ellipse((x - 9, y - 9, x + 9, y + 9), outline=GAZE, width=3)
+    if moment.decision is not None and moment.decision.box is not None:
+        x1, y1, x2, y2 = (c * s for c, s in zip(moment.decision.box.tolist(), (across, down) * 2, strict=True))
+        draw.rectangle((min(x1, x2), min(y1, y2), max(x1, x2), max(y1, y2)), outline=FOUND, width=3)
+    font = ImageFont.load_default(14)
+    draw.rectangle((0, 0, size[0], 22), fill="black")
+    draw.text((6, 2), text, fill="white", font=font)
+    return np.asarray(picture)
+
+
+def video_suffix() -> str:
+    """That of the videos that OpenCV writes here: `.mp4`, or `.avi` where it was built without FFmpeg."""
+    return next(suffix for suffix, codec in _CODECS if suffix == _CODECS[-1][0] or _writes(suffix, codec))
+
+
+@contextmanager
+def video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
+    """Write frames to a video, whole or not at all.
+
+    Args:
+        path: of the file; its suffix is that of `video_suffix`.
+        rate: frames per second.
+
+    Yields:
+        What takes the frames `(h, w, 3)`, all of one size, one after the other.
+
+    Raises:
+        DataError: the file cannot be written, or OpenCV is not installed.
+    """
+    try:
+        import cv2
+    except ImportError:
+        raise DataError(f"{path}: videos need OpenCV; pip install opencv-python-headless") from None
+    codec = dict(_CODECS)[path.suffix]
+    with replacing(path) as temporary:
+        # OpenCV goes by the suffix.
+        named = temporary.with_name(temporary.name + path.suffix)
+        writer: Any = None
+        try:
+
+            def add(frame: Frame) -> None:
+                nonlocal writer
+                if writer is None:
+                    code = cv2.VideoWriter.fourcc(*codec)
+                    writer = cv2.VideoWriter(str(named), code, rate, (frame.shape[1], frame.shape[0]))
+                    if not writer.isOpened():
+                        raise DataError(f"cannot write {path}: OpenCV has no {codec} encoder")
+                writer.write(np.ascontiguousarray(frame[..., ::-1]))
+
+            yield add
+            if writer is not None:
+                writer.release()
+                named.replace(temporary)
+        finally:
+            if writer is not None:
+                writer.release()
+            named.unlink(missing_ok=True)
+
+
+def _writes(suffix: str, codec: str) -> bool:
+    """Whether OpenCV has this encoder."""
+    import tempfile
+
+    import cv2
+
+    with tempfile.TemporaryDirectory() as folder:
+        writer = cv2.VideoWriter(f"{folder}/try{suffix}", cv2.VideoWriter.fourcc(*codec), 10, (64, 64))
+        opened = bool(writer.isOpened())
+        writer.release()
+    return opened
