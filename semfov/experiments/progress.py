@@ -78,7 +78,7 @@ class Whole:
 
     def _move(self, to: float) -> None:
         self._at = max(self._at, to)
-        self._bar.update(self.done - self._bar.n)
+        self._bar.update(min(self.done, 1.0) - self._bar.n)
 
     def __enter__(self) -> Whole:
         self._token = _whole.set(self)

@@ -14,7 +14,7 @@ import yaml
 
 from semfov.agent import ActivePerception
 from semfov.errors import InputError
-from semfov.experiments.config import DataConfig, DetectorConfig
+from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.parallel import available_cores, rank
 from semfov.experiments.progress import Whole
 from semfov.experiments.run import finish
@@ -22,6 +22,7 @@ from semfov.experiments.setup import detector_options, plain
 from semfov.experiments.summary import table
 from semfov.io.files import write_text
 from semfov.io.manifest import PARTS, Manifest, place_of
+from semfov.sensor import SENSORS
 from semfov.training.detector_parts import Fitted, Workshop
 from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.evidence_examples import LookingRun, looking_run
@@ -103,6 +104,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
     started = time.monotonic()
     run = looking_run(replace(config, out=config.out / "progress"))
     shop = Workshop(config, run)
+    config = shop.config
     missing = class_counts(run, range(len(run.scenes)))
     _tell(missing)
     with Whole("fitting", {"looking": {"looking": seconds_of_looks(run)}, **shop.stages}) as whole:
@@ -163,7 +165,7 @@ def _tell(counts: dict[str, int]) -> None:
 
 def manifest_of(config: FitDetectorConfig, run: LookingRun, shop: Workshop) -> Manifest:
     """The record of the folder."""
-    detector, sensor = run.eye.detector, run.eye.settings()["sensor"]
+    detector, sensor = run.eye.detector, config.sensor
     options = plain(detector_options(config.detector))
     weights = options.pop("weights", None)
     is_file = Path(config.detector.name).is_file()
@@ -177,7 +179,7 @@ def manifest_of(config: FitDetectorConfig, run: LookingRun, shop: Workshop) -> M
             "weights_file": None if weights is None else place_of(weights, config.out),
             "options": options,
         },
-        sensor={"name": config.sensor.name, **sensor},
+        sensor={**asdict(sensor), **SENSORS[sensor.name], **given_of(sensor)},
         grid=(config.columns, config.rows),
         parts={name: fitted.part for name, fitted in shop.parts.items()},
         training={
@@ -189,17 +191,24 @@ def manifest_of(config: FitDetectorConfig, run: LookingRun, shop: Workshop) -> M
     )
 
 
+def given_of(sensor: SensorConfig) -> dict[str, float]:
+    """Settings of a sensor that differ from those that its name stands for."""
+    given = {"sigma": sensor.sigma, "growth": sensor.growth}
+    return {name: value for name, value in given.items() if value is not None}
+
+
 def report(config: FitDetectorConfig, run: LookingRun, parts: dict[str, Fitted], seconds: float) -> str:
     """How everything that was fitted does, as Markdown."""
     photographs = len(run.scenes)
-    held_out = [index for index in range(photographs) if index % config.holdout == 0]
-    counts = class_counts(run, (index for index in range(photographs) if index % config.holdout))
+    holdout = config.observation.holdout
+    held_out = [index for index in range(photographs) if index % holdout == 0]
+    counts = class_counts(run, (index for index in range(photographs) if index % holdout))
     rows = [["part", "used", "because on held-out photographs"]]
     rows += [[TITLES[name], "yes" if each.part.used else "no, raw", each.part.why] for name, each in parts.items()]
     lines = [
         f"# Models of {run.eye.detector.name}",
         "",
-        f"{photographs} photographs, {len(held_out)} of them held out (every {config.holdout}th); "
+        f"{photographs} photographs, {len(held_out)} of them held out (every {holdout}th); "
         f"{len(counts)} classes; {config.columns} × {config.rows} cells; "
         f"sensor {config.sensor.name}; {seconds / 60:.1f} minutes in this run.",
         "",

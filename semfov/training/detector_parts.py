@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,8 @@ LONGEST = 15
 """Gaze shifts that they have."""
 ABSENT = 10
 """Classes that each held-out photograph does not hold, at most, by which thresholds are chosen."""
+SUREST = 0.9
+"""The highest threshold of finding, where absent classes are too few to tell what share of false alarms one makes."""
 
 
 @dataclass(frozen=True)
@@ -70,9 +72,10 @@ class Workshop:
     """
 
     def __init__(self, config: FitDetectorConfig, run: LookingRun) -> None:
-        self.config, self.run = config, run
+        self.config, self.run = config.sized(len(run.scenes)), run
         self.components = len(run.scenes.classes) + 1
-        self.held_out = [index for index in range(len(run.scenes)) if index % config.holdout == 0]
+        self.holdout = self.config.observation.holdout
+        self.held_out = [index for index in range(len(run.scenes)) if index % self.holdout == 0]
         self.parts: dict[str, Fitted] = {}
 
     @property
@@ -80,22 +83,34 @@ class Workshop:
         """Tasks of each part, with about how many seconds they take on one core."""
         photographs, judged = len(self.run.scenes), min(len(self.held_out), self.config.judged)
         described = {"describing looks": 0.05 * photographs}
-        exponents = self.config.tempering.exponents
+        config = self.config
+        tried = [f"{scores} {t:g}" for scores in ("raw", "calibrated") for t in config.tempering.exponents]
+        evidence, everything = config.evidence(self.components - 1), config.map
         return {
-            "observation": {"fitting": 10 + 0.05 * photographs * self.config.fixations},
-            "tempering": {f"{scores} {t:g}": 0.03 * photographs for scores in ("raw", "calibrated") for t in exponents},
-            "evidence": {**described, "training": 0.15 * self.config.steps, "searching": judged, "deciding": judged},
+            "observation": {"fitting": 1 + 0.1 * photographs},
+            "tempering": dict.fromkeys(tried, 0.005 * photographs),
+            "evidence": {**described, "training": 0.1 * evidence.steps, "searching": judged, "deciding": judged},
             "map": {
                 **described,
-                "training": 0.12 * self.config.map_steps,
-                "learning what looks bring": 0.02 * self.config.map_steps,
+                "training": 0.25 * everything.steps,
+                "learning what looks bring": 0.1 * everything.gain_steps,
                 "exploring": judged,
             },
         }
 
+    def _settings(self, name: str) -> list[Any]:
+        """What a part is made from and judged by, beside the looks."""
+        if name == "evidence":
+            own: Any = self.config.evidence(self.components - 1)
+        else:
+            own = getattr(self.config, name)
+        before = [self.parts[other].part.sha256 for other in self.parts]
+        before += [_plain(asdict(each.part)) for each in self.parts.values() if each.part.settings]
+        return [name, _plain(asdict(own)), self.config.judged, before]
+
     def fit(self, name: str) -> Fitted:
         """Fit a part, or read back what the same settings, photographs and code made of it before."""
-        key = digest_of([self.run.key, name, _plain(asdict(self.config))])
+        key = digest_of([self.run.key, self._settings(name)])
         kept = self._kept(name, key)
         if kept is None:
             made: Callable[[], Fitted] = getattr(self, f"_{name}")
@@ -121,11 +136,11 @@ class Workshop:
             return None
         return Fitted(part, record["report"], record["figures"]) if whole else None
 
-    def _write(self, name: str, model: Model, gain: Difference, why: str) -> Part:
+    def _write(self, name: str, model: Model, used: bool, why: str) -> Part:
         """Write the model of a part."""
         file = f"{name}.safetensors"
         model.save(self.config.out / file)
-        return Part(file, sha256(self.config.out / file), gain.better, why)
+        return Part(file, sha256(self.config.out / file), used, why)
 
     def model(self, name: str) -> Model | None:
         """The model of a part that was fitted and is to be used."""
@@ -196,7 +211,7 @@ class Workshop:
             f"from, {len(judged)} of {len(photographs)} photographs that were held out.",
             rows,
         )
-        part = self._write("observation", model, gain, why)
+        part = self._write("observation", model, gain.better, why)
         return Fitted(part, report, ["reliability.png"])
 
     def _tempering(self) -> Fitted:
@@ -242,7 +257,9 @@ class Workshop:
         wide = make_examples(
             run, config.classes, config.max_target_area, config.seed, absent=ABSENT, scenes=self.held_out
         )
-        _, fit.model.thresholds = judge(config, fit.model, wide, grid)
+        absent = int((~wide.goal.any(-1)).sum())
+        surest = SUREST if absent * config.false_alarms < 3 else config.surest
+        _, fit.model.thresholds = judge(replace(config, surest=surest), fit.model, wide, grid)
         thresholds = fit.model.thresholds
         learned = _strategy(Target(fit.model), NonPredictive())
         ways = {
@@ -294,7 +311,7 @@ class Workshop:
         )
         figure = _curves_figure(curves, "search")
         save_figure(figure, self.config.out / "search.png")
-        part = self._write("evidence", fit.model, gain, why)
+        part = self._write("evidence", fit.model, gain.better, why)
         return Fitted(part, report, ["search.png"])
 
     def _map(self) -> Fitted:
@@ -311,14 +328,20 @@ class Workshop:
         protocol = ProtocolConfig(shifts=min(LONGEST, config.columns * config.rows - 1), seed=config.seed)
         curves = explore_curves(run, self.held_out[: self.config.judged], ways, protocol)
         at = min(SHIFTS, protocol.shifts)
-        every = curves["all"]
-        gain = Difference.of(every["fitted"][:, at], every["raw"][:, at])
+        every, objects = curves["all"], curves["objects"]
+        if not len(objects["raw"]):
+            raise DataError("no photograph that was held out has an object; give more photographs")
+        gain = Difference.of(objects["fitted"][:, at], objects["raw"][:, at])
+        # A map that says background everywhere would be right of most cells, and one that never does of all objects.
+        loss = Difference.of(every["raw"][:, at], every["fitted"][:, at])
         why = (
-            f"{100 * every['fitted'][:, at].mean():.1f} % of all cells are named right after {at} gaze shifts, "
-            f"{100 * every['raw'][:, at].mean():.1f} % by raw scores and random gaze; {_told(gain, 'points', 100)}"
+            f"{100 * objects['fitted'][:, at].mean():.1f} % of the cells with objects are named right after {at} gaze "
+            f"shifts, {100 * objects['raw'][:, at].mean():.1f} % by raw scores and random gaze; "
+            f"{_told(gain, 'points', 100)}; of all cells {100 * every['fitted'][:, at].mean():.1f} and "
+            f"{100 * every['raw'][:, at].mean():.1f} %"
         )
         sections = []
-        for what, words in (("all", "all cells"), ("objects", "cells with objects, the published success rate")):
+        for what, words in (("objects", "cells with objects, the published success rate"), ("all", "all cells")):
             rows = [["map", *(f"after {n}" for n in (1, at, protocol.shifts))]]
             rows += [
                 [name, *(_percent(curve[:, n]) for n in (1, at, protocol.shifts))]
@@ -326,11 +349,11 @@ class Workshop:
             ]
             sections.append(_section(f"Named right after n gaze shifts, in % of {words}:", rows))
         head = (
-            f"On {len(every['raw'])} photographs that were held out (`raw`: scores as they are, random gaze; `fused`: "
+            f"On {len(objects['raw'])} photographs that were held out (`raw`: scores as they are, random gaze; `fused`: "
             "as under tempering, with the fitted map's gaze). The answer for a cell may be background.\n"
         )
-        save_figure(_curves_figure(every, "explore"), self.config.out / "explore.png")
-        part = self._write("map", fit.model, gain, why)
+        save_figure(_curves_figure(objects, "explore"), self.config.out / "explore.png")
+        part = self._write("map", fit.model, gain.better and not loss.better, why)
         return Fitted(part, "\n".join([head, *sections, fit.report]), ["explore.png"])
 
 
@@ -375,5 +398,5 @@ def _curves_figure(curves: dict[str, Array], task: str) -> Any:
 
 def _plain(settings: dict[str, Any]) -> Any:
     """Settings that a part depends on."""
-    left_out = ("out", "cache", "workers", "thin")
+    left_out = ("out", "cache", "workers")
     return json.loads(json.dumps({name: each for name, each in settings.items() if name not in left_out}, default=str))

@@ -14,6 +14,8 @@ from semfov.training.tempering import FitTemperingConfig
 
 FEW = 8
 """Detectors of fewer classes learn from photographs without any of them, too."""
+MANY = 100
+"""From so many photographs on, every fifth is held out, and training takes all its steps."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +30,12 @@ class FitDetectorConfig(Settings):
         columns: cells in a row.
         rows: cells in a column.
         max_target_area: classes that cover a larger share of the image are not searched for.
-        holdout: every n-th photograph is kept out, to judge and to choose thresholds by.
+        holdout: every n-th photograph is kept out, to judge and to choose thresholds by (None: every fifth, every third
+            of fewer than 100).
         judged: most of these photographs on which searches and explorations are compared with raw ones.
         fixations: looks at each photograph that the observation model is fitted to.
-        steps: steps of training for searches.
-        map_steps: steps of training for maps.
+        steps: steps of training for searches (None: 500, fewer for fewer than 100 photographs).
+        map_steps: steps of training for maps (None: 1000, fewer for fewer than 100 photographs).
         thin: classes with fewer objects in the photographs to learn from are named in the report.
         seed: of every choice that is drawn.
         out: folder of models to write.
@@ -47,11 +50,11 @@ class FitDetectorConfig(Settings):
     columns: Side = 10
     rows: Side = 10
     max_target_area: Positive = 0.2
-    holdout: Annotated[int, Range(2, 10**9)] = 5
+    holdout: Annotated[int, Range(2, 10**9)] | None = None
     judged: Count = 100
     fixations: Count = 8
-    steps: Count = 500
-    map_steps: Count = 1000
+    steps: Count | None = None
+    map_steps: Count | None = None
     thin: Whole = 20
     seed: Seed = 0
     out: Path = Path("mymodels")
@@ -73,14 +76,26 @@ class FitDetectorConfig(Settings):
         data = replace(self.data, max_target_area=None)
         return replace(self, data=data, detector=replace(self.detector, name=str(self.model)))
 
+    def sized(self, photographs: int) -> "FitDetectorConfig":
+        """The same, with what is left open as it suits so many photographs; fits are made from this."""
+        few = photographs < MANY
+        share = min(photographs / MANY, 1)
+        return replace(
+            self,
+            holdout=self.holdout or (3 if few else 5),
+            steps=self.steps or max(250, round(500 * share)),
+            map_steps=self.map_steps or max(300, round(1000 * share)),
+        )
+
     @property
     def _common(self) -> dict[str, object]:
-        return {name: getattr(self, name) for name in ("data", "detector", "sensor", "seed", "out")}
+        shared = {name: getattr(self, name) for name in ("data", "detector", "sensor", "seed", "out")}
+        return {**shared, "holdout": self.holdout or 5}
 
     @property
     def observation(self) -> FitConfig:
         """Settings of the observation model."""
-        return FitConfig(**self._common, holdout=self.holdout, fixations=self.fixations)  # type: ignore[arg-type]
+        return FitConfig(**self._common, fixations=self.fixations)  # type: ignore[arg-type]
 
     @property
     def tempering(self) -> FitTemperingConfig:
@@ -92,7 +107,6 @@ class FitDetectorConfig(Settings):
             rows=self.rows,
             min_objects=1,
             max_target_area=self.max_target_area,
-            holdout=self.holdout,
         )
 
     def evidence(self, classes: int) -> FitSearchConfig:
@@ -103,8 +117,7 @@ class FitDetectorConfig(Settings):
             columns=self.columns,
             rows=self.rows,
             max_target_area=self.max_target_area,
-            holdout=self.holdout,
-            steps=self.steps,
+            steps=self.steps or 500,
         )
 
     @property
@@ -114,7 +127,6 @@ class FitDetectorConfig(Settings):
             **self._common,  # type: ignore[arg-type]
             columns=self.columns,
             rows=self.rows,
-            holdout=self.holdout,
-            steps=self.map_steps,
-            gain_steps=max(1, self.map_steps // 5),
+            steps=self.map_steps or 1000,
+            gain_steps=max(1, (self.map_steps or 1000) // 5),
         )

@@ -51,6 +51,7 @@ class FitSearchConfig(Settings):
         landing: weight in the loss of landing on the target with the next fixation.
         presence: weight in the loss of telling whether the target is in the photograph.
         false_alarms: share of absent targets that may be called found, by which the threshold is chosen.
+        surest: probability from which on a target counts as found at the latest, however many false alarms that makes.
         lost: share of the targets that may be missed because no cell is worth a look any more.
         steps: steps of training.
         batch: examples in a step.
@@ -76,6 +77,7 @@ class FitSearchConfig(Settings):
     landing: Weight = 1.0
     presence: Weight = 0.5
     false_alarms: Share = 0.015
+    surest: Share = 1.0
     lost: Share = 0.02
     steps: Count = 500
     batch: Count = 48
@@ -217,6 +219,7 @@ def choose_thresholds(
         if float(found(candidate, 0.0)[~there].double().mean()) > config.false_alarms:
             break
         confirm = candidate
+    confirm = min(confirm, config.surest)
     told = int(found(confirm, 0.0)[there].sum())
     for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01):
         if told - int(found(confirm, give_up)[there].sum()) <= config.lost * int(there.sum()):
