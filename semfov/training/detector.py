@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import asdict, fields, replace
-from os import PathLike, fspath
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -19,23 +19,15 @@ from semfov.experiments.parallel import available_cores, rank
 from semfov.experiments.progress import Whole
 from semfov.experiments.run import finish
 from semfov.experiments.setup import detector_options, plain
-from semfov.experiments.summary import table
 from semfov.io.files import write_text
 from semfov.io.manifest import PARTS, Manifest, place_of
 from semfov.sensor import SENSORS
-from semfov.training.detector_parts import Fitted, Workshop
+from semfov.training.detector_parts import Workshop
+from semfov.training.detector_report import class_counts, next_commands, report
 from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.evidence_examples import LookingRun, looking_run
 
 _log = logging.getLogger(__name__)
-
-TITLES = {
-    "observation": "Observation model",
-    "tempering": "Tempering",
-    "evidence": "Target evidence (searches)",
-    "map": "Learned map (explorations)",
-}
-"""What reports call the parts."""
 
 SETTINGS = ("holdout", "fixations", "steps", "map_steps", "seed")
 """Settings that a folder tells."""
@@ -141,14 +133,6 @@ def seconds_of_looks(run: LookingRun) -> float:
     return (time.monotonic() - before) * len(grid) * len(left) / workers
 
 
-def class_counts(run: LookingRun, scenes: Any) -> dict[str, int]:
-    """Objects of each class in some photographs."""
-    count = torch.zeros(len(run.scenes.classes) + 1, dtype=torch.int64)
-    for index in scenes:
-        count += torch.bincount(run.scenes.annotation(index).labels, minlength=len(count))
-    return dict(zip(run.scenes.classes, count[1:].tolist(), strict=True))
-
-
 def _tell(counts: dict[str, int]) -> None:
     """Warn of classes that no photograph shows."""
     missing = [name for name, count in counts.items() if not count]
@@ -195,64 +179,3 @@ def given_of(sensor: SensorConfig) -> dict[str, float]:
     """Settings of a sensor that differ from those that its name stands for."""
     given = {"sigma": sensor.sigma, "growth": sensor.growth}
     return {name: value for name, value in given.items() if value is not None}
-
-
-def report(config: FitDetectorConfig, run: LookingRun, parts: dict[str, Fitted], seconds: float) -> str:
-    """How everything that was fitted does, as Markdown."""
-    photographs = len(run.scenes)
-    holdout = config.observation.holdout
-    held_out = [index for index in range(photographs) if index % holdout == 0]
-    counts = class_counts(run, (index for index in range(photographs) if index % holdout))
-    rows = [["part", "used", "because on held-out photographs"]]
-    rows += [[TITLES[name], "yes" if each.part.used else "no, raw", each.part.why] for name, each in parts.items()]
-    lines = [
-        f"# Models of {run.eye.detector.name}",
-        "",
-        f"{photographs} photographs, {len(held_out)} of them held out (every {holdout}th); "
-        f"{len(counts)} classes; {config.columns} × {config.rows} cells; "
-        f"sensor {config.sensor.name}; {seconds / 60:.1f} minutes in this run.",
-        "",
-        "A part is used where it is better than raw scores by more than one standard error, paired over the "
-        "photographs that were held out; else the agent does without it.",
-        "",
-        *table(rows),
-        "",
-        *thin_classes(counts, config.thin),
-    ]
-    if len(held_out) < 10:
-        lines += [f"Only {len(held_out)} photographs judge: take the figures as rough.", ""]
-    for name, fitted in parts.items():
-        lines += [f"## {TITLES[name]}", "", fitted.report, ""]
-        lines += [line for figure in fitted.figures for line in (f"![{figure}]({figure})", "")]
-    return "\n".join(lines)
-
-
-def thin_classes(counts: dict[str, int], thin: int) -> list[str]:
-    """Lines that warn of classes with few objects to learn from."""
-    none = [name for name, count in counts.items() if count == 0]
-    few = [f"{name} {count}" for name, count in counts.items() if 0 < count < thin]
-    lines = []
-    if none:
-        lines += [f"**No object to learn from** ({len(none)} classes): {', '.join(none)}.", ""]
-    if few:
-        lines += [f"**Fewer than {thin} objects to learn from** ({len(few)} classes): {', '.join(few)}.", ""]
-    if lines:
-        lines += [
-            "Evidence and map weigh scores of all classes by one network, with one number for how frequent each class "
-            "is; the observation model leaves scores of a class without examples much as they are.",
-            "",
-        ]
-    return lines
-
-
-def next_commands(config: FitDetectorConfig, run: LookingRun) -> str:
-    """What to do with the folder."""
-    out = fspath(config.out)
-    target = max(class_counts(run, range(len(run.scenes))).items(), key=lambda pair: pair[1])[0]
-    quoted = f'"{target}"' if " " in target else target
-    return "\n".join(
-        [
-            f"  python -m eval.demo PHOTO.jpg --target {quoted} --models {out}",
-            f"  python -m eval.search --models {out} --data.root PHOTOS --data.annotations instances.json",
-        ]
-    )

@@ -21,18 +21,18 @@ from semfov.experiments.config import ProtocolConfig
 from semfov.experiments.run import digest_of
 from semfov.experiments.samples import Samples
 from semfov.experiments.seeds import generator_for
-from semfov.experiments.summary import percent, save_figure, table
+from semfov.experiments.summary import save_figure
 from semfov.gaze.policies import Closer, NonPredictive, Policy, Random
 from semfov.io.files import sha256, write_text
 from semfov.io.manifest import Part
-from semfov.metrics.averages import standard_error
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.model_folder import KINDS, Model
 from semfov.observation.foveal import FovealObservationModel
 from semfov.training.detector_settings import FitDetectorConfig
+from semfov.training.detector_words import curves_figure, in_words, mean_percent, section, share
 from semfov.training.evidence import fit_evidence, judge
 from semfov.training.evidence_examples import LookingRun, make_examples
-from semfov.training.held_out import Array, Difference, Rule, by_detection, decisions, explore_curves, search_curves
+from semfov.training.held_out import Difference, Rule, by_detection, decisions, explore_curves, search_curves
 from semfov.training.map_evidence import fit_map_evidence
 from semfov.training.misses import count_misses
 from semfov.training.observation import fit_model
@@ -200,13 +200,13 @@ class Workshop:
         ]
         why = (
             f"negative log likelihood of the true class {figures['fitted'].nll:.3f}, of raw scores "
-            f"{figures['raw'].nll:.3f}; {_told(gain, 'nats less')}"
+            f"{figures['raw'].nll:.3f}; {in_words(gain, 'nats less')}"
         )
         from semfov.viz import plot_reliability
 
         figure = plot_reliability({name: (p, judged.labels) for name, p in told.items()})
         save_figure(figure, self.config.out / "reliability.png")
-        report = _section(
+        report = section(
             f"How likely the true class of a detection is told to be: {len(samples) - len(judged)} detections to learn "
             f"from, {len(judged)} of {len(photographs)} photographs that were held out.",
             rows,
@@ -237,11 +237,11 @@ class Workshop:
         before = means_of(config, raw)["held_out"]
         why = (
             f"{100 * means[best]['held_out']:.1f} % of the next fixations hit the target with {scores} scores to the "
-            f"power of {exponent:g}, {100 * before:.1f} % with raw scores; {_told(gain, 'points', 100)}"
+            f"power of {exponent:g}, {100 * before:.1f} % with raw scores; {in_words(gain, 'points', 100)}"
         )
-        rows = [["scores", "exponent", "next fixations that hit, %"], ["raw, every cell of a box", "1", _share(before)]]
-        rows += [[way[0], f"{way[1]:g}", _share(mean["held_out"])] for way, mean in means.items()]
-        report = _section(
+        rows = [["scores", "exponent", "next fixations that hit, %"], ["raw, every cell of a box", "1", share(before)]]
+        rows += [[way[0], f"{way[1]:g}", share(mean["held_out"])] for way, mean in means.items()]
+        report = section(
             f"The exponent with which scores are fused ({scores}, {exponent:g}) was chosen on the photographs to learn "
             f"from; these are figures of {len(held_out)} that were held out.",
             rows,
@@ -276,7 +276,7 @@ class Workshop:
         gain = Difference.of(curves["fitted"][:, at], curves["raw"][:, at])
         why = (
             f"{100 * curves['fitted'][:, at].mean():.1f} % of the targets are found in {at} gaze shifts, "
-            f"{100 * curves['raw'][:, at].mean():.1f} % by raw scores; {_told(gain, 'points', 100)}"
+            f"{100 * curves['raw'][:, at].mean():.1f} % by raw scores; {in_words(gain, 'points', 100)}"
         )
         rules: dict[str, tuple[Strategy, Rule]] = {
             "fitted": (learned, partial(_by_thresholds, thresholds=thresholds)),
@@ -284,32 +284,34 @@ class Workshop:
         }
         decided = decisions(run, judged, rules, protocol, config.classes, config.max_target_area)
         rows = [["belief", *(f"CP@{n}" for n in (1, at, protocol.shifts))]]
-        rows += [[name, *(_percent(curve[:, n]) for n in (1, at, protocol.shifts))] for name, curve in curves.items()]
+        rows += [
+            [name, *(mean_percent(curve[:, n]) for n in (1, at, protocol.shifts))] for name, curve in curves.items()
+        ]
         told = [["belief", "found, there, %", "found, not there, %", "undecided, %", "looks"]]
         told += [
-            [name, _share(d.found), _share(d.false_alarms), _share(d.undecided), f"{d.looks:.1f}"]
+            [name, share(d.found), share(d.false_alarms), share(d.undecided), f"{d.looks:.1f}"]
             for name, d in decided.items()
         ]
         report = "\n".join(
             [
-                _section(
+                section(
                     f"Targets found after n gaze shifts, in %, on {len(curves['raw'])} photographs that were held out, "
                     f"{protocol.starts} starts for each target (`raw`: scores as they are; `fused`: as under "
                     "tempering).",
                     rows,
                 ),
-                _section(
+                section(
                     f"What {decided['fitted'].searches} searches for classes that are there and that are not decide. "
                     f"The thresholds (found from {thresholds.confirm:.2f}, a look is worth it from "
                     f"{thresholds.give_up:.2f}) were chosen on the same photographs; raw searches count a score of 0.5 "
                     "as found, and never give up.",
                     told,
                 ),
-                _section("The belief after some looks, in searches that it leads:", []),
+                section("The belief after some looks, in searches that it leads:", []),
                 fit.report,
             ]
         )
-        figure = _curves_figure(curves, "search")
+        figure = curves_figure(curves, "search")
         save_figure(figure, self.config.out / "search.png")
         part = self._write("evidence", fit.model, gain.better, why)
         return Fitted(part, report, ["search.png"])
@@ -337,22 +339,22 @@ class Workshop:
         why = (
             f"{100 * objects['fitted'][:, at].mean():.1f} % of the cells with objects are named right after {at} gaze "
             f"shifts, {100 * objects['raw'][:, at].mean():.1f} % by raw scores and random gaze; "
-            f"{_told(gain, 'points', 100)}; of all cells {100 * every['fitted'][:, at].mean():.1f} and "
+            f"{in_words(gain, 'points', 100)}; of all cells {100 * every['fitted'][:, at].mean():.1f} and "
             f"{100 * every['raw'][:, at].mean():.1f} %"
         )
         sections = []
         for what, words in (("objects", "cells with objects, the published success rate"), ("all", "all cells")):
             rows = [["map", *(f"after {n}" for n in (1, at, protocol.shifts))]]
             rows += [
-                [name, *(_percent(curve[:, n]) for n in (1, at, protocol.shifts))]
+                [name, *(mean_percent(curve[:, n]) for n in (1, at, protocol.shifts))]
                 for name, curve in curves[what].items()
             ]
-            sections.append(_section(f"Named right after n gaze shifts, in % of {words}:", rows))
+            sections.append(section(f"Named right after n gaze shifts, in % of {words}:", rows))
         head = (
-            f"On {len(objects['raw'])} photographs that were held out (`raw`: scores as they are, random gaze; `fused`: "
-            "as under tempering, with the fitted map's gaze). The answer for a cell may be background.\n"
+            f"On {len(objects['raw'])} photographs that were held out (`raw`: scores as they are, random gaze; "
+            "`fused`: as under tempering, with the fitted map's gaze). The answer for a cell may be background.\n"
         )
-        save_figure(_curves_figure(objects, "explore"), self.config.out / "explore.png")
+        save_figure(curves_figure(objects, "exploration"), self.config.out / "explore.png")
         part = self._write("map", fit.model, gain.better and not loss.better, why)
         return Fitted(part, "\n".join([head, *sections, fit.report]), ["explore.png"])
 
@@ -363,37 +365,6 @@ def _strategy(observer: Observer, policy: Policy) -> Strategy:
 
 def _by_thresholds(step: Step, target: int, grid: Grid, *, thresholds: Any) -> torch.Tensor:
     return decide(step, target, thresholds)
-
-
-def _told(gain: Difference, unit: str, scale: float = 1.0) -> str:
-    """A difference in words."""
-    digits = 1 if scale > 1 else 3
-    return (
-        f"{scale * gain.mean:+.{digits}f} ± {scale * gain.error:.{digits}f} {unit} "
-        f"on {gain.photographs} held-out photograph{'s' if gain.photographs != 1 else ''}"
-    )
-
-
-def _percent(values: Array) -> str:
-    return percent(float(values.mean()), float(standard_error(values)))
-
-
-def _share(value: float) -> str:
-    return f"{100 * value:.1f}"
-
-
-def _section(text: str, rows: list[list[str]]) -> str:
-    return "\n".join([text, "", *(table(rows) if rows else []), *([""] if rows else [])])
-
-
-def _curves_figure(curves: dict[str, Array], task: str) -> Any:
-    from semfov.viz import plot_cumulative_performance, plot_success_rate
-
-    means = {name: curve.mean(0) for name, curve in curves.items()}
-    errors = {name: standard_error(curve) for name, curve in curves.items()}
-    title = f"Photographs that were held out ({len(curves['raw'])})"
-    plot = plot_cumulative_performance if task == "search" else plot_success_rate
-    return plot(means, errors, title=title)
 
 
 def _plain(settings: dict[str, Any]) -> Any:
