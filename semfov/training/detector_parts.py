@@ -283,10 +283,9 @@ class Workshop:
             "raw": (ways["raw"], by_detection),
         }
         decided = decisions(run, judged, rules, protocol, config.classes, config.max_target_area)
-        rows = [["belief", *(f"CP@{n}" for n in (1, at, protocol.shifts))]]
-        rows += [
-            [name, *(mean_percent(curve[:, n]) for n in (1, at, protocol.shifts))] for name, curve in curves.items()
-        ]
+        shifts = (1, at, protocol.shifts)
+        rows = [["belief", *(f"CP@{n}" for n in shifts)]]
+        rows += [[name, *(mean_percent(curve[:, n]) for n in shifts)] for name, curve in curves.items()]
         told = [["belief", "found, there, %", "found, not there, %", "undecided, %", "looks"]]
         told += [
             [name, share(d.found), share(d.false_alarms), share(d.undecided), f"{d.looks:.1f}"]

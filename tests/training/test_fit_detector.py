@@ -24,7 +24,7 @@ from semfov.io.files import sha256
 from semfov.io.manifest import Manifest, Part
 from semfov.model_folder import ModelFolder
 from semfov.training import detector_parts
-from semfov.training.detector import thin_classes
+from semfov.training.detector_report import thin_classes
 from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.held_out import Difference
 from train.fit_detector import main
