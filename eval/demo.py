@@ -6,6 +6,7 @@
     python -m eval.demo PHOTO.jpg --explore              # no target: learn what is where
     python -m eval.demo --camera 0 --target cup          # live, from a camera, until Ctrl-C
     python -m eval.demo PHOTO.jpg --target cup --report cup.html
+    python -m eval.demo PHOTO.jpg --target cup --models mymodels    # your own detector, after train.fit_detector
 
 It prints what was seen and believed at each fixation, and writes pictures and an animation to the folder `out`.
 Each picture of a folder is looked at on its own. The frames of a video or a camera are looked at as they come, one gaze
@@ -59,7 +60,8 @@ class DemoConfig(Settings):
         agent: `recommended` (learned models, where they are shipped for the detector), `published` (the paper's:
             calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
             no model: scores as they are, looks where the target is most probable).
-        detector: name or file, as for `semfov.load_detector`.
+        detector: name or file, as for `semfov.load_detector`; with `models`, where the detector's file lies now.
+        models: folder of models of your own detector, from `train.fit_detector`; it names detector and sensor.
         sensor: `gradual` (the recommended agent's), `published` or `published-narrow` (`semfov.sensor.SENSORS`); none
             takes the agent's own.
         start: first cell, numbered row by row (none: drawn at random).
@@ -84,6 +86,7 @@ class DemoConfig(Settings):
     camera: Whole | None = None
     agent: Literal["recommended", "published", "raw"] = "recommended"
     detector: str = "yolov3-tiny"
+    models: Path | None = None
     sensor: SensorName | None = None
     start: Whole | None = None
     shifts: Shifts | None = None
@@ -146,11 +149,18 @@ def demo(config: DemoConfig) -> None:
 
 def make_agent(config: DemoConfig) -> ActivePerception:
     """The agent that the settings name."""
+    if config.models is not None:
+        return ActivePerception.from_pretrained(config.models, **moved(config.detector))
     if config.agent == "recommended":
         sensor = SENSORS[config.sensor or "gradual"]
         return ActivePerception.recommended(config.detector, sigma=sensor["sigma"], growth=sensor["growth"])
     make = ActivePerception.published if config.agent == "published" else ActivePerception.raw
     return make(config.detector, sensor=config.sensor or "published")
+
+
+def moved(detector: str) -> dict[str, str]:
+    """Where a detector lies now that a folder of models names, if that is told."""
+    return {} if detector == DemoConfig().detector else {"detector": detector}
 
 
 def zoom_agent(config: DemoConfig, agent: ActivePerception) -> ZoomAgent | None:

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from semfov.experiments.command import run_command
 from semfov.experiments.config import ExploreConfig
 from semfov.experiments.explore_report import report
+from semfov.experiments.fitted import with_models
 from semfov.experiments.parallel import rank
 from semfov.experiments.run import finish
 from semfov.experiments.runs import ExploreRun
@@ -21,7 +22,7 @@ from semfov.experiments.runs import ExploreRun
 
 def explore(config: ExploreConfig) -> None:
     """Run a scene exploration experiment and write its tables, figures and records."""
-    run = ExploreRun(config)
+    run = ExploreRun(with_models(config))
     finish(run, "exploring")
     if rank() == 0:
         report(run)

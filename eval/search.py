@@ -4,6 +4,7 @@ Without arguments it searches the embedded scenes, which need no data set. With 
 
     python -m eval.search --data.root val2017 --data.annotations instances_val2017.json --out runs/val
     python -m eval.search --config configs/paper_search.yaml --data.root ... --data.annotations ...
+    python -m eval.search --models mymodels --data.root ... --data.annotations ...   # of train.fit_detector
 
 A run that was stopped goes on where it was when the same command is given again.
 """
@@ -13,6 +14,7 @@ from collections.abc import Sequence
 
 from semfov.experiments.command import run_command
 from semfov.experiments.config import SearchConfig
+from semfov.experiments.fitted import with_models
 from semfov.experiments.parallel import rank
 from semfov.experiments.run import finish
 from semfov.experiments.runs import SearchRun
@@ -21,7 +23,7 @@ from semfov.experiments.search_report import report
 
 def search(config: SearchConfig) -> None:
     """Run a visual search experiment and write its tables, figures and records."""
-    run = SearchRun(config)
+    run = SearchRun(with_models(config))
     finish(run, "searching")
     if rank() == 0:
         report(run)

@@ -19,6 +19,7 @@ from semfov.zoom import ZoomAgent, ZoomEye
 
 if TYPE_CHECKING:
     from semfov.data import CocoScenes
+    from semfov.training.detector import fit_detector
 
 __all__ = [
     "ActivePerception",
@@ -46,6 +47,7 @@ __all__ = [
     "acquisition",
     "as_image",
     "dirichlet",
+    "fit_detector",
     "foveate",
     "fusion",
     "load_detector",
@@ -63,4 +65,9 @@ def __getattr__(name: str) -> Any:
         from semfov.data.coco import CocoScenes
 
         return CocoScenes
+    if name == "fit_detector":
+        # Training needs what importing the package should not cost.
+        from semfov.training.detector import fit_detector
+
+        return fit_detector
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

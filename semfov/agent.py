@@ -3,6 +3,8 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from os import PathLike, fspath
+from pathlib import Path
 from typing import Any, Self
 
 import torch
@@ -25,8 +27,11 @@ from semfov.gaze.acquisition import ExpectedGain
 from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.gaze.policies import KL, Closer, NonPredictive, Policy, Predictive, Random
 from semfov.io.compatibility import check_shipped_sensor, learned_for
+from semfov.io.manifest import is_folder_of_models
 from semfov.io.schema import is_number
+from semfov.io.shipped import shipped_model
 from semfov.live import RATE, LivePerception
+from semfov.model_folder import ModelFolder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.scanpath import Ending, Scanpath, trace
 from semfov.sensor.foveation import Foveation
@@ -116,7 +121,7 @@ class ActivePerception(nn.Module):
         _check_cells(grid)
         detector = load_detector(name, **options)
         eye = Eye(Foveation(sigma, growth=growth), detector)
-        name = learned_for(detector.name, growth)
+        name = shipped_model(TargetEvidence, learned_for(detector.name, growth), name)
         evidence = TargetEvidence.from_pretrained(name)
         evidence.check_compatible(eye.settings(), grid)
         everything = MapEvidence.from_pretrained(name)
@@ -131,9 +136,25 @@ class ActivePerception(nn.Module):
         return agent.eval().requires_grad_(False)
 
     @classmethod
-    def from_pretrained(cls, name: str = "yolov3-tiny", **options: Any) -> Self:
-        """The recommended agent, by the name that fitted models have for this; arguments of `recommended`."""
-        return cls.recommended(name, **options)
+    def from_pretrained(cls, name: str | PathLike[str] = "yolov3-tiny", **options: Any) -> Self:
+        """The recommended agent, by the name of a detector that models are shipped for, or by a folder of models.
+
+        Args:
+            name: as for `recommended`, or a folder that `train.fit_detector` or `semfov.fit_detector` wrote.
+            options: those of `recommended`; for a folder `detector` and `weights`, files that lie elsewhere now, and
+                other options of `semfov.load_detector`.
+
+        Raises:
+            InputError: no models are shipped for this name, and it is no folder of models (the message has the command
+                that makes one).
+            DataError: a file is missing, damaged, or another than the models were fitted to.
+        """
+        if is_folder_of_models(name) or Path(name).is_dir():
+            folder = ModelFolder(name)
+            eye = folder.eye(**options)
+            agent = cls(eye, folder.search(), folder.explore(), grid=folder.manifest.grid)
+            return agent.eval().requires_grad_(False)
+        return cls.recommended(fspath(name), **options)
 
     @classmethod
     def published(
@@ -167,7 +188,9 @@ class ActivePerception(nn.Module):
         lookup(search, ["predictive", "non-predictive"], "published search policy")
         detector = load_detector(name, **options)
         eye = Eye(named_sensor(sensor), detector)
-        model = FovealObservationModel.from_pretrained(f"{detector.name}-{sensor}")
+        model = FovealObservationModel.from_pretrained(
+            shipped_model(FovealObservationModel, f"{detector.name}-{sensor}", name)
+        )
         model.check_compatible(eye.settings(), detector.classes)
         observer = Semantic(len(detector.classes) + 1, model if calibrated else None)
         policy = Predictive(model) if search == "predictive" else NonPredictive()

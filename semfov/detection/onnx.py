@@ -22,6 +22,7 @@ from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection
 from semfov.detection.weights import WEIGHTS, fetch
 from semfov.errors import DataError, InputError, check, check_shape, lookup, values_known
+from semfov.io.compatibility import NETWORKS
 from semfov.io.files import sha256
 from semfov.io.schema import shown
 
@@ -203,19 +204,20 @@ def load_onnx(
         raise InputError(f"head: {chosen['head']!r} does not fit the outputs {told[:300]}") from error
     check(scores > 0, "outputs", "at least one score", f"{scores} with head {chosen['head']!r}")
     names = coco_names(scores) if names is None else names
+    digest = sha256(path)
     check(len(names) == scores, "classes", f"{scores} names, one for each score", len(names))
     return OnnxDetector(
         session,
         chosen["head"],
         names,
-        name=chosen.get("name", path.stem),
+        name=chosen.get("name") or NETWORKS.get(digest, path.stem),
         input_size=size,
         stride=chosen.get("stride"),
         preprocessing=preprocessing,
         logits=chosen.get("logits", False),
         background=chosen.get("background"),
         selection=Selection(threshold, iou, limit, per_class),
-        digest=sha256(path),
+        digest=digest,
     )
 
 

@@ -62,7 +62,7 @@ class DetectorConfig(Settings):
         name: `yolov3-tiny`, `yolov3`, `yolov3-spp`, `yolox-nano`, `yolox-tiny`, `yolox-s`, a Darknet cfg file, an
             ONNX model, or `torchvision:<model>`.
         weights: file with the weights (None: those registered for the name).
-        background: where the background score comes from (`semfov.detection.scores`).
+        background: where the background score comes from (`semfov.detection.scores`; None: what suits the network).
         threshold: boxes with a lower confidence are dropped.
         iou: class-agnostic non-maximum suppression drops boxes that overlap a better one by more.
         limit: most boxes kept in a view.
@@ -70,17 +70,21 @@ class DetectorConfig(Settings):
             `auto`: what is fastest, 32 for Darknet's networks).
         input_size: longer side in pixels at which it works, for Darknet's networks (None: its own, 416).
         runtime: what computes Darknet's networks: `torch`, `onnxruntime`, or what is faster (`auto`).
+        classes: names of the classes in the order of the scores (None: those that the network comes with, or COCO's).
+        head: of an ONNX model, where it is not recognised (docs/detectors.md).
     """
 
     name: str = "yolov3-tiny"
     weights: Path | None = None
-    background: BackgroundPolicy = "residual"
+    background: BackgroundPolicy | None = "residual"
     threshold: Share = 0.02
     iou: Share = 0.5
     limit: Count = 100
     stride: Annotated[int, Range(1, 4096)] | Literal["auto"] | None = "auto"
     input_size: Annotated[int, Range(1, 65_536)] | None = None
     runtime: Runtime = "auto"
+    classes: tuple[str, ...] | None = None
+    head: str | None = None
 
 
 @dataclass(frozen=True)
@@ -241,6 +245,7 @@ class SearchConfig(Settings):
         store: keep what the detector saw on disk; false recomputes it (the result is the same).
         workers: processes (None: one for each CPU core).
         scanpaths: draw this many episodes.
+        models: folder of `train.fit_detector` that names detector, sensor, grid and fitted models.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -263,6 +268,7 @@ class SearchConfig(Settings):
     store: bool = True
     workers: Workers | None = None
     scanpaths: Whole = 3
+    models: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -286,6 +292,7 @@ class ExploreConfig(Settings):
         cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
         store: keep what was seen on disk; false recomputes it (the result is the same).
         workers: processes (None: one for each CPU core).
+        models: folder of `train.fit_detector` that names detector, sensor, grid and fitted models.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -311,6 +318,7 @@ class ExploreConfig(Settings):
     cache: Path | None = None
     store: bool = True
     workers: Workers | None = None
+    models: Path | None = None
 
 
 RunConfig = SearchConfig | ExploreConfig

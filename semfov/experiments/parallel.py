@@ -9,13 +9,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from multiprocessing import resource_tracker
 from typing import TypeVar
 
-from tqdm import tqdm
-
 from semfov.errors import SemfovError
+from semfov.experiments.progress import task_bar
 from semfov.io.files import discard_unfinished
 
 _log = logging.getLogger(__name__)
@@ -91,8 +90,7 @@ def run_tasks(
     """
     if not tasks:
         return
-    bar = tqdm(total=len(tasks), desc=title, unit=unit, dynamic_ncols=True, disable=rank() > 0)
-    with bar:
+    with closing(task_bar(len(tasks), title, unit, hidden=rank() > 0)) as bar:
         if workers <= 1 or len(tasks) == 1:
             setup(*settings)
             for task in tasks:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.data.scene import Scenes
+from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
@@ -72,6 +72,32 @@ class Samples:
     def _view(self, rows: slice) -> Detections:
         boxes, scores = self.boxes[rows], self.scores[rows]
         return Detections(boxes[None], scores[None], torch.ones(1, len(boxes), dtype=torch.bool))
+
+    @classmethod
+    @torch.inference_mode()
+    def of(cls, seen: Detections, fixations: Tensor, annotation: Annotation, index: int, iou: float) -> Samples:
+        """Labelled detections of the looks at one scene.
+
+        Args:
+            seen: a batch of R looks.
+            fixations: `(R, 2)`, where they were fixated.
+            annotation: what is really there.
+            index: of the scene.
+            iou: overlap from which a detection shows an object.
+        """
+        labels = [
+            match(boxes[mask], annotation.boxes, annotation.labels, iou=iou)
+            for boxes, mask in zip(seen.boxes, seen.mask, strict=True)
+        ]
+        return cls(
+            boxes=seen.boxes[seen.mask],
+            scores=seen.scores[seen.mask],
+            distance=Grid(1, 1, annotation.size).box_distance(seen.boxes, fixations)[seen.mask],
+            labels=torch.cat(labels),
+            look=seen.mask.nonzero()[:, 0],
+            scenes=torch.full((len(fixations),), index),
+            fixations=fixations,
+        )
 
     @classmethod
     def join(cls, parts: list[Samples]) -> Samples:
@@ -183,21 +209,7 @@ class Sampler:
         generator = generator_for("fixations", settings.seed, scene.id)
         points = torch.rand(settings.fixations, 2, generator=generator) * grid.extent - 0.5
         seen = look_from(self.eye, scene.image, points)
-        with torch.inference_mode():
-            distance = grid.box_distance(seen.boxes, points)
-            labels = [
-                match(boxes[mask], scene.boxes, scene.labels, iou=settings.iou)
-                for boxes, mask in zip(seen.boxes, seen.mask, strict=True)
-            ]
-            return Samples(
-                boxes=seen.boxes[seen.mask],
-                scores=seen.scores[seen.mask],
-                distance=distance[seen.mask],
-                labels=torch.cat(labels),
-                look=seen.mask.nonzero()[:, 0],
-                scenes=torch.full((len(points),), index),
-                fixations=points,
-            )
+        return Samples.of(seen, points, self.scenes.annotation(index), index, settings.iou)
 
 
 _process: dict[str, tuple[Sampler, Path]] = {}

@@ -48,15 +48,30 @@ class Outcome:
     found_at: int
 
 
-def episodes_of(scenes: Scenes, index: int, columns: int, rows: int, protocol: ProtocolConfig) -> list[Episode]:
+def episodes_of(
+    scenes: Scenes,
+    index: int,
+    columns: int,
+    rows: int,
+    protocol: ProtocolConfig,
+    targets: Sequence[int] | None = None,
+) -> list[Episode]:
     """All episodes of one scene: every legal target, `starts` cells that no object of it overlaps.
 
     Starts differ from each other as long as there are enough cells.
+
+    Args:
+        scenes: the data set.
+        index: of the scene.
+        columns: cells in a row.
+        rows: cells in a column.
+        protocol: the experiment.
+        targets: classes to search for; None: those that the data set allows.
     """
     annotation = scenes.annotation(index)
     labels, covered = annotation.labels, Grid(columns, rows, annotation.size).footprint(annotation.boxes)
     counts = torch.bincount(labels, minlength=1)
-    targets = scenes.targets(index)
+    targets = scenes.targets(index) if targets is None else targets
     commonest = max(targets, key=lambda t: (int(counts[t]), -t)) if targets else None
     episodes = []
     for target in targets:
@@ -84,16 +99,32 @@ def episodes_of(scenes: Scenes, index: int, columns: int, rows: int, protocol: P
 
 
 def choose_classes(
-    scenes: Scenes, index: int, annotation: Annotation, classes: int, max_area: float, seed: int
+    scenes: Scenes,
+    index: int,
+    annotation: Annotation,
+    classes: int,
+    max_area: float,
+    seed: int,
+    absent: int | None = None,
 ) -> list[int]:
-    """Up to so many classes that a photograph holds and that may be searched for, and as many that it does not hold."""
+    """Up to so many classes that a photograph holds and that may be searched for, and as many that it does not hold.
+
+    Args:
+        scenes: the data set.
+        index: of the scene.
+        annotation: its objects.
+        classes: how many that it holds, at most.
+        max_area: classes that cover a larger share of the image are left out.
+        seed: of the choice.
+        absent: how many that it does not hold, at most; None: as many as were chosen of the others.
+    """
     generator = generator_for("classes", seed, scenes.ids[index])
     held = set(annotation.labels.tolist())
     legal = legal_targets(annotation, max_area)
     present = [legal[place] for place in torch.randperm(len(legal), generator=generator)[:classes].tolist()]
     others = [target for target in range(1, len(scenes.classes) + 1) if target not in held]
-    absent = [others[place] for place in torch.randperm(len(others), generator=generator)[: len(present)].tolist()]
-    return [*present, *absent]
+    count = len(present) if absent is None else absent
+    return [*present, *(others[place] for place in torch.randperm(len(others), generator=generator)[:count].tolist())]
 
 
 def tie_noise(scenes: Scenes, episode: Episode, cells: int, protocol: ProtocolConfig) -> Tensor:

@@ -21,6 +21,7 @@ from semfov.eye import Eye
 from semfov.gaze.learned import LearnedGaze
 from semfov.io.compatibility import learned_for, recommended
 from semfov.io.files import check_regular
+from semfov.io.shipped import shipped_model
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor import Foveation
 
@@ -57,23 +58,31 @@ def read_ids(path: Path) -> list[str]:
 
 def make_detector(detector: DetectorConfig) -> Detector:
     """The detector that the settings name."""
-    options: dict[str, object] = {
-        "background": detector.background,
+    # A session of onnxruntime keeps the threads that it is opened with.
+    with one_thread():
+        return load_detector(detector.name, **detector_options(detector))
+
+
+def detector_options(detector: DetectorConfig) -> dict[str, Any]:
+    """Options of `semfov.load_detector` that settings stand for."""
+    onnx = detector.name.endswith(".onnx")
+    if detector.head is not None and not onnx:
+        raise InputError(f"detector.head: expected none, for {detector.name!r} is no ONNX model of your own")
+    options: dict[str, Any] = {
         "threshold": detector.threshold,
         "iou": detector.iou,
         "limit": detector.limit,
     }
-    if detector.weights is not None:
-        options["weights"] = detector.weights
+    for name in ("background", "weights", "classes", "head"):
+        if getattr(detector, name) is not None:
+            options[name] = getattr(detector, name)
     if detector.stride != "auto":
         options["stride"] = detector.stride
     if detector.input_size is not None:
         options["input_size"] = detector.input_size
     if detector.runtime != "auto":
         options["runtime"] = detector.runtime
-    # A session of onnxruntime keeps the threads that it is opened with.
-    with one_thread():
-        return load_detector(detector.name, **options)
+    return options
 
 
 def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
@@ -92,21 +101,24 @@ def fovea_of(eye: Eye) -> Foveation:
 
 def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
     """The observation model of that name, or the one for this eye; checked to belong to detector and class list."""
-    model = FovealObservationModel.from_pretrained(name or recommended(eye.detector.name, fovea_of(eye).growth))
+    own = recommended(eye.detector.name, float(fovea_of(eye).growth))
+    model = FovealObservationModel.from_pretrained(name or shipped_model(FovealObservationModel, own, "MODEL"))
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)
 
 
 def make_target_evidence(name: str | None, eye: Eye) -> TargetEvidence:
     """The learned evidence for a target of that name, or the one for this eye; checked to belong to it."""
-    model = TargetEvidence.from_pretrained(name or learned_for(eye.detector.name, float(fovea_of(eye).growth)))
+    own = learned_for(eye.detector.name, float(fovea_of(eye).growth))
+    model = TargetEvidence.from_pretrained(name or shipped_model(TargetEvidence, own, "MODEL"))
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
 
 
 def make_map_evidence(name: str | None, eye: Eye) -> MapEvidence:
     """The learned map of that name, or the one for this eye; checked to belong to it."""
-    model = MapEvidence.from_pretrained(name or learned_for(eye.detector.name, float(fovea_of(eye).growth)))
+    own = learned_for(eye.detector.name, float(fovea_of(eye).growth))
+    model = MapEvidence.from_pretrained(name or shipped_model(MapEvidence, own, "MODEL"))
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
 

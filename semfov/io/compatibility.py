@@ -7,15 +7,14 @@ from typing import Any
 
 from semfov.errors import InputError
 
-CONVERSIONS = (
-    frozenset(
-        {
-            "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14",
-            "c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d",
-        }
-    ),
-)
-"""sha256 of files that are conversions of one checkpoint: here YOLOX-nano's, by Kazuhito00 and by its authors."""
+NETWORKS = {
+    "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14": "yolox-nano",
+    "c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d": "yolox-nano",
+}
+"""Networks that models are shipped for, by the sha256 of their file, whatever that is called.
+
+Files of one name are conversions of one checkpoint: YOLOX-nano's by Kazuhito00, and by its authors.
+"""
 
 SHIPPED_SIGMA = 100.0
 """Width of the fovea, in pixels of an image of 640, that learned models are shipped for."""
@@ -76,7 +75,7 @@ def check_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], what:
     mine, theirs = fitted.get("digest"), detector.get("digest")
     same = fitted.get("name") == detector.get("name")
     if mine and theirs:
-        same = mine == theirs or any({mine, theirs} <= files for files in CONVERSIONS)
+        same = mine == theirs or NETWORKS.get(mine, mine) == NETWORKS.get(theirs, theirs)
     if not same:
         raise InputError(
             f"detector: the {what} was fitted for {_describe(fitted)}, got {_describe(detector)}; fit a "

@@ -1,10 +1,12 @@
 """The loop of training small networks: one cycle of the learning rate, by a loss that is made anew in each step."""
 
 from collections.abc import Callable, Iterable
+from contextlib import closing
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
+
+from semfov.experiments.progress import task_bar
 
 
 def descend(
@@ -29,14 +31,15 @@ def descend(
     trained = list(parameters)
     optimiser = torch.optim.AdamW(trained, lr=rate, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
-    bar = tqdm(range(steps), desc=title, unit="step", dynamic_ncols=True)
-    for number in bar:
-        loss = loss_of(number)
-        optimiser.zero_grad()
-        loss.backward()
-        if clip is not None:
-            torch.nn.utils.clip_grad_norm_(trained, clip)
-        optimiser.step()
-        schedule.step()
-        if number % 25 == 0:
-            bar.set_postfix(loss=f"{float(loss.detach()):.3f}")
+    with closing(task_bar(steps, title, "step")) as bar:
+        for number in range(steps):
+            loss = loss_of(number)
+            optimiser.zero_grad()
+            loss.backward()
+            if clip is not None:
+                torch.nn.utils.clip_grad_norm_(trained, clip)
+            optimiser.step()
+            schedule.step()
+            bar.update()
+            if number % 25 == 0:
+                bar.set_postfix(loss=f"{float(loss.detach()):.3f}")

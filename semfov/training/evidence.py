@@ -1,6 +1,5 @@
 """Training evidence for targets on the looks of whole searches."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,9 +15,7 @@ from semfov.belief.observers import Target, TargetBelief
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import nearly_fixated
 from semfov.episode import Step, rollout
-from semfov.errors import DataError
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.experiments.parallel import rank
 from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Weight, Workers
 from semfov.experiments.summary import table
 from semfov.gaze.acquisition import TargetPosterior
@@ -26,8 +23,9 @@ from semfov.gaze.choice import Exploratory
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.training.descent import descend
-from semfov.training.evidence_examples import ExampleLooks, Examples, looking, make_examples
-from semfov.training.outputs import model_path, training_of, write_outputs
+from semfov.training.evidence_examples import ExampleLooks, Examples, LookingRun, make_examples
+from semfov.training.frame import Fit, fit_and_write, split
+from semfov.training.outputs import training_of
 
 JUDGED = (1, 5, 15)
 """Looks after which a belief is judged."""
@@ -42,7 +40,8 @@ class FitSearchConfig(Settings):
         detector: which detector looks through the fovea.
         sensor: the foveal sensor.
         name: name of the model (None: the detector's).
-        classes: classes that a photograph holds to learn from, and as many that it does not.
+        classes: classes that a photograph holds to learn from, at most.
+        absent: classes that a photograph does not hold, at most (None: as many as it holds).
         columns: cells in a row.
         rows: cells in a column.
         max_target_area: classes that cover a larger share of the image are not searched for.
@@ -52,6 +51,7 @@ class FitSearchConfig(Settings):
         landing: weight in the loss of landing on the target with the next fixation.
         presence: weight in the loss of telling whether the target is in the photograph.
         false_alarms: share of absent targets that may be called found, by which the threshold is chosen.
+        surest: probability from which on a target counts as found at the latest, however many false alarms that makes.
         lost: share of the targets that may be missed because no cell is worth a look any more.
         steps: steps of training.
         batch: examples in a step.
@@ -67,6 +67,7 @@ class FitSearchConfig(Settings):
     sensor: SensorConfig = field(default_factory=SensorConfig)
     name: Name | None = None
     classes: Count = 2
+    absent: Count | None = None
     columns: Side = 10
     rows: Side = 10
     max_target_area: Positive = 0.2
@@ -76,6 +77,7 @@ class FitSearchConfig(Settings):
     landing: Weight = 1.0
     presence: Weight = 0.5
     false_alarms: Share = 0.015
+    surest: Share = 1.0
     lost: Share = 0.02
     steps: Count = 500
     batch: Count = 48
@@ -88,21 +90,18 @@ class FitSearchConfig(Settings):
 
 def fit_search(config: FitSearchConfig) -> None:
     """Look from every cell, train, judge on held-out photographs, and write everything."""
-    run = looking(config)
-    if rank() > 0:
-        return
-    examples = make_examples(run, config.classes, config.max_target_area, config.seed)
-    held_out = examples.scene % config.holdout == 0
-    if held_out.all() or not held_out.any():
-        raise DataError(f"data: too few examples to train and to judge by ({len(examples)}); give more photographs")
+    fit_and_write(config, fit_evidence)
+
+
+def fit_evidence(config: FitSearchConfig, run: LookingRun) -> Fit[TargetEvidence]:
+    """The model with its thresholds, from a run that has looked."""
+    examples = make_examples(run, config.classes, config.max_target_area, config.seed, absent=config.absent)
+    held_out = split(examples.scene, config.holdout)
     grid = Grid(config.columns, config.rows, (config.columns, config.rows))
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
     model = train(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
     judged, model.thresholds = judge(config, model, examples[held_out], grid)
-    path = model_path(config, run.eye.detector.name)
-    model.save(path)
-    text = report(judged, model.thresholds, int((~held_out).sum()), int(held_out.sum()))
-    write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
+    return Fit(model, judged, report(judged, model.thresholds, int((~held_out).sum()), int(held_out.sum())))
 
 
 def train(
@@ -220,6 +219,7 @@ def choose_thresholds(
         if float(found(candidate, 0.0)[~there].double().mean()) > config.false_alarms:
             break
         confirm = candidate
+    confirm = min(confirm, config.surest)
     told = int(found(confirm, 0.0)[there].sum())
     for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01):
         if told - int(found(confirm, give_up)[there].sum()) <= config.lost * int(there.sum()):

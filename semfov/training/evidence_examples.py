@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score, look_features
@@ -19,6 +19,7 @@ from semfov.episode import Looks, Sight
 from semfov.errors import DataError
 from semfov.experiments.config import BeliefConfig, SearchConfig
 from semfov.experiments.parts import Record
+from semfov.experiments.progress import track
 from semfov.experiments.run import Run, finish
 from semfov.experiments.search_protocol import choose_classes
 from semfov.gaze.policies import Task
@@ -35,13 +36,13 @@ class LookingRun(Run):
         return [], {}
 
 
-def looking(config: Any) -> LookingRun:
-    """A run that has looked at all photographs of a fit from every cell.
+def looking_run(config: Any) -> LookingRun:
+    """A run that is to look at all photographs of a fit from every cell.
 
     Args:
         config: settings of the fit: data, detector, sensor, columns, rows, out, cache and workers.
     """
-    run = LookingRun(
+    return LookingRun(
         SearchConfig(
             data=config.data,
             detector=config.detector,
@@ -53,6 +54,11 @@ def looking(config: Any) -> LookingRun:
             workers=config.workers,
         )
     )
+
+
+def looking(config: Any) -> LookingRun:
+    """A run that has looked (`looking_run`)."""
+    run = looking_run(config)
     finish(run, "looking")
     return run
 
@@ -117,20 +123,30 @@ def no_detections() -> Detections:
     raise NotImplementedError("examples keep no detections")
 
 
-def make_examples(run: LookingRun, classes: int, max_area: float, seed: int) -> Examples:
-    """Examples from all photographs of a run: up to `classes` classes that are there, and as many that are not.
+def make_examples(
+    run: LookingRun,
+    classes: int,
+    max_area: float,
+    seed: int,
+    *,
+    absent: int | None = None,
+    scenes: Sequence[int] | None = None,
+) -> Examples:
+    """Examples from photographs of a run: up to `classes` classes that are there, and as many that are not.
 
     Args:
         run: that has looked.
         classes: of each kind, at most.
         max_area: classes that cover a larger share of the image are left out.
         seed: of the choice of classes.
+        absent: most classes that are not there; None: as many as there are of the others.
+        scenes: indices of the photographs; None takes all.
     """
     parts = []
-    for index in tqdm(range(len(run.scenes)), desc="describing looks", unit="scene", dynamic_ncols=True):
+    for index in track(range(len(run.scenes)) if scenes is None else scenes, "describing looks", "scene"):
         annotation, grid = run.scenes.annotation(index), run.grid(index)
         covered = grid.footprint(annotation.boxes)
-        chosen = choose_classes(run.scenes, index, annotation, classes, max_area, seed)
+        chosen = choose_classes(run.scenes, index, annotation, classes, max_area, seed, absent)
         detections = run.detections(index) if chosen else None
         for target in chosen:
             assert detections is not None

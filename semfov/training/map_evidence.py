@@ -1,6 +1,5 @@
 """Training the map of all classes on the looks of whole explorations."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,9 +13,8 @@ from semfov.belief import MapEvidence
 from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap, MapBelief
 from semfov.episode import Step, rollout
-from semfov.errors import DataError, check
+from semfov.errors import check
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.experiments.parallel import rank
 from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Workers
 from semfov.experiments.summary import table
 from semfov.gaze.acquisition import CloserLook
@@ -24,9 +22,10 @@ from semfov.gaze.choice import Exploratory
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.exploration import answers_of
 from semfov.training.descent import descend
-from semfov.training.evidence_examples import LookingRun, looking
+from semfov.training.evidence_examples import LookingRun
+from semfov.training.frame import Fit, fit_and_write, split
 from semfov.training.map_examples import MapExampleLooks, MapExamples, make_map_examples
-from semfov.training.outputs import model_path, training_of, write_outputs
+from semfov.training.outputs import training_of
 
 JUDGED = (1, 2, 3, 5, 10, 15)
 """Looks after which a map is judged."""
@@ -82,13 +81,13 @@ class FitMapConfig(Settings):
 def fit_map(config: FitMapConfig) -> None:
     """Look from every cell, train, judge on held-out photographs, and write everything."""
     check(config.others < config.classes, "others", f"from 1 to {config.classes - 1}", config.others)
-    run = looking(config)
-    if rank() > 0:
-        return
+    fit_and_write(config, fit_map_evidence)
+
+
+def fit_map_evidence(config: FitMapConfig, run: LookingRun) -> Fit[MapEvidence]:
+    """The model, from a run that has looked."""
     examples = make_map_examples(run, config.classes, config.others, config.seed)
-    held_out = examples.scene % config.holdout == 0
-    if held_out.all() or not held_out.any():
-        raise DataError(f"data: too few photographs to train and to judge by ({len(examples)}); give more")
+    held_out = split(examples.scene, config.holdout)
     grid = Grid(config.columns, config.rows, (config.columns, config.rows))
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
     with torch.random.fork_rng(devices=[]):
@@ -99,10 +98,7 @@ def fit_map(config: FitMapConfig) -> None:
     train(config, model, examples[~held_out], grid)
     train_gain(config, model, examples[~held_out], grid)
     judged = judge(config, model.eval(), examples[held_out], grid)
-    path = model_path(config, run.eye.detector.name)
-    model.save(path)
-    text = report(judged, int((~held_out).sum()), int(held_out.sum()))
-    write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
+    return Fit(model, judged, report(judged, int((~held_out).sum()), int(held_out.sum())))
 
 
 def frequencies(run: LookingRun, holdout: int) -> Tensor:

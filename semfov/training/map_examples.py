@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import class_features, highest_score
@@ -14,6 +13,7 @@ from semfov.belief.observers import LearnedMap, MapLook, Observer
 from semfov.belief.observers.base import own
 from semfov.episode import Looks, Sight
 from semfov.errors import DataError
+from semfov.experiments.progress import track
 from semfov.experiments.seeds import generator_for
 from semfov.metrics.exploration import answers_of
 from semfov.training.evidence_examples import LookingRun, no_detections
@@ -87,7 +87,7 @@ def make_map_examples(run: LookingRun, classes: int, others: int, seed: int) -> 
     """
     parts = []
     components = len(run.scenes.classes) + 1
-    for index in tqdm(range(len(run.scenes)), desc="describing looks", unit="scene", dynamic_ncols=True):
+    for index in track(range(len(run.scenes)), "describing looks", "scene"):
         annotation, grid = run.scenes.annotation(index), run.grid(index)
         if not len(annotation.labels):
             continue

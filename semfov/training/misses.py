@@ -4,12 +4,13 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.experiments.samples import Sampler, Samples
+from semfov.data.scene import Scenes
+from semfov.experiments.samples import Samples
 from semfov.observation import MissCounts
 
 
 def count_misses(
-    sampler: Sampler, samples: Samples, scenes: set[int], edges: Tensor, columns: int = 10, rows: int = 10
+    photographs: Scenes, samples: Samples, scenes: set[int], edges: Tensor, columns: int = 10, rows: int = 10
 ) -> MissCounts:
     """Cells in which nothing was detected, over all looks at the given scenes (`MissCounts`)."""
     counts = torch.bincount(samples.look, minlength=len(samples.scenes)).tolist()
@@ -18,7 +19,7 @@ def count_misses(
         index = int(samples.scenes[look])
         if index not in scenes:
             continue
-        annotation = sampler.scenes.annotation(index)
+        annotation = photographs.annotation(index)
         grid = Grid(columns, rows, annotation.size)
         level = torch.bucketize(grid.distance(samples.fixations[look]), edges)
         detected = grid.footprint(boxes).any(0)

@@ -1,11 +1,13 @@
 """Fitting a foveal observation model to labelled detections."""
 
 import warnings
-from typing import Any
+from typing import Any, Protocol
 
+from semfov.data.scene import Scenes
 from semfov.errors import DataError, check
 from semfov.experiments.parallel import rank
-from semfov.experiments.samples import Sampler, Samples, SampleSettings, collect
+from semfov.experiments.samples import Samples, SampleSettings, collect
+from semfov.eye import Eye
 from semfov.observation import fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.mle import Method
@@ -28,7 +30,7 @@ def fit_fom(config: FitConfig) -> None:
         raise DataError(f"data: too few detections to fit on and to judge by ({len(samples)}); give more photographs")
     model = fit_model(config, sampler, samples[~held_out])
     fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
-    model.miss_rate = count_misses(sampler, samples, fitted_on, model.edges).rates().to(model.edges)
+    model.miss_rate = count_misses(sampler.scenes, samples, fitted_on, model.edges).rates().to(model.edges)
     path = model_path(config, sampler.eye.detector.name)
     model.save(path)
     written = write_report(config, model, fit_all(config, sampler, samples[~held_out], model), samples, held_out)
@@ -37,7 +39,14 @@ def fit_fom(config: FitConfig) -> None:
         print(f"  {file}")
 
 
-def fit_model(config: FitConfig, sampler: Sampler, samples: Samples) -> FovealObservationModel:
+class Looker(Protocol):
+    """What has looked at photographs: a `Sampler`, or a run over the looks from every cell."""
+
+    eye: Eye
+    scenes: Scenes
+
+
+def fit_model(config: FitConfig, sampler: Looker, samples: Samples) -> FovealObservationModel:
     """The model of the method that the settings name."""
     if config.method != "discriminative":
         return published_model(config, sampler, samples, config.method)
@@ -47,7 +56,7 @@ def fit_model(config: FitConfig, sampler: Sampler, samples: Samples) -> FovealOb
 
 def published_model(
     config: FitConfig,
-    sampler: Sampler,
+    sampler: Looker,
     samples: Samples,
     method: Method,
     **options: Any,
@@ -81,7 +90,7 @@ def statistics_of(model: FovealObservationModel, samples: Samples) -> DirichletS
 
 
 def fit_all(
-    config: FitConfig, sampler: Sampler, samples: Samples, model: FovealObservationModel
+    config: FitConfig, sampler: Looker, samples: Samples, model: FovealObservationModel
 ) -> dict[str, FovealObservationModel]:
     """The models that the report compares: raw scores, the published estimators, and the model that was asked for."""
     edges, classes = config.edges, sampler.eye.detector.classes

@@ -7,15 +7,15 @@ from typing import Annotated
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from semfov.belief.grid import Footprint, Grid
 from semfov.belief.observers import Semantic
-from semfov.data.scene import legal_targets
+from semfov.data.scene import Scenes, legal_targets
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.parallel import rank
+from semfov.experiments.progress import track
 from semfov.experiments.samples import Sampler, Samples, SampleSettings, collect
 from semfov.experiments.settings import Count, Positive, Range, Seed, Settings, Share, Side, Whole, Workers
 from semfov.experiments.setup import make_observation
@@ -94,10 +94,35 @@ def measure(
 ) -> dict[str, float]:
     """Mean over photographs of the share of next fixations that hit, `fitted` and `held_out`."""
     observer = Semantic(len(sampler.eye.detector.classes) + 1, model, footprint=config.footprint, tempering=tempering)
+    return means_of(config, hit_rates(config, sampler.scenes, samples, observer, f"tempering {tempering:g}"))
+
+
+def means_of(config: FitTemperingConfig, rates: dict[int, float]) -> dict[str, float]:
+    """Means of what `hit_rates` gives, over the photographs to choose by, `fitted`, and over those `held_out`."""
     means: dict[str, list[float]] = {"fitted": [], "held_out": []}
-    number = min(config.photographs or len(sampler.scenes), len(sampler.scenes))
-    for index in tqdm(range(number), desc=f"tempering {tempering:g}", unit="scene", dynamic_ncols=True):
-        annotation = sampler.scenes.annotation(index)
+    for index, share in rates.items():
+        means["held_out" if index % config.holdout == 0 else "fitted"].append(share)
+    if not all(means.values()):
+        raise DataError("data: too few photographs to fit and to judge by; give more")
+    return {name: sum(values) / len(values) for name, values in means.items()}
+
+
+def hit_rates(
+    config: FitTemperingConfig, scenes: Scenes, samples: Samples, observer: Semantic, title: str
+) -> dict[int, float]:
+    """Share of next fixations that hit, by the index of the photograph.
+
+    Args:
+        config: which photographs and targets count.
+        scenes: the photographs.
+        samples: looks at them, `config.fixations` at each, in order.
+        observer: fuses the looks.
+        title: of the progress.
+    """
+    rates = {}
+    number = min(config.photographs or len(scenes), len(scenes))
+    for index in track(range(number), title, "scene"):
+        annotation = scenes.annotation(index)
         targets = legal_targets(annotation, config.max_target_area)
         if len(annotation.labels) < config.min_objects or not targets:
             continue
@@ -107,10 +132,8 @@ def measure(
         goal = torch.stack([covered[annotation.labels == target].any(0) for target in targets])
         share = hit_rate(observer, samples.seen(looks), samples.fixations[looks], grid, torch.tensor(targets), goal)
         if share is not None:
-            means["held_out" if index % config.holdout == 0 else "fitted"].append(share)
-    if not all(means.values()):
-        raise DataError("data: too few photographs to fit and to judge by; give more")
-    return {name: sum(values) / len(values) for name, values in means.items()}
+            rates[index] = share
+    return rates
 
 
 def hit_rate(

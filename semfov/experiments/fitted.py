@@ -1,0 +1,96 @@
+"""Settings of an experiment from a folder of models."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TypeVar
+
+from semfov.errors import InputError, check
+from semfov.experiments.config import DetectorConfig, ExploreConfig, PolicyConfig, RunConfig, SearchConfig, SensorConfig
+from semfov.experiments.presets import TARGET_EVIDENCE as EVIDENCE
+from semfov.experiments.presets import Choice, resolve
+from semfov.gaze.policies import POLICIES
+from semfov.model_folder import ModelFolder
+
+Config = TypeVar("Config", SearchConfig, ExploreConfig)
+
+
+def with_models(config: Config) -> Config:
+    """The settings with detector, sensor, grid and models of the folder that they name; the same where they name none.
+
+    A detector or its weights that are named beside the folder are files that lie elsewhere now. Policies keep their
+    names; `recommended` is what the folder's agent goes by, and of the policies that run where none are named, those
+    that need what the folder has not are left out.
+
+    Raises:
+        InputError: a policy that is named needs a model that the folder has not, or a setting is given twice.
+        DataError: it is no folder of models, or a file is missing or changed.
+    """
+    if config.models is None:
+        return config
+    folder = ModelFolder(config.models)
+    for name in ("model", "target_model", "map_model"):
+        given = getattr(config.belief, name)
+        check(given is None, f"belief.{name}", "none beside models, which names it", given)
+    files = {part: folder.file(part) for part in ("observation", "evidence", "map")}
+    names = {"model": "observation", "target_model": "evidence", "map_model": "map"}
+    columns, rows = folder.manifest.grid
+    told: dict[str, str | None] = {name: _text(files[part]) for name, part in names.items()}
+    belief = replace(config.belief, columns=columns, rows=rows, **told)  # type: ignore[arg-type]
+    detector = detector_of(folder, config.detector)
+    named = type(config)().policies != config.policies
+    policies = tuple(recommended(folder, config) if each == "recommended" else each for each in config.policies)
+    chosen = []
+    for policy in policies:
+        missing = next((part for part in needs(policy, config) if files[part] is None), None)
+        if missing is None:
+            chosen.append(policy)
+        elif named:
+            why = folder.manifest.parts[missing].why if missing in folder.manifest.parts else "not fitted"
+            raise InputError(f"policies: {policy!r} needs the part {missing!r}, which {config.models} lacks: {why}")
+    return replace(config, detector=detector, sensor=sensor_of(folder), belief=belief, policies=tuple(chosen))
+
+
+def detector_of(folder: ModelFolder, given: DetectorConfig) -> DetectorConfig:
+    """The settings of a folder's detector; what is given beside it names files that lie elsewhere now."""
+    moved = None if given.name == DetectorConfig().name else given.name
+    source, options = folder.detector_source(moved, given.weights)
+    known = {field.name for field in fields(DetectorConfig)}
+    options = {name: value for name, value in options.items() if name in known}
+    if options.get("classes") is not None:
+        options["classes"] = tuple(options["classes"])
+    if "weights" in options:
+        options["weights"] = Path(options["weights"])
+    return DetectorConfig(name=source, **{"background": None, **options})
+
+
+def sensor_of(folder: ModelFolder) -> SensorConfig:
+    """The settings of a folder's sensor."""
+    return SensorConfig(**folder.manifest.sensor)
+
+
+def recommended(folder: ModelFolder, config: RunConfig) -> Choice:
+    """The policy that the agent of a folder goes by."""
+    if isinstance(config, ExploreConfig):
+        return PolicyConfig("closer-look", "learned") if folder.used("map") else "random-raw"
+    if folder.used("evidence"):
+        return EVIDENCE
+    if not folder.used("tempering"):
+        return "non-predictive-raw"
+    settings = folder.manifest.parts["tempering"].settings
+    return PolicyConfig(
+        "non-predictive", settings["scores"], tempering=settings["exponent"], footprint=settings["footprint"]
+    )
+
+
+def needs(choice: Choice, config: RunConfig) -> list[str]:
+    """Parts that a policy needs."""
+    policy = resolve(choice, "exploration" if isinstance(config, ExploreConfig) else "search")
+    if policy.policy == EVIDENCE:
+        return ["evidence"]
+    learned = ["map"] if policy.scores == "learned" else []
+    model = policy.policy in POLICIES and POLICIES[policy.policy].needs_model
+    return [*learned, *(["observation"] if model or policy.scores == "calibrated" else [])]
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)

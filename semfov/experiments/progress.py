@@ -1,0 +1,134 @@
+"""Progress of work: a bar for each task, or one bar over the whole of several."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, Protocol, TypeVar
+
+from tqdm import tqdm
+
+Item = TypeVar("Item")
+
+_whole: ContextVar[Whole | None] = ContextVar("whole", default=None)
+
+
+class Bar(Protocol):
+    """What shows how far a task has come."""
+
+    def update(self, n: float = 1) -> object:
+        """So many more units are done."""
+
+    def set_postfix(self, **told: object) -> None:
+        """Show values beside the bar."""
+
+    def close(self) -> None:
+        """The task is over."""
+
+
+class Whole:
+    """One bar over stages that take different times, each of them made of tasks.
+
+    While it is open, tasks that `track` or `task_bar` would give a bar of their own move this one.
+
+    Args:
+        title: label of the bar.
+        stages: for each stage, in order, about how long each of its tasks takes, by the titles of the tasks; what
+            counts is how these compare. A task of another title moves nothing.
+
+    >>> with Whole("all", {"one": {"half": 1, "rest": 1}, "two": {"x": 2}}) as whole:
+    ...     with whole.stage("one"):
+    ...         _ = list(track(range(5), "half", "unit"))
+    ...         half = whole.done
+    ...     one = whole.done
+    >>> half, one
+    (0.25, 0.5)
+    """
+
+    def __init__(self, title: str, stages: Mapping[str, Mapping[str, float]]) -> None:
+        self.title, self.stages = title, stages
+        self._total = sum(sum(tasks.values()) for tasks in stages.values()) or 1.0
+        self._at, self._tasks = 0.0, dict[str, float]()
+        form = "{desc} {percentage:3.0f}% |{bar}| {elapsed} < {remaining}{postfix}"
+        self._bar = tqdm(total=1.0, desc=title, bar_format=form, dynamic_ncols=True)
+
+    @property
+    def done(self) -> float:
+        """Share of the whole that is done."""
+        return self._at / self._total
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Work on a stage; with its end all of it is done, whatever its tasks have told."""
+        before = 0.0
+        for other, tasks in self.stages.items():
+            if other == name:
+                break
+            before += sum(tasks.values())
+        self._tasks = dict(self.stages[name])
+        self._bar.set_description(f"{self.title}: {name}", refresh=True)
+        self._move(before)
+        yield
+        self._move(before + sum(self.stages[name].values()))
+
+    def task(self, title: str, total: float) -> Bar:
+        """What moves the bar for a task of this title."""
+        return _Task(self, self._tasks.pop(title, 0.0) / max(total, 1))
+
+    def _move(self, to: float) -> None:
+        self._at = max(self._at, to)
+        self._bar.update(min(self.done, 1.0) - self._bar.n)
+
+    def __enter__(self) -> Whole:
+        self._token = _whole.set(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        _whole.reset(self._token)
+        self._bar.close()
+
+
+class _Task:
+    """A part of the whole."""
+
+    def __init__(self, whole: Whole, step: float) -> None:
+        self._whole, self._step = whole, step
+
+    def update(self, n: float = 1) -> None:
+        self._whole._move(self._whole._at + n * self._step)
+
+    def set_postfix(self, **told: object) -> None:
+        """Nothing: what a task tells says nothing of the whole."""
+
+    def close(self) -> None:
+        """Nothing."""
+
+
+def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> Bar:
+    """A bar for a task, or what moves the bar of the whole where one is open.
+
+    Args:
+        total: units of the task.
+        title: what it is called.
+        unit: what a unit is called.
+        hidden: show nothing.
+    """
+    whole = _whole.get()
+    if whole is not None:
+        return whole.task(title, total)
+    bar: Any = tqdm(total=total, desc=title, unit=unit, dynamic_ncols=True, disable=hidden)
+    shown: Bar = bar
+    return shown
+
+
+def track(items: Iterable[Item], title: str, unit: str) -> Iterator[Item]:
+    """The items, with a bar that moves as they are taken (`task_bar`)."""
+    listed = list(items)
+    bar = task_bar(len(listed), title, unit)
+    try:
+        for item in listed:
+            yield item
+            bar.update()
+    finally:
+        bar.close()

@@ -1,0 +1,199 @@
+"""The record of a folder of models: which detector they were fitted to, which parts there are, and which are used."""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any, Self
+
+from semfov.errors import DataError, InputError
+from semfov.io.files import check_regular, inside, sha256, write_text
+from semfov.io.schema import CLASSES, Anything, Array, Json, Maybe, Number, Object, Schema, Text
+from semfov.io.storage import checksum
+from semfov.version import __version__
+
+FILE = "manifest.json"
+_KIND = "semfov-models"
+_MOST_BYTES = 2**24
+
+PARTS = ("observation", "tempering", "evidence", "map")
+"""What a folder may hold, in the order in which it is fitted."""
+
+_PLACE = Object({"relative": Text(), "absolute": Text()}, required=("relative", "absolute"))
+
+
+class _Flag(Json):
+    """True or false."""
+
+    def check(self, name: str, value: Any, sizes: dict[str, int]) -> None:
+        """See `Json`."""
+        if not isinstance(value, bool):
+            raise InputError(f"{name}: expected true or false, got {value!r}")
+
+
+_PART = Object(
+    {
+        "file": Maybe(Text()),
+        "sha256": Maybe(Text()),
+        "used": _Flag(),
+        "why": Text(),
+        "settings": Object(others=Anything()),
+    },
+    required=("file", "sha256", "used", "why", "settings"),
+)
+_SCHEMA = Schema(
+    {},
+    {
+        "kind": Text((_KIND,)),
+        "version": Text(),
+        "classes": CLASSES,
+        "detector": Object(
+            {
+                "name": Text(),
+                "sha256": Text(),
+                "model": Maybe(Text()),
+                "model_file": Maybe(_PLACE),
+                "weights_file": Maybe(_PLACE),
+                "options": Object(others=Anything()),
+            },
+            required=("name", "sha256", "options"),
+        ),
+        "sensor": Object(
+            {
+                "name": Text(),
+                "sigma": Number(above=0),
+                "growth": Number(above=0),
+                "levels": Number(1, 30),
+                "convention": Text(("kornia", "opencv")),
+                "reference": Number(above=0),
+            },
+            required=("name", "sigma", "growth", "levels", "convention", "reference"),
+        ),
+        "grid": Array(Number(1, 200), 2),
+        "parts": Object(dict.fromkeys(PARTS, _PART)),
+        "training": Object(others=Anything()),
+    },
+)
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of the things that are fitted.
+
+    Attributes:
+        file: its file in the folder; None where it is settings alone, or could not be fitted.
+        sha256: of the file.
+        used: whether the agent goes by it; else it does as an agent without models does.
+        why: what that rests on, in a sentence.
+        settings: JSON values that it is made of beside the file.
+    """
+
+    file: str | None
+    sha256: str | None
+    used: bool
+    why: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a folder of models says of itself.
+
+    Attributes:
+        classes: names of the detector's K classes.
+        detector: `name`, `sha256` of its weights, the `options` of `semfov.load_detector`, and what that loads:
+            `model`, a name, or `model_file` and `weights_file`, each a path relative to the folder and an absolute one.
+        sensor: settings of the foveal sensor.
+        grid: `(columns, rows)` of the belief.
+        parts: by name, of `PARTS`.
+        training: JSON values that tell what the parts were fitted to.
+    """
+
+    classes: tuple[str, ...]
+    detector: Mapping[str, Any]
+    sensor: Mapping[str, Any]
+    grid: tuple[int, int]
+    parts: Mapping[str, Part]
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+    def write(self, folder: str | PathLike[str]) -> Path:
+        """Write the record into the folder, whole or not at all; returns the file."""
+        record = {"kind": _KIND, "version": __version__, **json.loads(json.dumps(asdict(self)))}
+        path = Path(folder) / FILE
+        write_text(path, json.dumps({**record, "sha256": checksum({}, record)}, indent=2) + "\n")
+        return path
+
+    @classmethod
+    def read(cls, folder: str | PathLike[str]) -> Self:
+        """The record of a folder, once it and the files that it names are found to be as they were written.
+
+        Raises:
+            DataError: there is no record, or it or a file is missing, damaged or of another kind.
+        """
+        path = Path(folder) / FILE
+        record = _read(path)
+        told = record.pop("sha256", None)
+        if told != checksum({}, record):
+            raise DataError(f"{path}: damaged or changed, it does not have the sha256 it was written with; {_AGAIN}")
+        try:
+            _SCHEMA.check({}, record)
+        except InputError as error:
+            raise DataError(f"{path}: not a complete record of models ({error}); {_AGAIN}") from None
+        parts = {name: Part(**part) for name, part in record["parts"].items()}
+        for part in parts.values():
+            if part.file is not None:
+                _check_file(inside(Path(folder), part.file), part.sha256)
+        columns, rows = record["grid"]
+        known = {name: record[name] for name in ("detector", "sensor", "training")}
+        return cls(classes=tuple(record["classes"]), grid=(columns, rows), parts=parts, **known)
+
+
+_AGAIN = "run python -m train.fit_detector again, or copy the folder again"
+
+
+def is_folder_of_models(path: str | PathLike[str]) -> bool:
+    """Whether this is a folder with a record."""
+    return (Path(path) / FILE).is_file()
+
+
+def place_of(file: str | PathLike[str], folder: str | PathLike[str]) -> dict[str, str]:
+    """Where a file lies, from a folder and for itself."""
+    absolute = Path(file).resolve()
+    try:
+        relative = os.path.relpath(absolute, Path(folder).resolve())
+    except ValueError:  # on another drive
+        relative = str(absolute)
+    return {"relative": Path(relative).as_posix(), "absolute": str(absolute)}
+
+
+def find_file(place: Mapping[str, str], folder: str | PathLike[str]) -> Path | None:
+    """The file at a place that `place_of` told, seen from where the folder is now; None where it is gone."""
+    paths = Path(folder) / place["relative"], Path(place["absolute"])
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _check_file(path: Path, digest: str | None) -> None:
+    check_regular(path)
+    if not path.is_file():
+        raise DataError(f"{path}: no such file, though {FILE} beside it names it; {_AGAIN}")
+    if sha256(path) != digest:
+        raise DataError(f"{path}: damaged or changed, its sha256 is not that of {FILE}; {_AGAIN}")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    check_regular(path)
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise DataError(f"{path}: expected at most {_MOST_BYTES:,} bytes")
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DataError(
+            f"{path}: no such file; expected a folder of models that python -m train.fit_detector wrote"
+        ) from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: not a readable JSON file ({' '.join(str(error).split())}); {_AGAIN}") from None
+    if not isinstance(record, dict):
+        raise DataError(f"{path}: expected an object, got {type(record).__name__}; {_AGAIN}")
+    return record

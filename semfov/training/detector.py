@@ -1,0 +1,181 @@
+"""Fitting everything that the agent needs to a detector of one's own."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import asdict, fields, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from semfov.agent import ActivePerception
+from semfov.errors import InputError
+from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.experiments.parallel import available_cores, rank
+from semfov.experiments.progress import Whole
+from semfov.experiments.run import finish
+from semfov.experiments.setup import detector_options, plain
+from semfov.io.files import write_text
+from semfov.io.manifest import PARTS, Manifest, place_of
+from semfov.sensor import SENSORS
+from semfov.training.detector_parts import Workshop
+from semfov.training.detector_report import class_counts, next_commands, report
+from semfov.training.detector_settings import FitDetectorConfig
+from semfov.training.evidence_examples import LookingRun, looking_run
+
+_log = logging.getLogger(__name__)
+
+SETTINGS = ("holdout", "fixations", "steps", "map_steps", "seed")
+"""Settings that a folder tells."""
+
+
+def fit_detector(
+    model: str | PathLike[str],
+    root: str | PathLike[str],
+    annotations: str | PathLike[str],
+    *,
+    out: str | PathLike[str] = "mymodels",
+    limit: int | None = None,
+    workers: int = 1,
+    **settings: Any,
+) -> ActivePerception:
+    """Fit everything that the recommended agent needs to a detector, and return the agent.
+
+    The same as `python -m train.fit_detector`: looks at every photograph from every cell, fits an observation model,
+    the exponent of its likelihoods, target evidence and a map of all classes, and compares each with raw scores on
+    photographs that were held out. `ActivePerception.from_pretrained(out)` loads the agent again.
+
+    Args:
+        model: the detector: a name or a file, as for `semfov.load_detector`.
+        root: folder of the photographs.
+        annotations: their boxes, a file in COCO's format; categories are matched to the detector's classes by name.
+        out: folder of models to write; the same call goes on where one was stopped.
+        limit: most photographs.
+        workers: processes that look; more than one needs a script whose work is under `if __name__ == "__main__"`.
+        settings: others of `FitDetectorConfig` (`holdout`, `steps`, `seed`, …), and of the detector (`classes`, `head`,
+            `weights`, `threshold`, …: `DetectorConfig`).
+
+    Raises:
+        InputError: a setting is unknown or out of range, or the detector is.
+        DataError: a file is missing or damaged, or none of the annotated categories is a class of the detector.
+
+    Example::
+
+        agent = semfov.fit_detector("mine.onnx", "photographs", "instances.json", classes=["cat", "dog", "cup"])
+        scanpath = agent.search(semfov.read_image("kitchen.jpg"), "cup")
+    """
+    of_detector = {each.name for each in fields(DetectorConfig)} - {"name"}
+    of_fit = {each.name for each in fields(FitDetectorConfig)} - {"model", "data", "detector", "out", "workers"}
+    unknown = sorted(settings.keys() - of_detector - of_fit)
+    if unknown:
+        raise InputError(f"settings: expected some of {', '.join(sorted(of_detector | of_fit))}, got {unknown[0]!r}")
+    given = {name: value for name, value in settings.items() if name in of_detector}
+    if given.get("classes") is not None:
+        given["classes"] = tuple(given["classes"])
+    if given.get("weights") is not None:
+        given["weights"] = Path(given["weights"])
+    config = FitDetectorConfig(
+        model=Path(model),
+        data=DataConfig(Path(root), Path(annotations), limit, min_instances=0, max_target_area=None),
+        detector=DetectorConfig(**{"background": None, **given}),
+        out=Path(out),
+        workers=workers,
+        **{name: value for name, value in settings.items() if name in of_fit},
+    )
+    fit_folder(config)
+    return ActivePerception.from_pretrained(out)
+
+
+def fit_folder(config: FitDetectorConfig) -> None:
+    """Look, fit all parts, and write the folder, its report and its figures."""
+    config = config.named()
+    started = time.monotonic()
+    run = looking_run(replace(config, out=config.out / "progress"))
+    shop = Workshop(config, run)
+    config = shop.config
+    missing = class_counts(run, range(len(run.scenes)))
+    _tell(missing)
+    with Whole("fitting", {"looking": {"looking": seconds_of_looks(run)}, **shop.stages}) as whole:
+        with whole.stage("looking"):
+            finish(run, "looking")
+        if rank() > 0:
+            return
+        for part in PARTS:
+            with whole.stage(part):
+                shop.fit(part)
+    path = manifest_of(config, run, shop).write(config.out)
+    text = report(config, run, shop.parts, time.monotonic() - started)
+    print(text)
+    write_text(config.out / "report.md", text)
+    write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
+    figures = [figure for fitted in shop.parts.values() for figure in fitted.figures]
+    models = [fitted.part.file for fitted in shop.parts.values() if fitted.part.file]
+    print("written:", *(f"  {config.out / name}" for name in [path.name, *models, "report.md", *figures]), sep="\n")
+    print(f"\nnext:\n{next_commands(config, run)}")
+
+
+def seconds_of_looks(run: LookingRun) -> float:
+    """About how many seconds the looks take that are still to be made."""
+    left = [index for index in range(len(run.scenes)) if run.store.load(run.digest(index)) is None]
+    if not left:
+        return 1.0
+    image = run.scenes[left[0]].image[None]
+    grid = run.grid(left[0])
+    with torch.inference_mode():
+        run.eye(image, grid.centres[:1])
+        before = time.monotonic()
+        run.eye(image, grid.centres[1:2] if len(grid) > 1 else grid.centres)
+    workers = min(run.config.workers or available_cores(), len(left))
+    return (time.monotonic() - before) * len(grid) * len(left) / workers
+
+
+def _tell(counts: dict[str, int]) -> None:
+    """Warn of classes that no photograph shows."""
+    missing = [name for name, count in counts.items() if not count]
+    if missing:
+        some = ", ".join(missing[:8]) + (", …" if len(missing) > 8 else "")
+        _log.warning(
+            "%d of the detector's %d classes have no box in the photographs (%s): what is fitted knows them only by "
+            "what it learns of the others",
+            len(missing),
+            len(counts),
+            some,
+        )
+
+
+def manifest_of(config: FitDetectorConfig, run: LookingRun, shop: Workshop) -> Manifest:
+    """The record of the folder."""
+    detector, sensor = run.eye.detector, config.sensor
+    options = plain(detector_options(config.detector))
+    weights = options.pop("weights", None)
+    is_file = Path(config.detector.name).is_file()
+    return Manifest(
+        classes=detector.classes,
+        detector={
+            "name": detector.name,
+            "sha256": detector.digest,
+            "model": None if is_file else config.detector.name,
+            "model_file": place_of(config.detector.name, config.out) if is_file else None,
+            "weights_file": None if weights is None else place_of(weights, config.out),
+            "options": options,
+        },
+        sensor={**asdict(sensor), **SENSORS[sensor.name], **given_of(sensor)},
+        grid=(config.columns, config.rows),
+        parts={name: fitted.part for name, fitted in shop.parts.items()},
+        training={
+            "data": run.scenes.fingerprint,
+            "photographs": len(run.scenes),
+            "held_out": len(shop.held_out),
+            "settings": {name: getattr(config, name) for name in SETTINGS},
+        },
+    )
+
+
+def given_of(sensor: SensorConfig) -> dict[str, float]:
+    """Settings of a sensor that differ from those that its name stands for."""
+    given = {"sigma": sensor.sigma, "growth": sensor.growth}
+    return {name: value for name, value in given.items() if value is not None}

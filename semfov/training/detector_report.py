@@ -1,0 +1,90 @@
+"""What is told of everything that was fitted to a detector."""
+
+from __future__ import annotations
+
+from os import fspath
+from typing import Any
+
+import torch
+
+from semfov.experiments.summary import table
+from semfov.training.detector_parts import Fitted
+from semfov.training.detector_settings import FitDetectorConfig
+from semfov.training.evidence_examples import LookingRun
+
+TITLES = {
+    "observation": "Observation model",
+    "tempering": "Tempering",
+    "evidence": "Target evidence (searches)",
+    "map": "Learned map (explorations)",
+}
+"""What reports call the parts."""
+
+
+def class_counts(run: LookingRun, scenes: Any) -> dict[str, int]:
+    """Objects of each class in some photographs."""
+    count = torch.zeros(len(run.scenes.classes) + 1, dtype=torch.int64)
+    for index in scenes:
+        count += torch.bincount(run.scenes.annotation(index).labels, minlength=len(count))
+    return dict(zip(run.scenes.classes, count[1:].tolist(), strict=True))
+
+
+def report(config: FitDetectorConfig, run: LookingRun, parts: dict[str, Fitted], seconds: float) -> str:
+    """How everything that was fitted does, as Markdown."""
+    photographs = len(run.scenes)
+    holdout = config.observation.holdout
+    held_out = [index for index in range(photographs) if index % holdout == 0]
+    counts = class_counts(run, (index for index in range(photographs) if index % holdout))
+    rows = [["part", "used", "because on held-out photographs"]]
+    rows += [[TITLES[name], "yes" if each.part.used else "no, raw", each.part.why] for name, each in parts.items()]
+    lines = [
+        f"# Models of {run.eye.detector.name}",
+        "",
+        f"{photographs} photographs, {len(held_out)} of them held out (every {holdout}th); "
+        f"{len(counts)} classes; {config.columns} × {config.rows} cells; "
+        f"sensor {config.sensor.name}; {seconds / 60:.1f} minutes in this run.",
+        "",
+        "A part is used where it is better than raw scores by more than one standard error, paired over the "
+        "photographs that were held out; else the agent does without it.",
+        "",
+        *table(rows),
+        "",
+        *thin_classes(counts, config.thin),
+    ]
+    if len(held_out) < 10:
+        lines += [f"Only {len(held_out)} photographs judge: take the figures as rough.", ""]
+    for name, fitted in parts.items():
+        lines += [f"## {TITLES[name]}", "", fitted.report, ""]
+        lines += [line for figure in fitted.figures for line in (f"![{figure}]({figure})", "")]
+    return "\n".join(lines)
+
+
+def thin_classes(counts: dict[str, int], thin: int) -> list[str]:
+    """Lines that warn of classes with few objects to learn from."""
+    none = [name for name, count in counts.items() if count == 0]
+    few = [f"{name} {count}" for name, count in counts.items() if 0 < count < thin]
+    lines = []
+    if none:
+        lines += [f"**No object to learn from** ({len(none)} classes): {', '.join(none)}.", ""]
+    if few:
+        lines += [f"**Fewer than {thin} objects to learn from** ({len(few)} classes): {', '.join(few)}.", ""]
+    if lines:
+        lines += [
+            "Evidence and map weigh scores of all classes by one network, with one number for how frequent each class "
+            "is; the observation model leaves scores of a class without examples much as they are.",
+            "",
+        ]
+    return lines
+
+
+def next_commands(config: FitDetectorConfig, run: LookingRun) -> str:
+    """What to do with the folder."""
+    out = fspath(config.out)
+    target = max(class_counts(run, range(len(run.scenes))).items(), key=lambda pair: pair[1])[0]
+    quoted = f'"{target}"' if " " in target else target
+    return "\n".join(
+        [
+            f"  python -m eval.demo PHOTO.jpg --target {quoted} --models {out}",
+            f"  python -m eval.search --models {out} --data.root PHOTOS --data.annotations instances.json",
+        ]
+    )

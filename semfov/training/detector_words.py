@@ -1,0 +1,45 @@
+"""Figures in words, tables and pictures, for the report of a fit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from semfov.experiments.summary import percent, table
+from semfov.gaze.policies import Task
+from semfov.metrics.averages import standard_error
+from semfov.training.held_out import Array, Difference
+
+
+def in_words(gain: Difference, unit: str, scale: float = 1.0) -> str:
+    """A difference in words."""
+    digits = 1 if scale > 1 else 3
+    return (
+        f"{scale * gain.mean:+.{digits}f} ± {scale * gain.error:.{digits}f} {unit} "
+        f"on {gain.photographs} held-out photograph{'s' if gain.photographs != 1 else ''}"
+    )
+
+
+def mean_percent(values: Array) -> str:
+    """Mean of shares `(P,)` in percent, with its standard error."""
+    return percent(float(values.mean()), float(standard_error(values)))
+
+
+def share(value: float) -> str:
+    """A share in percent."""
+    return f"{100 * value:.1f}"
+
+
+def section(text: str, rows: list[list[str]]) -> str:
+    """Words, and a table below them where there are rows."""
+    return "\n".join([text, "", *(table(rows) if rows else []), *([""] if rows else [])])
+
+
+def curves_figure(curves: dict[str, Array], task: Task) -> Any:
+    """Means of curves `(P, shifts+1)` over photographs, with their standard errors."""
+    from semfov.viz import plot_cumulative_performance, plot_success_rate
+
+    means = {name: curve.mean(0) for name, curve in curves.items()}
+    errors = {name: standard_error(curve) for name, curve in curves.items()}
+    title = f"Photographs that were held out ({len(curves['raw'])})"
+    plot = plot_cumulative_performance if task == "search" else plot_success_rate
+    return plot(means, errors, title=title)

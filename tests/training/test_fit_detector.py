@@ -1,0 +1,428 @@
+"""`python -m train.fit_detector`: everything for a detector of coloured squares, from photographs to a search."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy import stats
+
+import semfov
+from eval.demo import main as demo
+from eval.search import main as search
+from semfov import ActivePerception, DataError, InputError
+from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov.experiments.config import DataConfig, DetectorConfig, ExploreConfig, PolicyConfig, SearchConfig
+from semfov.experiments.fitted import with_models
+from semfov.experiments.progress import Whole, task_bar, track
+from semfov.gaze.policies import Closer, Random
+from semfov.io.files import sha256
+from semfov.io.manifest import Manifest, Part
+from semfov.model_folder import ModelFolder
+from semfov.training import detector_parts
+from semfov.training.detector_report import thin_classes
+from semfov.training.detector_settings import FitDetectorConfig
+from semfov.training.held_out import Difference
+from train.fit_detector import main
+
+CLASSES = ("red", "green", "blue")
+COLOURS = np.array([[210, 40, 40], [40, 190, 40], [50, 50, 210]], dtype=np.uint8)
+SIDE = 64
+
+
+def write_network(path: Path, bias: float = -4.0) -> Path:
+    """A network that scores the three colours in 8 x 8 squares of a canvas of 64 x 64 pixels."""
+    from onnx import TensorProto, helper, numpy_helper, save
+
+    squares = SIDE // 8
+    weight = 12 * (1.5 * np.eye(3) - 0.5)[:, :, None, None]
+    y, x = np.mgrid[0:squares, 0:squares].reshape(2, -1) * 8
+    constants = {
+        "weight": weight.astype(np.float32),
+        "bias": np.full(3, bias, dtype=np.float32),
+        "shape": np.array([1, 3, -1]),
+        "corners": np.stack([x, y, x + 8, y + 8], -1)[None].astype(np.float32),
+    }
+    nodes = [
+        helper.make_node("AveragePool", ["images"], ["pooled"], kernel_shape=[8, 8], strides=[8, 8]),
+        helper.make_node("Conv", ["pooled", "weight", "bias"], ["colour"]),
+        helper.make_node("Sigmoid", ["colour"], ["scored"]),
+        helper.make_node("Reshape", ["scored", "shape"], ["rows"]),
+        helper.make_node("Transpose", ["rows"], ["classes"], perm=[0, 2, 1]),
+        helper.make_node("Identity", ["corners"], ["boxes"]),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "colours",
+        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, SIDE, SIDE])],
+        [
+            helper.make_tensor_value_info("boxes", TensorProto.FLOAT, [1, squares**2, 4]),
+            helper.make_tensor_value_info("classes", TensorProto.FLOAT, [1, squares**2, 3]),
+        ],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    helper.set_model_props(model, {"semfov": json.dumps({"classes": list(CLASSES)})})
+    save(model, str(path))
+    return path
+
+
+def write_photographs(folder: Path, count: int = 20) -> Path:
+    """Photographs of coloured squares on noise, with their boxes, and a category that the detector does not know."""
+    draw = np.random.default_rng(0)
+    images, boxes = [], []
+    for number in range(count):
+        pixels = draw.integers(90, 160, (SIDE, SIDE, 3), dtype=np.uint8)
+        for place in draw.permutation(64)[: draw.integers(2, 5)]:
+            kind, x, y = int(draw.integers(0, 3)), 8 * int(place % 8), 8 * int(place // 8)
+            pixels[y : y + 8, x : x + 8] = COLOURS[kind]
+            boxes.append((number, kind + 1, [x, y, 8, 8]))
+        Image.fromarray(pixels).save(folder / f"{number}.png")
+        images.append({"id": number, "file_name": f"{number}.png", "width": SIDE, "height": SIDE})
+    names = (*CLASSES, "sky")
+    categories = [{"id": number + 1, "name": name} for number, name in enumerate(names)]
+    boxes.append((0, 4, [0, 0, 60, 20]))
+    annotations = [
+        {"id": number, "image_id": image, "category_id": kind, "bbox": box}
+        for number, (image, kind, box) in enumerate(boxes)
+    ]
+    path = folder / "instances.json"
+    path.write_text(json.dumps({"images": images, "annotations": annotations, "categories": categories}))
+    return path
+
+
+SMALL = [
+    "--columns", "4", "--rows", "4", "--holdout", "4", "--steps", "20", "--map_steps", "20", "--fixations", "6",
+    "--sensor.sigma", "60", "--sensor.growth", "1", "--workers", "1",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """A network, photographs, and the folder that was fitted to them."""
+    folder = tmp_path_factory.mktemp("fit_detector")
+    write_network(folder / "colours.onnx")
+    (folder / "photographs").mkdir()
+    write_photographs(folder / "photographs")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    assert main(arguments(folder)) == 0
+    torch.set_num_threads(threads)
+    return folder
+
+
+def data(folder):
+    root = folder / "photographs"
+    return ["--data.root", str(root), "--data.annotations", str(root / "instances.json")]
+
+
+def arguments(folder, *more):
+    paths = ["--out", str(folder / "models"), "--cache", str(folder / "cache")]
+    return [str(folder / "colours.onnx"), *data(folder), *SMALL, *paths, *more]
+
+
+def test_the_folder_says_what_it_holds(home):
+    manifest = Manifest.read(home / "models")
+    assert manifest.classes == CLASSES
+    assert manifest.grid == (4, 4)
+    assert manifest.detector["sha256"] == sha256(home / "colours.onnx")
+    assert manifest.detector["model_file"]["relative"] == "../colours.onnx"
+    assert manifest.sensor["sigma"] == 60
+    assert manifest.sensor["growth"] == 1
+    assert list(manifest.parts) == ["observation", "tempering", "evidence", "map"]
+    assert manifest.training["photographs"] == 20
+    assert manifest.training["held_out"] == 5
+    for name, part in manifest.parts.items():
+        assert "held-out photographs" in part.why, (name, part.why)
+        assert (part.file is None) == (name == "tempering")
+    text = (home / "models/report.md").read_text()
+    assert "20 photographs, 5 of them held out (every 4th); 3 classes; 4 × 4 cells" in text
+    for name in ("reliability.png", "search.png", "explore.png"):
+        assert f"({name})" in text
+        with Image.open(home / "models" / name) as picture:
+            picture.verify()
+
+
+def test_the_agent_of_the_folder_finds_what_is_there(home):
+    folder = ModelFolder(home / "models")
+    agent = ActivePerception.from_pretrained(home / "models")
+    assert agent.classes[1:] == CLASSES
+    assert (agent.columns, agent.rows) == (4, 4)
+    assert not any(parameter.requires_grad for parameter in agent.parameters())
+    assert isinstance(agent.searching.observer, Target if folder.used("evidence") else Semantic)
+    assert isinstance(agent.exploring.observer, LearnedMap if folder.used("map") else Semantic)
+    pixels = np.full((SIDE, SIDE, 3), 125, dtype=np.uint8)
+    pixels[56:64, 0:8] = COLOURS[2]
+    image = torch.from_numpy(pixels).permute(2, 0, 1) / 255
+    scanpath = agent.search(image, "blue", start=3, shifts=15)
+    assert 12 in scanpath.cells.tolist()
+    assert len(agent.explore(image, shifts=3).cells) >= 1
+
+
+def test_searches_of_the_folder_are_those_of_the_report(home, capsys):
+    """`eval.search` on the held-out photographs alone gives the same cumulative performance, by other code."""
+    (home / "ids.txt").write_text("0 4 8 12 16")
+    out = home / "search"
+    options = [
+        "--models", str(home / "models"), "--policies", "[non-predictive-raw, target-evidence]", "--data.min_instances",
+        "0", "--data.ids", str(home / "ids.txt"), "--protocol.shifts", "15", "--workers", "1", "--scanpaths", "0",
+        "--out", str(out), "--cache", str(home / "cache"),
+    ]  # fmt: skip
+    assert search([*data(home), *options]) == 0
+    lines = (out / "summary.csv").read_text().splitlines()
+    rows = [line.split(",") for line in lines if line.startswith("all") or "all targets" in line]
+    told = {(row[1], int(row[2])): float(row[3]) for row in rows}
+    report = (home / "models/report.md").read_text().split("## Target evidence")[1]
+    for name, policy in (("fitted", "target-evidence"), ("raw", "non-predictive-raw")):
+        row = next(line for line in report.splitlines() if line.startswith(f"| {name} "))
+        shares = [float(cell.split("±")[0]) for cell in row.split("|")[2:5]]
+        assert shares == pytest.approx([100 * told[policy, n] for n in (1, 5, 15)], abs=0.051)
+    capsys.readouterr()
+
+
+def test_the_same_command_again_fits_nothing(home, monkeypatch, capsys):
+    before = {path.name: path.read_bytes() for path in (home / "models").glob("*.safetensors")}
+    for name in ("fit_model", "fit_evidence", "fit_map_evidence", "hit_rates"):
+        monkeypatch.setattr(detector_parts, name, None)
+    assert main(arguments(home)) == 0
+    assert {path.name: path.read_bytes() for path in (home / "models").glob("*.safetensors")} == before
+    printed = capsys.readouterr()
+    assert "python -m eval.demo PHOTO.jpg --target" in printed.out
+    assert f"--models {home / 'models'}" in printed.out
+
+
+def test_a_part_that_is_gone_is_fitted_again_alone(home, tmp_path, monkeypatch):
+    """As after a kill: what was finished is read back, the rest is made, and comes out the same."""
+    shutil.copytree(home / "models", tmp_path / "models")
+    (tmp_path / "models/map.safetensors").unlink()
+    (tmp_path / "models/manifest.json").unlink()
+    for name in ("fit_model", "fit_evidence", "hit_rates"):
+        monkeypatch.setattr(detector_parts, name, None)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    assert main(arguments(home, "--out", str(tmp_path / "models"))) == 0
+    torch.set_num_threads(threads)
+    again, once = (folder / "models/map.safetensors" for folder in (tmp_path, home))
+    assert again.read_bytes() == once.read_bytes()
+
+
+def test_the_demonstration_takes_the_folder(home, tmp_path, capsys):
+    photo = str(home / "photographs/0.png")
+    given = [photo, "--target", "red", "--shifts", "0", "--models", str(home / "models"), "--out", str(tmp_path)]
+    assert demo(given) == 0
+    assert "0.png: “red”" in capsys.readouterr().out
+
+
+def copied(home, tmp_path):
+    shutil.copytree(home / "models", tmp_path / "models")
+    shutil.copy(home / "colours.onnx", tmp_path)
+    return tmp_path / "models"
+
+
+def test_another_network_is_refused(home, tmp_path):
+    folder = copied(home, tmp_path)
+    write_network(tmp_path / "colours.onnx", bias=-3.0)
+    with pytest.raises(DataError, match=r"detector: .*another network .*python -m train\.fit_detector"):
+        ActivePerception.from_pretrained(folder)
+    with pytest.raises(DataError, match="another network"):
+        ActivePerception.from_pretrained(home / "models", detector=tmp_path / "colours.onnx")
+
+
+def test_a_network_that_moved_is_found_or_given(home, tmp_path):
+    folder = copied(home, tmp_path / "here")
+    # Beside the folder, as it was: the two may go anywhere together.
+    assert ModelFolder(folder).detector_source()[0] == str(tmp_path / "here/models/../colours.onnx")
+    place = tmp_path / "here/colours.onnx"
+    place.rename(tmp_path / "elsewhere.onnx")
+    assert ModelFolder(folder).detector_source()[0] == str((home / "colours.onnx").resolve())
+    record = json.loads((folder / "manifest.json").read_text())
+    assert record["detector"]["model_file"]["absolute"] == str((home / "colours.onnx").resolve())
+    agent = ActivePerception.from_pretrained(folder, detector=tmp_path / "elsewhere.onnx")
+    assert agent.eye.detector.classes == CLASSES
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "evidence.safetensors"])
+def test_a_changed_file_is_refused(home, tmp_path, name):
+    folder = copied(home, tmp_path)
+    content = (folder / name).read_bytes()
+    (folder / name).write_bytes(content.replace(b"red", b"rod", 1) if name.endswith("json") else content[:-1] + b"?")
+    with pytest.raises(DataError, match=f"{name}: damaged or changed"):
+        ModelFolder(folder)
+    (folder / name).unlink()
+    with pytest.raises(DataError, match=r"no such file.*train\.fit_detector"):
+        ModelFolder(folder)
+
+
+def rewrite(folder, **parts):
+    """The record of a folder with all parts used or not, or with other parts."""
+    known = Manifest.read(folder)
+    changed = dict(known.parts) | {name: part for name, part in parts.items() if name != "used"}
+    if "used" in parts:
+        changed = {name: replace(part, used=parts["used"]) for name, part in changed.items()}
+    replace(known, parts=changed).write(folder)
+
+
+def test_a_part_that_is_no_better_is_not_used(home, tmp_path):
+    folder = copied(home, tmp_path)
+    rewrite(folder, used=True)
+    agent = ActivePerception.from_pretrained(folder)
+    assert isinstance(agent.searching.observer, Target)
+    assert isinstance(agent.exploring.observer, LearnedMap)
+    assert isinstance(agent.exploring.policy, Closer)
+    given = SearchConfig(models=folder, policies=("recommended", "random"))
+    assert with_models(given).policies == ("target-evidence", "random")
+    rewrite(folder, used=False)
+    agent = ActivePerception.from_pretrained(folder)
+    for strategy, policy in ((agent.searching, None), (agent.exploring, Random)):
+        assert isinstance(strategy.observer, Semantic)
+        assert strategy.observer.observation is None
+        assert strategy.observer.tempering == 1
+        assert strategy.observer.footprint == "overlap"
+        assert policy is None or isinstance(strategy.policy, policy)
+    given = SearchConfig(models=folder, policies=("recommended", "target-evidence"))
+    assert with_models(given).policies == ("non-predictive-raw", "target-evidence")
+    assert with_models(ExploreConfig(models=folder, policies=("recommended",))).policies == ("random-raw",)
+
+
+def test_settings_of_experiments_from_the_folder(home):
+    folder = home / "models"
+    config = with_models(SearchConfig(models=folder, policies=("target-evidence", "predictive-calibrated")))
+    assert config.detector.name == str(folder / "../colours.onnx")
+    assert (config.sensor.sigma, config.sensor.growth, config.belief.columns) == (60, 1, 4)
+    assert config.belief.target_model == str(folder / "evidence.safetensors")
+    assert config.belief.model == str(folder / "observation.safetensors")
+    assert with_models(SearchConfig()) == SearchConfig()
+    moved = SearchConfig(models=folder, detector=DetectorConfig(name="elsewhere.onnx"))
+    assert with_models(moved).detector.name == "elsewhere.onnx"
+    with pytest.raises(InputError, match=r"belief\.map_model: expected none beside models"):
+        with_models(SearchConfig(models=folder, belief=SearchConfig().belief.__class__(map_model="x")))
+
+
+def test_policies_that_need_what_the_folder_has_not(home, tmp_path):
+    folder = copied(home, tmp_path)
+    rewrite(folder, observation=Part(None, None, False, "too few detections"))
+    kept = with_models(SearchConfig(models=folder)).policies
+    assert "predictive-raw" not in kept
+    assert {"random", "non-predictive-raw", "target-evidence"} <= set(kept)
+    named = SearchConfig(models=folder, policies=(PolicyConfig("non-predictive", "calibrated"),))
+    with pytest.raises(InputError, match="lacks: too few detections"):
+        with_models(named)
+
+
+def test_a_folder_that_is_none(tmp_path):
+    with pytest.raises(DataError, match=r"manifest\.json: no such file; .*train\.fit_detector"):
+        ActivePerception.from_pretrained(tmp_path)
+
+
+def test_errors_name_the_command(home):
+    network = str(home / "colours.onnx")
+    for make in (ActivePerception.recommended, ActivePerception.from_pretrained, ActivePerception.published):
+        with pytest.raises(InputError, match=r"python -m train\.fit_detector \S+colours\.onnx --data\.root"):
+            make(network)
+
+
+def test_a_known_network_is_known_by_its_checksum(home, monkeypatch):
+    network = home / "colours.onnx"
+    assert semfov.load_detector(network).name == "colours"
+    monkeypatch.setitem(semfov.io.compatibility.NETWORKS, sha256(network), "yolox-nano")
+    assert semfov.load_detector(network).name == "yolox-nano"
+
+
+def test_annotations_without_any_of_the_classes(home, tmp_path, capsys):
+    record = json.loads((home / "photographs/instances.json").read_text())
+    for category in record["categories"]:
+        category["name"] = f"other {category['id']}"
+    (tmp_path / "instances.json").write_text(json.dumps(record))
+    given = arguments(home, "--data.annotations", str(tmp_path / "instances.json"), "--out", str(tmp_path / "out"))
+    assert main(given) == 1
+    told = capsys.readouterr().err
+    assert "expected some of the detector's 3 classes (red, green, blue" in told
+    assert "'other 1'" in told
+
+
+def test_a_model_is_asked_for(capsys, tmp_path):
+    assert main(["--out", str(tmp_path)]) == 1
+    assert "model: expected the detector's name or file, got none" in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"detector\.name: expected none beside the model"):
+        FitDetectorConfig(model=Path("a.onnx"), detector=DetectorConfig(name="yolov3")).named()
+
+
+def test_settings_of_the_call_are_named():
+    with pytest.raises(InputError, match="got 'clases'"):
+        semfov.fit_detector("mine.onnx", "photographs", "instances.json", clases=["cat"])
+
+
+def test_thin_classes_are_told():
+    told = "\n".join(thin_classes({"cat": 3, "dog": 50, "cup": 0}, 20))
+    assert "**No object to learn from** (1 classes): cup." in told
+    assert "**Fewer than 20 objects to learn from** (1 classes): cat 3." in told
+    assert thin_classes({"cat": 20}, 20) == []
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_differences_are_those_of_a_paired_test(seed):
+    draw = np.random.default_rng(seed)
+    fitted, raw = draw.random((2, 8))
+    difference = Difference.of(fitted, raw)
+    test = stats.ttest_rel(fitted, raw)
+    assert difference.mean / difference.error == pytest.approx(test.statistic)
+    assert difference.better == (test.statistic > 1)
+
+
+def test_one_photograph_or_no_difference_tell_nothing():
+    assert not Difference.of(np.array([1.0]), np.array([0.0])).better
+    assert not Difference.of(np.ones(5), np.ones(5)).better
+    assert Difference.of(np.ones(5), np.zeros(5)).better
+
+
+def test_one_bar_over_stages(capsys):
+    """It stands where the stages' times say, counts unknown tasks for nothing, and skips what was not worked on."""
+    with Whole("all", {"one": {"a": 3, "b": 1}, "two": {"c": 4}, "three": {"d": 2}}) as whole:
+        with whole.stage("one"):
+            seen = [(item, whole.done) for item in track(range(6), "a", "unit")]
+            assert [share for _, share in seen] == pytest.approx([0.05 * number for number in range(6)])
+            assert [item for item, _ in seen] == list(range(6))
+            assert list(track(range(3), "not among them", "unit")) == [0, 1, 2]
+            assert whole.done == pytest.approx(0.3)
+        assert whole.done == pytest.approx(0.4)
+        with whole.stage("three"):
+            assert whole.done == pytest.approx(0.8)
+            bar = task_bar(4, "d", "unit")
+            bar.update(2)
+            assert whole.done == pytest.approx(0.9)
+        assert whole.done == pytest.approx(1)
+    printed = capsys.readouterr().err
+    assert "all: one" in printed
+    assert "not among them" not in printed
+    # Outside, a task has a bar of its own again.
+    assert list(track(range(2), "alone", "unit")) == [0, 1]
+    assert "alone" in capsys.readouterr().err
+
+
+def test_fitting_in_python_is_the_same(home, tmp_path):
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    root = home / "photographs"
+    agent = semfov.fit_detector(
+        home / "colours.onnx", root, root / "instances.json", out=tmp_path / "out", limit=6, columns=4, rows=4,
+        holdout=3, steps=3, map_steps=3, cache=home / "cache", threshold=0.05,
+    )  # fmt: skip
+    torch.set_num_threads(threads)
+    assert agent.eye.detector.selection.threshold == 0.05
+    assert Manifest.read(tmp_path / "out").training["photographs"] == 6
+    # What three steps of training make is hardly better than raw scores; what is used is what was found better.
+    folder = ModelFolder(tmp_path / "out")
+    assert isinstance(agent.searching.observer, Target) == folder.used("evidence")
+    assert isinstance(agent.exploring.policy, Closer) == folder.used("map")
+
+
+def test_photographs_of_all_targets_are_taken():
+    config = FitDetectorConfig(model=Path("a.onnx"), data=DataConfig(max_target_area=0.1)).named()
+    assert config.data.max_target_area is None
+    assert config.detector.background is None
+    assert config.evidence(3).absent == 2
+    assert config.evidence(80).absent is None
