@@ -73,10 +73,10 @@ class Landing(Observer):
     .. math:: e_k(x) = s_k \, \frac{r}{\sqrt{\sigma_x \sigma_y}}
               \exp\left( -\frac{(x - x_b)^2}{2\sigma_x^2} - \frac{(y - y_b)^2}{2\sigma_y^2} \right)
 
-    with :math:`\sigma = \max(r, a\,(w, h))`. The strongest evidence of any detection and look is kept. Saccades land near
-    the centres of objects, normally spread with about a quarter of their size (Nuthmann and Henderson, 2010): a is 1/4.
-    Of persons people look at the head (Yarbus, 1967; Cerf et al., 2009): there :math:`y_b` is 0.18 heights below the
-    box's top, and a is 0.15. With the factor, what an object draws in all grows with its side, not with its area.
+    with :math:`\sigma = \max(r, a\,(w, h))`. The strongest evidence of any detection and look is kept. Saccades land
+    near the centres of objects (Nuthmann and Henderson, 2010): a is 1/4. Of persons people look at the head (Yarbus,
+    1967; Cerf et al., 2009): there :math:`y_b` is 0.18 heights below the box's top, and a is 0.15. With the factor,
+    what an object draws in all grows with its side, not with its area.
 
     Args:
         classes: K.
@@ -84,7 +84,8 @@ class Landing(Observer):
         reach: r in longer sides of the image: how narrow a landing place may be.
 
     >>> grid = Grid(4, 4, (80, 80))
-    >>> seen = Detections(torch.tensor([[[0.0, 0.0, 20.0, 40.0]]]), torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1).bool())
+    >>> boxes, scores = torch.tensor([[[0.0, 0.0, 20.0, 40.0]]]), torch.tensor([[[0.2, 0.8]]])
+    >>> seen = Detections(boxes, scores, torch.ones(1, 1).bool())
     >>> belief = (observer := Landing(1))(observer.start(1, grid, torch.zeros(1)), seen, torch.zeros(1, 2), grid)
     >>> belief.probability(1).argmax().item()
     0
