@@ -60,6 +60,7 @@ def test_names_are_those_of_the_tasks():
             "expected-accuracy",
             "closer-look",
             "expected-gain",
+            "objects",
         ]
     )
 

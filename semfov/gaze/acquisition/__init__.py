@@ -12,6 +12,7 @@ from semfov.gaze.acquisition.exploration import (
     TwoPeaks,
     UpperConfidenceBound,
 )
+from semfov.gaze.acquisition.objects import ObjectEvidence
 from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
 from semfov.gaze.acquisition.saliency_prior import SaliencyPrior
 from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
@@ -27,6 +28,7 @@ __all__ = [
     "KLDivergence",
     "NegativeEntropy",
     "NeighbourhoodPosterior",
+    "ObjectEvidence",
     "PlaceInformation",
     "PredictedTargetPosterior",
     "ProbabilityOfImprovement",

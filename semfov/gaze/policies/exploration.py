@@ -18,6 +18,7 @@ from semfov.gaze.acquisition.exploration import (
     TwoPeaks,
     UpperConfidenceBound,
 )
+from semfov.gaze.acquisition.objects import ObjectEvidence
 from semfov.gaze.policies.base import GazeModel, Means, ModelPolicy, Policy
 
 
@@ -161,3 +162,14 @@ class Gain(Policy):
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The cells gained."""
         return ExpectedGain(self.model, grid)
+
+
+class Objects(Policy):
+    """Where an object is (`semfov.acquisition.ObjectEvidence`): with a `Landing` observer, where people look."""
+
+    name = "objects"
+    tasks = ("exploration",)
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
+        """The evidence for any object."""
+        return ObjectEvidence()
