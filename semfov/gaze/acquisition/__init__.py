@@ -12,6 +12,7 @@ from semfov.gaze.acquisition.exploration import (
     TwoPeaks,
     UpperConfidenceBound,
 )
+from semfov.gaze.acquisition.ideal import CorrectLocalisation, EntropyLimit
 from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
 from semfov.gaze.acquisition.saliency_prior import SaliencyPrior
 from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
@@ -21,6 +22,8 @@ __all__ = [
     "AcquisitionFunction",
     "BayesianSurprise",
     "CloserLook",
+    "CorrectLocalisation",
+    "EntropyLimit",
     "ExpectedAccuracy",
     "ExpectedGain",
     "FovealHit",
