@@ -23,6 +23,8 @@ MODULES = (
     "semfov.episode",
     "semfov.zoom",
     "semfov.data",
+    "semfov.data.fixations",
+    "semfov.metrics.scanpath",
     "semfov.errors",
 )
 _SECTION = re.compile(r"^(Args|Returns|Raises|Attributes|Shape|Example):{1,2}$")

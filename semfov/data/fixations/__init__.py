@@ -1,0 +1,30 @@
+"""Where people (and models of them) looked: one record, and the files that the field keeps it in.
+
+Points are `(x, y)` in pixels, pixel centres at integers, as everywhere in semfov. Files tell them in pixels of a
+screen, of a picture or in cells; `Letterbox` and `Fixations.resized` lead from one to the other.
+"""
+
+from semfov.data.fixations.cocosearch import read_cocosearch, write_cocosearch
+from semfov.data.fixations.osie import read_osie, write_osie
+from semfov.data.fixations.record import Fixations, by_picture
+from semfov.data.fixations.ruarte import coco_name, read_ruarte, write_ruarte
+from semfov.data.fixations.screen import Letterbox
+from semfov.data.fixations.table import read_table, write_table
+from semfov.data.fixations.trains import from_pysaliency, to_pysaliency
+
+__all__ = [
+    "Fixations",
+    "Letterbox",
+    "by_picture",
+    "coco_name",
+    "from_pysaliency",
+    "read_cocosearch",
+    "read_osie",
+    "read_ruarte",
+    "read_table",
+    "to_pysaliency",
+    "write_cocosearch",
+    "write_osie",
+    "write_ruarte",
+    "write_table",
+]

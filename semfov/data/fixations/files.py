@@ -1,0 +1,68 @@
+"""JSON files of fixations, read with errors that name file, record and field."""
+
+from __future__ import annotations
+
+import json
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semfov.data.fixations.record import Array
+from semfov.errors import DataError, InputError
+from semfov.io.files import check_regular, write_text
+from semfov.io.schema import Array as ListOf
+from semfov.io.schema import Json, Number
+
+PIXELS = ListOf(Number(low=-1e6, high=1e6), least=1)
+"""Coordinates of fixations."""
+MILLISECONDS = ListOf(Number(low=0, high=1e9))
+"""Durations."""
+SIDE = Number(above=0, high=1e6)
+"""Of a screen or a picture."""
+
+
+def read_json(path: str | PathLike[str], kind: Json) -> Any:
+    """JSON values of a file, which are as `kind` says.
+
+    Raises:
+        DataError: the file cannot be read, is no JSON, or holds something else: the file, the record and the field.
+    """
+    path = Path(path)
+    check_regular(path)
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: cannot be read as JSON ({error})") from None
+    check_record(kind, path, "", value)
+    return value
+
+
+def check_record(kind: Json, path: Path, name: str, value: Any) -> None:
+    """Raise `DataError` unless a value is as `kind` says: the file, the record and the field."""
+    try:
+        kind.check(name, value, {})
+    except InputError as error:
+        raise DataError(f"{path}: {str(error).lstrip('.: ') or 'unexpected content'}") from None
+
+
+def points_of(path: Path, name: str, x: list[float], y: list[float]) -> Array:
+    """Points `(n, 2)` of two lists."""
+    if len(x) != len(y):
+        raise DataError(f"{path}: {name}: expected as many Y as X, got {len(x)} X and {len(y)} Y")
+    return np.stack([np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)], axis=1)
+
+
+def durations_of(path: Path, name: str, times: list[float] | None, count: int) -> Array | None:
+    """The first `count` durations; there may be more where a scanpath was cut at its target, but not fewer."""
+    if times is None:
+        return None
+    if len(times) < count:
+        raise DataError(f"{path}: {name}: expected durations of {count} fixations, got {len(times)}")
+    return np.asarray(times[:count], dtype=np.float64)
+
+
+def write_json(path: str | PathLike[str], value: Any) -> None:
+    """Write JSON values atomically."""
+    write_text(Path(path), json.dumps(value) + "\n")

@@ -1,0 +1,64 @@
+"""To and from the fixation trains of pysaliency."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from semfov.data.fixations.record import Fixations
+from semfov.errors import InputError, check
+
+
+def to_pysaliency(fixations: Sequence[Fixations], pictures: Sequence[str]) -> Any:
+    """Fixations as `pysaliency.FixationTrains`.
+
+    pysaliency counts from the left and the top edge and rounds down, so that a pixel's centre is at .5; times there are
+    those of the onsets, in seconds, and 0, 1, … where durations are not known.
+
+    Args:
+        fixations: in pixels of the pictures.
+        pictures: names of the stimuli, in their order there.
+
+    Raises:
+        InputError: pysaliency is not installed, or a picture is not among the stimuli.
+    """
+    try:
+        from pysaliency import FixationTrains
+    except ImportError:
+        raise InputError("to_pysaliency: expected pysaliency; pip install pysaliency") from None
+    number = {name: index for index, name in enumerate(pictures)}
+    unknown = [each.picture for each in fixations if each.picture not in number]
+    check(not unknown, "pictures", "all pictures of the fixations", f"none called {unknown[:1]}")
+    people = {name: index for index, name in enumerate(sorted({each.subject for each in fixations}))}
+    return FixationTrains.from_fixation_trains(
+        xs=[each.points[:, 0] + 0.5 for each in fixations],
+        ys=[each.points[:, 1] + 0.5 for each in fixations],
+        ts=[_onsets(each) for each in fixations],
+        ns=[number[each.picture] for each in fixations],
+        subjects=[people[each.subject] for each in fixations],
+    )
+
+
+def from_pysaliency(trains: Any, pictures: Sequence[str], sizes: Mapping[str, tuple[int, int]]) -> list[Fixations]:
+    """Fixations from `pysaliency.FixationTrains`; their durations are not told there.
+
+    Args:
+        trains: the fixation trains.
+        pictures: names of the stimuli, in their order there.
+        sizes: `(width, height)` of the pictures by name.
+    """
+    found = []
+    columns = (trains.train_xs, trains.train_ys, trains.train_ns, trains.train_subjects)
+    for xs, ys, n, subject in zip(*columns, strict=True):
+        points = np.stack([np.asarray(xs, dtype=np.float64), np.asarray(ys, dtype=np.float64)], axis=1) - 0.5
+        picture = pictures[int(n)]
+        found.append(Fixations(picture, str(subject), points[np.isfinite(points).all(1)], sizes[picture]))
+    return found
+
+
+def _onsets(fixations: Fixations) -> Any:
+    if fixations.durations is None:
+        return np.arange(len(fixations), dtype=np.float64)
+    return (np.cumsum(fixations.durations) - fixations.durations) / 1000

@@ -1,0 +1,76 @@
+"""Photographs of a folder about whose objects nothing is known."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from os import PathLike
+from pathlib import Path
+
+import torch
+
+from semfov.data.images import read_image
+from semfov.data.scene import Annotation, Scene
+from semfov.errors import DataError
+from semfov.io.files import check_regular, inside, sha256
+
+
+class Pictures:
+    """Photographs by the names of their files (a `Scenes` without objects).
+
+    Args:
+        root: their folder.
+        names: of the files; each is taken once.
+        classes: the detector's.
+
+    Raises:
+        DataError: a name leads out of the folder, or there is no such file.
+
+    Example::
+
+        pictures = Pictures("osie/images", ["1001.jpg", "1005.jpg"], detector.classes)
+    """
+
+    def __init__(self, root: str | PathLike[str], names: Iterable[str], classes: tuple[str, ...]) -> None:
+        self.root = Path(root)
+        self.classes = classes
+        self.ids = sorted(set(names))
+        missing = [name for name in self.ids if not inside(self.root, name).is_file()]
+        if missing:
+            raise DataError(f"{self.root}: expected {len(self.ids)} pictures, {len(missing)} are missing: {missing[0]}")
+
+    @property
+    def fingerprint(self) -> str:
+        """sha256 of the names and of the files' content."""
+        what = [(name, self.digest(index)) for index, name in enumerate(self.ids)]
+        return hashlib.sha256(json.dumps(what).encode()).hexdigest()
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, index: int) -> Scene:
+        image = read_image(self._path(index))
+        return Scene(self.ids[index], self.ids[index], image, torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64))
+
+    def digest(self, index: int) -> str:
+        """sha256 of a file's content."""
+        path = self._path(index)
+        check_regular(path, f"image {path}")
+        try:
+            return sha256(path)
+        except OSError as error:
+            raise DataError(f"image {path}: cannot be read ({error.strerror})") from None
+
+    def annotation(self, index: int) -> Annotation:
+        """No objects, and the size of the picture."""
+        height, width = read_image(self._path(index)).shape[-2:]
+        none = torch.zeros(0, dtype=torch.int64)
+        return Annotation(torch.zeros(0, 4), none, none.bool(), (width, height))
+
+    def targets(self, index: int) -> list[int]:
+        """None: nothing is known to be there."""
+        return []
+
+    def _path(self, index: int) -> Path:
+        return inside(self.root, self.ids[index])

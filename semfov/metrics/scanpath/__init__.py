@@ -1,0 +1,47 @@
+"""Figures of merit of scanpaths: people's beside people's, and models' beside people's.
+
+Fixations are arrays of points in any one unit, maps are arrays `(H, W)` whose pixel centres are at integers.
+Definitions differ between groups: each function says whose it computes. Sequences need `pip install semfov[human]`.
+"""
+
+from semfov.metrics.scanpath.conditional import auc, information_gain, log_density, log_likelihood, nss
+from semfov.metrics.scanpath.maps import auc_judd, auc_shuffled
+from semfov.metrics.scanpath.multimatch import MultiMatch, multimatch
+from semfov.metrics.scanpath.performance import (
+    found_at,
+    mean_performance,
+    performance_area,
+    probability_mismatch,
+    scanpath_ratio,
+    tfp_auc,
+)
+from semfov.metrics.scanpath.sequence import (
+    cell_labels,
+    cluster_labels,
+    edit_distance,
+    sequence_score,
+)
+from semfov.metrics.scanpath.simplify import merge_close
+
+__all__ = [
+    "MultiMatch",
+    "auc",
+    "auc_judd",
+    "auc_shuffled",
+    "cell_labels",
+    "cluster_labels",
+    "edit_distance",
+    "found_at",
+    "information_gain",
+    "log_density",
+    "log_likelihood",
+    "mean_performance",
+    "merge_close",
+    "multimatch",
+    "nss",
+    "performance_area",
+    "probability_mismatch",
+    "scanpath_ratio",
+    "sequence_score",
+    "tfp_auc",
+]

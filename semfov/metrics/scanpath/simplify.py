@@ -1,0 +1,34 @@
+"""Scanpaths with small steps taken out."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def merge_close(points: ArrayLike, size: tuple[float, float]) -> Array:
+    """Fixations `(m, 2)` in which neighbours that are closer than half a window are one, at their mean point.
+
+    As Ruarte et al. (2025) and the benchmark before it (Travi et al., 2022) do, so that people's scanpaths can be laid
+    beside those of models that make one fixation a cell: from the start, a fixation and the next are replaced by their
+    mean as long as both differences are smaller than half the window.
+
+    Args:
+        points: `(n, 2)`, fixations in order.
+        size: `(width, height)` of the window.
+
+    >>> merge_close([[0, 0], [2, 0], [9, 9]], (10, 10))
+    array([[1., 0.],
+           [9., 9.]])
+    """
+    path = [np.asarray(point, dtype=np.float64) for point in np.asarray(points, dtype=np.float64)]
+    half = np.asarray(size, dtype=np.float64) / 2
+    index = 0
+    while index < len(path) - 1:
+        if (np.abs(path[index] - path[index + 1]) < half).all():
+            path[index : index + 2] = [(path[index] + path[index + 1]) / 2]
+        else:
+            index += 1
+    return np.array(path)

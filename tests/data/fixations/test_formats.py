@@ -1,0 +1,212 @@
+"""Files of fixations: what is written is read back, and what is wrong is named by file, record and field."""
+
+import json
+
+import numpy as np
+import pandas
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.data.fixations import (
+    Fixations,
+    by_picture,
+    coco_name,
+    read_cocosearch,
+    read_osie,
+    read_ruarte,
+    read_table,
+    write_cocosearch,
+    write_osie,
+    write_ruarte,
+    write_table,
+)
+from semfov.errors import DataError, InputError
+
+numbers = st.floats(-50, 900, allow_nan=False)
+
+
+def record(picture="a.jpg", subject="1", points=((1.5, 2.25), (3.0, 4.0)), **more):
+    return Fixations(picture, subject, np.array(points, dtype=np.float64), (800, 600), **more)
+
+
+def same(a, b):
+    assert (a.picture, a.subject, a.size, a.target, a.found) == (b.picture, b.subject, b.size, b.target, b.found)
+    np.testing.assert_allclose(a.points, b.points)
+    assert (a.durations is None) == (b.durations is None)
+    if a.durations is not None:
+        np.testing.assert_allclose(a.durations, b.durations)
+    assert (a.box is None) == (b.box is None)
+    if a.box is not None:
+        np.testing.assert_allclose(a.box, b.box)
+
+
+FULL = {
+    "durations": np.array([200.0, 310.5]),
+    "target": "dining table",
+    "box": (10.0, 20.0, 110.5, 70.0),
+    "found": True,
+}
+
+
+@pytest.mark.parametrize("more", [{}, FULL], ids=["bare", "full"])
+@pytest.mark.parametrize(
+    ("write", "read"),
+    [
+        (write_ruarte, read_ruarte),
+        (write_cocosearch, lambda path: read_cocosearch(path, screen=(800, 600))),
+        (write_table, read_table),
+    ],
+    ids=["ruarte", "cocosearch", "table"],
+)
+def test_searches_come_back_as_they_went(tmp_path, write, read, more):
+    records = [record(**more), record('b, with "comma".jpg', **more)]
+    write(tmp_path / "file", records)
+    for before, after in zip(records, read(tmp_path / "file"), strict=True):
+        same(before, after)
+
+
+def test_free_viewing_comes_back_as_it_went(tmp_path):
+    records = [record("a.jpg", "1", durations=np.array([1.0, 2.0])), record("a.jpg", "2"), record("b.jpg", "1")]
+    write_osie(tmp_path / "file", records)
+    for before, after in zip(records, read_osie(tmp_path / "file"), strict=True):
+        same(before, after)
+    with pytest.raises(InputError, match="one size"):
+        write_osie(tmp_path / "file", [records[0], records[0].resized((8, 6))])
+
+
+@given(st.lists(st.tuples(numbers, numbers), min_size=1, max_size=8))
+def test_any_points_survive_the_table(tmp_path_factory, points):
+    path = tmp_path_factory.mktemp("table") / "t.csv"
+    write_table(path, [record(points=points)])
+    np.testing.assert_array_equal(read_table(path)[0].points, points)
+
+
+def test_a_table_of_pandas_is_read(tmp_path):
+    frame = pandas.DataFrame(
+        {"picture": ["a"] * 2 + ["b"], "subject": [1, 1, 1], "x": [0.0, 1, 2], "y": [0, 1, 2.5]}
+    ).assign(width=8, height=6)
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    first, second = read_table(tmp_path / "t.csv")
+    assert (first.picture, len(first), second.picture, first.size) == ("a", 2, "b", (8, 6))
+    assert second.points.tolist() == [[2, 2.5]]
+
+
+def trial(**changes):
+    fields = {"X": [1, 2], "Y": [3, 4], "T": [100, 200, 50], "image_width": 1680, "image_height": 1050}
+    return {**fields, **changes}
+
+
+def test_durations_beyond_the_target_are_left_out(tmp_path):
+    """Of a scanpath that was cut at its target, X is cut and T is not."""
+    (tmp_path / "s.json").write_text(json.dumps({"a.jpg": trial()}))
+    assert read_ruarte(tmp_path / "s.json")[0].durations.tolist() == [100, 200]
+
+
+def test_cells_have_their_last_row_and_column_in_the_box(tmp_path):
+    cells = trial(X=[15], Y=[11], image_width=32, image_height=24, receptive_width=1, receptive_height=1)
+    cells |= {"target_bbox": [12, 25, 21, 28], "target_object": "bottle", "target_found": False}
+    (tmp_path / "s.json").write_text(json.dumps({"a.jpg": cells}))
+    (inside,) = read_ruarte(tmp_path / "s.json")
+    assert inside.box == (25, 12, 29, 22)
+    (mapped,) = read_ruarte(tmp_path / "s.json", screen=(1600, 1200))
+    assert mapped.points.tolist() == [[15 * 50 + 24.5, 11 * 50 + 24.5]]
+    assert mapped.box == (1250, 600, 1450, 1100)
+    assert mapped.found is False
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"Y": [3]}, r"s\.json: a\.jpg: expected as many Y as X, got 2 X and 1 Y"),
+        ({"X": [1, None]}, r"s\.json: a\.jpg\.X\[1\]: expected a finite number"),
+        ({"T": [100]}, r"s\.json: a\.jpg\.T: expected durations of 2 fixations, got 1"),
+        ({"image_width": 0}, r"s\.json: a\.jpg\.image_width"),
+        ({"target_bbox": [1, 2, 3]}, r"s\.json: a\.jpg\.target_bbox"),
+        ({"target_found": "yes"}, r"s\.json: a\.jpg\.target_found"),
+        ({"X": [], "Y": []}, r"s\.json: a\.jpg\.X: expected at least 1"),
+    ],
+)
+def test_errors_name_file_record_and_field(tmp_path, changes, said):
+    (tmp_path / "s.json").write_text(json.dumps({"a.jpg": trial(**changes)}))
+    with pytest.raises(DataError, match=said):
+        read_ruarte(tmp_path / "s.json")
+
+
+@pytest.mark.parametrize(
+    ("content", "read", "said"),
+    [
+        ("{", read_osie, "cannot be read as JSON"),
+        ("[]", read_osie, "expected an object"),
+        ('{"a.jpg": [{"x": [1]}]}', read_osie, r"a\.jpg\[0\]\.y: expected a value"),
+        ('[{"X": [1], "Y": [1]}]', read_cocosearch, r"\[0\]\.name: expected a value"),
+        ('[{"name": "a", "X": [1], "Y": [1, 2]}]', read_cocosearch, r"\[0\] \(a\): expected as many Y as X"),
+        ("picture,subject,x,y\na,1,2,3\n", read_table, "width, height missing"),
+        ("picture,subject,x,y,width,height\na,1,2,?,8,6\n", read_table, r"line 2, y: expected a number, got '\?'"),
+        ("picture,subject,x,y,width,height\na,1,2,,8,6\n", read_table, "line 2, y: expected a number, got nothing"),
+        ("picture,subject,x,y,width,height\na,1,2,3,0,6\n", read_table, "line 2, size"),
+        ("picture,subject,x,y,width,height,found\na,1,2,3,8,6,maybe\n", read_table, "line 2, found"),
+    ],
+)
+def test_files_that_hold_something_else(tmp_path, content, read, said):
+    (tmp_path / "f").write_text(content)
+    with pytest.raises(DataError, match=rf"{tmp_path.name}/f: .*{said}"):
+        read(tmp_path / "f")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(DataError, match=r"nothing\.csv"):
+        read_table(tmp_path / "nothing.csv")
+
+
+def test_one_person_looks_at_a_picture_once_in_ruartes_file(tmp_path):
+    with pytest.raises(InputError, match=r"two for a\.jpg"):
+        write_ruarte(tmp_path / "s.json", [record(), record()])
+
+
+def test_pictures_are_in_the_order_of_their_names():
+    assert list(by_picture([record("b"), record("a"), record("b", "2")])) == ["a", "b"]
+    with pytest.raises(InputError, match="name"):
+        coco_name("dog.jpg")
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [{"points": ()}, {"points": ((np.nan, 1.0),)}, {"durations": np.ones(3)}],
+    ids=["none", "NaN", "durations"],
+)
+def test_records_that_cannot_be(broken):
+    with pytest.raises(InputError):
+        record(**broken)
+
+
+def test_inside_is_up_to_the_pixels_edges():
+    assert record(points=[(-0.5, 0), (799.49, 599.49), (799.5, 0), (0, -0.51)]).inside.tolist() == [
+        True, True, False, False,
+    ]  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_fixation_trains_of_pysaliency(monkeypatch):
+    import importlib.util
+    import sys
+    from types import SimpleNamespace
+
+    from semfov.data.fixations import from_pysaliency, to_pysaliency
+
+    if importlib.util.find_spec("pysaliency") is None:
+        pytest.skip("pip install pysaliency")
+    if importlib.util.find_spec("pkg_resources") is None:
+        monkeypatch.setitem(sys.modules, "pkg_resources", SimpleNamespace(resource_string=None, resource_listdir=None))
+    records = [record("a.jpg", "0"), record("b.jpg", "1", points=[(7.0, 8.0)], durations=np.array([200.0]))]
+    trains = to_pysaliency(records, ["b.jpg", "a.jpg"])
+    # The pixel that pysaliency looks a fixation up in is the one whose centre is nearest.
+    assert list(zip(trains.x_int.tolist(), trains.y_int.tolist(), trains.n.tolist(), strict=True)) == [
+        (2, 2, 1), (3, 4, 1), (7, 8, 0),
+    ]  # fmt: skip
+    back = from_pysaliency(trains, ["b.jpg", "a.jpg"], {"a.jpg": (800, 600), "b.jpg": (800, 600)})
+    for before, after in zip(records, back, strict=True):
+        np.testing.assert_allclose(before.points, after.points)
+        assert (before.picture, before.subject) == (after.picture, after.subject)
+    with pytest.raises(InputError, match="pictures"):
+        to_pysaliency(records, ["b.jpg"])

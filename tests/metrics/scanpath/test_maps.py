@@ -1,0 +1,171 @@
+"""Figures of conditional and of fixation maps, against pysaliency where it is installed, and against closed forms."""
+
+import importlib.util
+import sys
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import mannwhitneyu, multivariate_normal
+
+from semfov.errors import InputError
+from semfov.metrics.scanpath import (
+    auc,
+    auc_judd,
+    auc_shuffled,
+    information_gain,
+    log_density,
+    log_likelihood,
+    nss,
+)
+
+SHAPE = (12, 17)
+
+
+@pytest.fixture
+def pysaliency(monkeypatch):
+    if importlib.util.find_spec("pysaliency") is None:
+        pytest.skip("pip install pysaliency")
+    # It asks for a name that setuptools has given up, and never calls it here; its ROC for one that NumPy has.
+    if importlib.util.find_spec("pkg_resources") is None:
+        monkeypatch.setitem(sys.modules, "pkg_resources", SimpleNamespace(resource_string=None, resource_listdir=None))
+    monkeypatch.setattr(np, "trapz", np.trapezoid, raising=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return importlib.import_module("pysaliency")
+
+
+def picture(pysaliency, maps):
+    """A model, stimuli and fixations of pysaliency for maps, with fixations drawn at random."""
+    generator = np.random.default_rng(1)
+    stimuli = pysaliency.Stimuli([np.full((*SHAPE, 3), number, dtype=np.uint8) for number in range(len(maps))])
+
+    class Model(pysaliency.SaliencyMapModel):
+        def _saliency_map(self, stimulus):
+            return maps[int(stimulus[0, 0, 0])]
+
+    count = 8
+    # In distinct pixels, or a pixel would count twice as fixated.
+    pixels = [generator.choice(SHAPE[0] * SHAPE[1], count, replace=False) for _ in maps]
+    xs = [(each % SHAPE[1]).astype(float) for each in pixels]
+    ys = [(each // SHAPE[1]).astype(float) for each in pixels]
+    trains = pysaliency.FixationTrains.from_fixation_trains(
+        xs, ys, [np.arange(count)] * len(maps), list(range(len(maps))), [0] * len(maps)
+    )
+    return Model(caching=False), stimuli, trains, np.array(xs), np.array(ys)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("levels", [None, 4], ids=["distinct", "many ties"])
+def test_all_are_those_of_pysaliency(pysaliency, levels):
+    generator = np.random.default_rng(0)
+    maps = generator.uniform(0, 1, (3, *SHAPE))
+    if levels is not None:
+        maps = np.round(maps * levels) / levels
+    model, stimuli, trains, xs, ys = picture(pysaliency, maps)
+    np.testing.assert_allclose(nss(maps, xs, ys).ravel(), model.NSSs(stimuli, trains), atol=1e-12)
+    np.testing.assert_allclose(
+        auc(maps, xs, ys).ravel(), model.AUCs(stimuli, trains, nonfixations="uniform"), atol=1e-12
+    )
+    judd = [auc_judd(each, x, y) for each, x, y in zip(maps, xs, ys, strict=True)]
+    assert np.mean(judd) == pytest.approx(model.AUC_Judd(stimuli, trains, jitter=False), abs=1e-12)
+    shuffled = [
+        auc_shuffled(maps[i], xs[i], ys[i], np.delete(xs, i, 0).ravel(), np.delete(ys, i, 0).ravel()) for i in range(3)
+    ]
+    assert np.mean(shuffled) == pytest.approx(
+        np.mean(model.AUC_per_image(stimuli, trains, nonfixations="shuffled")), abs=1e-12
+    )
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_information_gain_is_that_of_pysaliency(pysaliency):
+    generator = np.random.default_rng(2)
+    densities, base = (log_density(generator.uniform(0.1, 1, (2, *SHAPE))) for _ in range(2))
+    _, stimuli, trains, xs, ys = picture(pysaliency, densities)
+
+    class Density(pysaliency.Model):
+        def __init__(self, tables):
+            super().__init__(caching=False)
+            self.tables = tables
+
+        def _log_density(self, stimulus):
+            return self.tables[int(stimulus[0, 0, 0])]
+
+    gain = information_gain(densities, base, xs, ys)
+    expected = Density(densities).information_gain(stimuli, trains, baseline_model=Density(base))
+    assert gain.mean() == pytest.approx(expected, abs=1e-12)
+
+
+def test_the_same_without_pysaliency():
+    """Every figure by its definition, pixel by pixel."""
+    generator = np.random.default_rng(3)
+    values = np.round(generator.uniform(0, 1, SHAPE), 1)
+    x, y = np.array([0, 16, 5]), np.array([0, 11, 7])
+    at = values[y, x]
+    np.testing.assert_allclose(nss(values, x, y), (at - values.mean()) / values.std())
+    np.testing.assert_allclose(auc(values, x, y), [(values < v).mean() + (values == v).mean() / 2 for v in at])
+    others = values[::2, ::3].ravel()
+    rows, columns = (each.ravel() for each in np.mgrid[0:12:2, 0:17:3])
+    expected = mannwhitneyu(at, others).statistic / (len(at) * len(others))
+    assert auc_shuffled(values, x, y, columns, rows) == pytest.approx(expected)
+
+
+def test_a_gaussian_gains_what_its_closed_form_says():
+    """Mean log likelihood of draws from a normal density is minus its entropy."""
+    sigma, side = 6.0, 80
+    y, x = np.mgrid[0:side, 0:side]
+    normal = multivariate_normal(mean=[side / 2, side / 2], cov=sigma**2)
+    density = log_density(normal.pdf(np.stack([x, y], -1)))
+    draws = np.clip(normal.rvs(20_000, random_state=0), 0, side - 1)
+    bits = log_likelihood(density, draws[:, 0], draws[:, 1]).mean()
+    entropy = np.log2(2 * np.pi * np.e * sigma**2)
+    assert bits == pytest.approx(2 * np.log2(side) - entropy, abs=0.03)
+
+
+def test_a_uniform_map_tells_nothing():
+    flat = np.ones(SHAPE)
+    x, y = [3, 4], [5, 6]
+    assert nss(flat, x, y).tolist() == [0, 0]
+    assert auc(flat, x, y).tolist() == [0.5, 0.5]
+    np.testing.assert_allclose(log_likelihood(log_density(flat), x, y), 0, atol=1e-12)
+
+
+def test_a_floor_gives_every_pixel_a_chance():
+    values = np.zeros(SHAPE)
+    values[0, 0] = 1
+    assert log_likelihood(log_density(values), [5], [5])[0] == -np.inf
+    assert log_likelihood(log_density(values, floor=0.1), [5], [5])[0] == pytest.approx(np.log2(0.1))
+    assert np.exp(log_density(values, floor=0.1)).sum() == pytest.approx(1)
+
+
+def test_leading_dimensions_and_tensors():
+    maps = torch.rand(2, 3, *SHAPE, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    x, y = torch.zeros(2, 3, 4), torch.ones(2, 3, 4)
+    for figure in (nss, auc, log_likelihood):
+        together = figure(maps, x, y)
+        assert together.shape == (2, 3, 4)
+        np.testing.assert_allclose(together[1, 2], figure(maps[1, 2], x[1, 2], y[1, 2]))
+
+
+def test_points_belong_to_the_pixel_that_they_are_nearest_to():
+    values = np.arange(6.0).reshape(2, 3)
+    assert log_likelihood(values, [0.49], [0.4]) == log_likelihood(values, [0], [0])
+    assert log_likelihood(values, [0.51], [0.4]) == log_likelihood(values, [1], [0])
+
+
+@pytest.mark.parametrize(
+    ("call", "argument"),
+    [
+        (lambda: nss(np.ones(SHAPE), [17], [0]), "x, y"),
+        (lambda: nss(np.ones(SHAPE), [-0.6], [0]), "x, y"),
+        (lambda: nss(np.ones((2, *SHAPE)), [1], [0]), "x, y"),
+        (lambda: log_density(np.zeros(SHAPE)), "maps"),
+        (lambda: log_density(-np.ones(SHAPE)), "maps"),
+        (lambda: auc_judd(np.ones((1, 1)), [0], [0]), "saliency"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(call, argument):
+    with pytest.raises(InputError, match=f"^{argument}"):
+        call()

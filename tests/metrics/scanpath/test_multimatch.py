@@ -1,0 +1,50 @@
+"""MultiMatch against the package multimatch-gaze."""
+
+import math
+
+import numpy as np
+import pytest
+
+from semfov.errors import InputError
+from semfov.metrics.scanpath import multimatch
+
+package = pytest.importorskip("multimatch_gaze", reason="pip install multimatch-gaze")
+
+
+def fields(path, durations):
+    rows = [(x, y, t) for (x, y), t in zip(path, durations, strict=True)]
+    return np.array(rows, dtype=[("start_x", "<f8"), ("start_y", "<f8"), ("duration", "<f8")])
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_all_five_are_those_of_the_package(seed):
+    generator = np.random.default_rng(seed)
+    size = (1680, 1050)
+    n, m = generator.integers(3, 12, 2)
+    a, b = generator.uniform(0, size, (n, 2)), generator.uniform(0, size, (m, 2))
+    s, t = generator.uniform(0.05, 0.9, n), generator.uniform(0.05, 0.9, m)
+    ours = multimatch(a, b, size, (s, t))
+    np.testing.assert_allclose(ours, package.docomparison(fields(a, s), fields(b, t), size), atol=1e-12)
+    assert ours.mean == pytest.approx(np.mean(ours[:4]))
+
+
+def test_a_scanpath_is_most_like_itself_and_its_reverse_points_the_other_way():
+    path = np.array([[0.0, 0.0], [100.0, 0.0], [200.0, 0.0]])
+    same = multimatch(path, path, (400, 300), ([1, 2, 3], [1, 2, 3]))
+    assert same == (1, 1, 1, 1, 1)
+    back = multimatch(path, path[::-1], (400, 300))
+    assert back.direction == pytest.approx(0)
+    assert back.length == 1
+    assert back.shape == pytest.approx(1 - 200 / 1000)
+    assert math.isnan(back.duration)
+
+
+def test_fewer_than_three_fixations_have_no_similarity():
+    assert all(map(math.isnan, multimatch([[0, 0], [1, 1]], [[0, 0], [1, 1], [2, 2]], (10, 10))))
+
+
+def test_what_cannot_be_is_refused_by_name():
+    with pytest.raises(InputError, match=r"^theirs:"):
+        multimatch([[0, 0]] * 3, [0, 1, 2], (10, 10))
+    with pytest.raises(InputError, match=r"^durations:"):
+        multimatch([[0, 0]] * 3, [[0, 0]] * 3, (10, 10), ([1, 2, 3], [1, 2]))

@@ -1,0 +1,86 @@
+"""Scanpaths as words, against alignments by dynamic programming as the field's own code writes them."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.errors import InputError
+from semfov.metrics.scanpath import cell_labels, cluster_labels, edit_distance, merge_close, sequence_score
+
+words = st.lists(st.sampled_from(["cup", "fork", "oven", "tv"]), min_size=1, max_size=9)
+
+
+def needleman_wunsch(a, b, gap=0.0):
+    table = np.zeros((len(a) + 1, len(b) + 1))
+    for i in range(len(a)):
+        for j in range(len(b)):
+            table[i + 1, j + 1] = max(table[i, j] + (a[i] == b[j]), table[i, j + 1] + gap, table[i + 1, j] + gap)
+    return table[-1, -1] / max(len(a), len(b))
+
+
+def levenshtein(a, b):
+    if not a or not b:
+        return len(a) + len(b)
+    return min(
+        levenshtein(a[1:], b) + 1, levenshtein(a, b[1:]) + 1, levenshtein(a[1:], b[1:]) + (a[0] != b[0])
+    )  # fmt: skip
+
+
+@given(words, words)
+def test_the_sequence_score_is_the_alignment_without_a_price_of_gaps(a, b):
+    assert sequence_score(a, b) == pytest.approx(needleman_wunsch(a, b))
+    assert sequence_score(a, b) == pytest.approx(sequence_score(b, a))
+    assert sequence_score(a, a) == 1
+
+
+@given(words.map(lambda word: word[:5]), words.map(lambda word: word[:5]))
+def test_the_edit_distance_is_the_fewest_changes(a, b):
+    assert edit_distance(a, b) == levenshtein(a, b)
+
+
+def test_labels_of_arrays_are_letters_too():
+    a, b = np.array([3, 7, 7]), np.array([3, 7])
+    assert sequence_score(a, b) == pytest.approx(2 / 3)
+    assert edit_distance(a, b) == 1
+
+
+def test_cells_are_those_of_the_grid():
+    from semfov.belief.grid import Grid
+
+    grid = Grid(5, 4, (101, 77))
+    np.testing.assert_array_equal(cell_labels(grid.centres.numpy(), 5, 4, (101, 77)), np.arange(20))
+    assert cell_labels([[-0.5, -0.5], [100.5, 76.5]], 5, 4, (101, 77)).tolist() == [0, 19]
+
+
+def test_clusters_part_what_lies_apart():
+    generator = np.random.default_rng(0)
+    places = np.array([[100.0, 100.0], [400.0, 100.0], [250.0, 400.0]])
+    truth = np.repeat([0, 1, 2], 20)
+    points = places[truth] + generator.normal(0, 10, (60, 2))
+    labels = cluster_labels(points, points, bandwidth=60)
+    assert len(set(labels.tolist())) == 3
+    assert all(len(set(labels[truth == place].tolist())) == 1 for place in range(3))
+    assert len(set(cluster_labels(points, points, bandwidth=1000).tolist())) == 1
+
+
+def test_neighbours_merge_while_they_are_closer_than_half_a_window():
+    path = [[0.0, 0.0], [4.0, 4.0], [5.0, 5.0], [50.0, 50.0]]
+    # (0,0)+(4,4) is (2,2); the next is 3 away and merges again.
+    np.testing.assert_allclose(merge_close(path, (10, 10)), [[3.5, 3.5], [50, 50]])
+    np.testing.assert_allclose(merge_close(path, (1, 1)), path)
+    # Both differences have to be small.
+    np.testing.assert_allclose(merge_close([[0.0, 0.0], [1.0, 30.0]], (10, 10)), [[0, 0], [1, 30]])
+
+
+@pytest.mark.parametrize(
+    ("call", "argument"),
+    [
+        (lambda: sequence_score([], [1]), "ours"),
+        (lambda: edit_distance([1], []), "theirs"),
+        (lambda: cell_labels([[100, 0]], 2, 2, (100, 100)), "points"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(call, argument):
+    with pytest.raises(InputError, match=f"^{argument}:"):
+        call()
