@@ -80,14 +80,21 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
     return Models(
         make_observation(belief.model, eye) if needs_observation(policies, belief) else None,
         make_target_evidence(belief.target_model, eye)
-        if any(policy.policy == TARGET_EVIDENCE for policy in policies)
+        if any(by_evidence(policy, task) for policy in policies)
         else None,
         make_context(belief.context_model, eye)
         if any(_of(policy.context, belief.context) != "none" for policy in policies)
         else None,
         make_learned_gaze(config.gaze_model, eye) if gazes and isinstance(config, SearchConfig) else None,
-        make_map_evidence(belief.map_model, eye) if any(policy.scores == "learned" for policy in policies) else None,
+        make_map_evidence(belief.map_model, eye)
+        if any(policy.scores == "learned" and not by_evidence(policy, task) for policy in policies)
+        else None,
     )
+
+
+def by_evidence(policy: PolicyConfig, task: Task) -> bool:
+    """Whether a policy goes by learned evidence for the target."""
+    return policy.policy == TARGET_EVIDENCE or (task == "search" and policy.scores == "learned")
 
 
 def needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -> bool:
@@ -134,6 +141,8 @@ def _strategy(
     chosen = Random() if policy.policy == SALIENCY else named_policy(policy.policy, task, means)
     if chosen.needs_gaze and models.gaze is not None:
         return Strategy(models.gaze.observer(components), chosen)
+    if by_evidence(policy, task):
+        return Strategy(Target(_given(models.evidence, "scores", "learned target evidence")), chosen)
     if policy.scores == "learned":
         return Strategy(LearnedMap(_given(models.map, "scores", "a learned map")), chosen)
     misses = _of(policy.misses, belief.misses)

@@ -181,7 +181,7 @@ class PolicyConfig(Settings):
         policy: name of a registered policy (`semfov.gaze.policies`), `saliency`, which goes by a saliency map alone, or
             `target-evidence`, which goes by learned evidence for the target.
         scores: whether scores are likelihoods as they are, `raw`, or go through the observation model, `calibrated`;
-            or, for explorations, the map is a `learned` one.
+            or the belief is a `learned` one, the map of explorations or the evidence for a target.
         tempering: exponent of the likelihoods.
         footprint: which cells a detection updates: `overlap`, `centre`, `box_centre` or `soft`.
         memory: fuse `all` looks, or keep what the `closest` look at each cell says.
@@ -237,8 +237,9 @@ class SearchConfig(Settings):
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: non-predictive,
             scores: calibrated, tempering: 0.25}` (`PolicyConfig`). Presets: `recommended` (target-evidence),
             `published` (predictive-calibrated), `target-evidence`, `learned`, `random`, `vocus2`, `itti-koch`, and
-            `non-predictive`, `predictive`, `neighbourhood`, `foveal-hit` or `place-information` followed by `-raw` or
-            `-calibrated`.
+            `non-predictive` (also as `maximum-a-posteriori`), `predictive`, `neighbourhood`, `foveal-hit`,
+            `place-information`, `entropy-limit` or `ideal-observer` followed by `-raw` or `-calibrated`; the last four
+            also by `-learned`, with the evidence of `target-evidence`, which is `maximum-a-posteriori-learned`.
         gaze_model: learned gaze policy of `learned`, by name or file (None: the one shipped for the detector).
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what the detector saw from every cell, shared between runs (None: the user's cache).

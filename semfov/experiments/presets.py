@@ -16,6 +16,12 @@ SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
 WORDS = {"scores": Scores, "footprint": Footprint, "memory": Memory, "saliency": SaliencyModel, "context": Context}
 """Settings that are one of a few words."""
 
+ALIASES = ("recommended", "published")
+"""Presets that tables call otherwise, beside those of `MAXIMUM_A_POSTERIORI`."""
+
+MAXIMUM_A_POSTERIORI = "maximum-a-posteriori"
+"""What Najemnik and Geisler (2005) call the searcher that fixates where the target is most probable."""
+
 OF_THE_MAP = ("tempering", "footprint", "memory", "misses")
 """Settings of the map of all classes."""
 
@@ -36,6 +42,7 @@ def presets(task: Task) -> dict[str, PolicyConfig]:
         alone |= {name: PolicyConfig(SALIENCY, saliency=name) for name in SALIENCY_MODELS}
         best, published = PolicyConfig(TARGET_EVIDENCE), PolicyConfig("predictive", "calibrated")
         scored = {name: PolicyConfig(name) for name in policy_names("search") if name not in alone}
+        alone |= {f"{name}-learned": PolicyConfig(name, "learned") for name in scored if POLICIES[name].by_place}
     else:
         best, published = PolicyConfig("closer-look", "learned"), PolicyConfig("kl", "calibrated")
         scored = {name: PolicyConfig(name) for name in policy_names("exploration") if not POLICIES[name].needs_map}
@@ -50,7 +57,13 @@ def presets(task: Task) -> dict[str, PolicyConfig]:
         for name, policy in scored.items()
         for scores in ("raw", "calibrated")
     }
-    return {**alone, **both, "recommended": best, "published": published}
+    same = {"recommended": best, "published": published}
+    if task == "search":
+        same |= {
+            f"{MAXIMUM_A_POSTERIORI}-{scores}": both[f"non-predictive-{scores}"] for scores in ("raw", "calibrated")
+        }
+        same[f"{MAXIMUM_A_POSTERIORI}-learned"] = alone[TARGET_EVIDENCE]
+    return {**alone, **both, **same}
 
 
 def resolve(choice: Choice, task: Task) -> PolicyConfig:
@@ -92,7 +105,11 @@ def label(choice: Choice, task: Task) -> str:
     'non-predictive-raw, tempering 0.25, footprint box_centre'
     """
     settings = resolve(choice, task)
-    names = {preset: name for name, preset in presets(task).items() if name not in ("recommended", "published")}
+    names = {
+        preset: name
+        for name, preset in presets(task).items()
+        if name not in ALIASES and not name.startswith(MAXIMUM_A_POSTERIORI)
+    }
     alone = settings.saliency if settings.policy == SALIENCY else None
     base = names[PolicyConfig(settings.policy, settings.scores, saliency=alone)]
     differs = []

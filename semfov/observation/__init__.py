@@ -6,6 +6,7 @@ from semfov.observation.folded import FoldedObservationModel
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import match
 from semfov.observation.misses import MissCounts
+from semfov.observation.separation import visibility
 from semfov.observation.statistics import DirichletStatistics
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "dirichlet",
     "fit_discriminative",
     "match",
+    "visibility",
 ]

@@ -199,8 +199,18 @@ def test_help_and_print_config(capsys):
     for name, preset in presets("search").items():
         if preset.policy in POLICIES and not POLICIES[preset.policy].__module__.startswith("semfov."):
             continue  # registered by another test
-        assert f"`{name.removesuffix('-raw').removesuffix('-calibrated')}`" in explained, name
+        alone = re.sub("-(raw|calibrated|learned)$", "", name)
+        assert f"`{alone}`" in explained, name
     assert "`-raw`or`-calibrated`" in explained
+    assert "thelastfouralsoby`-learned`" in explained
+    learned = [name for name in presets("search") if name.endswith("-learned")]
+    assert learned == [
+        "foveal-hit-learned",
+        "place-information-learned",
+        "entropy-limit-learned",
+        "ideal-observer-learned",
+        "maximum-a-posteriori-learned",
+    ]
     with pytest.raises(SystemExit):
         main(["--sensor.sigma", "50", "--print_config"])
     printed = yaml.safe_load(capsys.readouterr().out)

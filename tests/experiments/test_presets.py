@@ -16,7 +16,13 @@ from semfov.gaze.policies import Task, policy_names
 
 TASKS = get_args(Task)
 ALIASES = {
-    "search": {"recommended": "target-evidence", "published": "predictive-calibrated"},
+    "search": {
+        "recommended": "target-evidence",
+        "published": "predictive-calibrated",
+        "maximum-a-posteriori-raw": "non-predictive-raw",
+        "maximum-a-posteriori-calibrated": "non-predictive-calibrated",
+        "maximum-a-posteriori-learned": "target-evidence",
+    },
     "exploration": {"recommended": "closer-look-learned", "published": "kl-calibrated"},
 }
 
@@ -43,6 +49,7 @@ def test_names_tell_policy_scores_and_saliency():
     assert resolve("predictive-calibrated", "search") == PolicyConfig("predictive", "calibrated")
     assert resolve("place-information-raw", "search") == PolicyConfig("place-information", "raw")
     assert resolve("learned", "search") == PolicyConfig("learned")
+    assert resolve("entropy-limit-learned", "search") == PolicyConfig("entropy-limit", "learned")
     assert resolve("vocus2", "search") == PolicyConfig("saliency", saliency="vocus2")
     assert resolve("expected-accuracy-raw", "exploration") == PolicyConfig("expected-accuracy")
     assert resolve("itti-koch-calibrated", "exploration") == PolicyConfig(

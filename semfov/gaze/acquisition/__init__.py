@@ -12,6 +12,7 @@ from semfov.gaze.acquisition.exploration import (
     TwoPeaks,
     UpperConfidenceBound,
 )
+from semfov.gaze.acquisition.ideal import CorrectLocalisation, EntropyLimit
 from semfov.gaze.acquisition.objects import ObjectEvidence
 from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
 from semfov.gaze.acquisition.saliency_prior import SaliencyPrior
@@ -22,6 +23,8 @@ __all__ = [
     "AcquisitionFunction",
     "BayesianSurprise",
     "CloserLook",
+    "CorrectLocalisation",
+    "EntropyLimit",
     "ExpectedAccuracy",
     "ExpectedGain",
     "FovealHit",

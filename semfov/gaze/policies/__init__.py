@@ -14,7 +14,9 @@ from semfov.gaze.policies.exploration import (
     Surprise,
 )
 from semfov.gaze.policies.search import (
+    EntropyLimitMinimisation,
     FovealHits,
+    IdealObserver,
     InformationOnPlace,
     Learned,
     Neighbourhood,
@@ -29,8 +31,10 @@ __all__ = [
     "Accuracy",
     "Closer",
     "ConfidenceBound",
+    "EntropyLimitMinimisation",
     "FovealHits",
     "Gain",
+    "IdealObserver",
     "Improvement",
     "InformationOnPlace",
     "Learned",

@@ -11,6 +11,7 @@ from semfov.belief.map_evidence import MapEvidence
 from semfov.errors import InputError, lookup
 from semfov.gaze.acquisition.accuracy import SightedModel
 from semfov.gaze.acquisition.base import AcquisitionFunction
+from semfov.gaze.acquisition.ideal import SignalModel
 from semfov.gaze.acquisition.lookahead import LevelledModel
 from semfov.gaze.acquisition.place import MissModel
 from semfov.gaze.learned import LearnedGaze
@@ -18,7 +19,7 @@ from semfov.gaze.learned import LearnedGaze
 Task = Literal["search", "exploration"]
 
 
-class GazeModel(LevelledModel, MissModel, SightedModel, Protocol):
+class GazeModel(LevelledModel, MissModel, SightedModel, SignalModel, Protocol):
     """What all policies together need of an observation model (`semfov.FovealObservationModel`)."""
 
 
@@ -53,6 +54,7 @@ class Policy(nn.Module, ABC):
         needs_model: whether it is made from an observation model.
         needs_gaze: whether it is made from a learned gaze policy.
         needs_map: whether it is made from a learned map, and goes by that.
+        by_place: whether it searches by the target's probability in every cell alone, and so with any belief.
     """
 
     name: ClassVar[str]
@@ -60,6 +62,7 @@ class Policy(nn.Module, ABC):
     needs_model: ClassVar[bool] = False
     needs_gaze: ClassVar[bool] = False
     needs_map: ClassVar[bool] = False
+    by_place: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)

@@ -1,4 +1,9 @@
-"""Policies of visual search. `random`, `non-predictive` and `predictive` are published, the others are ours."""
+"""Policies of visual search.
+
+`random`, `non-predictive` and `predictive` are those of Luzio, Bernardino and Moreno (2024), `entropy-limit` and
+`ideal-observer` those of Najemnik and Geisler (2009, 2005), whose searcher by maximum a posteriori is `non-predictive`.
+The others are ours.
+"""
 
 from typing import ClassVar, Self
 
@@ -6,6 +11,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.gaze.acquisition.base import AcquisitionFunction
+from semfov.gaze.acquisition.ideal import CorrectLocalisation, EntropyLimit
 from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
 from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
 from semfov.gaze.acquisition.static import Uniform
@@ -25,7 +31,10 @@ class Random(Policy):
 
 
 class NonPredictive(Policy):
-    """Where the target is most probable (`semfov.acquisition.TargetPosterior`)."""
+    """Where the target is most probable (`semfov.acquisition.TargetPosterior`).
+
+    It is also the searcher by maximum a posteriori (MAP) that Najemnik and Geisler (2005) compare with their ideal one.
+    """
 
     name = "non-predictive"
     tasks = ("search",)
@@ -62,6 +71,7 @@ class FovealHits(ModelPolicy):
 
     name = "foveal-hit"
     tasks = ("search",)
+    by_place = True
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The probability of a detection."""
@@ -73,10 +83,41 @@ class InformationOnPlace(ModelPolicy):
 
     name = "place-information"
     tasks = ("search",)
+    by_place = True
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The expected information about the place."""
         return PlaceInformation(wanted(target, self.name), self.model, grid)
+
+
+class EntropyLimitMinimisation(ModelPolicy):
+    """From where the entropy of the target's place can fall most (`semfov.acquisition.EntropyLimit`).
+
+    It needs miss rates, and a model whose Dirichlets are densities of the scores (`semfov.observation.visibility`).
+    """
+
+    name = "entropy-limit"
+    tasks = ("search",)
+    by_place = True
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
+        """The limit of the entropy lost."""
+        return EntropyLimit(wanted(target, self.name), self.model, grid)
+
+
+class IdealObserver(ModelPolicy):
+    """From where the target is most likely told right (`semfov.acquisition.CorrectLocalisation`).
+
+    It needs what `EntropyLimitMinimisation` does, and time: a tenth of a second and more for 100 cells.
+    """
+
+    name = "ideal-observer"
+    tasks = ("search",)
+    by_place = True
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
+        """The probability of being right."""
+        return CorrectLocalisation(wanted(target, self.name), self.model, grid)
 
 
 class Learned(Policy):

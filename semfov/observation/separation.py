@@ -1,0 +1,95 @@
+"""How well a target can be told from background at each level of distance: the d' of signal detection."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from semfov.errors import InputError, check_shape
+from semfov.observation.dirichlet import kl_divergence
+
+
+class ScoringModel(Protocol):
+    """What visibility needs of an observation model (`semfov.FovealObservationModel`)."""
+
+    miss_rate: Tensor | None
+
+    @property
+    def alpha(self) -> Tensor:
+        """Dirichlet parameters, `(K+1, N, K+1)`, of the scores of each class at each level, background first."""
+        ...
+
+
+def visibility(model: ScoringModel) -> Tensor:
+    r"""d' of every class at every level of distance, `(K+1, N)`; background's own is 0.
+
+    The signal of a cell is the log likelihood ratio of target and background for what is detected there, R = ln Dir(S |
+    α_k) - ln Dir(S | α_0). Where nothing is detected there is no signal, R = 0, as a belief that fuses detections alone
+    has it. With the miss rates m its means and variances are those of a mixture, and
+
+    .. math::
+
+        d' &= \frac{E_k[R] - E_0[R]}{\sqrt{(V_k[R] + V_0[R]) / 2}}, \qquad E_c[R] = (1 - m_c) \mu_c, \qquad
+        V_c[R] = (1 - m_c) (\sigma_c^2 + m_c \mu_c^2) \\
+        \mu_k &= \mathrm{KL}(\alpha_k \| \alpha_0), \qquad \mu_0 = -\mathrm{KL}(\alpha_0 \| \alpha_k), \qquad
+        \sigma_c^2 = \sum_j w_j^2 \psi'(\alpha_{cj}) - \Bigl(\sum_j w_j\Bigr)^2 \psi'(A_c), \quad
+        w = \alpha_k - \alpha_0
+
+    (d' of two distributions of unequal variances, `d_a` of Simpson and Fitter, 1973; the moments of log scores are
+    those of Minka, 2000.) It is never negative, 0 where a class is never detected and background neither, and does not
+    depend on the tempering.
+
+    The Dirichlets must be densities of the scores, as in models fitted by maximum likelihood (`...-published`). Those
+    of models trained for the posterior of the class are not: theirs is nearly the same at all levels.
+
+    Args:
+        model: the observation model, with miss rates.
+
+    Raises:
+        InputError: the model has no miss rates.
+
+    >>> from semfov import FovealObservationModel
+    >>> alpha = torch.tensor([[[9.0, 1.0], [5.0, 1.0]], [[1.0, 9.0], [1.0, 1.0]]])
+    >>> missed = torch.tensor([[0.5, 0.9], [0.1, 0.8]])
+    >>> model = FovealObservationModel(alpha, [0.2], ["cup"], miss_rate=missed)
+    >>> visibility(model).detach()
+    tensor([[0.0000, 0.0000],
+            [2.4116, 0.3841]])
+    """
+    if model.miss_rate is None:
+        raise InputError("model: expected an observation model with miss rates, got one without")
+    alpha, background = model.alpha, model.alpha[:1]
+    target = _mixed(*log_ratio_moments(alpha, alpha, background), model.miss_rate)
+    nothing = _mixed(*log_ratio_moments(background, alpha, background), model.miss_rate[:1])
+    spread = ((target[1] + nothing[1]) / 2).sqrt()
+    apart = target[0] - nothing[0]
+    return torch.where(spread > 0, apart / spread.clamp(min=torch.finfo(spread.dtype).tiny), 0.0)
+
+
+def log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and variance of `ln Dir(S | target) - ln Dir(S | background)` for scores S of Dir(alpha), each `(...)`.
+
+    Args:
+        alpha: `(..., K)`, what the scores come from.
+        target: `(..., K)`; broadcasts with `alpha`.
+        background: `(..., K)`; broadcasts with `alpha`.
+
+    >>> mean, variance = log_ratio_moments(*torch.tensor([[2.0, 2.0], [2.0, 1.0], [1.0, 2.0]]))
+    >>> mean, variance
+    (tensor(0.), tensor(1.2899))
+    """
+    check_shape(target, "target", alpha.shape[-1])
+    check_shape(background, "background", alpha.shape[-1])
+    # ln p/q under r is KL(r || q) - KL(r || p).
+    mean = kl_divergence(alpha, background) - kl_divergence(alpha, target)
+    weight = target - background
+    total = torch.polygamma(1, alpha.sum(-1))
+    variance = (weight.square() * torch.polygamma(1, alpha)).sum(-1) - weight.sum(-1).square() * total
+    # A variance of 0 comes out of the difference as a rounding error.
+    return mean, variance.clamp(min=0)
+
+
+def _mixed(mean: Tensor, variance: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
+    """Moments of what is 0 with the probability `missed` and has these moments otherwise."""
+    seen = 1 - missed
+    return seen * mean, seen * (variance + missed * mean.square())

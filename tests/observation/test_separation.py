@@ -1,0 +1,101 @@
+"""d' of the observation model against draws from its Dirichlets, scipy, and closed forms."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import integrate, stats
+from torch.distributions import Dirichlet
+
+from semfov import FovealObservationModel
+from semfov.errors import InputError
+from semfov.observation import visibility
+from semfov.observation.separation import log_ratio_moments
+
+
+def make_model(dtype=torch.float64, missed=None, levels=3, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    alpha = 0.5 + 4 * torch.rand(4, levels, 4, generator=generator, dtype=dtype)
+    alpha += 6 * torch.eye(4, dtype=dtype)[:, None] * torch.linspace(1, 0.1, levels, dtype=dtype)[:, None]
+    missed = torch.rand(4, levels, generator=generator, dtype=dtype) if missed is None else missed
+    return FovealObservationModel(alpha, [0.1 * n for n in range(1, levels)], ["a", "b", "c"], miss_rate=missed)
+
+
+def test_moments_equal_those_of_scipys_density():
+    """Of two components the simplex is a line, and the Dirichlet a beta distribution."""
+    source, target, background = (3.0, 2.0), (4.0, 1.5), (1.2, 2.5)
+    density, p, q = (stats.beta(*each) for each in (source, target, background))
+
+    def expect(function):
+        return integrate.quad(lambda s: density.pdf(s) * function(s), 0, 1, epsabs=1e-10)[0]
+
+    mean = expect(lambda s: p.logpdf(s) - q.logpdf(s))
+    variance = expect(lambda s: (p.logpdf(s) - q.logpdf(s) - mean) ** 2)
+    got = log_ratio_moments(*(torch.tensor(each, dtype=torch.float64) for each in (source, target, background)))
+    assert [float(each) for each in got] == pytest.approx([mean, variance], rel=1e-6)
+
+
+def test_equals_draws_of_what_is_seen():
+    """Scores drawn from the Dirichlets, their log likelihood ratio taken, and replaced by 0 where nothing is seen."""
+    model, count = make_model(), 200_000
+    alpha, missed = model.alpha.detach(), model.miss_rate
+    rng = np.random.default_rng(0)
+    for target, level in ((1, 0), (2, 1), (3, 2)):
+        ratio = {}
+        for source in (0, target):
+            scores = torch.as_tensor(rng.dirichlet(alpha[source, level].numpy(), count))
+            told = [Dirichlet(alpha[k, level], validate_args=False).log_prob(scores) for k in (target, 0)]
+            seen = rng.random(count) >= float(missed[source, level])
+            ratio[source] = np.where(seen, (told[0] - told[1]).numpy(), 0)
+        apart = ratio[target].mean() - ratio[0].mean()
+        expected = apart / np.sqrt((ratio[target].var() + ratio[0].var()) / 2)
+        assert float(visibility(model)[target, level].detach()) == pytest.approx(expected, rel=0.02)
+
+
+def test_what_is_never_detected_cannot_be_told():
+    missed = torch.full((4, 3), 0.3, dtype=torch.float64)
+    missed[:, 2] = 1
+    seen = visibility(make_model(missed=missed)).detach()
+    assert torch.equal(seen[:, 2], torch.zeros(4, dtype=torch.float64))
+    assert torch.equal(seen[0], torch.zeros(3, dtype=torch.float64))
+    assert bool((seen[1:, :2] > 0).all())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_it_falls_with_every_target_that_is_missed(dtype, device):
+    rates = torch.linspace(0, 0.95, 8, dtype=dtype)
+    missed = torch.stack([torch.full_like(rates, 0.5), *[rates] * 3])
+    one = make_model(dtype, levels=1)
+    alpha = one.alpha.detach().expand(4, 8, 4)
+    model = FovealObservationModel(alpha, [0.1 * n for n in range(1, 8)], one.classes, miss_rate=missed).to(device)
+    got = visibility(model)[1:].detach()
+    assert got.dtype == dtype
+    assert got.device.type == device.type
+    assert bool((got.diff(dim=-1) < 0).all())
+
+
+def test_dtypes_agree():
+    torch.testing.assert_close(
+        visibility(make_model().float()).double().detach(), visibility(make_model()).detach(), rtol=1e-4, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("name", ["yolov3-tiny-published", "yolox-nano-published"])
+def test_acuity_of_the_published_fovea_falls_off(name):
+    """Of nearly all classes, and on average at every step away from the fovea."""
+    seen = visibility(FovealObservationModel.from_pretrained(name).double()).detach()[1:]
+    assert bool(seen.isfinite().all())
+    assert bool((seen.mean(0).diff() < 0).all())
+    assert float((seen[:, 0] > seen[:, -1]).double().mean()) > 0.95
+
+
+def test_gradients():
+    alpha = make_model().alpha.detach().requires_grad_()
+    target, background = (make_model(seed=seed).alpha.detach().requires_grad_() for seed in (1, 2))
+    assert torch.autograd.gradcheck(log_ratio_moments, (alpha, target, background))
+
+
+def test_a_model_without_miss_rates_is_refused():
+    with pytest.raises(InputError, match="model: expected an observation model with miss rates"):
+        visibility(FovealObservationModel.identity(["a"], [0.1]))
+    with pytest.raises(InputError, match="target"):
+        log_ratio_moments(torch.ones(3), torch.ones(2), torch.ones(3))
