@@ -4,9 +4,9 @@
     python -m benchmarks.sahi --data.root DIR --data.annotations FILE --mosaics 0 --target person
 
 SAHI (Akyon, Altinuc and Temizel, 2022) looks at every slice and at the whole picture, and merges what they show by its
-own rules (`GREEDYNMM`, its default, or `NMS`). It has no order and no end before the last slice, so what it gives is one
-point: recall after all of its passes. Beside it are the same slices, merged by `semfov.zoom.merge`, and windows of our
-choice.
+own rules (`GREEDYNMM`, its default, or `NMS`). It has no order and no end before the last slice, so what it gives is
+one point: recall after all of its passes. Beside it are the same slices, merged by `semfov.zoom.merge`, and windows of
+our choice.
 """
 
 import sys

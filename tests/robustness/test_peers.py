@@ -34,7 +34,7 @@ class RedSquares(Detector):
 def test_contrast_of_a_sensor_that_keeps_everything_is_whole():
     assert acuity.contrasts(Foveation(1e9), 8.0) == pytest.approx([1.0] * 7, abs=1e-3)
     kept = acuity.contrasts(LogPolar(60.0), 8.0)
-    assert kept[0] > 0.9
+    assert kept[0] > 0.85
     assert kept[-1] < 0.05
 
 
