@@ -170,6 +170,28 @@ def report(chosen: dict[str, Sensor], detector: Detector, scenes: Scenes, count:
     )
 
 
+def draw(image: Tensor, sensor: LogPolar, path: Path) -> None:
+    """A picture `(1, 3, H, W)`, what both sensors show of it, and the cortical image, side by side in a file."""
+    from matplotlib.figure import Figure
+
+    gaze = torch.tensor([image.shape[-1] * 0.4, image.shape[-2] * 0.5])
+    cortical = sensor.cortical(image, gaze)
+    views = {
+        "picture": image,
+        "published": named_sensor("published")(image, gaze),
+        "log-polar, back-projected": sensor.back(cortical, gaze, (image.shape[-1], image.shape[-2])),
+        "cortical image": cortical,
+    }
+    figure = Figure(figsize=(14, 3.4), layout="constrained")
+    for axes, (name, view) in zip(figure.subplots(1, 4), views.items(), strict=True):
+        axes.imshow(view[0].clamp(0, 1).movedim(0, -1).numpy())
+        axes.set_title(name)
+        axes.set_axis_off()
+        if view is not cortical:
+            axes.plot(*gaze.tolist(), "+", color="white")
+    figure.savefig(path, dpi=75)
+
+
 @torch.inference_mode()
 def main() -> None:
     """Measure and print."""
@@ -183,12 +205,15 @@ def main() -> None:
     parser.add_argument("--fovea", type=float, default=60.0, help="of the log-polar sensor, as for the next two")
     parser.add_argument("--spacing", type=float, default=1.0)
     parser.add_argument("--pooling", type=float, default=1.0)
+    parser.add_argument("--picture", type=Path, help="file for a picture of the views")
     options = parser.parse_args()
     torch.set_num_threads(1)
     detector = load_detector(options.detector, **({} if options.weights is None else {"weights": options.weights}))
     scenes: Scenes = EmbeddedScenes(detector.classes, count=options.count)
     if options.root is not None:
         scenes = CocoScenes(options.root, options.annotations, detector.classes, min_instances=0, max_target_area=None)
+    if options.picture is not None:
+        draw(scenes[0].image[None], LogPolar(options.fovea, options.spacing, options.pooling), options.picture)
     chosen = sensors(options.fovea, options.spacing, options.pooling)
     rings, wedges = LogPolar(options.fovea, options.spacing).retina.receptors((SIDE, SIDE * 3 // 4))
     print(f"log-polar: {rings} rings of {wedges} receptors, {rings * wedges:,} for {SIDE * SIDE * 3 // 4:,} pixels\n")

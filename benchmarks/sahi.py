@@ -4,8 +4,9 @@
     python -m benchmarks.sahi --data.root DIR --data.annotations FILE --mosaics 0 --target person
 
 SAHI (Akyon, Altinuc and Temizel, 2022) looks at every slice and at the whole picture, and merges what they show by its
-own rules (`GREEDYNMM`, its default). It has no order and no end before the last slice, so what it gives is one point:
-recall after all of its passes. Beside it are the same slices, merged by `semfov.zoom.merge`, and windows of our choice.
+own rules (`GREEDYNMM`, its default, or `NMS`). It has no order and no end before the last slice, so what it gives is
+one point: recall after all of its passes. Beside it are the same slices, merged by `semfov.zoom.merge`, and windows of
+our choice.
 """
 
 import sys
@@ -122,8 +123,8 @@ class Outcome:
         self.passes += passes
 
 
-def sliced(run: ZoomRun, index: int) -> tuple[Tensor, Tensor, int]:
-    """Boxes and labels that SAHI gives for a picture, and its passes."""
+def sliced(run: ZoomRun, index: int, **merging: str) -> tuple[Tensor, Tensor, int]:
+    """Boxes and labels that SAHI gives for a picture, and its passes; by its own defaults unless told otherwise."""
     config = run.config
     model = Slicing(run.eye.detector, run.target, FOUND)
     picture = (run.scenes[index].image * 255).round().byte().permute(1, 2, 0).numpy()
@@ -135,6 +136,7 @@ def sliced(run: ZoomRun, index: int) -> tuple[Tensor, Tensor, int]:
         overlap_height_ratio=config.overlap,
         overlap_width_ratio=config.overlap,
         verbose=0,
+        **merging,
     )
     kept = result.object_prediction_list
     boxes = torch.tensor([each.bbox.to_xyxy() for each in kept], dtype=torch.float32).view(-1, 4)
@@ -144,16 +146,18 @@ def sliced(run: ZoomRun, index: int) -> tuple[Tensor, Tensor, int]:
 def compare(config: ZoomConfig) -> None:
     """Look at every picture in each way, and print the table."""
     run = ZoomRun(config)
-    names = "SAHI", "the same slices, merged here", "ours, as many passes", "ours, half as many"
-    outcomes = {name: Outcome() for name in names}
+    merging = {"SAHI": {}, "SAHI, NMS": {"postprocess_type": "NMS", "postprocess_match_metric": "IOU"}}
+    names = "the same slices, merged here", "ours, as many passes", "ours, half as many"
+    outcomes = {name: Outcome() for name in (*merging, *names)}
     with one_thread():
         for index in range(len(run.scenes)):
             annotation, glances = run.annotation(index), run.glances(index)
-            boxes, labels, passes = sliced(run, index)
-            outcomes["SAHI"].add(boxes, labels, annotation, passes)
+            for name, how in merging.items():
+                boxes, labels, passes = sliced(run, index, **how)
+                outcomes[name].add(boxes, labels, annotation, passes)
             same = raster(glances, slices(glances.lattice, config.slice, config.overlap))
             chosen = list(islice((look for look, _ in find_everything(glances, run.evidence, run.target)), passes))
-            ways = {names[1]: list(same), names[2]: chosen, names[3]: chosen[: passes // 2]}
+            ways = {names[0]: list(same), names[1]: chosen, names[2]: chosen[: passes // 2]}
             for name, looks in ways.items():
                 found = merge(looks, run.target, score=FOUND)
                 outcomes[name].add(found.boxes, found.labels, annotation, len(looks))

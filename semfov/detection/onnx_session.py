@@ -36,7 +36,6 @@ class OnnxSession:
     Attributes:
         image: name of the input that takes the image.
         shape: its shape, None where it is dynamic.
-        dtype: its type.
         outputs: name and shape of every output, None where a size is dynamic.
         metadata: the model's own key-value pairs.
         producer: what the file says made it.
@@ -93,7 +92,7 @@ class OnnxSession:
                 what = f"{self.path.name}: output {output.name!r}"
                 raise InputError(f"{what}: expected numbers of floating point, got {output.type}")
         self.outputs = tuple((o.name, _sizes(o.shape)) for o in self._session.get_outputs())
-        self.image, self.shape, self.dtype, self._extra = self._inputs()
+        self.image, self.shape, self._dtype, self._extra = self._inputs()
 
     def _inputs(self) -> tuple[str, tuple[int | None, ...], torch.dtype, list[str]]:
         """Name, shape and dtype of the image input, and the names of the others."""
@@ -115,7 +114,7 @@ class OnnxSession:
         batch, fixed = image.shape[0], self.shape[0]
         check(batch > 0, "image", "at least one image", batch)
         size = batch if fixed is None else fixed
-        source = image.detach().to(device="cpu", dtype=self.dtype)
+        source = image.detach().to(device="cpu", dtype=self._dtype)
         short = -batch % size
         if short:
             source = torch.cat([source, source[-1:].expand(short, -1, -1, -1)])

@@ -18,6 +18,7 @@ Levels = tuple[Tensor, ...]
 
 _TALLEST = 30  # levels of a pyramid; an image with sides of 2^30 pixels is a single pixel then
 _MOST = 2**26  # receptors
+_FARTHEST = 1e15  # pixels from the image to a fixation
 
 
 @dataclass(frozen=True)
@@ -247,6 +248,8 @@ def _sample(levels: Levels, fixation: Tensor, retina: Retina) -> Tensor:
 def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: Retina) -> Tensor:
     """Images `(B, G, C, H, W)` from cortical ones `(B, G, C, M, N)` around `(B, G, 2)` fixations."""
     batch, many, _, rings, wedges = cortical.shape
+    # Nothing changes any more where squares overflow.
+    fixation = fixation.clamp(-_FARTHEST, _FARTHEST)
     x, y = (torch.arange(n, dtype=fixation.dtype, device=fixation.device) for n in size)
     scale = fixation.new_tensor(retina.scale)
     across = ((x - fixation[..., :1]) / scale[0])[:, :, None, :]

@@ -1,5 +1,7 @@
 """Pictures larger than the detector's input: where to look, and how close."""
 
+from typing import TYPE_CHECKING, Any
+
 from semfov.zoom.agent import ZoomAgent
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import ZoomEye, ZoomView
@@ -7,4 +9,26 @@ from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import Objects, merge
 from semfov.zoom.search import ZoomPath
 
-__all__ = ["GlimpseEvidence", "Lattice", "Objects", "ZoomAgent", "ZoomEye", "ZoomPath", "ZoomView", "merge"]
+if TYPE_CHECKING:
+    from semfov.zoom.export import export_look
+
+__all__ = [
+    "GlimpseEvidence",
+    "Lattice",
+    "Objects",
+    "ZoomAgent",
+    "ZoomEye",
+    "ZoomPath",
+    "ZoomView",
+    "export_look",
+    "merge",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "export_look":
+        # `semfov.zoom.export` is also a program: Python warns when it has been imported before it is run.
+        from semfov.zoom.export import export_look
+
+        return export_look
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -82,7 +82,7 @@ def export_look(
     shown, scores = graph.selection(boxes, confidence, vectors, detector.selection)
     placed, cut = graph.placed(shown, frame, "picture")
     window = graph.add("Slice", frame, graph.constant([0]), graph.constant([4]))
-    outputs = {
+    outputs: dict[str, tuple[str, list[Any]]] = {
         "boxes": (placed, ["found", 4]),
         "scores": (scores, ["found", kinds + 1]),
         "cut": (cut, ["found"]),
@@ -198,15 +198,17 @@ def _network(graph: LookGraph, detector: OnnxDetector, canvas: str) -> list[str]
     model = onnx.load(detector.session.path)
     constants = {constant.name for constant in model.graph.initializer}
     inputs = [value for value in model.graph.input if value.name not in constants]
-    if len(inputs) != 1 or detector.session.dtype != torch.float32:
-        names = ", ".join(value.name for value in inputs)
-        raise InputError(f"detector: expected one input of single precision, got {names}; export a simpler model")
+    if len(inputs) != 1 or detector.session.shape[0] not in (None, 1):
+        told = ", ".join(f"{value.name!r}" for value in inputs)
+        raise InputError(f"detector: expected a network that takes one image and nothing else, got inputs {told}")
     try:
         model = version_converter.convert_version(model, OPSET)
     except Exception as error:  # of many kinds, for operators that it cannot convert
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"detector: expected a model that converts to opset {OPSET}, got {reason}") from error
-    return graph.append(model, "network/", {inputs[0].name: image})
+    image = graph.add("Cast", image, to=inputs[0].type.tensor_type.elem_type)
+    outputs = graph.append(model, "network/", {inputs[0].name: image})
+    return [graph.add("Cast", output, to=onnx.TensorProto.FLOAT) for output in outputs]
 
 
 def _exported(module: nn.Module, *inputs: Tensor) -> Any:

@@ -69,7 +69,7 @@ class LookGraph(Graph):
         lead = self.constant([1, 3])
         for size in ([lead, rows, columns], [lead, lines, columns]):
             # Weights beyond the border are left out, as Pillow and torch leave them out.
-            how = {"mode": "linear", "antialias": 1, "exclude_outside": 1}
+            how: dict[str, Any] = {"mode": "linear", "antialias": 1, "exclude_outside": 1}
             resized = self.add("Resize", pixels, "", "", self.add("Concat", *size, axis=0), **how)
             pixels = self.add("Clip", self.add("Round", resized), self.constant(0.0), self.constant(255.0))
         pixels = self.add("Div", pixels, self.constant(255.0))

@@ -197,6 +197,16 @@ def test_a_fixation_on_a_pixel_has_a_gradient():
     assert gaze.grad.abs().sum() > 0
 
 
+@pytest.mark.parametrize("far", [1e4, 1e30])
+def test_a_fixation_far_away_sees_a_blur(far):
+    image = draw(1, 3, 60, 80, dtype=torch.float32).requires_grad_()
+    gaze = torch.tensor([far, -far], requires_grad=True)
+    view = LogPolar(8.0)(image, gaze)
+    view.sum().backward()
+    assert all(bool(torch.isfinite(each).all()) for each in (view, image.grad, gaze.grad))
+    assert view.std() < 0.1 * image.std()
+
+
 def test_many_fixations_are_the_loop_over_them(device):
     image, gaze, sensor = draw(2, 3, 20, 27, device=device), 30 * draw(2, 4, 2, device=device), LogPolar(6.0)
     many, seen = sensor(image, gaze), sensor.cortical(image, gaze)

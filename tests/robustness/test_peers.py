@@ -1,0 +1,85 @@
+"""Programs that measure beside peers and beside other sensors: they count what they say they count."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import acuity
+from semfov.detection.detector import Detector
+from semfov.detection.scores import Candidates
+from semfov.eye import Eye
+from semfov.sensor import Foveation, LogPolar
+
+pytestmark = pytest.mark.slow
+
+
+class RedSquares(Detector):
+    """Proposes one box around all that is red, of the second of two classes."""
+
+    def __init__(self, size=(64, 64)):
+        super().__init__("red", ("nothing", "red"), size, fill=0.0)
+
+    def propose(self, canvas):
+        red = canvas[0, 0] > 0.5
+        if not red.any():
+            return Candidates(torch.zeros(1, 0, 4), torch.zeros(1, 0, 2), torch.zeros(1, 0))
+        y, x = red.nonzero().unbind(-1)
+        box = torch.stack([x.min(), y.min(), x.max() + 1, y.max() + 1]).float()
+        return Candidates(box.view(1, 1, 4), torch.tensor([[[0.0, 0.75]]]), torch.tensor([[0.8]]))
+
+
+def test_contrast_of_a_sensor_that_keeps_everything_is_whole():
+    assert acuity.contrasts(Foveation(1e9), 8.0) == pytest.approx([1.0] * 7, abs=1e-3)
+    kept = acuity.contrasts(LogPolar(60.0), 8.0)
+    assert kept[0] > 0.85
+    assert kept[-1] < 0.05
+
+
+def test_finest_gratings_grow_with_the_distance():
+    found = [float(value.strip("≤ >")) for value in acuity.finest(LogPolar(60.0))]
+    assert found == sorted(found)
+    # Two neighbours to a wave at least: 1 + 350 / 60 times as far apart as in the middle.
+    assert 2 * (1 + 350 / 60) < found[-1] < 4 * (1 + 350 / 60)
+
+
+def test_errors_and_finds_are_counted_by_distance():
+    image = torch.zeros(1, 3, 64, 640)
+    image[0, 0, 20:40, 100:120] = 1
+    boxes, labels = torch.tensor([[100.0, 20, 120, 40], [600, 20, 620, 40]]), torch.tensor([2, 2])
+    tally = acuity.Tally()
+    detector = RedSquares((640, 64))
+    tally.add(Eye(Foveation(1e9), detector), image, torch.tensor([[109.5, 29.5], [300.0, 29.5]]), boxes, labels)
+    assert tally.looks == 2
+    assert tally.objects.tolist() == [1, 0, 0, 0, 1, 0, 1]  # at 0 and 500 px, and at 190 and 310 px
+    assert tally.found.tolist() == [1, 0, 0, 0, 1, 0, 0]
+    assert float(tally.error.max()) < 1e-6
+    assert float(tally.pixels.sum()) > 40_000
+
+
+def test_sahi_is_asked_for_by_name():
+    """Where it is not there, or is not what it should be."""
+    code = "import sys; sys.modules['sahi'] = None; import benchmarks.sahi"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "pip install --no-deps sahi" in result.stderr.splitlines()[-1]
+
+
+def test_sahi_takes_a_detector():
+    pytest.importorskip("sahi")
+    from sahi.predict import get_sliced_prediction
+
+    from benchmarks.sahi import Slicing
+
+    picture = np.zeros((128, 192, 3), dtype=np.uint8)
+    picture[70:90, 140:150, 0] = 255
+    model = Slicing(RedSquares(), None, 0.1)
+    found = get_sliced_prediction(picture, model, slice_height=64, slice_width=64, overlap_height_ratio=0.2,
+                                  overlap_width_ratio=0.2, verbose=0).object_prediction_list  # fmt: skip
+    assert model.passes == 1 + 3 * 4
+    assert [(each.category.id, each.category.name) for each in found] == [(2, "red")] * len(found)
+    assert [140, 70, 150, 90] in [[round(side) for side in each.bbox.to_xyxy()] for each in found]
+    assert found[0].score.value == pytest.approx(0.8)
+    rare = Slicing(RedSquares(), 1, 0.1)
+    assert not get_sliced_prediction(picture, rare, slice_height=64, slice_width=64, verbose=0).object_prediction_list
