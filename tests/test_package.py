@@ -102,6 +102,8 @@ def test_import_is_light():
         ("eval.search", ["--help"]),
         ("eval.search", ["--workers", "0"]),
         ("eval.explore", ["--protocol.shifts", "-1"]),
+        ("eval.search", ["--data.root", "nosuch", "--data.annotations", "nosuch.json"]),
+        ("eval.explore", ["--detector.name", "yolo"]),
         ("train.fit_fom", ["--help"]),
         ("train.fit_map", ["--steps", "-1"]),
     ],
