@@ -21,12 +21,19 @@ MODULES = (
     "semfov.gaze.acquisition",
     "semfov.gaze.saliency",
     "semfov.episode",
+    "semfov.live",
     "semfov.zoom",
     "semfov.data",
     "semfov.data.fixations",
     "semfov.metrics.scanpath",
     "semfov.errors",
 )
+_ARRAY = "numpy.ndarray[tuple[Any, ...], numpy.dtype[Any]]"
+_ALIASES = {
+    f"Tensor, {_ARRAY}, str, os.PathLike[str], ForwardRef('Image')": "ImageLike",
+    f"Tensor | {_ARRAY} | Sequence[Any]": "PointLike",
+}
+"""What `semfov.data.inputs` calls its unions; signatures write them out."""
 _SECTION = re.compile(r"^(Args|Returns|Raises|Attributes|Shape|Example):{1,2}$")
 
 
@@ -69,7 +76,10 @@ def signature(thing: Any) -> str:
         text = str(inspect.signature(thing).replace(return_annotation=inspect.Signature.empty))
     except (TypeError, ValueError):
         return ""
-    return re.sub(r"(?:torch|typing|collections\.abc|pathlib|semfov(?:\.\w+)+)\.(?=\w)", "", text)
+    text = re.sub(r"(?:torch|typing|collections\.abc|pathlib|semfov(?:\.\w+)+)\.(?=\w)", "", text)
+    for kinds, name in _ALIASES.items():
+        text = text.replace(kinds, name)
+    return re.sub(r"Union\[([^][]*)\]", lambda union: union[1].replace(", ", " | "), text)
 
 
 def methods(thing: Any) -> list[str]:

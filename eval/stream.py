@@ -1,6 +1,7 @@
 """The demonstration on a video or a camera: what is seen and believed at every frame, printed and drawn into it."""
 
 import time
+from collections import deque
 from pathlib import Path
 
 from semfov import viz
@@ -25,6 +26,7 @@ def watch(live: LivePerception, stream: Stream, path: Path) -> Path:
     """
     path = path.with_suffix(video_suffix())
     began, looking, shown = time.perf_counter(), 0.0, 0
+    lately = deque([began], maxlen=20)
     print(f"{stream.name}: {'exploring' if live.target is None else f'searching for “{live.classes[live.target]}”'}")
     with video(path, stream.rate or UNKNOWN_RATE) as add:
         try:
@@ -32,7 +34,8 @@ def watch(live: LivePerception, stream: Stream, path: Path) -> Path:
                 moment = live.step(picture.image)
                 shown += 1
                 looking += sum(moment.seconds.values())
-                speed = f"{shown / (time.perf_counter() - began):.1f} frames/s"
+                lately.append(time.perf_counter())
+                speed = f"{(len(lately) - 1) / (lately[-1] - lately[0]):.1f} frames/s"
                 print(f"  {told(moment, live)}  {speed}", flush=True)
                 add(draw_moment(picture.image, moment, f"{headline(moment, live)}   {speed}"))
         except KeyboardInterrupt:

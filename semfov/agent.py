@@ -1,7 +1,7 @@
 """An agent with a foveal sensor: it searches an image for a class, or explores it."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
 from pathlib import Path
@@ -109,7 +109,7 @@ class ActivePerception(nn.Module):
             name: a detector for which models are shipped, `yolov3-tiny` or `yolox-nano`.
             sigma: width of the fovea in pixels of an image of 640; the models are fitted for 100.
             growth: see `Foveation`; models are fitted for 2, and for 1 as published.
-            grid: `(columns, rows)` of the belief; models are fitted on 10 x 10 cells.
+            grid: `(columns, rows)` of the belief; models are fitted on 10 x 10 cells, and hold for 5 to 20 a side.
             context: whether search also goes by the usual places and company of the target (`ContextPrior`).
             options: of `semfov.load_detector`.
 
@@ -407,7 +407,7 @@ def _check_thresholds(confirm: float | None, give_up: float | None) -> None:
 
 def _check_cells(grid: tuple[int, int]) -> None:
     """Raise `InputError` unless this is a grid."""
-    check(len(grid) == 2, "grid", "(columns, rows)", grid)
+    check(isinstance(grid, Sequence) and len(grid) == 2, "grid", "(columns, rows)", grid)
     for side in grid:
         check_whole(side, "grid", 1, 200)
 

@@ -86,11 +86,40 @@ def test_public_surface():
         assert getattr(semfov, name) is not None
 
 
+HEAVY = ["kornia", "onnx", "onnxruntime", "pycocotools", "torchvision", "matplotlib", "skimage", "cv2", "torch._dynamo"]
+
+
 def test_import_is_light():
-    heavy = ["kornia", "onnx", "onnxruntime", "pycocotools", "torchvision", "matplotlib", "skimage", "jsonargparse"]
-    code = f"import sys, semfov; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, semfov; print([m for m in {[*HEAVY, 'jsonargparse']} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("eval.demo", ["--help"]),
+        ("eval.demo", ["--target", "zebr"]),
+        ("eval.demo", ["nosuch.jpg", "--target", "cup"]),
+        ("eval.search", ["--help"]),
+        ("eval.search", ["--workers", "0"]),
+        ("eval.explore", ["--protocol.shifts", "-1"]),
+        ("eval.search", ["--data.root", "nosuch", "--data.annotations", "nosuch.json"]),
+        ("eval.explore", ["--detector.name", "yolo"]),
+        ("train.fit_fom", ["--help"]),
+        ("train.fit_map", ["--steps", "-1"]),
+    ],
+)
+def test_help_and_mistakes_wait_for_nothing_heavy(command, arguments):
+    """Time is not measured here: it is what is imported that takes it."""
+    code = (
+        f"import sys\nfrom {command} import main\n"
+        f"try:\n    code = main({arguments})\nexcept SystemExit as stopped:\n    code = stopped.code\n"
+        f"print(code, [m for m in {HEAVY} if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    wanted = 0 if "--help" in arguments else 1
+    assert result.stdout.splitlines()[-1] == f"{wanted} []", result.stdout
 
 
 def imports(source: str, module: str, *, package: bool = False) -> list[tuple[str, str]]:

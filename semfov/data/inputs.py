@@ -113,7 +113,7 @@ def channels_first(pixels: Tensor, argument: str = "image", *, choose: bool = Tr
         first, last = batch.shape[1] == channels, batch.shape[-1] == channels
         if first and last and not choose:
             raise InputError(
-                f"{argument}: expected {_SHAPES}, got {shape}, which may be either; give a tensor (3, H, W)"
+                f"{argument}: expected {_SHAPES}, got shape {shape}, which may be either; give a tensor (3, H, W)"
             )
         if first or last:
             batch = batch if first else batch.movedim(-1, 1)

@@ -268,4 +268,5 @@ def _opening(path: Path, what: str) -> Iterator[None]:
 
 def _tensor(pixels: NDArray[np.uint8]) -> Tensor:
     """Bytes `(h, w, 3)` as `(3, h, w)` without a copy where memory may be shared."""
-    return torch.from_numpy(pixels if pixels.flags.writeable else pixels.copy()).permute(2, 0, 1)
+    shared = pixels.flags.writeable and min(pixels.strides) >= 0
+    return torch.from_numpy(pixels if shared else pixels.copy()).permute(2, 0, 1)

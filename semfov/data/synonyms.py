@@ -26,12 +26,9 @@ backpack: rucksack, knapsack, bag, school bag
 umbrella: parasol, sunshade
 handbag: purse, bag, tote, shopping bag, clutch
 tie: necktie, bow tie
-suitcase: luggage, baggage, trunk, trolley, bag, briefcase
+suitcase: luggage, baggage, trunk, bag, briefcase
 frisbee: disc, flying disc
-skis: ski
-snowboard: snow board
 sports ball: ball, football, soccer ball, tennis ball, basketball, baseball, volleyball
-surfboard: surf board
 tennis racket: racket, racquet, tennis racquet
 baseball glove: glove, mitt, baseball mitt
 baseball bat: bat
@@ -69,7 +66,6 @@ vase: urn, jar
 scissors: shears
 teddy bear: teddy, stuffed animal, plush, soft toy, toy
 hair drier: hair dryer, blow dryer, hairdryer, dryer
-toothbrush: tooth brush
 """
 
 

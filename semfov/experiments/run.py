@@ -24,7 +24,7 @@ from semfov.experiments.parallel import available_cores, mine, run_tasks, wait_f
 from semfov.experiments.parts import Parts, Record
 from semfov.experiments.presets import SALIENCY, label, resolve
 from semfov.experiments.saliency_store import SaliencyStore, saliency_table
-from semfov.experiments.setup import fovea_of, make_eye, make_scenes, prepare_worker
+from semfov.experiments.setup import check_sources, fovea_of, make_eye, make_scenes, prepare_worker
 from semfov.experiments.store import DetectionStore, versions
 from semfov.gaze.policies import POLICIES, Task
 from semfov.io.code import class_digest, package_digest
@@ -52,6 +52,7 @@ class Run(ABC):
         for name in labels:
             check(labels.count(name) == 1, "policies", "each of them once", f"{name!r} {labels.count(name)} times")
         self.policies = {name: resolve(choice, self.task) for name, choice in zip(labels, config.policies, strict=True)}
+        check_sources(config.data, config.detector)
         self.eye = make_eye(config.detector, config.sensor)
         self.scenes: Scenes = self.open_scenes()
         if not len(self.scenes):

@@ -20,7 +20,7 @@ from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.looks import look_from
 from semfov.experiments.parallel import available_cores, mine, run_tasks, wait_for_others
 from semfov.experiments.seeds import generator_for
-from semfov.experiments.setup import make_eye, make_scenes, prepare_worker
+from semfov.experiments.setup import check_sources, make_eye, make_scenes, prepare_worker
 from semfov.experiments.store import looks_digest, versions
 from semfov.eye import Eye
 from semfov.io.cached import read_tensors, write_tensors
@@ -152,6 +152,7 @@ class Sampler:
 
     def __init__(self, settings: SampleSettings) -> None:
         self.settings = settings
+        check_sources(settings.data, settings.detector)
         self.eye: Eye = make_eye(settings.detector, settings.sensor)
         self.scenes: Scenes = make_scenes(settings.data, self.eye.detector.classes)
         what = [self.eye.settings(), self.scenes.fingerprint, settings.fixations, settings.iou, settings.seed]

@@ -13,7 +13,7 @@ import torch
 from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
 from semfov.data.scene import Scenes
 from semfov.detection.detector import Detector
-from semfov.detection.load import load_detector
+from semfov.detection.load import check_detector, load_detector
 from semfov.errors import DataError, InputError
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.looks import one_thread
@@ -26,10 +26,25 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor import Foveation
 
 
-def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
-    """The scenes to search: photographs where a root is given, else embedded ones."""
+def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
+    """Raise an error where photographs, annotations or a detector are not there, before any of them is loaded."""
+    check_data(data)
+    check_detector(detector.name)
+
+
+def check_data(data: DataConfig) -> None:
+    """Raise an error unless photographs and annotations are there, or neither is asked for."""
     if (data.root is None) != (data.annotations is None):
         raise InputError("data: expected both data.root and data.annotations, or neither for the embedded scenes")
+    if data.root is not None and not data.root.is_dir():
+        raise DataError(f"data.root: no such folder: {data.root}; check the path")
+    if data.annotations is not None and not data.annotations.exists():
+        raise DataError(f"data.annotations: no such file: {data.annotations}; check the path")
+
+
+def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
+    """The scenes to search: photographs where a root is given, else embedded ones."""
+    check_data(data)
     if data.root is None or data.annotations is None:
         from semfov.data.scenes import EmbeddedScenes
 

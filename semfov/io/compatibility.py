@@ -92,9 +92,10 @@ def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str
 
 
 def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> None:
-    """Raise `InputError` unless the model was fitted on a grid like this.
+    """Raise `InputError` where cells are more than twice as wide or as narrow as those that a model was fitted on.
 
-    A cell that is smaller or larger holds an object less or more often, and a network has learned how often.
+    Learned evidence is told sizes and distances in parts of the image, and holds on finer and coarser grids. How often
+    a cell holds an object, and how far its neighbours reach, it has learned from cells of one size.
 
     Args:
         fitted: settings of its training; without `columns` and `rows` it may stand on any grid.
@@ -102,11 +103,11 @@ def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> N
         what: title of the model.
     """
     known = fitted.get("columns"), fitted.get("rows")
-    if None not in known and known != tuple(grid):
+    if None not in known and not all(n / 2 <= side <= 2 * n for n, side in zip(known, grid, strict=True)):  # type: ignore[operator]
         raise InputError(
-            f"grid: the {what} was fitted on {known[0]} × {known[1]} cells, got {grid[0]} × {grid[1]}; take "
-            f"grid={known}, or fit models on such a grid (python -m train.fit_search and train.fit_map, with "
-            f"--columns {grid[0]} --rows {grid[1]})"
+            f"grid: the {what} was fitted on {known[0]} × {known[1]} cells and holds for half to twice as many a side, "
+            f"got {grid[0]} × {grid[1]}; take grid={known}, or fit models on such a grid (python -m train.fit_search "
+            f"and train.fit_map, with --columns {grid[0]} --rows {grid[1]})"
         )
 
 

@@ -18,7 +18,7 @@ from semfov.errors import DataError, check
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.seeds import generator_for
 from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Weight
-from semfov.experiments.setup import fovea_of, make_eye, make_scenes, prepare_worker
+from semfov.experiments.setup import check_sources, fovea_of, make_eye, make_scenes, prepare_worker
 from semfov.experiments.store import versions
 from semfov.experiments.summary import table
 from semfov.eye import Eye
@@ -100,6 +100,7 @@ def fit_gaze(config: FitGazeConfig) -> None:
         check(getattr(config, name) >= 1, name, "1 or more", getattr(config, name))
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     prepare_worker()
+    check_sources(config.data, config.detector)
     eye = make_eye(config.detector, config.sensor)
     scenes = make_scenes(config.data, eye.detector.classes)
     held_out = list(range(0, len(scenes), config.holdout))[: config.judged]

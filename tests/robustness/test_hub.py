@@ -49,7 +49,7 @@ def test_eye_sees():
 
 
 AGENTS = {
-    "recommended": ({"grid": (4, 3)}, observers.Target, policies.NonPredictive, policies.Closer),
+    "recommended": ({"grid": (6, 5)}, observers.Target, policies.NonPredictive, policies.Closer),
     "published": ({"search": "predictive"}, observers.Semantic, policies.Predictive, policies.KL),
     "raw": ({"sensor": "published-narrow"}, observers.Semantic, policies.NonPredictive, policies.Random),
 }

@@ -1,0 +1,200 @@
+"""The demonstration on videos: belief follows a photograph that moves through the view, and a video tells of it."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+import eval.demo as program
+from semfov import ActivePerception, Detections, Eye, Foveation, Grid, observers, policies
+from semfov.belief import DirichletBelief
+from semfov.data.sources import Picture, Stream, embedded_picture
+from semfov.decision import Decision
+from semfov.detection import Candidates, Detector
+from semfov.live import Moment
+from semfov.viz.live import draw_moment, video, video_suffix
+
+cv2 = pytest.importorskip("cv2")
+
+
+def write(path, frames):
+    height, width = frames[0].shape[-2:]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (width, height))
+    for frame in frames:
+        writer.write(np.ascontiguousarray((frame * 255).byte().permute(1, 2, 0).numpy()[..., ::-1]))
+    writer.release()
+    return path
+
+
+def read(path):
+    recorder, frames = cv2.VideoCapture(str(path)), []
+    while True:
+        whole, frame = recorder.read()
+        if not whole:
+            return frames
+        frames.append(frame[..., ::-1])
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_a_photograph_that_pans(tmp_path, capsys):
+    """The target is found, is followed to the edge, and is forgotten when it has left the view."""
+    scene = embedded_picture(ActivePerception.recommended().classes[1:], "motorcycle", 0)
+    places = [89] * 8 + [89 + round(22.5 * shift) for shift in range(1, 11)] + [314] * 12
+    path = write(tmp_path / "pan.avi", [scene.image[..., x : x + 320] for x in places])
+    assert program.main([str(path), "--target", "Motorbikes", "--out", str(tmp_path / "out")]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "frames/s" in line]
+    assert len(lines) == len(places)
+    assert "motorcycle: found" in lines[7]
+    assert "motorcycle: absent" in lines[-1]
+    left, top, right, bottom = scene.boxes[0].tolist()
+    for x, line in zip(places[:14], lines, strict=False):
+        column, row = map(int, re.search(r"most likely at \((\d), (\d)\)", line).groups())
+        # Its cell overlaps the annotated box, moved with the view.
+        assert left - x < 32 * (column + 1)
+        assert right - x > 32 * column
+        assert top < 48 * (row + 1)
+        assert bottom > 48 * row
+    chances = [float(re.search(r"p ([\d.]+), most", line)[1]) for line in lines]
+    assert min(chances[1:14]) > 0.9
+    assert chances[-1] < 0.3
+    shown = read(tmp_path / "out" / f"live{video_suffix()}")
+    assert len(shown) == len(places)
+    assert shown[0].shape == (480, 320, 3)
+
+
+class Red(Detector):
+    """Detects the bounding box of what is red."""
+
+    def __init__(self):
+        super().__init__("red", ("red", "green"), (160, 120))
+
+    def propose(self, canvas):
+        ys, xs = (canvas[0, 0] - canvas[0, 1] > 0.1).nonzero(as_tuple=True)
+        if not len(xs):
+            return Candidates(canvas.new_zeros(1, 0, 4), canvas.new_zeros(1, 0, 2))
+        box = torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas)
+        return Candidates(box[None, None], canvas.new_tensor([[[0.9, 0.0]]]))
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path, capsys):
+    observer = observers.Semantic(3)
+    eye = Eye(Foveation(40.0), Red(), reference=160.0)
+    agent = ActivePerception(
+        eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(8, 6)
+    ).eval()
+    monkeypatch.setattr(program, "make_agent", lambda config: agent)
+    monkeypatch.setattr(program, "known_classes", lambda config: None)
+
+    def call(*arguments):
+        code = program.main([*map(str, arguments), "--out", str(tmp_path / "out")])
+        return code, capsys.readouterr()
+
+    return call
+
+
+def frames(count=6):
+    pictures = torch.full((count, 3, 120, 160), 0.4)
+    for number, picture in enumerate(pictures):
+        picture[0, 40:60, 10 * number : 10 * number + 20] = 0.9
+    return list(pictures)
+
+
+def test_a_video_and_what_does_not_go_with_it(run, tmp_path):
+    path = write(tmp_path / "red.avi", frames())
+    code, printed = run(path, "--target", "red", "--frames", 4, "--start", 47)
+    assert code == 0
+    lines = printed.out.splitlines()
+    assert lines[0] == "red.avi: searching for “red”"
+    assert re.match(r"     0  at \(7, 5\): red 0\.9\d +p\(red\) up to 0\.\d\d, most likely at", lines[1])
+    assert re.search(r"\d frames/s$", lines[4])
+    assert re.match(r"4 frames, [\d.]+ a second", lines[5])
+    assert len(read(tmp_path / "out" / f"live{video_suffix()}")) == 4
+    code, printed = run(path, "--explore")
+    assert "red.avi: exploring" in printed.out
+    assert "p(object) up to 0." in printed.out
+    for option in ("--shifts", "--price", "--until", "--report"):
+        code, printed = run(path, "--target", "red", option, 1)
+        assert code == 1
+        assert f"{option[2:]}: expected none for a video or a camera" in printed.err
+
+
+def test_a_camera_until_it_is_stopped(run, tmp_path, monkeypatch):
+    """Ctrl-C ends it in good order: what was seen until then is written."""
+
+    def endless():
+        yield from (Picture(f"frame {number}", frame) for number, frame in enumerate(frames(3)))
+        raise KeyboardInterrupt
+
+    asked = []
+    monkeypatch.setattr(program, "open_stream", lambda *what: asked.append(what) or Stream("camera 0", None, endless()))
+    code, printed = run("--camera", 0, "--target", "red", "--rate", 0.5)
+    assert asked == [(0, None)]
+    assert code == 0
+    assert "stopped\n3 frames" in printed.out
+    assert len(read(tmp_path / "out" / f"live{video_suffix()}")) == 3
+
+
+def moment(**changes):
+    grid = Grid(4, 2, (40, 20))
+    beta = torch.ones(1, 8, 2)
+    beta[0, 6, 1] = 1e6
+    beta[0, :6, 0] = beta[0, 7:, 0] = 1e6
+    belief = DirichletBelief(beta)
+    seen = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 2), torch.zeros(1, 0, dtype=torch.bool))
+    made = {
+        "number": 0, "grid": grid, "target": 1, "cell": 0, "fixation": grid.centres[0], "detections": seen,
+        "belief": belief, "decision": None, "visited": torch.zeros(8, dtype=torch.bool), "next_cell": 3, "seconds": {},
+    }  # fmt: skip
+    return Moment(**{**made, **changes})
+
+
+def test_what_is_drawn_into_a_frame():
+    """Belief colours its own cell, the gaze is where it is, and the box of the decision is around what was found."""
+    grey = torch.full((3, 200, 400), 0.5)
+    grid = Grid(4, 2, (400, 200))
+    plain = moment(grid=grid, fixation=grid.centres[0])
+    drawn = draw_moment(grey, plain, "cup").astype(int)
+    assert drawn.shape == (200, 400, 3)
+    coloured = abs(drawn - 127).max(-1) > 8
+    assert coloured[101:199, 201:299].all()
+    assert not coloured[101:199, 101:199].any()
+    assert not coloured[130:199, :].any(0)[np.r_[0:200, 300:400]].any()
+    assert coloured[40:61, 40:61].any()
+    # The line leads from the gaze to the next cell.
+    assert coloured[50, 100:300].all()
+    box = torch.tensor([110.0, 110, 190, 190])
+    found = draw_moment(
+        grey, moment(grid=grid, fixation=grid.centres[0], decision=Decision("found", 0.9, 6, box)), "cup"
+    )
+    changed = abs(found.astype(int) - drawn).max(-1) > 8
+    assert changed[110, 110:190].all()
+    assert changed[110:190, 110].all()
+    assert not changed[115:185, 115:185].any()
+    large = draw_moment(torch.zeros(3, 1001, 1999), moment(grid=Grid(4, 2, (1999, 1001))), "cup")
+    assert large.shape == (320, 640, 3)
+
+
+def test_videos_are_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "film.avi"
+    generator = np.random.default_rng(0)
+    shown = [np.full((48, 64, 3), shade, np.uint8) for shade in generator.integers(0, 256, 5)]
+    with video(path, 10.0) as add:
+        for frame in shown:
+            add(frame)
+        assert not path.exists()
+    for frame, back in zip(shown, read(path), strict=True):
+        assert abs(back.astype(int) - frame).max() <= 4
+    before = path.read_bytes()
+
+    def fail():
+        with video(path, 10.0) as add:
+            add(shown[0])
+            raise RuntimeError("no more")
+
+    with pytest.raises(RuntimeError, match="no more"):
+        fail()
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["film.avi"]

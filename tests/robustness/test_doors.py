@@ -1,0 +1,392 @@
+"""What a newcomer calls, right and wrong: each gives the right result, or an error that names argument and remedy."""
+
+import io
+import re
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import eval.demo as program
+from semfov import (
+    ActivePerception,
+    Eye,
+    Foveation,
+    MapEvidence,
+    TargetEvidence,
+    ZoomAgent,
+    ZoomEye,
+    as_image,
+    foveate,
+    observers,
+    policies,
+)
+from semfov.data.classes import class_index
+from semfov.data.synonyms import SYNONYMS
+from semfov.detection import Candidates, Detector
+from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.detection.load import check_detector
+from semfov.errors import SemfovError
+from semfov.zoom import GlimpseEvidence
+
+RNG = np.random.default_rng(0)
+PIXELS = RNG.integers(0, 256, (30, 44, 3), dtype=np.uint8)
+GREY = RNG.integers(0, 256, (30, 44), dtype=np.uint8)
+DEEP = RNG.integers(0, 65536, (30, 44), dtype=np.uint16)
+RGB = torch.from_numpy(PIXELS).permute(2, 0, 1) / 255
+GREYS = torch.from_numpy(GREY)[None].expand(3, -1, -1) / 255
+DEEPS = torch.from_numpy(DEEP.astype(np.int32))[None].expand(3, -1, -1) / 65535
+
+
+class Quiet(Detector):
+    """Sees one cup, wherever it looks."""
+
+    def __init__(self):
+        super().__init__("quiet", ("cup", "wine glass"), (32, 32))
+
+    def propose(self, canvas):
+        box = canvas.new_tensor([[4.0, 4, 20, 20]]).expand(len(canvas), 1, 4)
+        return Candidates(box, canvas.new_tensor([[0.9, 0.1]]).expand(len(canvas), 1, 2), None)
+
+
+@pytest.fixture(scope="module")
+def agent():
+    observer, eye = observers.Semantic(3), Eye(Foveation(10.0), Quiet(), reference=64.0)
+    return ActivePerception(eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(4, 3))
+
+
+@pytest.fixture(scope="module")
+def zooming():
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return ZoomAgent(ZoomEye(Quiet()), GlimpseEvidence(2, 8)).eval()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A photograph, what is none, and a folder without any."""
+    path = tmp_path_factory.mktemp("pictures")
+    Image.fromarray(PIXELS).save(path / "photo.png")
+    (path / "notes.txt").write_text("no picture")
+    (path / "cut.png").write_bytes((path / "photo.png").read_bytes()[:200])
+    (path / "empty").mkdir()
+    return path
+
+
+def turned():
+    """A photograph that its EXIF data turn upright, as a camera that was held sideways stores it."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    file = io.BytesIO()
+    Image.fromarray(np.rot90(PIXELS)).save(file, format="PNG", exif=exif)
+    return Image.open(file)
+
+
+def over_white():
+    """Transparent in its left half."""
+    alpha = np.full((30, 44, 1), 255, np.uint8)
+    alpha[:, :22] = 0
+    return Image.fromarray(np.concatenate([PIXELS, alpha], -1), "RGBA")
+
+
+WHITE = RGB.clone()
+WHITE[:, :, :22] = 1
+PALETTE = Image.fromarray(PIXELS).quantize(16)
+
+PICTURES = {
+    "str": (lambda folder: str(folder / "photo.png"), RGB),
+    "path": (lambda folder: folder / "photo.png", RGB),
+    "pillow": (lambda _: Image.fromarray(PIXELS), RGB),
+    "pillow file": (lambda folder: Image.open(folder / "photo.png"), RGB),
+    "pillow sideways": (lambda _: turned(), RGB),
+    "pillow alpha": (lambda _: over_white(), WHITE),
+    "pillow grey": (lambda _: Image.fromarray(GREY), GREYS),
+    "pillow grey alpha": (lambda _: Image.fromarray(GREY).convert("LA"), GREYS),
+    "pillow 16 bits": (lambda _: Image.fromarray(DEEP), DEEPS),
+    "pillow palette": (lambda _: PALETTE, torch.from_numpy(np.array(PALETTE.convert("RGB"))).permute(2, 0, 1) / 255),
+    "array": (lambda _: PIXELS, RGB),
+    "array CHW": (lambda _: PIXELS.transpose(2, 0, 1), RGB),
+    "array of floats": (lambda _: (PIXELS / 255).astype(np.float32), RGB),
+    "array of doubles CHW": (lambda _: PIXELS.transpose(2, 0, 1) / 255, RGB.double()),
+    "array grey": (lambda _: GREY, GREYS),
+    "array grey (H, W, 1)": (lambda _: GREY[..., None], GREYS),
+    "array grey (1, H, W)": (lambda _: GREY[None] / np.float32(255), GREYS),
+    "array 16 bits": (lambda _: DEEP, DEEPS),
+    "array 16 bits big endian": (lambda _: DEEP.astype(">u2"), DEEPS),
+    "array BGR turned round": (lambda _: np.ascontiguousarray(PIXELS[..., ::-1])[..., ::-1], RGB),
+    "array that is read only": (lambda _: np.asarray(Image.fromarray(PIXELS)), RGB),
+    "array batch of one": (lambda _: PIXELS[None], RGB),
+    "tensor": (lambda _: RGB, RGB),
+    "tensor batch of one": (lambda _: RGB[None], RGB),
+    "tensor of bytes": (lambda _: torch.from_numpy(PIXELS).permute(2, 0, 1), RGB),
+    "tensor of bytes HWC": (lambda _: torch.from_numpy(PIXELS), RGB),
+    "tensor of doubles": (lambda _: RGB.double(), RGB.double()),
+    "tensor grey": (lambda _: torch.from_numpy(GREY), GREYS),
+    "tensor 16 bits": (lambda _: torch.from_numpy(DEEP), DEEPS),
+}
+
+
+@pytest.mark.parametrize("kind", PICTURES)
+def test_pictures_of_any_kind(kind, folder, agent, zooming):
+    """At every door, with the values that they have."""
+    make, expected = PICTURES[kind]
+    image = as_image(make(folder))
+    assert image.dtype == expected.dtype
+    torch.testing.assert_close(image, expected, atol=1e-6, rtol=0)
+    own = expected.float()
+    as_agents = as_image(make(folder), like=torch.zeros(1))
+    assert as_agents.dtype == torch.float32
+    torch.testing.assert_close(as_agents, own, atol=1e-6, rtol=0)
+    with torch.inference_mode():
+        for look in (agent.search(make(folder), "cup", seed=3), agent.explore(make(folder), shifts=2, seed=3)):
+            assert look.grid.size == (44, 30)
+        views = agent.eye.open(make(folder)), agent.eye.open(own[None])
+        torch.testing.assert_close(views[0].bands.base, views[1].bands.base, atol=1e-6, rtol=0)
+        view = foveate(make(folder), (20, 12), sigma=8.0)
+        wanted = foveate(expected[None], torch.tensor([20.0, 12.0]), sigma=8.0)[0]
+        torch.testing.assert_close(view.reshape(wanted.shape), wanted, atol=1e-6, rtol=0)
+        seen = zooming.eye.open(make(folder)).picture.read((0, 0, 44, 30))
+        torch.testing.assert_close(seen / 255, own, atol=0.5 / 255 + 1e-6, rtol=0)
+
+
+MEAN, STD = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+NORMALISED = ((RGB.permute(1, 2, 0) - MEAN) / STD).permute(2, 0, 1)
+
+
+def closed():
+    image = Image.fromarray(PIXELS)
+    image.close()
+    return image
+
+
+NO_PICTURES = {
+    "0 to 255": (lambda _: RGB * 255, r"expected RGB in \[0, 1\], got numbers from 0 to 255; divide by 255"),
+    "array 0 to 255": (lambda _: PIXELS.astype(np.float32), "divide by 255"),
+    "0 to 65535": (lambda _: RGB * 65535, "divide by the value of white"),
+    "normalised": (lambda _: NORMALISED, r"undo the normalisation: image \* std \+ mean, for ImageNet's"),
+    "-1 to 1": (lambda _: RGB * 2 - 1, r"\(image \+ 1\) / 2"),
+    "resampled": (lambda _: RGB * 1.1, r"clamp to \[0, 1\]"),
+    "NaN": (lambda _: RGB.masked_fill(RGB > 0.9, torch.nan), "got NaN; replace"),
+    "infinity": (lambda _: RGB.masked_fill(RGB > 0.9, torch.inf), "to inf; replace"),
+    "batch": (lambda _: RGB.expand(4, -1, -1, -1), "expected one picture, got a batch of 4; give them one by one"),
+    "array batch": (lambda _: PIXELS[None].repeat(2, 0), "expected one picture, got a batch of 2"),
+    "two channels": (lambda _: RGB[:2], r"expected a picture of shape .*with 3 channels or 1, got shape \(2, 30, 44\)"),
+    "four channels": (lambda _: np.dstack([PIXELS, GREY]), "of four channels drop the last, or give the image"),
+    "row": (lambda _: RGB[0, 0], r"expected a picture of shape .*got shape \(44,\)"),
+    "five axes": (lambda _: RGB[None, None], r"got shape \(1, 1, 3, 30, 44\)"),
+    "empty": (lambda _: RGB[:, :0], "expected at least one pixel"),
+    "empty array": (lambda _: PIXELS[:, :0], "expected at least one pixel"),
+    "either way round": (lambda _: PIXELS[:3], r"got shape \(3, 44, 3\), which may be either"),
+    "long integers": (lambda _: PIXELS.astype(np.int64), r"expected bytes.*int64; make it uint8"),
+    "tensor of integers": (lambda _: (RGB * 255).int(), r"expected bytes.*torch\.int32; make bytes of it"),
+    "mask": (lambda _: RGB > 0.5, r"expected bytes.*torch\.bool"),
+    "complex": (lambda _: PIXELS * 1j, "expected bytes.*complex128"),
+    "objects": (lambda _: PIXELS.astype(object), "expected bytes.*object"),
+    "None": (lambda _: None, "expected a path.*got None, which is what OpenCV gives"),
+    "list": (lambda _: [RGB, RGB], "expected a path.*got a list; give pictures one by one"),
+    "file object": (lambda _: io.BytesIO(b"x"), "expected a path.*got BytesIO"),
+    "address": (lambda _: "https://example.org/cup.jpg", "expected a file on this machine.*download it first"),
+    "missing": (lambda folder: folder / "nosuch.jpg", r"nosuch\.jpg: no such file; check"),
+    "folder": (lambda folder: folder, "expected a file, got a folder"),
+    "text": (lambda folder: folder / "notes.txt", r"notes\.txt: not an image in a format that Pillow reads"),
+    "half a file": (lambda folder: folder / "cut.png", r"cut\.png: truncated, damaged"),
+    "half a file, opened": (
+        lambda folder: Image.open(io.BytesIO((folder / "cut.png").read_bytes())),
+        "image: truncated, damaged or closed",
+    ),
+    "closed": (lambda _: closed(), "image: truncated, damaged or closed .*open it again"),
+}
+
+
+@pytest.mark.parametrize("kind", NO_PICTURES)
+def test_what_is_no_picture(kind, folder, agent):
+    """Every door that takes one picture tells so in one line that begins with the argument, or the file."""
+    make, told = NO_PICTURES[kind]
+    for door in (as_image, lambda image: agent.search(image, "cup"), agent.explore):
+        with pytest.raises(SemfovError, match=told) as error:
+            door(make(folder))
+        assert str(error.value).startswith("image")
+        assert "\n" not in str(error.value)
+
+
+def test_batches_go_on_working():
+    """Foveation takes batches of any channels and range, keeps gradients, and compiles whole."""
+    batch = RGB[None].repeat(2, 1, 1, 1)
+    gaze = [[3, 4], [20, 12]]
+    wanted = foveate(batch, torch.tensor(gaze), sigma=6.0)
+    torch.testing.assert_close(foveate(batch, gaze, sigma=6.0), wanted)
+    torch.testing.assert_close(foveate(batch, np.array(gaze), sigma=6.0), wanted)
+    torch.testing.assert_close(foveate((batch * 255).byte(), gaze, sigma=6.0), wanted, atol=5e-3, rtol=0)
+    assert foveate(torch.randn(2, 5, 16, 16), (3, 4), sigma=6.0).shape == (2, 5, 16, 16)
+    several = foveate(RGB, gaze, sigma=6.0)
+    torch.testing.assert_close(several, wanted)
+    torch.testing.assert_close(foveate(RGB, tuple(gaze[1]), sigma=6.0), wanted[1])
+    image = RGB.clone().requires_grad_()
+    as_image(image, like=torch.zeros(1, dtype=torch.float64)).sum().backward()
+    torch.testing.assert_close(image.grad, torch.ones_like(image))
+    image.grad = None
+    foveate(image, (3, 4), sigma=6.0).sum().backward()
+    assert image.grad.abs().sum() > 0
+    torch.compiler.reset()
+    compiled = torch.compile(Foveation(6.0), fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(batch, torch.tensor(gaze).float()), wanted)
+
+
+@pytest.mark.parametrize("gaze", [(1, 2, 3), "ab", None, [[1, 2], [3]], (float("nan"), 2), 5, {}, []])
+def test_what_is_no_gaze(gaze, agent):
+    with pytest.raises(SemfovError, match=r"^gaze: expected "):
+        foveate(RGB, gaze, sigma=6.0)
+
+
+def test_fixations_as_people_write_them(agent):
+    view = agent.eye.open(PIXELS)
+    wanted = agent.eye.look(view, torch.tensor([[20.0, 12.0]])).boxes
+    for fixation in ((20, 12), [20.0, 12.0], np.array([20, 12]), [[20, 12]]):
+        assert torch.equal(agent.eye.look(view, fixation).boxes, wanted)
+    with pytest.raises(SemfovError, match=r"^fixations: expected"):
+        agent.eye.look(view, "here")
+
+
+NAMES = {
+    "Wine_Glass": "wine glass", "wineglass": "wine glass", "WINE-GLASS": "wine glass", "  wine  glasses ": "wine glass",
+    "Cups": "cup", "people": "person", "persons": "person", "knives": "knife", "buses": "bus", "mice": "mouse",
+    "Sandwiches": "sandwich", "ski": "skis", "sofa": "couch", "sofas": "couch", "TV monitor": "tv", "tvs": "tv",
+    "motorbikes": "motorcycle", "teddy-bears": "teddy bear", "hotdog": "hot dog", "scissor": "scissors",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "known"), NAMES.items())
+def test_names_as_people_write_them(name, known):
+    assert COCO_CLASSES[class_index(name, COCO_CLASSES) - 1] == known
+
+
+@pytest.mark.parametrize("index", [2, np.int64(2), np.uint8(2), torch.tensor(2)])
+def test_indices_of_any_kind(index, agent):
+    assert agent.search(PIXELS, index, shifts=0).target == 2
+
+
+SUGGESTED = {
+    "mug": "cup", "Mugs": "cup", "coffee cup": "cup", "phone": "cell phone", "smartphones": "cell phone",
+    "plane": "airplane", "fridge": "refrigerator", "puppy": "dog", "women": "person", "bike": "bicycle' or 'motorcycle",
+    "glass": "wine glass' or 'cup", "zebr": "zebra", "bycicle": "bicycle", "trafic light": "traffic light",
+    "monitor": "tv", "doughnuts": "donut", "giraff": "giraffe", "football": "sports ball",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "meant"), SUGGESTED.items())
+def test_other_names_are_told_the_class(name, meant):
+    with pytest.raises(SemfovError, match=rf"^target: unknown class '{name}'; did you mean '{re.escape(meant)}'"):
+        class_index(name, COCO_CLASSES, "target")
+
+
+def test_synonyms_lead_to_classes_and_stand_in_no_ones_way():
+    for word, classes in SYNONYMS.items():
+        assert set(classes) <= set(COCO_CLASSES)
+        assert word not in {name.replace(" ", "") for name in COCO_CLASSES}
+    with pytest.raises(SemfovError, match=r"^target: unknown class 'mug'; known: person, dog"):
+        class_index("mug", ("person", "dog"), "target")
+
+
+@pytest.mark.parametrize("target", ["", "qqqq", 0, 3, -1, True, 1.0, None, ["cup"], torch.ones(2)])
+def test_what_is_no_target(target, agent, zooming):
+    for search in (agent.search, zooming.search, zooming.find_all):
+        with pytest.raises(SemfovError, match=r"^target: (expected a name, or a whole number from 1 to 2|unknown)"):
+            search(PIXELS, target)
+
+
+ARGUMENTS = [
+    ("shifts", -1), ("shifts", 2.5), ("shifts", None), ("seed", -1), ("seed", 1.5), ("start", 12), ("start", -1),
+    ("start", "middle"), ("confirm", 50), ("confirm", -0.1), ("confirm", "high"), ("give_up", 2),
+    ("give_up", float("nan")), ("price", -1), ("price", "cheap"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value"), ARGUMENTS)
+def test_arguments_of_a_search(name, value, agent):
+    with pytest.raises(SemfovError, match=f"^{name}: expected "):
+        agent.search(PIXELS, "cup", **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: ActivePerception.recommended(sigma=50), "sigma: models are shipped for 100 pixels of 640, got 50"),
+        (lambda: ActivePerception.recommended(growth=3), "growth: models are shipped for 1 and 2, got 3"),
+        (lambda: ActivePerception.recommended(grid=(0, 10)), "grid: expected a whole number from 1"),
+        (lambda: ActivePerception.recommended(grid=10), r"grid: expected \(columns, rows\), got 10"),
+        (lambda: ActivePerception.recommended("yolo"), "unknown detector 'yolo'; did you mean 'yolov3'"),
+        (lambda: ActivePerception.recommended("mine.weights"), "detector: expected a cfg and its weights"),
+        (lambda: ActivePerception.published(sensor="gradual"), "unknown published sensor 'gradual'"),
+        (lambda: ActivePerception.raw(sensor="wide"), "unknown sensor 'wide'"),
+        (lambda: check_detector("nosuch.onnx"), r"detector: no such file: nosuch\.onnx; check the path"),
+    ],
+)
+def test_agents_that_cannot_be(call, told):
+    with pytest.raises(SemfovError, match=f"^{told}"):
+        call()
+
+
+@pytest.mark.parametrize("kind", [TargetEvidence, MapEvidence])
+def test_grids_that_learned_models_hold_for(kind):
+    """Half to twice the cells that they were fitted on."""
+    model = kind.from_pretrained("yolov3-tiny")
+    settings = {"detector": model.metadata["detector"], "sensor": model.metadata["sensor"]}
+    for grid in ((10, 10), (20, 20), (5, 5), (16, 12)):
+        model.check_compatible(settings, grid)
+    for grid in ((21, 10), (10, 4), (40, 40), (1, 1)):
+        with pytest.raises(SemfovError, match=r"^grid: the .* was fitted on 10 × 10 cells.*take grid=\(10, 10\)"):
+            model.check_compatible(settings, grid)
+
+
+COMMANDS = {
+    "--target zebr": "target: unknown class 'zebr'; did you mean 'zebra'?",
+    "--target mug": "target: unknown class 'mug'; did you mean 'cup'?",
+    "--target 1.5": "target: unknown class",
+    "--target cup --explore": "target: expected none with --explore, got cup",
+    "--target zebra": "target: the embedded scenes hold",
+    "nosuch.jpg --target cup": "photo: no such file or folder: nosuch.jpg; check the path",
+    "nosuch.mp4 --explore": "nosuch.mp4; check the path",
+    "FOLDER/empty --target cup": "photo: expected photographs (.jpg",
+    "FOLDER/notes.txt --target cup": "not an image in a format that Pillow reads",
+    "FOLDER/cut.png --explore": "truncated, damaged",
+    "FOLDER/photo.png --camera 0 --target cup": "photo: expected none with --camera",
+    "--camera -1 --target cup": "camera: expected a whole number from 0",
+    "--target cup --shifts -1": "shifts: expected a whole number from 0 to 10,000, got -1",
+    "--target cup --confirm 50": "confirm: expected a number from 0 to 1, got 50",
+    "--target cup --give_up -1": "give_up: expected a number from 0 to 1, got -1",
+    "--target cup --price -1": "price: expected a number from 0",
+    "--target cup --start -1": "start: expected a whole number from 0",
+    "--target cup --seed -1": "seed: expected a whole number from 0",
+    "--target cup --rate -1": "rate: expected a number from 0",
+    "--target cup --frames 0": "frames: expected a whole number from 1",
+    "--target cup --detector yolo": "unknown detector 'yolo'; did you mean 'yolov3'",
+    "--target cup --detector nosuch.onnx": "detector: no such file: nosuch.onnx; check the path",
+    "--target cup --detector my.weights": "detector: expected a cfg and its weights",
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_mistakes_on_the_command_line(command, folder, monkeypatch, capsys):
+    """Told in one line, before a detector is loaded."""
+    monkeypatch.setattr(program, "make_agent", lambda config: pytest.fail("the agent was loaded"))
+    assert program.main(command.replace("FOLDER", str(folder)).split()) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert COMMANDS[command] in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["--nosuch", "--shifts many --target cup", "--sensor wide", "--agent best", "a b"])
+def test_usage_on_the_command_line(command, monkeypatch, capsys):
+    monkeypatch.setattr(program, "make_agent", lambda config: pytest.fail("the agent was loaded"))
+    with pytest.raises(SystemExit) as stopped:
+        program.main(command.split())
+    assert stopped.value.code == 2
+    assert command.split()[0].strip("-") in capsys.readouterr().err.replace("Unrecognized arguments: b", "a b")
+
+
+def test_classes_are_listed_without_loading_anything(monkeypatch, capsys):
+    monkeypatch.setattr(program, "make_agent", lambda config: pytest.fail("the agent was loaded"))
+    assert program.main([]) == 0
+    assert "wine glass" in capsys.readouterr().out
