@@ -140,7 +140,7 @@ def test_the_folder_says_what_it_holds(home):
         assert "held-out photographs" in part.why, (name, part.why)
         assert (part.file is None) == (name == "tempering")
     text = (home / "models/report.md").read_text()
-    assert "20 photographs, 5 of them held out (every 4th); 3 classes; 4 × 4 cells" in text
+    assert "20 photographs, 5 of them held out (one in 4); 3 classes; 4 × 4 cells" in text
     for name in ("reliability.png", "search.png", "explore.png"):
         assert f"({name})" in text
         with Image.open(home / "models" / name) as picture:
