@@ -26,6 +26,7 @@ from semfov.experiments.config import (
     SensorConfig,
 )
 from semfov.experiments.decisions import DecisionConfig, DecisionRun
+from semfov.experiments.fitted import with_models
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.run import finish
@@ -54,6 +55,7 @@ class DecideConfig(Settings):
         out: folder for table and records.
         cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
         workers: processes (None: one for each CPU core).
+        models: folder of `train.fit_detector` that names detector, sensor, grid and learned evidence.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -67,12 +69,13 @@ class DecideConfig(Settings):
     out: Path = Path("runs/decide")
     cache: Path | None = None
     workers: Workers | None = None
+    models: Path | None = None
 
 
 def search_and_decide(config: DecideConfig) -> None:
     """Run the searches and write their table and records."""
     settings = {each.name: getattr(config, each.name) for each in fields(config)}
-    run = DecisionRun(DecisionConfig(**settings))
+    run = DecisionRun(with_models(DecisionConfig(**settings)))
     finish(run, "deciding")
     if rank() > 0:
         return

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
-from pathlib import Path
 from typing import Any, Self
 
 import torch
@@ -27,11 +26,10 @@ from semfov.gaze.acquisition import ExpectedGain
 from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.gaze.policies import KL, Closer, NonPredictive, Policy, Predictive, Random
 from semfov.io.compatibility import check_shipped_sensor, learned_for
-from semfov.io.manifest import is_folder_of_models
 from semfov.io.schema import is_number
 from semfov.io.shipped import shipped_model
 from semfov.live import RATE, LivePerception
-from semfov.model_folder import ModelFolder
+from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
 from semfov.scanpath import Ending, Scanpath, trace
 from semfov.sensor.foveation import Foveation
@@ -149,8 +147,8 @@ class ActivePerception(nn.Module):
                 that makes one).
             DataError: a file is missing, damaged, or another than the models were fitted to.
         """
-        if is_folder_of_models(name) or Path(name).is_dir():
-            folder = ModelFolder(name)
+        folder = open_folder(name)
+        if folder is not None:
             eye = folder.eye(**options)
             agent = cls(eye, folder.search(), folder.explore(), grid=folder.manifest.grid)
             return agent.eval().requires_grad_(False)

@@ -13,7 +13,9 @@ from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
-from semfov.errors import DataError, lookup
+from semfov.detection.torchvision import PREFIX
+from semfov.detection.weights import WEIGHTS
+from semfov.errors import DataError, InputError, lookup
 from semfov.eye import Eye
 from semfov.gaze.policies import Closer, NonPredictive, Policy, Random
 from semfov.io.compatibility import NETWORKS
@@ -31,6 +33,24 @@ KINDS: dict[str, type[Model]] = {
     "map": MapEvidence,
 }
 """Parts that are models."""
+
+
+def open_folder(name: str | PathLike[str]) -> ModelFolder | None:
+    """The folder of models of this name; None where a detector has the name.
+
+    Raises:
+        InputError: it is neither.
+        DataError: the folder has no models, or they are damaged.
+    """
+    path, text = Path(name), os.fspath(name)
+    if path.is_dir():
+        return ModelFolder(path)
+    if text in WEIGHTS or path.suffix or text.startswith(PREFIX):
+        return None
+    raise InputError(
+        f"name: expected a folder of models, or a detector that they are shipped for, got {text!r}; make a folder by "
+        f"`{fit_command(out=text)}` or semfov.fit_detector"
+    )
 
 
 class ModelFolder:

@@ -83,7 +83,7 @@ class CocoScenes:
         packed = _Packed(coco, _match(coco, self.classes, annotations), drop_crowds=crowd == "drop")
         self.repairs = packed.repairs
         if self.repairs:
-            _log.warning("%s: %s", annotations, ", ".join(f"{what}: {n}" for what, n in self.repairs.items()))
+            _log.warning("%s: %s", annotations, _told(self.repairs))
 
         self._packed = packed
         self._rows: list[int] = []
@@ -135,6 +135,13 @@ class CocoScenes:
         except OSError as error:
             raise DataError(f"image {path}: cannot be read ({error.strerror}); check data.root") from None
         return _sha256(content, self._packed.sizes[self._rows[index]])
+
+
+def _told(repairs: Counter[str], most: int = 8) -> str:
+    """Repairs in words, the most frequent ones one by one."""
+    first = ", ".join(f"{what}: {n}" for what, n in repairs.most_common(most))
+    rest = [n for _, n in repairs.most_common()[most:]]
+    return first + (f", and {len(rest)} more kinds of boxes cut or dropped: {sum(rest)}" if rest else "")
 
 
 def _known_ids(ids: Collection[int | str], known: Sequence[Any], annotations: str | PathLike[str]) -> set[str]:

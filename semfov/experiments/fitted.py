@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import TypeVar
 
 from semfov.errors import InputError, check
-from semfov.experiments.config import DetectorConfig, ExploreConfig, PolicyConfig, RunConfig, SearchConfig, SensorConfig
+from semfov.experiments.config import DetectorConfig, ExploreConfig, PolicyConfig, RunConfig, SensorConfig
 from semfov.experiments.presets import TARGET_EVIDENCE as EVIDENCE
 from semfov.experiments.presets import Choice, resolve
 from semfov.gaze.policies import POLICIES
 from semfov.model_folder import ModelFolder
 
-Config = TypeVar("Config", SearchConfig, ExploreConfig)
+Config = TypeVar("Config", bound=RunConfig)
 
 
 def with_models(config: Config) -> Config:

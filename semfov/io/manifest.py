@@ -153,11 +153,6 @@ class Manifest:
 _AGAIN = "run python -m train.fit_detector again, or copy the folder again"
 
 
-def is_folder_of_models(path: str | PathLike[str]) -> bool:
-    """Whether this is a folder with a record."""
-    return (Path(path) / FILE).is_file()
-
-
 def place_of(file: str | PathLike[str], folder: str | PathLike[str]) -> dict[str, str]:
     """Where a file lies, from a folder and for itself."""
     absolute = Path(file).resolve()

@@ -1,7 +1,5 @@
 """Fitting everything that the agent needs to a detector of one's own."""
 
-from __future__ import annotations
-
 import logging
 import time
 from dataclasses import asdict, fields, replace

@@ -31,6 +31,7 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.detector_words import curves_figure, in_words, mean_percent, section, share
 from semfov.training.evidence import fit_evidence, judge
+from semfov.training.evidence import report as judged_report
 from semfov.training.evidence_examples import LookingRun, make_examples
 from semfov.training.held_out import Difference, Rule, by_detection, decisions, explore_curves, search_curves
 from semfov.training.map_evidence import fit_map_evidence
@@ -306,8 +307,7 @@ class Workshop:
                     "as found, and never give up.",
                     told,
                 ),
-                section("The belief after some looks, in searches that it leads:", []),
-                fit.report,
+                judged_report(fit.judged, thresholds, fit.trained, fit.held_out),
             ]
         )
         figure = curves_figure(curves, "search")

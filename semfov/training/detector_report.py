@@ -40,7 +40,7 @@ def report(config: FitDetectorConfig, run: LookingRun, parts: dict[str, Fitted],
     lines = [
         f"# Models of {run.eye.detector.name}",
         "",
-        f"{photographs} photographs, {len(held_out)} of them held out (every {holdout}th); "
+        f"{photographs} photographs, {len(held_out)} of them held out (one in {holdout}); "
         f"{len(counts)} classes; {config.columns} × {config.rows} cells; "
         f"sensor {config.sensor.name}; {seconds / 60:.1f} minutes in this run.",
         "",

@@ -101,7 +101,8 @@ def fit_evidence(config: FitSearchConfig, run: LookingRun) -> Fit[TargetEvidence
     metadata = {**run.eye.settings(), **training_of(config, run.scenes)}
     model = train(config, examples[~held_out], grid, metadata, len(run.scenes.classes) + 1)
     judged, model.thresholds = judge(config, model, examples[held_out], grid)
-    return Fit(model, judged, report(judged, model.thresholds, int((~held_out).sum()), int(held_out.sum())))
+    counts = int((~held_out).sum()), int(held_out.sum())
+    return Fit(model, judged, *counts, report(judged, model.thresholds, *counts))
 
 
 def train(

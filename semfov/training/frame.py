@@ -23,11 +23,15 @@ class Fit(Generic[Model]):
     Attributes:
         model: fitted to the photographs that were not held out.
         judged: figures on those that were, after some looks.
+        trained: examples that it was trained on.
+        held_out: examples that it was judged on.
         report: the figures as Markdown.
     """
 
     model: Model
     judged: list[dict[str, float]]
+    trained: int
+    held_out: int
     report: str
 
 

@@ -98,7 +98,8 @@ def fit_map_evidence(config: FitMapConfig, run: LookingRun) -> Fit[MapEvidence]:
     train(config, model, examples[~held_out], grid)
     train_gain(config, model, examples[~held_out], grid)
     judged = judge(config, model.eval(), examples[held_out], grid)
-    return Fit(model, judged, report(judged, int((~held_out).sum()), int(held_out.sum())))
+    counts = int((~held_out).sum()), int(held_out.sum())
+    return Fit(model, judged, *counts, report(judged, *counts))
 
 
 def frequencies(run: LookingRun, holdout: int) -> Tensor:

@@ -16,9 +16,11 @@ from eval.demo import main as demo
 from eval.search import main as search
 from semfov import ActivePerception, DataError, InputError
 from semfov.belief.observers import LearnedMap, Semantic, Target
+from semfov.data.scenes import EmbeddedScenes
 from semfov.experiments.config import DataConfig, DetectorConfig, ExploreConfig, PolicyConfig, SearchConfig
 from semfov.experiments.fitted import with_models
 from semfov.experiments.progress import Whole, task_bar, track
+from semfov.experiments.search_protocol import choose_classes
 from semfov.gaze.policies import Closer, Random
 from semfov.io.files import sha256
 from semfov.io.manifest import Manifest, Part
@@ -26,6 +28,7 @@ from semfov.model_folder import ModelFolder
 from semfov.training import detector_parts
 from semfov.training.detector_report import thin_classes
 from semfov.training.detector_settings import FitDetectorConfig
+from semfov.training.evidence import FitSearchConfig, choose_thresholds
 from semfov.training.held_out import Difference
 from train.fit_detector import main
 
@@ -140,7 +143,7 @@ def test_the_folder_says_what_it_holds(home):
         assert "held-out photographs" in part.why, (name, part.why)
         assert (part.file is None) == (name == "tempering")
     text = (home / "models/report.md").read_text()
-    assert "20 photographs, 5 of them held out (every 4th); 3 classes; 4 × 4 cells" in text
+    assert "20 photographs, 5 of them held out (one in 4); 3 classes; 4 × 4 cells" in text
     for name in ("reliability.png", "search.png", "explore.png"):
         assert f"({name})" in text
         with Image.open(home / "models" / name) as picture:
@@ -318,6 +321,13 @@ def test_a_folder_that_is_none(tmp_path):
         ActivePerception.from_pretrained(tmp_path)
 
 
+def test_a_name_of_nothing():
+    with pytest.raises(
+        InputError, match=r"got 'mymodels'; make a folder by `python -m train\.fit_detector .*mymodels`"
+    ):
+        ActivePerception.from_pretrained("mymodels")
+
+
 def test_errors_name_the_command(home):
     network = str(home / "colours.onnx")
     for make in (ActivePerception.recommended, ActivePerception.from_pretrained, ActivePerception.published):
@@ -354,6 +364,27 @@ def test_a_model_is_asked_for(capsys, tmp_path):
 def test_settings_of_the_call_are_named():
     with pytest.raises(InputError, match="got 'clases'"):
         semfov.fit_detector("mine.onnx", "photographs", "instances.json", clases=["cat"])
+
+
+def test_classes_that_are_not_there(home):
+    """So many as are asked for, also of a photograph without a target."""
+    scenes = EmbeddedScenes(("person", "cat", "cup", "zebra"), count=4)
+    for index in range(4):
+        annotation = scenes.annotation(index)
+        held = set(annotation.labels.tolist())
+        for area in (0.0, 1.0):
+            chosen = choose_classes(scenes, index, annotation, 1, area, 0, 3)
+            absent = [target for target in chosen if target not in held]
+            assert len(absent) == len(set(absent)) == min(3, 4 - len(held))
+            assert len(chosen) - len(absent) == (1 if area else 0)
+
+
+def test_the_surest_threshold_is_the_highest():
+    there, looked = torch.tensor([True, False]), torch.ones(1, 2, dtype=torch.bool)
+    anywhere, left = torch.tensor([[0.95, 0.99]]), torch.tensor([[0.4, 0.0]])
+    assert choose_thresholds(FitSearchConfig(), anywhere, looked, left, there).confirm == 1
+    thresholds = choose_thresholds(FitSearchConfig(surest=0.9), anywhere, looked, left, there)
+    assert thresholds.confirm == 0.9
 
 
 def test_thin_classes_are_told():
