@@ -21,8 +21,8 @@ Table = Mapping[tuple[str, str], Scored]
 
 GROUPS = {
     "alone": "each map alone: its weight (an inverse temperature) and its blur are fitted",
-    "with habits": "to each map are added, with fitted weights, the logarithms of a centre bias and of how far eyes jump "
-    "from where they are, and the cells that were visited",
+    "with habits": "to each map are added, with fitted weights, the logarithms of a centre bias and of how far eyes "
+    "jump, and the cells that were visited",
 }
 FLOORS = {"alone": "centre bias", "with habits": "nearby"}
 """Row without any map, by group."""
