@@ -61,10 +61,10 @@ def in_cells(search: Fixations, grid: Grid) -> Array:
     """Columns and rows of the cells that were fixated, `(n, 2)`, neighbours merged, up to the target.
 
     One fixation after another in the same cell is one (`merge_close`), and what comes after the first in a cell of the
-    target is left out.
+    target is left out. Coordinates count from the left and the top edge of the screen, as they do it.
     """
-    cell = grid.cell_of(torch.from_numpy(search.points)).numpy()
-    path = merge_close(np.stack([cell % grid.columns, cell // grid.columns], 1), (1, 1))
+    step = np.array(search.size) / (grid.columns, grid.rows)
+    path = merge_close(np.clip(np.floor(search.points / step), 0, (grid.columns - 1, grid.rows - 1)), (1, 1))
     left, right, top, bottom = goal_cells(search, grid)
     x, y = path.T
     on = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)

@@ -91,11 +91,11 @@ class ViewingConfig(Settings):
         "surprise-calibrated",
         "closer-look-learned",
         "expected-gain-learned",
-        "objects-learned",
+        "objects-calibrated",
     )
     models: tuple[SaliencyModel, ...] = ("vocus2", "itti-koch")
     swap: bool = False
-    sequences: tuple[str, ...] = ("random", "centre bias", "nearby", "vocus2", "closer-look-learned", "landing")
+    sequences: tuple[str, ...] = ("random", "centre bias", "nearby", "vocus2", "kl-calibrated", "landing")
     bandwidth: Positive = 0.08
     longest: Annotated[int, Range(2, 1000)] = 20
     out: Path = Path("runs/human_viewing")

@@ -74,9 +74,7 @@ class ViewingRun(Run):
         return [self.config.density.columns, self.config.density.rows]
 
     def _what(self) -> dict[str, object]:
-        """What maps along people's scanpaths depend on, whatever the policy."""
-        paths = [[name, [each.points.tolist() for each in people]] for name, people in self.people.items()]
-        seen = hashlib.sha256(json.dumps(paths).encode()).hexdigest()
+        """What maps along people's scanpaths depend on, whatever picture and policy."""
         grid = [self.config.belief.columns, self.config.belief.rows]
         fitted = {
             name: None if model is None else checksum(model.state_dict())
@@ -84,7 +82,12 @@ class ViewingRun(Run):
         }
         belief = {name: value for name, value in asdict(self.config.belief).items() if not name.endswith("model")}
         eye = {"eye": self.eye.settings(), "grid": grid, "belief": belief, "fitted": fitted}
-        return {**eye, "people": seen, "longest": self.config.longest}
+        return {**eye, "longest": self.config.longest}
+
+    def _followed(self, index: int) -> str:
+        """sha256 of a picture and of the scanpaths in it."""
+        paths = [each.points.tolist() for each in self.people[str(self.scenes.ids[index])]]
+        return hashlib.sha256(json.dumps([self.digest(index), paths]).encode()).hexdigest()
 
     @property
     def names(self) -> list[str]:
@@ -129,7 +132,7 @@ class ViewingRun(Run):
 
         Policies that observe alike are followed together.
         """
-        digest = self.digest(index)
+        digest = self._followed(index)
         kept = self.map_stores[name].read(digest) if self.config.store else None
         if kept is not None:
             return kept["values"]
