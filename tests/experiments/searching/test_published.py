@@ -60,10 +60,12 @@ def similarities(pairs):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["nnIBS", "elm_final"])
 def test_multimatch(searches, name):
-    """People are averaged over the pictures for which the model has a similarity: those of nnIBS give what is published."""
+    """Means over the pictures for which there are similarities both of the model to people and among people."""
     people = by_picture(searches["humans"])
     model = similarities((a, b) for a in searches[name] for b in people[a.picture])
-    np.testing.assert_allclose(np.mean(list(model.values()), axis=0), MULTIMATCH[name], atol=0.005)
+    themselves = similarities(pair for picture in model for pair in combinations(people[picture], 2))
+    rows = [model[picture] for picture in themselves]
+    np.testing.assert_allclose(np.mean(rows, axis=0), MULTIMATCH[name], atol=0.001)
     if name == "nnIBS":
-        themselves = similarities(pair for picture in model for pair in combinations(people[picture], 2))
-        np.testing.assert_allclose(np.mean(list(themselves.values()), axis=0), MULTIMATCH["humans"], atol=0.005)
+        # Of the figures for people, which differ with the model, those beside nnIBS are published.
+        np.testing.assert_allclose(np.mean(list(themselves.values()), axis=0), MULTIMATCH["humans"], atol=0.001)
