@@ -23,7 +23,7 @@ from semfov.experiments.summary import gather
 
 Array = NDArray[np.float64]
 
-RANDOM, CENTRE = "random", "centre bias"
+RANDOM, CENTRE = "random draws", "centre draws"
 
 
 def compare(config: PeopleSearchConfig) -> None:

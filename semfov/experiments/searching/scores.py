@@ -56,14 +56,12 @@ class Beside:
     def mean(self, figure: int) -> tuple[float, float]:
         """Mean over pictures of a figure of `alike`, and its standard error."""
         values = np.array([each[figure] for each in self.alike.values()])
-        values = values[np.isfinite(values)]
-        return float(values.mean()), float(standard_error(values))
+        return _mean_and_error(values[np.isfinite(values)])
 
     @property
     def multimatch(self) -> tuple[float, float]:
         """Mean of MultiMatch's four, and its standard error over pictures."""
-        values = np.array([each[:4].mean() for each in self.alike.values() if np.isfinite(each[0])])
-        return float(values.mean()), float(standard_error(values))
+        return _mean_and_error(np.array([each[:4].mean() for each in self.alike.values() if np.isfinite(each[0])]))
 
 
 class People:
@@ -107,10 +105,7 @@ class People:
             (performance_area(curve), float(standard_error(np.array([np.mean(v) for v in areas.values()])))),
             (tfp_auc(found.tolist(), [each.target for each in searches]), self._error(found, searches)),
             probability_mismatch(by_category, self.curve),
-            (
-                float(ratio.mean()) if len(ratio) else float("nan"),
-                float(standard_error(ratio)) if len(ratio) else float("nan"),
-            ),
+            _mean_and_error(ratio),
             self._alike(searches),
         )
 
@@ -159,3 +154,8 @@ class People:
             drawn = table[generator.integers(0, len(table), (self.bootstrap, len(table)))].sum(1)
             sums += drawn[:, 0] / drawn[:, 1]
         return float((sums / len(categories)).std(ddof=1))
+
+
+def _mean_and_error(values: Array) -> tuple[float, float]:
+    """Mean and standard error, NaN where there are too few values."""
+    return (float(values.mean()), float(standard_error(values))) if len(values) else (float("nan"), float("nan"))

@@ -39,7 +39,7 @@ def report(run: ViewingRun, scored: Table, sequences: Mapping[str, Array]) -> No
         "weights.csv": weights_csv(scored),
         "sequences.csv": sequences_csv(sequences),
     }
-    written = write_files(run, "eval.human viewing", tables, records, seconds)
+    written = write_files(run, "eval.human", tables, records, seconds)
     written.append(draw_shifts(run, scored))
     announce(summary, written)
 
@@ -140,10 +140,10 @@ def draw_shifts(run: ViewingRun, scored: Table) -> Path:
         each = scored.get((name, "with habits"))
         if each is None:
             continue
-        values = each.shifts[..., 0]
-        known = np.isfinite(values)
-        curves[name] = np.nanmean(values, axis=0)
-        errors[name] = np.nanstd(values, axis=0, ddof=1) / np.sqrt(known.sum(0))
+        columns = [column[np.isfinite(column)] for column in each.shifts[..., 0].T]
+        columns = [column for column in columns if len(column)]
+        curves[name] = np.array([column.mean() for column in columns])
+        errors[name] = np.array([standard_error(column) for column in columns])
     figure = plot_by_shift(curves, errors, label="conditional NSS", title=f"Free viewing, with habits\n{sensing(run)}")
     return save_figure(figure, run.config.out / "nss_by_shift.png")
 
