@@ -34,7 +34,7 @@ def viewing(config: ViewingConfig) -> None:
     if rank() == 0:
         fitted, reported = halves(run)
         scored = score_all(run, fitted, reported)
-        report(run, scored, score_sequences(scored, reported))
+        report(run, scored, score_sequences(scored, reported), reported)
 
 
 JOBS: dict[str, tuple[Callable[[Any], None], type[Any]]] = {

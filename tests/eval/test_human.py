@@ -42,6 +42,7 @@ def pictures(tmp_path_factory):
     for who in ("a", "b"):
         write_ruarte(folder / "people" / f"{who}.json", searched[who])
     write_table(folder / "model.csv", searched["model"])
+    write_table(folder / "others.csv", [each for each in viewed if each.subject == "2"])
     return folder
 
 
@@ -51,7 +52,7 @@ def viewing(folder: Path, out: str, *more: str) -> list[str]:
         "--belief.columns", "4", "--belief.rows", "3", "--density.columns", "8", "--density.rows", "6",
         "--density.blurs", "[0, 1]", "--policies", "[kl-calibrated, objects-raw]", "--workers", "1",
         "--sequences", "[random, vocus2, landing, kl-calibrated]", "--cache", str(folder / "cache"),
-        "--out", str(folder / out), *more,
+        "--files", f"[{folder / 'others.csv'}]", "--out", str(folder / out), *more,
     ]  # fmt: skip
 
 
@@ -94,12 +95,13 @@ def test_more_terms_fit_the_fitted_half_no_worse(finished):
 def test_figures_are_of_the_half_that_was_not_fitted(finished):
     told = {row["picture"] for row in rows(finished / "pictures.csv")}
     assert told == {"1.png", "3.png"}
-    assert len({row["row"] for row in rows(finished / "sequences.csv")}) == 5
+    assert len({row["row"] for row in rows(finished / "sequences.csv")}) == 6
     summary = (finished / "summary.md").read_text()
     assert "2 pictures" in summary
     manifest = json.loads((finished / "manifest.json").read_text())
     assert manifest["command"][:3] == ["python", "-m", "eval.human"]
     assert (finished / "nss_by_shift.png").stat().st_size > 5000
+    assert {path.name for path in finished.glob("scanpaths_*.png")} == {"scanpaths_1.png", "scanpaths_3.png"}
 
 
 @pytest.mark.weights

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.experiments.summary import announce, gather, save_figure, sensing, table, write_files
-from semfov.experiments.viewing.rows import PEOPLE
+from semfov.experiments.viewing.rows import PEOPLE, Half
 from semfov.experiments.viewing.run import ViewingRun
 from semfov.experiments.viewing.scores import FIGURES, Scored
+from semfov.experiments.viewing.sequences import drawn_scanpaths
+from semfov.io.files import clean
 from semfov.metrics.averages import standard_error
 
 Array = NDArray[np.float64]
@@ -28,7 +30,7 @@ FLOORS = {"alone": "centre bias", "with habits": "nearby"}
 """Row without any map, by group."""
 
 
-def report(run: ViewingRun, scored: Table, sequences: Mapping[str, Array]) -> None:
+def report(run: ViewingRun, scored: Table, sequences: Mapping[str, Array], reported: Half) -> None:
     """Write everything and print the tables."""
     records, seconds = gather(run)
     summary = summary_markdown(run, scored, sequences)
@@ -41,6 +43,7 @@ def report(run: ViewingRun, scored: Table, sequences: Mapping[str, Array]) -> No
     }
     written = write_files(run, "eval.human", tables, records, seconds)
     written.append(draw_shifts(run, scored))
+    written += draw_scanpaths(run, scored, reported)
     announce(summary, written)
 
 
@@ -146,6 +149,21 @@ def draw_shifts(run: ViewingRun, scored: Table) -> Path:
         errors[name] = np.array([standard_error(column) for column in columns])
     figure = plot_by_shift(curves, errors, label="conditional NSS", title=f"Free viewing, with habits\n{sensing(run)}")
     return save_figure(figure, run.config.out / "nss_by_shift.png")
+
+
+def draw_scanpaths(run: ViewingRun, scored: Table, reported: Half) -> list[Path]:
+    """Scanpaths of four people, of `landing` and of `nearby` over the same pictures."""
+    from semfov.viz.human import plot_scanpaths_beside
+
+    written = []
+    for place, index in enumerate(reported.pictures[: run.config.drawings]):
+        name = str(run.scenes.ids[index])
+        shown = {"people": [each.points[: run.config.longest] for each in run.people[name]]}
+        shown |= {each: drawn_scanpaths(scored[each, "with habits"], reported, place) for each in ("landing", "nearby")}
+        few = {name: paths[:4] for name, paths in shown.items()}
+        figure = plot_scanpaths_beside(run.scenes[index].image, few)
+        written.append(save_figure(figure, run.config.out / f"scanpaths_{clean(Path(name).stem)}.png"))
+    return written
 
 
 def _figure(values: Array) -> str:
