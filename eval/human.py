@@ -1,4 +1,8 @@
-"""Beside people: how well models tell where people look, and how soon they find what people search for.
+"""Beside people: how soon models find what people search for, and how well they tell where people look.
+
+Visual search: files of scanpaths, floors, and our policies on those of the pictures that are at hand:
+
+    python -m eval.human search --people human_scanpaths --files "[elm.json, nnIBS.json]" --pictures "[val2017]"
 
 Free viewing: exploration policies, saliency, centre bias and random gaze, held against people fixation by fixation:
 
@@ -8,11 +12,14 @@ A run that was stopped goes on where it was when the same command is given again
 """
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from semfov.experiments.command import run_command
 from semfov.experiments.parallel import rank
 from semfov.experiments.run import finish
+from semfov.experiments.searching.compare import compare
+from semfov.experiments.searching.config import PeopleSearchConfig
 from semfov.experiments.viewing.config import ViewingConfig
 from semfov.experiments.viewing.report import report
 from semfov.experiments.viewing.run import ViewingRun
@@ -27,10 +34,13 @@ def viewing(config: ViewingConfig) -> None:
     if rank() == 0:
         fitted, reported = halves(run)
         scored = score_all(run, fitted, reported)
-        report(run, scored, score_sequences(scored, reported))
+        report(run, scored, score_sequences(scored, reported), reported)
 
 
-JOBS = {"viewing": (viewing, ViewingConfig)}
+JOBS: dict[str, tuple[Callable[[Any], None], type[Any]]] = {
+    "search": (compare, PeopleSearchConfig),
+    "viewing": (viewing, ViewingConfig),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -10,6 +10,7 @@ from torch import Tensor
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Observer
+from semfov.data.fixations import Fixations
 from semfov.decision import Decision
 from semfov.detection.detections import Detections
 from semfov.episode import Step
@@ -65,6 +66,23 @@ class Scanpath:
     def shifts(self) -> int:
         """Number of gaze shifts (saccades): fixations after the start."""
         return len(self) - 1
+
+    def as_fixations(self, picture: str, subject: str = "semfov") -> Fixations:
+        """The fixations alone, as people's are kept, for `semfov.data.fixations` to write and metrics to compare.
+
+        Args:
+            picture: its name.
+            subject: who looked.
+        """
+        width, height = (int(side) for side in self.grid.extent)
+        return Fixations(
+            picture,
+            subject,
+            self.fixations.detach().double().cpu().numpy(),
+            (width, height),
+            target=None if self.target is None else self.classes[self.target],
+            found=None if self.target is None else self.found,
+        )
 
 
 def trace(

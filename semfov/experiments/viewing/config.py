@@ -15,7 +15,7 @@ from semfov.experiments.config import (
     SaliencyModel,
     SensorConfig,
 )
-from semfov.experiments.settings import Count, Positive, Range, Seed, Settings, Side, Workers
+from semfov.experiments.settings import Count, Positive, Range, Seed, Settings, Side, Whole, Workers
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,8 @@ class ViewingConfig(Settings):
         models: saliency models.
         swap: report on the half of the pictures that is fitted on otherwise, and fit on the other.
         sequences: rows whose scanpaths are drawn and compared with people's.
+        files: scanpaths of other models in these pictures, as tables (`.csv`), compared with people's, too.
+        drawings: pictures in which scanpaths of people and of `landing` are drawn side by side.
         bandwidth: of the clusters of fixations that sequences are spelled by, in longer sides of the picture.
         longest: fixations of a scanpath that count.
         out: folder for tables, figures and the manifest.
@@ -91,11 +93,13 @@ class ViewingConfig(Settings):
         "surprise-calibrated",
         "closer-look-learned",
         "expected-gain-learned",
-        "objects-learned",
+        "objects-calibrated",
     )
     models: tuple[SaliencyModel, ...] = ("vocus2", "itti-koch")
     swap: bool = False
-    sequences: tuple[str, ...] = ("random", "centre bias", "nearby", "vocus2", "closer-look-learned", "landing")
+    sequences: tuple[str, ...] = ("random", "centre bias", "nearby", "vocus2", "kl-calibrated", "landing")
+    files: tuple[Path, ...] = ()
+    drawings: Whole = 2
     bandwidth: Positive = 0.08
     longest: Annotated[int, Range(2, 1000)] = 20
     out: Path = Path("runs/human_viewing")

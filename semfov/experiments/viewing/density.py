@@ -63,7 +63,7 @@ def fit(names: Sequence[str], terms: Sequence[Tensor], bins: Tensor, blur: float
     """
     check(len(names) == len(terms) > 0, "terms", f"{len(names)} maps, at least one", len(terms))
     weights = torch.zeros(len(terms), requires_grad=True)
-    optimiser = torch.optim.LBFGS([weights], max_iter=60, line_search_fn="strong_wolfe")
+    optimiser = torch.optim.LBFGS([weights], max_iter=30, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
         optimiser.zero_grad()

@@ -10,10 +10,12 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Look, Observer
+from semfov.belief.observers.base import Gatherer
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Stopwatch, rollout
 from semfov.experiments.candidates import Candidate
 from semfov.experiments.store import SceneStore, looks_digest
+from semfov.gaze.acquisition import Uniform
 from semfov.gaze.choice import Given
 from semfov.io.schema import Field, Schema
 
@@ -57,23 +59,27 @@ class FineLooks(Looks):
         return Sight(self._weighed[1][row], lambda: self.detections[row], Stopwatch().seconds)
 
 
-def follow(looks: Looks, candidate: Candidate, scanpaths: Sequence[Tensor]) -> Tensor:
+def follow(looks: Looks, candidates: Mapping[str, Candidate], scanpaths: Sequence[Tensor]) -> dict[str, Tensor]:
     """Values `(E, X·Y)` of the cells after each fixation but the last of each scanpath, scanpath by scanpath.
+
+    Where the gaze goes is given, so that policies which observe alike believe alike: one rollout serves all of them.
 
     Args:
         looks: what is seen.
-        candidate: observer and policy.
+        candidates: policies by name, whose observers are made alike.
         scanpaths: for each `(n,)`, cells that are fixated.
     """
     longest = max(map(len, scanpaths))
     padded = torch.stack([torch.cat([path, path[-1:].expand(longest - len(path))]) for path in scanpaths])
-    steps = rollout(
-        looks,
-        candidate.observer,
-        lambda _, cell: candidate.acquisition(None, looks.grid, cell),
-        padded[:, 0],
-        Given(padded),
-        most=max(longest - 1, 1),
-    )
-    table = torch.stack([step.values for step in steps], 1)
-    return torch.cat([table[person, : len(path) - 1] for person, path in enumerate(scanpaths)])
+    observer = next(iter(candidates.values())).observer
+    if isinstance(observer, Gatherer):
+        # The batch is always that of all people, and so are the bits.
+        observer.together = True
+    tables: dict[str, list[Tensor]] = {name: [] for name in candidates}
+    most = max(longest - 1, 1)
+    for step in rollout(looks, observer, Uniform(), padded[:, 0], Given(padded), most=most):
+        for name, candidate in candidates.items():
+            tables[name].append(candidate.acquisition(None, looks.grid, step.cell)(step.belief, step.visited))
+    rows = [(person, len(path) - 1) for person, path in enumerate(scanpaths)]
+    stacked = {name: torch.stack(values, 1) for name, values in tables.items()}
+    return {name: torch.cat([table[person, :count] for person, count in rows]) for name, table in stacked.items()}

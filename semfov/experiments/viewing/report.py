@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.experiments.summary import announce, gather, save_figure, sensing, table, write_files
-from semfov.experiments.viewing.rows import PEOPLE
+from semfov.experiments.viewing.rows import PEOPLE, Half
 from semfov.experiments.viewing.run import ViewingRun
 from semfov.experiments.viewing.scores import FIGURES, Scored
+from semfov.experiments.viewing.sequences import drawn_scanpaths
+from semfov.io.files import clean
 from semfov.metrics.averages import standard_error
 
 Array = NDArray[np.float64]
@@ -22,13 +24,13 @@ Table = Mapping[tuple[str, str], Scored]
 GROUPS = {
     "alone": "each map alone: its weight (an inverse temperature) and its blur are fitted",
     "with habits": "to each map are added, with fitted weights, the logarithms of a centre bias and of how far eyes "
-    "jump from where they are, and the cells that were visited",
+    "jump, and the cells that were visited",
 }
 FLOORS = {"alone": "centre bias", "with habits": "nearby"}
 """Row without any map, by group."""
 
 
-def report(run: ViewingRun, scored: Table, sequences: Mapping[str, Array]) -> None:
+def report(run: ViewingRun, scored: Table, sequences: Mapping[str, Array], reported: Half) -> None:
     """Write everything and print the tables."""
     records, seconds = gather(run)
     summary = summary_markdown(run, scored, sequences)
@@ -39,8 +41,9 @@ def report(run: ViewingRun, scored: Table, sequences: Mapping[str, Array]) -> No
         "weights.csv": weights_csv(scored),
         "sequences.csv": sequences_csv(sequences),
     }
-    written = write_files(run, "eval.human viewing", tables, records, seconds)
+    written = write_files(run, "eval.human", tables, records, seconds)
     written.append(draw_shifts(run, scored))
+    written += draw_scanpaths(run, scored, reported)
     announce(summary, written)
 
 
@@ -140,12 +143,27 @@ def draw_shifts(run: ViewingRun, scored: Table) -> Path:
         each = scored.get((name, "with habits"))
         if each is None:
             continue
-        values = each.shifts[..., 0]
-        known = np.isfinite(values)
-        curves[name] = np.nanmean(values, axis=0)
-        errors[name] = np.nanstd(values, axis=0, ddof=1) / np.sqrt(known.sum(0))
+        columns = [column[np.isfinite(column)] for column in each.shifts[..., 0].T]
+        columns = [column for column in columns if len(column)]
+        curves[name] = np.array([column.mean() for column in columns])
+        errors[name] = np.array([standard_error(column) for column in columns])
     figure = plot_by_shift(curves, errors, label="conditional NSS", title=f"Free viewing, with habits\n{sensing(run)}")
     return save_figure(figure, run.config.out / "nss_by_shift.png")
+
+
+def draw_scanpaths(run: ViewingRun, scored: Table, reported: Half) -> list[Path]:
+    """Scanpaths of four people, of `landing` and of `nearby` over the same pictures."""
+    from semfov.viz.human import plot_scanpaths_beside
+
+    written = []
+    for place, index in enumerate(reported.pictures[: run.config.drawings]):
+        name = str(run.scenes.ids[index])
+        shown = {"people": [each.points[: run.config.longest] for each in run.people[name]]}
+        shown |= {each: drawn_scanpaths(scored[each, "with habits"], reported, place) for each in ("landing", "nearby")}
+        few = {name: paths[:4] for name, paths in shown.items()}
+        figure = plot_scanpaths_beside(run.scenes[index].image, few)
+        written.append(save_figure(figure, run.config.out / f"scanpaths_{clean(Path(name).stem)}.png"))
+    return written
 
 
 def _figure(values: Array) -> str:

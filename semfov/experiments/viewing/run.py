@@ -23,6 +23,7 @@ from semfov.data.scene import Scenes
 from semfov.episode import Looks, Stopwatch, StoredLooks
 from semfov.errors import DataError, InputError
 from semfov.experiments.candidates import Candidate
+from semfov.experiments.config import PolicyConfig
 from semfov.experiments.looks import one_thread
 from semfov.experiments.parts import Record
 from semfov.experiments.run import Run, cache_folder
@@ -73,9 +74,7 @@ class ViewingRun(Run):
         return [self.config.density.columns, self.config.density.rows]
 
     def _what(self) -> dict[str, object]:
-        """What maps along people's scanpaths depend on, whatever the policy."""
-        paths = [[name, [each.points.tolist() for each in people]] for name, people in self.people.items()]
-        seen = hashlib.sha256(json.dumps(paths).encode()).hexdigest()
+        """What maps along people's scanpaths depend on, whatever picture and policy."""
         grid = [self.config.belief.columns, self.config.belief.rows]
         fitted = {
             name: None if model is None else checksum(model.state_dict())
@@ -83,7 +82,12 @@ class ViewingRun(Run):
         }
         belief = {name: value for name, value in asdict(self.config.belief).items() if not name.endswith("model")}
         eye = {"eye": self.eye.settings(), "grid": grid, "belief": belief, "fitted": fitted}
-        return {**eye, "people": seen, "longest": self.config.longest}
+        return {**eye, "longest": self.config.longest}
+
+    def _followed(self, index: int) -> str:
+        """sha256 of a picture and of the scanpaths in it."""
+        paths = [each.points.tolist() for each in self.people[str(self.scenes.ids[index])]]
+        return hashlib.sha256(json.dumps([self.digest(index), paths]).encode()).hexdigest()
 
     @property
     def names(self) -> list[str]:
@@ -124,23 +128,39 @@ class ViewingRun(Run):
         return FineLooks(detections, grid, self.raster(index)) if name == LANDING else StoredLooks(detections, grid)
 
     def values(self, name: str, index: int) -> Tensor:
-        """Values `(E, X·Y)` after each fixation of all people, or `(1, bins)` of a saliency map; kept."""
-        store, digest = self.map_stores[name], self.digest(index)
-        kept = store.read(digest) if self.config.store else None
+        """Values `(E, X·Y)` after each fixation of all people, or `(1, bins)` of a saliency map; kept.
+
+        Policies that observe alike are followed together.
+        """
+        digest = self._followed(index)
+        kept = self.map_stores[name].read(digest) if self.config.store else None
         if kept is not None:
             return kept["values"]
         with one_thread(), torch.inference_mode():
             if name in SALIENCY_MODELS:
-                found = SALIENCY_MODELS[name]()(self.scenes[index].image[None])
+                saliency = SALIENCY_MODELS[name]()(self.scenes[index].image[None])
                 columns, rows = self._raster_size
-                values = F.adaptive_avg_pool2d(found, (rows, columns)).flatten(1)
+                found = {name: F.adaptive_avg_pool2d(saliency, (rows, columns)).flatten(1)}
             else:
                 events = self.events(index)
                 paths = events.fine if name == LANDING else events.cells
-                values = follow(self.looks(name, index), self.candidate(name, index), paths).float()
+                alike = {each: self.candidate(each, index) for each in self._alike(name)}
+                found = follow(self.looks(name, index), alike, paths)
         if self.config.store:
-            store.write(digest, {"values": values.contiguous()})
-        return values
+            for each, values in found.items():
+                self.map_stores[each].write(digest, {"values": values.float().contiguous()})
+        return found[name].float()
+
+    def _alike(self, name: str) -> list[str]:
+        """Policies that observe as this one does, itself among them."""
+        if name == LANDING:
+            return [name]
+
+        def observing(policy: PolicyConfig) -> object:
+            return policy.scores, policy.tempering, policy.footprint, policy.memory, policy.misses
+
+        own = observing(self.policies[name])
+        return [each for each, policy in self.policies.items() if observing(policy) == own]
 
     def maps(self, name: str, index: int) -> Tensor:
         """The same as maps `(E, H, W)`, or `(1, H, W)`, over the bins."""

@@ -9,6 +9,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from semfov.belief.grid import Grid
+from semfov.data.fixations import by_picture, read_table
 from semfov.episode import rollout
 from semfov.experiments.seeds import generator_for
 from semfov.experiments.viewing.density import Weights, log_densities, standardised
@@ -113,11 +114,13 @@ def drawn_scanpaths(scored: Scored, half: Half, place: int) -> list[Array]:
 def score_sequences(scored: dict[tuple[str, str], Scored], half: Half) -> dict[str, Array]:
     """Sequence score of each row that the settings name, and of people, by picture: means over all pairs of people.
 
-    A drawn scanpath is compared with those of all people but the one whose first fixation it has.
+    A drawn scanpath is compared with those of all people but the one whose first fixation it has, and one of a file
+    with those of all people. Pictures that a file does not have are left out of its row.
     """
     run = half.run
+    files = {path.stem: by_picture(read_table(path)) for path in run.config.files}
     chosen = [scored[key] for name in run.config.sequences for key in [_key(name, scored)] if key is not None]
-    found: dict[str, list[float]] = {name: [] for name in [*(each.row.name for each in chosen), PEOPLE]}
+    found: dict[str, list[float]] = {name: [] for name in [*(each.row.name for each in chosen), *files, PEOPLE]}
     for place, index in enumerate(tqdm(half.pictures, desc="sequences", unit="picture")):
         people = [each.points[: run.config.longest] for each in run.people[str(run.scenes.ids[index])]]
         bandwidth = run.config.bandwidth * max(run.scenes.annotation(index).size)
@@ -127,7 +130,12 @@ def score_sequences(scored: dict[tuple[str, str], Scored], half: Half) -> dict[s
         for each in chosen:
             drawn = _words(drawn_scanpaths(each, half, place), every, bandwidth)
             found[each.row.name].append(_beside(drawn, words))
-    return {name: np.array(values) for name, values in found.items()}
+        for name, pictures in files.items():
+            theirs = [each.points[: run.config.longest] for each in pictures.get(str(run.scenes.ids[index]), [])]
+            if theirs:
+                spelled = _words(theirs, every, bandwidth)
+                found[name].append(float(np.mean([sequence_score(a, b) for a in spelled for b in words])))
+    return {name: np.array(values) for name, values in found.items() if values}
 
 
 def _key(name: str, scored: dict[tuple[str, str], Scored]) -> tuple[str, str] | None:
