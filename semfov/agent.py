@@ -25,7 +25,7 @@ from semfov.gaze.policies import KL, Closer, NonPredictive, Policy, Predictive, 
 from semfov.io.compatibility import learned_for
 from semfov.io.schema import is_number
 from semfov.observation.foveal import FovealObservationModel
-from semfov.scanpath import Ending, Scanpath, trace
+from semfov.scanpath import Ending, Scanpath, Stimulus, trace
 from semfov.sensor.foveation import Foveation
 from semfov.sensor.named import named_sensor
 
@@ -346,7 +346,7 @@ class ActivePerception(nn.Module):
         scanpath = trace(steps, grid, self.classes, target, beside)
         assert ended is not None
         ending: Ending = "cells" if bool(ended[1].visited.all()) else "shifts"
-        return replace(scanpath, ending=ending), *ended
+        return replace(scanpath, ending=ending, stimulus=Stimulus.of(self.eye, image)), *ended
 
     def _target(self, target: str | int) -> int:
         if isinstance(target, str):

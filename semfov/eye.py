@@ -61,9 +61,13 @@ class Eye(nn.Module):
         """Fit an image `(1, 3, H, W)`, RGB in [0, 1], into the input and build its pyramid."""
         check_shape(image, "image", 1, 3, None, None)
         canvas, placement = self.detector.fit(image)
-        scale = canvas.new_tensor([placement.scale]) * (max(placement.size) / self.reference)
+        return View(self.sensor.pyramid(canvas), placement, self.width(placement, canvas))
+
+    def width(self, placement: Placement, like: Tensor) -> Tensor:
+        """Width of the fovea in canvas pixels along x and y, `(1, 2)`, where an image lies so; type as of `like`."""
+        scale = like.new_tensor([placement.scale]) * (max(placement.size) / self.reference)
         shrink = scale.pow(1 - torch.as_tensor(self.sensor.growth).to(scale).log2())
-        return View(self.sensor.pyramid(canvas), placement, self.sensor.sigma * shrink)
+        return self.sensor.sigma * shrink
 
     def foveated(self, view: View, fixations: Tensor) -> Tensor:
         """What the sensor gives for fixations `(F, 2)` in image pixels: canvases `(F, 3, h, w)`."""

@@ -32,18 +32,19 @@
     const steps = report.colours[scale];
     const at = Math.min(Math.max(share, 0), 1) * (steps.length - 1);
     const low = Math.floor(at), high = Math.min(low + 1, steps.length - 1);
-    return `rgb(${steps[low].map((value, n) => Math.round(value + (steps[high][n] - value) * (at - low))).join(" ")})`;
+    const [r, g, b, opacity] = steps[low].map((value, n) => value + (steps[high][n] - value) * (at - low));
+    return { fill: `rgb(${[r, g, b].map(Math.round).join(" ")})`, "fill-opacity": Number(opacity.toFixed(3)) };
   }
 
   // Pictures. Coordinates are pixels of the photograph; one unit is a 640th of its width.
   const unit = () => episode.size[0] / 640;
-  function frame(id, picture, label) {
+  function frame(id, picture, label, grey = false) {
     const target = find(id);
     target.setAttribute("viewBox", `0 0 ${episode.size[0]} ${episode.size[1]}`);
     target.setAttribute("aria-label", label);
     target.replaceChildren();
     if (picture !== null) {
-      const source = { href: report.pictures[picture], width: episode.size[0], height: episode.size[1], preserveAspectRatio: "none" };
+      const source = { href: report.pictures[picture], width: episode.size[0], height: episode.size[1], preserveAspectRatio: "none", class: grey ? "grey" : "" };
       target.append(svg("image", source));
     }
     return target;
@@ -100,11 +101,12 @@
   }
 
   function drawMap(id, values, low, high, scale, label) {
-    const target = frame(id, episode.image, label);
+    const target = frame(id, episode.image, label, true);
     const readout = drawScale(`${id}-scale`, low, high, scale);
     values.forEach((value, cell) => {
       const share = value === null ? 0 : (value - low) / (high - low || 1);
-      const square = box(cellBox(cell), { fill: value === null ? "#777777" : colour(scale, share), "fill-opacity": 0.82, stroke: "white", "stroke-width": 0.6 * unit(), "stroke-opacity": 0.5 });
+      const shade = value === null ? { fill: "#777777", "fill-opacity": 0.82 } : colour(scale, share);
+      const square = box(cellBox(cell), { ...shade, stroke: "white", "stroke-width": 0.6 * unit(), "stroke-opacity": 0.5 });
       const tell = () => { readout.textContent = `${place(cell)}: ${short(value)}`; };
       square.addEventListener("pointerenter", tell);
       square.addEventListener("pointerdown", tell);
@@ -113,9 +115,9 @@
     return target;
   }
   function drawScale(id, low, high, scale) {
-    const stops = report.colours[scale].map((rgb) => `rgb(${rgb.join(" ")})`).join(", ");
+    const stops = report.colours[scale].map(([r, g, b, opacity]) => `rgb(${r} ${g} ${b} / ${opacity})`).join(", ");
     const bar = html("i");
-    bar.style.background = `linear-gradient(90deg, ${stops})`;
+    bar.style.backgroundImage = `linear-gradient(90deg, ${stops})`;
     const readout = html("span");
     find(id).replaceChildren(html("span", {}, short(low)), bar, html("span", {}, short(high)), readout);
     return readout;
@@ -124,7 +126,8 @@
 
   function drawBelief() {
     const map = episode.maps[chosenClass], values = mapValues(map), best = bestOf(values);
-    drawMap("belief", values, 0, map.max, "probability", `Probability of ${map.label}: highest ${short(values[best])} at ${place(best)}`)
+    // One scale for all classes and fixations: nothing at 0, and the most at 1.
+    drawMap("belief", values, 0, 1, "overlay", `Probability of ${map.label}: highest ${short(values[best])} at ${place(best)}`)
       .append(...cross(episode.fixations[fixation].cell));
     return `Probability of ${map.label} is highest at ${place(best)}: ${short(values[best])}.`;
   }
@@ -210,8 +213,7 @@
     find("fixation").max = episode.fixations.length - 1;
     find("class").replaceChildren(...episode.maps.map((map, index) => html("option", { value: index }, map.label)));
     find("class").value = chosenClass;
-    const where = episode.outcome.cell === null ? "" : ` It is at ${place(episode.outcome.cell)}.`;
-    find("outcome").textContent = `Outcome: ${episode.summary}.${where} ${episode.outcome.why}`;
+    for (const told of document.querySelectorAll("[data-about]")) told.textContent = episode[told.dataset.about] ?? "not recorded";
     show();
   }
   function stop() {
