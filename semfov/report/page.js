@@ -74,14 +74,19 @@
     if (episode.outcome.box !== null && fixation === episode.fixations.length - 1) {
       target.append(box(episode.outcome.box, { stroke: "white", "stroke-width": 5 * unit() }), box(episode.outcome.box, { stroke: FOUND, "stroke-width": 3 * unit() }));
     }
-    const points = visited.map((cell) => middle(cell).join(",")).join(" ");
-    target.append(svg("polyline", { points, fill: "none", stroke: "white", "stroke-width": 5 * unit() }));
-    target.append(svg("polyline", { points, fill: "none", stroke: GAZE, "stroke-width": 3 * unit() }));
-    visited.forEach((cell, number) => {
-      const [x, y] = middle(cell);
+    // From dark to bright as time goes on, with the same colours however far it is shown.
+    const last = Math.max(episode.fixations.length - 1, 1);
+    const when = (number) => colour("time", number / last).fill;
+    const points = visited.map(middle);
+    points.slice(1).forEach(([x2, y2], number) => {
+      const [x1, y1] = points[number], ends = { x1, y1, x2, y2 };
+      target.append(svg("line", { ...ends, stroke: "white", "stroke-width": 3.4 * unit(), "stroke-opacity": 0.7 }));
+      target.append(svg("line", { ...ends, stroke: when(number + 1), "stroke-width": 1.8 * unit() }));
+    });
+    points.forEach(([x, y], number) => {
       const end = episode.found && number === episode.fixations.length - 1;
-      target.append(svg("circle", { cx: x, cy: y, r: 15 * unit(), fill: end ? FOUND : GAZE, stroke: "white", "stroke-width": (number === fixation ? 4 : 1.5) * unit() }));
-      target.append(svg("text", { x, y, fill: "white", "font-size": 19 * unit(), "font-weight": "bold", "text-anchor": "middle", "dominant-baseline": "central" }, String(number)));
+      target.append(svg("circle", { cx: x, cy: y, r: 14 * unit(), fill: when(number), stroke: end ? FOUND : "white", "stroke-width": (number === fixation ? 4 : 1.5) * unit() }));
+      target.append(svg("text", { x, y, fill: number / last > 0.6 ? "black" : "white", "font-size": 18 * unit(), "font-weight": "bold", "text-anchor": "middle", "dominant-baseline": "central" }, String(number)));
     });
   }
 

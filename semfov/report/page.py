@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from semfov.io.files import write_text
 from semfov.report.episode import Data, Pool
-from semfov.viz.style import PROBABILITY, UNCERTAINTY, overlay_colours
+from semfov.viz.style import PROBABILITY, TIME, UNCERTAINTY, overlay_colours
 
 if TYPE_CHECKING:
     from matplotlib.colors import Colormap
@@ -44,6 +44,7 @@ def page_html(title: str, episodes: Sequence[Data], pool: Pool, *, sections: str
         "episodes": list(episodes),
         "pictures": pool.pictures,
         "colours": {
+            "time": colour_steps(TIME),
             "overlay": colour_steps(overlay_colours()),
             "probability": colour_steps(PROBABILITY, OPACITY),
             "uncertainty": colour_steps(UNCERTAINTY, OPACITY),
