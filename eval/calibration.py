@@ -37,10 +37,11 @@ from semfov.experiments.run import finish
 from semfov.experiments.samples import Samples, SampleSettings, collect
 from semfov.experiments.settings import Count, Seed, Settings, Share, Side, Workers
 from semfov.experiments.setup import make_observation, plain
-from semfov.experiments.summary import announce, save_figure, table
+from semfov.experiments.summary import announce, table
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
 from semfov.viz import plot_reliability
+from semfov.viz.style import save_figure
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,11 @@ from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.run import finish
 from semfov.experiments.settings import Positive, Settings, Share, Workers
-from semfov.experiments.summary import announce, gather, save_figure, sensing, table
+from semfov.experiments.summary import announce, gather, sensing, table
 from semfov.io.files import write_text
 from semfov.metrics.presence import area_under_roc, hits_at
 from semfov.viz.presence import plot_roc
+from semfov.viz.style import save_figure
 
 SHARES = (0.01, 0.02, 0.05)
 

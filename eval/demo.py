@@ -16,7 +16,7 @@ detector's input, or larger, is looked at in windows: the agent chooses where, a
 
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -34,16 +34,17 @@ from semfov.detection.load import check_detector
 from semfov.errors import check
 from semfov.experiments.command import run_command
 from semfov.experiments.settings import Range, Seed, Settings, Share, Shifts, Weight, Whole
-from semfov.experiments.summary import save_figure
 from semfov.live import RATE
 from semfov.report.episode import Pool, episode_data
 from semfov.report.page import write_page
+from semfov.scanpath.stimulus import reduced
 from semfov.sensor import SENSORS
 from semfov.sensor.named import SensorName
-from semfov.viz.animation import render, save_animation
-from semfov.viz.views import foveated_views
-from semfov.viz.zoom import describe_zoom, plot_zoom_path
+from semfov.viz.animation import film_of
+from semfov.viz.zoom import describe_zoom
 from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye
+
+Drawn = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
 
 PHOTO = "photograph, folder of photographs or video (none: an embedded scene)"
 
@@ -77,6 +78,8 @@ class DemoConfig(Settings):
         frames: how many frames of a video or camera to look at (none: all of a video, of a camera until Ctrl-C).
         rate: at which the belief about a video or camera fades from frame to frame (0: never).
         report: write a page to step through in a browser to this file.
+        draw: what to draw: `scanpath`, `views` (what the eye saw), `belief` (of an exploration: what is where),
+            `belief_bars` and `animation`; `[]` draws nothing.
         out: folder for pictures and animations.
     """
 
@@ -98,6 +101,7 @@ class DemoConfig(Settings):
     frames: Annotated[int, Range(1, 10**9)] | None = None
     rate: Annotated[float, Range(0, 100)] = RATE
     report: Path | None = None
+    draw: tuple[Drawn, ...] = ("scanpath", "views", "belief", "animation")
     out: Path = Path("runs/demo")
 
 
@@ -133,12 +137,11 @@ def demo(config: DemoConfig) -> None:
             continue
         scanpath = look_at(agent, picture, config)
         print(told(picture.name, scanpath))
-        views = foveated_views(agent.eye, picture.image, scanpath.fixations)
         folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
-        written += draw(folder, scanpath, picture, views)
+        views = shown(scanpath, config)
+        written += draw(folder, scanpath, picture, views, config.draw)
         if config.report is not None:
-            shown = episode_data(scanpath, picture.image, views, pool, name=picture.name, boxes=picture.boxes)
-            episodes.append(shown)
+            episodes.append(episode_data(scanpath, scanpath.image, views, pool, name=picture.name, boxes=picture.boxes))
     if config.report is not None and episodes:
         title = "exploration" if config.target is None else f"search for “{config.target}”"
         written.append(write_page(config.report, f"semfov: {title}", episodes, pool))
@@ -191,7 +194,7 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig, folder: Path
         count = int((glance.detections.confidence >= viz.CONFIDENT).sum())
         where = f"at ({x:.0f}, {y:.0f})" if number else "the whole picture"
         print(f"  {number:2d}  {where} × {magnification:.2f}: {count} detection{'s' if count != 1 else ''}")
-    return [save_figure(plot_zoom_path(path, small(picture.image)), folder / "zoom.png")]
+    return [viz.save_figure(viz.plot_zoom_path(path, reduced(picture.image).clamp(0, 1)), folder / "zoom.png")]
 
 
 def chosen(values: dict[str, float | None]) -> dict[str, Any]:
@@ -302,32 +305,32 @@ def place(scanpath: Scanpath, cell: int) -> str:
     return f"({column}, {row})"
 
 
-def draw(folder: Path, scanpath: Scanpath, picture: Picture, views: list[Tensor]) -> list[Path]:
-    """Write the figures and the animation of an episode."""
-    image, boxes = small(picture.image), picture.boxes
-    figures = {
-        "scanpath": viz.plot_scanpath(scanpath, image, boxes=boxes),
-        "views": viz.plot_foveated_strip(scanpath, views),
+def shown(scanpath: Scanpath, config: DemoConfig) -> list[Tensor]:
+    """What the eye was shown at each fixation, where something that is asked for needs it."""
+    needed = config.report is not None or {"views", "animation"} & set(config.draw)
+    return scanpath.views() if needed else []
+
+
+def draw(
+    folder: Path, scanpath: Scanpath, picture: Picture, views: list[Tensor], wanted: Sequence[Drawn]
+) -> list[Path]:
+    """Write those figures of an episode that are wanted, and the animation."""
+    boxes, searched = picture.boxes, scanpath.target is not None
+    figures: dict[str, Callable[[], Any]] = {
+        "scanpath": lambda: viz.plot_scanpath(scanpath, boxes=boxes),
+        "views": lambda: viz.plot_foveated_strip(scanpath, views),
     }
-    if scanpath.target is None:
-        figures["map"] = viz.plot_semantic_map(scanpath, image=image)
+    if searched:
+        figures["belief"] = lambda: viz.plot_belief_strip(scanpath)
+        figures["belief_bars"] = lambda: viz.plot_belief_bars(scanpath)
     else:
-        figures["belief"] = viz.plot_belief_strip(scanpath, image=image)
-        figures["belief_bars"] = viz.plot_belief_bars(scanpath)
-    written = [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items()]
-    steps = (viz.plot_fixation(scanpath, n, image, view, boxes=boxes) for n, view in enumerate(views))
-    return [*written, *save_animation(render(steps), folder / "animation.gif")]
-
-
-def small(image: Tensor, longest: int = 1280) -> Tensor:
-    """The picture at a size that figures can show."""
-    from semfov.detection.placement import resize
-
-    scale = longest / max(image.shape[-2:])
-    if scale >= 1:
-        return image
-    width, height = (max(1, round(n * scale)) for n in (image.shape[-1], image.shape[-2]))
-    return resize(image[None], (width, height))[0].clamp(0, 1)
+        figures["map"] = lambda: viz.plot_semantic_map(scanpath)
+    names = [name if searched or name != "belief" else "map" for name in wanted]
+    written = [viz.save_figure(figures[name](), folder / f"{name}.png") for name in names if name in figures]
+    if "animation" in wanted:
+        film = film_of(scanpath, views=views, boxes=boxes)
+        written += film.save(folder / "animation.gif")
+    return written
 
 
 def columns(names: Sequence[str], width: int = 100) -> str:

@@ -9,7 +9,6 @@ from semfov import ActivePerception, EmbeddedScenes
 from semfov.io.files import replacing
 from semfov.viz import plot_belief_strip, plot_foveated_strip
 from semfov.viz.animation import Frame, in_palette, render
-from semfov.viz.views import foveated_views
 
 PATH = Path(__file__).parents[1] / "docs" / "pictures" / "search.png"
 SCENE, TARGET, START = 5, "cup", 99
@@ -22,9 +21,8 @@ def make_picture(path: Path = PATH) -> None:
     boxes = scene.boxes[scene.labels == agent.classes.index(TARGET)]
     with torch.inference_mode():
         scanpath = agent.search(scene.image, TARGET, start=START, boxes=boxes)
-    views = foveated_views(agent.eye, scene.image, scanpath.fixations)
-    seen = plot_foveated_strip(scanpath, views, most=3)
-    believed = plot_belief_strip(scanpath, image=scene.image, most=3)
+    seen = plot_foveated_strip(scanpath, most=3)
+    believed = plot_belief_strip(scanpath, most=3)
     with replacing(path) as temporary:
         in_palette(stacked(render([seen, believed], dpi=105)), refine=3).save(temporary, format="PNG", optimize=True)
 

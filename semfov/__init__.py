@@ -12,6 +12,7 @@ from semfov.errors import DataError, InputError, SemfovError
 from semfov.eye import Eye
 from semfov.gaze import acquisition, policies, saliency
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
+from semfov.report import notebook as _notebook  # noqa: F401 (scanpaths are drawn there)
 from semfov.scanpath import Scanpath
 from semfov.sensor import Foveation, foveate
 from semfov.version import __version__

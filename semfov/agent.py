@@ -31,7 +31,7 @@ from semfov.io.shipped import shipped_model
 from semfov.live import RATE, LivePerception
 from semfov.model_folder import open_folder
 from semfov.observation.foveal import FovealObservationModel
-from semfov.scanpath import Ending, Scanpath, trace
+from semfov.scanpath import Ending, Scanpath, Stimulus, trace
 from semfov.sensor.foveation import Foveation
 from semfov.sensor.named import named_sensor
 
@@ -394,7 +394,7 @@ class ActivePerception(nn.Module):
         scanpath = trace(steps, grid, self.classes, target, beside)
         assert ended is not None
         ending: Ending = "cells" if bool(ended[1].visited.all()) else "shifts"
-        return replace(scanpath, ending=ending), *ended
+        return replace(scanpath, ending=ending, stimulus=Stimulus.of(self.eye, image)), *ended
 
 
 def _check_thresholds(confirm: float | None, give_up: float | None) -> None:

@@ -7,9 +7,11 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgba
 from mpl_toolkits.mplot3d import Axes3D
 
 from semfov import Detections, Grid, InputError, Scanpath
+from semfov.decision import Decision
 from semfov.gaze.saliency import cell_saliency
 from semfov.metrics.calibration import BinarySums
 from semfov.viz import (
@@ -76,21 +78,31 @@ def test_curves_and_bands():
     assert len(axes.collections) == 1
 
 
-def test_many_curves_can_be_told_apart():
-    curves = {f"policy {number}": np.linspace(0, number / 20, 21) for number in range(16)}
-    figure = draw(plot_success_rate(curves, title="exploration"))
-    lines = figure.axes[0].lines
-    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 16
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == list(curves)
+def test_of_many_curves_the_legend_names_the_highest_and_random_gaze():
+    curves = {"random": np.zeros(21)} | {f"policy {number}": np.linspace(0, number / 20, 21) for number in range(16)}
+    (axes,) = draw(plot_success_rate(curves, title="exploration")).axes
+    named = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert named == ["random", *(f"policy {number}" for number in range(10, 16)), "10 others"]
+    shown = {line.get_label(): (line.get_color(), line.get_linestyle()) for line in axes.lines}
+    assert len(axes.lines) == 17
+    assert len({shown[name] for name in named}) == len(named)
+    assert [entry.get_color() for entry in axes.get_legend().legend_handles] == [shown[name][0] for name in named]
+
+
+@pytest.mark.parametrize("count", [1, 7])
+def test_few_curves_are_all_named(count):
+    curves = {f"policy {number}": np.linspace(0, number / 20, 21) for number in range(count)}
+    (axes,) = draw(plot_success_rate(curves)).axes
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == list(curves)
+    assert len({(line.get_color(), line.get_linestyle()) for line in axes.lines}) == count
 
 
 def test_scanpath_shows_numbered_fixations(scanpath, image):
     figure = draw(plot_scanpath(scanpath, image, boxes=torch.tensor([[60.0, 45, 79, 59]])))
     axes = figure.axes[0]
     assert [text.get_text() for text in axes.texts] == ["0", "1", "2", "cat 0.80", "cup 0.60"]
-    numbers = np.array([text.get_position() for text in axes.texts[:3]])
-    np.testing.assert_allclose(numbers, scanpath.fixations + 0.5)
-    np.testing.assert_allclose(axes.lines[-4].get_xydata(), scanpath.fixations + 0.5)
+    np.testing.assert_allclose([text.xy for text in axes.texts[:3]], scanpath.fixations + 0.5)
+    np.testing.assert_allclose(axes.collections[-1].get_offsets(), scanpath.fixations + 0.5)
     framed = {patch.get_bbox().bounds: patch.get_linestyle() for patch in axes.patches}
     assert framed == {(60, 45, 19, 14): "--", (10, 10, 20, 20): "-", (50, 40, 20, 15): "-"}
     bare = draw(plot_scanpath(scanpath, image, detections=False))
@@ -105,6 +117,61 @@ def test_belief_is_the_posterior(scanpath):
     shown = np.asarray(figure.axes[0].images[0].get_array())
     belief = scanpath.probabilities[1]
     np.testing.assert_allclose(shown, (belief[:, 2]).reshape(3, 4), rtol=1e-6)
+
+
+def test_belief_is_laid_over_a_grey_photograph(scanpath, image):
+    """Where it is 0 the photograph is as it is, and where it is greater it hides more."""
+    certain = replace(scanpath, posterior=torch.linspace(0, 1, 12).expand(3, 12))
+    figure = draw(plot_belief(certain, image=image))
+    photograph, overlay = figure.axes[0].images
+    pixels = np.asarray(photograph.get_array())
+    weights = np.array([0.299, 0.587, 0.114])
+    np.testing.assert_allclose(
+        pixels, np.repeat((image.permute(1, 2, 0).numpy() @ weights)[..., None], 3, -1), atol=1e-6
+    )
+    opacity = overlay.to_rgba(np.asarray(overlay.get_array()))[..., 3].ravel()
+    assert opacity[0] == 0
+    assert (np.diff(opacity) > 0).all()
+    assert opacity[-1] == pytest.approx(0.85)
+    # The colour bar has the same colours.
+    (scale,) = figure.axes[1:]
+    assert scale.collections[-1].get_cmap() is overlay.get_cmap()
+    assert overlay.get_alpha() is None
+
+
+def test_pictures_take_the_photograph_that_the_scanpath_kept(scanpath, image):
+    from semfov.detection import Placement
+    from semfov.scanpath import Stimulus
+    from semfov.scanpath.stimulus import in_bytes
+
+    sensor = {"sigma": 20.0, "levels": 2, "growth": 2.0, "convention": "kornia", "reference": 640.0}
+    placement = Placement((80, 60), (1.0, 1.0), (0, 0))
+    settings = {"sensor": sensor, "detector": {"name": "none"}}
+    kept = replace(scanpath, stimulus=Stimulus(in_bytes(image), in_bytes(image), placement, settings))
+    drawn = np.asarray(draw(plot_scanpath(kept)).axes[0].images[0].get_array())
+    np.testing.assert_allclose(drawn, image.permute(1, 2, 0), atol=0.5 / 255 + 1e-6)
+    assert len(draw(plot_belief(kept)).axes[0].images) == 2
+    assert len(draw(plot_foveated_strip(kept)).axes) == 3
+    with pytest.raises(InputError, match="image: expected the photograph"):
+        plot_scanpath(scanpath)
+    with pytest.raises(InputError, match="stimulus"):
+        plot_foveated_strip(scanpath)
+
+
+def test_the_legend_tells_whose_boxes_they_are(scanpath, image):
+    decision = Decision("found", 0.9, 11, torch.tensor([50.0, 40, 70, 55]))
+    sought = replace(scanpath, decision=decision, ending="decision")
+    (axes,) = draw(plot_scanpath(sought, image, boxes=torch.tensor([[60.0, 45, 79, 59]]))).axes
+    told = {
+        text.get_text(): line
+        for text, line in zip(axes.get_legend().get_texts(), axes.get_legend().get_lines(), strict=True)
+    }
+    assert list(told) == ["annotated: cup", "where the cup was found", "last look: cup", "last look: other objects"]
+    for box in axes.patches:
+        near = [line for line in told.values() if to_rgba(line.get_color()) == box.get_edgecolor()]
+        assert [line.get_linestyle() for line in near] == [box.get_linestyle()]
+    (bare,) = draw(plot_scanpath(scanpath, image, detections=False)).axes
+    assert bare.get_legend() is None
 
 
 def test_belief_refuses_what_is_not_there(scanpath):
@@ -129,7 +196,8 @@ def test_belief_strip_shows_every_fixation_on_one_scale(scanpath, image):
     belief = scanpath.probabilities[..., 2]
     maps = [axes.images[-1] for axes in figure.axes if axes.get_title()]
     np.testing.assert_allclose([np.asarray(m.get_array()).ravel() for m in maps], belief, rtol=1e-6)
-    assert {m.get_clim() for m in maps} == {(0, float(belief.max()))}
+    assert {m.get_clim() for m in maps} == {(0, 1)}
+    assert [axes.get_ylabel() for axes in figure.axes if not axes.get_title()] == ["probability of cup"]
 
 
 def test_bars_are_as_high_as_the_posterior(scanpath):
@@ -173,8 +241,8 @@ def test_labels_do_not_overlap(scanpath, image):
 
 
 def test_fixation_is_scanpath_view_and_belief(scanpath, image):
-    path, seen, believed = draw(plot_fixation(scanpath, 1, image, image * 0.5)).axes
-    assert [text.get_text() for text in path.texts] == ["0", "1"]
+    path, seen, believed, _ = draw(plot_fixation(scanpath, 1, image, image * 0.5)).axes
+    assert [text.get_text() for text in path.texts if text.get_visible()] == ["0", "1"]
     np.testing.assert_allclose(np.asarray(seen.images[0].get_array()), (image * 0.5).permute(1, 2, 0))
     belief = scanpath.probabilities[1]
     shown = np.asarray(believed.images[-1].get_array()).ravel()
@@ -245,9 +313,9 @@ def test_colours_differ_in_lightness_or_hue_for_dichromats():
 
 def test_episode_has_one_scale_and_at_most_so_many_panels(scanpath, image):
     figure = draw(plot_episode(scanpath, image, [image] * 3, most=2))
-    assert len(figure.axes) == 1 + 2 * 2
+    assert len(figure.axes) == 1 + 2 * 2 + 1  # the last is the scale
     maps = [axes.images[-1] for axes in figure.axes if axes.get_title().startswith("p(cup)")]
-    assert len({image.get_clim() for image in maps}) == 1
+    assert {image.get_clim() for image in maps} == {(0, 1)}
     with pytest.raises(InputError, match="views"):
         plot_episode(scanpath, image, [image])
 

@@ -6,7 +6,8 @@ from pathlib import Path
 from eval.page.curves import per_image, records_of, repetition_error
 from eval.page.findings import LAST
 from eval.page.tables import Runs, columns
-from semfov.experiments.summary import Array, save_figure
+from semfov.experiments.summary import Array
+from semfov.viz.style import save_figure
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,12 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from semfov.detection.exchange import Exchange
 from semfov.errors import check, check_shape
 
 
 @dataclass(frozen=True)
-class Detections:
+class Detections(Exchange):
     """A padded batch of detections, each with a score for every class and for background.
 
     Attributes:

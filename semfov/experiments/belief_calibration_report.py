@@ -15,10 +15,11 @@ from torch import Tensor
 from semfov.errors import DataError
 from semfov.experiments.belief_calibration import BANDS, CELLS, MAP, BeliefCalibrationRun
 from semfov.experiments.parts import Record
-from semfov.experiments.summary import gather, save_figure, sensing, table
+from semfov.experiments.summary import gather, sensing, table
 from semfov.io.files import write_text
 from semfov.metrics.calibration import BinarySums
 from semfov.viz import plot_cell_reliability
+from semfov.viz.style import save_figure
 
 Sums = dict[tuple[str, int, str], BinarySums]
 """Sums over predictions by belief, number of looks, and group of cells."""

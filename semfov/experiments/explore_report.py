@@ -17,12 +17,12 @@ from semfov.experiments.summary import (
     curve_of,
     curve_rows,
     curves_csv,
-    save_figure,
     sensing,
     table,
     write_files,
 )
 from semfov.metrics.exploration import success_rate
+from semfov.viz.style import save_figure
 
 SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
 """Gaze shifts at which tables show the success rate."""

@@ -92,7 +92,7 @@ def choose_episodes(records: list[Record], policies: Sequence[str], count: int) 
 
 
 def _episodes(run: Run, records: Sequence[Record], pool: Pool) -> list[Data]:
-    data, size = [], 0
+    data, size, settings = [], 0, run.eye.settings()
     for record in records:
         if len(pool) + size > LIMIT:
             break
@@ -102,7 +102,18 @@ def _episodes(run: Run, records: Sequence[Record], pool: Pool) -> list[Data]:
         boxes = None if scanpath.target is None else scene.boxes[scene.labels == scanpath.target]
         name = f"{scene.name}, {record['policy']}"
         data.append(
-            episode_data(scanpath, scene.image, views, pool, name=name, boxes=boxes, classes=10, width=256, quality=60)
+            episode_data(
+                scanpath,
+                scene.image,
+                views,
+                pool,
+                name=name,
+                settings=settings,
+                boxes=boxes,
+                classes=10,
+                width=256,
+                quality=60,
+            )
         )
         size += sum(len(each["data"]) for each in [*data[-1]["maps"], data[-1]["entropy"]])
         size += 7 * scanpath.values.numel()

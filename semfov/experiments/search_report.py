@@ -22,13 +22,13 @@ from semfov.experiments.summary import (
     curve_of,
     curve_rows,
     curves_csv,
-    save_figure,
     sensing,
     table,
     write_files,
 )
 from semfov.io.files import clean, inside
 from semfov.metrics.search import cumulative_performance, random_search
+from semfov.viz.style import save_figure
 from semfov.viz.views import foveated_views
 
 SHIFTS = (1, 5, 10, 15, 30)

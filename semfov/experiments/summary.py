@@ -22,7 +22,7 @@ from semfov.experiments.parts import Record
 from semfov.experiments.run import Run
 from semfov.experiments.setup import fovea_of, plain
 from semfov.io.compatibility import recommended
-from semfov.io.files import inside, replacing, write_text
+from semfov.io.files import inside, write_text
 from semfov.io.storage import checksum
 from semfov.metrics.averages import standard_error
 from semfov.version import __version__
@@ -214,10 +214,3 @@ def sensing(run: Run) -> str:
         return what
     own = model or recommended(run.eye.detector.name, float(spread.growth))
     return f"{what}, observation model {Path(own).stem}"
-
-
-def save_figure(figure: Any, path: Path) -> Path:
-    """Save a matplotlib figure atomically."""
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=150, format=path.suffix[1:])
-    return path

@@ -8,9 +8,10 @@ from semfov.errors import DataError
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.run import finish
-from semfov.experiments.summary import announce, save_figure, table
+from semfov.experiments.summary import announce, table
 from semfov.experiments.zoom import ZoomConfig, ZoomRun
 from semfov.io.files import write_text
+from semfov.viz.style import save_figure
 
 
 def zoom(config: ZoomConfig) -> None:

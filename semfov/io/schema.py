@@ -25,7 +25,7 @@ FLOATS = (torch.float32, torch.float64)
 
 @dataclass(frozen=True)
 class Field:
-    """A tensor of finite numbers.
+    """A tensor of numbers.
 
     Attributes:
         shape: its sizes.
@@ -36,6 +36,8 @@ class Field:
         ascending: values grow along the tensor.
         simplex: the last dimension sums to 1.
         optional: whether it may be missing.
+        finite: whether infinities and NaN are refused.
+        mixed: with no `dtype`, whether its type may be another than that of other tensors.
     """
 
     shape: tuple[Size, ...]
@@ -46,6 +48,8 @@ class Field:
     ascending: bool = False
     simplex: bool = False
     optional: bool = False
+    finite: bool = True
+    mixed: bool = False
 
     def check(self, name: str, tensor: Tensor, sizes: Sizes) -> None:
         """Raise `InputError` unless a tensor is so; names of sizes that were not known before are now."""
@@ -55,7 +59,7 @@ class Field:
         check(fits, name, f"shape ({told})" + (f" with {known}" if known else ""), tuple(tensor.shape))
         types = FLOATS if self.dtype is None else (self.dtype,)
         check(tensor.dtype in types, name, " or ".join(map(str, types)), tensor.dtype)
-        if not tensor.numel():
+        if not tensor.numel() or not self.finite:
             return
         values = tensor.to(torch.float64)
         bad = int((~values.isfinite()).sum())
@@ -85,21 +89,31 @@ class Number(Json):
         high: largest value.
         above: it is larger than this.
         size: name of a size that it tells; it is then a whole number from 1.
+        whole: whether it is a whole number.
     """
 
     low: float = -math.inf
     high: float = math.inf
     above: float = -math.inf
     size: Size | None = None
+    whole: bool = False
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
         """See `Json`."""
-        whole = self.size is not None
+        whole = self.whole or self.size is not None
         check(is_number(value, whole=whole), name, "a whole number" if whole else "a finite number", shown(value))
         if self.size is not None:
             check(value >= 1 and _fits(self.size, value, sizes), name, f"{self.size}, at least 1", shown(value))
         inside = self.low <= value <= self.high and value > self.above
         check(inside, name, interval(self.low, self.high, self.above), shown(value))
+
+
+class Flag(Json):
+    """True or false."""
+
+    def check(self, name: str, value: Any, sizes: Sizes) -> None:
+        """See `Json`."""
+        check(isinstance(value, bool), name, "true or false", shown(value))
 
 
 @dataclass(frozen=True)
@@ -244,7 +258,8 @@ class Schema:
             check(name in tensors or each.optional, name, "a tensor", "nothing")
             if name in tensors:
                 each.check(name, tensors[name], sizes)
-        free = {tensors[name].dtype for name, each in self.tensors.items() if each.dtype is None and name in tensors}
+        shared = [name for name, each in self.tensors.items() if each.dtype is None and not each.mixed]
+        free = {tensors[name].dtype for name in shared if name in tensors}
         check(len(free) <= 1, "tensors", "one floating-point type for all", ", ".join(sorted(map(str, free))))
 
 

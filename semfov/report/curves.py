@@ -8,16 +8,20 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from semfov.viz.curves import highlighted, others_named
+
 Array = NDArray[np.float64]
 
 _WIDTH, _HEIGHT = 640, 380
-_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 12, 46
+_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 12, 14, 66
 _COLOURS = 7
 _DASHES = ("", "9 5", "3 4", "12 4 3 4")
 
 
 def curves_html(curves: Mapping[str, Array], errors: Mapping[str, Array], label: str) -> str:
     """Shares after 0, 1, … gaze shifts as lines in percent, with bands of one standard error, and a legend.
+
+    Of many curves the legend names some, as in `semfov.viz`; the others are grey.
 
     Args:
         curves: by name, in [0, 1].
@@ -33,24 +37,33 @@ def curves_html(curves: Mapping[str, Array], errors: Mapping[str, Array], label:
         y = _HEIGHT - _BOTTOM - np.clip(share, 0, top) / top * (_HEIGHT - _TOP - _BOTTOM)
         return f"{x:.1f},{y:.1f}"
 
-    parts = [_axes(last, top, label)]
-    for order, (name, curve) in enumerate(curves.items()):
-        band = errors.get(name)
+    named = highlighted(curves)
+    parts = [_axes(last, top)]
+    rest = [curve for name, curve in curves.items() if name not in named]
+    for curve in rest:
+        points = " ".join(point(*p) for p in enumerate(curve))
+        parts.append(f'<polyline class="rest" points="{points}"/>')
+    for order, name in enumerate(named):
+        curve, band = curves[name], errors.get(name)
         if band is not None and np.isfinite(band).all():
             around = [*enumerate(curve + band), *reversed(list(enumerate(curve - band)))]
             parts.append(f'<polygon class="c{order % _COLOURS}" points="{" ".join(point(*p) for p in around)}"/>')
-    for order, curve in enumerate(curves.values()):
-        points = " ".join(point(*p) for p in enumerate(curve))
-        parts.append(f'<polyline {_line(order, len(curves))} points="{points}"/>')
-    samples = (f'<polyline {_line(order, len(curves))} points="0,6 38,6"/>' for order in range(len(curves)))
+    for order, name in enumerate(named):
+        points = " ".join(point(*p) for p in enumerate(curves[name]))
+        parts.append(f'<polyline {_line(order, len(named))} points="{points}"/>')
+    samples = [f'<polyline {_line(order, len(named))} points="0,6 38,6"/>' for order in range(len(named))]
+    if rest:
+        named = [*named, others_named(len(rest))]
+        samples.append('<polyline class="rest" points="0,6 38,6"/>')
     legend = "".join(
         f'<li><svg viewBox="0 0 38 12" aria-hidden="true">{sample}</svg> {escape(name)}</li>'
-        for name, sample in zip(curves, samples, strict=True)
+        for name, sample in zip(named, samples, strict=True)
     )
     title = escape(f"{label} after 0 to {last} gaze shifts; the table below has the figures")
     return (
-        f'<div class="curves"><div class="wide"><svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{title}">'
-        f'{"".join(parts)}</svg></div><ul class="legend">{legend}</ul></div>'
+        f'<div class="curves"><p>{escape(label)}</p>'
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{title}">{"".join(parts)}</svg>'
+        f'<ul class="legend">{legend}</ul></div>'
     )
 
 
@@ -81,21 +94,19 @@ def _line(order: int, count: int) -> str:
     return f'class="c{order % _COLOURS}"' + (f' stroke-dasharray="{dashes}"' if dashes else "")
 
 
-def _axes(last: int, top: float, label: str) -> str:
+def _axes(last: int, top: float) -> str:
     left, right, bottom = _LEFT, _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
     parts = []
     for step in range(6):
         y = bottom - step / 5 * (bottom - _TOP)
         parts.append(f'<line class="tick" x1="{left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(f'<text x="{left - 7}" y="{y + 4:.1f}" text-anchor="end">{100 * top * step / 5:.0f}</text>')
+        parts.append(f'<text x="{left - 7}" y="{y + 5:.1f}" text-anchor="end">{100 * top * step / 5:.0f}</text>')
     every = next(step for step in (1, 2, 5, 10, 20, 50, 100, 10**6) if last / step <= 10)
     for shift in range(0, last + 1, every):
         x = left + shift / max(last, 1) * (right - left)
-        parts.append(f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle">{shift}</text>')
+        # On a phone, where letters are larger, every other number has to do.
+        minor = ' class="minor"' if (shift // every) % 2 else ""
+        parts.append(f'<text{minor} x="{x:.1f}" y="{bottom + 25}" text-anchor="middle">{shift}</text>')
     parts.append(f'<line class="axis" x1="{left}" x2="{right}" y1="{bottom}" y2="{bottom}"/>')
     parts.append(f'<text x="{(left + right) / 2}" y="{_HEIGHT - 8}" text-anchor="middle">gaze shifts</text>')
-    middle = (bottom + _TOP) / 2
-    parts.append(
-        f'<text x="13" y="{middle}" text-anchor="middle" transform="rotate(-90 13 {middle})">{escape(label)}</text>'
-    )
     return "".join(parts)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,10 @@ import torch
 from torch import Tensor
 
 from semfov.detection.placement import resize
-from semfov.scanpath import Scanpath
-from semfov.viz.belief import class_posterior, entropy
+from semfov.scanpath import Scanpath, describe, sensor_in_words, why_it_ended
+from semfov.viz.belief import class_posterior
 from semfov.viz.labels import place_labels
-from semfov.viz.scanpath import describe, why_it_ended
+from semfov.viz.semantic import entropy
 
 Data = dict[str, Any]
 
@@ -61,11 +62,12 @@ def jpeg_uri(image: Tensor, width: int, quality: int) -> str:
 
 def episode_data(
     scanpath: Scanpath,
-    image: Tensor,
-    views: Sequence[Tensor],
+    image: Tensor | None,
+    views: Sequence[Tensor] | None,
     pool: Pool,
     *,
     name: str,
+    settings: Mapping[str, Any] | None = None,
     boxes: Tensor | None = None,
     classes: int | None = None,
     width: int = 416,
@@ -75,10 +77,11 @@ def episode_data(
 
     Args:
         scanpath: the episode.
-        image: `(3, H, W)`, RGB in [0, 1].
-        views: for each fixation the foveated photograph `(3, h, w)`, of any size.
+        image: `(3, H, W)`, RGB in [0, 1]; None shows none.
+        views: for each fixation the foveated photograph `(3, h, w)`, of any size; None shows none.
         pool: takes the pictures.
         name: what to call the episode.
+        settings: of detector and sensor, `Eye.settings()`; None are those that the scanpath kept.
         boxes: `(M, 4)`, where the target really is.
         classes: keep the belief about so many classes beside background, the most probable anywhere (None: all).
         width: of the views in pixels; the photograph is half as wide again.
@@ -88,31 +91,49 @@ def episode_data(
     size = grid.extent.tolist()
     timed = len(scanpath.seconds) > 0
     after = [*scanpath.cells.tolist()[1:], None]
+    shown: Sequence[Tensor | None] = [None] * len(scanpath) if views is None else views
     fixations = [
         {
             "cell": cell,
-            "view": pool.add(view, width, quality),
+            "view": None if view is None else pool.add(view, width, quality),
             "detections": detection_data(scanpath, number),
             "values": [rounded(value) for value in scanpath.values[number].tolist()],
             "next": after[number],
             "seconds": dict(scanpath.seconds[number]) if timed else None,
         }
-        for number, (cell, view) in enumerate(zip(scanpath.cells.tolist(), views, strict=True))
+        for number, (cell, view) in enumerate(zip(scanpath.cells.tolist(), shown, strict=True))
     ]
     return {
         "name": name,
+        **about_data(scanpath, settings),
         "summary": describe(scanpath),
         "outcome": outcome_data(scanpath),
         "presence": None if scanpath.presence is None else [rounded(p) for p in scanpath.presence.tolist()],
         "size": size,
         "grid": [grid.columns, grid.rows],
-        "image": pool.add(image, width * 3 // 2, quality),
+        "image": None if image is None else pool.add(image, width * 3 // 2, quality),
         "target": None if scanpath.target is None else scanpath.classes[scanpath.target],
         "found": scanpath.found,
         "truth": [] if boxes is None else boxes.tolist(),
         "fixations": fixations,
         "maps": map_data(scanpath, classes),
         "entropy": quantised(entropy(scanpath)),
+    }
+
+
+def about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
+    """Detector, sensor and decision in words; None for what was not kept."""
+    if settings is None and scanpath.stimulus is not None:
+        settings = scanpath.stimulus.settings
+    decision = f"{describe(scanpath)}. {why_it_ended(scanpath)}".rstrip()
+    if scanpath.decision is not None and scanpath.decision.cell is not None:
+        row, column = divmod(scanpath.decision.cell, scanpath.grid.columns)
+        decision += f" It is at column {column}, row {row}."
+    told = None if settings is None else sensor_in_words(settings["sensor"])
+    return {
+        "detector": None if settings is None else settings["detector"]["name"],
+        "sensor": told,
+        "decision": decision,
     }
 
 
@@ -162,8 +183,15 @@ def map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
     if target is not None:
         order = [index for index in order if index != target]
         maps.append({"label": scanpath.classes[target], **quantised(class_posterior(scanpath))})
-    kept = [*order[: None if classes is None else classes - len(maps)], 0]
-    return maps + [{"label": scanpath.classes[index], **quantised(probabilities[..., index])} for index in kept]
+    kept = [*order[: None if classes is None else max(0, classes - len(maps))], 0]
+    maps += [{"label": scanpath.classes[index], **quantised(probabilities[..., index])} for index in kept]
+    # One entry for each class: detectors have been seen that give several of them one name.
+    times: Counter[str] = Counter()
+    for each in maps:
+        times[each["label"]] += 1
+        if times[each["label"]] > 1:
+            each["label"] = f"{each['label']} ({times[each['label']]})"
+    return maps
 
 
 def quantised(values: Tensor) -> Data:

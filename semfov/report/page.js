@@ -32,18 +32,19 @@
     const steps = report.colours[scale];
     const at = Math.min(Math.max(share, 0), 1) * (steps.length - 1);
     const low = Math.floor(at), high = Math.min(low + 1, steps.length - 1);
-    return `rgb(${steps[low].map((value, n) => Math.round(value + (steps[high][n] - value) * (at - low))).join(" ")})`;
+    const [r, g, b, opacity] = steps[low].map((value, n) => value + (steps[high][n] - value) * (at - low));
+    return { fill: `rgb(${[r, g, b].map(Math.round).join(" ")})`, "fill-opacity": Number(opacity.toFixed(3)) };
   }
 
   // Pictures. Coordinates are pixels of the photograph; one unit is a 640th of its width.
   const unit = () => episode.size[0] / 640;
-  function frame(id, picture, label) {
+  function frame(id, picture, label, grey = false) {
     const target = find(id);
     target.setAttribute("viewBox", `0 0 ${episode.size[0]} ${episode.size[1]}`);
     target.setAttribute("aria-label", label);
     target.replaceChildren();
     if (picture !== null) {
-      const source = { href: report.pictures[picture], width: episode.size[0], height: episode.size[1], preserveAspectRatio: "none" };
+      const source = { href: report.pictures[picture], width: episode.size[0], height: episode.size[1], preserveAspectRatio: "none", class: grey ? "grey" : "" };
       target.append(svg("image", source));
     }
     return target;
@@ -73,14 +74,19 @@
     if (episode.outcome.box !== null && fixation === episode.fixations.length - 1) {
       target.append(box(episode.outcome.box, { stroke: "white", "stroke-width": 5 * unit() }), box(episode.outcome.box, { stroke: FOUND, "stroke-width": 3 * unit() }));
     }
-    const points = visited.map((cell) => middle(cell).join(",")).join(" ");
-    target.append(svg("polyline", { points, fill: "none", stroke: "white", "stroke-width": 5 * unit() }));
-    target.append(svg("polyline", { points, fill: "none", stroke: GAZE, "stroke-width": 3 * unit() }));
-    visited.forEach((cell, number) => {
-      const [x, y] = middle(cell);
+    // From dark to bright as time goes on, with the same colours however far it is shown.
+    const last = Math.max(episode.fixations.length - 1, 1);
+    const when = (number) => colour("time", number / last).fill;
+    const points = visited.map(middle);
+    points.slice(1).forEach(([x2, y2], number) => {
+      const [x1, y1] = points[number], ends = { x1, y1, x2, y2 };
+      target.append(svg("line", { ...ends, stroke: "white", "stroke-width": 3.4 * unit(), "stroke-opacity": 0.7 }));
+      target.append(svg("line", { ...ends, stroke: when(number + 1), "stroke-width": 1.8 * unit() }));
+    });
+    points.forEach(([x, y], number) => {
       const end = episode.found && number === episode.fixations.length - 1;
-      target.append(svg("circle", { cx: x, cy: y, r: 15 * unit(), fill: end ? FOUND : GAZE, stroke: "white", "stroke-width": (number === fixation ? 4 : 1.5) * unit() }));
-      target.append(svg("text", { x, y, fill: "white", "font-size": 19 * unit(), "font-weight": "bold", "text-anchor": "middle", "dominant-baseline": "central" }, String(number)));
+      target.append(svg("circle", { cx: x, cy: y, r: 14 * unit(), fill: when(number), stroke: end ? FOUND : "white", "stroke-width": (number === fixation ? 4 : 1.5) * unit() }));
+      target.append(svg("text", { x, y, fill: number / last > 0.6 ? "black" : "white", "font-size": 18 * unit(), "font-weight": "bold", "text-anchor": "middle", "dominant-baseline": "central" }, String(number)));
     });
   }
 
@@ -100,11 +106,12 @@
   }
 
   function drawMap(id, values, low, high, scale, label) {
-    const target = frame(id, episode.image, label);
+    const target = frame(id, episode.image, label, true);
     const readout = drawScale(`${id}-scale`, low, high, scale);
     values.forEach((value, cell) => {
       const share = value === null ? 0 : (value - low) / (high - low || 1);
-      const square = box(cellBox(cell), { fill: value === null ? "#777777" : colour(scale, share), "fill-opacity": 0.82, stroke: "white", "stroke-width": 0.6 * unit(), "stroke-opacity": 0.5 });
+      const shade = value === null ? { fill: "#777777", "fill-opacity": 0.82 } : colour(scale, share);
+      const square = box(cellBox(cell), { ...shade, stroke: "white", "stroke-width": 0.6 * unit(), "stroke-opacity": 0.5 });
       const tell = () => { readout.textContent = `${place(cell)}: ${short(value)}`; };
       square.addEventListener("pointerenter", tell);
       square.addEventListener("pointerdown", tell);
@@ -113,9 +120,9 @@
     return target;
   }
   function drawScale(id, low, high, scale) {
-    const stops = report.colours[scale].map((rgb) => `rgb(${rgb.join(" ")})`).join(", ");
+    const stops = report.colours[scale].map(([r, g, b, opacity]) => `rgb(${r} ${g} ${b} / ${opacity})`).join(", ");
     const bar = html("i");
-    bar.style.background = `linear-gradient(90deg, ${stops})`;
+    bar.style.backgroundImage = `linear-gradient(90deg, ${stops})`;
     const readout = html("span");
     find(id).replaceChildren(html("span", {}, short(low)), bar, html("span", {}, short(high)), readout);
     return readout;
@@ -124,7 +131,8 @@
 
   function drawBelief() {
     const map = episode.maps[chosenClass], values = mapValues(map), best = bestOf(values);
-    drawMap("belief", values, 0, map.max, "probability", `Probability of ${map.label}: highest ${short(values[best])} at ${place(best)}`)
+    // One scale for all classes and fixations: nothing at 0, and the most at 1.
+    drawMap("belief", values, 0, 1, "overlay", `Probability of ${map.label}: highest ${short(values[best])} at ${place(best)}`)
       .append(...cross(episode.fixations[fixation].cell));
     return `Probability of ${map.label} is highest at ${place(best)}: ${short(values[best])}.`;
   }
@@ -210,8 +218,7 @@
     find("fixation").max = episode.fixations.length - 1;
     find("class").replaceChildren(...episode.maps.map((map, index) => html("option", { value: index }, map.label)));
     find("class").value = chosenClass;
-    const where = episode.outcome.cell === null ? "" : ` It is at ${place(episode.outcome.cell)}.`;
-    find("outcome").textContent = `Outcome: ${episode.summary}.${where} ${episode.outcome.why}`;
+    for (const told of document.querySelectorAll("[data-about]")) told.textContent = episode[told.dataset.about] ?? "not recorded";
     show();
   }
   function stop() {

@@ -1,9 +1,12 @@
 """Foveal sensors by name: the published ones, and the agent's own."""
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
-from semfov.errors import lookup
+from semfov.errors import InputError, lookup
+from semfov.sensor.base import Sensor
 from semfov.sensor.foveation import Foveation
+from semfov.sensor.log_polar import LogPolar
 
 SensorName = Literal["published", "published-narrow", "gradual"]
 
@@ -35,3 +38,20 @@ def named_sensor(name: str, **settings: Any) -> Foveation:
     Foveation(sigma=50, levels=5, growth=1, convention='opencv')
     """
     return Foveation(**{**SENSORS[lookup(name, SENSORS, "sensor")], **settings})
+
+
+def sensor_of(settings: Mapping[str, Any]) -> Sensor:
+    """The sensor with these settings (`Sensor.settings()`), one of the library's.
+
+    Raises:
+        InputError: they are those of another sensor.
+
+    >>> sensor_of(Foveation(20.0, growth=1.0).settings())
+    Foveation(sigma=20, levels=5, growth=1, convention='kornia')
+    """
+    if settings.get("kind") == "log-polar":
+        return LogPolar(settings["fovea"], settings["spacing"], settings["pooling"])
+    names = "sigma", "levels", "growth", "convention"
+    if not all(name in settings for name in names):
+        raise InputError(f"sensor: expected settings of a Foveation or of a LogPolar, got {dict(settings)}")
+    return Foveation(**{name: settings[name] for name in names})

@@ -21,7 +21,6 @@ from semfov.experiments.config import ProtocolConfig
 from semfov.experiments.run import digest_of
 from semfov.experiments.samples import Samples
 from semfov.experiments.seeds import generator_for
-from semfov.experiments.summary import save_figure
 from semfov.gaze.policies import Closer, NonPredictive, Policy, Random
 from semfov.io.files import sha256, write_text
 from semfov.io.manifest import Part
@@ -38,6 +37,7 @@ from semfov.training.map_evidence import fit_map_evidence
 from semfov.training.misses import count_misses
 from semfov.training.observation import fit_model
 from semfov.training.tempering import hit_rates, means_of
+from semfov.viz.style import save_figure
 
 SHIFTS = 5
 """Gaze shifts after which searches and explorations are compared."""

@@ -14,13 +14,14 @@ import yaml
 
 from semfov.experiments.samples import Samples
 from semfov.experiments.setup import plain
-from semfov.experiments.summary import commit, save_figure, table
+from semfov.experiments.summary import commit, table
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
 from semfov.observation.foveal import FovealObservationModel
 from semfov.training.observation_settings import FitConfig
 from semfov.version import __version__
 from semfov.viz import plot_reliability
+from semfov.viz.style import save_figure
 
 Models = dict[str, FovealObservationModel]
 

@@ -1,27 +1,27 @@
 """Figures of search and belief, drawn to be read in print; each function returns a matplotlib figure.
 
-Save one with `figure.savefig("name.png", dpi=150)`; in a notebook, let it be the last value of a cell.
+Save one with `save_figure(figure, "name.pdf")` (PNG and SVG too); in a notebook, let it be the last value of a cell. To
+draw in a figure of your own, give its axes as `ax=` or `axes=`.
 """
 
-from semfov.viz.belief import (
-    class_posterior,
-    entropy,
-    named_regions,
-    plot_belief,
-    plot_belief_bars,
-    plot_belief_strip,
-    plot_semantic_map,
-)
+from semfov.scanpath import describe, why_it_ended
+from semfov.viz.animation import animate
+from semfov.viz.belief import class_posterior, plot_belief, plot_belief_bars, plot_belief_strip
 from semfov.viz.curves import plot_cumulative_performance, plot_curve_panels, plot_success_rate
 from semfov.viz.drawing import CONFIDENT
+from semfov.viz.fixation import plot_fixation
+from semfov.viz.presence import plot_roc
 from semfov.viz.reliability import plot_cell_reliability, plot_reliability
 from semfov.viz.saliency import plot_saliency
-from semfov.viz.scanpath import describe, plot_episode, plot_fixation, plot_foveated_strip, plot_scanpath, why_it_ended
-from semfov.viz.style import COLOURS
+from semfov.viz.scanpath import plot_episode, plot_foveated_strip, plot_scanpath
+from semfov.viz.semantic import entropy, named_regions, plot_semantic_map
+from semfov.viz.style import COLOURS, save_figure
+from semfov.viz.zoom import plot_zoom_path
 
 __all__ = [
     "COLOURS",
     "CONFIDENT",
+    "animate",
     "class_posterior",
     "describe",
     "entropy",
@@ -36,9 +36,12 @@ __all__ = [
     "plot_fixation",
     "plot_foveated_strip",
     "plot_reliability",
+    "plot_roc",
     "plot_saliency",
     "plot_scanpath",
     "plot_semantic_map",
     "plot_success_rate",
+    "plot_zoom_path",
+    "save_figure",
     "why_it_ended",
 ]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semfov.errors import check
-from semfov.viz.style import COLOURS, line_style, make_figure, styled
+from semfov.viz.style import COLOURS, line_style, make_figure, only, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,63 +17,105 @@ if TYPE_CHECKING:
 
 Curves = Mapping[str, NDArray[np.float64]]
 
+REST = "0.6"
+"""Colour of the curves that a legend does not name."""
+
 
 @styled
-def plot_cumulative_performance(curves: Curves, errors: Curves | None = None, *, title: str = "") -> Figure:
+def plot_cumulative_performance(
+    curves: Curves, errors: Curves | None = None, *, title: str = "", ax: Axes | None = None
+) -> Figure:
     """Share of targets found after each gaze shift, one curve per policy, with bands of one standard error.
+
+    Of more than seven curves the legend names the highest and those of random gaze; the others are grey.
 
     Args:
         curves: for each policy its cumulative performance after 0, 1, 2, … gaze shifts, in [0, 1].
         errors: standard errors of the same shape.
         title: title of the figure.
+        ax: axes to draw in; None makes a figure.
 
     >>> figure = plot_cumulative_performance({"random": np.linspace(0, 0.8, 31)})
     """
-    figure = _plot_curves(curves, errors, title, "targets found (%)")
-    figure.axes[0].set_ylim(0, 102)
+    figure, axes = _plot_curves(curves, errors, title, "targets found (%)", ax)
+    axes.set_ylim(0, 102)
     return figure
 
 
 @styled
-def plot_success_rate(curves: Curves, errors: Curves | None = None, *, title: str = "") -> Figure:
+def plot_success_rate(
+    curves: Curves, errors: Curves | None = None, *, title: str = "", ax: Axes | None = None
+) -> Figure:
     """Share of the cells with objects whose class is right after each gaze shift.
 
     Arguments as for `plot_cumulative_performance`.
     """
-    return _plot_curves(curves, errors, title, "cells with the right class (%)")
+    return _plot_curves(curves, errors, title, "cells with the right class (%)", ax)[0]
 
 
 @styled
-def plot_curve_panels(panels: Mapping[str, tuple[Curves, Curves]], *, label: str, columns: int = 2) -> Figure:
+def plot_curve_panels(
+    panels: Mapping[str, tuple[Curves, Curves]],
+    *,
+    label: str,
+    columns: int = 2,
+    axes: Sequence[Axes] | None = None,
+) -> Figure:
     """Curves of several experiments with the same policies side by side, with one legend.
 
     Args:
         panels: by title, curves in [0, 1] and their standard errors, as for `plot_cumulative_performance`.
         label: of the vertical axis.
         columns: panels in a row.
+        axes: to draw in, one for each panel; None makes a figure.
 
     >>> curves = {"random": np.linspace(0, 0.8, 31)}
     >>> figure = plot_curve_panels({"wide": (curves, {}), "narrow": (curves, {})}, label="targets found (%)")
     """
     check(len(panels) > 0, "panels", "at least one", 0)
+    columns = len(panels) if axes is not None else columns
     rows = -(-len(panels) // columns)
-    figure, every = make_figure(rows, columns, width=4.4 * columns, height=2.9 * rows + 0.5)
-    for axes, (title, (curves, errors)) in zip(every, panels.items(), strict=False):
-        _draw(axes, curves, errors, band=0.15)
-        axes.set(xlabel="gaze shifts", ylabel=label, title=title)
-    for axes in every[len(panels) :]:
-        axes.remove()
-    lines, names = every[0].get_legend_handles_labels()
-    figure.legend(lines, names, loc="outside lower center", ncols=3)
+    figure, every = make_figure(rows, columns, width=4.4 * columns, height=2.9 * rows + 0.5, given=axes)
+    for panel, (title, (curves, errors)) in zip(every, panels.items(), strict=False):
+        _draw(panel, curves, errors, band=0.15)
+        panel.set(xlabel="gaze shifts", ylabel=label, title=title)
+    for panel in every[len(panels) :]:
+        panel.remove()
+    legend_of(figure, every[0], columns=3, given=axes is not None)
     return figure
 
 
-def _draw(axes: Axes, curves: Curves, errors: Curves | None, band: float) -> None:
-    """Curves with bands of one standard error."""
+def highlighted(curves: Curves, most: int = len(COLOURS)) -> list[str]:
+    """Curves that a legend names, at most so many: the highest on average, and random gaze, which all are held against.
+
+    >>> highlighted({"random": np.zeros(2), "a": np.ones(2), "b": np.full(2, 0.5)}, most=2)
+    ['random', 'a']
+    """
+    order = sorted(curves, key=lambda name: (not name.startswith("random"), -float(np.nanmean(curves[name]))))
+    chosen = order[:most]
+    return [name for name in curves if name in chosen]
+
+
+def others_named(count: int) -> str:
+    """The one entry in a legend for all curves that it does not name.
+
+    >>> others_named(9)
+    '9 others'
+    """
+    return f"{count} other{'s' if count != 1 else ''}"
+
+
+def _draw(axes: Axes, curves: Curves, errors: Curves | None, band: float, named: Sequence[str] | None = None) -> None:
+    """Curves with bands of one standard error; those that are not `named` are grey."""
     from matplotlib.ticker import MaxNLocator
 
-    for order, (name, curve) in enumerate(curves.items()):
-        style = line_style(order, len(curves))
+    named = list(curves) if named is None else named
+    rest = [name for name in curves if name not in named]
+    for number, name in enumerate(rest):
+        label = others_named(len(rest)) if number == 0 else None
+        axes.plot(np.arange(len(curves[name])), 100 * curves[name], color=REST, linewidth=0.8, label=label, zorder=1)
+    for order, name in enumerate(named):
+        curve, style = curves[name], line_style(order, len(named))
         shifts = np.arange(len(curve))
         axes.plot(shifts, 100 * curve, label=name, linewidth=1.6, **style)
         error = None if errors is None else errors.get(name)
@@ -85,14 +127,23 @@ def _draw(axes: Axes, curves: Curves, errors: Curves | None, band: float) -> Non
     axes.grid(alpha=0.3, linewidth=0.5)
 
 
-def _plot_curves(curves: Curves, errors: Curves | None, title: str, label: str) -> Figure:
-    check(len(curves) > 0, "curves", "at least one", 0)
-    many = len(curves) > len(COLOURS)
-    figure, (axes,) = make_figure(1, 1, width=8.0 if many else 6.2, height=4.0)
-    _draw(axes, curves, errors, band=0.05 if many else 0.15)
-    axes.set(xlabel="gaze shifts", ylabel=label, title=title)
-    if many:
-        figure.legend(loc="outside right upper")
+def legend_of(figure: Figure, axes: Axes, *, columns: int, given: bool) -> None:
+    """The legend of axes below their figure, or in the axes where the figure is the caller's own."""
+    lines, names = axes.get_legend_handles_labels()
+    if given:
+        axes.legend(lines, names)
     else:
-        axes.legend(loc="lower right", framealpha=0.9)
-    return figure
+        figure.legend(lines, names, loc="outside lower center", ncols=columns)
+
+
+def _plot_curves(curves: Curves, errors: Curves | None, title: str, label: str, ax: Axes | None) -> tuple[Figure, Axes]:
+    check(len(curves) > 0, "curves", "at least one", 0)
+    figure, (axes,) = make_figure(1, 1, width=6.2, height=4.0, given=only(ax))
+    _draw(axes, curves, errors, band=0.15, named=highlighted(curves))
+    axes.set(xlabel="gaze shifts", ylabel=label, title=title)
+    lines, names = axes.get_legend_handles_labels()
+    if len(curves) > len(COLOURS):
+        # The rest was drawn first, below the others, and comes last.
+        lines, names = [*lines[1:], lines[0]], [*names[1:], names[0]]
+    axes.legend(lines, names, loc="lower right", framealpha=0.9)
+    return figure, axes

@@ -1,24 +1,40 @@
-"""What figures are made of: the photograph, the grid over it, boxes with their labels, the point of gaze."""
+"""What figures are made of: photograph, grid, what is believed of cells, boxes with labels, the point of gaze."""
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.errors import check, check_shape
+from semfov.errors import InputError, check, check_shape
 from semfov.scanpath import Scanpath
-from semfov.viz.labels import place_labels
-from semfov.viz.style import GAZE, OTHER, TARGET
+from semfov.viz.labels import Box, place_labels
+from semfov.viz.style import GAZE, OTHER, TARGET, overlay_colours
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
 
 CONFIDENT = 0.1
 """Detections that are less confident are not drawn."""
 
 _LABEL_POINTS = 6.5
+
+
+def photograph_of(scanpath: Scanpath, image: Tensor | None) -> Tensor:
+    """The image that was given, or the one that the scanpath kept, `(3, h, w)`.
+
+    Raises:
+        InputError: there is neither.
+    """
+    shown = scanpath.image if image is None else image
+    if shown is None:
+        raise InputError("image: expected the photograph, for the scanpath has kept none, got None")
+    return shown
 
 
 def check_fixation(scanpath: Scanpath, fixation: int) -> int:
@@ -35,97 +51,158 @@ def choose_fixations(scanpath: Scanpath, most: int) -> list[int]:
     return list(range(count)) if count <= most else [*range(most - 1), count - 1]
 
 
-def draw_image(axes: Axes, image: Tensor, grid: Grid, dim: float = 0.0) -> None:
-    """A photograph or a view of it `(3, h, w)`, of any size, in the frame of the grid, darkened by `dim`.
+def draw_image(axes: Axes, image: Tensor, grid: Grid, *, grey: bool = False) -> AxesImage:
+    """A photograph or a view of it `(3, h, w)`, of any size, in the frame of the grid.
 
     Coordinates are pixel edges, not centres, at integers: the frame of boxes and of the grid.
+
+    Args:
+        axes: to draw in.
+        image: RGB in [0, 1].
+        grid: the cells.
+        grey: its lightness alone, for colours to be laid over it.
     """
-    check_shape(image, "image", 3, None, None)
     width, height = grid.extent.tolist()
-    pixels = image.detach().cpu().clamp(0, 1).permute(1, 2, 0).numpy() * (1 - dim)
-    axes.imshow(pixels, extent=(0, width, height, 0), interpolation="bilinear")
+    drawn = axes.imshow(pixels_of(image, grey=grey), extent=(0, width, height, 0), interpolation="bilinear")
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
+    return drawn
 
 
-def draw_cells(axes: Axes, grid: Grid, values: Tensor, *, alpha: float = 1.0, **style: Any) -> None:
+def pixels_of(image: Tensor, *, grey: bool = False) -> Any:
+    """A picture `(3, h, w)` as matplotlib takes it; grey is Rec. 601's luma."""
+    check_shape(image, "image", 3, None, None)
+    shown = image.detach().cpu().clamp(0, 1)
+    if grey:
+        shown = (shown * shown.new_tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0).clamp(0, 1).expand(3, -1, -1)
+    return shown.permute(1, 2, 0).numpy()
+
+
+def draw_cells(axes: Axes, grid: Grid, values: Tensor, *, alpha: float | None = None, **style: Any) -> AxesImage:
     """A value of every cell `(X·Y,)` as a colour."""
     width, height = grid.extent.tolist()
-    table = values.detach().cpu().reshape(grid.rows, grid.columns).numpy()
-    axes.imshow(table, extent=(0, width, height, 0), alpha=alpha, interpolation="nearest", **style)
+    drawn = axes.imshow(
+        table_of(grid, values), extent=(0, width, height, 0), alpha=alpha, interpolation="nearest", **style
+    )
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
+    return drawn
+
+
+def draw_overlay(axes: Axes, grid: Grid, probabilities: Tensor) -> AxesImage:
+    """A probability of every cell `(X·Y,)`, from 0, which is transparent, to 1: one scale for all pictures."""
+    return draw_cells(axes, grid, probabilities, cmap=overlay_colours(), vmin=0, vmax=1)
+
+
+def draw_scale(axes: Axes | list[Axes], drawn: AxesImage, label: str) -> None:
+    """The colour bar of what was drawn."""
+    first = axes[0] if isinstance(axes, list) else axes
+    figure: Any = first.figure
+    figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
+
+
+def table_of(grid: Grid, values: Tensor) -> Any:
+    """Values of cells `(X·Y,)` as a table `(Y, X)`."""
+    return values.detach().cpu().reshape(grid.rows, grid.columns).numpy()
 
 
 def draw_grid(axes: Axes, grid: Grid) -> None:
     """The borders of the cells."""
+    from matplotlib.collections import LineCollection
+
     width, height = grid.extent.tolist()
-    style: dict[str, Any] = {"color": "white", "linewidth": 0.4, "alpha": 0.45}
-    for column in range(1, grid.columns):
-        axes.axvline(column * width / grid.columns, **style)
-    for row in range(1, grid.rows):
-        axes.axhline(row * height / grid.rows, **style)
+    across = [[(n * width / grid.columns, 0), (n * width / grid.columns, height)] for n in range(1, grid.columns)]
+    down = [[(0, n * height / grid.rows), (width, n * height / grid.rows)] for n in range(1, grid.rows)]
+    axes.add_collection(LineCollection(across + down, colors="white", linewidths=0.4, alpha=0.45), autolim=False)
 
 
-def draw_boxes(axes: Axes, boxes: Tensor, colour: str, line: str = "-", width: float = 1.2) -> None:
+def draw_boxes(axes: Axes, boxes: Tensor, colour: str, line: str = "-", width: float = 1.2) -> list[Artist]:
     """Outlines of boxes `(M, 4)`."""
     from matplotlib.patches import Rectangle
 
-    for x1, y1, x2, y2 in boxes.tolist():
-        style: dict[str, Any] = {"edgecolor": colour, "linestyle": line, "linewidth": width}
-        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, **style))
+    style: dict[str, Any] = {"edgecolor": colour, "linestyle": line, "linewidth": width}
+    return [
+        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, **style)) for x1, y1, x2, y2 in boxes.tolist()
+    ]
 
 
-def draw_gaze(axes: Axes, scanpath: Scanpath, fixation: int) -> None:
+def draw_gaze(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
     """A cross where the gaze is."""
     x, y = (scanpath.fixations[fixation].cpu() + 0.5).tolist()
-    axes.plot(x, y, "+", color="white", markersize=11, markeredgewidth=2.8, zorder=5)
-    axes.plot(x, y, "+", color=GAZE, markersize=10, markeredgewidth=1.4, zorder=5)
+    return [
+        *axes.plot(x, y, "+", color="white", markersize=11, markeredgewidth=2.8, zorder=5),
+        *axes.plot(x, y, "+", color=GAZE, markersize=10, markeredgewidth=1.4, zorder=5),
+    ]
 
 
-def draw_detections(axes: Axes, scanpath: Scanpath, fixation: int, most: int = 6, kept_free: int = 1) -> None:
-    """The most confident detections of a look, each labelled by its best class that is not background.
-
-    Labels leave the point of gaze free, and those of the `kept_free` fixations up to it.
-    """
+def seen_well(scanpath: Scanpath, fixation: int, most: int) -> tuple[Tensor, list[int], list[float]]:
+    """The most confident detections of a look that are drawn: boxes `(M, 4)`, classes and scores."""
     detections = scanpath.detections[fixation]
     sure = detections.confidence[0] >= CONFIDENT
-    boxes = detections.boxes[0][sure][:most].cpu()
     labels = detections.labels[0][sure][:most].tolist()
-    scores = detections.confidence[0][sure][:most].tolist()
+    return detections.boxes[0][sure][:most].cpu(), labels, detections.confidence[0][sure][:most].tolist()
+
+
+def draw_detections(
+    axes: Axes, scanpath: Scanpath, fixation: int, most: int = 6, kept_free: list[Box] | None = None
+) -> list[Artist]:
+    """The most confident detections of a look, each labelled by its best class that is not background.
+
+    Labels leave the point of gaze free, and the rectangles of `kept_free`; where they fit is known once the figure is
+    laid out.
+    """
+    boxes, labels, scores = seen_well(scanpath, fixation, most)
     texts = [f"{scanpath.classes[label]} {score:.2f}" for label, score in zip(labels, scores, strict=True)]
     frame = tuple(scanpath.grid.extent.tolist())
-    sizes = [_text_size(axes, text) for text in texts]
-    reach = 8 * _per_point(axes)
-    points = (scanpath.fixations[: fixation + 1][-kept_free:].cpu() + 0.5).tolist()
-    marks = [(x - reach, y - reach, x + reach, y + reach) for x, y in points]
+    sizes = [text_size(axes, text, _LABEL_POINTS) for text in texts]
+    reach = 8 * per_point(axes)
+    x, y = (scanpath.fixations[fixation].cpu() + 0.5).tolist()
+    marks = [(x - reach, y - reach, x + reach, y + reach), *(kept_free or [])]
     places = place_labels([tuple(box) for box in boxes.tolist()], sizes, frame, marks)
-    for box, label, text, (x, y, _, _) in zip(boxes, labels, texts, places, strict=True):
+    drawn: list[Artist] = []
+    for box, label, text, (left, top, _, _) in zip(boxes, labels, texts, places, strict=True):
         colour = TARGET if label == scanpath.target else OTHER
-        draw_boxes(axes, box[None], colour)
-        axes.text(
-            x,
-            y,
+        drawn += draw_boxes(axes, box[None], colour)
+        written = axes.text(
+            left,
+            top,
             text,
             color="white" if colour == TARGET else "black",
             fontsize=_LABEL_POINTS,
             va="top",
             clip_on=True,
+            parse_math=False,
             zorder=4,
             bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.8, "alpha": 0.9},
         )
+        drawn.append(written)
+    return drawn
 
 
-def _text_size(axes: Axes, text: str) -> tuple[float, float]:
+def text_size(axes: Axes, text: str, points: float) -> tuple[float, float]:
     """About the `(width, height)` of a label in the units of axes that are laid out."""
+    scale = per_point(axes)
+    return (_text_width(text) * points + 3) * scale, (points * 1.2 + 2.5) * scale
+
+
+@lru_cache(1024)
+def _text_width(text: str) -> float:
+    """How wide a text is beside the size of its letters."""
     from matplotlib.textpath import TextPath
 
-    points = TextPath((0, 0), text, size=_LABEL_POINTS).get_extents().width + 3
-    scale = _per_point(axes)
-    return points * scale, (_LABEL_POINTS * 1.2 + 2.5) * scale
+    # An empty path has no extents. What stands between dollars is text here, and no formula.
+    return float(TextPath((0, 0), text.replace("$", "S"), size=1).get_extents().width) if text.strip() else 0.0
 
 
-def _per_point(axes: Axes) -> float:
+def per_point(axes: Axes) -> float:
     """How many units of the axes make a point, once the figure is laid out."""
+    figure: Any = axes.figure
     box = axes.get_window_extent()
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     # A picture keeps its proportions, so one scale serves both directions.
-    return max(abs(right - left) / box.width, abs(top - bottom) / box.height) * axes.figure.dpi / 72
+    return max(abs(right - left) / box.width, abs(top - bottom) / box.height) * figure.dpi / 72
+
+
+def lightness(colour: Any) -> float:
+    """Rec. 601's luma of a colour, from 0 to 1."""
+    from matplotlib.colors import to_rgb
+
+    return float(torch.tensor(to_rgb(colour)) @ torch.tensor([0.299, 0.587, 0.114]))

@@ -1,9 +1,11 @@
-"""Where to write the labels of boxes, so that none covers another."""
+"""Where to write labels, so that none covers another."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 
 Box = tuple[float, float, float, float]
 Size = tuple[float, float]
+Point = tuple[float, float]
 
 
 def place_labels(boxes: Sequence[Box], sizes: Sequence[Size], frame: Size, taken: Sequence[Box] = ()) -> list[Box]:
@@ -34,8 +36,70 @@ def place_labels(boxes: Sequence[Box], sizes: Sequence[Size], frame: Size, taken
     return placed[len(taken) :]
 
 
+def place_numbers(points: Sequence[Point], sizes: Sequence[Size], frame: Size, reach: float) -> list[Box | None]:
+    """Rectangles for the numbers of points: on the point where there is room, else near it; None where there is none.
+
+    No number covers another number or another point. The first and the last point come first.
+
+    Args:
+        points: `(x, y)`, those that are the same count as one.
+        sizes: `(width, height)` of each number.
+        frame: `(width, height)` that numbers do not leave.
+        reach: how far from a point its number may be.
+
+    >>> place_numbers([(5, 5), (6, 5)], [(4, 4), (4, 4)], (20, 20), 9)
+    [(0.6, 3.0, 4.6, 7.0), (6.4, 3.0, 10.4, 7.0)]
+    """
+    placed: list[Box] = []
+    places: list[Box | None] = [None] * len(points)
+    ends = [len(points) - 1, 0] if len(points) > 1 else [0]
+    for number in [*ends, *range(1, len(points) - 1)]:
+        width, height = sizes[number]
+        others = [point for point in points if point != points[number]]
+        for x, y in _around(points[number], (width, height), reach):
+            label = _into(x - width / 2, y - height / 2, width, height, frame)
+            if not _covers_any(label, placed) and not any(_holds(label, point) for point in others):
+                places[number] = label
+                placed.append(label)
+                break
+    return places
+
+
+def place_within(
+    candidates: Sequence[Iterable[Point]], sizes: Sequence[Size], frame: Size, taken: Sequence[Box] = ()
+) -> list[Box]:
+    """Rectangles for labels whose middle may be at any of some points, in order: the first one that is free.
+
+    Where none is, the label is moved down from the first.
+
+    >>> place_within([[(2, 1)], [(2, 1), (7, 1)]], [(4, 2), (4, 2)], (10, 10))
+    [(0.0, 0.0, 4.0, 2.0), (5.0, 0.0, 9.0, 2.0)]
+    """
+    placed: list[Box] = list(taken)
+    for points, (width, height) in zip(candidates, sizes, strict=True):
+        inside = [_into(x - width / 2, y - height / 2, width, height, frame) for x, y in points]
+        free = next((label for label in inside if not _covers_any(label, placed)), None)
+        placed.append(free or _further(inside[0], placed))
+    return placed[len(taken) :]
+
+
+def _around(point: Point, size: Size, reach: float) -> Iterator[Point]:
+    """The point itself, then rings of places around it."""
+    yield point
+    radius = step = 0.6 * max(size)
+    while radius <= reach:
+        for turn in range(16):
+            angle = math.pi / 8 * turn
+            yield point[0] + radius * math.cos(angle), point[1] + radius * math.sin(angle)
+        radius += step / 2
+
+
+def _holds(label: Box, point: Point) -> bool:
+    return label[0] < point[0] < label[2] and label[1] < point[1] < label[3]
+
+
 def _into(x: float, y: float, width: float, height: float, frame: Size) -> Box:
-    x, y = max(0, min(x, frame[0] - width)), max(0, min(y, frame[1] - height))
+    x, y = max(0.0, min(x, frame[0] - width)), max(0.0, min(y, frame[1] - height))
     return x, y, x + width, y + height
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,26 +12,30 @@ from semfov.metrics.presence import area_under_roc, roc
 from semfov.viz.style import COLOURS, LINES, make_figure, styled
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
 @styled
-def plot_roc(scores: Mapping[str, Tensor], present: Tensor) -> Figure:
+def plot_roc(scores: Mapping[str, Tensor], present: Tensor, *, axes: Sequence[Axes] | None = None) -> Figure:
     """Receiver operating characteristic: hits against false alarms, the whole of it beside its first tenth.
 
     Args:
         scores: by name, `(M,)`.
         present: `(M,)` boolean; cases of both kinds are needed.
+        axes: two of them to draw in; None makes a figure.
     """
-    figure, panels = make_figure(1, 2, width=10, height=4.6, layout="compressed")
-    for axes, widest in zip(panels, (1.0, 0.1), strict=True):
+    figure, panels = make_figure(1, 2, width=10, height=4.6, layout="compressed", given=axes)
+    for panel, widest in zip(panels, (1.0, 0.1), strict=True):
         for (name, score), colour, line in zip(
             scores.items(), COLOURS * len(scores), LINES * len(scores), strict=False
         ):
             alarms, hits = roc(score, present)
             label = f"{name} ({area_under_roc(score, present):.3f})"
-            axes.plot(torch.tensor(alarms), torch.tensor(hits), line, color=colour, label=label, drawstyle="steps-post")
-        axes.set(xlim=(0, widest), ylim=(0, 1), xlabel="false alarms", ylabel="hits")
-        axes.grid(alpha=0.3)
+            panel.plot(
+                torch.tensor(alarms), torch.tensor(hits), line, color=colour, label=label, drawstyle="steps-post"
+            )
+        panel.set(xlim=(0, widest), ylim=(0, 1), xlabel="false alarms", ylabel="hits")
+        panel.grid(alpha=0.3)
     panels[0].legend(title="area under the curve", loc="lower right", fontsize=7)
     return figure

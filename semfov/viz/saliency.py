@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -9,16 +10,23 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.errors import check_shape
 from semfov.gaze.saliency.cells import Reduction, cell_saliency
-from semfov.viz.drawing import draw_boxes, draw_cells, draw_grid, draw_image
+from semfov.viz.drawing import draw_boxes, draw_cells, draw_grid, draw_image, draw_scale
 from semfov.viz.style import PROBABILITY, TARGET, make_figure, styled
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
 @styled
 def plot_saliency(
-    saliency: Tensor, image: Tensor, *, grid: Grid | None = None, reduction: Reduction = "max", title: str = "saliency"
+    saliency: Tensor,
+    image: Tensor,
+    *,
+    grid: Grid | None = None,
+    reduction: Reduction = "max",
+    title: str = "saliency",
+    axes: Sequence[Axes] | None = None,
 ) -> Figure:
     """A saliency map beside its photograph and, with a grid, the saliency of the cells with the greatest one framed.
 
@@ -28,26 +36,26 @@ def plot_saliency(
         grid: the cells over the photograph.
         reduction: how a cell's saliency comes from its pixels (`semfov.saliency.cell_saliency`).
         title: what to call the map.
+        axes: to draw in, two of them, three with a grid; None makes a figure.
     """
     check_shape(saliency, "saliency", None, None)
     height, width = image.shape[-2:]
     panels = 2 if grid is None else 3
-    figure, axes = make_figure(
-        1, panels, width=3.4 * panels + 0.6, height=3.4 * height / width + 0.35, layout="compressed"
-    )
-    draw_image(axes[0], image, grid or Grid(1, 1, (width, height)))
-    axes[0].set_title("photograph")
+    size = 3.4 * panels + 0.6, 3.4 * height / width + 0.35
+    figure, every = make_figure(1, panels, width=size[0], height=size[1], layout="compressed", given=axes)
+    draw_image(every[0], image, grid or Grid(1, 1, (width, height)))
+    every[0].set_title("photograph")
     values = saliency.detach().cpu()
-    shown = axes[1].imshow(values.numpy(), extent=(0, width, height, 0), cmap=PROBABILITY, vmin=0)
-    axes[1].set(xticks=[], yticks=[], title=title)
-    figure.colorbar(shown, ax=axes[1], shrink=0.85)
+    shown = every[1].imshow(values.numpy(), extent=(0, width, height, 0), cmap=PROBABILITY, vmin=0)
+    every[1].set(xticks=[], yticks=[], title=title)
+    draw_scale(every[1], shown, "")
     if grid is not None:
         cells = cell_saliency(values[None], grid.columns, grid.rows, reduction)[0]
-        draw_cells(axes[2], grid, cells, cmap=PROBABILITY, vmin=0)
-        draw_grid(axes[2], grid)
+        draw_cells(every[2], grid, cells, cmap=PROBABILITY, vmin=0)
+        draw_grid(every[2], grid)
         row, column = divmod(int(cells.argmax()), grid.columns)
         step = grid.extent / grid.extent.new_tensor([grid.columns, grid.rows])
         corner = grid.extent.new_tensor([column, row]) * step
-        draw_boxes(axes[2], cells.new_tensor([[*corner.tolist(), *(corner + step).tolist()]]), TARGET, width=2.0)
-        axes[2].set_title(f"{reduction} in each cell")
+        draw_boxes(every[2], cells.new_tensor([[*corner.tolist(), *(corner + step).tolist()]]), TARGET, width=2.0)
+        every[2].set_title(f"{reduction} in each cell")
     return figure

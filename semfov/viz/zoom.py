@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from semfov.viz.style import FOUND, GAZE, TARGET, make_figure, styled
+from semfov.viz.style import FOUND, GAZE, TARGET, make_figure, only, styled
 from semfov.zoom.search import ZoomPath
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -25,7 +26,7 @@ def describe_zoom(path: ZoomPath) -> str:
 
 
 @styled
-def plot_zoom_path(path: ZoomPath, image: Tensor, *, score: float = 0.1) -> Figure:
+def plot_zoom_path(path: ZoomPath, image: Tensor, *, score: float = 0.1, ax: Axes | None = None) -> Figure:
     """The windows that were looked at, numbered in their order, and the objects that were found.
 
     A number stands in a corner of its window where none stands yet. Objects are named where all classes were looked
@@ -35,11 +36,13 @@ def plot_zoom_path(path: ZoomPath, image: Tensor, *, score: float = 0.1) -> Figu
         path: of a search or an exploration.
         image: `(3, h, w)`, RGB in [0, 1], the picture at any size.
         score: objects with a lower one are not drawn.
+        ax: axes to draw in; None makes a figure.
     """
     from matplotlib.patches import Rectangle
 
     width, height = path.lattice.size
-    figure, (axes,) = make_figure(1, 1, width=7.2, height=7.2 * height / width + 0.3, layout="compressed")
+    size = 7.2, 7.2 * height / width + 0.3
+    figure, (axes,) = make_figure(1, 1, width=size[0], height=size[1], layout="compressed", given=only(ax))
     pixels = image.detach().cpu().clamp(0, 1).permute(1, 2, 0).numpy()
     axes.imshow(pixels, extent=(0, width, height, 0), interpolation="bilinear")
     taken: list[tuple[float, float]] = []

@@ -70,12 +70,26 @@ def test_search(run, photo, tmp_path):
     assert re.search(r"my photo\.png: “red” found after 1 gaze shift \(probability [01]\.\d\d\)", printed.out)
     rows = [line.split() for line in printed.out.splitlines() if line[:1] in ("0", "1")]
     assert rows[0][:3] == ["0", "(7,", "5)"]
-    for name in ("scanpath.png", "views.png", "belief.png", "belief_bars.png", "animation.gif"):
+    for name in ("scanpath.png", "views.png", "belief.png", "animation.gif"):
         with Image.open(tmp_path / "out" / name) as picture:
             picture.verify()
         assert f"out/{name}" in printed.out
     assert "<!DOCTYPE html>" in (tmp_path / "page.html").read_text(encoding="utf-8")
     assert str(tmp_path / "page.html") in printed.out
+    assert not (tmp_path / "out" / "belief_bars.png").exists()
+
+
+@pytest.mark.parametrize("task", ["search", "exploration"])
+def test_only_what_is_asked_for_is_drawn(run, photo, tmp_path, task):
+    arguments = (photo, "--target", "red", "--start", 47) if task == "search" else (photo, "--explore", "--shifts", 1)
+    code, _ = run(*arguments, "--draw", "[]")
+    assert code == 0
+    assert not (tmp_path / "out").exists()
+    code, _ = run(*arguments, "--draw", "[belief, belief_bars]")
+    wanted = {"belief.png", "belief_bars.png"} if task == "search" else {"map.png"}
+    assert {file.name for file in (tmp_path / "out").iterdir()} == wanted
+    with pytest.raises(SystemExit):
+        run(*arguments, "--draw", "[portrait]")
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from semfov.errors import DataError, InputError
 from semfov.gaze.learned import LearnedGaze
 from semfov.io import storage
 from semfov.io.cached import read_tensors, write_tensors
-from semfov.io.schema import Array, Field, Maybe, Number, Object, Pair, Schema, Text, is_number, is_plain
+from semfov.io.schema import Array, Field, Flag, Maybe, Number, Object, Pair, Schema, Text, is_number, is_plain
 from semfov.zoom import GlimpseEvidence
 
 CLASSES = ["cup", "cat"]
@@ -253,3 +253,36 @@ def test_what_schemas_say_of_single_values():
             kind.check("name", value, {})
     assert not is_number(10**400)
     assert not is_plain("\x85")
+
+
+@pytest.mark.parametrize(
+    ("kind", "good", "bad"),
+    [
+        (Flag(), [True, False], [0, 1, None, "true"]),
+        (Number(low=0, whole=True), [0, 3], [1.0, -1, True, None]),
+    ],
+    ids=["flag", "whole number"],
+)
+def test_values_of_these_kinds(kind, good, bad):
+    for value in good:
+        Schema({}, {"x": kind}).check({}, {"x": value})
+    for value in bad:
+        with pytest.raises(InputError, match="x: expected"):
+            Schema({}, {"x": kind}).check({}, {"x": value})
+
+
+def test_tensors_may_be_of_several_types_where_that_is_said():
+    mixed = {"a": torch.zeros(2), "b": torch.zeros(2, dtype=torch.float64)}
+    Schema({name: Field((2,), mixed=True) for name in mixed}).check(mixed)
+    Schema({"a": Field((2,), mixed=True), "b": Field((2,))}).check(mixed)
+    with pytest.raises(InputError, match="one floating-point type"):
+        Schema({name: Field((2,)) for name in mixed}).check(mixed)
+    with pytest.raises(InputError, match=r"a: expected torch\.float32 or torch\.float64"):
+        Schema({"a": Field((2,), mixed=True)}).check({"a": torch.zeros(2, dtype=torch.int64)})
+
+
+def test_numbers_may_be_infinite_where_that_is_said():
+    tensor = torch.tensor([-torch.inf, torch.nan])
+    Schema({"a": Field((2,), finite=False)}).check({"a": tensor})
+    with pytest.raises(InputError, match="finite"):
+        Schema({"a": Field((2,))}).check({"a": tensor})

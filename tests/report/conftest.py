@@ -58,7 +58,10 @@ def run_page(scanpath: Scanpath, image: torch.Tensor, hostile: str, tmp_path: Pa
         task=hostile,
         policies={hostile: PolicyConfig("random")},
         config=SearchConfig(data=DataConfig(annotations=Path(hostile)), policies=(hostile,), out=tmp_path / "run"),
-        eye=SimpleNamespace(detector=SimpleNamespace(name=hostile)),
+        eye=SimpleNamespace(
+            detector=SimpleNamespace(name=hostile),
+            settings=lambda: {"detector": {"name": hostile}, "sensor": {"sigma": 100, "reference": 640, "growth": 2}},
+        ),
         scenes=type("Scenes", (list,), {"ids": [7]})([scene]),
     )
     run.config.out.mkdir()

@@ -4,15 +4,19 @@ The browser is `chromium`, `chromium-browser` or `google-chrome` on the path, or
 """
 
 import os
+import re
 import shutil
 from dataclasses import replace
+from itertools import combinations
 
 import pytest
 
 from semfov.report.episode import Pool, episode_data
 from semfov.report.page import write_page
+from semfov.viz.style import overlay_colours
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install playwright)")
+axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="needs axe-playwright-python")
 NAMES = (os.environ.get("CHROMIUM", ""), "chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next((path for name in NAMES if name and (path := shutil.which(name))), None)
 pytestmark = [
@@ -34,7 +38,9 @@ def path(scanpath, image, hostile, tmp_path):
     pool = Pool()
     views = [image * share for share in (0.3, 0.6, 0.9)]
     timed = replace(scanpath, seconds=tuple({"detect": 0.1 * number} for number in (1, 2, 3)))
-    episodes = [episode_data(timed, image, views, pool, name=name) for name in (hostile, "another")]
+    settings = {"sensor": {"sigma": 20, "reference": 640, "growth": 2}, "detector": {"name": "none"}}
+    names = (hostile, "another")
+    episodes = [episode_data(timed, image, views, pool, name=name, settings=settings) for name in names]
     return write_page(tmp_path / "page.html", f"search for {hostile}", episodes, pool)
 
 
@@ -106,15 +112,129 @@ def test_another_class_changes_the_map(opened, scanpath):
 
 
 def test_cells_have_the_colours_of_their_values(opened, scanpath):
-    """The cell with the greatest value has the last colour of the map."""
+    """On one scale from 0, which is transparent, to 1."""
     cells = opened.locator("#belief rect").evaluate_all("all => all.map(cell => cell.getAttribute('fill'))")
     assert len(cells) == 12
     opened.keyboard.press("End")
     posterior = scanpath.posterior
     look, cell = divmod(int(posterior.argmax()), 12)
     opened.locator("#fixation").fill(str(look))
-    fills = opened.locator("#belief rect").evaluate_all("all => all.map(cell => cell.getAttribute('fill'))")
-    assert fills[cell] == "rgb(253 231 37)"
+    read = "all => all.map(cell => [cell.getAttribute('fill'), Number(cell.getAttribute('fill-opacity'))])"
+    shades = opened.locator("#belief rect").evaluate_all(read)
+    for value, (fill, opacity) in zip(posterior[look].tolist(), shades, strict=True):
+        *rgb, alpha = overlay_colours()(value)
+        told = [int(part) for part in re.findall(r"\d+", fill)]
+        assert told == pytest.approx([255 * part for part in rgb], abs=5)
+        assert opacity == pytest.approx(alpha, abs=0.09)
+    assert opened.locator("#belief-scale span").all_inner_texts()[:2] == ["0", "1"]
+    assert max(range(12), key=lambda each: shades[each][1]) == cell
+    assert opened.locator("#belief image").evaluate("each => getComputedStyle(each).filter") == "grayscale(1)"
+
+
+def test_head_tells_what_and_how_and_the_outcome_from_the_start(opened, hostile):
+    told = dict(
+        zip(opened.locator("#about dt").all_inner_texts(), opened.locator("#about dd").all_inner_texts(), strict=True)
+    )
+    assert told == {
+        "Photograph": hostile,
+        "Detector": "none",
+        "Sensor": "fovea of 20 px in 640, growth 2",
+        "Decision": f"“{hostile}” found after 2 gaze shifts.",
+    }
+    assert opened.locator("#number").inner_text() == "0 of 2"
+    opened.locator("#episode").select_option(index=1)
+    assert opened.locator("#about dd").first.inner_text() == "another"
+
+
+def test_one_entry_for_each_class(opened, scanpath):
+    entries = opened.locator("#class option").all_inner_texts()
+    assert sorted(entries) == sorted(scanpath.classes)
+
+
+def test_saccades_are_thin_and_fixations_coloured_by_time(opened):
+    opened.keyboard.press("End")
+    fills = opened.locator("#path circle").evaluate_all("all => all.map(each => each.getAttribute('fill'))")
+    assert len(set(fills)) == len(fills) == 3
+    # One unit is a 640th of the width.
+    widths = opened.locator("#path line").evaluate_all("all => all.map(each => each.getAttribute('stroke-width'))")
+    assert max(float(width) for width in widths) <= 3.5 * 80 / 640
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1200, 900), (360, 740)], ids=["desktop", "phone"])
+@pytest.mark.parametrize("kind", ["episodes", "run", "notebook"])
+def test_axe_finds_no_violation(chromium, path, run_page, scanpath, kind, size, scheme, tmp_path):
+    if kind == "notebook":
+        frame = scanpath._repr_html_()
+        page_file = tmp_path / "notebook.html"
+        page_file.write_text(f'<!DOCTYPE html><html lang="en"><title>n</title><main><h1>n</h1>{frame}</main>', "utf-8")
+    else:
+        page_file = path if kind == "episodes" else run_page
+    context = chromium.new_context(viewport={"width": size[0], "height": size[1]}, color_scheme=scheme)
+    page = context.new_page()
+    page.goto(page_file.as_uri())
+    page.keyboard.press("End")
+    found = axe.Axe().run(page)
+    assert found.violations_count == 0, found.generate_report()
+    assert len(found.response["passes"]) > 8
+    context.close()
+
+
+def test_axe_would_find_a_violation(chromium, path):
+    page = chromium.new_page()
+    page.goto(path.as_uri())
+    page.evaluate("document.querySelector('label[for=fixation]').remove()")
+    found = axe.Axe().run(page)
+    assert [each["id"] for each in found.response["violations"]] == ["label"]
+    page.close()
+
+
+def test_page_runs_in_a_frame_and_reaches_nothing_outside(chromium, scanpath, tmp_path):
+    """A notebook's style does not reach in, and the page's program does not reach out."""
+    file = tmp_path / "notebook.html"
+    style = "<style>* { color: red !important; display: block }</style><p id=outcome>mine</p>"
+    file.write_text(f"<!DOCTYPE html>{style}{scanpath._repr_html_()}", "utf-8")
+    page, told = watched(chromium)
+    page.goto(file.as_uri())
+    inside = page.frame_locator("iframe")
+    assert inside.locator("#number").inner_text() == "0 of 2"
+    inside.locator("#forward").click()
+    assert inside.locator("#number").inner_text() == "1 of 2"
+    assert inside.locator("h1").evaluate("each => getComputedStyle(each).color") != "rgb(255, 0, 0)"
+    assert (
+        inside.locator("h1").evaluate("() => { try { return parent.document.title } catch { return 'refused' } }")
+        == "refused"
+    )
+    height = page.locator("iframe").bounding_box()["height"]
+    assert 400 <= height <= 900
+    assert told == []
+    page.close()
+
+
+def test_curves_are_whole_on_a_phone(chromium, run_page):
+    """They fit without scrolling, and their numbers are not too small to read."""
+    context = chromium.new_context(viewport={"width": 360, "height": 740})
+    page = context.new_page()
+    page.goto(run_page.as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    box = page.locator(".curves > svg").bounding_box()
+    assert box["x"] >= 0
+    assert box["x"] + box["width"] <= 360
+    assert (
+        page.locator(".curves > svg").evaluate(
+            "each => each.parentElement.scrollWidth - each.parentElement.clientWidth"
+        )
+        <= 0
+    )
+    heights = page.locator(".curves > svg text:visible").evaluate_all("all => all.map(e => e.getBoundingClientRect())")
+    assert len(heights) > 5
+    assert min(each["height"] for each in heights) >= 11
+    for each in heights:
+        assert box["x"] - 0.5 <= each["left"] <= each["right"] <= box["x"] + box["width"] + 0.5
+    for a, b in combinations(heights, 2):
+        apart = a["right"] <= b["left"] or b["right"] <= a["left"] or a["bottom"] <= b["top"] or b["bottom"] <= a["top"]
+        assert apart
+    context.close()
 
 
 def test_names_are_shown_and_not_run(opened, hostile):

@@ -160,6 +160,45 @@ def test_curves_are_the_numbers(hostile):
     assert text.count("<polygon") == 1
 
 
+def test_the_legend_of_many_curves_is_sparse(hostile):
+    curves = {"random": np.zeros(3)} | {f"policy {number}": np.full(3, number / 40) for number in range(30)}
+    text = curves_html(curves, {}, hostile)
+    entries = re.findall(r"</svg> ([^<]+)</li>", text)
+    assert entries == ["random", *(f"policy {number}" for number in range(24, 30)), "24 others"]
+    assert text.count("<polyline") == 31 + len(entries)
+    few = curves_html(dict(list(curves.items())[:3]), {}, hostile)
+    assert re.findall(r"</svg> ([^<]+)</li>", few) == ["random", "policy 0", "policy 1"]
+
+
+def test_one_entry_for_each_class(scanpath, image):
+    """Whatever the detector calls its classes."""
+    twins = replace(scanpath, classes=("background", "N/A", "cup", "N/A"))
+    data = episode_data(twins, image, [image] * 3, Pool(), name="twins")
+    labels = [each["label"] for each in data["maps"]]
+    assert labels[0] == "cup"
+    assert sorted(labels) == ["N/A", "N/A (2)", "background", "cup"]
+
+
+def test_without_pictures(scanpath, tmp_path):
+    data = episode_data(scanpath, None, None, pool := Pool(), name="in the dark")
+    page = write_page(tmp_path / "page.html", "t", [data], pool).read_text(encoding="utf-8")
+    assert data_of(page)["pictures"] == []
+    assert "not recorded" in page
+
+
+def test_head_of_the_page(scanpath, image, hostile, tmp_path):
+    """It stands there without the program, too."""
+    settings = {"detector": {"name": hostile}, "sensor": {"sigma": 50.0, "reference": 640.0, "growth": 1.0}}
+    decided = replace(scanpath, decision=Decision("found", 0.97, 6), ending="decision")
+    data = episode_data(decided, image, [image] * 3, pool := Pool(), name="a.jpg", settings=settings)
+    page = write_page(tmp_path / "page.html", "t", [data], pool).read_text(encoding="utf-8")
+    texts = Elements(page).texts
+    assert {"a.jpg", hostile, "fovea of 50 px in 640, growth 1"} <= set(texts)
+    (told,) = [text for text in texts if "found after" in text and "{" not in text]
+    assert told.endswith("It is at column 2, row 1.")
+    assert page.index("found after") < page.index("<main>")
+
+
 def test_the_outcome_comes_through(scanpath, image):
     """What was decided, why it ended, and how sure each look made the search."""
     decision = Decision("found", 0.97, 6, torch.tensor([1.0, 2.0, 30.25, 40.0]))

@@ -1,14 +1,44 @@
 """Animations hold every frame, and play it as long as asked."""
 
+import base64
+import re
 import shutil
 import subprocess
+from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from semfov.viz.animation import render, save_animation
+from semfov import Detections, Grid, InputError, Scanpath
+from semfov.viz import animate, describe, plot_fixation
+from semfov.viz.animation import episode_frames, in_one_palette, render, save_animation
+from semfov.viz.fixation import FixationFigure
+
+
+@pytest.fixture(params=["search", "exploration"])
+def searched(request):
+    """Three fixations, the photograph and three views of it."""
+    generator = torch.Generator().manual_seed(0)
+    grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 6, 11])
+    scores = torch.tensor([[0.1, 0.8, 0.1], [0.3, 0.1, 0.6]])
+    corner = torch.rand(3, 2, 2, generator=generator) * 40
+    boxes = torch.cat([corner, corner + 18], -1)
+    scanpath = Scanpath(
+        grid=grid,
+        classes=("background", "cat", "cup"),
+        target=2 if request.param == "search" else None,
+        cells=cells,
+        fixations=grid.centres[cells],
+        detections=tuple(Detections(each[None], scores[None], torch.ones(1, 2, dtype=torch.bool)) for each in boxes),
+        probabilities=torch.rand(3, 12, 3, generator=generator).pow(3),
+        values=torch.rand(3, 12, generator=generator),
+        found=False,
+    )
+    image = torch.rand(3, 60, 80, generator=generator)
+    return scanpath, image, [image * share for share in (0.3, 0.6, 0.9)]
 
 
 @pytest.fixture
@@ -39,6 +69,57 @@ def test_mp4(frames, tmp_path):
 def test_without_ffmpeg(frames, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: None)
     assert save_animation(frames, tmp_path / "a.gif") == [tmp_path / "a.gif"]
+
+
+def test_frames_are_the_figures_drawn_one_by_one(searched):
+    """One figure makes them all, yet each is what `plot_fixation` draws."""
+    scanpath, image, views = searched
+    frames = episode_frames(scanpath, image, views)
+    assert len(frames) == len(scanpath)
+    for fixation, (frame, view) in enumerate(zip(frames, views, strict=True)):
+        (alone,) = render([plot_fixation(scanpath, fixation, image, view)])
+        assert frame.shape == alone.shape
+        # The layout of a figure that is drawn on its own is done once more, and may move by part of a pixel.
+        off = np.abs(frame.astype(int) - alone) > 48
+        assert off.mean() < 2e-3, fixation
+    assert all((a != b).mean() > 1e-3 for a, b in pairwise(frames))
+
+
+def test_frames_do_not_depend_on_those_before(searched):
+    scanpath, image, views = searched
+    figure = FixationFigure(scanpath, image, views[0])
+    (last,) = render([figure.show(2, views[2])])
+    for number in (0, 1):
+        figure.show(number, views[number])
+    (again,) = render([figure.show(2, views[2])])
+    np.testing.assert_array_equal(last, again)
+
+
+def test_film(searched, tmp_path):
+    scanpath, image, views = searched
+    film = animate(scanpath, image=image, views=views, seconds=0.5, hold=1)
+    assert len(film) == 3
+    assert repr(film).startswith(f"Film: {describe(scanpath)}, 3 frames of ")
+    inside = re.fullmatch(r'<img [^>]*src="data:image/gif;base64,([^"]+)">', film._repr_html_())
+    path = animate(scanpath, tmp_path / "film.gif", image=image, views=views, seconds=0.5, hold=1)
+    assert path.read_bytes() == base64.b64decode(inside[1])
+    with Image.open(path) as read:
+        for number, frame in enumerate(film.frames):
+            read.seek(number)
+            assert read.info["duration"] == (500, 500, 1500)[number]
+            shown = np.asarray(read.convert("RGB")).astype(int)
+            assert (shown[0] == 255).all()
+            # The photograph is noise, which needs more colours than there are.
+            assert np.abs(shown - frame).mean() < 9
+    for bad in ({"seconds": 0.0}, {"hold": -1.0}):
+        with pytest.raises(InputError, match=next(iter(bad))):
+            animate(scanpath, image=image, views=views, **bad)
+
+
+def test_frames_share_their_colours(searched):
+    """What stands still does not flicker."""
+    first, *others = in_one_palette(episode_frames(*searched))
+    assert all(frame.getpalette() == first.getpalette() for frame in others)
 
 
 def test_render_is_the_figure():

@@ -11,7 +11,7 @@ import torch
 from eval import demo
 from semfov import Detections, Grid, Scanpath
 from semfov.viz import entropy, plot_semantic_map
-from semfov.viz.belief import named_regions, regions
+from semfov.viz.semantic import named_regions, regions
 
 CLASSES = ("background", "cat", "cup", "dog")
 
@@ -112,9 +112,19 @@ def test_figure_of_marginal_probabilities():
         np.testing.assert_allclose(
             named.images[-1].get_array(), scanpath.probabilities[-1, :, 1:].amax(-1).reshape(4, 6), rtol=1e-6
         )
-        assert named.images[-1].get_clim() == pytest.approx((0, 0.95))
+        assert named.images[-1].get_clim() == (0, 1)
         np.testing.assert_allclose(unsure.images[-1].get_array(), entropy(scanpath)[-1].reshape(4, 6), rtol=1e-6)
         assert sorted(text.get_text() for text in named.texts if text.get_text() in CLASSES) == ["cat", "dog", "dog"]
+
+
+def test_names_of_many_regions_do_not_hide_each_other():
+    generator = torch.Generator().manual_seed(0)
+    probabilities = torch.rand(1, 100, 4, generator=generator).pow(4)
+    figure = plot_semantic_map(scanpath_of(probabilities, 10, ("background", "fire hydrant", "dining table", "cup")))
+    figure.canvas.draw()
+    extents = [text.get_window_extent().padded(-0.5) for text in figure.axes[0].texts]
+    assert len(extents) == len(named_regions(scanpath_of(probabilities, 10))) > 15
+    assert not any(a.overlaps(b) for n, a in enumerate(extents) for b in extents[n + 1 :])
 
 
 def test_entropy_of_marginal_probabilities_is_that_of_their_shares():

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
@@ -59,6 +60,12 @@ def test_figure(agent, picture):
     figure = plot_zoom_path(path, picture)
     assert len(figure.axes) == 1
     assert describe_zoom(path).startswith("red: ")
+    mine = Figure()
+    given, other = mine.subplots(1, 2)
+    assert plot_zoom_path(path, picture, ax=given) is mine
+    assert given.get_title() == figure.axes[0].get_title()
+    assert [len(given.patches), len(given.texts)] == [len(figure.axes[0].patches), len(figure.axes[0].texts)]
+    assert not other.images
 
 
 def test_errors(agent, picture):

@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.experiments.summary import announce, gather, save_figure, sensing, table, write_files
+from semfov.experiments.summary import announce, gather, sensing, table, write_files
 from semfov.experiments.viewing.rows import PEOPLE, Half
 from semfov.experiments.viewing.run import ViewingRun
 from semfov.experiments.viewing.scores import FIGURES, Scored
 from semfov.experiments.viewing.sequences import drawn_scanpaths
 from semfov.io.files import clean
 from semfov.metrics.averages import standard_error
+from semfov.viz.style import save_figure
 
 Array = NDArray[np.float64]
 Table = Mapping[tuple[str, str], Scored]

@@ -1,0 +1,129 @@
+"""One fixation after the other in one figure: what an animation is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from semfov.scanpath import Scanpath
+from semfov.viz.belief import belief_title, draw_belief
+from semfov.viz.belief import class_posterior as posterior_of
+from semfov.viz.drawing import (
+    check_fixation,
+    draw_detections,
+    draw_gaze,
+    draw_image,
+    draw_scale,
+    photograph_of,
+    pixels_of,
+    table_of,
+)
+from semfov.viz.path import GazePath
+from semfov.viz.scanpath import MOST_BOXES, draw_legend, draw_place
+from semfov.viz.semantic import draw_semantic_map, most_probable, write_names
+from semfov.viz.style import make_figure, styled
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+@styled
+def plot_fixation(
+    scanpath: Scanpath,
+    fixation: int,
+    image: Tensor | None = None,
+    view: Tensor | None = None,
+    *,
+    boxes: Tensor | None = None,
+    axes: Sequence[Axes] | None = None,
+) -> Figure:
+    """One fixation: the scanpath so far, what was seen, what was believed after it; a frame of an animation.
+
+    The belief is the target's posterior, or what is where if nothing is searched for.
+
+    Args:
+        scanpath: the episode.
+        fixation: its number; -1 is the last.
+        image: `(3, H, W)`, RGB in [0, 1]; None is the scanpath's own.
+        view: the foveated photograph `(3, h, w)`, of any size; None is the scanpath's own.
+        boxes: `(M, 4)`, where the target really is (drawn dashed).
+        axes: three of them to draw in; None makes a figure.
+
+    Raises:
+        InputError: there are no photograph and view, neither given nor kept.
+    """
+    fixation = check_fixation(scanpath, fixation)
+    view = scanpath.views()[fixation] if view is None else view
+    return FixationFigure(scanpath, photograph_of(scanpath, image), view, boxes, axes).show(fixation, view)
+
+
+class FixationFigure:
+    """A figure of one fixation that goes to others: laid out once, and only what differs is changed.
+
+    Args:
+        scanpath: the episode.
+        image: `(3, H, W)`, RGB in [0, 1].
+        view: any foveated photograph `(3, h, w)`, for its size.
+        boxes: `(M, 4)`, where the target really is.
+        axes: three of them to draw in; None makes a figure.
+
+    Attributes:
+        figure: the figure.
+        axes: of scanpath, view and belief.
+    """
+
+    def __init__(
+        self,
+        scanpath: Scanpath,
+        image: Tensor,
+        view: Tensor,
+        boxes: Tensor | None = None,
+        axes: Sequence[Axes] | None = None,
+    ) -> None:
+        self.scanpath = scanpath
+        height = 4 * image.shape[-2] / image.shape[-1] + 0.3
+        self.figure, self.axes = make_figure(1, 3, width=12.6, height=height, layout="compressed", given=axes)
+        path, seen, believed = self.axes
+        draw_place(path, scanpath, image, boxes)
+        draw_legend(path, scanpath, boxes, None)
+        self.view = draw_image(seen, view, scanpath.grid)
+        seen.set_title("what the eye sees")
+        if scanpath.target is None:
+            self.belief = draw_semantic_map(believed, scanpath, 0, image)
+        else:
+            self.belief = draw_belief(believed, scanpath, 0, None, image)
+        # Its cross goes with the fixation.
+        for line in list(believed.lines):
+            line.remove()
+        draw_scale(believed, self.belief, "probability")
+        path.set_title("fixation 0")
+        self.figure.draw_without_rendering()
+        if axes is None:
+            # Nothing moves from now on, and to lay it out again takes as long as to draw it.
+            self.figure.set_layout_engine("none")
+        self.path = GazePath(path, scanpath)
+        self.changing: list[Artist] = []
+
+    def show(self, fixation: int, view: Tensor) -> Figure:
+        """Go to a fixation, seen as `view` `(3, h, w)`."""
+        path, seen, believed = self.axes
+        for artist in self.changing:
+            artist.remove()
+        self.path.show(fixation)
+        path.set_title(f"fixation {fixation}")
+        self.view.set_data(pixels_of(view))
+        self.changing = draw_gaze(seen, self.scanpath, fixation) + draw_gaze(believed, self.scanpath, fixation)
+        self.changing += draw_detections(seen, self.scanpath, fixation, MOST_BOXES)
+        if self.scanpath.target is None:
+            values: Any = most_probable(self.scanpath, fixation)
+            believed.set_title(f"what is where after fixation {fixation}")
+            self.changing += write_names(believed, self.scanpath, fixation)
+        else:
+            values = posterior_of(self.scanpath)[fixation]
+            believed.set_title(belief_title(self.scanpath, fixation), parse_math=False)
+        self.belief.set_data(table_of(self.scanpath.grid, values))
+        return self.figure

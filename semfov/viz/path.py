@@ -1,0 +1,100 @@
+"""The path of the gaze: fixations in their order, coloured by time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from semfov.scanpath import Scanpath
+from semfov.viz.drawing import lightness, per_point
+from semfov.viz.labels import Box, place_numbers
+from semfov.viz.style import FOUND, TIME
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.text import Annotation
+
+_POINTS = 6.5
+
+
+class GazePath:
+    """Saccades as thin lines, fixations as dots with their numbers, from dark to bright as time goes on.
+
+    All is made once, from the whole episode, so that a fixation looks the same however much of the path is shown.
+
+    Args:
+        axes: that the photograph is in, laid out.
+        scanpath: the episode.
+
+    Attributes:
+        numbers: of the fixations; None for those that there is no room for.
+        taken: rectangles that the numbers take.
+    """
+
+    def __init__(self, axes: Axes, scanpath: Scanpath) -> None:
+        from matplotlib import colormaps
+        from matplotlib.collections import LineCollection
+
+        self.scanpath = scanpath
+        self.path = (scanpath.fixations.detach().cpu() + 0.5).double().numpy()
+        count = len(self.path)
+        self.colours = colormaps[TIME](np.linspace(0, 1, max(count, 2))[:count])
+        lines = np.stack([self.path[:-1], self.path[1:]], 1)
+        self.lines: list[Any] = [
+            axes.add_collection(LineCollection(list(lines), colors=colours, linewidths=width), autolim=False)
+            for colours, width in (((1, 1, 1, 0.7), 1.6), (self.colours[1:], 0.8))
+        ]
+        self.segments = lines
+        x, y = self.path.T
+        self.dots = axes.scatter(x, y, s=16, c=self.colours, edgecolors="white", linewidths=0.6, zorder=5)
+        self.numbers = self._numbers(axes)
+        self.show(count - 1)
+
+    def _numbers(self, axes: Axes) -> list[Annotation | None]:
+        scale, count = per_point(axes), len(self.path)
+        # A digit is about 0.64 of the height of the letters, and the frame adds 4 points.
+        sizes = [((0.64 * len(str(n)) * _POINTS + 4.5) * scale, (_POINTS + 4) * scale) for n in range(count)]
+        points = [(float(x), float(y)) for x, y in self.path]
+        frame = self.scanpath.grid.extent.tolist()
+        places = place_numbers(points, sizes, (frame[0], frame[1]), 60 * scale)
+        self.taken: list[Box] = [place for place in places if place is not None]
+        written: list[Annotation | None] = []
+        for number, (point, place) in enumerate(zip(points, places, strict=True)):
+            if place is None:
+                written.append(None)
+                continue
+            colour = self.colours[number]
+            box = {"boxstyle": "round,pad=0.22,rounding_size=0.5", "facecolor": colour, "edgecolor": "white",
+                   "linewidth": 0.7}  # fmt: skip
+            text = axes.annotate(
+                str(number),
+                xy=point,
+                xytext=((place[0] + place[2]) / 2, (place[1] + place[3]) / 2),
+                color="white" if lightness(colour) < 0.55 else "black",
+                fontsize=_POINTS,
+                fontweight="bold",
+                ha="center",
+                va="center",
+                zorder=6,
+                bbox=box,
+                # A line to a number that stands off its point.
+                arrowprops={"arrowstyle": "-", "color": "white", "linewidth": 0.7, "shrinkA": 0, "shrinkB": 0},
+            )
+            written.append(text)
+        return written
+
+    def show(self, last: int) -> list[Any]:
+        """Show fixations up to the `last` one, of which the end of a search that found its target is framed."""
+        for lines in self.lines:
+            lines.set_segments(list(self.segments[:last]))
+        self.dots.set_offsets(self.path[: last + 1])
+        self.dots.set_facecolor([tuple(colour) for colour in self.colours[: last + 1]])
+        for number, text in enumerate(self.numbers):
+            if text is not None:
+                text.set_visible(number <= last)
+                ends = number == last
+                box: Any = text.get_bbox_patch()
+                found = ends and self.scanpath.found and last == len(self.path) - 1
+                box.set(edgecolor=FOUND if found else "white", linewidth=1.6 if ends else 0.7)
+        return [*self.lines, self.dots, *(text for text in self.numbers if text is not None)]

@@ -1,0 +1,192 @@
+"""Detections in the forms of Supervision, torchvision and COCO, and back, against these packages themselves."""
+
+import builtins
+import contextlib
+import io
+
+import numpy as np
+import pytest
+import supervision
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
+from torchvision.ops import box_iou
+
+from semfov import Detections, InputError
+from semfov.detection.exchange import category_ids
+
+CLASSES = ("person", "cup", "tvmonitor")
+
+
+def some(count=4, *, padding=0, seed=0, dtype=torch.float32, classes=3):
+    """A batch of one, in descending order of confidence."""
+    generator = torch.Generator().manual_seed(seed)
+    corner = torch.rand(count, 2, generator=generator) * 50
+    boxes = torch.cat([corner, corner + 5 + torch.rand(count, 2, generator=generator) * 40], -1)
+    scores = torch.randn(count, classes + 1, generator=generator).mul(2).softmax(-1)
+    order = scores[:, 1:].amax(-1).argsort(descending=True)
+    mask = torch.arange(count + padding) < count
+    pad = torch.nn.functional.pad
+    return Detections(
+        pad(boxes[order], (0, 0, 0, padding))[None].to(dtype), pad(scores[order], (0, 0, 0, padding))[None].to(dtype),
+        mask[None],
+    )  # fmt: skip
+
+
+def same(a, b):
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("boxes", "scores", "mask"))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_supervision_and_back_loses_nothing(count, dtype):
+    seen = some(count, padding=2, dtype=dtype)
+    given_out = seen.to_supervision(CLASSES)
+    assert isinstance(given_out, supervision.Detections)
+    assert len(given_out) == count
+    np.testing.assert_array_equal(given_out.class_id, seen.labels[0, :count].numpy() - 1)
+    np.testing.assert_array_equal(given_out.confidence, seen.confidence[0, :count].numpy())
+    assert given_out.data["class_name"].tolist() == [CLASSES[label - 1] for label in seen.labels[0, :count].tolist()]
+    back = Detections.from_supervision(given_out, len(CLASSES))
+    assert same(back, some(count, dtype=dtype))
+
+
+def test_supervision_works_with_them():
+    """Its own selection, merging and drawing take what comes out."""
+    seen = some(5)
+    out = seen.to_supervision(CLASSES)
+    sure = out[out.confidence > float(seen.confidence[0, 2])]
+    assert len(sure) == 2
+    best = Detections(seen.boxes[:, :2], seen.scores[:, :2], seen.mask[:, :2])
+    assert same(Detections.from_supervision(sure, 3), best)
+    assert len(supervision.Detections.merge([out, out])) == 10
+    scene = supervision.BoxAnnotator().annotate(np.zeros((100, 100, 3), np.uint8), out)
+    assert scene.any()
+
+
+def test_detections_of_others_by_supervision():
+    """With a class and a confidence alone, what is left of 1 is background; the most confident comes first."""
+    theirs = supervision.Detections(
+        xyxy=np.array([[0, 0, 5, 5], [1, 2, 3, 4]]), confidence=np.array([0.25, 0.75]), class_id=np.array([0, 2])
+    )
+    seen = Detections.from_supervision(theirs, 3)
+    torch.testing.assert_close(seen.boxes, torch.tensor([[[1.0, 2, 3, 4], [0, 0, 5, 5]]]))
+    expected = torch.tensor([[[0.25, 0, 0, 0.75], [0.75, 0.25, 0, 0]]])
+    torch.testing.assert_close(seen.scores, expected, check_dtype=False)
+    sure = Detections.from_supervision(supervision.Detections(np.zeros((1, 4)), class_id=np.array([1])), 3)
+    assert sure.scores.tolist() == [[[0, 0, 1, 0]]]
+    assert Detections.from_supervision(supervision.Detections.empty(), 3).scores.shape == (1, 0, 4)
+
+
+def test_torchvision_and_back():
+    seen = some(5, padding=1)
+    out = seen.to_torchvision()
+    assert {name: tuple(value.shape) for name, value in out.items()} == {
+        "boxes": (5, 4),
+        "labels": (5,),
+        "scores": (5,),
+    }
+    assert out["labels"].dtype == torch.int64
+    back = Detections.from_torchvision(out, 3)
+    torch.testing.assert_close(back.boxes, seen.boxes[:, :5])
+    torch.testing.assert_close(back.confidence, seen.confidence[:, :5])
+    assert torch.equal(back.labels, seen.labels[:, :5])
+    torch.testing.assert_close(back.scores.sum(-1), torch.ones(1, 5))
+    torch.testing.assert_close(box_iou(out["boxes"], back.boxes[0]).diagonal(), torch.ones(5))
+    target = Detections.from_torchvision({"boxes": out["boxes"], "labels": out["labels"]}, 3)
+    assert (target.confidence == 1).all()
+
+
+def test_torchvisions_own_detector(device):
+    """What a detector of torchvision's returns is taken as it is."""
+    from torchvision.models.detection import ssdlite320_mobilenet_v3_large
+
+    torch.manual_seed(0)
+    model = ssdlite320_mobilenet_v3_large(weights=None, weights_backbone=None, num_classes=4).eval().to(device)
+    with torch.no_grad():
+        (out,) = model([torch.rand(3, 64, 64, device=device)])
+    seen = Detections.from_torchvision(out, 3)
+    assert seen.boxes.device.type == device.type
+    assert int(seen.count) == len(out["boxes"]) > 0
+    torch.testing.assert_close(seen.confidence[0], out["scores"].sort(descending=True).values)
+
+
+ids = st.lists(st.integers(1, 90), min_size=3, max_size=3, unique=True)
+
+
+@given(ids, st.integers(0, 6))
+def test_coco_results_are_read_by_pycocotools(category, count):
+    seen = some(count, padding=2, seed=count)
+    records = [{"id": number, "name": name} for number, name in zip(category, ("person", "cup", "tv"), strict=True)]
+    results = seen.to_coco(7, category)
+    assert results == seen.to_coco(7, records[::-1], CLASSES)
+    if not count:
+        assert results == []
+        return
+    truth = COCO()
+    truth.dataset = {
+        "info": {},
+        "images": [{"id": 7, "width": 100, "height": 100}],
+        "categories": records,
+        "annotations": [{**each, "id": n + 1, "area": each["bbox"][2] * each["bbox"][3], "iscrowd": 0}
+                        for n, each in enumerate(results)],
+    }  # fmt: skip
+    with contextlib.redirect_stdout(io.StringIO()):
+        truth.createIndex()
+        read = truth.loadRes(results)
+        judge = COCOeval(truth, read, "bbox")
+        judge.evaluate()
+        judge.accumulate()
+        judge.summarize()
+    assert judge.stats[0] == pytest.approx(1)
+    for row, each in enumerate(read.loadAnns(read.getAnnIds())):
+        x, y, width, height = each["bbox"]
+        torch.testing.assert_close(torch.tensor([x, y, x + width, y + height]), seen.boxes[0, row])
+        assert each["category_id"] == category[int(seen.labels[0, row]) - 1]
+        assert each["score"] == pytest.approx(float(seen.confidence[0, row]))
+
+
+def test_names_in_either_spelling():
+    assert category_ids([{"id": 72, "name": "tv"}, {"id": 1, "name": "person"}], ["person", "TVmonitor"]) == [1, 72]
+
+
+def test_what_does_not_fit_is_refused_by_name():
+    two = Detections.stack([some(), some()])
+    for call in (two.to_supervision, two.to_torchvision, lambda: two.to_coco(1, [1, 2, 3])):
+        with pytest.raises(InputError, match=r"one image \(detections\[0\]\), got \(2,\)"):
+            call()
+    assert same(Detections.from_supervision(two[0].to_supervision(), 3), some())
+    seen = some()
+    for call, told in (
+        (lambda: seen.to_supervision(["one"]), "classes: expected 3 names"),
+        (lambda: seen.to_coco(1, [1, 2]), "categories: expected one id for each of 3 classes"),
+        (lambda: seen.to_coco(1, [{"id": 1, "name": "person"}]), "classes: expected the names"),
+        (lambda: seen.to_coco(1, [{"id": 1, "name": "person"}], CLASSES), "none for cup, tv"),
+        (lambda: Detections.from_supervision(seen.to_supervision(), 4), "data\\['scores'\\]: expected shape"),
+        (lambda: Detections.from_supervision(supervision.Detections(np.zeros((1, 4))), 3), "class_id"),
+        (lambda: Detections.from_torchvision({"boxes": seen.boxes[0]}, 3), "'labels'"),
+    ):
+        with pytest.raises(InputError, match=told):
+            call()
+    boxes = torch.zeros(1, 4)
+    for labels, scores, told in (([0], [0.5], "labels"), ([4], [0.5], "labels"), ([1], [1.5], "scores"),
+                                 ([1], [float("nan")], "scores"), ([1], [0.5, 0.5], "scores"),
+                                 ([1, 1], [0.5, 0.5], "boxes")):  # fmt: skip
+        with pytest.raises(InputError, match=told):
+            Detections.from_torchvision({"boxes": boxes, "labels": torch.tensor(labels),
+                                         "scores": torch.tensor(scores)}, 3)  # fmt: skip
+
+
+def test_without_supervision(monkeypatch):
+    importing = builtins.__import__
+
+    def without(name, *arguments, **options):
+        if name == "supervision":
+            raise ImportError(name)
+        return importing(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(InputError, match="pip install supervision"):
+        some().to_supervision()

@@ -1,0 +1,102 @@
+"""A scanpath in a notebook: the page in a frame of its own, bounded in size."""
+
+import html
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import pytest
+import torch
+
+from semfov import Detections, Grid, Scanpath
+from semfov.detection import Placement
+from semfov.report import notebook
+from semfov.scanpath import Stimulus
+from semfov.scanpath.stimulus import in_bytes
+
+
+class Frame(HTMLParser):
+    """The only element of a cell's output."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+
+def kept(scanpath, image):
+    """The scanpath with its photograph."""
+    height, width = image.shape[-2:]
+    sensor = {"sigma": 20.0, "levels": 2, "growth": 2.0, "convention": "kornia", "reference": 640.0}
+    settings = {"sensor": sensor, "detector": {"name": "none"}}
+    placement = Placement((80, 60), (width / 80, height / 60), (0, 0))
+    pixels = in_bytes(image)
+    return replace(scanpath, stimulus=Stimulus(pixels, pixels, placement, settings))
+
+
+def data_of(page):
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)[1])
+
+
+def test_frame_holds_the_page(scanpath, image, hostile):
+    text = kept(scanpath, image)._repr_html_()
+    ((tag, attributes),) = Frame(text).tags
+    assert tag == "iframe"
+    assert attributes["sandbox"] == "allow-scripts"
+    assert hostile in attributes["title"]
+    page = attributes["srcdoc"]
+    assert page.startswith("<!DOCTYPE html>")
+    data = data_of(page)
+    (episode,) = data["episodes"]
+    assert len(episode["fixations"]) == 3
+    assert (episode["name"], episode["detector"]) == ("80 × 60 px", "none")
+    assert len(data["pictures"]) == 4
+    assert html.unescape(re.search('srcdoc="([^"]*)"', text)[1]) == page
+
+
+def test_without_a_photograph_there_are_no_pictures(scanpath):
+    page = Frame(scanpath._repr_html_()).tags[0][1]["srcdoc"]
+    data = data_of(page)
+    assert data["pictures"] == []
+    assert data["episodes"][0]["image"] is None
+    assert data["episodes"][0]["detector"] is None
+
+
+def long(looks, columns, classes):
+    grid = Grid(columns, columns, (80, 60))
+    cells = torch.arange(looks) % len(grid)
+    return Scanpath(
+        grid=grid,
+        classes=("background", *(f"class {number}" for number in range(classes))),
+        target=1,
+        cells=cells,
+        fixations=grid.centres[cells],
+        detections=(Detections.empty(1, classes),) * looks,
+        probabilities=torch.rand(1, len(grid), classes + 1).expand(looks, -1, -1),
+        values=torch.rand(1, len(grid)).expand(looks, -1),
+        found=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("looks", "columns", "classes", "size", "shown"),
+    [(31, 10, 80, 200, True), (120, 10, 80, 416, True), (31, 40, 80, 200, True), (900, 40, 2, 20, False)],
+)
+def test_size_is_bounded(looks, columns, classes, size, shown):
+    """Finer pictures and more classes where there is room, then coarser ones and fewer, then words."""
+    noise = torch.rand(3, size * 3 // 4, size)
+    text = kept(long(looks, columns, classes), noise)._repr_html_()
+    assert len(text.encode()) <= notebook.MOST
+    if shown:
+        episode = data_of(Frame(text).tags[0][1]["srcdoc"])["episodes"][0]
+        assert len(episode["fixations"]) == looks
+        labels = [each["label"] for each in episode["maps"]]
+        assert labels[0] == "class 0"
+        assert labels[-1] == "background"
+    else:
+        assert Frame(text).tags == [("pre", {})]
+        assert "class 0" in text

@@ -1,0 +1,354 @@
+"""Scanpaths in words, as tables and as files, and the views that they keep."""
+
+import builtins
+import dataclasses
+import json
+import math
+import shutil
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from semfov import ActivePerception, Detections, Eye, Foveation, Grid, InputError, Scanpath, observers, policies
+from semfov.decision import Decision
+from semfov.detection import Candidates, Detector, Placement
+from semfov.errors import DataError
+from semfov.io.storage import read, write
+from semfov.scanpath import Stimulus
+from semfov.scanpath.files import KIND
+from semfov.scanpath.stimulus import LONGEST
+from semfov.sensor.foveation import foveate
+
+
+class Bright(Detector):
+    """Sees one object where the picture is brightest, of a class that depends on its colour."""
+
+    def __init__(self, size=(96, 96), stride=None) -> None:
+        super().__init__("bright", ("red", "green"), size)
+        self.stride = stride
+
+    def propose(self, canvas):
+        y, x = divmod(int(canvas[0].sum(0).argmax()), canvas.shape[-1])
+        box = canvas.new_tensor([[[x - 8.0, y - 8.0, x + 8.0, y + 8.0]]])
+        return Candidates(box, canvas[:, :2, y, x][:, None] * 0.9)
+
+
+@pytest.fixture
+def image():
+    torch.manual_seed(0)
+    picture = torch.rand(3, 90, 130) * 0.6
+    picture[0, 60:75, 90:110] = 1
+    return picture
+
+
+@pytest.fixture
+def agent():
+    eye = Eye(Foveation(20.0), Bright(), reference=130.0)
+    observer = observers.Semantic(3)
+    return ActivePerception(
+        eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(5, 4)
+    ).eval()
+
+
+@pytest.fixture(params=["search", "exploration"])
+def scanpath(request, agent, image):
+    with torch.inference_mode():
+        if request.param == "search":
+            return agent.search(image, "red", start=0, shifts=4, confirm=1.0)
+        return agent.explore(image, start=3, shifts=11)
+
+
+def same(a, b):
+    """Whether two values are equal to the bit, whatever they are made of."""
+    if isinstance(a, torch.Tensor):
+        return a.dtype == b.dtype and a.shape == b.shape and torch.equal(a.nan_to_num(7.0), b.nan_to_num(7.0))
+    if dataclasses.is_dataclass(a):
+        return type(a) is type(b) and all(same(value, vars(b)[name]) for name, value in vars(a).items())
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return type(a) is type(b) and a == b
+
+
+def test_agents_keep_what_they_looked_at(agent, image, scanpath):
+    """The views are what the eye gave the detector, up to the rounding of bytes."""
+    view = agent.eye.open(image[None])
+    with torch.inference_mode():
+        shown = agent.eye.foveated(view, scanpath.fixations)
+    left, top = view.placement.offset
+    views = scanpath.views()
+    assert len(views) == len(scanpath)
+    for got, canvas in zip(views, shown, strict=True):
+        height, width = got.shape[1:]
+        assert (width, height) == tuple(round(n * view.placement.scale[0]) for n in (130, 90))
+        torch.testing.assert_close(got, canvas[:, top : top + height, left : left + width], rtol=0, atol=1.01 / 255)
+    torch.testing.assert_close(scanpath.image, image, rtol=0, atol=0.51 / 255)
+    assert scanpath.stimulus.photograph.dtype == torch.uint8
+    assert scanpath.stimulus.settings == agent.eye.settings()
+
+
+@pytest.mark.parametrize("growth", [1.0, 2.0])
+def test_views_of_a_stretched_canvas_are_foveated_as_the_eye_does(growth):
+    class Wide(Bright):
+        def fit(self, images):
+            canvas = torch.nn.functional.interpolate(images, (64, 128), mode="bilinear")
+            return canvas, Placement((images.shape[-1], images.shape[-2]), (128 / 100, 64 / 100), (0, 0))
+
+    eye = Eye(Foveation(30.0, growth=growth), Wide(), reference=200.0)
+    image, points = torch.rand(3, 100, 100), torch.tensor([[10.0, 80.0], [99.0, 0.0]])
+    kept = Stimulus.of(eye, image)
+    torch.testing.assert_close(
+        torch.stack(kept.views(points)), eye.foveated(eye.open(image[None]), points), rtol=0, atol=1.01 / 255
+    )
+
+
+def test_large_photographs_are_reduced():
+    kept = Stimulus.of(Eye(Foveation(20.0), Bright()), torch.rand(3, 700, 2 * LONGEST))
+    assert kept.photograph.shape == (3, 350, LONGEST)
+    assert kept.placement.size == (2 * LONGEST, 700)
+
+
+def test_a_scanpath_without_a_photograph_says_so(scanpath):
+    bare = replace(scanpath, stimulus=None)
+    assert bare.image is None
+    for call in (bare.views, bare.plot, bare.animate):
+        with pytest.raises(InputError, match=r"kept|stimulus"):
+            call()
+
+
+def test_repr_is_three_lines(scanpath):
+    first, second, third = repr(scanpath).splitlines()
+    assert first.startswith("Scanpath: ")
+    assert f"{scanpath.shifts} gaze shifts" in first
+    column, row = int(scanpath.cells[-1]) % 5, int(scanpath.cells[-1]) // 5
+    assert second.endswith(f"({column}, {row}) of 5 × 4 cells over 130 × 90 px")
+    assert ("…" in second) == (len(scanpath) > 8)
+    assert third.startswith("  seen last: red 0.")
+    nothing = replace(scanpath, detections=(Detections.empty(1, 2),) * len(scanpath))
+    assert repr(nothing).splitlines()[2] == "  seen last: nothing"
+    assert max(map(len, repr(scanpath).splitlines())) < 200
+
+
+def test_rows_are_what_happened(scanpath):
+    rows = scanpath.rows()
+    json.dumps(rows, allow_nan=False)
+    assert [row["fixation"] for row in rows] == list(range(len(scanpath)))
+    for number, row in enumerate(rows):
+        cell = int(scanpath.cells[number])
+        assert (row["cell"], row["row"] * 5 + row["column"]) == (cell, cell)
+        assert (row["x"], row["y"]) == tuple(scanpath.grid.centres[cell].tolist())
+        seen = scanpath.detections[number]
+        assert row["detections"] == int(seen.mask.sum())
+        if not row["detections"]:
+            assert (row["seen"], row["score"]) == (None, None)
+            continue
+        assert (row["seen"], row["score"]) == (
+            scanpath.classes[int(seen.labels[0, 0])], pytest.approx(float(seen.scores[0, 0, 1:].max()))
+        )  # fmt: skip
+        assert row["seconds"] == pytest.approx(sum(scanpath.seconds[number].values()))
+        if scanpath.target is None:
+            assert {row[name] for name in ("probability", "highest", "highest_cell", "presence")} == {None}
+        else:
+            belief = scanpath.posterior[number]
+            assert row["probability"] == float(belief[cell])
+            assert row["highest"] == float(belief[row["highest_cell"]]) == float(belief.max())
+            assert row["presence"] == float(scanpath.presence[number])
+
+
+def test_to_frame(scanpath):
+    frame = scanpath.to_frame()
+    assert isinstance(frame, pd.DataFrame)
+    assert frame.to_dict("records")[0].keys() == scanpath.rows()[0].keys()
+    assert frame["cell"].tolist() == scanpath.cells.tolist()
+
+
+@pytest.mark.parametrize("target", [None, 1])
+def test_nothing_seen_and_nothing_timed(scanpath, target):
+    nothing = replace(
+        scanpath, detections=(Detections.empty(1, 2),) * len(scanpath), seconds=(), posterior=None, target=target
+    )
+    for number, row in enumerate(nothing.rows()):
+        assert (row["detections"], row["seen"], row["score"], row["seconds"]) == (0, None, None, None)
+        expected = None if target is None else float(nothing.probabilities[number, row["cell"], 1])
+        assert row["probability"] == expected
+
+
+def test_without_pandas(scanpath, monkeypatch):
+    importing = builtins.__import__
+
+    def without(name, *arguments, **options):
+        if name == "pandas":
+            raise ImportError(name)
+        return importing(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(InputError, match="pip install pandas"):
+        scanpath.to_frame()
+
+
+def test_files_hold_everything(scanpath, tmp_path):
+    path = tmp_path / "a.safetensors"
+    scanpath.save(path)
+    loaded = Scanpath.load(path)
+    for name in Scanpath.__dataclass_fields__:
+        assert same(getattr(scanpath, name), getattr(loaded, name)), name
+    assert repr(loaded) == repr(scanpath)
+    loaded.save(tmp_path / "b.safetensors")
+    assert (tmp_path / "b.safetensors").read_bytes() == path.read_bytes()
+
+
+def variants(scanpath):
+    none = Detections.empty(1, 2)
+    values = scanpath.values.clone()
+    values[0, :3] = torch.tensor([-math.inf, math.inf, math.nan])
+    double = {name: getattr(scanpath, name).double() for name in ("fixations", "probabilities", "values")}
+    return {
+        "bare": replace(scanpath, stimulus=None, seconds=(), decision=None, ending=None),
+        "nothing seen": replace(scanpath, detections=(none,) * len(scanpath)),
+        "not finite": replace(scanpath, values=values),
+        "padded": replace(scanpath, detections=tuple(Detections.stack([each, none]).__getitem__(slice(0, 1))
+                                                     for each in scanpath.detections)),
+        "double": replace(scanpath, **double),
+        "found": replace(scanpath, found=True, target=2, decision=Decision("found", 0.1 + 0.2, 7, torch.rand(4))),
+        "absent": replace(scanpath, target=1, decision=Decision("absent", 1e-300), ending="decision"),
+        "other grid": replace(scanpath, grid=Grid(5, 4, (130.5, 90.25))),
+    }  # fmt: skip
+
+
+VARIANTS = ["bare", "nothing seen", "not finite", "padded", "double", "found", "absent", "other grid"]
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_files_hold_scanpaths_of_every_kind(name, scanpath, tmp_path):
+    changed = variants(scanpath)[name]
+    changed.save(tmp_path / "a.safetensors")
+    loaded = Scanpath.load(tmp_path / "a.safetensors")
+    for field in Scanpath.__dataclass_fields__:
+        assert same(getattr(changed, field), getattr(loaded, field)), field
+
+
+def spoil(tensors, record):
+    """Files that say what cannot be, by what an error must name."""
+
+    def changed(name, value):
+        return {**tensors, name: value}, record
+
+    def told(**values):
+        return tensors, {**record, **values}
+
+    yield "cells", changed("cells", tensors["cells"] + 20)
+    yield "cells", changed("cells", tensors["cells"].float())
+    yield "fixations", changed("fixations", tensors["fixations"][:-1])
+    yield "fixations", changed("fixations", tensors["fixations"] * math.nan)
+    yield "probabilities", changed("probabilities", tensors["probabilities"] - 1)
+    yield "probabilities", changed("probabilities", tensors["probabilities"][..., :2])
+    yield "values", changed("values", tensors["values"][:, :-1])
+    yield "scores", changed("scores", tensors["scores"][:, :-1])
+    yield "canvas", changed("canvas", tensors["canvas"].float())
+    yield "photograph", changed("photograph", torch.zeros(3, 4, LONGEST + 1, dtype=torch.uint8))
+    yield "photograph", ({k: v for k, v in tensors.items() if k != "canvas"}, record)
+    yield "placement", told(placement={**record["placement"], "offset": [0, 60]})
+    yield "placement", told(placement={**record["placement"], "scale": [1e9, 1.0]})
+    yield "tensors", changed("more", torch.zeros(1))
+    yield "grid", told(grid=[5, 0])
+    yield "values", told(grid=[5, 5])
+    yield "target", told(target=3)
+    yield "target", told(target=0)
+    yield "found", told(found=1)
+    yield "ending", told(ending="boredom")
+    yield "lengths", told(lengths=[n + 1 for n in record["lengths"]])
+    yield "seconds", told(seconds=record["seconds"][1:])
+    yield "decision", told(decision={"outcome": "perhaps", "probability": 0.5, "cell": None})
+    yield "decision.cell", told(decision={"outcome": "found", "probability": 0.5, "cell": 20})
+    yield "settings.sensor", told(settings={**record["settings"], "sensor": {}})
+    yield (
+        "settings.sensor.levels",
+        told(settings={**record["settings"], "sensor": {**record["settings"]["sensor"], "levels": 1000}}),
+    )
+    yield "record", told(more=1)
+    for name in record:
+        yield name.split(".")[0], (tensors, {key: value for key, value in record.items() if key != name})
+
+
+def test_files_that_cannot_be_are_refused_by_name(scanpath, tmp_path):
+    scanpath.save(tmp_path / "a.safetensors")
+    tensors, record = read(tmp_path / "a.safetensors", KIND)
+    record.pop("kind")
+    for number, (named, (parts, told)) in enumerate(spoil(tensors, record)):
+        # What may be null may be missing, too.
+        if named in ("decision", "ending", "target", "placement", "settings") and len(told) < len(record):
+            continue
+        path = tmp_path / f"{number}.safetensors"
+        write(path, parts, {"kind": KIND, **told})
+        with pytest.raises(DataError, match="not a complete scanpath") as caught:
+            Scanpath.load(path)
+        assert named in str(caught.value), (named, caught.value)
+
+
+def test_other_files_are_refused(scanpath, tmp_path):
+    path = tmp_path / "a.safetensors"
+    with pytest.raises(DataError, match="no such file"):
+        Scanpath.load(path)
+    save_file({"x": torch.zeros(1)}, path)
+    with pytest.raises(DataError, match="without its record"):
+        Scanpath.load(path)
+    write(path, {"x": torch.zeros(1)}, {"kind": "observation model"})
+    with pytest.raises(DataError, match="expected scanpath"):
+        Scanpath.load(path)
+    path.write_bytes(b"not a tensor")
+    with pytest.raises(DataError, match="not a readable"):
+        Scanpath.load(path)
+    scanpath.save(path)
+    content = bytearray(path.read_bytes())
+    content[-5] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="damaged"):
+        Scanpath.load(path)
+
+
+def test_a_file_that_cannot_be_written_leaves_what_was_there(scanpath, tmp_path, monkeypatch):
+    path = tmp_path / "a.safetensors"
+    scanpath.save(path)
+    before = path.read_bytes()
+    monkeypatch.setattr("pathlib.Path.replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
+    with pytest.raises(DataError, match="cannot write"):
+        replace(scanpath, found=not scanpath.found).save(path)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["a.safetensors"]
+
+
+def test_nothing_but_tensors_and_json(scanpath, tmp_path):
+    """The file is what any reader of safetensors reads."""
+    scanpath.save(tmp_path / "a.safetensors")
+    shutil.copy(tmp_path / "a.safetensors", tmp_path / "b.safetensors")
+    tensors = load_file(tmp_path / "b.safetensors")
+    assert torch.equal(tensors["cells"], scanpath.cells)
+    assert len(tensors["mask"]) == sum(look.mask.shape[-1] for look in scanpath.detections)
+
+
+def test_pictures_of_a_loaded_scanpath(scanpath, tmp_path):
+    scanpath.save(tmp_path / "a.safetensors")
+    loaded = Scanpath.load(tmp_path / "a.safetensors")
+    figure = loaded.plot()
+    assert len(figure.axes) == 1
+    assert sum(text.get_text().isdigit() for text in figure.axes[0].texts) == len(loaded)
+    path = replace(loaded, **{name: getattr(loaded, name)[:2] for name in ("cells", "fixations", "probabilities")},
+                   detections=loaded.detections[:2], values=loaded.values[:2], seconds=(), posterior=None,
+                   presence=None).animate(tmp_path / "a.gif")  # fmt: skip
+    assert path == tmp_path / "a.gif"
+    assert path.stat().st_size > 1000
+
+
+def test_views_by_an_independent_way(scanpath):
+    """The canvas and the sensor, put together by hand."""
+    kept = scanpath.stimulus
+    gaze = kept.placement.points_to_canvas(scanpath.fixations[:1])
+    # With growth 2 the fovea of a canvas of another size is as wide in pixels.
+    sigma = kept.settings["sensor"]["sigma"]
+    whole = foveate(kept.canvas[None].float() / 255, gaze[0], sigma=sigma, levels=5, growth=2.0)[0]
+    left, top = kept.placement.offset
+    first = scanpath.views()[0]
+    height, width = first.shape[1:]
+    torch.testing.assert_close(first, whole[:, top : top + height, left : left + width])

@@ -1,0 +1,157 @@
+"""Every picture can be drawn in axes of the caller's, and written as pixels, PDF and SVG."""
+
+import inspect
+import re
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pypdf
+import pytest
+import torch
+from matplotlib.figure import Figure
+from PIL import Image
+
+from semfov import Detections, Grid, InputError, Scanpath, viz
+from semfov.errors import DataError
+from semfov.metrics.calibration import BinarySums
+
+CURVES = {"random": np.linspace(0, 0.8, 31), "predictive": np.linspace(0, 0.9, 31)}
+
+
+@pytest.fixture
+def scanpath():
+    generator = torch.Generator().manual_seed(0)
+    grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 6, 11])
+    seen = Detections(
+        torch.tensor([[[10.0, 10, 30, 30], [50, 40, 70, 55]]]),
+        torch.tensor([[[0.1, 0.8, 0.1], [0.3, 0.1, 0.6]]]),
+        torch.ones(1, 2, dtype=torch.bool),
+    )
+    return Scanpath(
+        grid=grid,
+        classes=("background", "cat", "cup"),
+        target=2,
+        cells=cells,
+        fixations=grid.centres[cells],
+        detections=(seen,) * 3,
+        probabilities=torch.rand(3, 12, 3, generator=generator),
+        values=torch.rand(3, 12, generator=generator),
+        found=True,
+    )
+
+
+def calls(scanpath):
+    """For each function its arguments, and how many axes it takes (0: a figure)."""
+    image = torch.rand(3, 60, 80)
+    views = [image] * 3
+    p = torch.rand(500, 1)
+    sums = BinarySums.of(p[:, 0].double(), torch.rand(500) < p[:, 0]).bins
+    return {
+        "plot_belief": ((scanpath,), {"image": image}, "ax"),
+        "plot_belief_bars": ((scanpath,), {}, 3),
+        "plot_belief_strip": ((scanpath,), {"image": image}, 3),
+        "plot_cell_reliability": (({"one": {"a": sums}}, {"a": {"x": 0.1}}), {"groups": "cells"}, 2),
+        "plot_cumulative_performance": ((CURVES,), {}, "ax"),
+        "plot_curve_panels": (({"a": (CURVES, {}), "b": (CURVES, {})},), {"label": "found"}, 2),
+        "plot_episode": ((scanpath, image, views), {}, "figure"),
+        "plot_fixation": ((scanpath, 1, image, image), {}, 3),
+        "plot_foveated_strip": ((scanpath, views), {}, 3),
+        "plot_reliability": (({"one": (torch.cat([p, 1 - p], 1), torch.zeros(500, dtype=torch.long))},), {}, 2),
+        "plot_roc": (({"one": torch.rand(40)}, torch.arange(40) < 20), {}, 2),
+        "plot_saliency": ((torch.rand(30, 40), image), {"grid": scanpath.grid}, 3),
+        "plot_scanpath": ((scanpath, image), {}, "ax"),
+        "plot_semantic_map": ((scanpath,), {"image": image}, 2),
+        "plot_success_rate": ((CURVES,), {}, "ax"),
+    }
+
+
+NAMES = [name for name in viz.__all__ if name.startswith("plot_") and name != "plot_zoom_path"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_drawn_in_the_callers_axes(name, scanpath):
+    """What is in them is what is in a figure of the function's own, and nothing else is drawn to."""
+    function, (arguments, options, place) = getattr(viz, name), calls(scanpath)[name]
+    mine = Figure(figsize=(12, 8), layout="constrained")
+    left, right = mine.subfigures(1, 2, width_ratios=[1, 3])
+    other = left.subplots()
+    kind = {"projection": "3d"} if name == "plot_belief_bars" else {}
+    if place == "figure":
+        given, key = right, "figure"
+    elif place == "ax":
+        given, key = right.subplots(subplot_kw=kind), "ax"
+    else:
+        given, key = list(right.subplots(1, place, squeeze=False, subplot_kw=kind).flat), "axes"
+    assert function(*arguments, **options, **{key: given}) is mine
+    mine.canvas.draw()
+    assert not any([other.lines, other.images, other.texts, other.patches, other.collections])
+    own = function(*arguments, **options)
+    drawn = [axes for axes in mine.axes if axes is not other]
+    assert len(drawn) == len(own.axes)
+    for a, b in zip(drawn, own.axes, strict=True):
+        assert [len(x) for x in (a.lines, a.images, a.texts, a.patches)] == [
+            len(x) for x in (b.lines, b.images, b.texts, b.patches)
+        ]
+        assert a.get_title() == b.get_title()
+    if isinstance(place, int):
+        with pytest.raises(InputError, match=f"axes: expected {place} of them"):
+            function(*arguments, **options, axes=given[:-1])
+
+
+def test_every_function_says_where_it_draws():
+    for name in [*NAMES, "plot_zoom_path"]:
+        assert {"ax", "axes", "figure"} & set(inspect.signature(getattr(viz, name)).parameters), name
+
+
+def test_pdf_holds_its_fonts_and_text(scanpath, tmp_path):
+    figure = viz.plot_scanpath(scanpath, torch.rand(3, 60, 80))
+    path = viz.save_figure(figure, tmp_path / "a.pdf")
+    (page,) = pypdf.PdfReader(path).pages
+    text = page.extract_text()
+    assert "found after 2 gaze shifts" in text
+    assert "cat 0.80" in text
+    fonts = [font.get_object() for font in page["/Resources"]["/Font"].get_object().values()]
+    assert fonts
+    for font in fonts:
+        # TrueType inside of a composite font: what publishers take.
+        assert font["/Subtype"] == "/Type0"
+        (inner,) = [each.get_object() for each in font["/DescendantFonts"]]
+        assert "/FontFile2" in inner["/FontDescriptor"].get_object()
+    assert len(page.images) == 1  # the photograph alone is made of pixels
+
+
+def test_svg_holds_its_text_as_outlines(scanpath, tmp_path):
+    figure = viz.plot_cumulative_performance(CURVES)
+    root = ET.parse(viz.save_figure(figure, tmp_path / "a.svg")).getroot()
+    tags = [element.tag.rpartition("}")[2] for element in root.iter()]
+    assert tags.count("path") > 20
+    assert "image" not in tags
+    assert "text" not in tags
+    text = (tmp_path / "a.svg").read_text(encoding="utf-8")
+    assert "targets found (%)" in re.sub(r"<!-- (.*?) -->", r"\1", text)
+
+
+def test_png_is_as_fine_as_asked_for(tmp_path):
+    figure = viz.plot_cumulative_performance(CURVES)
+    with Image.open(viz.save_figure(figure, tmp_path / "a.png", dpi=50)) as picture:
+        assert picture.size == (310, 200)
+
+
+def test_a_figure_that_cannot_be_written_leaves_what_was_there(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_bytes(b"before")
+    with pytest.raises(ValueError, match="nonsense"):
+        viz.save_figure(viz.plot_cumulative_performance(CURVES), path.with_suffix(".nonsense"))
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(DataError, match="cannot write"):
+        viz.save_figure(viz.plot_cumulative_performance(CURVES), tmp_path / "file" / "a.png")
+    assert {file.name for file in tmp_path.iterdir()} == {"a.png", "file"}
+    assert path.read_bytes() == b"before"
+
+
+def test_the_callers_settings_stay(scanpath, tmp_path):
+    import matplotlib as mpl
+
+    before = dict(mpl.rcParams)
+    viz.save_figure(viz.plot_belief(scanpath), tmp_path / "a.pdf")
+    assert dict(mpl.rcParams) == before
