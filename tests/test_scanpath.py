@@ -66,7 +66,8 @@ def same(a, b):
     if isinstance(a, torch.Tensor):
         return a.dtype == b.dtype and a.shape == b.shape and torch.equal(a.nan_to_num(7.0), b.nan_to_num(7.0))
     if dataclasses.is_dataclass(a):
-        return type(a) is type(b) and all(same(value, vars(b)[name]) for name, value in vars(a).items())
+        compared = [field.name for field in dataclasses.fields(a) if field.compare]
+        return type(a) is type(b) and all(same(getattr(a, name), getattr(b, name)) for name in compared)
     if isinstance(a, tuple):
         return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
     return type(a) is type(b) and a == b
