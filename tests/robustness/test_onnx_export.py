@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from semfov import DirichletBelief, FovealObservationModel, Foveation, Grid, acquisition, fusion
 from semfov.gaze import select_fixation
 from semfov.observation import FoldedObservationModel
+from semfov.sensor import LogPolar
 
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript", reason="torch exports ONNX with it")
@@ -59,12 +60,12 @@ def seeded(*shape: int) -> Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(len(shape)))
 
 
-def test_sensor(tmp_path):
-    sensor = Foveation(15.0, levels=3).eval()
-    inputs = seeded(1, 3, 48, 64), torch.tensor([[40.0, 30.5]])
-    (view,) = run(sensor, inputs, tmp_path / "sensor.onnx")
+@pytest.mark.parametrize(("sensor", "tolerance"), [(Foveation(15.0, levels=3), 2e-6), (LogPolar(15.0), 2e-4)])
+def test_sensor(sensor, tolerance, tmp_path):
+    inputs = seeded(1, 3, 48, 64), torch.tensor([[40.2, 30.5]])
+    (view,) = run(sensor.eval(), inputs, tmp_path / "sensor.onnx")
     with torch.no_grad():
-        np.testing.assert_allclose(view, sensor(*inputs).numpy(), rtol=0, atol=2e-6)
+        np.testing.assert_allclose(view, sensor(*inputs).numpy(), rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("name", ["predictive", "negative entropy"])
