@@ -135,24 +135,20 @@ class ActivePerception(nn.Module):
 
     @classmethod
     def from_pretrained(cls, name: str | PathLike[str] = "yolov3-tiny", **options: Any) -> Self:
-        """The recommended agent, by the name of a detector that models are shipped for, or by a folder of models.
+        """The agent of a folder that `semfov.fit_detector` wrote, or the recommended one of a detector's name.
 
         Args:
-            name: as for `recommended`, or a folder that `train.fit_detector` or `semfov.fit_detector` wrote.
-            options: those of `recommended`; for a folder `detector` and `weights`, files that lie elsewhere now, and
-                other options of `semfov.load_detector`.
+            name: the folder, or a name as for `recommended`.
+            options: of `recommended`; for a folder those of `semfov.model_folder.ModelFolder.load_detector`.
 
         Raises:
-            InputError: no models are shipped for this name, and it is no folder of models (the message has the command
-                that makes one).
+            InputError: it is no folder, and no models are shipped for the name (the message has the command for both).
             DataError: a file is missing, damaged, or another than the models were fitted to.
         """
         folder = open_folder(name)
-        if folder is not None:
-            eye = folder.eye(**options)
-            agent = cls(eye, folder.search(), folder.explore(), grid=folder.manifest.grid)
-            return agent.eval().requires_grad_(False)
-        return cls.recommended(fspath(name), **options)
+        if folder is None:
+            return cls.recommended(fspath(name), **options)
+        return cls(**folder.parts(**options)).eval().requires_grad_(False)
 
     @classmethod
     def published(
@@ -186,9 +182,8 @@ class ActivePerception(nn.Module):
         lookup(search, ["predictive", "non-predictive"], "published search policy")
         detector = load_detector(name, **options)
         eye = Eye(named_sensor(sensor), detector)
-        model = FovealObservationModel.from_pretrained(
-            shipped_model(FovealObservationModel, f"{detector.name}-{sensor}", name)
-        )
+        shipped = shipped_model(FovealObservationModel, f"{detector.name}-{sensor}", name)
+        model = FovealObservationModel.from_pretrained(shipped)
         model.check_compatible(eye.settings(), detector.classes)
         observer = Semantic(len(detector.classes) + 1, model if calibrated else None)
         policy = Predictive(model) if search == "predictive" else NonPredictive()

@@ -172,6 +172,11 @@ class ModelFolder:
             return LearnedMap(learned), Closer(sensor["sigma"] / sensor["reference"])
         return Semantic(len(self.manifest.classes) + 1), Random()
 
+    def parts(self, **source: Any) -> dict[str, Any]:
+        """What `semfov.ActivePerception` is made of; arguments of `load_detector`."""
+        grid = self.manifest.grid
+        return {"eye": self.eye(**source), "search": self.search(), "explore": self.explore(), "grid": grid}
+
     def _find(self, place: dict[str, str]) -> Path:
         path = find_file(place, self.path)
         if path is None:

@@ -4,6 +4,8 @@
     python -m eval.demo PHOTO.jpg --target cup --models mymodels
     python -m eval.search --models mymodels --data.root PHOTOS --data.annotations instances.json
 
+Without photographs it uses the embedded scenes, which is only good for trying it out.
+
 MODEL is a name or a file, as for `semfov.load_detector` (docs/detectors.md); a few dozen photographs with boxes are
 enough to begin with. Every photograph is looked at from every cell. To these looks are fitted an observation model with
 its misses, the exponent of its likelihoods, target evidence with the thresholds of decisions, and a map of all classes.

@@ -201,7 +201,7 @@ class Workshop:
         ]
         why = (
             f"negative log likelihood of the true class {figures['fitted'].nll:.3f}, of raw scores "
-            f"{figures['raw'].nll:.3f}; {in_words(gain, 'nats less')}"
+            f"{figures['raw'].nll:.3f}; {in_words(gain, 'nats gained')}"
         )
         from semfov.viz import plot_reliability
 
@@ -238,7 +238,7 @@ class Workshop:
         before = means_of(config, raw)["held_out"]
         why = (
             f"{100 * means[best]['held_out']:.1f} % of the next fixations hit the target with {scores} scores to the "
-            f"power of {exponent:g}, {100 * before:.1f} % with raw scores; {in_words(gain, 'points', 100)}"
+            f"power of {exponent:g}, {100 * before:.1f} % with raw scores; {in_words(gain, 'points gained', 100)}"
         )
         rows = [["scores", "exponent", "next fixations that hit, %"], ["raw, every cell of a box", "1", share(before)]]
         rows += [[way[0], f"{way[1]:g}", share(mean["held_out"])] for way, mean in means.items()]
@@ -277,7 +277,7 @@ class Workshop:
         gain = Difference.of(curves["fitted"][:, at], curves["raw"][:, at])
         why = (
             f"{100 * curves['fitted'][:, at].mean():.1f} % of the targets are found in {at} gaze shifts, "
-            f"{100 * curves['raw'][:, at].mean():.1f} % by raw scores; {in_words(gain, 'points', 100)}"
+            f"{100 * curves['raw'][:, at].mean():.1f} % by raw scores; {in_words(gain, 'points gained', 100)}"
         )
         rules: dict[str, tuple[Strategy, Rule]] = {
             "fitted": (learned, partial(_by_thresholds, thresholds=thresholds)),
@@ -338,7 +338,7 @@ class Workshop:
         why = (
             f"{100 * objects['fitted'][:, at].mean():.1f} % of the cells with objects are named right after {at} gaze "
             f"shifts, {100 * objects['raw'][:, at].mean():.1f} % by raw scores and random gaze; "
-            f"{in_words(gain, 'points', 100)}; of all cells {100 * every['fitted'][:, at].mean():.1f} and "
+            f"{in_words(gain, 'points gained', 100)}; of all cells {100 * every['fitted'][:, at].mean():.1f} and "
             f"{100 * every['raw'][:, at].mean():.1f} %"
         )
         sections = []
