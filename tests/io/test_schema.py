@@ -277,7 +277,7 @@ def test_tensors_may_be_of_several_types_where_that_is_said():
     Schema({"a": Field((2,), mixed=True), "b": Field((2,))}).check(mixed)
     with pytest.raises(InputError, match="one floating-point type"):
         Schema({name: Field((2,)) for name in mixed}).check(mixed)
-    with pytest.raises(InputError, match="a: expected torch.float32 or torch.float64"):
+    with pytest.raises(InputError, match=r"a: expected torch\.float32 or torch\.float64"):
         Schema({"a": Field((2,), mixed=True)}).check({"a": torch.zeros(2, dtype=torch.int64)})
 
 
