@@ -13,7 +13,7 @@ from semfov.viz.curves import highlighted, others_named
 Array = NDArray[np.float64]
 
 _WIDTH, _HEIGHT = 640, 380
-_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 12, 14, 66
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 20, 16, 66
 _COLOURS = 7
 _DASHES = ("", "9 5", "3 4", "12 4 3 4")
 
@@ -100,13 +100,13 @@ def _axes(last: int, top: float) -> str:
     for step in range(6):
         y = bottom - step / 5 * (bottom - _TOP)
         parts.append(f'<line class="tick" x1="{left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(f'<text x="{left - 7}" y="{y + 5:.1f}" text-anchor="end">{100 * top * step / 5:.0f}</text>')
+        parts.append(f'<text x="{left - 10}" y="{y + 5:.1f}" text-anchor="end">{100 * top * step / 5:.0f}</text>')
     every = next(step for step in (1, 2, 5, 10, 20, 50, 100, 10**6) if last / step <= 10)
     for shift in range(0, last + 1, every):
         x = left + shift / max(last, 1) * (right - left)
         # On a phone, where letters are larger, every other number has to do.
         minor = ' class="minor"' if (shift // every) % 2 else ""
-        parts.append(f'<text{minor} x="{x:.1f}" y="{bottom + 25}" text-anchor="middle">{shift}</text>')
+        parts.append(f'<text{minor} x="{x:.1f}" y="{bottom + 27}" text-anchor="middle">{shift}</text>')
     parts.append(f'<line class="axis" x1="{left}" x2="{right}" y1="{bottom}" y2="{bottom}"/>')
     parts.append(f'<text x="{(left + right) / 2}" y="{_HEIGHT - 8}" text-anchor="middle">gaze shifts</text>')
     return "".join(parts)
