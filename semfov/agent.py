@@ -258,7 +258,7 @@ class ActivePerception(nn.Module):
         _check_thresholds(confirm, give_up)
         check(price is None or (is_number(price) and price >= 0), "price", "0 or more right decisions", price)
         image, grid = self._frame(image)
-        goal = None if boxes is None else grid.footprint(boxes.to(image)).any(-2)
+        goal = None if boxes is None else grid.footprint(torch.as_tensor(boxes).to(image)).any(-2)
         chosen = self.searching.observer.thresholds
         if price is not None and (chosen is None or confirm is not None or give_up is not None):
             raise InputError("price: expected None, with thresholds or for a belief that tells no presence")
