@@ -1,7 +1,8 @@
 """Where to look next: acquisition functions over the belief, policies, and the choice of a fixation."""
 
 from semfov.gaze import acquisition, policies, saliency
-from semfov.gaze.choice import Choice, Given, Greedy, Relaxed
+from semfov.gaze.choice import Choice, Given, Greedy, Relaxed, Softmax
+from semfov.gaze.habits import GazeHabits, Habitual
 from semfov.gaze.learned import LearnedGaze
 from semfov.gaze.policies import Policy
 from semfov.gaze.relaxation import soft_fixation
@@ -9,11 +10,14 @@ from semfov.gaze.selection import select_fixation
 
 __all__ = [
     "Choice",
+    "GazeHabits",
     "Given",
     "Greedy",
+    "Habitual",
     "LearnedGaze",
     "Policy",
     "Relaxed",
+    "Softmax",
     "acquisition",
     "policies",
     "saliency",

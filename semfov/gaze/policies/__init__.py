@@ -9,6 +9,7 @@ from semfov.gaze.policies.exploration import (
     Gain,
     Improvement,
     Negentropy,
+    Objects,
     Peaks,
     Surprise,
 )
@@ -42,6 +43,7 @@ __all__ = [
     "Negentropy",
     "Neighbourhood",
     "NonPredictive",
+    "Objects",
     "Peaks",
     "Policy",
     "Predictive",

@@ -18,6 +18,7 @@ from semfov.gaze.acquisition.exploration import (
     TwoPeaks,
     UpperConfidenceBound,
 )
+from semfov.gaze.acquisition.objects import ObjectProbability
 from semfov.gaze.policies.base import GazeModel, Means, ModelPolicy, Policy
 
 
@@ -135,6 +136,17 @@ class Closer(Policy):
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The acuity gained."""
         return CloserLook(grid, self.fovea)
+
+
+class Objects(Policy):
+    """Where something most probably is (`semfov.acquisition.ObjectProbability`)."""
+
+    name = "objects"
+    tasks = ("exploration",)
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
+        """The probability of anything but background."""
+        return ObjectProbability()
 
 
 class Gain(Policy):
