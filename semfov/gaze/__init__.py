@@ -3,13 +3,17 @@
 from semfov.gaze import acquisition, policies, saliency
 from semfov.gaze.choice import Choice, Given, Greedy, Relaxed, Softmax
 from semfov.gaze.habits import GazeHabits, Habitual
+from semfov.gaze.ivsn import IVSN
 from semfov.gaze.learned import LearnedGaze
 from semfov.gaze.policies import Policy
 from semfov.gaze.relaxation import soft_fixation
 from semfov.gaze.selection import select_fixation
+from semfov.gaze.templates import ClassTemplates
 
 __all__ = [
+    "IVSN",
     "Choice",
+    "ClassTemplates",
     "GazeHabits",
     "Given",
     "Greedy",
