@@ -70,6 +70,13 @@ class Darknet(nn.Module):
         outputs = self._run(outputs, stem, len(self.layers))
         return [outputs[index] for index, layer in enumerate(self.layers) if isinstance(layer, Head)]
 
+    def features(self, image: Tensor) -> Tensor:
+        """What the last convolution before the first head reads, `(B, C, H', W')`."""
+        self.check_image(image)
+        head = next(index for index, layer in enumerate(self.layers) if layer is self.heads[0])
+        wanted = self.sources[self.sources[head][0]][0]
+        return self._run({-1: image.contiguous(memory_format=torch.channels_last)}, 0, wanted + 1)[wanted]
+
     def cfg_digest(self) -> str:
         """sha256 of the sections."""
         cfg = repr([(section.kind, sorted(section.options.items())) for section in self.sections])

@@ -10,7 +10,7 @@ from semfov.detection.detections import Detections
 from semfov.detection.placement import Placement, letterbox
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection, select
-from semfov.errors import check, check_pixels, check_whole
+from semfov.errors import InputError, check, check_pixels, check_whole
 
 _LARGEST = 65_536  # pixels of a side
 
@@ -95,6 +95,14 @@ class Detector(nn.Module, ABC):
         """Detections in images `(B, 3, H, W)`, RGB in [0, 1], boxes in pixels of those images."""
         canvas, placement = self.fit(images)
         return self.detect(canvas, placement)
+
+    def features(self, canvas: Tensor) -> Tensor:
+        """Features of a canvas from `fit`, `(B, C, h, w)`, on which the first head works.
+
+        Raises:
+            InputError: they are not at hand, as within an ONNX model.
+        """
+        raise InputError(f"detector: expected one whose features are at hand, such as yolov3-tiny, got {self.name}")
 
     def settings(self) -> dict[str, object]:
         """What the detections depend on, for the keys of caches and the metadata of fitted models."""

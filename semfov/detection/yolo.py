@@ -115,6 +115,10 @@ class YoloV3(Detector):
             torch.cat([part.objectness for part in parts if part.objectness is not None], 1),
         )
 
+    def features(self, canvas: Tensor) -> Tensor:
+        """What the last convolution before the first head reads; torch computes it, whatever the runtime."""
+        return self.network.features(canvas.to(next(self.network.parameters()).dtype))
+
     def _chosen(self, obstacle: str | None) -> Runtime:
         """What computes, where `obstacle` is why onnxruntime cannot."""
         if obstacle is None:

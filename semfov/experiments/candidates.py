@@ -14,18 +14,20 @@ from semfov.belief import ContextPrior, Grid, MapEvidence, TargetEvidence
 from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
 from semfov.errors import InputError, check
 from semfov.experiments.config import BeliefConfig, PolicyConfig, RunConfig, SearchConfig
-from semfov.experiments.presets import SALIENCY, TARGET_EVIDENCE, resolve
+from semfov.experiments.presets import IVSN, SALIENCY, TARGET_EVIDENCE, resolve
 from semfov.experiments.setup import (
     make_context,
     make_learned_gaze,
     make_map_evidence,
     make_observation,
     make_target_evidence,
+    make_templates,
 )
 from semfov.eye import Eye
-from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static
+from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static, TemplateAttention
 from semfov.gaze.learned import LearnedGaze
-from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, Task, named_policy
+from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, Task, named_policy, wanted
+from semfov.gaze.templates import ClassTemplates
 from semfov.observation.foveal import FovealObservationModel
 
 T = TypeVar("T")
@@ -39,11 +41,16 @@ class Candidate:
         strategy: observer and policy.
         saliency: `(X·Y, X·Y)`, saliency of all cells seen from each cell, or `(1, X·Y)`.
         weight: of the saliency as a prior over the cells (`SaliencyPrior`); None: saliency takes the policy's place.
+        attention: `(X·Y, K, X·Y)`, to all classes in all cells, seen from each cell (`TemplateAttention`); it takes the
+            policy's place.
+        fovea: width of the fovea in longer sides of the image, by which attention is weighed.
     """
 
     strategy: Strategy
     saliency: Tensor | None = None
     weight: float | None = None
+    attention: Tensor | None = None
+    fovea: float = 100 / 640
 
     @property
     def observer(self) -> Observer:
@@ -52,6 +59,8 @@ class Candidate:
 
     def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
         """The acquisition function of episodes that fixate `cell` `(B,)`."""
+        if self.attention is not None:
+            return TemplateAttention(wanted(target, IVSN), self.attention, grid, self.fovea)
         if self.saliency is None:
             return self.strategy.policy(target, grid)
         salient = self.saliency[cell if len(self.saliency) > 1 else torch.zeros_like(cell)]
@@ -69,6 +78,7 @@ class Models:
     context: ContextPrior | None = None
     gaze: LearnedGaze | None = None
     map: MapEvidence | None = None
+    templates: ClassTemplates | None = None
 
 
 def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
@@ -88,6 +98,9 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
         make_learned_gaze(config.gaze_model, eye) if gazes and isinstance(config, SearchConfig) else None,
         make_map_evidence(belief.map_model, eye)
         if any(policy.scores == "learned" and not by_evidence(policy, task) for policy in policies)
+        else None,
+        make_templates(config.templates, eye)
+        if isinstance(config, SearchConfig) and any(policy.policy == IVSN for policy in policies)
         else None,
     )
 
@@ -138,7 +151,7 @@ def _strategy(
     if policy.policy == TARGET_EVIDENCE:
         return Strategy(Target(_given(models.evidence, "policy", "learned target evidence")), NonPredictive())
     means = Means(models.observation, models.gaze, models.map, fovea, belief.prior)
-    chosen = Random() if policy.policy == SALIENCY else named_policy(policy.policy, task, means)
+    chosen = Random() if policy.policy in (SALIENCY, IVSN) else named_policy(policy.policy, task, means)
     if chosen.needs_gaze and models.gaze is not None:
         return Strategy(models.gaze.observer(components), chosen)
     if by_evidence(policy, task):

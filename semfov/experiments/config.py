@@ -179,7 +179,7 @@ class PolicyConfig(Settings):
 
     Args:
         policy: name of a registered policy (`semfov.gaze.policies`), `saliency`, which goes by a saliency map alone, or
-            `target-evidence`, which goes by learned evidence for the target.
+            `target-evidence`, which goes by learned evidence for the target, or `ivsn`, which goes by class templates.
         scores: whether scores are likelihoods as they are, `raw`, or go through the observation model, `calibrated`;
             or the belief is a `learned` one, the map of explorations or the evidence for a target.
         tempering: exponent of the likelihoods.
@@ -236,11 +236,12 @@ class SearchConfig(Settings):
         protocol: the experiment.
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: non-predictive,
             scores: calibrated, tempering: 0.25}` (`PolicyConfig`). Presets: `recommended` (target-evidence),
-            `published` (predictive-calibrated), `target-evidence`, `learned`, `random`, `vocus2`, `itti-koch`, and
+            `published` (predictive-calibrated), `target-evidence`, `learned`, `ivsn`, `random`, `vocus2`, `itti-koch`,
             `non-predictive` (also as `maximum-a-posteriori`), `predictive`, `neighbourhood`, `foveal-hit`,
             `place-information`, `entropy-limit` or `ideal-observer` followed by `-raw` or `-calibrated`; the last four
             also by `-learned`, with the evidence of `target-evidence`, which is `maximum-a-posteriori-learned`.
         gaze_model: learned gaze policy of `learned`, by name or file (None: the one shipped for the detector).
+        templates: class templates of `ivsn`, by name or file (None: those shipped for the detector).
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what the detector saw from every cell, shared between runs (None: the user's cache).
         store: keep what the detector saw on disk; false recomputes it (the result is the same).
@@ -264,6 +265,7 @@ class SearchConfig(Settings):
         "target-evidence",
     )
     gaze_model: str | None = None
+    templates: str | None = None
     out: Path = Path("runs/search")
     cache: Path | None = None
     store: bool = True
@@ -286,9 +288,10 @@ class ExploreConfig(Settings):
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: kl, scores:
             calibrated, memory: closest}` (`PolicyConfig`). Presets: `recommended` (closer-look-learned), `published`
             (kl-calibrated), and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
-            `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`, `vocus2` or
-            `itti-koch` followed by `-raw` or `-calibrated`. With a learned map there are `random-learned`,
-            `closer-look-learned`, `expected-gain-learned`, `vocus2-learned` and `itti-koch-learned`.
+            `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`, `objects`,
+            `vocus2` or `itti-koch` followed by `-raw` or `-calibrated`. With a learned map there are `random-learned`,
+            `closer-look-learned`, `objects-learned`, `expected-gain-learned`, `vocus2-learned` and
+            `itti-koch-learned`.
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
         store: keep what was seen on disk; false recomputes it (the result is the same).

@@ -11,6 +11,7 @@ from semfov.gaze.policies import POLICIES, Task, policy_names
 
 SALIENCY = "saliency"
 TARGET_EVIDENCE = "target-evidence"
+IVSN = "ivsn"
 SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
 
 WORDS = {"scores": Scores, "footprint": Footprint, "memory": Memory, "saliency": SaliencyModel, "context": Context}
@@ -31,14 +32,14 @@ Choice = str | PolicyConfig
 
 def known_policies(task: Task) -> list[str]:
     """Names that `PolicyConfig.policy` may have."""
-    own = [SALIENCY, TARGET_EVIDENCE] if task == "search" else [SALIENCY]
+    own = [SALIENCY, TARGET_EVIDENCE, IVSN] if task == "search" else [SALIENCY]
     return [*policy_names(task), *own]
 
 
 def presets(task: Task) -> dict[str, PolicyConfig]:
     """The presets for a task."""
     if task == "search":
-        alone = {name: PolicyConfig(name) for name in ("random", "learned", TARGET_EVIDENCE)}
+        alone = {name: PolicyConfig(name) for name in ("random", "learned", TARGET_EVIDENCE, IVSN)}
         alone |= {name: PolicyConfig(SALIENCY, saliency=name) for name in SALIENCY_MODELS}
         best, published = PolicyConfig(TARGET_EVIDENCE), PolicyConfig("predictive", "calibrated")
         scored = {name: PolicyConfig(name) for name in policy_names("search") if name not in alone}

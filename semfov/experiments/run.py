@@ -17,12 +17,13 @@ from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check, lookup
+from semfov.experiments.attention import attend_all
 from semfov.experiments.candidates import Candidate, load_models, make_strategy
 from semfov.experiments.config import RunConfig, SaliencyModel
 from semfov.experiments.looks import see_all
 from semfov.experiments.parallel import available_cores, mine, run_tasks, wait_for_others
 from semfov.experiments.parts import Parts, Record
-from semfov.experiments.presets import SALIENCY, label, resolve
+from semfov.experiments.presets import IVSN, SALIENCY, label, resolve
 from semfov.experiments.saliency_store import SaliencyStore, saliency_table
 from semfov.experiments.setup import check_sources, fovea_of, make_eye, make_scenes, prepare_worker
 from semfov.experiments.store import DetectionStore, versions
@@ -100,6 +101,8 @@ class Run(ABC):
             )
         }
         fitted["context"] = None if models.context is None else models.context.digest()
+        if models.templates is not None:
+            fitted["templates"] = checksum(models.templates.state_dict())
         if models.map is not None:
             fitted["map"] = checksum(models.map.state_dict())
         belief = {name: value for name, value in asdict(config.belief).items() if not name.endswith("model")}
@@ -127,6 +130,9 @@ class Run(ABC):
     def candidate(self, name: str, index: int) -> Candidate:
         """The policy that tables call `name`, in a scene."""
         policy = self.policies[lookup(name, self.policies, "policy of this run")]
+        if policy.policy == IVSN:
+            fovea = self.config.sensor.fovea
+            return Candidate(self.strategies[name], attention=self.attention(index), fovea=fovea)
         if policy.saliency is None:
             return Candidate(self.strategies[name])
         weight = None if policy.policy == SALIENCY else self.config.saliency.weight
@@ -145,6 +151,11 @@ class Run(ABC):
             if self.config.store:
                 self.store.save(digest, seen)
         return seen
+
+    def attention(self, index: int) -> Tensor:
+        """Attention to all classes in the cells of a scene, seen from every cell; computed whenever it is asked for."""
+        assert self.models.templates is not None
+        return attend_all(self.eye, self.models.templates, self.scenes[index].image, self.grid(index))
 
     def saliency(self, name: SaliencyModel, index: int) -> Tensor:
         """Saliency of the cells of a scene (`saliency_table`), from the store or computed (and kept)."""

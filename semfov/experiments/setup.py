@@ -19,6 +19,7 @@ from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.looks import one_thread
 from semfov.eye import Eye
 from semfov.gaze.learned import LearnedGaze
+from semfov.gaze.templates import ClassTemplates
 from semfov.io.compatibility import learned_for, recommended
 from semfov.io.files import check_regular
 from semfov.io.shipped import shipped_model
@@ -143,6 +144,13 @@ def make_learned_gaze(name: str | None, eye: Eye) -> LearnedGaze:
     gaze = LearnedGaze.from_pretrained(name or eye.detector.name)
     gaze.check_compatible(eye.settings())
     return gaze.requires_grad_(False)
+
+
+def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
+    """The class templates of that name, or those for this detector; checked to belong to it."""
+    model = ClassTemplates.from_pretrained(name or eye.detector.name)
+    model.check_eye(eye.settings(), eye.detector.classes)
+    return model
 
 
 def make_context(name: str, eye: Eye) -> ContextPrior:

@@ -1,19 +1,27 @@
 """Where to look next: acquisition functions over the belief, policies, and the choice of a fixation."""
 
 from semfov.gaze import acquisition, policies, saliency
-from semfov.gaze.choice import Choice, Given, Greedy, Relaxed
+from semfov.gaze.choice import Choice, Given, Greedy, Relaxed, Softmax
+from semfov.gaze.habits import GazeHabits, Habitual
+from semfov.gaze.ivsn import IVSN
 from semfov.gaze.learned import LearnedGaze
 from semfov.gaze.policies import Policy
 from semfov.gaze.relaxation import soft_fixation
 from semfov.gaze.selection import select_fixation
+from semfov.gaze.templates import ClassTemplates
 
 __all__ = [
+    "IVSN",
     "Choice",
+    "ClassTemplates",
+    "GazeHabits",
     "Given",
     "Greedy",
+    "Habitual",
     "LearnedGaze",
     "Policy",
     "Relaxed",
+    "Softmax",
     "acquisition",
     "policies",
     "saliency",

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from semfov.errors import check_whole
+from semfov.errors import check, check_whole
 from semfov.gaze.relaxation import soft_fixation
 from semfov.gaze.selection import select_fixation
 
@@ -68,6 +68,35 @@ class Exploratory(Greedy):
         """The best cell, or any."""
         lost = self.noise(shift, episodes)[:, :1] < self.astray
         return super().__call__(shift, episodes, torch.where(lost, 0.0, values.detach()), visited, centres)
+
+
+class Softmax(Choice):
+    r"""A noisy choice: a cell not visited is drawn with :math:`P(x) \propto e^{b \, a(x)}`.
+
+    With b = 0 all cells are equally likely; the larger b, the nearer it comes to `Greedy`. The draw is that of
+    `soft_fixation` and so of the random numbers alone. No gradient flows through it.
+
+    Args:
+        noise: draws.
+        inverse_temperature: b, 0 or more, in units of one over those of the values.
+
+    >>> noise = drawn_from(torch.rand(1, 1, 3, generator=torch.Generator().manual_seed(0)))
+    >>> values, centres = torch.tensor([[0.0, 1.0, 2.0]]), torch.zeros(3, 2)
+    >>> Softmax(noise, 9.0)(0, torch.tensor([0]), values, torch.tensor([[False, False, True]]), centres)[1]
+    tensor([1])
+    """
+
+    def __init__(self, noise: Noise, inverse_temperature: float) -> None:
+        check(inverse_temperature >= 0, "inverse_temperature", "0 or more", inverse_temperature)
+        self.noise = noise
+        self.inverse_temperature = inverse_temperature
+
+    def __call__(
+        self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The drawn cell's centre; any cell where all were visited."""
+        logits = self.inverse_temperature * values.detach()
+        return soft_fixation(logits, visited, centres, self.noise(shift, episodes))
 
 
 class Relaxed(Choice):

@@ -5,7 +5,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov.gaze.choice import Exploratory, Greedy
+from semfov.errors import InputError
+from semfov.gaze.choice import Exploratory, Greedy, Softmax, drawn_from
 
 CENTRES = torch.stack([torch.arange(9.0), torch.zeros(9)], -1)
 
@@ -67,3 +68,37 @@ def test_no_gradient_flows_through_a_choice():
     values = torch.rand(3, 9, requires_grad=True)
     fixation, _ = Exploratory(fresh(2), 0.5)(0, torch.arange(3), values, torch.zeros(3, 9, dtype=torch.bool), CENTRES)
     assert not fixation.requires_grad
+
+
+@pytest.mark.parametrize("inverse_temperature", [0.0, 0.7, 3.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_softmax_draws_in_proportion_to_exponentials(inverse_temperature, dtype, device):
+    count = 40_000
+    generator = torch.Generator().manual_seed(4)
+    values = torch.randn(9, generator=generator).to(device, dtype)
+    visited = torch.zeros(count, 9, dtype=torch.bool, device=device)
+    visited[:, 2] = True
+    noise = drawn_from(torch.rand(count, 1, 9, generator=generator).to(device))
+    choice, centres = Softmax(noise, inverse_temperature), CENTRES.to(device)
+    fixation, cell = choice(0, torch.arange(count, device=device), values.expand(count, 9), visited, centres)
+    assert torch.equal(fixation.to(centres), centres[cell])
+    weight = (inverse_temperature * values.double()).exp()
+    weight[2] = 0
+    share = weight / weight.sum()
+    counts = torch.bincount(cell, minlength=9)
+    assert bool(((counts - count * share).abs() <= 5 * (count * share * (1 - share)).sqrt()).all())
+
+
+def test_a_cold_softmax_is_greedy():
+    values, visited = torch.rand(200, 9), torch.rand(200, 9) < 0.5
+    visited[:, 0] = False
+    noise = drawn_from(torch.rand(200, 1, 9))
+    cold, greedy = (
+        choice(0, torch.arange(200), values, visited, CENTRES)[1] for choice in (Softmax(noise, 1e7), Greedy(noise))
+    )
+    assert torch.equal(cold, greedy)
+
+
+def test_a_softmax_turned_round_is_refused():
+    with pytest.raises(InputError, match="inverse_temperature"):
+        Softmax(lambda *_: torch.zeros(1, 9), -1.0)

@@ -13,11 +13,12 @@ from semfov.gaze.acquisition.exploration import (
     UpperConfidenceBound,
 )
 from semfov.gaze.acquisition.ideal import CorrectLocalisation, EntropyLimit
-from semfov.gaze.acquisition.objects import ObjectEvidence
+from semfov.gaze.acquisition.objects import ObjectProbability
 from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
 from semfov.gaze.acquisition.saliency_prior import SaliencyPrior
 from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
 from semfov.gaze.acquisition.static import Static, Uniform
+from semfov.gaze.acquisition.templates import TemplateAttention
 
 __all__ = [
     "AcquisitionFunction",
@@ -31,13 +32,14 @@ __all__ = [
     "KLDivergence",
     "NegativeEntropy",
     "NeighbourhoodPosterior",
-    "ObjectEvidence",
+    "ObjectProbability",
     "PlaceInformation",
     "PredictedTargetPosterior",
     "ProbabilityOfImprovement",
     "SaliencyPrior",
     "Static",
     "TargetPosterior",
+    "TemplateAttention",
     "TwoPeaks",
     "Uniform",
     "UpperConfidenceBound",

@@ -38,11 +38,7 @@ class CloserLook(AcquisitionFunction):
         super().__init__()
         check(fovea > 0, "fovea", "a positive number", fovea)
         self.fovea = fovea
-        self.register_buffer("seen", self.acuity(grid.cell_distance))
-
-    def acuity(self, distance: Tensor) -> Tensor:
-        """v, of distances in longer sides."""
-        return (1 - distance / self.fovea).clamp(max=0).exp()
+        self.register_buffer("seen", acuity(grid.cell_distance, fovea))
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(B, X·Y)` for a belief about all classes; where the fovea was is in `belief.closest`."""
@@ -51,9 +47,14 @@ class CloserLook(AcquisitionFunction):
     def _values(self, probabilities: Tensor, closest: Tensor) -> Tensor:
         objects = probabilities[..., 1:]
         unknown = 1 - objects.amax(-1) / objects.sum(-1)
-        gain = (self.seen.to(objects) - self.acuity(closest)[..., None]).clamp(min=0)
+        gain = (self.seen.to(objects) - acuity(closest, self.fovea)[..., None]).clamp(min=0)
         return (gain * unknown[..., None]).sum(-2)
 
     def extra_repr(self) -> str:
         """Settings, for `repr`."""
         return f"fovea={self.fovea:g}"
+
+
+def acuity(distance: Tensor, fovea: float) -> Tensor:
+    """How well is seen at distances in longer sides, `exp(-max(d / r - 1, 0))` for a fovea of the width r."""
+    return (1 - distance / fovea).clamp(max=0).exp()

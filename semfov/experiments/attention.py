@@ -1,0 +1,23 @@
+"""Attention by class templates to a whole scene, from everywhere."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.experiments.looks import one_thread
+from semfov.eye import Eye
+from semfov.gaze.templates import ClassTemplates, at_points
+
+
+def attend_all(eye: Eye, templates: ClassTemplates, image: Tensor, grid: Grid) -> Tensor:
+    """Attention to all classes in all cells of `image` `(3, H, W)` from the centre of every cell, `(X·Y, K, X·Y)`."""
+    with one_thread(), torch.inference_mode():
+        view, points = eye.open(image[None]), grid.centres.to(image)
+        found = []
+        for point in points:
+            canvas = eye.foveated(view, point[None])
+            maps = templates(eye.detector.features(canvas))
+            found.append(at_points(maps, points, view.placement, (canvas.shape[-1], canvas.shape[-2])))
+        return torch.cat(found)

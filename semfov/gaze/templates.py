@@ -1,0 +1,100 @@
+"""What objects of each class look like to a detector: templates among its own features."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.detection.placement import Placement
+from semfov.errors import check, check_finite, check_shape
+from semfov.io.compatibility import check_classes
+from semfov.io.pretrained import PretrainedForEye
+from semfov.io.schema import CLASSES, Field, Schema
+
+
+class ClassTemplates(PretrainedForEye):
+    r"""Attention for every class: how like its template the features of every place are.
+
+    .. math:: M_k(y) = \cos\bigl(\hat\phi(y) - \mu, T_k\bigr), \qquad T_k = \bar\phi_k - \mu, \qquad
+              \hat\phi = \phi / \|\phi\|
+
+    with φ a detector's features before its first head, :math:`\bar\phi_k` the mean of :math:`\hat\phi` at the centres
+    of objects of class k, and μ that over all places. IVSN (Zhang, Feng, Ma, Lim, Zhao and Kreiman, 2018) correlates
+    the features of a search image with those of a picture of the target; here the picture is the average object of the
+    class, and the network the detector that searches. `train.fit_templates` fits them.
+
+    Args:
+        templates: `(K, C)`, T.
+        mean: `(C)`, μ.
+        classes: names of the K classes.
+        metadata: JSON values kept with the model: `detector` (settings that they were fitted for) and `counts`.
+
+    >>> templates = ClassTemplates(torch.eye(2), torch.zeros(2), ["cup", "cat"])
+    >>> templates(torch.tensor([3.0, 4.0]).view(1, 2, 1, 1)).flatten()
+    tensor([0.6000, 0.8000])
+    """
+
+    kind: ClassVar[str] = "class-templates"
+    title: ClassVar[str] = "class templates"
+    shipped: ClassVar[Path] = Path(__file__).parent / "models" / "templates"
+    schema: ClassVar[Schema] = Schema(
+        {"templates": Field(("K", "C"), low=-1e3, high=1e3), "mean": Field(("C",), low=-1e3, high=1e3)},
+        {"classes": CLASSES},
+    )
+    templates: Tensor
+    mean: Tensor
+
+    def __init__(
+        self, templates: Tensor, mean: Tensor, classes: Sequence[str], *, metadata: Mapping[str, Any] | None = None
+    ) -> None:
+        super().__init__()
+        check_shape(mean, "mean", None)
+        check_shape(templates, "templates", len(classes), len(mean))
+        check_finite(templates, "templates")
+        self.classes = tuple(classes)
+        self.metadata = dict(metadata or {})
+        self.register_buffer("templates", templates.detach().clone())
+        self.register_buffer("mean", mean.detach().clone())
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Cosine of the features `(B, C, h, w)` at every place with the template of every class, `(B, K, h, w)`."""
+        check_shape(features, "features", None, len(self.mean), None, None)
+        centred = unit(features) - self.mean.to(features)[:, None, None]
+        return torch.einsum("kc,bchw->bkhw", F.normalize(self.templates.to(features), dim=-1), unit(centred))
+
+    def check_eye(self, settings: Mapping[str, Any], classes: Sequence[str]) -> None:
+        """Raise `InputError` beside another detector or other classes; arguments as `Eye.settings` and its classes."""
+        check_classes(self.classes, classes, self.title)
+        self.check_compatible(settings)
+
+    def _record(self) -> dict[str, Any]:
+        """Classes."""
+        return {"classes": self.classes}
+
+    @classmethod
+    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """The templates from what was kept."""
+        return cls(tensors["templates"], tensors["mean"], record["classes"], metadata=record["metadata"])
+
+
+def unit(features: Tensor) -> Tensor:
+    """Features `(B, C, h, w)` of length 1 at every place."""
+    return F.normalize(features, dim=1)
+
+
+def at_points(maps: Tensor, points: Tensor, placement: Placement, canvas: tuple[int, int]) -> Tensor:
+    """Values of maps `(B, K, h, w)` over a canvas at points `(P, 2)` of the image, `(B, K, P)`, bilinear.
+
+    Args:
+        maps: over the whole canvas, padding included.
+        points: in pixels of the image.
+        placement: where the image lies on the canvas.
+        canvas: `(width, height)` of the canvas.
+    """
+    check(min(canvas) > 0, "canvas", "a width and a height", canvas)
+    share = (placement.points_to_canvas(points.to(maps)) + 0.5) / maps.new_tensor(canvas)
+    where = (2 * share - 1).expand(len(maps), 1, -1, -1)
+    return F.grid_sample(maps, where, padding_mode="border", align_corners=False)[:, :, 0]

@@ -1,0 +1,166 @@
+"""Fitting how people choose their next fixation, and asking other people whether it is so."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from semfov.belief.grid import Grid
+from semfov.data.fixations import Fixations, by_picture, read_osie
+from semfov.data.pictures import Pictures
+from semfov.episode import StoredLooks
+from semfov.errors import DataError, check, lookup
+from semfov.experiments.candidates import Candidate, load_models, make_strategy
+from semfov.experiments.config import (
+    BeliefConfig,
+    DetectorConfig,
+    ExploreConfig,
+    PolicyConfig,
+    SaliencyConfig,
+    SensorConfig,
+)
+from semfov.experiments.looks import see_all
+from semfov.experiments.presets import SALIENCY, label, resolve
+from semfov.experiments.run import cache_folder
+from semfov.experiments.saliency_store import saliency_table
+from semfov.experiments.settings import Count, Name, Positive, Settings
+from semfov.experiments.setup import make_eye, prepare_worker
+from semfov.experiments.store import DetectionStore
+from semfov.eye import Eye
+from semfov.training.habits import Halves, fit_terms, habits_of
+from semfov.training.habits_report import report
+from semfov.training.outputs import model_path, write_outputs
+from semfov.training.viewings import Choices, cells_of, choices_in, values_in
+
+
+@dataclass(frozen=True)
+class FitHumanlikeConfig(Settings):
+    """Fit how people choose their next fixation.
+
+    Args:
+        root: folder of the pictures.
+        fixations: JSON file of people's fixations in them, as OSIE's (`semfov.data.fixations.write_osie`).
+        detector: which detector looks through the fovea.
+        sensor: the foveal sensor.
+        belief: the grid of beliefs.
+        saliency: the saliency baselines.
+        policies: explorations to compare, as those of `eval.explore`.
+        save: which of them the model that is written is for (None: the one that predicts best on the fitted half).
+        limit: use only the first so many pictures (None: all).
+        ridge: penalty on the squares of the weights.
+        smoothing: fixations that every cell is given before the centre bias is counted.
+        name: name of the model (None: the detector's).
+        out: folder for the model and the report.
+        cache: folder for what the detector saw from every cell, shared with other runs (None: the user's cache).
+    """
+
+    root: Path
+    fixations: Path
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
+    saliency: SaliencyConfig = field(default_factory=lambda: SaliencyConfig(view="picture", reduction="mean"))
+    policies: tuple[str | PolicyConfig, ...] = ("kl-raw", "closer-look-raw", "vocus2-raw", "itti-koch-raw")
+    save: str | None = None
+    limit: Count | None = None
+    ridge: Positive = 1.0
+    smoothing: Positive = 1.0
+    name: Name | None = None
+    out: Path = Path("runs/fit_humanlike")
+    cache: Path | None = None
+
+
+def fit_humanlike(config: FitHumanlikeConfig) -> None:
+    """Gather people's choices, fit half of the people on half of the pictures, and judge by the others."""
+    check(len(config.policies) > 0, "policies", "at least one policy", "none")
+    prepare_worker()
+    names = [label(choice, "exploration") for choice in config.policies]
+    if config.save is not None:
+        lookup(config.save, names, "policy to save")
+    choices, size, eye = gather(config)
+    columns, rows = config.belief.columns, config.belief.rows
+    halves = Halves.of(choices, Grid(columns, rows, size), config.smoothing)
+    models = {name: fit_terms(halves, name, config.ridge) for name in [None, *names]}
+    best = max(names, key=lambda name: models[name][-1].fitted)
+    chosen = models[config.save or best][-1]
+    habits = habits_of(chosen, halves)
+    habits.metadata |= {"policy": chosen.policy, **eye.settings(), "held_out_bits": chosen.gain, **halves.sizes}
+    path = model_path(config, eye.detector.name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    habits.save(path)
+    text = report(halves, [model for several in models.values() for model in several], habits)
+    figures = [model.figures() for several in models.values() for model in several]
+    write_outputs(config, text, ("bits.json", json.dumps(figures, indent=2) + "\n"), path)
+
+
+def gather(config: FitHumanlikeConfig) -> tuple[Choices, tuple[int, int], Eye]:
+    """All choices with the values that every policy gives; the size of the pictures; the eye.
+
+    Raises:
+        DataError: pictures are missing, or of another size than the fixations.
+    """
+    people = by_picture(read_osie(config.fixations))
+    viewer = Viewer(config, list(people)[: config.limit])
+    size = people[str(viewer.pictures.ids[0])][0].size
+    found = []
+    for number, name in enumerate(tqdm(viewer.pictures.ids, desc="looking as people did", unit="picture")):
+        found.append(viewer.choices(number, people[str(name)], size))
+    return Choices.join(found), size, viewer.eye
+
+
+class Viewer:
+    """What policies make of pictures, whenever somebody chose where to look next.
+
+    Args:
+        config: of the fit.
+        names: of the pictures.
+    """
+
+    def __init__(self, config: FitHumanlikeConfig, names: list[str]) -> None:
+        self.config = config
+        self.eye = make_eye(config.detector, config.sensor)
+        self.pictures = Pictures(config.root, names, self.eye.detector.classes)
+        policies = config.policies
+        run = ExploreConfig(detector=config.detector, sensor=config.sensor, belief=config.belief, policies=policies)
+        models, components = load_models(run, "exploration", self.eye), len(self.pictures.classes) + 1
+        self.policies = {label(choice, "exploration"): resolve(choice, "exploration") for choice in policies}
+        self.strategies = {
+            name: make_strategy(policy, "exploration", config.belief, components, models, config.sensor.fovea)
+            for name, policy in self.policies.items()
+        }
+        size = config.belief.columns, config.belief.rows
+        self.store = DetectionStore(cache_folder(config.cache) / "looks", self.eye.settings(), *size, components)
+
+    def choices(self, number: int, records: list[Fixations], size: tuple[int, int]) -> Choices:
+        """The choices of all people in a picture."""
+        image, digest = self.pictures[number].image, self.pictures.digest(number)
+        if any((each.size, (image.shape[-1], image.shape[-2])) != (size, size) for each in records):
+            raise DataError(f"{self.config.fixations}: expected pictures of {size} pixels, {records[0].picture} is not")
+        grid = Grid(self.config.belief.columns, self.config.belief.rows, size)
+        seen = self.store.load(digest)
+        if seen is None:
+            seen = see_all(self.eye, image, grid)
+            self.store.save(digest, seen)
+        cells, count = cells_of(records, grid)
+        values = {}
+        for name in self.policies:
+            candidate = self.candidate(name, image, grid)
+            acquire = partial(candidate.acquisition, None, grid)
+            with torch.inference_mode():
+                values[name] = values_in(StoredLooks(seen, grid), candidate.observer, acquire, cells, count)
+        subject = torch.tensor([int(each.subject) for each in records])
+        return replace(choices_in(cells, count, grid, number, subject), values=values)
+
+    def candidate(self, name: str, image: Tensor, grid: Grid) -> Candidate:
+        """A policy in a picture."""
+        policy, saliency = self.policies[name], self.config.saliency
+        if policy.saliency is None:
+            return Candidate(self.strategies[name])
+        maps = saliency_table(policy.saliency, saliency, self.eye.sensor, self.config.sensor.reference, image, grid)
+        return Candidate(self.strategies[name], maps, None if policy.policy == SALIENCY else saliency.weight)

@@ -1,0 +1,123 @@
+"""People's next fixations as choices among cells, with what a policy makes of every cell at that moment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.belief.observers import Observer
+from semfov.data.fixations import Fixations
+from semfov.episode import Looks, rollout
+from semfov.gaze.acquisition import AcquisitionFunction
+from semfov.gaze.choice import Given
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Next fixations, n of them.
+
+    Attributes:
+        picture: `(n,)`, number of the picture.
+        subject: `(n,)`, number of the person.
+        cell: `(n,)`, that was fixated.
+        taken: `(n,)`, cell that was fixated next; it may be the same.
+        age: `(n, X·Y)`, how many fixations ago each cell was fixated last; infinite for never.
+        values: of each policy, `(n, X·Y)`.
+    """
+
+    picture: Tensor
+    subject: Tensor
+    cell: Tensor
+    taken: Tensor
+    age: Tensor
+    values: Mapping[str, Tensor]
+
+    def __len__(self) -> int:
+        return len(self.taken)
+
+    def __getitem__(self, index: Tensor) -> Choices:
+        """Some of the choices."""
+        tensors = {name: getattr(self, name)[index] for name in ("picture", "subject", "cell", "taken", "age")}
+        return Choices(**tensors, values={name: values[index] for name, values in self.values.items()})
+
+    @classmethod
+    def join(cls, parts: Sequence[Choices]) -> Choices:
+        """All choices of several pictures."""
+        names = ("picture", "subject", "cell", "taken", "age")
+        tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+        values = {name: torch.cat([part.values[name] for part in parts]) for name in parts[0].values}
+        return cls(**tensors, values=values)
+
+
+def cells_of(fixations: Sequence[Fixations], grid: Grid) -> tuple[Tensor, Tensor]:
+    """Cells that people fixated, `(P, n)` with the last one repeated, and how many, `(P,)`.
+
+    Fixations outside the picture are left out; who has none inside is left out by a count of 0.
+    """
+    rows = [grid.cell_of(torch.as_tensor(each.points[each.inside], dtype=torch.float32)) for each in fixations]
+    count = torch.tensor([len(row) for row in rows])
+    longest = max(1, int(count.max()))
+    cells = torch.zeros(len(rows), longest, dtype=torch.int64)
+    for number, row in enumerate(rows):
+        if len(row):
+            cells[number] = torch.cat([row, row[-1:].expand(longest - len(row))])
+    return cells, count
+
+
+def choices_in(cells: Tensor, count: Tensor, grid: Grid, picture: int, subject: Tensor) -> Choices:
+    """The choices in one picture, person by person, without values.
+
+    Args:
+        cells: `(P, n)`, that each person fixated.
+        count: `(P,)`, how many of them.
+        grid: the cells.
+        picture: its number.
+        subject: `(P,)`, numbers of the people.
+    """
+    found = []
+    age = torch.full((len(cells), len(grid)), torch.inf)
+    for shift in range(cells.shape[1] - 1):
+        age = (age + 1).scatter(-1, cells[:, shift, None], 0.0)
+        found.append(age)
+    going = torch.arange(cells.shape[1] - 1) < count[:, None] - 1
+    ages = torch.stack(found, 1)[going] if found else age[:0]
+    people = subject[:, None].expand(going.shape)[going]
+    return Choices(torch.full_like(people, picture), people, cells[:, :-1][going], cells[:, 1:][going], ages, {})
+
+
+def values_in(
+    looks: Looks,
+    observer: Observer,
+    acquire: Callable[[Tensor], AcquisitionFunction],
+    cells: Tensor,
+    count: Tensor,
+) -> Tensor:
+    """Values of all cells whenever somebody chose, `(n, X·Y)` in the order of `choices_in`.
+
+    Beliefs are made of the looks from the cells that the people fixated.
+
+    Args:
+        looks: at the picture.
+        observer: turns looks into belief.
+        acquire: the acquisition function of episodes that fixate cells `(A,)`.
+        cells: `(P, n)`.
+        count: `(P,)`.
+    """
+    seeing = (count > 1).nonzero()[:, 0]
+    table = torch.zeros(len(cells), cells.shape[1] - 1, len(looks.grid))
+    steps = rollout(
+        looks,
+        observer,
+        lambda _, cell: acquire(cell),
+        cells[seeing, 0],
+        Given(cells[seeing]),
+        most=cells.shape[1] - 1,
+        ends=lambda step: step.shift + 2 >= count[seeing[step.episodes]],
+    )
+    for step in steps:
+        table[seeing[step.episodes], step.shift] = step.values.to(table)
+    return table[torch.arange(cells.shape[1] - 1) < count[:, None] - 1]

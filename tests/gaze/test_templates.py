@@ -1,0 +1,125 @@
+"""Class templates and attention over foveal looks, against loops and SciPy."""
+
+import pytest
+import torch
+from scipy.spatial.distance import cosine
+
+from semfov import DirichletBelief, Grid
+from semfov.detection.placement import Placement, letterbox
+from semfov.errors import DataError, InputError
+from semfov.gaze import ClassTemplates
+from semfov.gaze.acquisition import TemplateAttention
+from semfov.gaze.templates import at_points
+
+GRID = Grid(4, 3, (80, 60))
+
+
+def make_templates(dtype=torch.float32):
+    generator = torch.Generator().manual_seed(0)
+    templates, mean = (torch.randn(*size, generator=generator, dtype=torch.float64) for size in ((3, 5), (5,)))
+    return ClassTemplates(templates.to(dtype), (mean / 10).to(dtype), ["a", "b", "c"])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_attention_is_the_cosine(dtype, device):
+    model = make_templates(dtype).to(device)
+    features = torch.randn(2, 5, 2, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    got = model(features.to(device, dtype))
+    assert got.dtype == dtype
+    for batch, row, column in ((0, 0, 0), (1, 1, 2)):
+        place = features[batch, :, row, column]
+        centred = place / place.norm() - model.mean.double().cpu()
+        for k in range(3):
+            expected = 1 - cosine(centred.numpy(), model.templates[k].double().cpu().numpy())
+            assert float(got[batch, k, row, column]) == pytest.approx(expected, abs=1e-5)
+
+
+def test_gradients():
+    model = make_templates(torch.float64)
+    features = torch.randn(1, 5, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    assert torch.autograd.gradcheck(model, (features.requires_grad_(),))
+
+
+def test_points_of_the_image_are_found_on_the_canvas():
+    """A canvas that is a ramp over the image: the value at a point is the point."""
+    ramp = torch.linspace(0.5, 79.5, 80).expand(1, 3, 60, 80) / 80
+    canvas, placement = letterbox(ramp, (160, 160))
+    points = torch.tensor([[10.0, 20.0], [40.5, 30.0], [70.0, 50.0]])
+    got = at_points(canvas[:, :1], points, placement, (160, 160))[0, 0]
+    torch.testing.assert_close(got, (points[:, 0] + 0.5) / 80, rtol=0, atol=2e-3)
+    # Maps that are coarser than the canvas lie on it all the same.
+    coarse = torch.nn.functional.avg_pool2d(canvas[:, :1], 8)
+    torch.testing.assert_close(at_points(coarse, points, placement, (160, 160))[0, 0], got, rtol=0, atol=5e-3)
+    assert isinstance(placement, Placement)
+
+
+def make_attention(dtype=torch.float64):
+    return torch.randn(12, 3, 12, generator=torch.Generator().manual_seed(3), dtype=torch.float64).to(dtype)
+
+
+def nothing_known(batch, dtype=torch.float64, device="cpu"):
+    return DirichletBelief(torch.ones(batch, 12, 4, dtype=dtype, device=device))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_looks_gather_as_the_loop_has_it(dtype, device):
+    visited = torch.zeros(2, 12, dtype=torch.bool)
+    visited[0, [0, 7, 11]] = visited[1, 4] = True
+    target = torch.tensor([3, 1])
+    attention = make_attention(dtype)
+    value = TemplateAttention(target, attention, GRID, 0.2).to(device)
+    got = value(nothing_known(2, dtype, device), visited.to(device))
+    assert got.dtype == dtype
+    for episode in range(2):
+        for x in range(12):
+            total = weights = 0.0
+            for f in visited[episode].nonzero()[:, 0].tolist():
+                weight = min(1.0, float((1 - GRID.cell_distance[f, x] / 0.2).exp()))
+                total += weight * float(attention[f, int(target[episode]) - 1, x])
+                weights += weight
+            assert float(got[episode, x]) == pytest.approx(total / weights, rel=1e-4, abs=1e-5)
+
+
+def test_one_look_is_what_it_shows():
+    visited = torch.zeros(1, 12, dtype=torch.bool)
+    visited[0, 5] = True
+    got = TemplateAttention(2, make_attention(), GRID)(nothing_known(1), visited)
+    torch.testing.assert_close(got[0], make_attention()[5, 1])
+
+
+def test_an_episode_does_not_depend_on_the_others():
+    visited = torch.rand(5, 12, generator=torch.Generator().manual_seed(0)) < 0.4
+    target = torch.tensor([1, 2, 3, 2, 1])
+    together = TemplateAttention(target, make_attention(), GRID)(nothing_known(5), visited)
+    for episode in range(5):
+        alone = TemplateAttention(target[episode : episode + 1], make_attention(), GRID)
+        part = slice(episode, episode + 1)
+        assert torch.equal(alone(nothing_known(1), visited[part]), together[part])
+
+
+def test_what_is_saved_is_read(tmp_path):
+    model = make_templates()
+    model.metadata["detector"] = {"name": "yolov3-tiny", "digest": "1"}
+    model.save(tmp_path / "templates.safetensors")
+    again = ClassTemplates.from_pretrained(tmp_path / "templates.safetensors")
+    features = torch.randn(1, 5, 2, 2)
+    assert torch.equal(again(features), model(features))
+    with pytest.raises(InputError, match="class templates"):
+        again.check_eye({"detector": {"name": "another", "digest": "2"}, "sensor": {}}, ["a", "b", "c"])
+    with pytest.raises(InputError, match="class"):
+        again.check_eye({"detector": {"name": "yolov3-tiny", "digest": "1"}, "sensor": {}}, ["a", "b", "d"])
+    (tmp_path / "templates.safetensors").write_bytes(b"no")
+    with pytest.raises(DataError, match=r"templates\.safetensors"):
+        ClassTemplates.from_pretrained(tmp_path / "templates.safetensors")
+
+
+def test_arguments():
+    with pytest.raises(InputError, match="templates"):
+        ClassTemplates(torch.zeros(2, 5), torch.zeros(5), ["a", "b", "c"])
+    with pytest.raises(InputError, match="features"):
+        make_templates()(torch.zeros(1, 4, 2, 2))
+    for target in (0, 4):
+        with pytest.raises(InputError, match="target"):
+            TemplateAttention(target, make_attention(), GRID)
+    with pytest.raises(InputError, match="attention"):
+        TemplateAttention(1, make_attention()[:5], GRID)
