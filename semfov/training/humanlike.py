@@ -30,7 +30,7 @@ from semfov.experiments.presets import SALIENCY, label, resolve
 from semfov.experiments.run import cache_folder
 from semfov.experiments.saliency_store import saliency_table
 from semfov.experiments.settings import Count, Name, Positive, Settings
-from semfov.experiments.setup import make_eye, prepare_worker
+from semfov.experiments.setup import fovea_of, make_eye, prepare_worker
 from semfov.experiments.store import DetectionStore
 from semfov.eye import Eye
 from semfov.training.habits import Halves, fit_terms, habits_of
@@ -162,5 +162,5 @@ class Viewer:
         policy, saliency = self.policies[name], self.config.saliency
         if policy.saliency is None:
             return Candidate(self.strategies[name])
-        maps = saliency_table(policy.saliency, saliency, self.eye.sensor, self.config.sensor.reference, image, grid)
+        maps = saliency_table(policy.saliency, saliency, fovea_of(self.eye), self.config.sensor.reference, image, grid)
         return Candidate(self.strategies[name], maps, None if policy.policy == SALIENCY else saliency.weight)
