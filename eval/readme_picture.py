@@ -1,26 +1,26 @@
-"""Make the picture of the README from an embedded scene: `python -m eval.readme_picture`."""
+"""Make the picture of the README from a photograph that scikit-image carries: `python -m eval.readme_picture`."""
 
 from pathlib import Path
 
 import numpy as np
+import skimage
 import torch
 
-from semfov import ActivePerception, EmbeddedScenes
+from semfov import ActivePerception
 from semfov.io.files import replacing
 from semfov.viz import plot_belief_strip, plot_foveated_strip
 from semfov.viz.animation import Frame, in_palette, render
 
 PATH = Path(__file__).parents[1] / "docs" / "pictures" / "search.png"
-SCENE, TARGET, START = 5, "cup", 99
+PHOTOGRAPH = Path(skimage.__file__).parent / "data" / "coffee.png"  # by Rachel Michetti, CC0
+TARGET, START = "cup", 99
 
 
 def make_picture(path: Path = PATH) -> None:
-    """Search the scene, and draw what was seen above what was believed, in a small file."""
+    """Search the photograph, and draw what was seen above what was believed, in a small file."""
     agent = ActivePerception.recommended("yolov3-tiny")
-    scene = EmbeddedScenes(agent.classes[1:])[SCENE]
-    boxes = scene.boxes[scene.labels == agent.classes.index(TARGET)]
     with torch.inference_mode():
-        scanpath = agent.search(scene.image, TARGET, start=START, boxes=boxes)
+        scanpath = agent.search(PHOTOGRAPH, TARGET, start=START)
     seen = plot_foveated_strip(scanpath, most=3)
     believed = plot_belief_strip(scanpath, most=3)
     with replacing(path) as temporary:

@@ -12,6 +12,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,9 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 LINES = [line for block in re.findall(r"```sh\n(.*?)```", README, re.S) for line in block.splitlines() if line.strip()]
 COMMANDS = {line: shlex.split(line, comments=True) for line in LINES}
-PYTHON = [line for line, words in COMMANDS.items() if words[:2] == ["python", "-m"]]
+OWN = [line for line in LINES if "mymodels" in line]
+PYTHON = [line for line, words in COMMANDS.items() if words[:2] == ["python", "-m"] and line not in OWN]
+PIP = [line for line, words in COMMANDS.items() if words[0] == "pip"]
 MAKE = [line for line, words in COMMANDS.items() if words[0] == "make"]
 DEMO = next(line for line in PYTHON if "eval.demo" in line)
 
@@ -44,8 +47,36 @@ def test_pictures_are_small():
 
 
 def test_every_command_is_run_or_asked_below():
-    assert set(PYTHON) | set(MAKE) == set(LINES)
+    assert set(PYTHON) | set(OWN) | set(MAKE) | set(PIP) == set(LINES)
     assert len(PYTHON) >= 3
+
+
+def test_what_pip_installs_is_this_or_needed_by_it():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = {re.split(r"[<>=\[ ]", each)[0] for each in project["dependencies"]} | {project["name"]}
+    for line in PIP:
+        asked = [word for word in COMMANDS[line][2:] if not word.startswith(("-", "https:")) and word != "."]
+        assert {re.split(r"[<>=\[@ ]", word)[0] for word in asked} <= needed
+
+
+@pytest.mark.slow
+def test_a_detector_of_ones_own_in_three_commands(tmp_path):
+    """As printed, but for the size of the fit, and for a detector that knows colours in place of cups."""
+    assert [COMMANDS[line][2] for line in OWN] == ["train.fit_detector", "eval.demo", "eval.search"]
+    assert all(line in (ROOT / "docs/detectors.md").read_text() for line in OWN)
+    spec = importlib.util.spec_from_file_location("colours", ROOT / "tests/training/test_fit_detector.py")
+    colours = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(colours)
+    colours.write_network(tmp_path / "mine.onnx")
+    for name, instances in (("PHOTOS", "instances.json"), ("OTHERS", "others.json")):
+        (tmp_path / name).mkdir()
+        colours.write_photographs(tmp_path / name).rename(tmp_path / instances)
+    Image.open(tmp_path / "OTHERS/3.png").convert("RGB").save(tmp_path / "PHOTO.jpg")
+    fit, demo, search = ([word.replace("cup", "red") for word in COMMANDS[line]] for line in OWN)
+    assert written(run([*fit, *colours.SMALL], tmp_path, tmp_path / "cache"), tmp_path)
+    assert "“red”" in run(demo, tmp_path, tmp_path / "cache")
+    few = ["--data.min_instances", "0", "--data.limit", "3", "--workers", "1"]
+    assert written(run([*search, *few], tmp_path, tmp_path / "cache"), tmp_path)
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
@@ -114,7 +145,7 @@ def run(words, folder, cache):
 
 def written(printed, folder):
     """The files that a command says it wrote."""
-    names = [line.strip() for line in printed.partition("written:\n")[2].splitlines()]
+    names = [line.strip() for line in printed.partition("written:\n")[2].partition("\n\n")[0].splitlines()]
     assert names
     assert [name for name in names if not (folder / name).is_file()] == []
     return names
@@ -149,7 +180,7 @@ def test_demonstration_also_takes(other, folder, weights):
     if other == "video":
         film(folder)
     words = ALSO[other](COMMANDS[DEMO])
-    printed = run([*words, "--shifts", "2"], folder, weights)
+    printed = run([*words, *(["--frames", "1"] if other == "video" else ["--shifts", "2"])], folder, weights)
     assert "cup.html" in written(printed, folder)
     assert ("explored with 2 gaze shifts" in printed) == (other == "explore")
 
