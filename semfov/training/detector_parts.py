@@ -43,10 +43,13 @@ SHIFTS = 5
 """Gaze shifts after which searches and explorations are compared."""
 LONGEST = 15
 """Gaze shifts that they have."""
-ABSENT = 10
-"""Classes that each held-out photograph does not hold, at most, by which thresholds are chosen."""
-SUREST = 0.9
-"""The highest threshold of finding, where absent classes are too few to tell what share of false alarms one makes."""
+ABSENT = 1000
+"""About so many searches for classes that are not there choose the thresholds, at most 20 in a photograph."""
+SUREST, SUREST_OF_FEW = 0.99, 0.9
+"""The highest threshold of finding; the second where few false alarms are expected among so many searches.
+
+One that no search reaches would never find anything; and among few searches one false alarm decides.
+"""
 
 
 @dataclass(frozen=True)
@@ -255,11 +258,11 @@ class Workshop:
         fit = fit_evidence(config, run)
         grid = Grid(config.columns, config.rows, (config.columns, config.rows))
         # Absent classes are many: with more of them, the share of false alarms is known better.
-        wide = make_examples(
-            run, config.classes, config.max_target_area, config.seed, absent=ABSENT, scenes=self.held_out
-        )
-        absent = int((~wide.goal.any(-1)).sum())
-        surest = SUREST if absent * config.false_alarms < 3 else config.surest
+        each = max(config.classes, min(20, ABSENT // len(self.held_out)))
+        area, scenes = config.max_target_area, self.held_out
+        wide = make_examples(run, config.classes, area, config.seed, absent=each, scenes=scenes)
+        expected = config.false_alarms * int((~wide.goal.any(-1)).sum())
+        surest = SUREST_OF_FEW if expected < 10 else SUREST
         _, fit.model.thresholds = judge(replace(config, surest=surest), fit.model, wide, grid)
         thresholds = fit.model.thresholds
         learned = _strategy(Target(fit.model), NonPredictive())

@@ -142,7 +142,10 @@ def test_the_folder_says_what_it_holds(home):
     for name, part in manifest.parts.items():
         assert "held-out photographs" in part.why, (name, part.why)
         assert (part.file is None) == (name == "tempering")
+    thresholds = semfov.TargetEvidence.from_pretrained(home / "models/evidence.safetensors").thresholds
+    assert 0.49 < thresholds.confirm <= 0.9  # few searches judge
     text = (home / "models/report.md").read_text()
+    assert f"found from {thresholds.confirm:.2f}, a look is worth it from {thresholds.give_up:.2f}" in text
     assert "20 photographs, 5 of them held out (one in 4); 3 classes; 4 × 4 cells" in text
     for name in ("reliability.png", "search.png", "explore.png"):
         assert f"({name})" in text
