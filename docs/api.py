@@ -21,6 +21,8 @@ MODULES = (
     "semfov.gaze.acquisition",
     "semfov.gaze.saliency",
     "semfov.episode",
+    "semfov.scanpath",
+    "semfov.viz",
     "semfov.zoom",
     "semfov.data",
     "semfov.errors",

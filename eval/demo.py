@@ -7,7 +7,8 @@
     python -m eval.demo --camera 0 --target cup          # a picture from a camera
     python -m eval.demo PHOTO.jpg --target cup --report cup.html
 
-It prints what was seen and believed at each fixation, and writes pictures and an animation to the folder `out`.
+It prints what was seen and believed at each fixation, and writes pictures and an animation to the folder `out`: those
+that `--draw` names (`--draw "[scanpath]"`, `--draw "[]"` for none).
 Each picture of a folder, a video or a camera is looked at on its own. A picture that is four times as large as the
 detector's input, or larger, is looked at in windows: the agent chooses where, and how close.
 """
