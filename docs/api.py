@@ -22,6 +22,8 @@ MODULES = (
     "semfov.gaze.saliency",
     "semfov.episode",
     "semfov.live",
+    "semfov.scanpath",
+    "semfov.viz",
     "semfov.zoom",
     "semfov.data",
     "semfov.data.fixations",

@@ -8,7 +8,8 @@
     python -m eval.demo PHOTO.jpg --target cup --report cup.html
     python -m eval.demo PHOTO.jpg --target cup --models mymodels    # your own detector, after train.fit_detector
 
-It prints what was seen and believed at each fixation, and writes pictures and an animation to the folder `out`.
+It prints what was seen and believed at each fixation, and writes pictures and an animation to the folder `out`: those
+that `--draw` names (`--draw "[scanpath]"`, `--draw "[]"` for none).
 Each picture of a folder is looked at on its own. The frames of a video or a camera are looked at as they come, one gaze
 shift a frame: belief goes on from frame to frame and fades at a rate. A picture that is four times as large as the
 detector's input, or larger, is looked at in windows: the agent chooses where, and how close.

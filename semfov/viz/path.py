@@ -67,10 +67,14 @@ class GazePath:
             colour = self.colours[number]
             box = {"boxstyle": "round,pad=0.22,rounding_size=0.5", "facecolor": colour, "edgecolor": "white",
                    "linewidth": 0.7}  # fmt: skip
+            middle = (place[0] + place[2]) / 2, (place[1] + place[3]) / 2
+            # A line to a number that stands off its point.
+            off = max(abs(a - b) for a, b in zip(point, middle, strict=True)) > scale
+            arrow = {"arrowstyle": "-", "color": "white", "linewidth": 0.7, "shrinkA": 0, "shrinkB": 0}
             text = axes.annotate(
                 str(number),
                 xy=point,
-                xytext=((place[0] + place[2]) / 2, (place[1] + place[3]) / 2),
+                xytext=middle,
                 color="white" if lightness(colour) < 0.55 else "black",
                 fontsize=_POINTS,
                 fontweight="bold",
@@ -78,8 +82,7 @@ class GazePath:
                 va="center",
                 zorder=6,
                 bbox=box,
-                # A line to a number that stands off its point.
-                arrowprops={"arrowstyle": "-", "color": "white", "linewidth": 0.7, "shrinkA": 0, "shrinkB": 0},
+                arrowprops=arrow if off else None,
             )
             written.append(text)
         return written

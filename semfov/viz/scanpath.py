@@ -23,7 +23,7 @@ from semfov.viz.drawing import (
 )
 from semfov.viz.path import GazePath
 from semfov.viz.semantic import draw_semantic_map, write_names
-from semfov.viz.style import FOUND, OTHER, TARGET, TRUTH, make_figure, only, styled
+from semfov.viz.style import FOUND, OTHER, TARGET, TRUTH, lay_out, make_figure, only, root, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,7 +65,7 @@ def plot_scanpath(
         draw_boxes(axes, box[None], FOUND, width=2.0)
     axes.set_title(describe(scanpath), parse_math=False)
     draw_legend(axes, scanpath, boxes, len(scanpath) - 1 if detections else None)
-    figure.draw_without_rendering()
+    lay_out(figure)
     path = GazePath(axes, scanpath)
     if detections:
         draw_detections(axes, scanpath, len(scanpath) - 1, MOST_BOXES, kept_free=path.taken)
@@ -135,8 +135,6 @@ def plot_episode(
         InputError: there are no photograph and views, neither given nor kept.
     """
     from matplotlib.figure import Figure
-
-    from semfov.viz.style import root
 
     image, views = photograph_of(scanpath, image), views_of(scanpath, views)
     shown = choose_fixations(scanpath, most)
@@ -226,6 +224,6 @@ def views_of(scanpath: Scanpath, views: Sequence[Tensor] | None) -> Sequence[Ten
 
 def _label_views(figure: Figure, scanpath: Scanpath, views: Iterable[tuple[Axes, int]]) -> None:
     """Detections of views; where their labels fit is known only once the figure is laid out."""
-    figure.draw_without_rendering()
+    lay_out(figure)
     for axes, fixation in views:
         draw_detections(axes, scanpath, fixation, MOST_BOXES)

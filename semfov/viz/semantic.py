@@ -21,7 +21,7 @@ from semfov.viz.drawing import (
     text_size,
 )
 from semfov.viz.labels import place_within
-from semfov.viz.style import UNCERTAINTY, make_figure, styled
+from semfov.viz.style import UNCERTAINTY, lay_out, make_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -68,7 +68,7 @@ def plot_semantic_map(
     draw_gaze(unsure, scanpath, fixation)
     unsure.set_title(f"uncertainty after fixation {fixation}")
     draw_scale(unsure, bits, "entropy (bits)")
-    figure.draw_without_rendering()
+    lay_out(figure)
     write_names(named, scanpath, fixation)
     return figure
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import cache, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec
+from weakref import WeakSet
 
 from semfov.errors import check
 from semfov.io.files import replacing
@@ -48,6 +49,7 @@ FILES: Any = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "path"}
 Arguments = ParamSpec("Arguments")
 
 _PLACES = ("ax", "axes", "figure")
+_laid_out: WeakSet[Figure] = WeakSet()
 
 
 def styled(plot: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
@@ -61,11 +63,17 @@ def styled(plot: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
             figure = plot(*arguments, **options)
             # Matplotlib makes the labels of ticks when it draws: they would come in the caller's fonts. A figure of the
             # caller's own is left for him to draw.
-            if all(options.get(name) is None for name in _PLACES):
+            if all(options.get(name) is None for name in _PLACES) and figure not in _laid_out:
                 figure.draw_without_rendering()
             return figure
 
     return draw
+
+
+def lay_out(figure: Figure) -> None:
+    """Find where everything is, for what is placed by it."""
+    figure.draw_without_rendering()
+    _laid_out.add(figure)
 
 
 def make_figure(
