@@ -279,9 +279,9 @@ class ExploreConfig(Settings):
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: kl, scores:
             calibrated, memory: closest}` (`PolicyConfig`). Presets: `recommended` (closer-look-learned), `published`
             (kl-calibrated), and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
-            `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`, `vocus2` or
-            `itti-koch` followed by `-raw` or `-calibrated`. With a learned map there are `random-learned`,
-            `closer-look-learned`, `expected-gain-learned`, `vocus2-learned` and `itti-koch-learned`.
+            `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`, `objects`,
+            `vocus2` or `itti-koch` followed by `-raw` or `-calibrated`. With a learned map there are `random-learned`,
+            `closer-look-learned`, `expected-gain-learned`, `objects-learned`, `vocus2-learned` and `itti-koch-learned`.
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
         store: keep what was seen on disk; false recomputes it (the result is the same).
