@@ -36,6 +36,7 @@ class Pictures:
         self.root = Path(root)
         self.classes = classes
         self.ids = sorted(set(names))
+        self._sizes: dict[int, tuple[int, int]] = {}
         missing = [name for name in self.ids if not inside(self.root, name).is_file()]
         if missing:
             raise DataError(f"{self.root}: expected {len(self.ids)} pictures, {len(missing)} are missing: {missing[0]}")
@@ -64,9 +65,11 @@ class Pictures:
 
     def annotation(self, index: int) -> Annotation:
         """No objects, and the size of the picture."""
-        height, width = read_image(self._path(index)).shape[-2:]
+        if index not in self._sizes:
+            height, width = read_image(self._path(index)).shape[-2:]
+            self._sizes[index] = width, height
         none = torch.zeros(0, dtype=torch.int64)
-        return Annotation(torch.zeros(0, 4), none, none.bool(), (width, height))
+        return Annotation(torch.zeros(0, 4), none, none.bool(), self._sizes[index])
 
     def targets(self, index: int) -> list[int]:
         """None: nothing is known to be there."""

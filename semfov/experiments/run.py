@@ -54,7 +54,7 @@ class Run(ABC):
             check(labels.count(name) == 1, "policies", "each of them once", f"{name!r} {labels.count(name)} times")
         self.policies = {name: resolve(choice, self.task) for name, choice in zip(labels, config.policies, strict=True)}
         self.eye = make_eye(config.detector, config.sensor)
-        self.scenes: Scenes = make_scenes(config.data, self.eye.detector.classes)
+        self.scenes: Scenes = self.open_scenes()
         if not len(self.scenes):
             raise DataError("data: no scene passes the selection; lower data.min_instances or raise data.limit")
         self.models = load_models(config, self.task, self.eye)
@@ -73,6 +73,10 @@ class Run(ABC):
         }
         self.make_key()
         self._digests: dict[int, str] = {}
+
+    def open_scenes(self) -> Scenes:
+        """The scenes of the run; a subclass may have others."""
+        return make_scenes(self.config.data, self.eye.detector.classes)
 
     def make_key(self) -> None:
         """Set the keys from what the run is made of; asked for again where a subclass makes more of it."""

@@ -31,8 +31,10 @@ def nss(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
     """
     values, at = looked_up(maps, x, y)
     flat = values.reshape(*values.shape[:-2], -1)
-    deviation = flat.std(-1)[..., None]
-    return np.asarray((at - flat.mean(-1)[..., None]) / np.where(deviation > 0, deviation, 1))
+    # Of equal values the mean may differ from them by rounding, and so may the deviation from 0.
+    even = (np.ptp(flat, axis=-1) == 0)[..., None]
+    deviation = np.where(even, 1, flat.std(-1)[..., None])
+    return np.where(even, 0, (at - flat.mean(-1)[..., None]) / deviation)
 
 
 def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Hashable, Sequence
 from typing import Any
 
@@ -49,7 +50,11 @@ def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None
         from sklearn.cluster import MeanShift
     except ImportError:
         raise InputError("cluster_labels: expected scikit-learn; pip install semfov[human]") from None
-    shift = MeanShift(bandwidth=bandwidth, bin_seeding=True).fit(np.asarray(others, dtype=np.float64))
+    shift = MeanShift(bandwidth=bandwidth, bin_seeding=True)
+    with warnings.catch_warnings():
+        # Where each fixation has a bin of its own all of them are seeds, which is as good.
+        warnings.filterwarnings("ignore", message="Binning data failed")
+        shift.fit(np.asarray(others, dtype=np.float64))
     return np.asarray(shift.predict(np.asarray(points, dtype=np.float64)), dtype=np.int64)
 
 

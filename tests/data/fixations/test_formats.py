@@ -210,3 +210,30 @@ def test_fixation_trains_of_pysaliency(monkeypatch):
         assert (before.picture, before.subject) == (after.picture, after.subject)
     with pytest.raises(InputError, match="pictures"):
         to_pysaliency(records, ["b.jpg"])
+
+
+@pytest.mark.parametrize("target", [None, 1])
+def test_an_agents_scanpath_is_a_record_like_peoples(tmp_path, target):
+    import torch
+
+    from semfov import Grid, Scanpath
+
+    grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 5, 11])
+    nothing = torch.zeros(3, 12)
+    path = Scanpath(
+        grid=grid,
+        classes=("background", "cup"),
+        target=target,
+        cells=cells,
+        fixations=grid.centres[cells],
+        detections=(),
+        probabilities=nothing[..., None],
+        values=nothing,
+        found=True,
+    )
+    fixations = path.as_fixations("a.jpg")
+    np.testing.assert_allclose(fixations.points, [[9.5, 9.5], [29.5, 29.5], [69.5, 49.5]])
+    assert (fixations.size, fixations.subject) == ((80, 60), "semfov")
+    assert (fixations.target, fixations.found) == ((None, None) if target is None else ("cup", True))
+    write_table(tmp_path / "t.csv", [fixations])
+    same(fixations, read_table(tmp_path / "t.csv")[0])

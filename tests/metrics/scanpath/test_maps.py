@@ -128,6 +128,7 @@ def test_a_uniform_map_tells_nothing():
     flat = np.ones(SHAPE)
     x, y = [3, 4], [5, 6]
     assert nss(flat, x, y).tolist() == [0, 0]
+    assert nss(flat / flat.size, x, y).tolist() == [0, 0]
     assert auc(flat, x, y).tolist() == [0.5, 0.5]
     np.testing.assert_allclose(log_likelihood(log_density(flat), x, y), 0, atol=1e-12)
 

@@ -1,0 +1,1 @@
+"""Searches beside people's: how soon targets are found, and how alike scanpaths are."""

@@ -1,0 +1,1 @@
+"""Free viewing: how well policies, saliency and centre bias foretell where people look next."""

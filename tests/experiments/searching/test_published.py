@@ -1,0 +1,71 @@
+"""What Ruarte et al. (2025) published for files that we have, by their definitions."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from semfov import Grid
+from semfov.data.fixations import by_picture
+from semfov.experiments.searching.trials import in_cells, read_searches, shift_found
+from semfov.metrics.scanpath import mean_performance, multimatch, performance_area, tfp_auc
+
+pytestmark = pytest.mark.shared
+SCREEN, GRID = (1680, 1050), Grid(32, 24, (1680, 1050))
+
+AREA = {"humans": 0.802, "nnIBS": 0.460, "elm_final": 0.626}
+TFP_AUC = {"humans": 4.925, "nnIBS": 2.522, "elm_final": 3.492, "sIBS": 2.369}
+MULTIMATCH = {
+    "humans": (0.937, 0.760, 0.926, 0.906),
+    "nnIBS": (0.918, 0.696, 0.914, 0.884),
+    "elm_final": (0.923, 0.723, 0.921, 0.886),
+}
+
+
+@pytest.fixture(scope="module")
+def searches(shared):
+    folder = shared / "human/cocosearch18"
+    found = {name: read_searches(folder / f"predicted/{name}.json", SCREEN) for name in ("nnIBS", "elm_final", "sIBS")}
+    return {"humans": read_searches(folder / "human_scanpaths", SCREEN), **found}
+
+
+def shifts(searches):
+    return [shift_found(each, 10) for each in searches]
+
+
+@pytest.mark.parametrize("name", AREA)
+def test_area_under_cumulative_performance(searches, name):
+    curve = mean_performance(shifts(searches[name]), [each.subject for each in searches[name]], 9)
+    assert performance_area(curve) == pytest.approx(AREA[name], abs=5e-4)
+
+
+@pytest.mark.parametrize("name", TFP_AUC)
+def test_tfp_auc(searches, name):
+    """Summed over seven fixations, a mean over target categories; pooled over searches people would have 4.899."""
+    found = [shift_found(each, 10**6) for each in searches[name]]
+    assert tfp_auc(found, [each.target for each in searches[name]]) == pytest.approx(TFP_AUC[name], abs=5e-4)
+
+
+def similarities(pairs):
+    """MultiMatch's four of pairs that both found, mean by picture."""
+    found = {}
+    for a, b in pairs:
+        if a.found and b.found:
+            figures = multimatch(in_cells(a, GRID), in_cells(b, GRID), (32, 24))
+            found.setdefault(a.picture, []).append(figures[:4])
+    means = {name: np.nanmean(rows, axis=0) for name, rows in found.items() if np.isfinite(rows).any()}
+    return {name: row for name, row in means.items() if np.isfinite(row).all()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["nnIBS", "elm_final"])
+def test_multimatch(searches, name):
+    """Means over the pictures for which there are similarities both of the model to people and among people."""
+    people = by_picture(searches["humans"])
+    model = similarities((a, b) for a in searches[name] for b in people[a.picture])
+    themselves = similarities(pair for picture in model for pair in combinations(people[picture], 2))
+    rows = [model[picture] for picture in themselves]
+    np.testing.assert_allclose(np.mean(rows, axis=0), MULTIMATCH[name], atol=0.001)
+    if name == "nnIBS":
+        # Of the figures for people, which differ with the model, those beside nnIBS are published.
+        np.testing.assert_allclose(np.mean(list(themselves.values()), axis=0), MULTIMATCH["humans"], atol=0.001)

@@ -1,0 +1,57 @@
+"""Policies along given scanpaths: together or one by one, from coarse looks or fine."""
+
+import torch
+
+from semfov import Detections, Grid
+from semfov.agent import Strategy
+from semfov.belief.observers import Landing, Semantic
+from semfov.episode import StoredLooks, rollout
+from semfov.experiments.candidates import Candidate
+from semfov.experiments.viewing.follow import FineLooks, follow
+from semfov.gaze.choice import Given
+from semfov.gaze.policies import Closer, Objects
+
+GRID = Grid(3, 2, (90, 60))
+
+
+def detections(looks, classes=3, count=4):
+    generator = torch.Generator().manual_seed(0)
+    corner = torch.rand(looks, count, 2, generator=generator) * 50
+    boxes = torch.cat([corner, corner + 5 + torch.rand(looks, count, 2, generator=generator) * 30], -1)
+    scores = (4 * torch.rand(looks, count, classes + 1, generator=generator)).softmax(-1)
+    return Detections(boxes, scores, torch.rand(looks, count, generator=generator) < 0.8)
+
+
+def test_all_at_once_is_each_person_and_each_policy_alone():
+    paths = [torch.tensor([4, 1, 1, 5]), torch.tensor([0, 2]), torch.tensor([5, 4, 3])]
+    seen = detections(6)
+    observer = Semantic(4)
+    candidates = {name: Candidate(Strategy(observer, policy)) for name, policy in (("a", Objects()), ("b", Closer()))}
+    together = follow(StoredLooks(seen, GRID), candidates, paths)
+    for name, candidate in candidates.items():
+        expected = []
+        for path in paths:
+            steps = rollout(
+                StoredLooks(seen, GRID),
+                observer,
+                candidate.acquisition(None, GRID, path[:1]),
+                path[:1],
+                Given(path[None]),
+                most=len(path) - 1,
+            )
+            expected += [step.values[0] for step in steps]
+        torch.testing.assert_close(together[name], torch.stack(expected))
+
+
+def test_a_fine_belief_is_of_looks_from_the_coarse_cell():
+    fine, seen = Grid(9, 6, (90, 60)), detections(6)
+    observer = Landing(3)
+    looks = FineLooks(seen, GRID, fine)
+    # The bins in the corners of the picture lie in the first and the last cell.
+    values = follow(looks, {"landing": Candidate(Strategy(observer, Objects()))}, [torch.tensor([0, 53, 10])])[
+        "landing"
+    ]
+    assert values.shape == (2, 54)
+    said = observer.weigh(seen, GRID.centres, fine).evidence
+    torch.testing.assert_close(values[0], said[0].sum(-1))
+    torch.testing.assert_close(values[1], torch.maximum(said[0], said[5]).sum(-1))
