@@ -117,6 +117,38 @@ def test_learned_gaze():
             assert gaze(DirichletBelief(beta, closest), visited, 7, 10).argmax() == cell
 
 
+def test_class_templates():
+    paths = sorted(semfov.gaze.ClassTemplates.shipped.glob("*.safetensors"))
+    assert [path.stem for path in paths] == ["yolov3-tiny"]
+    model = semfov.gaze.ClassTemplates.from_pretrained("yolov3-tiny")
+    assert paths[0].stat().st_size < 200_000
+    assert model.metadata["detector"]["name"] == "yolov3-tiny"
+    assert "/" not in json.dumps(model.metadata)
+    assert sum(model.metadata["counts"]) == 13_988
+    assert "13,988 objects" in (paths[0].parent / "README.md").read_text(encoding="utf-8")
+    # What is most like the average object of a class is that itself.
+    average = (model.templates + model.mean)[:, :, None, None]
+    assert torch.equal(model(average)[..., 0, 0].argmax(-1), torch.arange(80))
+
+
+def test_gaze_habits():
+    paths = sorted(semfov.gaze.GazeHabits.shipped.glob("*.safetensors"))
+    assert [path.stem for path in paths] == ["osie-vocus2"]
+    habits = semfov.gaze.GazeHabits.from_pretrained("osie-vocus2")
+    assert paths[0].stat().st_size < 10_000
+    assert "/" not in json.dumps(habits.metadata)
+    assert habits.metadata["policy"] == "vocus2-raw"
+    card = (paths[0].parent / "README.md").read_text(encoding="utf-8")
+    assert f"{habits.metadata['held_out_bits']:.3f} ± " in card
+    assert f"{habits.metadata['fitted_choices']:,} fixations" in card
+    # People go by what they see, to the centre, by short steps, and sooner back to what they left longer ago.
+    place = habits.place.view(10, 10)
+    assert float(habits.pull) > 0
+    assert place[4:6, 4:6].mean() > place[[0, 9]].mean()
+    assert bool((habits.step.diff() < 0).all())
+    assert bool((habits.back[:4].diff() > 0).all())
+
+
 @pytest.mark.parametrize("path", ZOOM, ids=lambda path: path.stem)
 def test_glimpse_evidence(path):
     model = GlimpseEvidence.from_pretrained(path.stem)

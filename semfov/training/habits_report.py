@@ -6,7 +6,7 @@ from semfov.experiments.summary import table
 from semfov.gaze.habits import GazeHabits
 from semfov.training.habits import AGES, EDGES, Fitted, Halves
 
-_TERMS = {"policy": "policy alone", "centre": "centre bias", "steps": "saccade length", "return": "return"}
+_TERMS = {"policy": "policy", "centre": "centre bias", "steps": "saccade length", "return": "return"}
 
 
 def report(halves: Halves, models: Sequence[Fitted], habits: GazeHabits) -> str:

@@ -6,13 +6,13 @@ import torch
 from semfov.belief import DirichletBelief
 from semfov.belief.observers.target import TargetBelief
 from semfov.errors import InputError
-from semfov.gaze.acquisition import ObjectProbability
+from semfov.gaze.acquisition import ObjectEvidence
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_value_equals_the_loop(dtype, device):
     beta = torch.rand(2, 6, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(device, dtype)
-    got = ObjectProbability()(DirichletBelief(beta), torch.zeros(2, 6, dtype=torch.bool, device=device))
+    got = ObjectEvidence()(DirichletBelief(beta), torch.zeros(2, 6, dtype=torch.bool, device=device))
     assert got.dtype == dtype
     for episode in range(2):
         for x in range(6):
@@ -23,11 +23,11 @@ def test_value_equals_the_loop(dtype, device):
 def test_gradients():
     beta = torch.rand(1, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_()
     none = torch.zeros(1, 3, dtype=torch.bool)
-    assert torch.autograd.gradcheck(lambda b: ObjectProbability()(DirichletBelief(b), none), (beta,))
+    assert torch.autograd.gradcheck(lambda b: ObjectEvidence()(DirichletBelief(b), none), (beta,))
 
 
 def test_a_belief_about_one_target_is_refused():
     cells, one = torch.zeros(1, 3), torch.zeros(1)
     about_one = TargetBelief(cells, cells, one, cells, cells, cells, cells, cells, one, one, cells.bool())
     with pytest.raises(InputError, match="all classes"):
-        ObjectProbability()(about_one, torch.zeros(1, 3, dtype=torch.bool))
+        ObjectEvidence()(about_one, torch.zeros(1, 3, dtype=torch.bool))

@@ -13,7 +13,7 @@ from semfov.gaze.acquisition.exploration import (
     UpperConfidenceBound,
 )
 from semfov.gaze.acquisition.ideal import CorrectLocalisation, EntropyLimit
-from semfov.gaze.acquisition.objects import ObjectProbability
+from semfov.gaze.acquisition.objects import ObjectEvidence
 from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
 from semfov.gaze.acquisition.saliency_prior import SaliencyPrior
 from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
@@ -32,7 +32,7 @@ __all__ = [
     "KLDivergence",
     "NegativeEntropy",
     "NeighbourhoodPosterior",
-    "ObjectProbability",
+    "ObjectEvidence",
     "PlaceInformation",
     "PredictedTargetPosterior",
     "ProbabilityOfImprovement",

@@ -1,26 +1,23 @@
-"""Exploration that looks at things."""
+"""Exploration that goes by where objects are."""
 
 from torch import Tensor
 
-from semfov.belief.belief import Belief, one_by_one
+from semfov.belief.belief import Belief
 from semfov.gaze.acquisition.base import AcquisitionFunction
 
 
-class ObjectProbability(AcquisitionFunction):
-    r"""Probability that a cell holds anything but background.
+class ObjectEvidence(AcquisitionFunction):
+    r"""How much speaks for any object in each cell: the sum over all classes but background.
 
-    .. math:: a(x) = 1 - P(C^x = 0)
-
-    (Objects tell where people look better than early saliency does: Einhäuser, Spain and Perona, 2008. There it is a
-    map of objects that people named; here it is what the belief knows of them so far.)
+    .. math:: a(x) = \sum_{k \ge 1} P(C^x = k)
 
     >>> import torch
     >>> from semfov import DirichletBelief
-    >>> belief = DirichletBelief(torch.tensor([[[3.0, 0.5, 0.5], [1.0, 1.0, 2.0]]]))
-    >>> ObjectProbability()(belief, torch.zeros(1, 2, dtype=torch.bool))
-    tensor([[0.2500, 0.7500]])
+    >>> belief = DirichletBelief(torch.tensor([[[1.0, 1.0, 2.0], [8.0, 1.0, 1.0]]]))
+    >>> ObjectEvidence()(belief, torch.zeros(1, 2, dtype=torch.bool))
+    tensor([[0.7500, 0.2000]])
     """
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(B, X·Y)` for a belief about all classes."""
-        return one_by_one(lambda p: p[..., 1:].sum(-1) / p.sum(-1), belief.class_probabilities())
+        return belief.class_probabilities()[..., 1:].sum(-1)

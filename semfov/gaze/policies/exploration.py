@@ -18,7 +18,7 @@ from semfov.gaze.acquisition.exploration import (
     TwoPeaks,
     UpperConfidenceBound,
 )
-from semfov.gaze.acquisition.objects import ObjectProbability
+from semfov.gaze.acquisition.objects import ObjectEvidence
 from semfov.gaze.policies.base import GazeModel, Means, ModelPolicy, Policy
 
 
@@ -138,17 +138,6 @@ class Closer(Policy):
         return CloserLook(grid, self.fovea)
 
 
-class Objects(Policy):
-    """Where something most probably is (`semfov.acquisition.ObjectProbability`); by `Landing`, where people look."""
-
-    name = "objects"
-    tasks = ("exploration",)
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The probability of anything but background."""
-        return ObjectProbability()
-
-
 class Gain(Policy):
     """Where a look is expected to name most cells right that are not yet (`semfov.acquisition.ExpectedGain`).
 
@@ -173,3 +162,14 @@ class Gain(Policy):
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The cells gained."""
         return ExpectedGain(self.model, grid)
+
+
+class Objects(Policy):
+    """Where an object is (`semfov.acquisition.ObjectEvidence`): with a `Landing` observer, where people look."""
+
+    name = "objects"
+    tasks = ("exploration",)
+
+    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
+        """The evidence for any object."""
+        return ObjectEvidence()

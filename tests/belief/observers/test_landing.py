@@ -8,7 +8,7 @@ import torch
 from semfov import Detections, Grid
 from semfov.belief.observers import Landing, LandingBelief
 from semfov.errors import InputError
-from semfov.gaze.acquisition import ObjectProbability
+from semfov.gaze.acquisition import ObjectEvidence
 from semfov.gaze.policies import Objects
 
 
@@ -61,9 +61,8 @@ def test_belief_keeps_the_strongest_look_and_the_closest():
     torch.testing.assert_close(belief.closest[0], grid.distance(points).amin(0))
     torch.testing.assert_close(belief.probability(2), belief.evidence[..., 1])
     assert (belief.class_probabilities() >= 0).all()
-    values = ObjectProbability()(belief, torch.zeros(1, 20, dtype=torch.bool))
-    everything = belief.evidence.sum(-1)
-    torch.testing.assert_close(values, everything / (1 - belief.evidence.amax(-1) + everything))
+    values = ObjectEvidence()(belief, torch.zeros(1, 20, dtype=torch.bool))
+    torch.testing.assert_close(values, belief.evidence.sum(-1))
     torch.testing.assert_close(Objects()(None, grid)(belief, belief.closest < 0), values)
 
 
