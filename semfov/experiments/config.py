@@ -290,13 +290,9 @@ class ExploreConfig(Settings):
                 (kl-calibrated), and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
                 `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`, `objects`,
                 `vocus2` or `itti-koch` followed by `-raw` or `-calibrated`. With a learned map there are `random-learned`,
-    <<<<<<< ours
-                `closer-look-learned`, `objects-learned`, `expected-gain-learned`, `vocus2-learned` and
+                    `closer-look-learned`, `objects-learned`, `expected-gain-learned`, `vocus2-learned` and
                 `itti-koch-learned`.
-    =======
-                `closer-look-learned`, `expected-gain-learned`, `objects-learned`, `vocus2-learned` and `itti-koch-learned`.
-    >>>>>>> theirs
-            out: folder for tables, figures, per-episode records and the manifest.
+                out: folder for tables, figures, per-episode records and the manifest.
             cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
             store: keep what was seen on disk; false recomputes it (the result is the same).
             workers: processes (None: one for each CPU core).
