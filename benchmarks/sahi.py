@@ -37,7 +37,7 @@ try:
     from sahi.predict import get_sliced_prediction
     from sahi.prediction import ObjectPrediction
 except ImportError as error:
-    # SAHI asks for opencv-python, whose files are those of opencv-python-headless; it runs with either.
+    # SAHI asks for opencv-python, whose files are those of opencv-python-headless, and runs with the latter.
     raise ModuleNotFoundError(
         "benchmarks.sahi needs SAHI: pip install 'semfov[peers]' && pip install --no-deps sahi"
     ) from error
