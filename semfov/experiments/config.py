@@ -278,25 +278,25 @@ class SearchConfig(Settings):
 class ExploreConfig(Settings):
     """Scene exploration: learn what is where by moving a fovea, and count the cells whose class is right.
 
-        Args:
-            data: which scenes to explore.
-            detector: which detector looks through the fovea.
-            sensor: the foveal sensor.
-            belief: the grid of beliefs.
-            saliency: the saliency baselines.
-            protocol: the experiment.
-            policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: kl, scores:
-                calibrated, memory: closest}` (`PolicyConfig`). Presets: `recommended` (closer-look-learned), `published`
-                (kl-calibrated), and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
-                `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`, `objects`,
-                `vocus2` or `itti-koch` followed by `-raw` or `-calibrated`. With a learned map there are `random-learned`,
-                    `closer-look-learned`, `objects-learned`, `expected-gain-learned`, `vocus2-learned` and
-                `itti-koch-learned`.
-                out: folder for tables, figures, per-episode records and the manifest.
-            cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
-            store: keep what was seen on disk; false recomputes it (the result is the same).
-            workers: processes (None: one for each CPU core).
-            models: folder of `train.fit_detector` that names detector, sensor, grid and fitted models.
+    Args:
+        data: which scenes to explore.
+        detector: which detector looks through the fovea.
+        sensor: the foveal sensor.
+        belief: the grid of beliefs.
+        saliency: the saliency baselines.
+        protocol: the experiment.
+        policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: kl, scores:
+            calibrated, memory: closest}` (`PolicyConfig`). Presets: `recommended` (closer-look-learned), `published`
+            (kl-calibrated), and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
+            `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`, `objects`,
+            `vocus2` or `itti-koch` followed by `-raw` or `-calibrated`. With a learned map there are `random-learned`,
+            `closer-look-learned`, `objects-learned`, `expected-gain-learned`, `vocus2-learned` and
+            `itti-koch-learned`.
+        out: folder for tables, figures, per-episode records and the manifest.
+        cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
+        store: keep what was seen on disk; false recomputes it (the result is the same).
+        workers: processes (None: one for each CPU core).
+        models: folder of `train.fit_detector` that names detector, sensor, grid and fitted models.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
