@@ -16,8 +16,7 @@ from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Tar
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike, as_image
-from semfov.decision import conclude, decide, decide_by_price
-from semfov.detection.detections import Detections
+from semfov.decision import check_thresholds, conclude, confirms, decide, decide_by_price, goal_cells
 from semfov.detection.load import load_detector
 from semfov.episode import LiveLooks, Step, rollout
 from semfov.errors import InputError, check, check_whole, lookup
@@ -220,7 +219,7 @@ class ActivePerception(nn.Module):
         start: int | None = None,
         shifts: int = 30,
         seed: int = 0,
-        boxes: Tensor | None = None,
+        boxes: Tensor | Sequence[Sequence[float]] | None = None,
         confirm: float | None = None,
         give_up: float | None = None,
         price: float | None = None,
@@ -255,10 +254,10 @@ class ActivePerception(nn.Module):
             DataError: the image's file cannot be read.
         """
         index = class_index(target, self.classes[1:], "target")
-        _check_thresholds(confirm, give_up)
+        check_thresholds(confirm, give_up)
         check(price is None or (is_number(price) and price >= 0), "price", "0 or more right decisions", price)
         image, grid = self._frame(image)
-        goal = None if boxes is None else grid.footprint(torch.as_tensor(boxes).to(image)).any(-2)
+        goal = None if boxes is None else goal_cells(boxes, grid, image)
         chosen = self.searching.observer.thresholds
         if price is not None and (chosen is None or confirm is not None or give_up is not None):
             raise InputError("price: expected None, with thresholds or for a belief that tells no presence")
@@ -331,7 +330,7 @@ class ActivePerception(nn.Module):
         and `confirm` and `give_up` those of `search`.
         """
         index = None if target is None else class_index(target, self.classes[1:], "target")
-        _check_thresholds(confirm, give_up)
+        check_thresholds(confirm, give_up)
         strategy = self.exploring if index is None else self.searching
         chosen = strategy.observer.thresholds
         return LivePerception(
@@ -392,21 +391,8 @@ class ActivePerception(nn.Module):
         return replace(scanpath, ending=ending, stimulus=Stimulus.of(self.eye, image)), *ended
 
 
-def _check_thresholds(confirm: float | None, give_up: float | None) -> None:
-    """Raise `InputError` unless the thresholds that are given are probabilities."""
-    for name, value in (("confirm", confirm), ("give_up", give_up)):
-        check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability from 0 to 1", value)
-
-
 def _check_cells(grid: tuple[int, int]) -> None:
     """Raise `InputError` unless this is a grid."""
     check(isinstance(grid, Sequence) and len(grid) == 2, "grid", "(columns, rows)", grid)
     for side in grid:
         check_whole(side, "grid", 1, 200)
-
-
-def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:
-    """Whether a detection that overlaps `cell` `(B,)` has `target` as its best class with such a score, `(B,)`."""
-    sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score) & detections.mask
-    there = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
-    return (there & sure).any(-1)

@@ -13,7 +13,8 @@ from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
 from semfov.episode import Step
-from semfov.errors import check
+from semfov.errors import check, check_finite, check_shape
+from semfov.io.schema import is_number
 
 Outcome = Literal["found", "absent", "undecided"]
 OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")
@@ -161,3 +162,36 @@ def best_box(looks: Sequence[Detections], grid: Grid, cell: int, target: int) ->
         if scores.numel() and float(scores.max()) > score:
             score, box = float(scores.max()), seen.boxes[0, int(scores.argmax())]
     return box
+
+
+def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:
+    """Whether a detection that overlaps `cell` `(B,)` has `target` as its best class with such a score, `(B,)`."""
+    sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score) & detections.mask
+    there = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
+    return (there & sure).any(-1)
+
+
+def goal_cells(boxes: Tensor | Sequence[Sequence[float]], grid: Grid, like: Tensor) -> Tensor:
+    """Which cells boxes overlap, `(X·Y,)`: where a search is at its end by the protocol of the paper.
+
+    Args:
+        boxes: `(M, 4)`, `(x1, y1, x2, y2)` in pixels of the image.
+        grid: the cells.
+        like: whose type and device they take.
+
+    Raises:
+        InputError: they are no boxes.
+    """
+    tensor = torch.as_tensor(boxes).to(like)
+    check_shape(tensor, "boxes", None, 4)
+    check(tensor.ndim == 2, "boxes", "shape (M, 4)", tuple(tensor.shape))
+    check_finite(tensor, "boxes")
+    full = bool((tensor[:, 2:] > tensor[:, :2]).all())
+    check(full, "boxes", "(x1, y1, x2, y2) with x1 < x2 and y1 < y2", "others; of (x, y, width, height) make x + width")
+    return grid.footprint(tensor).any(-2)
+
+
+def check_thresholds(confirm: float | None, give_up: float | None) -> None:
+    """Raise `InputError` unless the thresholds that are given are probabilities."""
+    for name, value in (("confirm", confirm), ("give_up", give_up)):
+        check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability from 0 to 1", value)

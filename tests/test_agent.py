@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from semfov import ActivePerception, FovealObservationModel, Foveation, Grid
-from semfov.agent import confirms
 from semfov.belief import ContextPrior, TargetEvidence
 from semfov.belief.observers import Context, Semantic, Target
+from semfov.decision import confirms
 from semfov.detection import Candidates, Detections, Detector
 from semfov.episode import STAGES
 from semfov.errors import InputError

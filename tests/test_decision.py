@@ -1,5 +1,6 @@
 """What searches decide: by beliefs made by hand, against a loop, and by agents whose observers follow a script."""
 
+import math
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -12,7 +13,17 @@ from semfov import ActivePerception, Detections, DirichletBelief, Foveation, Gri
 from semfov.belief import Belief, ContextPrior
 from semfov.belief.observers import Context, Look, Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import NEARLY, OUTCOMES, Decision, best_box, conclude, decide, decide_by_price, strength
+from semfov.decision import (
+    NEARLY,
+    OUTCOMES,
+    Decision,
+    best_box,
+    conclude,
+    decide,
+    decide_by_price,
+    goal_cells,
+    strength,
+)
 from semfov.detection import Candidates, Detector
 from semfov.errors import InputError
 from semfov.eye import Eye
@@ -480,3 +491,16 @@ def test_what_is_no_probability_is_refused_by_name(image, observer, given):
     (name,) = given
     with pytest.raises(InputError, match=f"^{name}: expected a probability"):
         agent(observer).search(image, "red", **given)
+
+
+def test_goal_cells_are_those_that_boxes_overlap():
+    grid = Grid(4, 2, (80, 40))
+    assert goal_cells([[0, 0, 20, 20], [61, 21, 80, 40]], grid, torch.zeros(())).nonzero()[:, 0].tolist() == [0, 7]
+    for wrong, told in (
+        ([[20, 0, 0, 20]], "x1 < x2"),
+        ([0.0, 0, 20, 20], "shape"),
+        (torch.rand(2, 5), "shape"),
+        ([[0, 0, math.inf, 5]], "finite"),
+    ):
+        with pytest.raises(InputError, match=f"boxes: .*{told}"):
+            goal_cells(wrong, grid, torch.zeros(()))

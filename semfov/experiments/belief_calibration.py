@@ -12,9 +12,10 @@ from typing import ClassVar, TypeVar
 import torch
 from torch import Tensor
 
-from semfov.agent import PUBLISHED_SENSORS, confirms
+from semfov.agent import PUBLISHED_SENSORS
 from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap, Observer, Target
+from semfov.decision import confirms
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Step, Stopwatch, rollout
 from semfov.errors import InputError

@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.agent import Strategy, confirms
+from semfov.agent import Strategy
 from semfov.belief.grid import Grid
 from semfov.data.scene import legal_targets
-from semfov.decision import OUTCOMES
+from semfov.decision import OUTCOMES, confirms
 from semfov.episode import Step, StoredLooks, rollout
 from semfov.experiments.candidates import Candidate
 from semfov.experiments.config import ProtocolConfig
