@@ -163,6 +163,14 @@ def test_settings_out_of_their_range_are_refused_by_name(config, name, base, all
         (["--belief.columns", "0"], "belief.columns: expected a whole number from 1 to 200, got 0"),
         (["--sensor.sigma", "0"], "sensor.sigma: expected a number above 0"),
         (["--workers", "0"], "workers: expected a whole number from 1 to 1,024, got 0"),
+        (
+            ["--data.root", "nosuch", "--data.annotations", "no.json"],
+            "data.root: no such folder: nosuch; check the path",
+        ),
+        (["--data.root", "tests", "--data.annotations", "no.json"], "data.annotations: no such file: no.json; check"),
+        (["--data.root", "tests"], "data: expected both data.root and data.annotations"),
+        (["--detector.name", "yolo"], "unknown detector 'yolo'; did you mean 'yolov3'"),
+        (["--detector.name", "nosuch.onnx"], "detector: no such file: nosuch.onnx; check the path"),
     ],
 )
 def test_command_lines(arguments, told, capsys, tmp_path):
