@@ -65,7 +65,7 @@ def draw(figure):
     """Render it; a figure that cannot be laid out warns."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        figure.canvas.draw()
+        figure.draw_without_rendering()
     return figure
 
 

@@ -31,7 +31,7 @@ def scanpath_of(cells, columns, rows, size=(640, 480)):
 
 def drawn(scanpath):
     figure = plot_scanpath(scanpath, torch.rand(3, 48, 64))
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     return figure.axes[0]
 
 

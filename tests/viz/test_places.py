@@ -83,7 +83,7 @@ def test_drawn_in_the_callers_axes(name, scanpath):
     else:
         given, key = list(right.subplots(1, place, squeeze=False, subplot_kw=kind).flat), "axes"
     assert function(*arguments, **options, **{key: given}) is mine
-    mine.canvas.draw()
+    mine.draw_without_rendering()
     assert not any([other.lines, other.images, other.texts, other.patches, other.collections])
     own = function(*arguments, **options)
     drawn = [axes for axes in mine.axes if axes is not other]

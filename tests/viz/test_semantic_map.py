@@ -107,7 +107,7 @@ def test_figure_of_marginal_probabilities():
         figure = plot_semantic_map(scanpath, image=image)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            figure.canvas.draw()
+            figure.draw_without_rendering()
         named, unsure = figure.axes[:2]
         np.testing.assert_allclose(
             named.images[-1].get_array(), scanpath.probabilities[-1, :, 1:].amax(-1).reshape(4, 6), rtol=1e-6
@@ -121,7 +121,7 @@ def test_names_of_many_regions_do_not_hide_each_other():
     generator = torch.Generator().manual_seed(0)
     probabilities = torch.rand(1, 100, 4, generator=generator).pow(4)
     figure = plot_semantic_map(scanpath_of(probabilities, 10, ("background", "fire hydrant", "dining table", "cup")))
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     extents = [text.get_window_extent().padded(-0.5) for text in figure.axes[0].texts]
     assert len(extents) == len(named_regions(scanpath_of(probabilities, 10))) > 15
     assert not any(a.overlaps(b) for n, a in enumerate(extents) for b in extents[n + 1 :])
