@@ -128,7 +128,9 @@ def test_a_copied_or_pickled_search_policy_values_alike(name, means):
             assert other.model is not means.model
 
 
-@pytest.mark.parametrize("name", ["random", "kl", "surprise", "two-peaks", "expected-accuracy", "closer-look"])
+@pytest.mark.parametrize(
+    "name", ["random", "kl", "surprise", "two-peaks", "expected-accuracy", "closer-look", "objects"]
+)
 def test_a_copied_or_pickled_exploration_policy_values_alike(name, means):
     policy = named_policy(name, "exploration", means)
     beta = torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)) + 0.1
@@ -137,7 +139,7 @@ def test_a_copied_or_pickled_exploration_policy_values_alike(name, means):
 
 
 def test_a_missing_model_is_told_at_once():
-    free = {"random", "non-predictive", "closer-look"}
+    free = {"random", "non-predictive", "closer-look", "objects"}
     for task in ("search", "exploration"):
         for name in policy_names(task):
             if name in free:
