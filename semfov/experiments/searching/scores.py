@@ -15,7 +15,6 @@ from semfov.data.fixations import Fixations, by_picture
 from semfov.experiments.searching.trials import in_cells, shift_found
 from semfov.metrics.averages import standard_error
 from semfov.metrics.scanpath import (
-    cluster_labels,
     edit_distance,
     mean_performance,
     multimatch,
@@ -25,6 +24,7 @@ from semfov.metrics.scanpath import (
     sequence_score,
     tfp_auc,
 )
+from semfov.metrics.scanpath.sequence import fitted_clusters, labels_by
 from semfov.metrics.search import cumulative_performance
 
 Array = NDArray[np.float64]
@@ -83,6 +83,7 @@ class People:
         self.pictures = by_picture(self.searches)
         self.cells = {name: [in_cells(each, grid) for each in people] for name, people in self.pictures.items()}
         self.points = {name: np.concatenate([each.points for each in people]) for name, people in self.pictures.items()}
+        self.clusters: dict[str, Any] = {}
         self.words = {name: self._words(name, people) for name, people in self.pictures.items()}
         found = [shift_found(each, longest) for each in self.searches]
         self.curve = mean_performance(found, [each.target for each in self.searches], 6)
@@ -134,7 +135,9 @@ class People:
         return alike
 
     def _words(self, name: str, searches: Sequence[Fixations]) -> list[list[int]]:
-        labels = cluster_labels(np.concatenate([each.points for each in searches]), self.points[name], self.bandwidth)
+        if name not in self.clusters:
+            self.clusters[name] = fitted_clusters(self.points[name], self.bandwidth)
+        labels = labels_by(self.clusters[name], np.concatenate([each.points for each in searches]))
         ends = np.cumsum([len(each) for each in searches]).tolist()
         return [labels[start:end].tolist() for start, end in zip([0, *ends], ends, strict=False)]
 

@@ -46,6 +46,11 @@ def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None
     Raises:
         InputError: scikit-learn is not installed.
     """
+    return labels_by(fitted_clusters(others, bandwidth), points)
+
+
+def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
+    """The clusters of `cluster_labels`, a fitted `sklearn.cluster.MeanShift`, for those who label more than once."""
     try:
         from sklearn.cluster import MeanShift
     except ImportError:
@@ -54,8 +59,12 @@ def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None
     with warnings.catch_warnings():
         # Where each fixation has a bin of its own all of them are seeds, which is as good.
         warnings.filterwarnings("ignore", message="Binning data failed")
-        shift.fit(np.asarray(others, dtype=np.float64))
-    return np.asarray(shift.predict(np.asarray(points, dtype=np.float64)), dtype=np.int64)
+        return shift.fit(np.asarray(others, dtype=np.float64))
+
+
+def labels_by(clusters: Any, points: ArrayLike) -> Labels:
+    """Which of the fitted clusters each fixation `(n, 2)` is in, `(n,)`."""
+    return np.asarray(clusters.predict(np.asarray(points, dtype=np.float64)), dtype=np.int64)
 
 
 def sequence_score(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> float:
