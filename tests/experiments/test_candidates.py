@@ -56,9 +56,9 @@ def test_a_model_is_needed_to_predict_to_calibrate_and_for_misses():
     assert needed(None, "closer-look-calibrated", task="exploration")
     assert needed(BeliefConfig(misses=True), "non-predictive-raw")
     assert not needed(BeliefConfig(misses=True), PolicyConfig("non-predictive", misses=False))
-    ahead = ("predictive", "neighbourhood", "foveal-hit", "place-information")
+    ahead = ("predictive", "neighbourhood", "foveal-hit", "place-information", "entropy-limit", "ideal-observer")
     assert all(needed(None, PolicyConfig(name)) for name in ahead)
-    without = {"random", "closer-look", "saliency", "expected-gain"}
+    without = {"random", "closer-look", "saliency", "expected-gain", "objects"}
     for name in known_policies("exploration"):
         scores = "learned" if name == "expected-gain" else "raw"
         given = PolicyConfig(name, scores, saliency="vocus2" if name == "saliency" else None)
@@ -249,3 +249,30 @@ def test_saliency_takes_a_policys_place_or_stands_beside_it(rows):
     plain = Candidate(sought)
     assert plain.observer is sought.observer
     assert isinstance(plain.acquisition(1, GRID, cell), TargetPosterior)
+
+
+@pytest.mark.parametrize("name", ["foveal-hit", "place-information", "entropy-limit", "ideal-observer"])
+def test_searches_by_place_go_by_learned_evidence_too(model, name):
+    """The belief is that of `target-evidence`, and the policy looks for the place that it tells of."""
+    evidence = TargetEvidence(4, 4, components=3)
+    made = strategy(PolicyConfig(name, "learned"), observation=model, evidence=evidence)
+    assert isinstance(made.observer, observers.Target)
+    assert made.observer.model is evidence
+    assert made.policy.name == name
+    belief = made.observer.start(2, GRID, torch.zeros(()))
+    visited = torch.zeros(2, 12, dtype=torch.bool)
+    assert made.policy(torch.tensor([1, 2]), GRID)(belief, visited).shape == (2, 12)
+    with pytest.raises(InputError, match="learned target evidence"):
+        strategy(PolicyConfig(name, "learned"), observation=model)
+
+
+def test_attention_takes_the_place_of_a_policy():
+    attention = torch.rand(12, 2, 12)
+    candidate = Candidate(strategy("ivsn"), attention=attention, fovea=0.2)
+    acquisition = candidate.acquisition(torch.tensor([2]), GRID, torch.tensor([5]))
+    visited = torch.zeros(1, 12, dtype=torch.bool)
+    visited[0, 5] = True
+    belief = candidate.observer.start(1, GRID, torch.zeros(()))
+    torch.testing.assert_close(acquisition(belief, visited)[0], attention[5, 1])
+    with pytest.raises(InputError, match="policy 'ivsn': expected a target"):
+        candidate.acquisition(None, GRID, torch.tensor([5]))
