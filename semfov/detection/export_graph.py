@@ -51,7 +51,12 @@ class Graph:
 
 
 class _NetworkGraph(Graph):
-    """The graph of a Darknet network."""
+    """The graph of a Darknet network, all of single precision."""
+
+    def constant(self, values: Tensor | list[int] | list[float] | int | float) -> str:
+        """A constant; single precision whatever torch's default is."""
+        tensor = torch.as_tensor(values)
+        return super().constant(tensor.float() if tensor.is_floating_point() else tensor)
 
     def activation(self, kind: str, source: str) -> str:
         """An activation of Darknet."""
@@ -95,8 +100,8 @@ class _NetworkGraph(Graph):
         return self.add(
             "Conv",
             source,
-            self.constant(layer.weight.float()),
-            self.constant(layer.bias.float()),  # type: ignore[union-attr]
+            self.constant(layer.weight),
+            self.constant(layer.bias),  # type: ignore[arg-type]
             strides=list(layer.stride),
             pads=[vertical, horizontal, vertical, horizontal],
             group=layer.groups,

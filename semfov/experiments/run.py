@@ -53,7 +53,7 @@ class Run(ABC):
         for name in labels:
             check(labels.count(name) == 1, "policies", "each of them once", f"{name!r} {labels.count(name)} times")
         self.policies = {name: resolve(choice, self.task) for name, choice in zip(labels, config.policies, strict=True)}
-        check_sources(config.data, config.detector)
+        self.check_sources()
         self.eye = make_eye(config.detector, config.sensor)
         self.scenes: Scenes = self.open_scenes()
         if not len(self.scenes):
@@ -74,6 +74,10 @@ class Run(ABC):
         }
         self.make_key()
         self._digests: dict[int, str] = {}
+
+    def check_sources(self) -> None:
+        """Raise an error where what the run looks at, or its detector, is not there, before any of it is loaded."""
+        check_sources(self.config.data, self.config.detector)
 
     def open_scenes(self) -> Scenes:
         """The scenes of the run; a subclass may have others."""

@@ -9,6 +9,7 @@ import torch
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
 from semfov.data.scene import Scenes
+from semfov.detection.load import check_detector
 from semfov.episode import Stopwatch
 from semfov.experiments.parts import Record
 from semfov.experiments.run import Run
@@ -27,6 +28,10 @@ class PeopleSearchRun(Run):
 
     def __init__(self, config: PeopleSearchConfig) -> None:
         super().__init__(cast(Any, config))
+
+    def check_sources(self) -> None:
+        """Raise an error where the detector is not there; pictures are looked for when people's files are read."""
+        check_detector(self.config.detector.name)
 
     def open_scenes(self) -> Scenes:
         """The screens whose pictures are there."""

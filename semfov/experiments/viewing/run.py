@@ -20,6 +20,7 @@ from semfov.data.classes import class_index
 from semfov.data.fixations import Fixations, by_picture, read_osie, read_table
 from semfov.data.pictures import Pictures
 from semfov.data.scene import Scenes
+from semfov.detection.load import check_detector
 from semfov.episode import Looks, Stopwatch, StoredLooks
 from semfov.errors import DataError, InputError
 from semfov.experiments.candidates import Candidate
@@ -60,6 +61,10 @@ class ViewingRun(Run):
         self.map_stores[LANDING] = MapStore(cache, {**common, "policy": LANDING, "bins": bins}, bins)
         for name in config.models:
             self.map_stores[name] = MapStore(cache, {"saliency": name, "raster": self._raster_size}, bins)
+
+    def check_sources(self) -> None:
+        """Raise an error where the detector is not there; pictures are looked for when people's files are read."""
+        check_detector(self.config.detector.name)
 
     def open_scenes(self) -> Scenes:
         """The pictures that people saw and that are there."""
