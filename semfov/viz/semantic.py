@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from semfov.belief.grid import Grid
 from semfov.scanpath import Scanpath
 from semfov.viz.drawing import (
     check_fixation,
@@ -90,7 +91,8 @@ def most_probable(scanpath: Scanpath, fixation: int) -> Tensor:
 
 
 def write_names(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
-    """Names of regions, each on one of its cells where it covers no other; the figure is laid out."""
+    """Borders of regions, and names, each on a cell where it covers no other; the figure is laid out."""
+    from matplotlib.collections import LineCollection
     from matplotlib.patheffects import withStroke
 
     grid = scanpath.grid
@@ -102,13 +104,35 @@ def write_names(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
         candidates.append([(x, y) for x, y in centres[order].tolist()])
         sizes.append(text_size(axes, name, _NAME_POINTS))
     width, height = grid.extent.tolist()
-    written: list[Artist] = []
+    lines = LineCollection([side for _, region, _ in named for side in borders(grid, region)], colors="white")
+    lines.set(linewidths=1.3, zorder=3)
+    written: list[Artist] = [axes.add_collection(lines, autolim=False)]
     for (name, _, _), (x1, y1, x2, y2) in zip(named, place_within(candidates, sizes, (width, height)), strict=True):
         text = axes.text((x1 + x2) / 2, (y1 + y2) / 2, name, color="black", fontsize=_NAME_POINTS, clip_on=True)
         text.set(ha="center", va="center", parse_math=False)
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
         written.append(text)
     return written
+
+
+def borders(grid: Grid, region: Sequence[int]) -> list[list[tuple[float, float]]]:
+    """The sides of cells of a region beyond which it ends.
+
+    >>> len(borders(Grid(3, 2, (30, 20)), [0, 1]))
+    6
+    """
+    cells, edges = set(region), grid.edges.tolist()
+    found = []
+    for cell in region:
+        column, (x1, y1, x2, y2) = cell % grid.columns, edges[cell]
+        sides = (
+            (cell - 1 if column else None, [(x1, y1), (x1, y2)]),
+            (cell + 1 if column + 1 < grid.columns else None, [(x2, y1), (x2, y2)]),
+            (cell - grid.columns, [(x1, y1), (x2, y1)]),
+            (cell + grid.columns, [(x1, y2), (x2, y2)]),
+        )
+        found += [line for beside, line in sides if beside not in cells]
+    return found
 
 
 def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, list[int], float]]:

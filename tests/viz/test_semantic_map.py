@@ -11,7 +11,7 @@ import torch
 from eval import demo
 from semfov import Detections, Grid, Scanpath
 from semfov.viz import entropy, plot_semantic_map
-from semfov.viz.semantic import named_regions, regions
+from semfov.viz.semantic import borders, named_regions, regions
 
 CLASSES = ("background", "cat", "cup", "dog")
 
@@ -115,6 +115,27 @@ def test_figure_of_marginal_probabilities():
         assert named.images[-1].get_clim() == (0, 1)
         np.testing.assert_allclose(unsure.images[-1].get_array(), entropy(scanpath)[-1].reshape(4, 6), rtol=1e-6)
         assert sorted(text.get_text() for text in named.texts if text.get_text() in CLASSES) == ["cat", "dog", "dog"]
+
+
+def test_borders_go_around_regions():
+    """Their length is that of the sides between cells of different labels, and of the frame, counted on the table."""
+    table = torch.randint(3, (6, 7), generator=torch.Generator().manual_seed(0))
+    grid = Grid(7, 6, (70, 60))
+    padded = np.pad(table.numpy(), 1, constant_values=-1)
+    for region in regions(table):
+        inside = np.zeros(42, dtype=int)
+        inside[region] = 1
+        framed = np.pad(inside.reshape(6, 7), 1)
+        expected = np.abs(np.diff(framed, axis=0)).sum() + np.abs(np.diff(framed, axis=1)).sum()
+        lines = borders(grid, region)
+        assert len(lines) == expected
+        for (x1, y1), (x2, y2) in lines:
+            assert abs(x2 - x1) + abs(y2 - y1) == pytest.approx(10)
+            # Beside the middle of a side lie a cell of the region and one that is not.
+            x, y = (x1 + x2) / 20, (y1 + y2) / 20
+            off = (0.5, 0) if x1 == x2 else (0, 0.5)
+            pair = [padded[math.floor(y + s * off[1]) + 1, math.floor(x + s * off[0]) + 1] for s in (-1, 1)]
+            assert len({int(each) for each in pair}) == 2
 
 
 def test_names_of_many_regions_do_not_hide_each_other():
