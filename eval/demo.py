@@ -35,6 +35,7 @@ from semfov.detection.load import check_detector
 from semfov.errors import check
 from semfov.experiments.command import run_command
 from semfov.experiments.settings import Range, Seed, Settings, Share, Shifts, Weight, Whole
+from semfov.io.manifest import Manifest
 from semfov.live import RATE
 from semfov.report.episode import Pool, episode_data
 from semfov.report.page import write_page
@@ -115,7 +116,7 @@ def demo(config: DemoConfig) -> None:
     agent = None if classes is not None else make_agent(config)
     classes = agent.classes[1:] if agent is not None else classes or ()
     if config.target is None and not config.explore:
-        print(f"Choose a class with --target, or --explore. {config.detector} knows:\n")
+        print(f"Choose a class with --target, or --explore. {config.models or config.detector} knows:\n")
         print(columns(classes))
         return
     if config.target is not None:
@@ -205,7 +206,7 @@ def chosen(values: dict[str, float | None]) -> dict[str, Any]:
 
 def known_classes(config: DemoConfig) -> tuple[str, ...] | None:
     """Classes of the detector, where they are known before it is loaded."""
-    return check_detector(config.detector)
+    return check_detector(config.detector) if config.models is None else Manifest.read(config.models).classes
 
 
 def open_live(config: DemoConfig) -> Stream | None:
