@@ -84,7 +84,7 @@ def test_a_still_picture_at_rate_zero_is_an_ordinary_search(name, one_thread):
     agent, image = agent_with(observers()[name]), scene(100, 80)
     live = agent.live("green", rate=0, seed=5)
     with torch.inference_mode():
-        searched = agent.search(image, "green", seed=5, shifts=11, boxes=torch.tensor([[0.0, 0, 0, 0]]))
+        searched = agent.search(image, "green", seed=5, shifts=11, boxes=torch.tensor([[-9.0, -9, -1, -1]]))
     moments = [live.step(image) for _ in range(12)]
     assert [moment.cell for moment in moments] == searched.cells.tolist()
     for moment, posterior, seen in zip(moments, searched.posterior, searched.detections, strict=True):

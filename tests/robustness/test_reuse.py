@@ -18,9 +18,10 @@ import semfov
 from semfov import Eye, FovealObservationModel, Foveation, Grid, acquisition, fusion, policies, saliency
 from semfov.agent import ActivePerception
 from semfov.belief import ContextPrior, DirichletBelief, MapEvidence, TargetEvidence
-from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
+from semfov.belief.observers import Context, Landing, LearnedMap, Observer, Semantic, Target
 from semfov.detection import Candidates, Detections, Detector, Selection
-from semfov.gaze import LearnedGaze, Policy, select_fixation
+from semfov.gaze import IVSN, GazeHabits, LearnedGaze, Policy, select_fixation
+from semfov.gaze.templates import ClassTemplates
 from semfov.observation import FoldedObservationModel
 from semfov.sensor import Glimpse, LogPolar, RandomFoveation
 from semfov.zoom import GlimpseEvidence
@@ -144,6 +145,13 @@ class Given(nn.Module):
         return self.part(*inputs, *self.arguments)
 
 
+class Drawing(Given):
+    """Log probabilities of the next cell, from a cell."""
+
+    def forward(self, values: Tensor, cell: Tensor, age: Tensor) -> Tensor:
+        return self.part(values, cell.long(), age, GRID)
+
+
 class Valuing(nn.Module):
     """An acquisition function, given the parameters of a belief and how close the fovea was to each cell."""
 
@@ -243,6 +251,9 @@ SEARCHERS: dict[str, Callable[[], nn.Module]] = {
     "PlaceInformation": lambda: acquisition.PlaceInformation(2, model(), GRID),
     "SaliencyPrior": lambda: acquisition.SaliencyPrior(acquisition.TargetPosterior(2), rand(len(GRID)), weight=0.5),
     "LearnedGaze": lambda: policies.Learned(LearnedGaze())(2, GRID),
+    "EntropyLimit": lambda: acquisition.EntropyLimit(2, model(), GRID),
+    "TemplateAttention": lambda: acquisition.TemplateAttention(2, rand(len(GRID), 3, len(GRID)), GRID),
+    "ObjectEvidence": acquisition.ObjectEvidence,
     "CloserLook": lambda: acquisition.CloserLook(GRID),
     "Static": lambda: acquisition.Static(rand(len(GRID))),
     "Uniform": acquisition.Uniform,
@@ -282,6 +293,8 @@ OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]
     "Semantic, misses": (lambda: Watching(Semantic(4, misses=model().requires_grad_(False), memory="closest")), look),
     "Target": (lambda: Watching(Target(TargetEvidence(4, 4).eval())), look),
     "Context": (lambda: Watching(Context(observing(), context())), look),
+    "Landing": (lambda: Watching(Landing(3)), look),
+    "ClassTemplates": (lambda: ClassTemplates(rand(3, 5), rand(5), CLASSES), lambda: (rand(2, 5, 4, 6),)),
     "VOCUS2": (saliency.VOCUS2, lambda: (rand(1, 3, 40, 60),)),
     "IttiKoch": (saliency.IttiKoch, lambda: (rand(1, 3, 64, 96),)),
 }
@@ -291,6 +304,7 @@ DECIDERS: dict[str, Callable[[], nn.Module]] = {
     "NonPredictive": policies.NonPredictive,
     "Learned": lambda: policies.Learned(LearnedGaze()),
     "Closer": policies.Closer,
+    "Objects": policies.Objects,
 } | {
     kind.__name__: partial(lambda kind: kind(model()), kind) for kind in policies.POLICIES.values() if kind.needs_model
 }
@@ -302,6 +316,18 @@ BRANCHING = {
     "Glimpse": (
         lambda: Glimpse((32, 24)),
         lambda: (rand(1, 3, 48, 64), torch.tensor([[[20.0, 30.0], [50.0, 9.0]]]), torch.tensor([[0.5, 1.0]])),
+    ),
+    "CorrectLocalisation": (
+        lambda: Valuing(acquisition.CorrectLocalisation(2, model(), GRID, nodes=8)),
+        memory,
+    ),
+    "GazeHabits": (
+        lambda: Drawing(GazeHabits(0.5, rand(len(GRID)), rand(3), [0.2, 0.5], rand(2), [2.0], 4)),
+        lambda: (rand(2, len(GRID)), torch.tensor([1, 7]), torch.full((2, len(GRID)), torch.inf)),
+    ),
+    "IVSN": (
+        lambda: IVSN(nn.Conv2d(3, 4, 3, 2, 1), nn.AdaptiveMaxPool2d(1), picture=32, target=8),
+        lambda: (rand(1, 3, 48, 64), rand(1, 3, 12, 9)),
     ),
     "GlimpseEvidence": (lambda: Hinting(GlimpseEvidence(3, 8).eval()), lambda: (rand(5, 3), rand(5, 3))),
 }

@@ -106,7 +106,7 @@ class Landing(Observer):
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> LandingLook:
         """What looks from `fixation` `(B, 2)` say, whatever `target` is."""
         centres = grid.centres.to(detections.scores)
-        floor = self.reach * float(grid.extent.max())
+        floor = self.reach * grid.extent.max().to(centres)
 
         def evidence(boxes: Tensor, scores: Tensor, mask: Tensor) -> Tensor:
             scores = torch.where(mask[..., None], scores[..., 1:], 0.0)
