@@ -87,6 +87,9 @@ def run_command(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except KeyboardInterrupt:
+        # CPython remembers an interrupt in a string that `exec` runs, as some packages do when they are imported,
+        # and would end by the signal though it was caught here. The next string that ends well makes it forget.
+        exec("")
         print(f"interrupted; {_GOES_ON}", file=sys.stderr)
         return 128 + signal.SIGINT
     except _Terminated:
