@@ -37,7 +37,8 @@ def faults(source: str) -> list[str]:
             continue
         name = ast.unparse(node.func)
         given = {word.arg: ast.unparse(word.value) for word in node.keywords}
-        bad = name in FORBIDDEN or name.split(".")[-1] in EXTRACTING
+        written_here = name in ("eval", "exec") and all(isinstance(each, ast.Constant) for each in node.args)
+        bad = (name in FORBIDDEN and not written_here) or name.split(".")[-1] in EXTRACTING
         bad |= name == "torch.load" and given.get("weights_only") != "True"
         bad |= name in ("np.load", "numpy.load") and given.get("allow_pickle", "False") != "False"
         bad |= name.startswith("subprocess.") and given.get("shell", "False") != "False"
@@ -56,6 +57,11 @@ def faults(source: str) -> list[str]:
 )  # fmt: skip
 def test_the_scan_finds(line):
     assert faults(line)
+
+
+def test_the_scan_lets_pass_what_is_written_in_the_source():
+    assert not faults("exec('')")
+    assert faults("exec('' + text)")
 
 
 def test_sources_run_nothing_that_they_read():
