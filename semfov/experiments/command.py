@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any, TypeVar
 
 from jsonargparse import ArgumentParser, set_parsing_settings
@@ -19,6 +20,7 @@ from semfov.io.files import discard_unfinished
 Config = TypeVar("Config")
 
 _GOES_ON = "the same command goes on where this one stopped"
+_SAID: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
 
 def make_parser(
@@ -90,10 +92,10 @@ def run_command(
         # CPython remembers an interrupt in a string that `exec` runs, as some packages do when they are imported,
         # and would end by the signal though it was caught here. The next string that ends well makes it forget.
         exec("")
-        print(f"interrupted; {_GOES_ON}", file=sys.stderr)
+        print(f"{_SAID[signal.SIGINT]}; {_GOES_ON}", file=sys.stderr)
         return 128 + signal.SIGINT
     except _Terminated:
-        print(f"terminated; {_GOES_ON}", file=sys.stderr)
+        print(f"{_SAID[signal.SIGTERM]}; {_GOES_ON}", file=sys.stderr)
         return 128 + signal.SIGTERM
     return 0
 
@@ -109,9 +111,13 @@ def _signals() -> Iterator[None]:
         yield
         return
 
-    def end(number: int, _: object) -> None:
+    def end(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGINT, _leave)
         signal.signal(signal.SIGTERM, _leave)
+        if _importing(frame):
+            # An exception from here would pass through the start of a native module, and some abort the process.
+            os.write(sys.stderr.fileno(), f"{_SAID[number]}; {_GOES_ON}\n".encode())
+            _leave(number, frame)
         raise KeyboardInterrupt if number == signal.SIGINT else _Terminated
 
     wanted = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) != signal.SIG_IGN]
@@ -121,6 +127,15 @@ def _signals() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _importing(frame: FrameType | None) -> bool:
+    """Whether the command, down from `run_command`, is loading a module."""
+    while frame is not None and frame.f_code is not run_command.__code__:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _leave(number: int, _: object) -> None:

@@ -114,11 +114,15 @@ class DecisionRun(Run):
                 "tiled": max(float(highest_score(seen, target)) for seen in (sharp, *tiles)),
             }
             looks = StoredLooks(detections, grid, torch.tensor([target]))
-            for name, (strategy, rule) in self.compared.items():
+            for name, (strategy, judge) in self.compared.items():
+
+                def rule(step: Step, judge: Rule = judge, target: int = target) -> Tensor:
+                    return judge(step, target)
+
                 with torch.inference_mode():
-                    steps = self._search(strategy, rule, looks, cell, noise, target)
+                    steps = search_steps(looks, strategy, target, cell, noise, rule)
                 last, seen = steps[-1], torch.cat([step.cell for step in steps])
-                ended = int(rule(last, target))
+                ended = int(rule(last))
                 decision = conclude(ended, last.belief, [detections[cell] for cell in seen.split(1)], grid, target)
                 records.append(
                     {
@@ -135,20 +139,23 @@ class DecisionRun(Run):
         watch.lap("search")
         return records, watch.seconds
 
-    def _search(
-        self, strategy: Strategy, rule: Rule, looks: StoredLooks, start: Tensor, noise: Tensor, target: int
-    ) -> list[Step]:
-        return list(
-            rollout(
-                looks,
-                strategy.observer,
-                strategy.policy(target, looks.grid),
-                start,
-                Greedy(drawn_from(noise)),
-                most=self.config.protocol.shifts + 1,
-                ends=lambda step: rule(step, target) > 0,
-            )
-        )
+
+def search_steps(
+    looks: StoredLooks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
+) -> list[Step]:
+    """Steps of one search, to its decision or through all looks.
+
+    Args:
+        looks: at the scene.
+        strategy: how it is gone about.
+        target: class that is searched for.
+        start: `(1,)`, first cell.
+        noise: `(1, N, X·Y)`, for ties, of N looks at most.
+        rule: says by a number above 0 that a step decides, `(1,)`.
+    """
+    policy, choice = strategy.policy(target, looks.grid), Greedy(drawn_from(noise))
+    ends: Callable[[Step], Tensor] = lambda step: rule(step) > 0  # noqa: E731
+    return list(rollout(looks, strategy.observer, policy, start, choice, most=noise.shape[1], ends=ends))
 
 
 def quarters(image: Tensor) -> list[Tensor]:

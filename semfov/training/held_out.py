@@ -17,14 +17,14 @@ from semfov.agent import Strategy
 from semfov.belief.grid import Grid
 from semfov.data.scene import legal_targets
 from semfov.decision import OUTCOMES, confirms
-from semfov.episode import Step, StoredLooks, rollout
+from semfov.episode import Step, StoredLooks
 from semfov.experiments.candidates import Candidate
 from semfov.experiments.config import ProtocolConfig
+from semfov.experiments.decisions import search_steps
 from semfov.experiments.exploration_protocol import explorations_of, explore_noise, run_explorations
 from semfov.experiments.progress import track
 from semfov.experiments.search_protocol import choose_classes, episodes_of, run_episodes, tie_noise
 from semfov.experiments.seeds import generator_for, noise_for
-from semfov.gaze.choice import Greedy, drawn_from
 from semfov.metrics.averages import standard_error
 from semfov.metrics.exploration import answers_of, success_rate
 from semfov.metrics.search import cumulative_performance
@@ -198,17 +198,7 @@ def _search(
     looks: StoredLooks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
 ) -> tuple[str, int]:
     """What one search decides, and after how many looks."""
-    steps = list(
-        rollout(
-            looks,
-            strategy.observer,
-            strategy.policy(target, looks.grid),
-            start,
-            Greedy(drawn_from(noise)),
-            most=noise.shape[1],
-            ends=lambda step: rule(step) > 0,
-        )
-    )
+    steps = search_steps(looks, strategy, target, start, noise, rule)
     return OUTCOMES[int(rule(steps[-1]))], len(steps)
 
 
