@@ -1,6 +1,9 @@
 """Policies by name, and what to call one that has no name."""
 
+from collections.abc import Mapping
 from dataclasses import fields
+from functools import cache
+from types import MappingProxyType
 from typing import get_args
 
 from semfov.belief.grid import Footprint
@@ -36,17 +39,22 @@ def known_policies(task: Task) -> list[str]:
     return [*policy_names(task), *own]
 
 
-def presets(task: Task) -> dict[str, PolicyConfig]:
+def presets(task: Task) -> Mapping[str, PolicyConfig]:
     """The presets for a task."""
+    return _presets(task, tuple(policy_names(task)))
+
+
+@cache
+def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig]:
     if task == "search":
         alone = {name: PolicyConfig(name) for name in ("random", "learned", TARGET_EVIDENCE, IVSN)}
         alone |= {name: PolicyConfig(SALIENCY, saliency=name) for name in SALIENCY_MODELS}
         best, published = PolicyConfig(TARGET_EVIDENCE), PolicyConfig("predictive", "calibrated")
-        scored = {name: PolicyConfig(name) for name in policy_names("search") if name not in alone}
+        scored = {name: PolicyConfig(name) for name in policies if name not in alone}
         alone |= {f"{name}-learned": PolicyConfig(name, "learned") for name in scored if POLICIES[name].by_place}
     else:
         best, published = PolicyConfig("closer-look", "learned"), PolicyConfig("kl", "calibrated")
-        scored = {name: PolicyConfig(name) for name in policy_names("exploration") if not POLICIES[name].needs_map}
+        scored = {name: PolicyConfig(name) for name in policies if not POLICIES[name].needs_map}
         scored |= {name: PolicyConfig(SALIENCY, saliency=name) for name in SALIENCY_MODELS}
         alone = {
             f"{name}-learned": PolicyConfig(policy.policy, "learned", saliency=policy.saliency)
@@ -64,7 +72,7 @@ def presets(task: Task) -> dict[str, PolicyConfig]:
             f"{MAXIMUM_A_POSTERIORI}-{scores}": both[f"non-predictive-{scores}"] for scores in ("raw", "calibrated")
         }
         same[f"{MAXIMUM_A_POSTERIORI}-learned"] = alone[TARGET_EVIDENCE]
-    return {**alone, **both, **same}
+    return MappingProxyType({**alone, **both, **same})
 
 
 def resolve(choice: Choice, task: Task) -> PolicyConfig:

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
@@ -90,7 +91,7 @@ def check_settings(config: type[Any], values: Any, prefix: str = "", *, nested: 
         prefix: before the names.
         nested: also check settings that are dataclasses themselves.
     """
-    hints = get_type_hints(config, include_extras=True)
+    hints = _hints(config)
     for field in fields(config):
         if field.name not in values:
             continue
@@ -100,6 +101,11 @@ def check_settings(config: type[Any], values: Any, prefix: str = "", *, nested: 
                 check_settings(hint, value, f"{prefix}{field.name}.")  # type: ignore[arg-type]
         else:
             _check(hint, value, prefix + field.name)
+
+
+@cache
+def _hints(config: type[Any]) -> dict[str, Any]:
+    return get_type_hints(config, include_extras=True)
 
 
 def _check(hint: Any, value: Any, name: str) -> None:
