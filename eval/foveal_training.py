@@ -104,11 +104,26 @@ def compare(config: FovealTrainingConfig) -> None:
 
 def arms(config: FovealTrainingConfig, name: str, detector: DetectorConfig) -> dict[str, Arm]:
     """The arms of a detector."""
-    common = {"detector": detector, "sensor": config.sensor, "cache": config.cache, "workers": config.workers}
     out = config.out / name
-    fit = FitConfig(data=config.fit, fixations=config.fit_fixations, seed=config.seed, out=out, **common)
-    belief = BeliefConfig(*config.grid)
-    search = SearchConfig(data=config.data, belief=belief, protocol=config.protocol, out=out, **common)
+    fit = FitConfig(
+        data=config.fit,
+        detector=detector,
+        sensor=config.sensor,
+        fixations=config.fit_fixations,
+        seed=config.seed,
+        out=out,
+        workers=config.workers,
+    )
+    search = SearchConfig(
+        data=config.data,
+        detector=detector,
+        sensor=config.sensor,
+        belief=BeliefConfig(*config.grid),
+        protocol=config.protocol,
+        out=out,
+        cache=config.cache,
+        workers=config.workers,
+    )
     return arms_of(fit, search, config.policy, config.fixations, config.rate)
 
 

@@ -19,7 +19,6 @@ from semfov.experiments.setup import check_sources, detector_options, make_scene
 from semfov.experiments.store import SceneStore, looks_digest
 from semfov.eye import Eye
 from semfov.io.schema import Field, Schema
-from semfov.sensor import RandomFoveation
 from semfov.sensor.foveation import Opened
 from semfov.training.foveal_settings import FinetuneConfig
 from semfov.training.tail import Tail
@@ -123,6 +122,8 @@ class Viewer:
 
     def foveated(self, canvas: Tensor, opened: Opened, scene: int | str) -> Tensor:
         """Random views of a canvas `(1, 3, h, w)`, `(F, 3, h, w)`: the same for the same scene, whatever was before."""
+        from semfov.sensor import RandomFoveation
+
         sensor, config = self.config.sensor.make(), self.config
         augment = RandomFoveation(
             float(opened.sigma.mean()), sensor.levels, sensor.growth, sensor.convention, p=config.foveated
