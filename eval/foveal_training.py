@@ -128,7 +128,7 @@ def arms(config: FovealTrainingConfig, name: str, detector: DetectorConfig) -> d
 
 
 def training_minutes(tuned: Path) -> float:
-    """Minutes that looking and training took, as the training told; NaN where it did not."""
+    """Minutes of processors that looking and training took, as the training told; NaN where it did not."""
     try:
         told = json.loads((tuned.parent / "training.json").read_text(encoding="utf-8"))
         return float(told["looking_seconds"] + sum(epoch["seconds"] for epoch in told["epochs"])) / 60
@@ -177,8 +177,8 @@ def report(config: FovealTrainingConfig, found: Mapping[str, Arm], random: Arm, 
 
 
 def effort(found: Mapping[str, Arm], minutes: float) -> list[list[str]]:
-    """Minutes that each arm took."""
-    rows = [["arm", "minutes of training", "minutes of fitting"]]
+    """Minutes of processors that each arm took."""
+    rows = [["arm", "training, minutes of a core", "fitting, minutes of a core"]]
     for name, arm in found.items():
         trained = f"{minutes:.1f}" if name.startswith("fine-tuned") else "0"
         rows.append([name, trained, f"{arm.minutes:.1f}" if arm.minutes else "0"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from semfov.errors import DataError
 from semfov.experiments.looks import one_thread
+from semfov.experiments.parallel import processor_seconds
 from semfov.experiments.progress import task_bar
 from semfov.experiments.run import digest_of
 from semfov.experiments.seeds import generator_for
@@ -86,7 +86,7 @@ class Trainer:
 
     def train(self, rate: float, trial: bool) -> None:
         """One epoch; its weights are kept if no epoch before it was as good."""
-        started = time.monotonic()
+        started = processor_seconds()
         self._set(self.base if trial else self.kept)
         optimiser = torch.optim.Adam(self.parameters.values(), lr=rate)
         if not trial:
@@ -107,7 +107,7 @@ class Trainer:
         for parameter in self.parameters.values():
             parameter.requires_grad_(False)
         parts = self.judge()
-        self.history.append(Epoch(rate, trial, total / len(self.trained), *parts, time.monotonic() - started))
+        self.history.append(Epoch(rate, trial, total / len(self.trained), *parts, processor_seconds() - started))
         if best_of(self.history) == len(self.history) - 1:
             self.kept = {name: parameter.detach().clone() for name, parameter in self.parameters.items()}
             self.moments = _moments(optimiser, list(self.parameters))
@@ -116,9 +116,9 @@ class Trainer:
         """Train to the end, from wherever `path` says that it was; the detector then has the weights that were kept."""
         self.load(path, key)
         if not self.history:
-            started = time.monotonic()
+            started = processor_seconds()
             parts = self.judge()
-            self.history.append(Epoch(0.0, False, sum(parts), *parts, time.monotonic() - started))
+            self.history.append(Epoch(0.0, False, sum(parts), *parts, processor_seconds() - started))
             self.save(path, key)
         while (following := next_epoch(self.history, self.config)) is not None:
             self.train(*following)

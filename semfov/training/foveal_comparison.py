@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -16,6 +15,7 @@ from torch import Tensor
 from semfov.belief.grid import Grid
 from semfov.data.scene import Scenes
 from semfov.experiments.config import BeliefConfig, SearchConfig
+from semfov.experiments.parallel import processor_seconds
 from semfov.experiments.run import finish
 from semfov.experiments.runs import SearchRun
 from semfov.experiments.samples import Samples, SampleSettings, collect
@@ -46,7 +46,7 @@ class Arm:
             all levels, `(P,)`, NaN where there is no object.
         objects: `(N,)`, objects of all looks by level.
         curves: cumulative performance of its searches by photograph, `(S, shifts+1)`.
-        minutes: that the fit of its observation model took; 0 for raw scores.
+        minutes: of processors that the fit of its observation model took; 0 for raw scores.
     """
 
     probabilities: Tensor
@@ -59,7 +59,7 @@ class Arm:
 
 
 def fitted(config: FitConfig) -> tuple[FovealObservationModel, Path, float]:
-    """An observation model of all photographs of the settings, its file, and the minutes that it took.
+    """An observation model of all photographs of the settings, its file, and the minutes of processors that it took.
 
     It is fitted once, and read back by later calls with the same settings. (The minutes are those of the call that
     fitted it: of a run that was stopped while it looked, the last part.)
@@ -76,10 +76,10 @@ def fitted(config: FitConfig) -> tuple[FovealObservationModel, Path, float]:
             return FovealObservationModel.from_pretrained(path), path, float(told["minutes"])
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    started = time.monotonic()
+    started = processor_seconds()
     sampler, samples = collect(SampleSettings.of(config), config.out / "samples", config.workers, "looking")
     model = fit_model(config, sampler, samples)
-    minutes = (time.monotonic() - started) / 60
+    minutes = (processor_seconds() - started) / 60
     model.save(path)
     write_text(record, json.dumps({"settings": settings, "minutes": minutes}, indent=2) + "\n")
     return model, path, minutes

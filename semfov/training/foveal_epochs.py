@@ -22,7 +22,7 @@ class Epoch:
         objectness: mean of this part of the loss over held-out views, after the epoch.
         classes: the same of this part.
         boxes: and of this one.
-        seconds: that it took.
+        seconds: of a processor that it took.
     """
 
     rate: float

@@ -23,7 +23,7 @@ def write_detector(config: FinetuneConfig, viewer: Viewer, history: Sequence[Epo
         config: settings.
         viewer: whose detector it is.
         history: what came of the epochs.
-        seconds: that looking took.
+        seconds: of processors that looking took.
     """
     detector = viewer.detector
     base, detector.name = detector.name, config.name or f"{detector.name}-foveal"
@@ -66,7 +66,7 @@ def report(config: FinetuneConfig, viewer: Viewer, base: str, history: Sequence[
             f"{config.fixations} random fixations each, by the loss of YOLOv3 (Redmon and Farhadi 2018).",
             f"{held_out} photographs were held out to choose learning rate and epoch.",
             said,
-            f"Looking took {seconds / 60:.1f} minutes of one core's time, training {training / 60:.1f}.",
+            f"Looking took {seconds / 60:.1f} minutes of processors, training {training / 60:.1f}.",
             "",
             *table(rows),
             "",

@@ -17,7 +17,7 @@ class FinetuneConfig(Settings):
         detector: which detector, one of Darknet's; what it keeps of its boxes plays no part.
         sensor: the foveal sensor.
         name: name of the new detector (None: the detector's, and `-foveal`).
-        depth: convolutions before each head that are trained: 1 is the head alone.
+        depth: how many convolutions before each head are trained, the last ones; 1 is the map alone.
         fixations: views of each photograph, fixated at random.
         foveated: share of the views that are foveated; the others are sharp.
         rates: learning rates to try, an epoch each; the one with the least loss on held-out photographs goes on.
@@ -37,11 +37,11 @@ class FinetuneConfig(Settings):
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     name: Name | None = None
-    depth: Annotated[int, Range(1, 100)] = 1
+    depth: Annotated[int, Range(1, 100)] = 2
     fixations: Count = 2
     foveated: Share = 1.0
-    rates: tuple[Positive, ...] = (1e-4, 3e-4, 1e-3)
-    epochs: Count = 10
+    rates: tuple[Positive, ...] = (3e-5, 1e-4, 3e-4)
+    epochs: Count = 8
     patience: Count = 2
     batch: Count = 16
     ignore: Share = 0.5

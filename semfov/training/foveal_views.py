@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,7 +12,7 @@ from semfov.data.scene import Scenes
 from semfov.detection.load import load_yolo
 from semfov.errors import DataError, check_finite
 from semfov.experiments.looks import one_thread
-from semfov.experiments.parallel import available_cores, run_tasks
+from semfov.experiments.parallel import available_cores, processor_seconds, run_tasks
 from semfov.experiments.seeds import generator_for
 from semfov.experiments.setup import check_sources, detector_options, make_scenes, prepare_worker
 from semfov.experiments.store import SceneStore, looks_digest
@@ -96,10 +95,10 @@ class Viewer:
 
     def see(self, index: int) -> None:
         """Look at a photograph and keep the views."""
-        started = time.monotonic()
+        started = processor_seconds()
         with one_thread(), torch.inference_mode():
             tensors = self._see(index)
-        seconds = torch.tensor(time.monotonic() - started, dtype=torch.float64)
+        seconds = torch.tensor(processor_seconds() - started, dtype=torch.float64)
         self.store.write(self.scenes.digest(index), {**tensors, "seconds": seconds})
 
     def _see(self, index: int) -> dict[str, Tensor]:
@@ -135,7 +134,7 @@ class Viewer:
         return views
 
     def load(self, index: int) -> tuple[Views, float] | None:
-        """Views of a photograph, in half precision, and the seconds that they took; None if they are not there."""
+        """Views of a photograph, in half precision, and a processor's seconds for them; None where they are missing."""
         tensors = self.store.read(self.scenes.digest(index))
         if tensors is None:
             return None
@@ -160,7 +159,7 @@ def _see(index: int) -> int:
 
 
 def look(viewer: Viewer) -> tuple[list[Views], float]:
-    """Views of all photographs in order, looked at where they are not there yet, and the seconds that they took."""
+    """Views of all photographs in order, looked at where they are missing, and the processors' seconds for all."""
     found = [viewer.load(index) for index in range(len(viewer.scenes))]
     todo = [index for index, views in enumerate(found) if views is None]
     done = run_tasks(

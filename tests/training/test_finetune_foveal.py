@@ -22,7 +22,21 @@ from train.finetune_foveal import main
 pytestmark = [pytest.mark.weights, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
-SMALL = ["--data.limit", "6", "--holdout", "3", "--batch", "4", "--epochs", "3", "--rates", "[1e-4,1e-3]", "--workers"]
+SMALL = [
+    "--data.limit",
+    "6",
+    "--depth",
+    "1",
+    "--holdout",
+    "3",
+    "--batch",
+    "4",
+    "--epochs",
+    "3",
+    "--rates",
+    "[1e-4,1e-3]",
+    "--workers",
+]
 NAME = "yolov3-tiny-foveal"
 
 
