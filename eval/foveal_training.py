@@ -96,7 +96,7 @@ def compare(config: FovealTrainingConfig) -> None:
     names = {"shipped": config.detector, "tuned": replace(config.detector, name=str(config.tuned), weights=None)}
     found = {name: arms(config, name, detector) for name, detector in names.items()}
     chosen = {title: found[detector][scores] for (detector, scores), title in ARMS.items()}
-    text = report(config, chosen, found["shipped"]["random"], training_minutes(config.tuned))
+    text = report(config, chosen, training_minutes(config.tuned))
     write_text(config.out / "foveal_training.md", text)
     write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
     announce(text, [config.out / "foveal_training.md", config.out / "config.yaml"])
@@ -136,7 +136,7 @@ def training_minutes(tuned: Path) -> float:
         return float("nan")
 
 
-def report(config: FovealTrainingConfig, found: Mapping[str, Arm], random: Arm, minutes: float) -> str:
+def report(config: FovealTrainingConfig, found: Mapping[str, Arm], minutes: float) -> str:
     """All tables, as Markdown."""
     sensor = config.sensor.make()
     first = next(iter(found.values()))
@@ -166,7 +166,7 @@ def report(config: FovealTrainingConfig, found: Mapping[str, Arm], random: Arm, 
             f"Targets found (%) after n gaze shifts of {config.policy} search ({len(first.curves)} photographs, all "
             "legal targets, the same starts for all):",
             "",
-            *table(performance({**found, "random gaze": random}, config.protocol.shifts)),
+            *table(performance(found, config.protocol.shifts)),
             "",
             "Differences in points, paired over photographs:",
             "",
@@ -237,7 +237,8 @@ def performance(found: Mapping[str, Arm], last: int) -> list[list[str]]:
     for name, arm in found.items():
         mean, error = arm.curves.mean(0), standard_error(arm.curves)
         rows.append([name, *(percent(mean[n], error[n]) for n in shifts)])
-    return rows
+    chance = next(iter(found.values())).chance
+    return [*rows, ["random gaze, by formula", *(f"{100 * chance[n]:.1f}" for n in shifts)]]
 
 
 def differences(found: Mapping[str, Arm], last: int) -> list[list[str]]:

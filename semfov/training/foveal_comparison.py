@@ -19,6 +19,7 @@ from semfov.experiments.parallel import processor_seconds
 from semfov.experiments.run import finish
 from semfov.experiments.runs import SearchRun
 from semfov.experiments.samples import Samples, SampleSettings, collect
+from semfov.experiments.search_report import expected_random
 from semfov.experiments.setup import plain
 from semfov.experiments.store import versions
 from semfov.experiments.summary import gather
@@ -46,6 +47,7 @@ class Arm:
             all levels, `(P,)`, NaN where there is no object.
         objects: `(N,)`, objects of all looks by level.
         curves: cumulative performance of its searches by photograph, `(S, shifts+1)`.
+        chance: what random gaze finds by the formula, `(shifts+1,)`.
         minutes: of processors that the fit of its observation model took; 0 for raw scores.
     """
 
@@ -55,6 +57,7 @@ class Arm:
     recall: tuple[Array, Array]
     objects: Tensor
     curves: Array
+    chance: Array
     minutes: float
 
 
@@ -86,7 +89,7 @@ def fitted(config: FitConfig) -> tuple[FovealObservationModel, Path, float]:
 
 
 def arms_of(fit: FitConfig, search: SearchConfig, policy: str, fixations: int, rate: float) -> dict[str, Arm]:
-    """The arms of a detector, `raw` and `calibrated`; of `random` gaze there are the searches alone.
+    """The arms of a detector, `raw` and `calibrated`.
 
     Args:
         fit: settings of the fit of its observation model.
@@ -100,20 +103,21 @@ def arms_of(fit: FitConfig, search: SearchConfig, policy: str, fixations: int, r
     sampler, samples = collect(settings, search.out / "samples", search.workers, "looking")
     with torch.inference_mode():
         calibrated = model.calibrate(samples.scores, samples.distance)
-    curves = searched(search, path, policy)
+    curves, by_chance = searched(search, path, policy)
     arms = {}
     for name, probabilities in zip(SCORES, (samples.scores, calibrated), strict=True):
         recall, objects = recall_of(sampler.scenes, samples, probabilities, model.edges, fit.iou, rate)
         spent = minutes if name == "calibrated" else 0.0
         level = model.level(samples.distance)
-        arms[name] = Arm(probabilities, samples.labels, level, recall, objects, curves[f"{policy}-{name}"], spent)
-    arms["random"] = Arm(**{**vars(arms["raw"]), "curves": curves["random"]})
+        arms[name] = Arm(
+            probabilities, samples.labels, level, recall, objects, curves[f"{policy}-{name}"], by_chance, spent
+        )
     return arms
 
 
-def searched(config: SearchConfig, model: Path, policy: str) -> dict[str, Array]:
-    """Cumulative performance of random gaze and of a policy with raw and calibrated scores, by photograph."""
-    policies = ("random", *(f"{policy}-{scores}" for scores in SCORES))
+def searched(config: SearchConfig, model: Path, policy: str) -> tuple[dict[str, Array], Array]:
+    """Cumulative performance of a policy with raw and calibrated scores, by photograph, and that of random gaze."""
+    policies = tuple(f"{policy}-{scores}" for scores in SCORES)
     belief = BeliefConfig(config.belief.columns, config.belief.rows, model=str(model))
     run = SearchRun(SearchConfig(**{**vars(config), "policies": policies, "belief": belief}))
     finish(run, "searching")
@@ -122,7 +126,8 @@ def searched(config: SearchConfig, model: Path, policy: str) -> dict[str, Array]
     for record in records:
         found[record["policy"]][str(record["scene"])].append(record["found_at"])
     shifts = config.protocol.shifts
-    return {name: curves_of(scenes, shifts) for name, scenes in found.items()}
+    chance = expected_random(records, shifts, config.belief.columns * config.belief.rows)
+    return {name: curves_of(scenes, shifts) for name, scenes in found.items()}, chance
 
 
 def curves_of(scenes: Mapping[str, list[int]], shifts: int) -> Array:

@@ -58,7 +58,7 @@ def test_six_tables_of_four_arms(finished):
     effort, recall, calibration, surprise, performance, differences = tables(finished[0])
     for found in (effort, recall, calibration, surprise):
         assert [name for name in found if name in ARMS] == ARMS
-    assert list(performance)[-1] == "random gaze"
+    assert list(performance)[-1] == "random gaze, by formula"
     assert "calibrated" not in differences
     assert [effort[name][0] for name in ARMS] == ["0", "0", "3.0", "3.0"]
     counts = [int(cell) for cell in recall["objects"]]
