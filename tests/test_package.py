@@ -108,6 +108,8 @@ def test_import_is_light():
         ("eval.explore", ["--detector.name", "yolo"]),
         ("train.fit_fom", ["--help"]),
         ("train.fit_map", ["--steps", "-1"]),
+        ("train.finetune_foveal", ["--help"]),
+        ("eval.foveal_training", ["--help"]),
     ],
 )
 def test_help_and_mistakes_wait_for_nothing_heavy(command, arguments):

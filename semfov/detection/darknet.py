@@ -65,9 +65,9 @@ class Darknet(nn.Module):
         stem = self._stem if image.device.type == "cpu" and image.shape[0] > 1 else 0
         outputs = {-1: image}
         if stem:
-            parts = [self._run({-1: part}, 0, stem) for part in image.split(1)]
+            parts = [self.run({-1: part}, 0, stem) for part in image.split(1)]
             outputs = {index: torch.cat([part[index] for part in parts]) for index in parts[0]}
-        outputs = self._run(outputs, stem, len(self.layers))
+        outputs = self.run(outputs, stem, len(self.layers))
         return [outputs[index] for index, layer in enumerate(self.layers) if isinstance(layer, Head)]
 
     def features(self, image: Tensor) -> Tensor:
@@ -75,7 +75,7 @@ class Darknet(nn.Module):
         self.check_image(image)
         head = next(index for index, layer in enumerate(self.layers) if layer is self.heads[0])
         wanted = self.sources[self.sources[head][0]][0]
-        return self._run({-1: image.contiguous(memory_format=torch.channels_last)}, 0, wanted + 1)[wanted]
+        return self.run({-1: image.contiguous(memory_format=torch.channels_last)}, 0, wanted + 1)[wanted]
 
     def cfg_digest(self) -> str:
         """sha256 of the sections."""
@@ -89,8 +89,17 @@ class Darknet(nn.Module):
         fits = height % self.stride == 0 and width % self.stride == 0 and height * width > 0
         check(fits, "image", f"sides that are multiples of {self.stride}", f"{width} x {height}")
 
-    def _run(self, outputs: dict[int, Tensor], start: int, stop: int) -> dict[int, Tensor]:
-        """Outputs of layers `start` to `stop` that are read later, from the outputs that these layers read."""
+    def run(self, outputs: dict[int, Tensor], start: int, stop: int) -> dict[int, Tensor]:
+        """Outputs that are read after layer `stop - 1`, from those that are read after layer `start - 1`.
+
+        Args:
+            outputs: by the number of their layer; -1 is the image. They may be overwritten.
+            start: first layer to run.
+            stop: the layer after the last one to run.
+
+        Returns:
+            Outputs by the number of their layer, the maps of the heads among them.
+        """
         outputs = dict(outputs)
         for index in range(start, stop):
             outputs[index] = self.layers[index](*(outputs[source] for source in self.sources[index]))

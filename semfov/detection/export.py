@@ -17,8 +17,13 @@ from semfov.detection.yolo import YoloV3
 from semfov.errors import InputError
 from semfov.io.files import replacing
 
+CARD_KEY = "model_card"
+"""Key of the model's metadata under which an export keeps what people should know of it."""
 
-def export_onnx(detector: Detector, path: str | PathLike[str], *, static: bool = False) -> None:
+
+def export_onnx(
+    detector: Detector, path: str | PathLike[str], *, static: bool = False, card: str | None = None
+) -> None:
     """Write a Darknet detector as an ONNX model.
 
     The model takes `images` `(B, 3, H, W)`, RGB in [0, 1], and gives `boxes` `(B, N, 4)`, `(x1, y1, x2, y2)` in
@@ -30,6 +35,7 @@ def export_onnx(detector: Detector, path: str | PathLike[str], *, static: bool =
         path: where the model goes.
         static: one image of the detector's `input_size`, for runtimes that need to know; else any batch and any size
             that is a multiple of the network's stride.
+        card: text for people that travels in the metadata, under the key `model_card`.
 
     Raises:
         InputError: the detector is none of Darknet's.
@@ -39,6 +45,8 @@ def export_onnx(detector: Detector, path: str | PathLike[str], *, static: bool =
         raise InputError(f"detector: expected a Darknet network, got {type(detector).__name__}")
     model = network_model(detector.network, detector.name, detector.input_size if static else None)
     model.metadata_props.add(key=METADATA_KEY, value=json.dumps(_settings(detector, static)))
+    if card is not None:
+        model.metadata_props.add(key=CARD_KEY, value=card)
     with replacing(Path(path)) as temporary:
         temporary.write_bytes(model.SerializeToString())
 

@@ -64,6 +64,14 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def processor_seconds() -> float:
+    """Seconds that processors have spent on this process and on those that it started and that have ended.
+
+    On a busy machine a clock on the wall tells how busy it is, and this how much there was to do.
+    """
+    return sum(os.times()[:4])
+
+
 def run_tasks(
     function: Callable[[Task], Result],
     tasks: Sequence[Task],

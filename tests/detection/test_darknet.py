@@ -142,7 +142,7 @@ def test_reads_only_what_is_needed_later():
     # Without dropping outputs, the 107 layers of YOLOv3 hold many times the largest one.
     network = Darknet(yolov3(classes=1)).requires_grad_(False)
     alive = []
-    original = network._run
+    original = network.run
 
     def run(outputs, start, stop):
         for index in range(start, stop):
@@ -150,7 +150,7 @@ def test_reads_only_what_is_needed_later():
             alive.append(len(outputs))
         return outputs
 
-    network._run = run
+    network.run = run
     network(torch.zeros(1, 3, 32, 32))
     assert max(alive) <= 6
 

@@ -1,6 +1,7 @@
 """Processes: none is left when the one that started them ends, and ranks wait for each other as long as it takes."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from semfov.experiments.parallel import mine, wait_for_others
+from semfov.experiments.parallel import mine, processor_seconds, wait_for_others
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
@@ -172,3 +173,17 @@ def test_a_reader_that_leaves_is_no_traceback():
         error = process.communicate(timeout=120)[1]
         assert process.returncode == 141, error
         assert error == ""
+
+
+def test_processor_seconds_are_what_the_system_counts():
+    """Of this process and of one that it started, which works for a while."""
+
+    def counted():
+        parts = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return sum(part.ru_utime + part.ru_stime for part in parts)
+
+    before, expected = processor_seconds(), counted()
+    subprocess.run([sys.executable, "-c", "sum(range(10**7))"], check=True)
+    spent = processor_seconds() - before
+    assert spent == pytest.approx(counted() - expected, abs=0.05)
+    assert spent > 0.05
