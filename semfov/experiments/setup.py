@@ -14,7 +14,7 @@ from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
 from semfov.data.scene import Scenes
 from semfov.detection.detector import Detector
 from semfov.detection.load import check_detector, load_detector
-from semfov.errors import DataError, InputError
+from semfov.errors import DataError, InputError, check
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.looks import one_thread
 from semfov.eye import Eye
@@ -60,6 +60,33 @@ def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
         ids=None if data.ids is None else read_ids(data.ids),
         max_target_area=data.max_target_area,
         limit=data.limit,
+    )
+
+
+def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) -> tuple[Scenes, Scenes]:
+    """All photographs but every n-th, and these; of embedded scenes two sets.
+
+    Raises:
+        InputError: there are too few to split.
+    """
+    check_data(data)
+    if data.root is None or data.annotations is None:
+        from semfov.data.scenes import EmbeddedScenes
+
+        count = data.limit or 16
+        return (
+            EmbeddedScenes(classes, count=count, seed=data.scene_seed),
+            EmbeddedScenes(classes, count=count, seed=data.scene_seed + 1),
+        )
+    from semfov.data.coco import CocoScenes
+
+    selection: dict[str, Any] = {"min_instances": data.min_instances, "max_target_area": data.max_target_area}
+    ids = CocoScenes(data.root, data.annotations, classes, limit=data.limit, **selection).ids
+    check(len(ids) >= 2 * every, "data", f"at least {2 * every} photographs", len(ids))
+    kept = [name for number, name in enumerate(ids) if number % every]
+    return (
+        CocoScenes(data.root, data.annotations, classes, ids=kept, **selection),
+        CocoScenes(data.root, data.annotations, classes, ids=ids[::every], **selection),
     )
 
 

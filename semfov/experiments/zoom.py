@@ -19,9 +19,11 @@ from semfov.errors import DataError
 from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.parts import Parts, Record
 from semfov.experiments.run import cache_folder, digest_of
+from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.settings import Range, Seed, Settings, Side, Whole, Workers
 from semfov.experiments.setup import make_detector, make_scenes
 from semfov.experiments.store import versions
+from semfov.experiments.zoom_decisions import decide_all
 from semfov.experiments.zoom_orders import oracle, quad_tree, ranked, raster, shuffled, slices
 from semfov.experiments.zoom_store import GlanceStore, StoredGlances
 from semfov.io.code import package_digest
@@ -58,6 +60,8 @@ class ZoomConfig(Settings):
         slice: side in pixels of the slices of photographs; those of mosaics are their photographs.
         overlap: of neighbouring slices.
         passes: of the detector, at most.
+        sought: classes that a picture holds, and as many that it does not, to search for until it is decided (with a
+            `target` that alone).
         cut: what becomes of boxes at a window's border.
         model: fitted evidence by magnification, by name or file (None: the one shipped for the detector).
         seed: of mosaics and random orders.
@@ -77,6 +81,7 @@ class ZoomConfig(Settings):
     slice: Tile = 640
     overlap: Annotated[float, Range(0, 0.9)] = 0.2
     passes: Annotated[int, Range(2, 100_000)] = 24
+    sought: Whole = 4
     cut: Cut = "keep"
     model: str | None = None
     seed: Seed = 0
@@ -121,7 +126,9 @@ class ZoomRun:
         settings = asdict(self.config)
         besides = ("out", "cache", "store", "workers", "data", "detector", "model")
         protocol = {name: value for name, value in settings.items() if name not in besides}
-        model = [checksum(self.evidence.state_dict()), self.evidence.patience, self.evidence.foresight]
+        evidence = self.evidence
+        thresholds = None if evidence.thresholds is None else asdict(evidence.thresholds)
+        model = [checksum(evidence.state_dict()), evidence.patience, evidence.foresight, thresholds]
         return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, model])
 
     @property
@@ -156,6 +163,9 @@ class ZoomRun:
         if self.config.mosaics:
             records += self._first_hits(index, glances)
         watch.lap("first hit")
+        if self.config.sought:
+            records += self._decisions(index, glances)
+        watch.lap("decision")
         glances.save()
         return records, watch.seconds
 
@@ -172,6 +182,19 @@ class ZoomRun:
         found: Callable[[Glance], Tensor] = lambda glance: found_in([glance], annotation, target)  # noqa: E731
         every = [*half_steps(glances.lattice)][1:]
         yield "oracle", oracle(glances, [*every, *cut], found, self.config.passes)
+
+    def _decisions(self, index: int, glances: Glances) -> list[Record]:
+        """Searches for what is there and for what is not."""
+        config, annotation = self.config, self.scenes.annotation(index)
+        targets = (
+            choose_classes(self.scenes, index, annotation, config.sought, 1.0, config.seed)
+            if self.target is None
+            else [self.target]
+        )
+        names = "background", *self.scenes.classes
+        cut = self.slices(index, glances.lattice)
+        records = decide_all(glances, self.evidence, names, targets, annotation, cut, passes=config.passes)
+        return [record | {"scene": self.scenes.ids[index]} for record in records]
 
     def annotation(self, index: int) -> Annotation:
         """Objects that count."""

@@ -4,13 +4,17 @@ import json
 from collections import defaultdict
 from statistics import mean, median
 
+import torch
+
 from semfov.errors import DataError
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.run import finish
 from semfov.experiments.summary import announce, table
 from semfov.experiments.zoom import ZoomConfig, ZoomRun
+from semfov.experiments.zoom_decisions import decision_tables, probabilities
 from semfov.io.files import write_text
+from semfov.viz.reliability import plot_reliability
 from semfov.viz.style import save_figure
 
 
@@ -30,6 +34,10 @@ def zoom(config: ZoomConfig) -> None:
     write_text(config.out / "zoom.md", text)
     write_text(config.out / "records.jsonl", "".join(json.dumps(record) + "\n" for record in records))
     written = [config.out / "zoom.md", config.out / "records.jsonl", _curves(records, run)]
+    if decided := [record for record in records if record["measure"] == "decision"]:
+        told, there = probabilities(decided)
+        sure = {name: (torch.stack([1 - score, score], -1), there.long()) for name, score in told.items()}
+        written.append(save_figure(plot_reliability(sure), config.out / "reliability.png"))
     announce(text, written)
 
 
@@ -78,6 +86,8 @@ def summary(records: list[Record], run: ZoomRun) -> str:
             *table(rows),
             "",
         ]
+    if decided := groups.get(("decision", "ours")):
+        lines += decision_tables(decided)
     return "\n".join(lines)
 
 

@@ -12,20 +12,18 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Scenes
-from semfov.data.scenes import EmbeddedScenes
-from semfov.errors import check
 from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.parallel import available_cores, run_tasks
 from semfov.experiments.run import cache_folder
-from semfov.experiments.settings import Count, Seed, Settings, Workers
-from semfov.experiments.setup import make_detector, prepare_worker
+from semfov.experiments.settings import Count, Seed, Settings, Share, Workers
+from semfov.experiments.setup import make_detector, prepare_worker, split_photographs
 from semfov.experiments.summary import table as table_of
 from semfov.experiments.zoom import SHOWN, Tile
 from semfov.experiments.zoom_store import GlanceStore
 from semfov.io.files import inside
 from semfov.training.outputs import training_of, write_outputs
-from semfov.training.zoom_choice import choose
+from semfov.training.zoom_choice import choose, open_all
+from semfov.training.zoom_decision import fit_judge, judge_searches, search_mosaics
 from semfov.training.zoom_examples import LookedAt, MosaicStore, ZoomExample, look_at_mosaic, pack, unpack
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
@@ -47,6 +45,13 @@ class FitZoomConfig(Settings):
         judged: mosaics of 4 × 4 photographs that were held out, to judge the fit and to choose by.
         judged_far: mosaics of 8 × 6 photographs that were held out, to choose by.
         tile: width of a photograph's slot in pixels; three quarters of it is the height.
+        searched: mosaics of 4 × 4 photographs to fit on when a search decides.
+        sought: classes that are there, and as many that are not, to search for in each of them.
+        passes: of such a search, at most.
+        false_alarms: share of absent targets that may be called found, by which the threshold is chosen.
+        surest: probability from which on a target counts as found at the latest, however many false alarms that makes.
+        lost: share of the targets that may be missed because no look is worth its price any more.
+        evidence: model that was fitted before, to fit anew only when a search decides (None: fit all).
         steps: of each fit.
         seed: of mosaics and fit.
         out: folder for the model and a report.
@@ -61,6 +66,13 @@ class FitZoomConfig(Settings):
     judged: Count = 80
     judged_far: Count = 4
     tile: Tile = 480
+    searched: Count = 100
+    sought: Count = 5
+    passes: Count = 24
+    false_alarms: Share = 0.015
+    surest: Share = 1.0
+    lost: Share = 0.02
+    evidence: Path | None = None
     steps: Count = 800
     seed: Seed = 0
     out: Path = Path("runs/fit_zoom")
@@ -98,33 +110,15 @@ def make_eye(config: FitZoomConfig) -> ZoomEye:
 
 def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Mosaics]:
     """Mosaics to fit on, near and far, and those of photographs that were held out."""
-    kept, held = split(config.data, classes)
+    kept, held = split_photographs(config.data, classes, 5)
     tile = config.tile, config.tile * 3 // 4
     return {
         "near": Mosaics(kept, 4, 4, tile=tile, count=config.mosaics, seed=config.seed),
         "far": Mosaics(kept, 8, 6, tile=tile, count=config.far, seed=config.seed + 1),
         "judged": Mosaics(held, 4, 4, tile=tile, count=config.judged, seed=config.seed + 2),
         "judged far": Mosaics(held, 8, 6, tile=tile, count=config.judged_far, seed=config.seed + 3),
+        "searched": Mosaics(kept, 4, 4, tile=tile, count=config.searched, seed=config.seed + 4),
     }
-
-
-def split(data: DataConfig, classes: tuple[str, ...]) -> tuple[Scenes, Scenes]:
-    """Four fifths of the photographs, and every fifth."""
-    if data.root is None or data.annotations is None:
-        return (
-            EmbeddedScenes(classes, count=data.limit or 16, seed=data.scene_seed),
-            EmbeddedScenes(classes, count=data.limit or 16, seed=data.scene_seed + 1),
-        )
-    from semfov.data.coco import CocoScenes
-
-    selection: dict[str, Any] = {"min_instances": data.min_instances, "max_target_area": data.max_target_area}
-    every = CocoScenes(data.root, data.annotations, classes, limit=data.limit, **selection).ids
-    check(len(every) >= 10, "data", "at least 10 photographs", len(every))
-    kept = [name for number, name in enumerate(every) if number % 5]
-    return (
-        CocoScenes(data.root, data.annotations, classes, ids=kept, **selection),
-        CocoScenes(data.root, data.annotations, classes, ids=every[::5], **selection),
-    )
 
 
 def make_store(config: FitZoomConfig, eye: ZoomEye) -> MosaicStore:
@@ -313,8 +307,30 @@ def fit_zoom(config: FitZoomConfig) -> None:
     """Look, fit, judge on what was held out, and write the model and a report."""
     eye = make_eye(config)
     mosaics = make_mosaics(config, eye.detector.classes)
+    glances = GlanceStore(cache_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
+    parts: list[str] = []
+    figures = "{}"
+    if config.evidence is None:
+        model, examples = fit_looks(config, eye, mosaics)
+        tried = choose(model, eye, mosaics["judged"], mosaics["judged far"], glances)
+        text, figures = judge(model, examples)
+        chosen = f"Chosen: foresight {model.foresight:g}, patience {model.patience:g}."
+        parts += [text, chosen, "", *table_of(tried), ""]
+    else:
+        model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
+        model.check_compatible(eye.settings())
+    parts += fit_decision(config, model, eye, mosaics, glances)
+    path = inside(config.out, f"{eye.detector.name}.safetensors")
+    model.save(path)
+    write_outputs(config, "\n".join(parts), ("figures.json", figures), path)
+
+
+def fit_looks(
+    config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics]
+) -> tuple[GlimpseEvidence, list[ZoomExample]]:
+    """The model of what looks say of closer ones, and examples that were held out."""
     store = make_store(config, eye)
-    looked = {kind: some for kind, some in mosaics.items() if kind != "judged far"}
+    looked = {kind: mosaics[kind] for kind in ("near", "far", "judged")}
     todo = [(kind, n) for kind, some in looked.items() for n in range(len(some)) if store.read(some.digest(n)) is None]
     workers = config.workers or available_cores()
     for _ in run_tasks(look, todo, workers=workers, setup=prepare_process, settings=(config,), title="looking",
@@ -329,15 +345,41 @@ def fit_zoom(config: FitZoomConfig) -> None:
     known = examples["near"] + examples["far"]
     fit_presence(model, table(known), config.steps)
     fit_rates(model, known, config.steps)
-    model.eval().requires_grad_(False)
-    glances = GlanceStore(cache_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
-    tried = choose(model, eye, mosaics["judged"], mosaics["judged far"], glances)
-    path = inside(config.out, f"{eye.detector.name}.safetensors")
-    model.save(path)
-    text, figures = judge(model, examples["judged"])
-    chosen = f"Chosen: foresight {model.foresight:g}, patience {model.patience:g}."
-    text = "\n".join([text, chosen, "", *table_of(tried), ""])
-    write_outputs(config, text, ("figures.json", figures), path)
+    return model.eval().requires_grad_(False), examples["judged"]
+
+
+def fit_decision(
+    config: FitZoomConfig, model: GlimpseEvidence, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
+) -> list[str]:
+    """Fit and choose when a search decides; returns what to report, lines of Markdown."""
+    prepare_worker()
+    torch.manual_seed(config.seed)
+    searches = {
+        kind: search_mosaics(
+            model,
+            mosaics[kind],
+            open_all(eye, mosaics[kind], store),
+            classes=config.sought,
+            passes=config.passes,
+            seed=config.seed,
+            title=title,
+        )
+        for kind, title in (("searched", "searching"), ("judged", "searching what was held out"))
+    }
+    fit_judge(model, searches["searched"], config.steps)
+    rows = judge_searches(model, searches["judged"], config)
+    assert model.thresholds is not None
+    count, told = (len(searches[kind].there) for kind in ("searched", "judged"))
+    return [
+        f"Whether a picture holds a class, fitted on {count} searches, half of them for what is not there; judged on "
+        f"{told} in mosaics of photographs that were held out.",
+        "",
+        *rows,
+        "",
+        f"Thresholds: found from {model.thresholds.confirm:.2f}, a look is worth its price from "
+        f"{model.thresholds.give_up:g}.",
+        "",
+    ]
 
 
 @torch.no_grad()

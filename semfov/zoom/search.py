@@ -2,16 +2,23 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 
-from semfov.decision import Decision
+from semfov.belief.target_evidence import Thresholds
+from semfov.decision import OUTCOMES, Decision, settle
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance, Glances, Window, on_lattice
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import Objects, merge
 from semfov.zoom.policy import Choice, best_find, best_hit, best_slice, jointly
+from semfov.zoom.tally import Tally
+
+
+DEFAULTS = Thresholds(0.9, 0.005)
+"""For evidence without any."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,22 @@ class ZoomPath:
         return len(self.glances)
 
 
+class Turn(NamedTuple):
+    """A look of a search.
+
+    Attributes:
+        glance: what it shows.
+        worth: what it was worth when it was chosen.
+        ahead: what the best look that is left is worth now.
+        belief: after it.
+    """
+
+    glance: Glance
+    worth: float
+    ahead: float
+    belief: ZoomBelief
+
+
 def look_for(
     glances: Glances,
     evidence: GlimpseEvidence,
@@ -50,7 +73,7 @@ def look_for(
     confirm: float = 0.3,
     slices: Sequence[Window] | None = None,
     closest: bool = False,
-) -> Iterator[tuple[Glance, float, float]]:
+) -> Iterator[Turn]:
     """Look for one object of a class, glance by glance; ends when a look confirms it, or nothing is left to look at.
 
     Args:
@@ -60,9 +83,6 @@ def look_for(
         confirm: score that confirms it.
         slices: if given, only looks at these confirm it; else looks at all magnifications do.
         closest: only looks at the largest magnification confirm it.
-
-    Yields:
-        The glance, what it was worth, and what the best look is worth now: the probability that it shows the target.
     """
     belief, done = ZoomBelief(glances.lattice, evidence, target), set[Window]()
     window, worth = on_lattice(glances.lattice, (0, 0, 0)), float("inf")
@@ -72,7 +92,7 @@ def look_for(
         done.add(window)
         belief.add(glance)
         choice = best_hit(belief, done, closest=closest) if slices is None else best_slice(belief, slices, done)
-        yield glance, worth, 0.0 if choice is None else choice[1]
+        yield Turn(glance, worth, 0.0 if choice is None else choice[1], belief)
         last = window.level == glances.lattice.levels - 1
         confirms = window in allowed if allowed is not None else last or not closest
         if choice is None or (confirms and float(glance.show[target - 1]) >= confirm):
@@ -113,14 +133,14 @@ def search(
     target: int,
     *,
     passes: int = 24,
-    confirm: float = 0.3,
-    give_up: float = 0.005,
+    confirm: float | None = None,
+    give_up: float | None = None,
 ) -> ZoomPath:
-    """Search a picture for one object of a class, and decide.
+    """Search a picture for one object of a class, and decide (`semfov.decision.settle`).
 
-    It is `found` when a look shows it with a score of `confirm`; `absent` when every window's probability of showing it
-    is below `give_up`; `undecided` when the passes are spent. The probability of the decision is that score, or the
-    best window's probability.
+    It is `found` when the picture holds it with a probability of `confirm`, and a detection shows it. When no look is
+    worth `give_up` any more, it is `absent` if the picture rather does not hold it, else `undecided`, as when the passes
+    are spent.
 
     Args:
         glances: of the picture.
@@ -128,30 +148,35 @@ def search(
         classes: names, background first.
         target: class 1..K.
         passes: of the detector, at most.
-        confirm: see above.
-        give_up: see above.
+        confirm: probability that the picture holds the target (None: the evidence's).
+        give_up: probability that a look shows it (None: the evidence's).
     """
+    thresholds = (evidence.thresholds or DEFAULTS).changed(confirm, give_up)
     seen: list[Glance] = []
     values: list[float] = []
-    outcome: Decision | None = None
-    for glance, value, ahead in look_for(glances, evidence, target, confirm=confirm):
+    tally: Tally | None = None
+    ended, presence = 0, 0.0
+    for glance, value, ahead, belief in look_for(glances, evidence, target, confirm=float("inf")):
+        tally = tally or Tally(belief)
+        tally.add(glance)
         seen.append(glance)
         values.append(value)
-        score = float(glance.show[target - 1])
-        if score >= confirm:
-            place = glance.detections.scores[0, :, target]
-            box = glance.detections.boxes[0, int(place.argmax())] if len(place) else None
-            outcome = Decision("found", score, None, box)
+        presence = tally.presence(ahead)
+        known = (torch.tensor([each]) for each in (presence, tally.looked, ahead))
+        ended = int(settle(*known, thresholds))
+        if ended or len(seen) == passes:
             break
-        if ahead < give_up:
-            outcome = Decision("absent", ahead)
-            break
-        if len(seen) == passes:
-            outcome = Decision("undecided", ahead)
-            break
-    assert outcome is not None
-    objects = merge(seen, target)
-    return ZoomPath(glances.lattice, classes, target, tuple(seen), tuple(values), objects, outcome)
+    assert tally is not None
+    box = tally.box if OUTCOMES[ended] == "found" else None
+    return ZoomPath(
+        glances.lattice,
+        classes,
+        target,
+        tuple(seen),
+        tuple(values),
+        merge(seen, target),
+        Decision(OUTCOMES[ended], presence, None, box),
+    )
 
 
 def find_all(
