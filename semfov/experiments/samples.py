@@ -150,8 +150,7 @@ class SampleSettings:
 
 
 Cells = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
-"""From the size of an image and a fixation: cells in which misses are counted, the distance of each, `(X·Y,)`, and which
-of them the look shows."""
+"""From an image's size and a fixation: cells to count misses in, how far each is, `(X·Y,)`, and which are shown."""
 
 
 def cells_of(columns: int, rows: int) -> Cells:

@@ -25,6 +25,7 @@ from semfov.io.files import check_regular
 from semfov.io.shipped import shipped_model
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor import Foveation
+from semfov.zoom.eye import ZoomEye
 
 
 def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
@@ -146,6 +147,16 @@ def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
     """The observation model of that name, or the one for this eye; checked to belong to detector and class list."""
     own = recommended(eye.detector.name, float(fovea_of(eye).growth))
     model = FovealObservationModel.from_pretrained(name or shipped_model(FovealObservationModel, own, "MODEL"))
+    model.check_compatible(eye.settings(), eye.detector.classes)
+    return model.requires_grad_(False)
+
+
+def make_zoom_observation(name: str | None, eye: ZoomEye) -> FovealObservationModel | None:
+    """The observation model by magnification of that name, or the one for this eye; None where none is shipped."""
+    own = f"{eye.detector.name}-zoom"
+    if name is None and not (FovealObservationModel.shipped / f"{own}.safetensors").is_file():
+        return None
+    model = FovealObservationModel.from_pretrained(name or own)
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)
 

@@ -214,9 +214,7 @@ class Bounds(Protocol):
         ...
 
 
-def choose_thresholds(
-    config: Bounds, anywhere: Tensor, looked: Tensor, left: Tensor, there: Tensor
-) -> Thresholds:
+def choose_thresholds(config: Bounds, anywhere: Tensor, looked: Tensor, left: Tensor, there: Tensor) -> Thresholds:
     """The least confirmation with so few false alarms, and the largest price of a look that loses so few targets.
 
     Args:

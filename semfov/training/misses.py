@@ -8,9 +8,7 @@ from semfov.experiments.samples import Cells, Samples
 from semfov.observation import MissCounts
 
 
-def count_misses(
-    photographs: Scenes, samples: Samples, scenes: set[int], edges: Tensor, cells: Cells
-) -> MissCounts:
+def count_misses(photographs: Scenes, samples: Samples, scenes: set[int], edges: Tensor, cells: Cells) -> MissCounts:
     """Cells in which nothing was detected, over all looks at the given scenes (`MissCounts`).
 
     Args:

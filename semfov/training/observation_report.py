@@ -73,8 +73,13 @@ def report_markdown(
     fallback = model.metadata["fallback"]
     edges = ["0", *(f"{edge:.3f}" for edge in model.edges.tolist()), "…"]
     levels = [
-        [f"{low} - {high}", str(int(counts[0, n])), str(int(counts[1:, n].sum())), str(fallback.get(str(n), "")),
-         *by_level[n]]
+        [
+            f"{low} - {high}",
+            str(int(counts[0, n])),
+            str(int(counts[1:, n].sum())),
+            str(fallback.get(str(n), "")),
+            *by_level[n],
+        ]
         for n, (low, high) in enumerate(pairwise(edges))
     ]
     what = "octaves that the picture is reduced by" if config.mosaics else "distance"
@@ -88,8 +93,8 @@ def report_markdown(
             "",
             *summary,
             "",
-            f"Detections that the fit saw, by {where}; levels with too few objects take the parameters of another level. "
-            "Beside them figures of raw scores and of the model on what was held out.",
+            f"Detections that the fit saw, by {where}; levels with too few objects take the parameters of another "
+            "level. Beside them figures of raw scores and of the model on what was held out.",
             "",
             *table([head, *levels]),
             "",

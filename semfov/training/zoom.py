@@ -3,8 +3,7 @@
 import logging
 import random
 from collections import defaultdict
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,72 +11,23 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.data.mosaics import Mosaics
-from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.parallel import available_cores, run_tasks
 from semfov.experiments.run import cache_folder
-from semfov.experiments.settings import Count, Seed, Settings, Share, Workers
 from semfov.experiments.setup import make_detector, prepare_worker, split_photographs
 from semfov.experiments.summary import table as table_of
-from semfov.experiments.zoom import SHOWN, Tile
-from semfov.experiments.zoom_store import GlanceStore
+from semfov.experiments.zoom import SHOWN
+from semfov.experiments.zoom_store import GlanceStore, open_scene
 from semfov.io.files import inside
 from semfov.training.outputs import training_of, write_outputs
 from semfov.training.zoom_choice import choose, open_all
 from semfov.training.zoom_decision import fit_judge, judge_searches, search_mosaics
-from semfov.training.zoom_examples import LookedAt, MosaicStore, ZoomExample, look_at_mosaic, pack, unpack
+from semfov.training.zoom_examples import LookedAt, ZoomExample, example_of, windows_of
+from semfov.training.zoom_settings import FitZoomConfig
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
 from semfov.zoom.eye import ZoomEye
-from semfov.zoom.lattice import Lattice
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class FitZoomConfig(Settings):
-    """Fit evidence by magnification on mosaics.
-
-    Args:
-        data: photographs to compose mosaics of; every fifth is held out.
-        detector: which detector looks.
-        mosaics: mosaics of 4 × 4 photographs.
-        far: mosaics of 8 × 6 photographs, in which objects are half as large.
-        judged: mosaics of 4 × 4 photographs that were held out, to judge the fit and to choose by.
-        judged_far: mosaics of 8 × 6 photographs that were held out, to choose by.
-        tile: width of a photograph's slot in pixels; three quarters of it is the height.
-        searched: mosaics of 4 × 4 photographs to fit on when a search decides.
-        sought: classes that are there, and as many that are not, to search for in each of them.
-        passes: of such a search, at most.
-        false_alarms: share of absent targets that may be called found, by which the threshold is chosen.
-        surest: probability from which on a target counts as found at the latest, however many false alarms that makes.
-        lost: share of the targets that may be missed because no look is worth its price any more.
-        evidence: model that was fitted before, to fit anew only when a search decides (None: fit all).
-        steps: of each fit.
-        seed: of mosaics and fit.
-        out: folder for the model and a report.
-        cache: folder for the looks (None: the user's cache).
-        workers: processes (None: one for each CPU core).
-    """
-
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
-    mosaics: Count = 400
-    far: Count = 40
-    judged: Count = 80
-    judged_far: Count = 4
-    tile: Tile = 480
-    searched: Count = 100
-    sought: Count = 5
-    passes: Count = 24
-    false_alarms: Share = 0.015
-    surest: Share = 1.0
-    lost: Share = 0.02
-    evidence: Path | None = None
-    steps: Count = 800
-    seed: Seed = 0
-    out: Path = Path("runs/fit_zoom")
-    cache: Path | None = None
-    workers: Workers | None = None
 
 
 @dataclass(frozen=True)
@@ -121,9 +71,9 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
     }
 
 
-def make_store(config: FitZoomConfig, eye: ZoomEye) -> MosaicStore:
+def make_store(config: FitZoomConfig, eye: ZoomEye) -> GlanceStore:
     """Where looks at mosaics are kept."""
-    return MosaicStore(cache_folder(config.cache) / "mosaics", eye.settings(), len(eye.detector.classes))
+    return GlanceStore(cache_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
 
 
 _process: dict[str, Any] = {}
@@ -137,24 +87,18 @@ def prepare_process(config: FitZoomConfig) -> None:
 
 
 def look(task: tuple[str, int]) -> tuple[str, int]:
-    """Look at a mosaic, unless that was done before."""
+    """Look at a mosaic, where that was not done before."""
     kind, index = task
-    mosaics, store = _process["mosaics"][kind], _process["store"]
-    if store.read(mosaics.digest(index)) is None:
-        store.write(mosaics.digest(index), pack(look_at_mosaic(_process["eye"], mosaics, index)))
+    mosaics = _process["mosaics"][kind]
+    glances = open_scene(_process["eye"], mosaics, index, _process["store"])
+    glances.see(windows_of(mosaics, index, glances.lattice))
+    glances.save()
     return task
 
 
-def read_examples(mosaics: Mosaics, store: MosaicStore, eye: ZoomEye) -> list[ZoomExample]:
+def read_examples(mosaics: Mosaics, store: GlanceStore, eye: ZoomEye) -> list[ZoomExample]:
     """What was seen of all mosaics."""
-    lattice = Lattice.over(mosaics.size, eye.detector.input_size, finest=eye.finest)
-    examples = []
-    for index in range(len(mosaics)):
-        tensors = store.read(mosaics.digest(index))
-        assert tensors is not None
-        slots: Any = [tuple(map(float, tile.slot)) for tile in mosaics.tiles(index)]
-        examples.append(unpack(tensors, lattice, slots))
-    return examples
+    return [example_of(mosaics, n, open_scene(eye, mosaics, n, store)) for n in range(len(mosaics))]
 
 
 def table(examples: list[ZoomExample]) -> Windows:
@@ -307,31 +251,30 @@ def fit_zoom(config: FitZoomConfig) -> None:
     """Look, fit, judge on what was held out, and write the model and a report."""
     eye = make_eye(config)
     mosaics = make_mosaics(config, eye.detector.classes)
-    glances = GlanceStore(cache_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
+    store = make_store(config, eye)
     parts: list[str] = []
     figures = "{}"
     if config.evidence is None:
-        model, examples = fit_looks(config, eye, mosaics)
-        tried = choose(model, eye, mosaics["judged"], mosaics["judged far"], glances)
+        model, examples = fit_looks(config, eye, mosaics, store)
+        tried = choose(model, eye, mosaics["judged"], mosaics["judged far"], store)
         text, figures = judge(model, examples)
         chosen = f"Chosen: foresight {model.foresight:g}, patience {model.patience:g}."
         parts += [text, chosen, "", *table_of(tried), ""]
     else:
         model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
         model.check_compatible(eye.settings())
-    parts += fit_decision(config, model, eye, mosaics, glances)
+    parts += fit_decision(config, model, eye, mosaics, store)
     path = inside(config.out, f"{eye.detector.name}.safetensors")
     model.save(path)
     write_outputs(config, "\n".join(parts), ("figures.json", figures), path)
 
 
 def fit_looks(
-    config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics]
+    config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
 ) -> tuple[GlimpseEvidence, list[ZoomExample]]:
     """The model of what looks say of closer ones, and examples that were held out."""
-    store = make_store(config, eye)
     looked = {kind: mosaics[kind] for kind in ("near", "far", "judged")}
-    todo = [(kind, n) for kind, some in looked.items() for n in range(len(some)) if store.read(some.digest(n)) is None]
+    todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
     workers = config.workers or available_cores()
     for _ in run_tasks(look, todo, workers=workers, setup=prepare_process, settings=(config,), title="looking",
                        unit="mosaic"):  # fmt: skip

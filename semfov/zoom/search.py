@@ -8,22 +8,25 @@ import torch
 
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, Decision, settle
-from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.belief import Rates, ZoomBelief
+from semfov.zoom.drawing import path_html
 from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance, Glances, Window, on_lattice
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import Objects, merge
 from semfov.zoom.policy import Choice, best_find, best_hit, best_slice, jointly
 from semfov.zoom.tally import Tally
 
-
 DEFAULTS = Thresholds(0.9, 0.005)
 """For evidence without any."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ZoomPath:
     """The record of a search in, or an exploration of, a large picture.
+
+    In a notebook it shows the windows that were looked at; `semfov.viz.plot_zoom_path` draws them on the picture.
 
     Attributes:
         lattice: of the picture.
@@ -47,6 +50,50 @@ class ZoomPath:
     def passes(self) -> int:
         """Passes of the detector."""
         return len(self.glances)
+
+    def describe(self) -> str:
+        """What came of it, in a sentence."""
+        count = len(self.objects.above(FOUND))
+        passes = f"{self.passes} pass{'es' if self.passes != 1 else ''}"
+        if self.decision is not None and self.target is not None:
+            outcome = f"{self.decision.outcome} ({self.decision.probability:.2f})"
+            return f"{self.classes[self.target]}: {outcome} in {passes}"
+        if self.target is None:
+            return f"{count} object{'s' if count != 1 else ''} in {passes}"
+        return f"{count} × {self.classes[self.target]} in {passes}"
+
+    def shown(self, number: int) -> tuple[float, float, float, float]:
+        """What of the picture a look showed, `(x1, y1, x2, y2)` in pixels."""
+        window, (width, height) = self.glances[number].window, self.lattice.size
+        if window.within is not None:
+            return window.within
+        (x, y, magnification), (wide, high) = window.fixation, self.lattice.canvas
+        across, down = wide / magnification / 2, high / magnification / 2
+        x, y = x + 0.5, y + 0.5
+        return max(x - across, 0.0), max(y - down, 0.0), min(x + across, float(width)), min(y + down, float(height))
+
+    def __repr__(self) -> str:
+        """What came of it, where it looked, and what it found."""
+        looks = [f"({x:.0f}, {y:.0f}) × {m:.2f}" for x, y, m in (glance.window.fixation for glance in self.glances)]
+        path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
+        sure = self.objects.above(FOUND)
+        named = [
+            f"{self.classes[label]} {score:.2f}"
+            for label, score in zip(sure.labels.tolist()[:5], sure.scores.tolist(), strict=False)
+        ]
+        more = ["…"] if len(sure) > 5 else []
+        width, height = self.lattice.size
+        return "\n".join(
+            [
+                f"ZoomPath: {self.describe()}",
+                f"  at (x, y) × magnification: {', '.join(path)} of {width} × {height} px",
+                f"  objects: {', '.join([*named, *more]) or 'none'}",
+            ]
+        )
+
+    def _repr_html_(self) -> str:
+        """Windows, numbered in their order, and objects."""
+        return path_html(self)
 
 
 class Turn(NamedTuple):
@@ -101,7 +148,7 @@ def look_for(
 
 
 def find_everything(
-    glances: Glances, evidence: GlimpseEvidence, target: int | None = None, *, batch: int = 1, worth: float = 0.0
+    glances: Glances, evidence: Rates, target: int | None = None, *, batch: int = 1, worth: float = 0.0
 ) -> Iterator[tuple[Glance, float]]:
     """Look for all objects of a class, or of any, glance by glance, until no look is worth its price.
 
@@ -139,8 +186,8 @@ def search(
     """Search a picture for one object of a class, and decide (`semfov.decision.settle`).
 
     It is `found` when the picture holds it with a probability of `confirm`, and a detection shows it. When no look is
-    worth `give_up` any more, it is `absent` if the picture rather does not hold it, else `undecided`, as when the passes
-    are spent.
+    worth `give_up` any more, it is `absent` if the picture rather does not hold it, else `undecided`; so it is, too,
+    when the passes are spent.
 
     Args:
         glances: of the picture.

@@ -72,6 +72,9 @@ def test_tables_and_resuming(config, capsys):
         if record["measure"] == "recall":
             assert len(record["found"]) <= config.passes
             assert max(record["found"]) <= record["objects"]
+        elif record["measure"] == "decision":
+            assert record["passes"] <= config.passes
+            assert 0 <= record["probability"] <= 1
         else:
             assert 1 <= record["passes"] <= 5
     parts = sorted((config.out / "parts").rglob("*.json"))
