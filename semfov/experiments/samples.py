@@ -205,6 +205,12 @@ class Sampler:
         return cells_of(10, 10)(size, fixation)
 
     @property
+    def foveal_eye(self) -> Eye:
+        """The eye, where it looks through a fovea."""
+        assert isinstance(self.eye, Eye)
+        return self.eye
+
+    @property
     def shards(self) -> range:
         """Numbers of the shards."""
         return range(-(-len(self.scenes) // self.settings.shard))
@@ -239,11 +245,10 @@ class Sampler:
 
     def _look(self, index: int) -> Samples:
         settings, scene = self.settings, self.scenes[index]
-        assert isinstance(self.eye, Eye)
         grid = Grid(1, 1, scene.size)
         generator = generator_for("fixations", settings.seed, scene.id)
         points = torch.rand(settings.fixations, 2, generator=generator) * grid.extent - 0.5
-        seen = look_from(self.eye, scene.image, points)
+        seen = look_from(self.foveal_eye, scene.image, points)
         return Samples.of(seen, points, self.scenes.annotation(index), index, settings.iou)
 
 

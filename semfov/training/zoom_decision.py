@@ -109,8 +109,8 @@ def fit_judge(model: GlimpseEvidence, searches: Searches, steps: int, batch: int
 
 
 @torch.no_grad()
-def judge_searches(model: GlimpseEvidence, searches: Searches, bounds: Bounds) -> list[list[str]]:
-    """Set the thresholds by searches of mosaics that were held out; returns a table of how well presence is told."""
+def judge_searches(model: GlimpseEvidence, searches: Searches, bounds: Bounds) -> list[str]:
+    """Set the thresholds by searches that were held out; returns lines of a table of how well presence is told."""
     anywhere = model.anywhere(searches.best, searches.case).sigmoid()
     there = searches.there
     model.thresholds = choose_thresholds(bounds, anywhere.mT, searches.looked.mT, searches.left.mT, there)

@@ -30,7 +30,7 @@ def path_html(path: ZoomPath) -> str:
     sure = path.objects.above(FOUND)
     for box, label, score in zip(sure.boxes.tolist()[:MOST], sure.labels.tolist(), sure.scores.tolist(), strict=False):
         title = f"<title>{escape(path.classes[label])} {score:.2f}</title>"
-        shapes.append(_rect(*box, "#d55e00", unit, title))
+        shapes.append(_rect(box[0], box[1], box[2], box[3], "#d55e00", unit, title))
     drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
     return f"<div>{escape(path.describe())}<br>{drawing}</div>"
 

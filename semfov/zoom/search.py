@@ -209,8 +209,7 @@ def search(
         seen.append(glance)
         values.append(value)
         presence = tally.presence(ahead)
-        known = (torch.tensor([each]) for each in (presence, tally.looked, ahead))
-        ended = int(settle(*known, thresholds))
+        ended = int(settle(torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([ahead]), thresholds))
         if ended or len(seen) == passes:
             break
     assert tally is not None
