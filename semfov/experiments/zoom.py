@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.parts import Parts, Record
 from semfov.experiments.run import cache_folder, digest_of
 from semfov.experiments.search_protocol import choose_classes
-from semfov.experiments.settings import Range, Seed, Settings, Side, Whole, Workers
+from semfov.experiments.settings import Count, Range, Seed, Settings, Side, Whole, Workers
 from semfov.experiments.setup import make_detector, make_scenes, make_zoom_observation
 from semfov.experiments.store import versions
 from semfov.experiments.zoom_decisions import decide_all
@@ -47,6 +47,9 @@ Tile = Annotated[int, Range(16, 16_384)]
 """Side in pixels of a part of a picture."""
 
 
+Measure = Literal["recall", "hit", "decision"]
+
+
 @dataclass(frozen=True)
 class ZoomConfig(Settings):
     """Large pictures: recall against passes of the detector, and passes to the first confirmed hit.
@@ -62,6 +65,8 @@ class ZoomConfig(Settings):
         slice: side in pixels of the slices of photographs; those of mosaics are their photographs.
         overlap: of neighbouring slices.
         passes: of the detector, at most.
+        measures: what is measured: `recall` after each pass, passes to the `hit` that a slice of a mosaic shows, and
+            what searches end with, the `decision`.
         sought: classes that a picture holds, and as many that it does not, to search for until it is decided (with a
             `target` that alone).
         cut: what becomes of boxes at a window's border.
@@ -85,7 +90,8 @@ class ZoomConfig(Settings):
     slice: Tile = 640
     overlap: Annotated[float, Range(0, 0.9)] = 0.2
     passes: Annotated[int, Range(2, 100_000)] = 24
-    sought: Whole = 4
+    measures: tuple[Measure, ...] = ("recall", "hit", "decision")
+    sought: Count = 4
     cut: Cut = "keep"
     model: str | None = None
     observation: str | None = None
@@ -159,16 +165,17 @@ class ZoomRun:
         watch = Stopwatch()
         glances = self.glances(index)
         records: list[Record] = []
-        for name, looks in self._finding(index, glances):
+        measures = self.config.measures
+        for name, looks in self._finding(index, glances) if "recall" in measures else ():
             seen = [*islice(looks, self.config.passes)]
             records.append(self._recall(name, index, seen))
             if name in ("slices, raster", "ours"):
                 records.append(self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, seen)]))
         watch.lap("recall")
-        if self.config.mosaics:
+        if self.config.mosaics and "hit" in measures:
             records += self._first_hits(index, glances)
         watch.lap("first hit")
-        if self.config.sought:
+        if "decision" in measures:
             records += self._decisions(index, glances)
         watch.lap("decision")
         glances.save()

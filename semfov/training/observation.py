@@ -35,7 +35,8 @@ def fit_fom(config: FitConfig) -> None:
     fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
     misses = count_misses(sampler.scenes, samples, fitted_on, model.edges, sampler.cells)
     model.miss_rate = misses.rates().to(model.edges)
-    model.metadata["cells"] = misses.total.sum(1).tolist()
+    if config.mosaics:
+        model.metadata["cells"] = misses.total.sum(1).tolist()
     path = model_path(config, sampler.eye.detector.name)
     model.save(path)
     written = write_report(config, model, fit_all(config, sampler, samples[~held_out], model), samples, held_out)
