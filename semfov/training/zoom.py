@@ -27,6 +27,9 @@ from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
 from semfov.zoom.eye import ZoomEye
 
+DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", "tile", "seed")
+"""Settings that thresholds and the probability of presence depend on."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -309,9 +312,10 @@ def fit_decision(
         )
         for kind, title in (("searched", "searching"), ("judged", "searching what was held out"))
     }
-    fit_judge(model, searches["searched"], config.steps)
+    fit_judge(model, searches["searched"], config.judging)
     rows = judge_searches(model, searches["judged"], config)
     assert model.thresholds is not None
+    model.metadata["decision"] = {name: getattr(config, name) for name in DECIDING}
     count, told = (len(searches[kind].there) for kind in ("searched", "judged"))
     return [
         f"Whether a picture holds a class, fitted on {count} searches, half of them for what is not there; judged on "

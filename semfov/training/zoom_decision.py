@@ -104,7 +104,7 @@ def fit_judge(model: GlimpseEvidence, searches: Searches, steps: int, batch: int
         return F.binary_cross_entropy_with_logits(model.anywhere(best[rows], case[rows]), there[rows])
 
     model.judge.requires_grad_(True)
-    descend(model.judge.parameters(), loss_of, steps, 1e-2, title="judging")
+    descend(model.judge.parameters(), loss_of, steps, 1e-2, decay=1.0, title="judging")
     model.judge.requires_grad_(False)
 
 

@@ -27,7 +27,8 @@ class FitZoomConfig(Settings):
         surest: probability from which on a target counts as found at the latest, however many false alarms that makes.
         lost: share of the targets that may be missed because no look is worth its price any more.
         evidence: model that was fitted before, to fit anew only when a search decides (None: fit all).
-        steps: of each fit.
+        steps: of the fits of what looks say of closer ones.
+        judging: steps of the fit of when a search decides.
         seed: of mosaics and fit.
         out: folder for the model and a report.
         cache: folder for the looks (None: the user's cache).
@@ -41,14 +42,15 @@ class FitZoomConfig(Settings):
     judged: Count = 80
     judged_far: Count = 4
     tile: Tile = 480
-    searched: Count = 100
-    sought: Count = 5
+    searched: Count = 50
+    sought: Count = 4
     passes: Count = 24
-    false_alarms: Share = 0.015
-    surest: Share = 1.0
+    false_alarms: Share = 0.03
+    surest: Share = 0.9
     lost: Share = 0.02
     evidence: Path | None = None
     steps: Count = 800
+    judging: Count = 300
     seed: Seed = 0
     out: Path = Path("runs/fit_zoom")
     cache: Path | None = None
