@@ -93,7 +93,8 @@ class ZoomPath:
 
     def _repr_html_(self) -> str:
         """Windows, numbered in their order, and objects."""
-        return path_html(self)
+        windows = [self.shown(number) for number in range(self.passes)]
+        return path_html(self.describe(), self.lattice.size, windows, self.objects, self.classes)
 
 
 class Turn(NamedTuple):
