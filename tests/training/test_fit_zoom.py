@@ -12,11 +12,16 @@ from semfov.detection.detector import Detector
 from semfov.detection.scores import Candidates
 from semfov.errors import InputError
 from semfov.experiments.config import DataConfig
+from semfov.experiments.zoom_samples import MosaicSettings
 from semfov.experiments.zoom_store import GlanceStore, open_scene
+from semfov.observation.foveal import FovealObservationModel
+from semfov.training.observation import fit_fom
+from semfov.training.observation_settings import FitConfig
 from semfov.training.zoom import fit_zoom
 from semfov.training.zoom_examples import example_of
 from semfov.training.zoom_settings import FitZoomConfig
 from semfov.zoom import GlimpseEvidence, ZoomEye
+from semfov.zoom.lattice import Lattice
 
 
 class Bright(Detector):
@@ -90,3 +95,26 @@ def test_examples_are_the_same_from_a_store(tmp_path):
 def test_settings_have_ranges():
     with pytest.raises(InputError, match="steps: expected a whole number from 1"):
         FitZoomConfig(steps=0)
+
+
+def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Bright())
+    config = FitConfig(
+        data=DataConfig(limit=4, min_instances=0, max_target_area=None),
+        mosaics=2, fixations=1, levels=4, holdout=2, shard=1, method="newton", name="bright-zoom",
+        out=tmp_path / "out", workers=1,
+    )  # fmt: skip
+    fit_fom(config)
+    assert "octaves that the picture is reduced by" in capsys.readouterr().out
+    model = FovealObservationModel.from_pretrained(tmp_path / "out" / "bright-zoom.safetensors")
+    assert model.edges.tolist() == [0.5, 1.5, 2.5]
+    assert model.metadata["sensor"]["glimpse"] == "antialiased bilinear"
+    model.check_compatible(ZoomEye(Bright()).settings())
+    # One of the two mosaics was fitted on, the other judged; all that it shows is counted.
+    sampler = MosaicSettings.of(config).sampler()
+    samples = sampler.load(tmp_path / "out" / "samples", 1)
+    assert sum(map(sum, model.metadata["counts"])) == len(samples)
+    size = sampler.scenes.annotation(1).size
+    lattice = Lattice.over(size, (96, 96))
+    assert sum(model.metadata["cells"]) >= lattice.columns * lattice.rows
+    assert model.miss_rate.shape == (4, 4)
