@@ -98,7 +98,7 @@ def judge_scores(config: CalibrationConfig) -> None:
     sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
     if rank() > 0:
         return
-    model = make_observation(config.model, sampler.eye)
+    model = make_observation(config.model, sampler.foveal_eye)
     with torch.inference_mode():
         calibrated = model.calibrate(samples.scores, samples.distance)
     predictions = {"raw": samples.scores, "calibrated": calibrated}

@@ -25,6 +25,7 @@ from semfov.experiments.config import (
     ProtocolConfig,
     SensorConfig,
 )
+from semfov.experiments.decision_report import SHARES, mean, percent, telling
 from semfov.experiments.decisions import DecisionConfig, DecisionRun
 from semfov.experiments.fitted import with_models
 from semfov.experiments.parallel import rank
@@ -33,11 +34,8 @@ from semfov.experiments.run import finish
 from semfov.experiments.settings import Positive, Settings, Share, Workers
 from semfov.experiments.summary import announce, gather, sensing, table
 from semfov.io.files import write_text
-from semfov.metrics.presence import area_under_roc, hits_at
 from semfov.viz.presence import plot_roc
 from semfov.viz.style import save_figure
-
-SHARES = (0.01, 0.02, 0.05)
 
 
 @dataclass(frozen=True)
@@ -110,14 +108,7 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
     groups = {name: [record for record in records if record["policy"] == name] for name in names}
     told, there = probabilities(records)
     rows = [["", "area under ROC", *(f"hits at {share:.0%}" for share in SHARES)]]
-    rows += [
-        [
-            name,
-            f"{area_under_roc(score, there):.3f}",
-            *(f"{100 * hits_at(score, there, share):.0f}" for share in SHARES),
-        ]
-        for name, score in told.items()
-    ]
+    rows += [[name, *figures] for name, figures in zip(told, telling(told, there), strict=True)]
     decided = [["", "found, there", "found, not there", "undecided", "looks, there", "looks, not there", "place right",
                 "IoU", "p before and after landing"]]  # fmt: skip
     for name, group in groups.items():
@@ -178,16 +169,6 @@ def utility(records: Sequence[Record], price: float) -> float:
     right = [record["outcome"] == ("found" if record["present"] else "absent") for record in records]
     looks = [record["looks"] for record in records]
     return sum(each - price * count for each, count in zip(right, looks, strict=True)) / len(records)
-
-
-def percent(count: int, total: int) -> str:
-    """A share in percent."""
-    return f"{100 * count / total:.1f}" if total else "-"
-
-
-def mean(values: Sequence[float], digits: int = 1) -> str:
-    """A mean."""
-    return f"{sum(values) / len(values):.{digits}f}" if values else "-"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

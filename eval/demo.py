@@ -43,7 +43,6 @@ from semfov.scanpath.stimulus import reduced
 from semfov.sensor import SENSORS
 from semfov.sensor.named import SensorName
 from semfov.viz.animation import film_of
-from semfov.viz.zoom import describe_zoom
 from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye
 
 Drawn = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
@@ -187,7 +186,7 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig, folder: Path
         given = {"confirm": config.confirm, "give_up": config.give_up}
         path = agent.search(picture.image, config.target, passes=passes, **chosen(given))
     width, height = path.lattice.size
-    print(f"{picture.name}, {width} × {height} px, looked at in windows: {describe_zoom(path)}")
+    print(f"{picture.name}, {width} × {height} px, looked at in windows: {path.describe()}")
     unused = [name for name in ("sensor", "start", "price", "report") if getattr(config, name) is not None]
     if unused:
         print(f"  not used for a picture of this size: {', '.join(unused)}")

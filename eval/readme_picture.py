@@ -1,30 +1,52 @@
-"""Make the picture of the README from a photograph that scikit-image carries: `python -m eval.readme_picture`."""
+"""Make the picture of the README from a photograph that scikit-image carries: `python -m eval.readme_picture`.
 
+python -m eval.readme_picture
+python -m eval.readme_picture --zoom --weights yolox_nano_416.onnx    # that of docs/zoom.md, of embedded scenes
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import skimage
 import torch
 
-from semfov import ActivePerception
+from semfov import ActivePerception, EmbeddedScenes, ZoomAgent
+from semfov.data.mosaics import Mosaics
 from semfov.io.files import replacing
-from semfov.viz import plot_belief_strip, plot_foveated_strip
+from semfov.viz import plot_belief_strip, plot_foveated_strip, plot_zoom_path
 from semfov.viz.animation import Frame, in_palette, render
 
-PATH = Path(__file__).parents[1] / "docs" / "pictures" / "search.png"
+PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 PHOTOGRAPH = Path(skimage.__file__).parent / "data" / "coffee.png"  # by Rachel Michetti, CC0
 TARGET, START = "cup", 99
 
 
-def make_picture(path: Path = PATH) -> None:
+def make_picture(path: Path) -> None:
     """Search the photograph, and draw what was seen above what was believed, in a small file."""
     agent = ActivePerception.recommended("yolov3-tiny")
     with torch.inference_mode():
         scanpath = agent.search(PHOTOGRAPH, TARGET, start=START)
     seen = plot_foveated_strip(scanpath, most=3)
     believed = plot_belief_strip(scanpath, most=3)
+    write(stacked(render([seen, believed], dpi=105)), path)
+
+
+def make_zoom_picture(path: Path, weights: str | None) -> None:
+    """Find people in a mosaic of embedded scenes, and draw where the eye zoomed in."""
+    agent = ZoomAgent.recommended("yolox-nano", weights=weights)
+    scenes = EmbeddedScenes(agent.classes[1:], count=16)
+    mosaic = Mosaics(scenes, 4, 4, tile=(640, 480), count=1)[0].image
+    figure = plot_zoom_path(agent.find_all(mosaic, "person", passes=10), mosaic)
+    write(render([figure], dpi=110)[0], path)
+
+
+def write(frame: Frame, path: Path) -> None:
+    """Write a picture as a small PNG, whole or not at all."""
     with replacing(path) as temporary:
-        in_palette(stacked(render([seen, believed], dpi=105)), refine=3).save(temporary, format="PNG", optimize=True)
+        in_palette(frame, refine=3).save(temporary, format="PNG", optimize=True)
 
 
 def stacked(frames: list[Frame]) -> Frame:
@@ -35,6 +57,21 @@ def stacked(frames: list[Frame]) -> Frame:
     return np.concatenate(padded)
 
 
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m eval.readme_picture", description=__doc__.splitlines()[0])
+    parser.add_argument("--zoom", action="store_true", help="the picture of docs/zoom.md, with YOLOX-nano")
+    parser.add_argument("--weights", help="ONNX file of YOLOX-nano")
+    parser.add_argument("--out", type=Path, help="file to write (none: where the docs have it)")
+    options = parser.parse_args(arguments)
+    path = options.out or PICTURES / ("zoom.png" if options.zoom else "search.png")
+    if options.zoom:
+        make_zoom_picture(path, options.weights)
+    else:
+        make_picture(path)
+    print(path)
+    return 0
+
+
 if __name__ == "__main__":
-    make_picture()
-    print(PATH)
+    sys.exit(main())

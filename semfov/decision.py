@@ -55,10 +55,25 @@ def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
         target: class 1..K, or `(A,)`.
         thresholds: probabilities.
     """
-    presence = step.belief.presence(target)
     looked = nearly_fixated(step.belief.probability(target), step.visited)
-    nothing = step.belief.chance(target).masked_fill(step.visited, 0).amax(-1) < thresholds.give_up
-    rest = torch.where(nothing, torch.where(presence < 0.5, 2, 3), 0)
+    left = step.belief.chance(target).masked_fill(step.visited, 0).amax(-1)
+    return settle(step.belief.presence(target), looked, left, thresholds)
+
+
+def settle(presence: Tensor, looked: Tensor, left: Tensor, thresholds: Thresholds) -> Tensor:
+    """Which searches end, as for `decide`, by what is known of them, `(A,)` each.
+
+    Args:
+        presence: probability that the target is there.
+        looked: boolean, whether the place that it is most probably in was looked at.
+        left: what the best look that is left is worth.
+        thresholds: probabilities.
+
+    >>> settle(torch.tensor([0.95, 0.95, 0.2]), torch.tensor([True, False, False]), torch.tensor([0.1, 0.1, 0.01]),
+    ...        Thresholds(confirm=0.9, give_up=0.05)).tolist()
+    [1, 0, 2]
+    """
+    rest = torch.where(left < thresholds.give_up, torch.where(presence < 0.5, 2, 3), 0)
     return torch.where((presence >= thresholds.confirm) & looked, 1, rest)
 
 

@@ -12,6 +12,7 @@ from semfov.belief import ContextPrior, DirichletBelief
 from semfov.io.compatibility import learned_for, recommended
 from semfov.sensor import SENSORS
 from semfov.zoom import GlimpseEvidence
+from semfov.zoom.evidence import features
 
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
 TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
@@ -25,9 +26,12 @@ def test_observation_model(path):
     model = semfov.FovealObservationModel.from_pretrained(path.stem)
     assert path.stat().st_size < 1_100_000
     assert len(model.classes) == 80
-    assert model.alpha.shape == (81, 8, 81)
+    zoom = path.stem.endswith("-zoom")
+    assert model.alpha.shape == (81, 4 if zoom else 8, 81)
+    # Those of windows know how many cells hold each class.
+    assert ("cells" in model.metadata) == zoom
     assert bool((model.miss_rate > 0).all() and (model.miss_rate < 1).all())
-    # Objects are missed more often far out than near the fovea.
+    # Objects are missed more often far out than near the fovea, and where the picture is reduced more.
     assert model.miss_rate[1:, -1].mean() > model.miss_rate[1:, 0].mean()
     assert sum(map(sum, model.metadata["counts"])) == model.metadata["samples"]
     card = (Path(path).parent / "README.md").read_text(encoding="utf-8")
@@ -164,6 +168,14 @@ def test_glimpse_evidence(path):
         odds = model.presence(scores, summary, torch.ones(5), target=7)
         taper = model.taper(16)
     assert bool((odds.diff() > 0).all())
+    # The stronger a class was seen, and the more often, the more probable is it that the picture holds it.
+    assert model.thresholds is not None
+    case = torch.zeros(3, 11)
+    best = torch.tensor([0.02, 0.3, 0.9])
+    case[:, [0, 1, 2, 4]] = features(best)[:, None]
+    case[:, 9] = torch.tensor([0.0, 0.35, 0.7])
+    with torch.no_grad():
+        assert bool((model.anywhere(best, case).diff() > 0).all())
     # What lies in the middle of a window is found, what lies at its border may be cut.
     assert taper[8] > taper[0]
     torch.testing.assert_close(taper, taper.flip(0))
@@ -173,7 +185,7 @@ def test_both_kinds_exist_for_every_detector():
     names = {"yolov3-tiny", "yolox-nano"}
     learned = {learned_for(name, growth) for name in names for growth in (1.0, 2.0)}
     assert {path.stem for path in TARGET} == {path.stem for path in MAPS} == learned
-    kinds = ("", "-sharp", "-published", "-published-narrow")
+    kinds = ("", "-sharp", "-published", "-published-narrow", "-zoom")
     assert {path.stem for path in OBSERVATION} == {name + kind for name in names for kind in kinds}
 
 

@@ -14,7 +14,8 @@ import sys
 from collections.abc import Sequence
 
 from semfov.experiments.command import run_command
-from semfov.training.zoom import FitZoomConfig, fit_zoom
+from semfov.training.zoom import fit_zoom
+from semfov.training.zoom_settings import FitZoomConfig
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

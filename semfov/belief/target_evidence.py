@@ -38,6 +38,10 @@ class Thresholds:
         return Thresholds(self.confirm if confirm is None else confirm, self.give_up if give_up is None else give_up)
 
 
+THRESHOLDS = Maybe(Object({"confirm": Number(0, 1), "give_up": Number(0, 1)}, required=("confirm", "give_up")))
+"""As a file keeps them."""
+
+
 class TargetEvidence(Evidence):
     r"""Probability that a cell, and the image, holds the target: learned from looks at photographs with boxes.
 
@@ -71,9 +75,7 @@ class TargetEvidence(Evidence):
         {
             "widths": Pair((Number(size="L"), Number(size="R"))),
             "components": Number(size="C"),
-            "thresholds": Maybe(
-                Object({"confirm": Number(0, 1), "give_up": Number(0, 1)}, required=("confirm", "give_up"))
-            ),
+            "thresholds": THRESHOLDS,
         },
     )
 

@@ -1,6 +1,7 @@
 """From a detector's raw class scores to points of the simplex with a background component."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 import torch
@@ -27,7 +28,7 @@ class Candidates:
     objectness: Tensor | None = None
     background: Tensor | None = None
 
-    @property
+    @cached_property
     def confidence(self) -> Tensor:
         """Objectness times the best class score, `(B, N)`: what detectors rank their boxes by."""
         best = self.classes.amax(-1)

@@ -10,41 +10,39 @@ from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Window
 
 
-def gist_fields(dtype: torch.dtype, kinds: int) -> dict[str, Field]:
+def gist_fields(kinds: int) -> dict[str, Field]:
     """What a file of `N` looks holds of their gists.
 
     Args:
-        dtype: in which scores and sizes are kept.
         kinds: number of classes.
     """
     return {
         "gist.frames": Field(("N", 3), torch.int64, low=0, high=1 << 20),
         "gist.counts": Field(("N", 2), torch.int64, low=0),
         "gist.cells": Field(("P",), torch.int32, low=0),
-        "gist.scores": Field(("P", kinds), dtype, low=0, high=1),
-        "gist.sizes": Field(("P",), dtype, low=0),
+        "gist.scores": Field(("P", kinds), torch.float32, low=0, high=1),
+        "gist.sizes": Field(("P",), torch.float32, low=0),
         "gist.found": Field(("Q",), torch.int32, low=0),
     }
 
 
-def pack_gists(gists: Sequence[Gist | None], kinds: int, dtype: torch.dtype) -> dict[str, Tensor]:
+def pack_gists(gists: Sequence[Gist | None], kinds: int) -> dict[str, Tensor]:
     """Gists as tensors, see `gist_fields`; looks without one have no cells.
 
     Args:
         gists: of the looks.
         kinds: number of classes.
-        dtype: in which scores and sizes are kept.
     """
     frames, counts = torch.zeros(len(gists), 3, dtype=torch.int64), torch.zeros(len(gists), 2, dtype=torch.int64)
     cells, found = [torch.zeros(0, dtype=torch.int32)], [torch.zeros(0, dtype=torch.int32)]
-    scores, sizes = [torch.zeros(0, kinds, dtype=dtype)], [torch.zeros(0, dtype=dtype)]
+    scores, sizes = [torch.zeros(0, kinds)], [torch.zeros(0)]
     for number, look in enumerate(gists):
         if look is None:
             continue
         full = (look.scores > 0).any(-1).flatten()
         cells.append(full.nonzero()[:, 0].int())
-        scores.append(look.scores.flatten(0, 1)[full].to(dtype))
-        sizes.append(look.size.flatten()[full].to(dtype))
+        scores.append(look.scores.flatten(0, 1)[full].float())
+        sizes.append(look.size.flatten()[full].float())
         found.append(look.found.flatten().nonzero()[:, 0].int())
         frames[number] = torch.tensor([look.scale, *look.scores.shape[:2]])
         counts[number] = torch.tensor([len(cells[-1]), len(found[-1])])

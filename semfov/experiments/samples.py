@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -26,6 +27,7 @@ from semfov.eye import Eye
 from semfov.io.cached import read_tensors, write_tensors
 from semfov.io.schema import Field, Schema
 from semfov.observation.matching import match
+from semfov.zoom.eye import ZoomEye
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Samples:
         labels: `(M,)`, true classes, 0 where a detection shows no object.
         look: `(M,)`, the look that a detection belongs to, an index into `scenes` and `fixations`.
         scenes: `(R,)`, index of the scene that each look was at; a look may have seen nothing.
-        fixations: `(R, 2)`, where each look was fixated.
+        fixations: `(R, 2)`, where each look was fixated; with the magnification `(R, 3)` where windows were looked at.
     """
 
     boxes: Tensor
@@ -142,21 +144,43 @@ class SampleSettings:
         """Those of a command, whose settings have the same names."""
         return cls(**{field.name: getattr(config, field.name) for field in fields(cls)})
 
+    def sampler(self) -> Sampler:
+        """What looks."""
+        return Sampler(self)
+
+
+Cells = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
+"""From an image's size and a fixation: cells to count misses in, how far each is, `(X·Y,)`, and which are shown."""
+
+
+def cells_of(columns: int, rows: int) -> Cells:
+    """Cells of whole photographs, all of which every look shows, at their distances from the fixation."""
+
+    def cells(size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
+        grid = Grid(columns, rows, size)
+        return grid, grid.distance(fixation), torch.ones(len(grid), dtype=torch.bool)
+
+    return cells
+
 
 class Sampler:
     """Looks at photographs from random fixations; one shard is a run of successive photographs.
 
     Attributes:
         key: sha256 of everything that the samples depend on.
+        sources: modules that samples depend on, with all that they import.
+        coordinates: of a fixation.
     """
+
+    sources: ClassVar[tuple[str, ...]] = SOURCES
+    coordinates: ClassVar[int] = 2
 
     def __init__(self, settings: SampleSettings) -> None:
         self.settings = settings
         check_sources(settings.data, settings.detector)
-        self.eye: Eye = make_eye(settings.detector, settings.sensor)
-        self.scenes: Scenes = make_scenes(settings.data, self.eye.detector.classes)
+        self.eye, self.scenes = self.make()
         what = [self.eye.settings(), self.scenes.fingerprint, settings.fixations, settings.iou, settings.seed]
-        what += [settings.shard, versions(), looks_digest(*SOURCES)]
+        what += [settings.shard, versions(), looks_digest(*self.sources)]
         self.key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
         components = len(self.scenes.classes) + 1
         self._schema = Schema(
@@ -167,9 +191,24 @@ class Sampler:
                 "labels": Field(("M",), torch.int64, low=0, high=components - 1),
                 "look": Field(("M",), torch.int64, low=0),
                 "scenes": Field(("R",), torch.int64, low=0, high=len(self.scenes) - 1),
-                "fixations": Field(("R", 2)),
+                "fixations": Field(("R", self.coordinates)),
             }
         )
+
+    def make(self) -> tuple[Eye | ZoomEye, Scenes]:
+        """What looks, and at what."""
+        eye = make_eye(self.settings.detector, self.settings.sensor)
+        return eye, make_scenes(self.settings.data, eye.detector.classes)
+
+    def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
+        """Where misses are counted (`Cells`)."""
+        return cells_of(10, 10)(size, fixation)
+
+    @property
+    def foveal_eye(self) -> Eye:
+        """The eye, where it looks through a fovea."""
+        assert isinstance(self.eye, Eye)
+        return self.eye
 
     @property
     def shards(self) -> range:
@@ -209,7 +248,7 @@ class Sampler:
         grid = Grid(1, 1, scene.size)
         generator = generator_for("fixations", settings.seed, scene.id)
         points = torch.rand(settings.fixations, 2, generator=generator) * grid.extent - 0.5
-        seen = look_from(self.eye, scene.image, points)
+        seen = look_from(self.foveal_eye, scene.image, points)
         return Samples.of(seen, points, self.scenes.annotation(index), index, settings.iou)
 
 
@@ -218,7 +257,7 @@ _process: dict[str, tuple[Sampler, Path]] = {}
 
 def _prepare(settings: SampleSettings, folder: Path) -> None:
     prepare_worker()
-    _process["sampler"] = Sampler(settings), folder
+    _process["sampler"] = settings.sampler(), folder
 
 
 def _run_shard(shard: int) -> int:
@@ -232,7 +271,7 @@ def collect(settings: SampleSettings, folder: Path, workers: int | None, title: 
 
     The result is the same to the last bit for any number of workers and ranks.
     """
-    sampler = Sampler(settings)
+    sampler = settings.sampler()
     todo = [shard for shard in mine(sampler.shards) if sampler.load(folder, shard) is None]
     done = run_tasks(
         _run_shard,

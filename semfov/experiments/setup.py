@@ -14,7 +14,7 @@ from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
 from semfov.data.scene import Scenes
 from semfov.detection.detector import Detector
 from semfov.detection.load import check_detector, load_detector
-from semfov.errors import DataError, InputError
+from semfov.errors import DataError, InputError, check
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.looks import one_thread
 from semfov.eye import Eye
@@ -25,6 +25,7 @@ from semfov.io.files import check_regular
 from semfov.io.shipped import shipped_model
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor import Foveation
+from semfov.zoom.eye import ZoomEye
 
 
 def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
@@ -60,6 +61,33 @@ def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
         ids=None if data.ids is None else read_ids(data.ids),
         max_target_area=data.max_target_area,
         limit=data.limit,
+    )
+
+
+def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) -> tuple[Scenes, Scenes]:
+    """All photographs but every n-th, and these; of embedded scenes two sets.
+
+    Raises:
+        InputError: there are too few to split.
+    """
+    check_data(data)
+    if data.root is None or data.annotations is None:
+        from semfov.data.scenes import EmbeddedScenes
+
+        count = data.limit or 16
+        return (
+            EmbeddedScenes(classes, count=count, seed=data.scene_seed),
+            EmbeddedScenes(classes, count=count, seed=data.scene_seed + 1),
+        )
+    from semfov.data.coco import CocoScenes
+
+    selection: dict[str, Any] = {"min_instances": data.min_instances, "max_target_area": data.max_target_area}
+    ids = CocoScenes(data.root, data.annotations, classes, limit=data.limit, **selection).ids
+    check(len(ids) >= 2 * every, "data", f"at least {2 * every} photographs", len(ids))
+    kept = [name for number, name in enumerate(ids) if number % every]
+    return (
+        CocoScenes(data.root, data.annotations, classes, ids=kept, **selection),
+        CocoScenes(data.root, data.annotations, classes, ids=ids[::every], **selection),
     )
 
 
@@ -119,6 +147,16 @@ def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
     """The observation model of that name, or the one for this eye; checked to belong to detector and class list."""
     own = recommended(eye.detector.name, float(fovea_of(eye).growth))
     model = FovealObservationModel.from_pretrained(name or shipped_model(FovealObservationModel, own, "MODEL"))
+    model.check_compatible(eye.settings(), eye.detector.classes)
+    return model.requires_grad_(False)
+
+
+def make_zoom_observation(name: str | None, eye: ZoomEye) -> FovealObservationModel | None:
+    """The observation model by magnification of that name, or the one for this eye; None where none is shipped."""
+    own = f"{eye.detector.name}-zoom"
+    if name is None and not (FovealObservationModel.shipped / f"{own}.safetensors").is_file():
+        return None
+    model = FovealObservationModel.from_pretrained(name or own)
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)
 

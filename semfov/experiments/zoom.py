@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
@@ -14,25 +14,29 @@ from torch import Tensor
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scenes
+from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch
 from semfov.errors import DataError
 from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.parts import Parts, Record
 from semfov.experiments.run import cache_folder, digest_of
-from semfov.experiments.settings import Range, Seed, Settings, Side, Whole, Workers
-from semfov.experiments.setup import make_detector, make_scenes
+from semfov.experiments.search_protocol import choose_classes
+from semfov.experiments.settings import Count, Range, Seed, Settings, Side, Whole, Workers
+from semfov.experiments.setup import make_detector, make_scenes, make_zoom_observation
 from semfov.experiments.store import versions
+from semfov.experiments.zoom_decisions import decide_all
 from semfov.experiments.zoom_orders import oracle, quad_tree, ranked, raster, shuffled, slices
-from semfov.experiments.zoom_store import GlanceStore, StoredGlances
+from semfov.experiments.zoom_store import GlanceStore, StoredGlances, open_scene
 from semfov.io.code import package_digest
 from semfov.io.storage import checksum
 from semfov.observation.matching import box_iou
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, ZoomEye
 from semfov.zoom.gist import FOUND
-from semfov.zoom.glances import Glance, Glances, LiveGlances, Window, around, half_steps
+from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
+from semfov.zoom.observed import ObservedRates
 from semfov.zoom.search import find_everything, look_for
 
 SHOWN = 0.3
@@ -41,6 +45,9 @@ SHOWN = 0.3
 
 Tile = Annotated[int, Range(16, 16_384)]
 """Side in pixels of a part of a picture."""
+
+
+Measure = Literal["recall", "hit", "decision"]
 
 
 @dataclass(frozen=True)
@@ -58,8 +65,14 @@ class ZoomConfig(Settings):
         slice: side in pixels of the slices of photographs; those of mosaics are their photographs.
         overlap: of neighbouring slices.
         passes: of the detector, at most.
+        measures: what is measured: `recall` after each pass, passes to the `hit` that a slice of a mosaic shows, and
+            what searches end with, the `decision`.
+        sought: classes that a picture holds, and as many that it does not, to search for until it is decided (with a
+            `target` that alone).
         cut: what becomes of boxes at a window's border.
         model: fitted evidence by magnification, by name or file (None: the one shipped for the detector).
+        observation: observation model by magnification to compare with, by name or file (None: the one shipped for
+            the detector, if there is one).
         seed: of mosaics and random orders.
         out: folder for tables, records and figures.
         cache: folder for looks, shared between runs (None: the user's cache).
@@ -77,8 +90,11 @@ class ZoomConfig(Settings):
     slice: Tile = 640
     overlap: Annotated[float, Range(0, 0.9)] = 0.2
     passes: Annotated[int, Range(2, 100_000)] = 24
+    measures: tuple[Measure, ...] = ("recall", "hit", "decision")
+    sought: Count = 4
     cut: Cut = "keep"
     model: str | None = None
+    observation: str | None = None
     seed: Seed = 0
     out: Path = Path("runs/zoom")
     cache: Path | None = None
@@ -102,6 +118,7 @@ class ZoomRun:
         self.eye = ZoomEye(detector, cut=config.cut).eval().requires_grad_(False)
         self.evidence = GlimpseEvidence.from_pretrained(config.model or detector.name).requires_grad_(False)
         self.evidence.check_compatible(self.eye.settings())
+        self.observation = make_zoom_observation(config.observation, self.eye)
         photographs = make_scenes(config.data, detector.classes)
         if not len(photographs):
             raise DataError("data: no photograph passes the selection; lower data.min_instances or raise data.limit")
@@ -119,10 +136,13 @@ class ZoomRun:
 
     def _key(self) -> str:
         settings = asdict(self.config)
-        besides = ("out", "cache", "store", "workers", "data", "detector", "model")
+        besides = ("out", "cache", "store", "workers", "data", "detector", "model", "observation")
         protocol = {name: value for name, value in settings.items() if name not in besides}
-        model = [checksum(self.evidence.state_dict()), self.evidence.patience, self.evidence.foresight]
-        return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, model])
+        evidence = self.evidence
+        thresholds = None if evidence.thresholds is None else asdict(evidence.thresholds)
+        model = [checksum(evidence.state_dict()), evidence.patience, evidence.foresight, thresholds]
+        observed = None if self.observation is None else checksum(self.observation.state_dict())
+        return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, model, observed])
 
     @property
     def parts(self) -> Parts:
@@ -131,14 +151,7 @@ class ZoomRun:
 
     def glances(self, index: int) -> StoredGlances:
         """Looks at a scene."""
-        size = self.scenes.annotation(index).size
-        lattice = Lattice.over(size, self.eye.detector.input_size, finest=self.eye.finest)
-
-        def live() -> Glances:
-            return LiveGlances(self.eye, self.eye.open(self.scenes[index].image))
-
-        store = self.store if self.config.store else None
-        return StoredGlances(lattice, live, store, self.scenes.digest(index))
+        return open_scene(self.eye, self.scenes, index, self.store if self.config.store else None)
 
     def slices(self, index: int, lattice: Lattice) -> list[Window]:
         """What slicing looks at: the photographs of a mosaic, or squares of a picture."""
@@ -151,11 +164,20 @@ class ZoomRun:
         """Records of a scene: recall after each pass, and passes to the first hit, for every way of looking."""
         watch = Stopwatch()
         glances = self.glances(index)
-        records = [self._recall(name, index, looks) for name, looks in self._finding(index, glances)]
+        records: list[Record] = []
+        measures = self.config.measures
+        for name, looks in self._finding(index, glances) if "recall" in measures else ():
+            seen = [*islice(looks, self.config.passes)]
+            records.append(self._recall(name, index, seen))
+            if name in ("slices, raster", "ours"):
+                records.append(self._recall(f"{name}, cut boxes dropped", index, [*map(without_cut, seen)]))
         watch.lap("recall")
-        if self.config.mosaics:
+        if self.config.mosaics and "hit" in measures:
             records += self._first_hits(index, glances)
         watch.lap("first hit")
+        if "decision" in measures:
+            records += self._decisions(index, glances)
+        watch.lap("decision")
         glances.save()
         return records, watch.seconds
 
@@ -169,9 +191,25 @@ class ZoomRun:
         yield "quad-tree, best first", quad_tree(glances, target, most=False)
         yield "ours", (glance for glance, _ in find_everything(glances, self.evidence, target))
         yield "ours, four at a time", (g for g, _ in find_everything(glances, self.evidence, target, batch=4))
+        if self.observation is not None:
+            observed = ObservedRates(self.observation, glances.lattice, foresight=self.evidence.foresight)
+            yield "by the observation model", (g for g, _ in find_everything(glances, observed, target))
         found: Callable[[Glance], Tensor] = lambda glance: found_in([glance], annotation, target)  # noqa: E731
         every = [*half_steps(glances.lattice)][1:]
         yield "oracle", oracle(glances, [*every, *cut], found, self.config.passes)
+
+    def _decisions(self, index: int, glances: Glances) -> list[Record]:
+        """Searches for what is there and for what is not."""
+        config, annotation = self.config, self.scenes.annotation(index)
+        targets = (
+            choose_classes(self.scenes, index, annotation, config.sought, 1.0, config.seed)
+            if self.target is None
+            else [self.target]
+        )
+        names = "background", *self.scenes.classes
+        cut = self.slices(index, glances.lattice)
+        records = decide_all(glances, self.evidence, names, targets, annotation, cut, passes=config.passes)
+        return [record | {"scene": self.scenes.ids[index]} for record in records]
 
     def annotation(self, index: int) -> Annotation:
         """Objects that count."""
@@ -181,11 +219,9 @@ class ZoomRun:
         kept = annotation.labels == self.target
         return Annotation(annotation.boxes[kept], annotation.labels[kept], annotation.crowd[kept], annotation.size)
 
-    def _recall(self, name: str, index: int, looks: Iterator[Glance]) -> Record:
-        annotation, seen, counts = self.annotation(index), [], []
-        for glance in islice(looks, self.config.passes):
-            seen.append(glance)
-            counts.append(int(found_in(seen, annotation, self.target).sum()))
+    def _recall(self, name: str, index: int, seen: list[Glance]) -> Record:
+        annotation = self.annotation(index)
+        counts = [int(found_in(seen[: n + 1], annotation, self.target).sum()) for n in range(len(seen))]
         boxes = len(merge(seen, self.target, score=FOUND))
         return {
             "measure": "recall",
@@ -231,6 +267,13 @@ class ZoomRun:
                     }
                 )
         return records
+
+
+def without_cut(glance: Glance) -> Glance:
+    """A look without the boxes that the border of its window cuts."""
+    seen, whole = glance.detections, ~glance.cut
+    detections = Detections(seen.boxes[:, whole], seen.scores[:, whole], seen.mask[:, whole])
+    return replace(glance, detections=detections, cut=glance.cut[whole])
 
 
 def found_in(looks: Sequence[Glance], annotation: Annotation, target: int | None = None) -> Tensor:

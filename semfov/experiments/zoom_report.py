@@ -4,13 +4,17 @@ import json
 from collections import defaultdict
 from statistics import mean, median
 
+import torch
+
 from semfov.errors import DataError
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.run import finish
 from semfov.experiments.summary import announce, table
 from semfov.experiments.zoom import ZoomConfig, ZoomRun
+from semfov.experiments.zoom_decisions import decision_tables, probabilities
 from semfov.io.files import write_text
+from semfov.viz.reliability import plot_reliability
 from semfov.viz.style import save_figure
 
 
@@ -29,7 +33,13 @@ def zoom(config: ZoomConfig) -> None:
     text = summary(records, run)
     write_text(config.out / "zoom.md", text)
     write_text(config.out / "records.jsonl", "".join(json.dumps(record) + "\n" for record in records))
-    written = [config.out / "zoom.md", config.out / "records.jsonl", _curves(records, run)]
+    written = [config.out / "zoom.md", config.out / "records.jsonl"]
+    if "recall" in config.measures:
+        written.append(_curves(records, run))
+    if decided := [record for record in records if record["measure"] == "decision"]:
+        told, there = probabilities(decided)
+        sure = {name: (torch.stack([1 - score, score], -1), there.long()) for name, score in told.items()}
+        written.append(save_figure(plot_reliability(sure), config.out / "reliability.png"))
     announce(text, written)
 
 
@@ -42,27 +52,11 @@ def curve(records: list[Record], passes: int) -> list[float]:
 
 def summary(records: list[Record], run: ZoomRun) -> str:
     """Tables as Markdown."""
-    passes = run.config.passes
-    at = sorted({n for n in (1, 4, 8, 12, 16, 24) if n <= passes} | {passes})
     groups: dict[tuple[str, str], list[Record]] = defaultdict(list)
     for record in records:
         groups[record["measure"], record["way"]].append(record)
     finding = {way: group for (measure, way), group in groups.items() if measure == "recall"}
-    pixels = run.eye.detector.input_size[0] * run.eye.detector.input_size[1] / 1e6
-    rows = [["", *map(str, at), "area under the curve", "boxes for each object"]]
-    for way, group in finding.items():
-        line = curve(group, passes)
-        boxes = sum(r["boxes"] for r in group) / max(sum(r["objects"] for r in group), 1)
-        rows.append([way, *(f"{line[n - 1]:.3f}" for n in at), f"{mean(line):.3f}", f"{boxes:.2f}"])
-    what = "objects" if run.config.target is None else run.config.target
-    objects = sum(record["objects"] for record in next(iter(finding.values())))
-    lines = [
-        f"Recall of {objects} {what} in {len(run.scenes)} pictures after so many passes of the detector, overview "
-        f"included (score 0.1, IoU 0.5); a pass sees {pixels:.3f} million pixels.",
-        "",
-        *table(rows),
-        "",
-    ]
+    lines = recalls(finding, run) if finding else []
     hits = {way: group for (measure, way), group in groups.items() if measure == "first hit"}
     if hits:
         rows = [["", "mean", "median", "failures at the cap"]]
@@ -78,7 +72,30 @@ def summary(records: list[Record], run: ZoomRun) -> str:
             *table(rows),
             "",
         ]
+    if decided := groups.get(("decision", "ours")):
+        lines += decision_tables(decided)
     return "\n".join(lines)
+
+
+def recalls(finding: dict[str, list[Record]], run: ZoomRun) -> list[str]:
+    """What every way of looking finds."""
+    passes = run.config.passes
+    at = sorted({n for n in (1, 4, 8, 12, 16, 24) if n <= passes} | {passes})
+    pixels = run.eye.detector.input_size[0] * run.eye.detector.input_size[1] / 1e6
+    rows = [["", *map(str, at), "area under the curve", "boxes for each object"]]
+    for way, group in finding.items():
+        line = curve(group, passes)
+        boxes = sum(r["boxes"] for r in group) / max(sum(r["objects"] for r in group), 1)
+        rows.append([way, *(f"{line[n - 1]:.3f}" for n in at), f"{mean(line):.3f}", f"{boxes:.2f}"])
+    what = "objects" if run.config.target is None else run.config.target
+    objects = sum(record["objects"] for record in next(iter(finding.values())))
+    return [
+        f"Recall of {objects} {what} in {len(run.scenes)} pictures after so many passes of the detector, overview "
+        f"included (score 0.1, IoU 0.5); a pass sees {pixels:.3f} million pixels.",
+        "",
+        *table(rows),
+        "",
+    ]
 
 
 def _curves(records: list[Record], run: ZoomRun):  # type: ignore[no-untyped-def]

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.detection.load import load_detector
 from semfov.experiments.gists import gist_fields, pack_gists, unpack_gists
@@ -14,7 +15,8 @@ from semfov.experiments.looks import one_thread
 from semfov.experiments.store import SceneStore
 from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
-from semfov.zoom.glances import Glance, Glances, Window
+from semfov.zoom.eye import ZoomEye
+from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.lattice import Lattice
 
 SOURCES = (Glances.__module__, load_detector.__module__, "semfov.data.images", "semfov.data.large", __name__)
@@ -39,7 +41,7 @@ class GlanceStore(SceneStore):
                 "boxes": Field(("M", 4), torch.float32),
                 "scores": Field(("M", classes + 1), torch.float32, low=0, high=1),
                 "cut": Field(("M",), torch.bool),
-                **gist_fields(torch.float32, classes),
+                **gist_fields(classes),
             }
         )
         super().__init__(folder, {"settings": settings}, modules_digest(*SOURCES), schema)
@@ -94,6 +96,16 @@ class StoredGlances(Glances):
             self._kept = len(self._known)
 
 
+def open_scene(eye: ZoomEye, scenes: Scenes, index: int, store: GlanceStore | None) -> StoredGlances:
+    """Looks of an eye at a scene; it is composed, or read, when a look is not in the store."""
+    lattice = Lattice.over(scenes.annotation(index).size, eye.detector.input_size, finest=eye.finest)
+
+    def live() -> Glances:
+        return LiveGlances(eye, eye.open(scenes[index].image))
+
+    return StoredGlances(lattice, live, store, scenes.digest(index))
+
+
 def pack(glances: Sequence[Glance]) -> dict[str, Tensor]:
     """Glances as tensors for a file."""
     # No window ends at 0: four zeros stand for one without a limit.
@@ -108,7 +120,7 @@ def pack(glances: Sequence[Glance]) -> dict[str, Tensor]:
         "scores": torch.cat([g.detections.scores[0] for g in glances]),
         "cut": torch.cat([g.cut for g in glances]),
         "show": torch.stack([g.show for g in glances]),
-        **pack_gists([g.gist for g in glances], len(glances[0].show), torch.float32),
+        **pack_gists([g.gist for g in glances], len(glances[0].show)),
     }
 
 

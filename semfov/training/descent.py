@@ -16,6 +16,7 @@ def descend(
     rate: float,
     *,
     clip: float | None = 1.0,
+    decay: float = 1e-2,
     title: str = "training",
 ) -> None:
     """Train by AdamW, with one cycle of the learning rate (Smith and Topin, 2019).
@@ -26,10 +27,11 @@ def descend(
         steps: how many.
         rate: highest learning rate.
         clip: norm that gradients are cut to; None leaves them.
+        decay: of weights, in AdamW's sense.
         title: label of the progress bar.
     """
     trained = list(parameters)
-    optimiser = torch.optim.AdamW(trained, lr=rate, weight_decay=1e-2)
+    optimiser = torch.optim.AdamW(trained, lr=rate, weight_decay=decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
     with closing(task_bar(steps, title, "step")) as bar:
         for number in range(steps):

@@ -19,7 +19,7 @@ from semfov.episode import Step
 from semfov.errors import DataError, InputError
 from semfov.experiments.config import ProtocolConfig
 from semfov.experiments.run import digest_of
-from semfov.experiments.samples import Samples
+from semfov.experiments.samples import Samples, cells_of
 from semfov.experiments.seeds import generator_for
 from semfov.gaze.policies import Closer, NonPredictive, Policy, Random
 from semfov.io.files import sha256, write_text
@@ -185,7 +185,8 @@ class Workshop:
             raise DataError(f"too few detections to fit on and to judge by ({len(samples)}); give more photographs")
         model = fit_model(config, run, samples[~held_out])
         fitted_on = {index for index in range(len(run.scenes)) if index % config.holdout}
-        misses = count_misses(run.scenes, samples, fitted_on, model.edges, self.config.columns, self.config.rows)
+        cells = cells_of(self.config.columns, self.config.rows)
+        misses = count_misses(run.scenes, samples, fitted_on, model.edges, cells)
         model.miss_rate = misses.rates().to(model.edges)
         raw = FovealObservationModel.identity(run.scenes.classes, config.edges).eval()
         with torch.inference_mode():

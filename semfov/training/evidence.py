@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import torch
 from torch import Tensor
@@ -195,13 +195,30 @@ def judge(
     return judged, choose_thresholds(config, torch.stack(anywhere), looked, torch.stack(following), there)
 
 
-def choose_thresholds(
-    config: FitSearchConfig, anywhere: Tensor, looked: Tensor, left: Tensor, there: Tensor
-) -> Thresholds:
+class Bounds(Protocol):
+    """What thresholds are chosen by: see `FitSearchConfig`."""
+
+    @property
+    def false_alarms(self) -> float:
+        """Share of absent targets that may be called found."""
+        ...
+
+    @property
+    def surest(self) -> float:
+        """Probability from which on a target counts as found at the latest."""
+        ...
+
+    @property
+    def lost(self) -> float:
+        """Share of the targets that may be missed because no look is worth its price any more."""
+        ...
+
+
+def choose_thresholds(config: Bounds, anywhere: Tensor, looked: Tensor, left: Tensor, there: Tensor) -> Thresholds:
     """The least confirmation with so few false alarms, and the largest price of a look that loses so few targets.
 
     Args:
-        config: of the fit.
+        config: how many mistakes are allowed.
         anywhere: `(n, E)`, probability of presence after each look of each search.
         looked: `(n, E)` boolean, whether a cell about as probable as any was fixated.
         left: `(n, E)`, greatest chance of a cell that was not.

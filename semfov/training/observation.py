@@ -7,6 +7,7 @@ from semfov.data.scene import Scenes
 from semfov.errors import DataError, check
 from semfov.experiments.parallel import rank
 from semfov.experiments.samples import Samples, SampleSettings, collect
+from semfov.experiments.zoom_samples import MosaicSettings
 from semfov.eye import Eye
 from semfov.observation import fit_discriminative
 from semfov.observation.foveal import FovealObservationModel
@@ -16,12 +17,14 @@ from semfov.training.misses import count_misses
 from semfov.training.observation_report import write_report
 from semfov.training.observation_settings import FitConfig
 from semfov.training.outputs import model_path
+from semfov.zoom.eye import ZoomEye
 
 
 def fit_fom(config: FitConfig) -> None:
     """Collect labelled detections, fit the model, judge it on held-out photographs, and write everything."""
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
-    settings = SampleSettings.of(config)
+    kind = MosaicSettings if config.mosaics else SampleSettings
+    settings = kind.of(config)
     sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
     if rank() > 0:
         return
@@ -30,7 +33,10 @@ def fit_fom(config: FitConfig) -> None:
         raise DataError(f"data: too few detections to fit on and to judge by ({len(samples)}); give more photographs")
     model = fit_model(config, sampler, samples[~held_out])
     fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
-    model.miss_rate = count_misses(sampler.scenes, samples, fitted_on, model.edges).rates().to(model.edges)
+    misses = count_misses(sampler.scenes, samples, fitted_on, model.edges, sampler.cells)
+    model.miss_rate = misses.rates().to(model.edges)
+    if config.mosaics:
+        model.metadata["cells"] = misses.total.sum(1).tolist()
     path = model_path(config, sampler.eye.detector.name)
     model.save(path)
     written = write_report(config, model, fit_all(config, sampler, samples[~held_out], model), samples, held_out)
@@ -42,7 +48,11 @@ def fit_fom(config: FitConfig) -> None:
 class Looker(Protocol):
     """What has looked at photographs: a `Sampler`, or a run over the looks from every cell."""
 
-    eye: Eye
+    @property
+    def eye(self) -> Eye | ZoomEye:
+        """What looked."""
+        ...
+
     scenes: Scenes
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 import yaml
+from torch import Tensor
 
 from semfov.experiments.samples import Samples
 from semfov.experiments.setup import plain
@@ -38,7 +39,8 @@ def write_report(
             for name, m in models.items()
         }
     figures = {name: calibration(p, judged.labels) for name, p in predictions.items()}
-    text = report_markdown(config, model, figures, likelihood, len(samples) - len(judged))
+    by_level = figures_by_level(model, predictions, judged)
+    text = report_markdown(config, model, figures, likelihood, by_level, len(samples) - len(judged))
     print(text)
     write_text(config.out / "report.md", text)
     write_text(config.out / "config.yaml", yaml.safe_dump(plain(asdict(config)), sort_keys=False))
@@ -55,6 +57,7 @@ def report_markdown(
     model: FovealObservationModel,
     figures: dict[str, Calibration],
     likelihood: dict[str, float],
+    by_level: list[list[str]],
     fitted: int,
 ) -> str:
     """The report: figures of each model, then counts by level."""
@@ -65,28 +68,53 @@ def report_markdown(
          f"{f.classwise_ece:.4f}", f"{f.accuracy:.3f}"]
         for name, f in figures.items()
     ]  # fmt: skip
+    summary = table([head, *rows])
     counts = torch.tensor(model.metadata["counts"])
     fallback = model.metadata["fallback"]
     edges = ["0", *(f"{edge:.3f}" for edge in model.edges.tolist()), "…"]
     levels = [
-        [f"{low} - {high}", str(int(counts[0, n])), str(int(counts[1:, n].sum())), str(fallback.get(str(n), ""))]
+        [
+            f"{low} - {high}",
+            str(int(counts[0, n])),
+            str(int(counts[1:, n].sum())),
+            str(fallback.get(str(n), "")),
+            *by_level[n],
+        ]
         for n, (low, high) in enumerate(pairwise(edges))
     ]
+    what = "octaves that the picture is reduced by" if config.mosaics else "distance"
+    where = what if config.mosaics else "distance to the fixation in longer sides of the image"
+    head = [what, "background", "objects", "takes those of level", "NLL, raw", "NLL", "ECE, raw", "ECE"]
     return "\n".join(
         [
             f"Fitted on {fitted} detections, judged on {judged} of photographs that were held out "
             f"(every {config.holdout}th). Log likelihood of the scores given the true class, and figures of the "
             "posterior of the class, background included.",
             "",
-            *table([head, *rows]),
+            *summary,
             "",
-            "Detections that the fit saw, by distance to the fixation in longer sides of the image; levels with too",
-            "few objects take the parameters of another level.",
+            f"Detections that the fit saw, by {where}; levels with too few objects take the parameters of another "
+            "level. Beside them figures of raw scores and of the model on what was held out.",
             "",
-            *table([["distance", "background", "objects", "takes those of level"], *levels]),
+            *table([head, *levels]),
             "",
         ]
     )
+
+
+def figures_by_level(model: FovealObservationModel, predictions: dict[str, Tensor], judged: Samples) -> list[list[str]]:
+    """NLL and ECE of raw scores and of the model that was asked for, level by level."""
+    first, *_, last = predictions.values()
+    level = model.level(judged.distance)
+    rows = []
+    for n in range(len(model.edges) + 1):
+        here = level == n
+        if not here.any():
+            rows.append([""] * 4)
+            continue
+        raw, own = (calibration(told[here], judged.labels[here]) for told in (first, last))
+        rows.append([f"{value:.3f}" for value in (raw.nll, own.nll, raw.ece, own.ece)])
+    return rows
 
 
 def counts_csv(model: FovealObservationModel) -> str:

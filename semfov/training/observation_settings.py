@@ -20,7 +20,10 @@ class FitConfig(Settings):
         method: `newton`, `fixed_point` (both Minka's; the paper does not say which) and `gradient` maximise the
             likelihood, where `enough` lets them;
             `discriminative` trains the posterior of the class itself, which is what calibration needs.
-        fixations: random fixations in each photograph.
+        mosaics: mosaics of 8 × 6 photographs to look at in windows, for pictures larger than the detector's input
+            (0: photographs, through the fovea). Levels are then octaves that the picture is reduced by, and `width` and
+            `sensor` are of no account.
+        fixations: random fixations in each photograph; of a mosaic, windows at each magnification.
         levels: levels of distance, each `width` wide and the last one open.
         width: width of a level for a fovea of 100 pixels, in pixels of an image whose longer side is 640; it grows
             with the fovea.
@@ -42,6 +45,7 @@ class FitConfig(Settings):
     sensor: SensorConfig = field(default_factory=SensorConfig)
     name: Name | None = None
     method: Literal["newton", "fixed_point", "gradient", "discriminative"] = "discriminative"
+    mosaics: Whole = 0
     fixations: Count = 8
     levels: Annotated[int, Range(1, 1000)] = 8
     width: Positive = 50.0
@@ -58,6 +62,8 @@ class FitConfig(Settings):
 
     @property
     def edges(self) -> list[float]:
-        """Borders between the levels, in longer sides of the image."""
+        """Borders between the levels, in longer sides of the image; of mosaics, in octaves."""
+        if self.mosaics:
+            return [n - 0.5 for n in range(1, self.levels)]
         step = self.width / 100.0 * self.sensor.fovea
         return [step * n for n in range(1, self.levels)]

@@ -79,7 +79,7 @@ def fit_tempering(config: FitTemperingConfig) -> None:
     sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
     if rank() > 0:
         return
-    model = make_observation(None, sampler.eye) if config.calibrated else None
+    model = make_observation(None, sampler.foveal_eye) if config.calibrated else None
     hits = {tempering: measure(config, sampler, samples, model, tempering) for tempering in config.exponents}
     text = report(hits)
     write_outputs(config, text, ("hits.json", json.dumps(hits, indent=2) + "\n"))

@@ -3,8 +3,7 @@
 import logging
 import random
 from collections import defaultdict
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,60 +11,26 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.data.mosaics import Mosaics
-from semfov.data.scene import Scenes
-from semfov.data.scenes import EmbeddedScenes
-from semfov.errors import check
-from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.parallel import available_cores, run_tasks
 from semfov.experiments.run import cache_folder
-from semfov.experiments.settings import Count, Seed, Settings, Workers
-from semfov.experiments.setup import make_detector, prepare_worker
+from semfov.experiments.setup import make_detector, prepare_worker, split_photographs
 from semfov.experiments.summary import table as table_of
-from semfov.experiments.zoom import SHOWN, Tile
-from semfov.experiments.zoom_store import GlanceStore
+from semfov.experiments.zoom import SHOWN
+from semfov.experiments.zoom_store import GlanceStore, open_scene
 from semfov.io.files import inside
 from semfov.training.outputs import training_of, write_outputs
-from semfov.training.zoom_choice import choose
-from semfov.training.zoom_examples import LookedAt, MosaicStore, ZoomExample, look_at_mosaic, pack, unpack
+from semfov.training.zoom_choice import choose, open_all
+from semfov.training.zoom_decision import fit_judge, judge_searches, search_mosaics
+from semfov.training.zoom_examples import LookedAt, ZoomExample, example_of, windows_of
+from semfov.training.zoom_settings import FitZoomConfig
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
 from semfov.zoom.eye import ZoomEye
-from semfov.zoom.lattice import Lattice
+
+DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", "tile", "seed")
+"""Settings that thresholds and the probability of presence depend on."""
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class FitZoomConfig(Settings):
-    """Fit evidence by magnification on mosaics.
-
-    Args:
-        data: photographs to compose mosaics of; every fifth is held out.
-        detector: which detector looks.
-        mosaics: mosaics of 4 × 4 photographs.
-        far: mosaics of 8 × 6 photographs, in which objects are half as large.
-        judged: mosaics of 4 × 4 photographs that were held out, to judge the fit and to choose by.
-        judged_far: mosaics of 8 × 6 photographs that were held out, to choose by.
-        tile: width of a photograph's slot in pixels; three quarters of it is the height.
-        steps: of each fit.
-        seed: of mosaics and fit.
-        out: folder for the model and a report.
-        cache: folder for the looks (None: the user's cache).
-        workers: processes (None: one for each CPU core).
-    """
-
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
-    detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
-    mosaics: Count = 400
-    far: Count = 40
-    judged: Count = 80
-    judged_far: Count = 4
-    tile: Tile = 480
-    steps: Count = 800
-    seed: Seed = 0
-    out: Path = Path("runs/fit_zoom")
-    cache: Path | None = None
-    workers: Workers | None = None
 
 
 @dataclass(frozen=True)
@@ -98,38 +63,20 @@ def make_eye(config: FitZoomConfig) -> ZoomEye:
 
 def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Mosaics]:
     """Mosaics to fit on, near and far, and those of photographs that were held out."""
-    kept, held = split(config.data, classes)
+    kept, held = split_photographs(config.data, classes, 5)
     tile = config.tile, config.tile * 3 // 4
     return {
         "near": Mosaics(kept, 4, 4, tile=tile, count=config.mosaics, seed=config.seed),
         "far": Mosaics(kept, 8, 6, tile=tile, count=config.far, seed=config.seed + 1),
         "judged": Mosaics(held, 4, 4, tile=tile, count=config.judged, seed=config.seed + 2),
         "judged far": Mosaics(held, 8, 6, tile=tile, count=config.judged_far, seed=config.seed + 3),
+        "searched": Mosaics(kept, 4, 4, tile=tile, count=config.searched, seed=config.seed + 4),
     }
 
 
-def split(data: DataConfig, classes: tuple[str, ...]) -> tuple[Scenes, Scenes]:
-    """Four fifths of the photographs, and every fifth."""
-    if data.root is None or data.annotations is None:
-        return (
-            EmbeddedScenes(classes, count=data.limit or 16, seed=data.scene_seed),
-            EmbeddedScenes(classes, count=data.limit or 16, seed=data.scene_seed + 1),
-        )
-    from semfov.data.coco import CocoScenes
-
-    selection: dict[str, Any] = {"min_instances": data.min_instances, "max_target_area": data.max_target_area}
-    every = CocoScenes(data.root, data.annotations, classes, limit=data.limit, **selection).ids
-    check(len(every) >= 10, "data", "at least 10 photographs", len(every))
-    kept = [name for number, name in enumerate(every) if number % 5]
-    return (
-        CocoScenes(data.root, data.annotations, classes, ids=kept, **selection),
-        CocoScenes(data.root, data.annotations, classes, ids=every[::5], **selection),
-    )
-
-
-def make_store(config: FitZoomConfig, eye: ZoomEye) -> MosaicStore:
+def make_store(config: FitZoomConfig, eye: ZoomEye) -> GlanceStore:
     """Where looks at mosaics are kept."""
-    return MosaicStore(cache_folder(config.cache) / "mosaics", eye.settings(), len(eye.detector.classes))
+    return GlanceStore(cache_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
 
 
 _process: dict[str, Any] = {}
@@ -143,24 +90,18 @@ def prepare_process(config: FitZoomConfig) -> None:
 
 
 def look(task: tuple[str, int]) -> tuple[str, int]:
-    """Look at a mosaic, unless that was done before."""
+    """Look at a mosaic, where that was not done before."""
     kind, index = task
-    mosaics, store = _process["mosaics"][kind], _process["store"]
-    if store.read(mosaics.digest(index)) is None:
-        store.write(mosaics.digest(index), pack(look_at_mosaic(_process["eye"], mosaics, index)))
+    mosaics = _process["mosaics"][kind]
+    glances = open_scene(_process["eye"], mosaics, index, _process["store"])
+    glances.see(windows_of(mosaics, index, glances.lattice))
+    glances.save()
     return task
 
 
-def read_examples(mosaics: Mosaics, store: MosaicStore, eye: ZoomEye) -> list[ZoomExample]:
+def read_examples(mosaics: Mosaics, store: GlanceStore, eye: ZoomEye) -> list[ZoomExample]:
     """What was seen of all mosaics."""
-    lattice = Lattice.over(mosaics.size, eye.detector.input_size, finest=eye.finest)
-    examples = []
-    for index in range(len(mosaics)):
-        tensors = store.read(mosaics.digest(index))
-        assert tensors is not None
-        slots: Any = [tuple(map(float, tile.slot)) for tile in mosaics.tiles(index)]
-        examples.append(unpack(tensors, lattice, slots))
-    return examples
+    return [example_of(mosaics, n, open_scene(eye, mosaics, n, store)) for n in range(len(mosaics))]
 
 
 def table(examples: list[ZoomExample]) -> Windows:
@@ -314,8 +255,29 @@ def fit_zoom(config: FitZoomConfig) -> None:
     eye = make_eye(config)
     mosaics = make_mosaics(config, eye.detector.classes)
     store = make_store(config, eye)
-    looked = {kind: some for kind, some in mosaics.items() if kind != "judged far"}
-    todo = [(kind, n) for kind, some in looked.items() for n in range(len(some)) if store.read(some.digest(n)) is None]
+    parts: list[str] = []
+    figures = "{}"
+    if config.evidence is None:
+        model, examples = fit_looks(config, eye, mosaics, store)
+        tried = choose(model, eye, mosaics["judged"], mosaics["judged far"], store)
+        text, figures = judge(model, examples)
+        chosen = f"Chosen: foresight {model.foresight:g}, patience {model.patience:g}."
+        parts += [text, chosen, "", *table_of(tried), ""]
+    else:
+        model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
+        model.check_compatible(eye.settings())
+    parts += fit_decision(config, model, eye, mosaics, store)
+    path = inside(config.out, f"{eye.detector.name}.safetensors")
+    model.save(path)
+    write_outputs(config, "\n".join(parts), ("figures.json", figures), path)
+
+
+def fit_looks(
+    config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
+) -> tuple[GlimpseEvidence, list[ZoomExample]]:
+    """The model of what looks say of closer ones, and examples that were held out."""
+    looked = {kind: mosaics[kind] for kind in ("near", "far", "judged")}
+    todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
     workers = config.workers or available_cores()
     for _ in run_tasks(look, todo, workers=workers, setup=prepare_process, settings=(config,), title="looking",
                        unit="mosaic"):  # fmt: skip
@@ -329,15 +291,42 @@ def fit_zoom(config: FitZoomConfig) -> None:
     known = examples["near"] + examples["far"]
     fit_presence(model, table(known), config.steps)
     fit_rates(model, known, config.steps)
-    model.eval().requires_grad_(False)
-    glances = GlanceStore(cache_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
-    tried = choose(model, eye, mosaics["judged"], mosaics["judged far"], glances)
-    path = inside(config.out, f"{eye.detector.name}.safetensors")
-    model.save(path)
-    text, figures = judge(model, examples["judged"])
-    chosen = f"Chosen: foresight {model.foresight:g}, patience {model.patience:g}."
-    text = "\n".join([text, chosen, "", *table_of(tried), ""])
-    write_outputs(config, text, ("figures.json", figures), path)
+    return model.eval().requires_grad_(False), examples["judged"]
+
+
+def fit_decision(
+    config: FitZoomConfig, model: GlimpseEvidence, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
+) -> list[str]:
+    """Fit and choose when a search decides; returns what to report, lines of Markdown."""
+    prepare_worker()
+    torch.manual_seed(config.seed)
+    searches = {
+        kind: search_mosaics(
+            model,
+            mosaics[kind],
+            open_all(eye, mosaics[kind], store),
+            classes=config.sought,
+            passes=config.passes,
+            seed=config.seed,
+            title=title,
+        )
+        for kind, title in (("searched", "searching"), ("judged", "searching what was held out"))
+    }
+    fit_judge(model, searches["searched"], config.judging)
+    rows = judge_searches(model, searches["judged"], config)
+    assert model.thresholds is not None
+    model.metadata["decision"] = {name: getattr(config, name) for name in DECIDING}
+    count, told = (len(searches[kind].there) for kind in ("searched", "judged"))
+    return [
+        f"Whether a picture holds a class, fitted on {count} searches, half of them for what is not there; judged on "
+        f"{told} in mosaics of photographs that were held out.",
+        "",
+        *rows,
+        "",
+        f"Thresholds: found from {model.thresholds.confirm:.2f}, a look is worth its price from "
+        f"{model.thresholds.give_up:g}.",
+        "",
+    ]
 
 
 @torch.no_grad()

@@ -1,7 +1,6 @@
 """Choosing how evidence by magnification is gone by, on mosaics that were held out: `foresight` and `patience`."""
 
 from collections.abc import Sequence
-from functools import partial
 from itertools import islice
 
 import torch
@@ -10,11 +9,10 @@ from tqdm import tqdm
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.experiments.zoom import SHOWN, found_in
-from semfov.experiments.zoom_store import GlanceStore, StoredGlances
+from semfov.experiments.zoom_store import GlanceStore, StoredGlances, open_scene
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import ZoomEye
-from semfov.zoom.glances import Glance, Glances, LiveGlances, Window, around
-from semfov.zoom.lattice import Lattice
+from semfov.zoom.glances import Glance, Glances, Window, around
 from semfov.zoom.search import find_everything, look_for
 
 FORESIGHTS = (0.0, 0.1, 0.2, 0.35, 0.5)
@@ -70,12 +68,7 @@ def choose(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, far: Mosaics, st
 
 def open_all(eye: ZoomEye, mosaics: Mosaics, store: GlanceStore) -> list[StoredGlances]:
     """Looks at each mosaic."""
-    lattice = Lattice.over(mosaics.size, eye.detector.input_size, finest=eye.finest)
-
-    def live(index: int) -> Glances:
-        return LiveGlances(eye, eye.open(mosaics[index].image))
-
-    return [StoredGlances(lattice, partial(live, n), store, mosaics.digest(n)) for n in range(len(mosaics))]
+    return [open_scene(eye, mosaics, index, store) for index in range(len(mosaics))]
 
 
 def mean_recall(

@@ -14,17 +14,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def describe_zoom(path: ZoomPath) -> str:
-    """What came of it, in a sentence."""
-    count = sum(1 for score in path.objects.scores.tolist() if score >= 0.1)
-    what = "objects" if path.target is None else path.classes[path.target]
-    passes = f"{path.passes} pass{'es' if path.passes != 1 else ''}"
-    if path.decision is None:
-        named = f"{count} object{'s' if count != 1 else ''}" if path.target is None else f"{count} × {what}"
-        return f"{named} in {passes}"
-    return f"{what}: {path.decision.outcome} ({path.decision.probability:.2f}) in {passes}"
-
-
 @styled
 def plot_zoom_path(path: ZoomPath, image: Tensor, *, score: float = 0.1, ax: Axes | None = None) -> Figure:
     """The windows that were looked at, numbered in their order, and the objects that were found.
@@ -49,7 +38,7 @@ def plot_zoom_path(path: ZoomPath, image: Tensor, *, score: float = 0.1, ax: Axe
     for number, glance in enumerate(path.glances):
         if number == 0:
             continue
-        box = _shown(path, number)
+        box = path.shown(number)
         x1, y1, x2, y2 = box
         line: dict[str, Any] = {"fill": False, "edgecolor": GAZE, "linewidth": 0.8 + 0.5 * (glance.window.level == 1)}
         axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, **line))
@@ -65,7 +54,7 @@ def plot_zoom_path(path: ZoomPath, image: Tensor, *, score: float = 0.1, ax: Axe
             axes.text(x1, y2, path.classes[label], color="white", fontsize=5, parse_math=False, va="top", clip_on=True,
                       bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.5})  # fmt: skip
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
-    axes.set_title(describe_zoom(path), parse_math=False)
+    axes.set_title(path.describe(), parse_math=False)
     return figure
 
 
@@ -86,14 +75,3 @@ def _free(box: tuple[float, float, float, float], taken: list[tuple[float, float
         return min([room, *(max(abs(place[0] - x), abs(place[1] - y)) for x, y in taken)])
 
     return max(places, key=far)
-
-
-def _shown(path: ZoomPath, number: int) -> tuple[float, float, float, float]:
-    """What of the picture a look showed."""
-    window, (width, height) = path.glances[number].window, path.lattice.size
-    if window.within is not None:
-        return window.within
-    (x, y, magnification), (wide, high) = window.fixation, path.lattice.canvas
-    across, down = wide / magnification / 2, high / magnification / 2
-    x, y = x + 0.5, y + 0.5
-    return max(x - across, 0.0), max(y - down, 0.0), min(x + across, float(width)), min(y + down, float(height))

@@ -8,6 +8,7 @@ from torch import nn
 from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture
+from semfov.decision import check_thresholds
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
 from semfov.zoom.evidence import GlimpseEvidence
@@ -71,7 +72,13 @@ class ZoomAgent(nn.Module):
         return self.eye.open(picture).lattice.levels >= 3
 
     def search(
-        self, picture: Picture, target: str | int, *, passes: int = 24, confirm: float = 0.3, give_up: float = 0.005
+        self,
+        picture: Picture,
+        target: str | int,
+        *,
+        passes: int = 24,
+        confirm: float | None = None,
+        give_up: float | None = None,
     ) -> ZoomPath:
         """Search for one object of a class, and decide; see `semfov.zoom.search.search`.
 
@@ -79,16 +86,15 @@ class ZoomAgent(nn.Module):
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
             target: name or index (1..K) of the class.
             passes: of the detector, at most.
-            confirm: score from which on it is found.
-            give_up: probability below which no window is worth a look.
+            confirm: probability that the picture holds the target, from which on it is found (None: the evidence's).
+            give_up: probability that a look shows it, below which none is worth its price (None: the evidence's).
 
         Raises:
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
             DataError: the file cannot be read.
         """
         check_whole(passes, "passes", 1, MOST)
-        check_number(confirm, "confirm", 0, 1)
-        check_number(give_up, "give_up", 0, 1)
+        check_thresholds(confirm, give_up)
         index = class_index(target, self.classes[1:], "target")
         with torch.inference_mode():
             return search(

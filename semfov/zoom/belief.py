@@ -1,6 +1,7 @@
 """What looks at a picture say of where closer looks pay."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -10,6 +11,23 @@ from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool, pool_all
 from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
+
+
+class Rates(Protocol):
+    """What tells how many objects closer looks find: `GlimpseEvidence`, or `semfov.zoom.observed.ObservedRates`."""
+
+    @property
+    def foresight(self) -> float:
+        """Share of what still closer looks would find in a window that counts towards its value."""
+        ...
+
+    def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
+        """See `GlimpseEvidence.rates`."""
+        ...
+
+    def taper(self, span: int) -> Tensor:
+        """See `GlimpseEvidence.taper`."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -43,12 +61,13 @@ class ZoomBelief:
 
     Args:
         lattice: of the picture.
-        evidence: learned, by magnification.
+        evidence: learned, by magnification. What tells rates alone is enough to look for all objects.
         target: class 1..K, or 0 for any.
     """
 
-    def __init__(self, lattice: Lattice, evidence: GlimpseEvidence, target: int) -> None:
-        self.lattice, self.evidence, self.target = lattice, evidence, target
+    def __init__(self, lattice: Lattice, evidence: Rates, target: int) -> None:
+        self.lattice, self.target = lattice, target
+        self._rates = evidence
         shape = lattice.rows, lattice.columns
         self.rate = torch.zeros(STEPS, *shape)
         self.source = torch.full(shape, -1)
@@ -58,6 +77,12 @@ class ZoomBelief:
         self._changes: list[tuple[int, int, int, int]] = []
         self._tables: dict[tuple[int, tuple[int, int], int], _Table] = {}
         self._told: dict[Window, float] = {}
+
+    @property
+    def evidence(self) -> GlimpseEvidence:
+        """Learned evidence."""
+        assert isinstance(self._rates, GlimpseEvidence), "searches go by learned evidence"
+        return self._rates
 
     def restore(self, left: Tensor) -> None:
         """Go back to what was left to see before windows were discounted."""
@@ -101,7 +126,7 @@ class ZoomBelief:
         if look.level > 0:
             before = before_of(self.rate[:, *at], self.source[at], look)
         with torch.no_grad():
-            logs = self.evidence.rates(look, torch.tensor([self.target]), None if before is None else before[None])[0]
+            logs = self._rates.rates(look, torch.tensor([self.target]), None if before is None else before[None])[0]
         cells = logs.exp() / look.scale**2
         cells = cells.repeat_interleave(look.scale, -1).repeat_interleave(look.scale, -2)[:, :rows, :columns]
         newer = self.source[at] < look.level
@@ -117,7 +142,7 @@ class ZoomBelief:
     def finds(self, level: int) -> Tensor:
         """Objects that each window of a level is expected to find, `(down, across)`."""
         span = self.lattice.span(level)
-        weight = self.evidence.taper(span).detach()
+        weight = self._rates.taper(span).detach()
         image = self.expected(level)[None, None]
         wide, high = (max(span - n, 0) for n in (self.lattice.columns, self.lattice.rows))
         image = F.pad(image, (0, wide, 0, high))
@@ -137,22 +162,19 @@ class ZoomBelief:
             left, top = look.first
             shape = look.scores.shape[:2]
             high, wide = (max(n - span, 0) + 1 for n in shape)
-            row = (top + torch.arange(high) * look.scale).clamp(max=down - 1)
-            column = (left + torch.arange(wide) * look.scale).clamp(max=across - 1)
+            # Windows between the places that a coarse look tells go by the place before them.
+            there = slice(top, top + high * look.scale), slice(left, left + wide * look.scale)
             kept = self._tables.get((look.level, look.first, level))
             if kept is None or self._touched(look, kept.changes):
-                known = result[row[:, None], column]
+                known = result[there][:: look.scale, :: look.scale]
                 before = None if look.level == 0 else known.reshape(-1, 1).nan_to_num(neginf=-4.0)
                 kept = self._tell(look, level, before, kept)
                 self._tables[look.level, look.first, level] = kept
             table = kept.odds.view(high, wide)
             if look.scale > 1:
-                # Windows between the places that a coarse look tells go by the place before them.
                 table = table.repeat_interleave(look.scale, 0).repeat_interleave(look.scale, 1)
                 table = table[: down - top, : across - left]
-                result[top : top + table.shape[0], left : left + table.shape[1]] = table
-            else:
-                result[row[:, None], column] = table
+            result[there] = table
         self._odds[level] = result
         return result
 

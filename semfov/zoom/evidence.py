@@ -1,6 +1,7 @@
 """Learned evidence by magnification: what a look at a window says of closer looks at its parts."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -8,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semfov.belief.target_evidence import THRESHOLDS, Thresholds
 from semfov.errors import check, check_number, check_whole
 from semfov.io.compatibility import check_detector
 from semfov.io.pretrained import Pretrained
@@ -20,6 +22,8 @@ STEPS = 3
 _SUMMARY = 3
 _SHAPE, _SHAPE_WIDTH = 7, 24
 _RATE, _RATE_WIDTH = 14, 32
+CASE, _JUDGE_WIDTH = 11, 16
+"""What a search knows of whether its target is in the picture (`semfov.zoom.tally`)."""
 _FLOOR = 1e-4
 _LARGEST = 1e6
 
@@ -27,8 +31,8 @@ _LARGEST = 1e6
 class GlimpseEvidence(Pretrained):
     r"""What a look at a window says of looks at its parts, one to three octaves closer.
 
-    Two questions are asked of a part w, for a class t, and answered by two small networks that are fitted on mosaics of
-    photographs with boxes:
+    Two questions are asked of a part w, for a class t, and one of the whole picture. Small networks answer them, fitted
+    on mosaics of photographs with boxes:
 
     - does a closer look at w show t, with a score of 0.3 or more? Its log odds go by the strongest hint in w of t and
       of every other class, for things keep company:
@@ -41,7 +45,12 @@ class GlimpseEvidence(Pretrained):
 
       .. math:: E[n(w)] = \sum_{x \in w} r(x) \lambda(x)
 
-    with f, g and λ networks. Class 0 of the second question stands for any class.
+    - does the picture hold t at all, after the looks of a search? What they showed best, :math:`s^*`, is corrected by
+      what else is known of the search, its case c (`semfov.zoom.tally`):
+
+      .. math:: \operatorname{logit} P(t) = \operatorname{logit} s^* + j(c)
+
+    with f, g, λ and j networks. Class 0 of the second question stands for any class.
 
     Args:
         classes: of the detector, background not counted.
@@ -49,6 +58,7 @@ class GlimpseEvidence(Pretrained):
         patience: how much more, in expected hits, a window that is not close enough to confirm anything must hold than
             the best window that is, to be looked at first.
         foresight: share of what still closer looks would find in a window that counts towards its value.
+        thresholds: at which searches decide; None where none were chosen.
         metadata: JSON values kept with the model.
     """
 
@@ -65,6 +75,7 @@ class GlimpseEvidence(Pretrained):
             "company.3.bias": Field(("K",), low=-_LARGEST, high=_LARGEST),
             **perceptron("shape", _SHAPE, _SHAPE_WIDTH),
             **perceptron("rate", _RATE, _RATE_WIDTH, STEPS),
+            **perceptron("judge", CASE, _JUDGE_WIDTH),
             "prior": Field(("K+1", 2), low=-1e3, high=1e3),
             "border": Field((4,), low=-1e3, high=1e3),
         },
@@ -73,6 +84,7 @@ class GlimpseEvidence(Pretrained):
             "width": Number(size="W"),
             "patience": Number(above=0, high=_LARGEST),
             "foresight": Number(0, 1),
+            "thresholds": THRESHOLDS,
         },
     )
 
@@ -83,6 +95,7 @@ class GlimpseEvidence(Pretrained):
         *,
         patience: float = 2.3,
         foresight: float = 0.35,
+        thresholds: Thresholds | None = None,
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
@@ -91,7 +104,7 @@ class GlimpseEvidence(Pretrained):
         check(patience > 0, "patience", "a number above 0", patience)
         check_number(foresight, "foresight", 0, 1)
         self.classes, self.width = classes, width
-        self.patience, self.foresight = patience, foresight
+        self.patience, self.foresight, self.thresholds = patience, foresight, thresholds
         self.metadata = dict(metadata or {})
         self.slope = nn.Parameter(torch.full((classes,), 2.0))
         self.offset = nn.Parameter(torch.full((classes,), -2.0))
@@ -100,6 +113,11 @@ class GlimpseEvidence(Pretrained):
         )
         self.shape = _network(_SHAPE, _SHAPE_WIDTH, 1)
         self.rate = _network(_RATE, _RATE_WIDTH, STEPS)
+        self.judge = _network(CASE, _JUDGE_WIDTH, 1)
+        with torch.no_grad():
+            # Until it is fitted, the best score is the probability.
+            for parameter in self.judge[-1].parameters():
+                parameter.zero_()
         self.prior = nn.Parameter(torch.zeros(classes + 1, 2))
         self.border = nn.Parameter(torch.tensor([0.0, 1.0, 2.0, 2.0]))
 
@@ -180,6 +198,16 @@ class GlimpseEvidence(Pretrained):
         value: Tensor = self.rate(torch.stack(parts, -1)) + bias[:, None, None, None] - 6
         return value.clamp(max=3).movedim(-1, 1)
 
+    def anywhere(self, best: Tensor, case: Tensor) -> Tensor:
+        """Log odds that the picture holds a class, after the looks of a search, `(...)`.
+
+        Args:
+            best: `(...)`, highest score of the class in any look.
+            case: `(..., 11)`, what else is known (`semfov.zoom.tally.Tally.case`).
+        """
+        value: Tensor = torch.logit(best, eps=1e-4) + self.judge(case)[..., 0]
+        return value
+
     def taper(self, span: int) -> Tensor:
         """Weights r of the cells along a side of a window, `(span,)`: what lies at its border is cut."""
         cell = torch.arange(span, device=self.border.device)
@@ -201,6 +229,7 @@ class GlimpseEvidence(Pretrained):
             "width": self.width,
             "patience": self.patience,
             "foresight": self.foresight,
+            "thresholds": None if self.thresholds is None else asdict(self.thresholds),
         }
 
     @classmethod
@@ -211,6 +240,7 @@ class GlimpseEvidence(Pretrained):
             record["width"],
             patience=record["patience"],
             foresight=record["foresight"],
+            thresholds=None if record["thresholds"] is None else Thresholds(**record["thresholds"]),
             metadata=record["metadata"],
         )
         model.load_state_dict(tensors)

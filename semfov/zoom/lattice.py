@@ -50,6 +50,15 @@ class Lattice:
         return len(self.magnifications)
 
     @property
+    def octaves(self) -> Tensor:
+        """By how many octaves the picture is reduced at each level, `(levels,)`; 0 where it is not.
+
+        >>> Lattice.over((2560, 1920), (416, 416)).octaves
+        tensor([2.6215, 1.6215, 0.6215])
+        """
+        return -torch.tensor(self.magnifications).log2().clamp(max=0)
+
+    @property
     def pitch(self) -> tuple[float, float]:
         """`(width, height)` of a cell in picture pixels."""
         wide, high = self.window(self.levels - 1)

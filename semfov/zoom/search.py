@@ -2,21 +2,31 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 
-from semfov.decision import Decision
-from semfov.zoom.belief import ZoomBelief
+from semfov.belief.target_evidence import Thresholds
+from semfov.decision import OUTCOMES, Decision, settle
+from semfov.zoom.belief import Rates, ZoomBelief
+from semfov.zoom.drawing import path_html
 from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance, Glances, Window, on_lattice
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import Objects, merge
 from semfov.zoom.policy import Choice, best_find, best_hit, best_slice, jointly
+from semfov.zoom.tally import Tally
+
+DEFAULTS = Thresholds(0.9, 0.005)
+"""For evidence without any."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ZoomPath:
     """The record of a search in, or an exploration of, a large picture.
+
+    In a notebook it shows the windows that were looked at; `semfov.viz.plot_zoom_path` draws them on the picture.
 
     Attributes:
         lattice: of the picture.
@@ -41,6 +51,67 @@ class ZoomPath:
         """Passes of the detector."""
         return len(self.glances)
 
+    def describe(self) -> str:
+        """What came of it, in a sentence."""
+        count = len(self.objects.above(FOUND))
+        passes = f"{self.passes} pass{'es' if self.passes != 1 else ''}"
+        if self.decision is not None and self.target is not None:
+            outcome = f"{self.decision.outcome} ({self.decision.probability:.2f})"
+            return f"{self.classes[self.target]}: {outcome} in {passes}"
+        if self.target is None:
+            return f"{count} object{'s' if count != 1 else ''} in {passes}"
+        return f"{count} × {self.classes[self.target]} in {passes}"
+
+    def shown(self, number: int) -> tuple[float, float, float, float]:
+        """What of the picture a look showed, `(x1, y1, x2, y2)` in pixels."""
+        window, (width, height) = self.glances[number].window, self.lattice.size
+        if window.within is not None:
+            return window.within
+        (x, y, magnification), (wide, high) = window.fixation, self.lattice.canvas
+        across, down = wide / magnification / 2, high / magnification / 2
+        x, y = x + 0.5, y + 0.5
+        return max(x - across, 0.0), max(y - down, 0.0), min(x + across, float(width)), min(y + down, float(height))
+
+    def __repr__(self) -> str:
+        """What came of it, where it looked, and what it found."""
+        looks = [f"({x:.0f}, {y:.0f}) × {m:.2f}" for x, y, m in (glance.window.fixation for glance in self.glances)]
+        path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
+        sure = self.objects.above(FOUND)
+        named = [
+            f"{self.classes[label]} {score:.2f}"
+            for label, score in zip(sure.labels.tolist()[:5], sure.scores.tolist(), strict=False)
+        ]
+        more = ["…"] if len(sure) > 5 else []
+        width, height = self.lattice.size
+        return "\n".join(
+            [
+                f"ZoomPath: {self.describe()}",
+                f"  at (x, y) × magnification: {', '.join(path)} of {width} × {height} px",
+                f"  objects: {', '.join([*named, *more]) or 'none'}",
+            ]
+        )
+
+    def _repr_html_(self) -> str:
+        """Windows, numbered in their order, and objects."""
+        windows = [self.shown(number) for number in range(self.passes)]
+        return path_html(self.describe(), self.lattice.size, windows, self.objects, self.classes)
+
+
+class Turn(NamedTuple):
+    """A look of a search.
+
+    Attributes:
+        glance: what it shows.
+        worth: what it was worth when it was chosen.
+        ahead: what the best look that is left is worth now.
+        belief: after it.
+    """
+
+    glance: Glance
+    worth: float
+    ahead: float
+    belief: ZoomBelief
+
 
 def look_for(
     glances: Glances,
@@ -50,7 +121,7 @@ def look_for(
     confirm: float = 0.3,
     slices: Sequence[Window] | None = None,
     closest: bool = False,
-) -> Iterator[tuple[Glance, float, float]]:
+) -> Iterator[Turn]:
     """Look for one object of a class, glance by glance; ends when a look confirms it, or nothing is left to look at.
 
     Args:
@@ -60,9 +131,6 @@ def look_for(
         confirm: score that confirms it.
         slices: if given, only looks at these confirm it; else looks at all magnifications do.
         closest: only looks at the largest magnification confirm it.
-
-    Yields:
-        The glance, what it was worth, and what the best look is worth now: the probability that it shows the target.
     """
     belief, done = ZoomBelief(glances.lattice, evidence, target), set[Window]()
     window, worth = on_lattice(glances.lattice, (0, 0, 0)), float("inf")
@@ -72,7 +140,7 @@ def look_for(
         done.add(window)
         belief.add(glance)
         choice = best_hit(belief, done, closest=closest) if slices is None else best_slice(belief, slices, done)
-        yield glance, worth, 0.0 if choice is None else choice[1]
+        yield Turn(glance, worth, 0.0 if choice is None else choice[1], belief)
         last = window.level == glances.lattice.levels - 1
         confirms = window in allowed if allowed is not None else last or not closest
         if choice is None or (confirms and float(glance.show[target - 1]) >= confirm):
@@ -81,7 +149,7 @@ def look_for(
 
 
 def find_everything(
-    glances: Glances, evidence: GlimpseEvidence, target: int | None = None, *, batch: int = 1, worth: float = 0.0
+    glances: Glances, evidence: Rates, target: int | None = None, *, batch: int = 1, worth: float = 0.0
 ) -> Iterator[tuple[Glance, float]]:
     """Look for all objects of a class, or of any, glance by glance, until no look is worth its price.
 
@@ -113,14 +181,14 @@ def search(
     target: int,
     *,
     passes: int = 24,
-    confirm: float = 0.3,
-    give_up: float = 0.005,
+    confirm: float | None = None,
+    give_up: float | None = None,
 ) -> ZoomPath:
-    """Search a picture for one object of a class, and decide.
+    """Search a picture for one object of a class, and decide (`semfov.decision.settle`).
 
-    It is `found` when a look shows it with a score of `confirm`; `absent` when every window's probability of showing it
-    is below `give_up`; `undecided` when the passes are spent. The probability of the decision is that score, or the
-    best window's probability.
+    It is `found` when the picture holds it with a probability of `confirm`, and a detection shows it. When no look is
+    worth `give_up` any more, it is `absent` if the picture rather does not hold it, else `undecided`; so it is, too,
+    when the passes are spent.
 
     Args:
         glances: of the picture.
@@ -128,30 +196,34 @@ def search(
         classes: names, background first.
         target: class 1..K.
         passes: of the detector, at most.
-        confirm: see above.
-        give_up: see above.
+        confirm: probability that the picture holds the target (None: the evidence's).
+        give_up: probability that a look shows it (None: the evidence's).
     """
+    thresholds = (evidence.thresholds or DEFAULTS).changed(confirm, give_up)
     seen: list[Glance] = []
     values: list[float] = []
-    outcome: Decision | None = None
-    for glance, value, ahead in look_for(glances, evidence, target, confirm=confirm):
+    tally: Tally | None = None
+    ended, presence = 0, 0.0
+    for glance, value, ahead, belief in look_for(glances, evidence, target, confirm=float("inf")):
+        tally = tally or Tally(belief)
+        tally.add(glance)
         seen.append(glance)
         values.append(value)
-        score = float(glance.show[target - 1])
-        if score >= confirm:
-            place = glance.detections.scores[0, :, target]
-            box = glance.detections.boxes[0, int(place.argmax())] if len(place) else None
-            outcome = Decision("found", score, None, box)
+        presence = tally.presence(ahead)
+        ended = int(settle(torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([ahead]), thresholds))
+        if ended or len(seen) == passes:
             break
-        if ahead < give_up:
-            outcome = Decision("absent", ahead)
-            break
-        if len(seen) == passes:
-            outcome = Decision("undecided", ahead)
-            break
-    assert outcome is not None
-    objects = merge(seen, target)
-    return ZoomPath(glances.lattice, classes, target, tuple(seen), tuple(values), objects, outcome)
+    assert tally is not None
+    box = tally.box if OUTCOMES[ended] == "found" else None
+    return ZoomPath(
+        glances.lattice,
+        classes,
+        target,
+        tuple(seen),
+        tuple(values),
+        merge(seen, target),
+        Decision(OUTCOMES[ended], presence, None, box),
+    )
 
 
 def find_all(

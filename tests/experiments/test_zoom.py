@@ -11,6 +11,7 @@ from semfov.errors import InputError
 from semfov.experiments import zoom_report
 from semfov.experiments.config import DataConfig
 from semfov.experiments.zoom import ZoomConfig, ZoomRun
+from semfov.experiments.zoom_decisions import decision_tables
 from semfov.experiments.zoom_orders import quad_tree, ranked, raster, shuffled, slices
 from semfov.experiments.zoom_store import pack, unpack
 from semfov.zoom import GlimpseEvidence
@@ -72,6 +73,9 @@ def test_tables_and_resuming(config, capsys):
         if record["measure"] == "recall":
             assert len(record["found"]) <= config.passes
             assert max(record["found"]) <= record["objects"]
+        elif record["measure"] == "decision":
+            assert record["passes"] <= config.passes
+            assert 0 <= record["probability"] <= 1
         else:
             assert 1 <= record["passes"] <= 5
     parts = sorted((config.out / "parts").rglob("*.json"))
@@ -94,6 +98,43 @@ def test_a_damaged_store_is_looked_at_again(config):
         assert ZoomRun(config).outcomes(0)[0] == written
     file.write_bytes(file.read_bytes()[:-1])
     assert store.load(digest) == []
+
+
+def test_measures_can_be_left_out(config, capsys):
+    from dataclasses import replace
+
+    zoom_report.zoom(replace(config, measures=("decision",)))
+    text = capsys.readouterr().out
+    assert "Is it there?" in text
+    assert "Recall" not in text
+    assert {json.loads(line)["measure"] for line in (config.out / "records.jsonl").read_text().splitlines()} == {
+        "decision"
+    }
+
+
+def test_tables_of_decisions():
+    """Shares by hand, of two searches for what is there and two for what is not."""
+    common = {"measure": "decision", "way": "ours", "count": 17, "overview": 0.1, "slices": 0.2}
+    records = [
+        common | {"present": there, "outcome": outcome, "probability": p, "passes": passes, "overlap": overlap}
+        for there, outcome, p, passes, overlap in (
+            (True, "found", 0.95, 3, 0.8),
+            (True, "found", 0.85, 5, 0.1),
+            (False, "absent", 0.05, 10, None),
+            (False, "undecided", 0.6, 24, None),
+        )
+    ]
+    text = "\n".join(decision_tables(records))
+    cells = {
+        row[1].strip(): [cell.strip() for cell in row[2:-1]]
+        for row in (line.split("|") for line in text.splitlines())
+        if len(row) > 3
+    }
+    assert cells["it is there"] == ["100.0", "0.0", "0.0", "4.0", "0.90"]
+    assert cells["it is not"][:4] == ["0.0", "50.0", "50.0", "17.0"]
+    assert cells["ours"][:2] == ["10.5", "1.000"]
+    assert cells["all slices, highest score"][:2] == ["17.0", "0.500"]
+    assert "in 50.0 %" in text
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,16 @@ from semfov.detection.detector import Detector
 from semfov.detection.scores import Candidates
 from semfov.errors import InputError
 from semfov.experiments.config import DataConfig
-from semfov.training.zoom import FitZoomConfig, fit_zoom
-from semfov.training.zoom_examples import MosaicStore, look_at_mosaic, pack, unpack
+from semfov.experiments.zoom_samples import MosaicSettings
+from semfov.experiments.zoom_store import GlanceStore, open_scene
+from semfov.observation.foveal import FovealObservationModel
+from semfov.training.observation import fit_fom
+from semfov.training.observation_settings import FitConfig
+from semfov.training.zoom import fit_zoom
+from semfov.training.zoom_examples import example_of
+from semfov.training.zoom_settings import FitZoomConfig
 from semfov.zoom import GlimpseEvidence, ZoomEye
+from semfov.zoom.lattice import Lattice
 
 
 class Bright(Detector):
@@ -36,7 +43,7 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Bright())
     config = FitZoomConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
-        mosaics=1, far=1, judged=1, judged_far=1, tile=96, steps=3,
+        mosaics=1, far=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=96, steps=3,
         out=tmp_path / "out", cache=tmp_path / "cache", workers=1,
     )  # fmt: skip
     fit_zoom(config)
@@ -65,24 +72,49 @@ def tried(report):
     return recalls, {float(row[1]): float(row[4]) for row in rows if row[0] == "patience"}
 
 
-def test_examples_come_back_from_a_file(tmp_path):
+def test_examples_are_the_same_from_a_store(tmp_path):
     eye = ZoomEye(Bright())
     mosaics = Mosaics(EmbeddedScenes(("person", "cat", "cup"), count=3), 2, 2, tile=(96, 72), count=1)
-    example = look_at_mosaic(eye, mosaics, 0)
-    store = MosaicStore(tmp_path, eye.settings(), 3)
-    store.write(mosaics.digest(0), pack(example))
-    slots = [tuple(map(float, tile.slot)) for tile in mosaics.tiles(0)]
-    same = unpack(store.read(mosaics.digest(0)), example.lattice, slots)
+    store = GlanceStore(tmp_path, eye.settings(), 3)
+    glances = open_scene(eye, mosaics, 0, store)
+    example = example_of(mosaics, 0, glances)
+    glances.save()
+    assert sum(look.window.within is not None for look in example.looks) == 4
+    eye.detector.propose = None  # nothing is looked at again
+    same = example_of(mosaics, 0, open_scene(eye, mosaics, 0, store))
     assert torch.equal(same.labels, example.labels)
     for one, other in zip(example.looks, same.looks, strict=True):
         assert one.window == other.window
         assert torch.equal(one.found, other.found)
         assert (one.gist is None) == (other.gist is None)
         if one.gist is not None:
-            torch.testing.assert_close(other.gist.scores, one.gist.scores, rtol=1e-3, atol=1e-4)
+            assert torch.equal(other.gist.scores, one.gist.scores)
             assert torch.equal(other.gist.found, one.gist.found)
 
 
 def test_settings_have_ranges():
     with pytest.raises(InputError, match="steps: expected a whole number from 1"):
         FitZoomConfig(steps=0)
+
+
+def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Bright())
+    config = FitConfig(
+        data=DataConfig(limit=4, min_instances=0, max_target_area=None),
+        mosaics=2, fixations=1, levels=4, holdout=2, shard=1, method="newton", name="bright-zoom",
+        out=tmp_path / "out", workers=1,
+    )  # fmt: skip
+    fit_fom(config)
+    assert "octaves that the picture is reduced by" in capsys.readouterr().out
+    model = FovealObservationModel.from_pretrained(tmp_path / "out" / "bright-zoom.safetensors")
+    assert model.edges.tolist() == [0.5, 1.5, 2.5]
+    assert model.metadata["sensor"]["glimpse"] == "antialiased bilinear"
+    model.check_compatible(ZoomEye(Bright()).settings())
+    # One of the two mosaics was fitted on, the other judged; all that it shows is counted.
+    sampler = MosaicSettings.of(config).sampler()
+    samples = sampler.load(tmp_path / "out" / "samples", 1)
+    assert sum(map(sum, model.metadata["counts"])) == len(samples)
+    size = sampler.scenes.annotation(1).size
+    lattice = Lattice.over(size, (96, 96))
+    assert sum(model.metadata["cells"]) >= lattice.columns * lattice.rows
+    assert model.miss_rate.shape == (4, 4)

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
-from semfov.viz.zoom import describe_zoom, plot_zoom_path
+from semfov.viz.zoom import plot_zoom_path
 from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye, merge
 from semfov.zoom.glances import Glance, on_lattice
 from semfov.zoom.lattice import Lattice
@@ -59,7 +59,7 @@ def test_figure(agent, picture):
     path = agent.search(picture, "red", passes=4)
     figure = plot_zoom_path(path, picture)
     assert len(figure.axes) == 1
-    assert describe_zoom(path).startswith("red: ")
+    assert path.describe().startswith("red: ")
     mine = Figure()
     given, other = mine.subplots(1, 2)
     assert plot_zoom_path(path, picture, ax=given) is mine
@@ -78,8 +78,8 @@ def test_errors(agent, picture):
     for wrong, told in (
         ({"passes": 2.5}, "passes: expected a whole number"),
         ({"passes": True}, "passes: expected a whole number"),
-        ({"confirm": 1.5}, "confirm: expected a number from 0 to 1, got 1.5"),
-        ({"give_up": float("nan")}, "give_up: expected a number from 0 to 1"),
+        ({"confirm": 1.5}, "confirm: expected a probability from 0 to 1, got 1.5"),
+        ({"give_up": float("nan")}, "give_up: expected a probability from 0 to 1"),
     ):
         with pytest.raises(InputError, match=told):
             agent.search(picture, "red", **wrong)

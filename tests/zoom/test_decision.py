@@ -1,0 +1,148 @@
+"""Whether a large picture holds a class: what is counted of a search, and what is decided."""
+
+import math
+from xml.etree import ElementTree
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.nn import functional as F
+
+from semfov.belief.target_evidence import Thresholds
+from semfov.decision import settle
+from semfov.metrics.calibration import calibration_error
+from semfov.training.zoom_decision import Searches, fit_judge, judge_searches
+from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye
+from semfov.zoom.evidence import CASE, features
+from semfov.zoom.glances import LiveGlances
+from semfov.zoom.search import look_for
+from semfov.zoom.tally import Tally
+
+SHARE = st.floats(0, 1, width=32)
+
+
+@given(SHARE, st.booleans(), SHARE, SHARE, SHARE)
+def test_decisions_follow_the_rule(presence, looked, left, confirm, give_up):
+    ended = settle(*(torch.tensor([each]) for each in (presence, looked, left)), Thresholds(confirm, give_up))
+    if presence >= confirm and looked:
+        expected = 1
+    elif left >= give_up:
+        expected = 0
+    else:
+        expected = 2 if presence < 0.5 else 3
+    assert int(ended) == expected
+
+
+@pytest.fixture
+def eye(detector):
+    return ZoomEye(detector)
+
+
+def turns(eye, picture, target, most=6):
+    torch.manual_seed(0)
+    glances = LiveGlances(eye, eye.open(picture))
+    steps = look_for(glances, GlimpseEvidence(3, 8).eval(), target, confirm=math.inf)
+    with torch.inference_mode():
+        return [turn for turn, _ in zip(steps, range(most), strict=False)]
+
+
+def test_what_is_counted_of_a_search(eye, picture):
+    """Every feature from the looks themselves, in another way."""
+    target, seen = 1, turns(eye, picture, 1)
+    tally = Tally(seen[0].belief)
+    for turn in seen:
+        tally.add(turn.glance)
+    scores = [float(turn.glance.show[target - 1]) for turn in seen]
+    closest = [s for s, turn in zip(scores, seen, strict=True) if turn.glance.gist is None]
+    named = [
+        float(d.scores[0, n, target])
+        for d in (turn.glance.detections for turn in seen)
+        for n in range(d.scores.shape[1])
+        if int(d.scores[0, n].argmax()) == target
+    ]
+    ordered = sorted(scores, reverse=True)
+    case = tally.case(0.25)
+    raw = torch.tensor([ordered[0], ordered[1], max([0.0, *closest]), scores[0], max([0.0, *named]), 0.25])
+    torch.testing.assert_close(case[:6], features(raw))
+    assert case[8] == pytest.approx(float(seen[0].belief.left.mean()))
+    assert case[9] == pytest.approx(math.log(1 + sum(score >= 0.1 for score in scores)) / 2)
+    assert case[10] == pytest.approx(math.log(len(seen)) / 2)
+    assert case.shape == (CASE,)
+    boxes = torch.cat([turn.glance.detections.boxes[0] for turn in seen])
+    told = torch.cat([turn.glance.detections.scores[0, :, target] for turn in seen])
+    assert tally.box.tolist() == boxes[told.argmax()].tolist()
+
+
+def test_before_it_is_fitted_the_best_score_is_the_probability(eye, picture):
+    seen = turns(eye, picture, 1)
+    tally = Tally(seen[0].belief)
+    for turn in seen:
+        tally.add(turn.glance)
+        assert tally.presence(turn.ahead) == pytest.approx(min(max(tally.best, 1e-4), 1 - 1e-4), abs=1e-5)
+
+
+def test_thresholds_of_the_evidence_decide(eye, picture, tmp_path):
+    torch.manual_seed(0)
+    evidence = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.02))
+    evidence.save(tmp_path / "own.safetensors")
+    evidence = GlimpseEvidence.from_pretrained(tmp_path / "own.safetensors")
+    assert evidence.thresholds == Thresholds(0.3, 0.02)
+    agent = ZoomAgent(eye, evidence)
+    path = agent.search(picture, "red")
+    assert path.decision.outcome == "found"
+    assert path.decision.probability >= 0.3
+    longer = agent.search(picture, "red", confirm=1.0, give_up=0.0, passes=path.passes + 2)
+    assert longer.passes > path.passes
+    assert longer.decision.outcome == "undecided"
+    assert agent.search(picture, "green", give_up=1.0).passes == 1
+
+
+def synthetic(count, seed):
+    """Searches whose target is there with a probability that follows from their cases."""
+    generator = torch.Generator().manual_seed(seed)
+    case = torch.randn(count, 1, CASE, generator=generator)
+    best = torch.rand(count, 1, generator=generator)
+    odds = torch.logit(best, eps=1e-4) + 2 * case[..., 2] - case[..., 7] - 1
+    there = torch.rand(count, generator=generator) < odds[:, 0].sigmoid()
+    return Searches(best, case, best > 0.1, torch.zeros(count, 1), there), odds[:, 0]
+
+
+def test_a_fitted_probability_is_calibrated():
+    torch.manual_seed(0)
+    model = GlimpseEvidence(3, 8)
+    known, _ = synthetic(4000, 1)
+    fit_judge(model, known, steps=250)
+    new, odds = synthetic(4000, 2)
+    with torch.no_grad():
+        told = model.anywhere(new.best, new.case)[:, 0]
+    best = F.binary_cross_entropy_with_logits(odds, new.there.float())
+    loss = F.binary_cross_entropy_with_logits(told, new.there.float())
+    raw = F.binary_cross_entropy(new.best[:, 0], new.there.float())
+    assert loss < best + 0.1 * (raw - best)
+    assert calibration_error(told.sigmoid(), new.there) < 0.03 < calibration_error(new.best[:, 0], new.there)
+
+    class Bounds:
+        false_alarms, surest, lost = 0.05, 1.0, 0.02
+
+    rows = judge_searches(model, new, Bounds())
+    assert "ECE" in rows[0]
+    sure = (told.sigmoid() >= model.thresholds.confirm) & new.looked[:, 0]
+    assert sure[~new.there].double().mean() <= 0.05
+
+
+def test_a_path_shows_itself(eye, picture):
+    torch.manual_seed(0)
+    agent = ZoomAgent(eye, GlimpseEvidence(3, 8))
+    path = agent.explore(picture, passes=9, worth=0.0)
+    assert len(repr(path)) < 600
+    assert repr(path).startswith(f"ZoomPath: {path.describe()}")
+    assert "blue" in repr(path)
+    drawing = ElementTree.fromstring(path._repr_html_().replace("<br>", "<br/>")).find("svg")
+    rectangles = drawing.findall("rect")
+    assert len(rectangles) == 1 + (path.passes - 1) + len(path.objects.above(0.1))
+    assert len(drawing.findall("text")) == path.passes - 1
+    for number in range(path.passes):
+        box, action = path.shown(number), path.glances[number].window
+        x1, y1, x2, y2 = path.lattice.boxes(torch.tensor([action.level, *action.cells[:2]])).tolist()
+        assert box == pytest.approx((max(x1, 0), max(y1, 0), min(x2, 1024), min(y2, 768)), abs=1e-3)

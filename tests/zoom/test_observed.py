@@ -1,0 +1,129 @@
+"""Looks by magnification: labelled windows, misses in them, and what an observation model expects of closer looks."""
+
+import math
+
+import pytest
+import torch
+
+from semfov import FovealObservationModel
+from semfov.data.mosaics import Mosaics
+from semfov.data.scenes import EmbeddedScenes
+from semfov.errors import InputError
+from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.experiments.zoom_samples import HeldOutMosaics, MosaicSettings, choose_windows
+from semfov.observation.matching import box_iou
+from semfov.training.misses import count_misses
+from semfov.zoom.gist import Gist
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.observed import ObservedRates
+
+LATTICE = Lattice.over((1024, 768), (128, 128))
+
+
+def test_octaves_are_logarithms_of_the_magnifications():
+    assert LATTICE.octaves.tolist() == pytest.approx([-math.log2(m) for m in LATTICE.magnifications])
+    assert Lattice.over((100, 100), (128, 128), finest=8.0).octaves.min() == 0
+
+
+def test_windows_are_of_all_magnifications():
+    windows = choose_windows(LATTICE, 5, 0, "scene")
+    assert windows[0].tolist() == [0, 0, 0]
+    assert torch.bincount(windows[:, 0]).tolist() == [1, *[5] * (LATTICE.levels - 1)]
+    actions = set(map(tuple, LATTICE.actions.tolist()))
+    assert all(tuple(window) in actions for window in windows.tolist())
+    assert torch.equal(windows, choose_windows(LATTICE, 5, 0, "scene"))
+    assert not torch.equal(windows, choose_windows(LATTICE, 5, 1, "scene"))
+
+
+def test_every_nth_mosaic_is_of_other_photographs():
+    kept, held = (EmbeddedScenes(("person", "cat"), count=3, seed=seed) for seed in (0, 1))
+    both = HeldOutMosaics(*(Mosaics(some, 2, 2, tile=(64, 48), count=6) for some in (kept, held)), every=3)
+    assert len(both) == 6
+    for index in range(6):
+        own = Mosaics(held if index % 3 == 0 else kept, 2, 2, tile=(64, 48), count=6)
+        assert both.digest(index) == own.digest(index)
+        assert torch.equal(both[index].image, own[index].image)
+
+
+@pytest.fixture
+def sampler(detector, monkeypatch):
+    detector.classes = ("person", "cat", "cup")
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: detector)
+    data = DataConfig(limit=3, min_instances=0, max_target_area=None)
+    settings = MosaicSettings(data, DetectorConfig(), SensorConfig(), 2, 0.5, 0, 1, mosaics=2, holdout=2)
+    return settings.sampler()
+
+
+def test_samples_are_detections_with_octaves(sampler, tmp_path):
+    samples = sampler.sample(0)
+    x, y, magnification = samples.fixations[samples.look].unbind(-1)
+    torch.testing.assert_close(samples.distance, -magnification.log2().clamp(max=0))
+    reach = 64 / magnification
+    middle = (samples.boxes[:, :2] + samples.boxes[:, 2:]) / 2
+    assert ((middle - torch.stack([x, y], -1)).abs() <= reach[:, None] + 1).all()
+    annotation = sampler.scenes.annotation(0)
+    for box, label in zip(samples.boxes, samples.labels, strict=True):
+        overlaps = box_iou(box[None], annotation.boxes)[0] >= 0.5
+        assert int(label) in {0, *annotation.labels[overlaps].tolist()}
+    sampler.save(tmp_path, 0, samples)
+    assert torch.equal(sampler.load(tmp_path, 0).boxes, samples.boxes)
+
+
+def test_misses_are_counted_in_what_a_window_shows(sampler):
+    samples, edges = sampler.sample(1), torch.tensor([1.5, 2.5])
+    counts = count_misses(sampler.scenes, samples, {1}, edges, sampler.cells)
+    size = sampler.scenes.annotation(1).size
+    cells = torch.zeros(3, dtype=torch.long)
+    for x, y, magnification in samples.fixations.tolist():
+        lattice = Lattice.over(size, (128, 128))
+        wide, high = size[0] / lattice.columns, size[1] / lattice.rows
+        inside = sum(
+            abs((column + 0.5) * wide - 0.5 - x) <= 64 / magnification
+            and abs((row + 0.5) * high - 0.5 - y) <= 64 / magnification
+            for row in range(lattice.rows)
+            for column in range(lattice.columns)
+        )
+        cells[sum(-math.log2(magnification) > edge for edge in edges.tolist())] += inside
+    # A cell with objects of two classes counts twice.
+    assert (counts.total.sum(0) >= cells).all()
+    assert counts.total[0].sum() < cells.sum()
+    assert (counts.missed <= counts.total).all()
+    assert len(samples.fixations) == 1 + 2 * (Lattice.over(size, (128, 128)).levels - 1)
+
+
+def observation():
+    torch.manual_seed(0)
+    miss = torch.rand(3, 4).double().clamp(0.1, 0.9)
+    alpha = 1 + torch.rand(3, 4, 3).double()
+    cells = {"cells": [97, 1, 2]}
+    return FovealObservationModel(alpha, [0.5, 1.5, 2.5], ("red", "blue"), miss_rate=miss, metadata=cells)
+
+
+def test_what_is_expected_of_closer_looks():
+    model = observation()
+    rates = ObservedRates(model, LATTICE)
+    span = LATTICE.span(1)
+    scores, found = torch.zeros(span, span, 2), torch.zeros(span, span, 2, dtype=torch.bool)
+    scores[3, 4, 0] = 0.2
+    found[10, 10, 1] = True
+    look = Gist(1, (0, 0), 1, scores, torch.zeros(span, span), found)
+    told = rates.rates(look, torch.tensor([0, 1, 2])).exp()
+    level = [sum(float(octave) > edge for edge in (0.5, 1.5, 2.5)) for octave in LATTICE.octaves]
+    miss, share = model.miss_rate, torch.tensor([98.0, 2, 3]).double() / 103
+    nothing = share * miss[:, level[1]]
+    nothing = nothing / nothing.sum()
+    seen = model.calibrate(torch.tensor([0.8, 0.2, 0.0]).double(), LATTICE.octaves[1].double()).detach()
+    for cell, held in (((20, 20), nothing), ((3, 4), seen)):
+        for t in (1, 2):
+            expected = held[t] * (1 - miss[t, level[2]])
+            assert float(told[t, 0, *cell]) == pytest.approx(float(expected), rel=1e-4)
+        assert float(told[0, 0, *cell]) == pytest.approx(float(told[1:, 0, *cell].sum()), rel=1e-4)
+    # What was found is not to be found again, and there is no look closer than the closest.
+    assert told[2, 0, 9:12, 9:12].max() < 1e-6
+    assert told[:, LATTICE.levels - 2 :].max() < 1e-6
+    assert rates.taper(5).tolist() == [1.0] * 5
+
+
+def test_a_model_without_counts_of_cells_is_refused():
+    with pytest.raises(InputError, match=r"train\.fit_fom fitted with --mosaics"):
+        ObservedRates(FovealObservationModel.identity(("red", "blue"), [0.5]), LATTICE)
