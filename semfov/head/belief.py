@@ -87,11 +87,11 @@ class SceneBelief(Belief):
 
 
 class SceneObserver(Observer):
-    """Keeps what is believed of each view as an agent does that moves its eye alone, and all of it in scene coordinates.
+    """Keeps a belief about a scene that is seen one window at a time.
 
-    The cells of the scene that a view shows take over what is believed of the view, where the gaze has come nearest to
-    them from its pose. What was never seen has the value of a cell that was seen from a whole longer side away, and showed
-    nothing.
+    Each view is believed of as an agent does that moves its eye alone. Cells of the scene take that over from the view
+    in which the gaze has come nearest to them. A cell that was never seen has the value of one that was seen from a
+    whole longer side away, and showed nothing.
 
     Args:
         inner: observer of a view: `semfov.observers.Target` or `LearnedMap`.

@@ -18,6 +18,12 @@ FORESIGHT = 0.5
 """Share of what a look shows from aside that counts towards a find."""
 
 
+PRIOR = 0.01
+"""Probability that a cell that was never seen holds the target of a search."""
+
+UNSEEN = 0.1
+"""Cells of an exploration that are named right when they are first fixated, a share of all."""
+
 OUT = -1e6
 """Value of actions that are not to be chosen."""
 
@@ -49,10 +55,10 @@ class SearchGain(Gain):
 
     .. math:: G(h, f) = P(t \in f) + c \sum_x |x| \, P(t \in x) \, [a(d_{h,f}(x)) - a(d^*(x))]_+
 
-    The first is the probability that the cell f, which the gaze would rest on, holds the target, if no cell does that was
-    fixated. The second is the expected area of the target that is seen better than ever before: with |x| the area of a
-    cell, :math:`d^*` the distance of the closest gaze so far, and a the acuity of the fovea (`Views.acuity`), which is 0
-    for what was never seen. So one formula tells what it is worth to move the eye, and to turn the head.
+    The first is the probability that the cell f, which the gaze would rest on, holds the target, where the gaze has not
+    been. The second is the expected area of the target that is seen better than ever before: with |x| the area of a
+    cell, :math:`d^*` the distance of the closest gaze so far, and a the acuity of the fovea (`Views.acuity`), which is
+    0 for what was never seen. So one formula tells what it is worth to move the eye, and to turn the head.
 
     Args:
         views: all that can be looked at.
@@ -67,7 +73,7 @@ class SearchGain(Gain):
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
         """Gains `(A,)`, in finds."""
         views = self.views
-        chance = belief.chance(0)[0]
+        chance = belief.probability(0)[0]
         known = views.acuity(belief.closest[0])
         wanted = chance * views.world.area
         here_found = torch.where(belief.examined[0], 0.0, chance)[views.gaze_cell]
@@ -81,18 +87,24 @@ class SearchGain(Gain):
 
 
 class ExploreGain(Gain):
-    """How many more cells of the scene a look is expected to name right, by their area (`MapEvidence.gain`).
+    r"""How many more cells of the scene a look is expected to name right, by their area.
 
-    After a turn of the head the eye lands on one of nine cells; every cell is valued where the head stays.
+    .. math:: G(h, f) = \sum_{x \text{ seen}} |x| \, E[\Delta \mid f](x) + u \sum_{x \text{ not}} |x| \, a(d_{h,f}(x))
+
+    `MapEvidence.gain` has learned what a look brings to cells that were seen before. Of those that were not nothing is
+    known but how often a look names a cell right: u times the acuity of the fovea there. After a turn of the head the
+    eye lands on one of nine cells; every cell is valued where the head stays.
 
     Args:
         views: all that can be looked at.
         model: that the map is learned with.
+        unseen: u.
     """
 
-    def __init__(self, views: Views, model: MapEvidence) -> None:
+    def __init__(self, views: Views, model: MapEvidence, unseen: float = UNSEEN) -> None:
         super().__init__(views)
-        self.model = model
+        self.model, self.unseen = model, unseen
+        self._acuity = [views.acuity(distance) for distance in views.distances]
         third = torch.tensor([SIDE // 5, SIDE // 2, SIDE - 1 - SIDE // 5])
         self._landings = (third[:, None] * SIDE + third).flatten()
 
@@ -100,14 +112,20 @@ class ExploreGain(Gain):
         """Gains `(A,)`, in cells of average area; below all others where the eye does not land."""
         views = self.views
         probabilities = belief.class_probabilities()
-        # What was never seen counts as seen from a whole longer side away.
-        closest = belief.closest.clamp(max=1)
+        known = belief.owner[0] >= 0
+        worth = torch.where(known, 0.0, self.unseen * views.world.area)
         gains = torch.full((len(views.grid),), OUT)
         for pose in poses:
-            cells, distance = views.seen[pose].cells, views.distances[pose].clamp(max=1)
+            cells = views.seen[pose].cells
             rows = torch.arange(views.cells) if pose == here else self._landings
-            each = self.model.gain(probabilities[:, cells], closest[:, cells], belief.looks, distance[None, rows])[0]
-            gains[pose * views.cells + rows] = each @ views.world.area[cells]
+            total = self._acuity[pose][rows] @ worth[cells]
+            some = known[cells]
+            if bool(some.any()):
+                old = cells[some]
+                distance = views.distances[pose][rows][:, some]
+                each = self.model.gain(probabilities[:, old], belief.closest[:, old], belief.looks, distance[None])[0]
+                total = total + each @ views.world.area[old]
+            gains[pose * views.cells + rows] = total
         return gains
 
 

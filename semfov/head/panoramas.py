@@ -42,8 +42,8 @@ class Panoramas:
     """Equirectangular panoramas of photographs that hang around the viewer.
 
     Each photograph lies on a plane that touches the sphere, as large as fits its slot of 4:3 with its proportions kept.
-    A camera that looks straight at it sees it undistorted. Rings are turned at random. Panorama `i` of a seed depends on
-    the seed, on `i` and on the photographs only. No photograph is in a panorama twice, unless there are fewer than
+    A camera that looks straight at it sees it undistorted. Rings are turned at random. Panorama `i` of a seed depends
+    on the seed, on `i` and on the photographs only. No photograph is in a panorama twice, unless there are fewer than
     slots. What they leave free is grey.
 
     Args:
@@ -127,7 +127,9 @@ class Panoramas:
         shape = (max(1, round((y2 - y1) * scale)), max(1, round((x2 - x1) * scale)))
         image = F.interpolate(image, shape, mode="bilinear", antialias=True)
 
-        (frame,) = Regions(Camera(camera.pose[None], _SLOT), torch.tensor([patch.box])).panorama_boxes(self.size).tolist()
+        (frame,) = (
+            Regions(Camera(camera.pose[None], _SLOT), torch.tensor([patch.box])).panorama_boxes(self.size).tolist()
+        )
         columns = torch.arange(math.floor(frame[0]), math.ceil(frame[2])) % self.size[0]
         rows = torch.arange(math.floor(frame[1]), min(math.ceil(frame[3]), self.size[1]))
         pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), -1).float()

@@ -13,8 +13,8 @@ class Speeds:
     r"""How long eye, head and detector take.
 
     Saccades last longer the larger they are (the main sequence: Bahill, Clark and Stark, 1975): for an amplitude A in
-    degrees :math:`21 + 2.2 A` ms, the line of Carpenter (Movements of the Eyes, 1988). The head, as a motor with a bounded
-    speed v and acceleration a, turns by an angle A in the least time,
+    degrees :math:`21 + 2.2 A` ms, the line of Carpenter (Movements of the Eyes, 1988). The head, as a motor with a
+    bounded speed v and acceleration a, turns by an angle A in the least time,
 
     .. math:: t = 2 \sqrt{A / a} \ \text{ for } A \le v^2 / a, \quad \text{else } \frac{A}{v} + \frac{v}{a}
 

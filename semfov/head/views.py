@@ -33,8 +33,8 @@ class Seen:
 class Views:
     """The poses of a head, and the fixations of the eye in the view from each.
 
-    The views are thought of as a strip, one below the other. So an action, a pose and a cell of its view, is one cell of
-    a grid, `action = pose * 100 + cell`, and the loop that moves an eye over a picture moves eye and head over a scene.
+    The views are thought of as a strip, one below the other. So an action, a pose and a cell of its view, is one cell
+    of a grid, `action = pose * 100 + cell`, and the loop that moves an eye over a picture moves eye and head.
 
     Args:
         world: the scene.
@@ -103,11 +103,11 @@ class Views:
 
     @cached_property
     def distances(self) -> list[Tensor]:
-        r"""For each pose, distance `(cells, V)` from the gaze in each cell of its view to the scene's cells that it shows.
+        r"""For each pose, distance `(cells, V)` from each cell of its view to the scene's cells that it shows.
 
         In longer sides of the narrowest view. With σ the width of the fovea, a fovea's acuity at a distance d falls as
-        :math:`1 / (1 + d / σ)`, and that of a wider view is less everywhere by the ratio r of the fields. So what is seen
-        at d in a wider view is seen as well as at :math:`r (σ + d) - σ` in the narrowest.
+        :math:`1 / (1 + d / σ)`, and that of a wider view is less everywhere by the ratio r of the fields. So what is
+        seen at d in a wider view is seen as well as at :math:`r (σ + d) - σ` in the narrowest.
         """
         centres, side = self.view_grid.centres, self.view_grid.extent.amax()
         result = []
@@ -123,7 +123,7 @@ class Views:
     def action_of(self, point: Tensor) -> tuple[int, Tensor]:
         """Pose and pixel `(2,)` of its view, of a point `(2,)` of the strip."""
         high = self.world.size[1]
-        pose = int(((float(point[1]) + 0.5) // high))
+        pose = int((float(point[1]) + 0.5) // high)
         return pose, point - point.new_tensor([0, pose * high])
 
     @cached_property

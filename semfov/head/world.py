@@ -83,7 +83,7 @@ class World(ABC):
 
     @abstractmethod
     def poses(self, field: float) -> list[list[Tensor]]:
-        """Poses half a window apart with a field of view, row by row: every second of every second row tiles the scene."""
+        """Poses half a window apart, row by row; every second of every second row tile the scene."""
 
     @abstractmethod
     def places(self, boxes: Tensor, pose: Tensor) -> Places:

@@ -24,7 +24,8 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
 
     Args:
         panorama: `(B, C, H, W)`, an even number of columns; twice as wide as high where pixels are square.
-        pose: `(B, G, 3)`, or `(B, 3)` for one view of each: yaw, pitch and horizontal field of view in degrees (`Camera`).
+        pose: `(B, G, 3)`, or `(B, 3)` for one view of each: yaw, pitch and horizontal field of view in degrees
+            (`semfov.sensor.sphere.Camera`).
         size: `(width, height)` of the views.
         antialias: smooth what a view shrinks; false takes one bilinear sample for each pixel.
 

@@ -69,8 +69,8 @@ def angle_between(one: Tensor, other: Tensor) -> Tensor:
 class Camera:
     r"""Perspective cameras at the centre of a sphere, that turn and zoom.
 
-    A camera turns by its yaw to the right, then by its pitch up, :math:`R = R_y(\text{yaw}) R_x(\text{pitch})`, and never
-    rolls. Its focal length in pixels is :math:`f = w / (2 \tan(\text{field} / 2))`. A pixel (u, v) looks along
+    A camera turns by its yaw to the right, then by its pitch up, :math:`R = R_y(\text{yaw}) R_x(\text{pitch})`, and
+    never rolls. Its focal length in pixels is :math:`f = w / (2 \tan(\text{field} / 2))`. A pixel (u, v) looks along
 
     .. math:: d = R \, \left(\frac{u + ½ - w/2}{f}, \frac{v + ½ - h/2}{f}, 1\right)
 
