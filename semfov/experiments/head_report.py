@@ -105,9 +105,9 @@ def _searching(searches: dict[str, list[Record]], config: HeadConfig, what: str)
         rows.append(row)
     scenes = len({record["scene"] for record in ours})
     return [
-        f"{len(ours)} searches in {scenes} {what}, until the gaze rests on a cell that a target overlaps. One that does "
-        f"not get there within {limit:g} s and {config.passes} passes counts with these. Means over {what} and their "
-        "standard errors; `less ours`: how much more than ours, paired by scene.",
+        f"{len(ours)} searches in {scenes} {what}, until the gaze rests on a cell that a target overlaps. One that "
+        f"does not get there within {limit:g} s and {config.passes} passes counts with these. Means over {what} and "
+        "their standard errors; `less ours`: how much more than ours, paired by scene.",
         "",
         *table(rows),
         "",

@@ -81,9 +81,9 @@ class SceneBelief(Belief):
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "SceneBelief":
         """The belief with all tensors replaced."""
-        own_tensors = self.values, self.closest, self.owner, self.examined, self.looks
+        values, closest, owner = function(self.values), function(self.closest), function(self.owner)
         views = tuple(None if view is None else view.map(function) for view in self.views)
-        return SceneBelief(*map(function, own_tensors), views)
+        return SceneBelief(values, closest, owner, function(self.examined), function(self.looks), views)
 
 
 class SceneObserver(Observer):

@@ -7,6 +7,8 @@ from torch import Tensor
 
 from semfov.errors import check_number
 
+_STILL = 1e-3  # degrees, which an angle of 0 can be by rounding
+
 
 @dataclass(frozen=True)
 class Speeds:
@@ -48,13 +50,14 @@ class Speeds:
         check_number(self.look, "look", 1e-6, 1e6)
 
     def saccade(self, angle: Tensor) -> Tensor:
-        """Seconds of saccades by angles `(...)` in degrees; none for 0."""
-        return torch.where(angle > 0, self.eye_start + self.eye * angle, 0.0)
+        """Seconds of saccades by angles `(...)` in degrees; none where the eye stays."""
+        return torch.where(angle > _STILL, self.eye_start + self.eye * angle, 0.0)
 
     def turn(self, angle: Tensor) -> Tensor:
         """Seconds in which the head turns by angles `(...)` in degrees."""
+        angle = torch.where(angle > _STILL, angle, 0.0)
         fast = self.head**2 / self.acceleration
-        short = 2 * (angle.clamp(min=0) / self.acceleration).sqrt()
+        short = 2 * (angle / self.acceleration).sqrt()
         return torch.where(angle <= fast, short, angle / self.head + self.head / self.acceleration)
 
     def price(self, eye: Tensor, head: Tensor, octaves: Tensor) -> Tensor:

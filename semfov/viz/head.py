@@ -132,7 +132,8 @@ def _frames(path: HeadPath, image: Tensor) -> Iterator[Any]:
     high = 7.2 * height / width
     for look, action in enumerate(path.actions):
         figure = Figure(figsize=(7.2, high + 3.1), layout="constrained")
-        above, below = figure.subfigures(2, 1, height_ratios=[high, 2.9])
+        parts: Any = figure.subfigures(2, 1, height_ratios=[high, 2.9])
+        above, below = parts
         axes = above.subplots()
         draw_path(axes, path, image, look + 1)
         axes.set_title(f"look {look}, {path.seconds[look]:.1f} s")
