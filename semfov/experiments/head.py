@@ -28,7 +28,7 @@ from semfov.experiments.store import versions
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
 from semfov.head.episode import Detect, HeadStep, live, look_around, rests_on
-from semfov.head.gain import FORESIGHT, PRIOR, Anywhere, ExploreGain, Gain, PerPrice, Scan, SearchGain
+from semfov.head.gain import FORESIGHT, PRIOR, UNSEEN, Anywhere, ExploreGain, Gain, PerPrice, Scan, SearchGain
 from semfov.head.panoramas import Panoramas
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
@@ -62,6 +62,7 @@ class HeadConfig(Settings):
         dwell: looks from each pose of a head that scans.
         foresight: share of what a look shows from aside that counts towards a find.
         prior: probability that a cell that was never seen holds the target.
+        unseen: how often the first look at a cell names it right, for explorations.
         seed: of scenes, targets, starts and ties.
         out: folder for tables, records and figures.
         cache: folder for looks, shared between runs (None: the user's cache).
@@ -83,6 +84,7 @@ class HeadConfig(Settings):
     dwell: Count = 2
     foresight: Weight = FORESIGHT
     prior: Share = PRIOR
+    unseen: Weight = UNSEEN
     seed: Seed = 0
     out: Path = Path("runs/head")
     cache: Path | None = None
@@ -226,8 +228,11 @@ class HeadRun:
 
     def _explorations(self, index: int, views: Views, looks: Detect) -> list[Record]:
         answers = answers_of(views, self.places(index), self.scenes.annotation(index).labels, len(self.scenes.classes))
-        area = views.world.area * answers.any(-1)
-        gain, observer = ExploreGain(views, self.map_evidence), SceneObserver(LearnedMap(self.map_evidence), views)
+        area, config = views.world.area * answers.any(-1), self.config
+        gain, observer = (
+            ExploreGain(views, self.map_evidence, config.unseen),
+            SceneObserver(LearnedMap(self.map_evidence), views),
+        )
         start, records = self.start(index, views, 0), list[Record]()
         for name, acquire in self.ways(gain, start).items():
             seconds, success, objects, actions = list[float](), list[float](), list[float](), list[int]()

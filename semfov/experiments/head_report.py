@@ -143,7 +143,7 @@ def _curves(records: list[Record], config: HeadConfig):  # type: ignore[no-untyp
     from matplotlib.figure import Figure
 
     seconds = np.linspace(0, config.seconds, 101)
-    wanted = {
+    wanted: dict[str, tuple[str, Callable[..., float]]] = {
         "search": ("found, share", lambda r, s=0.0: float(r["found"] and r["seconds"] <= s)),
         "exploration": ("cells named right, share", lambda r, s: at(r, s, "success")),
     }
