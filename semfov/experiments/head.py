@@ -237,7 +237,8 @@ class HeadRun:
         for name, acquire in self.ways(gain, start).items():
             seconds, success, objects, actions = list[float](), list[float](), list[float](), list[int]()
             for step in self._steps(views, looks, observer, acquire, start, None, index):
-                told = step.belief.class_probabilities()
+                # What was never seen has no answer, whatever is usual.
+                told = step.belief.class_probabilities().masked_fill(step.belief.owner[..., None] < 0, 0.0)
                 right = (right_cells(told, answers)[0] * area).sum() / area.sum()
                 besides = (right_cells(told[..., 1:], answers[:, 1:])[0] * area).sum() / area.sum()
                 seconds.append(step.seconds)
