@@ -40,6 +40,9 @@ from semfov.metrics.exploration import right_cells
 OURS = "ours"
 """What the others are compared with."""
 
+MOSAIC = 240.0
+"""Degrees that a mosaic of 4 × 4 photographs is wide."""
+
 Degrees = Annotated[float, Range(1, 170)]
 
 
@@ -55,7 +58,7 @@ class HeadConfig(Settings):
         targets: classes to search for in each scene, drawn by the seed; 0 leaves searches out.
         explore: whether scenes are explored, too.
         fields: fields of view in degrees; several let the head zoom.
-        width: of panoramas in pixels; the pixels of a mosaic are 640 for 60 degrees.
+        width: of a scene in pixels: of the 360 degrees of a panorama, or of a mosaic, which is 240 degrees wide.
         passes: looks of an episode, at most.
         seconds: of an episode, at most.
         speeds: of eye and head.
@@ -117,7 +120,14 @@ class HeadRun:
         self.scenes: Scenes = (
             Panoramas(photographs, width=config.width, count=config.scenes, seed=config.seed)
             if config.scene == "panorama"
-            else Mosaics(photographs, 4, 4, count=config.scenes, seed=config.seed)
+            else Mosaics(
+                photographs,
+                4,
+                4,
+                tile=(config.width // 4, config.width * 3 // 16),
+                count=config.scenes,
+                seed=config.seed,
+            )
         )
         looks = {"eye": self.eye.settings(), "fields": config.fields}
         self.store = HeadStore(cache_folder(config.cache) / "head", looks, len(self.eye.detector.classes))
@@ -138,7 +148,7 @@ class HeadRun:
     def world(self, index: int) -> World:
         """The scene, as a head looks around in it."""
         image = self.scenes[index].image
-        return Panorama(image) if self.config.scene == "panorama" else Flat(image)
+        return Panorama(image) if self.config.scene == "panorama" else Flat(image, degree=image.shape[-1] / MOSAIC)
 
     def places(self, index: int) -> Places:
         """Where its objects are."""

@@ -10,11 +10,11 @@ import torch
 
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.target_evidence import TargetEvidence
+from semfov.data.scene import Annotation, Scene
 from semfov.detection.detector import Detector
 from semfov.detection.scores import Candidates
 from semfov.errors import InputError
 from semfov.experiments import head_report
-from semfov.experiments.config import DataConfig
 from semfov.experiments.head import HeadConfig, HeadRun, answers_of, raster
 from semfov.head.views import Views
 
@@ -34,15 +34,39 @@ class Textures(Detector):
         return Candidates(boxes, classes, classes.amax(-1))
 
 
+class Noise:
+    """Five pictures of coloured noise with a box each: quick to make."""
+
+    classes, ids, fingerprint = ("person", "cat", "cup"), [0, 1, 2, 3, 4], "noise"
+
+    def __len__(self):
+        return 5
+
+    def __getitem__(self, index):
+        image = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(index))
+        annotation = self.annotation(index)
+        return Scene(index, f"noise {index}", image, annotation.boxes, annotation.labels)
+
+    def annotation(self, index):
+        boxes = torch.tensor([[8.0 * index, 10, 8.0 * index + 20, 30]])
+        return Annotation(boxes, torch.tensor([1 + index % 3]), torch.zeros(1, dtype=torch.bool), (64, 48))
+
+    def targets(self, index):
+        return [1 + index % 3]
+
+    def digest(self, index):
+        return f"noise {index}"
+
+
 @pytest.fixture(params=["panorama", "mosaic"])
 def config(request, tmp_path, monkeypatch):
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Textures())
+    monkeypatch.setattr("semfov.experiments.head.make_scenes", lambda data, classes: Noise())
     torch.manual_seed(0)
     models = TargetEvidence(components=4).requires_grad_(False), MapEvidence(components=4).requires_grad_(False)
     monkeypatch.setattr("semfov.experiments.head.make_target_evidence", lambda name, eye: models[0])
     monkeypatch.setattr("semfov.experiments.head.make_map_evidence", lambda name, eye: models[1])
     return HeadConfig(
-        data=DataConfig(limit=5, min_instances=0, max_target_area=None),
         scene=request.param,
         scenes=2,
         targets=1,
