@@ -79,3 +79,15 @@ def test_own_detector_gets_an_observation_model(tmp_path):
     model = semfov.FovealObservationModel.from_pretrained(tmp_path / "model.safetensors")
     assert len(model.classes) == 80
     assert int(np.sum(model.metadata["counts"])) == int(re.search(r"fitted to (\d+)", output)[1])
+
+
+def test_looking_around_turns_the_head_and_draws_it(tmp_path):
+    output = run("look_around", "--seconds", 6, "--out", tmp_path / "head.png", "--film", tmp_path / "head.gif")
+    seconds = [float(value) for value in re.findall(r"([\d.]+) s: head at yaw", output)]
+    assert seconds == sorted(seconds)
+    assert seconds[-1] <= 6
+    turns = re.search(r"HeadPath: exploration, \d+ looks, (\d+) turns? of the head", output)
+    assert int(turns.group(1)) > 0
+    for name in ("head.png", "head.gif"):
+        with Image.open(tmp_path / name) as picture:
+            assert min(picture.size) > 300

@@ -68,6 +68,7 @@ ROOMS = [
     "decision",
     "scanpath",
     "zoom",
+    "head",
     "live",
     "model_folder",
     "agent",

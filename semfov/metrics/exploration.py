@@ -34,8 +34,13 @@ def count_right(beta: Tensor, answers: Tensor) -> Tensor:
     >>> count_right(beta, torch.tensor([[False, True]] * 3))
     tensor([1])
     """
+    return right_cells(beta, answers).sum(-1)
+
+
+def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
+    """Which cells `count_right` counts, `(B, X·Y)` boolean; arguments as there."""
     best = beta == beta.amax(-1, keepdim=True)
-    return ((best & answers).any(-1) & (best.sum(-1) == 1)).sum(-1)
+    return (best & answers).any(-1) & (best.sum(-1) == 1)
 
 
 def success_rate(right: Sequence[int], cells: int) -> Array:

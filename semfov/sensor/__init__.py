@@ -7,7 +7,9 @@ from semfov.sensor.foveation import Foveation, foveate
 from semfov.sensor.glimpse import Glimpse, glimpse
 from semfov.sensor.log_polar import LogPolar, from_log_polar, log_polar
 from semfov.sensor.named import SENSORS, named_sensor, sensor_of
+from semfov.sensor.perspective import Perspective, perspective
 from semfov.sensor.pyramid import Bands, gaussian_pyramid, laplacian_pyramid, pyrdown, pyrup
+from semfov.sensor.sphere import Camera, Regions
 
 if TYPE_CHECKING:
     from semfov.sensor.augmentation import RandomFoveation
@@ -15,10 +17,13 @@ if TYPE_CHECKING:
 __all__ = [
     "SENSORS",
     "Bands",
+    "Camera",
     "Foveation",
     "Glimpse",
     "LogPolar",
+    "Perspective",
     "RandomFoveation",
+    "Regions",
     "Sensor",
     "foveate",
     "from_log_polar",
@@ -27,6 +32,7 @@ __all__ = [
     "laplacian_pyramid",
     "log_polar",
     "named_sensor",
+    "perspective",
     "pyrdown",
     "pyrup",
     "sensor_of",

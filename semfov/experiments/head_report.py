@@ -1,0 +1,164 @@
+"""Finishing an experiment with a head that turns, and its tables."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semfov.errors import DataError
+from semfov.experiments.head import OURS, HeadConfig, HeadRun
+from semfov.experiments.parallel import rank
+from semfov.experiments.parts import Record
+from semfov.experiments.run import finish
+from semfov.experiments.summary import announce, percent, table
+from semfov.io.files import write_text
+from semfov.metrics.averages import standard_error
+from semfov.viz.style import line_style, save_figure
+
+Array = NDArray[np.float64]
+Measure = Callable[[Record], float]
+
+
+def head(config: HeadConfig) -> None:
+    """Run all scenes that have no part yet, and write tables, records and curves."""
+    run = HeadRun(config)
+    finish(run, "looking around")
+    if rank() > 0:
+        return
+    records: list[Record] = []
+    for index in range(len(run.scenes)):
+        part = run.parts.load(index)
+        if part is None:
+            raise DataError(f"{run.parts.path(index)}: this part is gone; give the same command again")
+        records += part["records"]
+    text = summary(records, config)
+    write_text(config.out / "head.md", text)
+    write_text(config.out / "records.jsonl", "".join(json.dumps(record) + "\n" for record in records))
+    announce(text, [config.out / "head.md", config.out / "records.jsonl", *_curves(records, config)])
+
+
+def by_scene(records: list[Record], measure: Measure) -> dict[Any, float]:
+    """Mean of a figure of merit in each scene."""
+    scenes: dict[Any, list[float]] = defaultdict(list)
+    for record in records:
+        scenes[record["scene"]].append(measure(record))
+    return {scene: float(np.mean(values)) for scene, values in scenes.items()}
+
+
+def compared(records: list[Record], others: list[Record], measure: Measure) -> tuple[float, float, float, float]:
+    """Mean over scenes and its standard error, and those of the paired differences to others in the same scenes."""
+    mine, theirs = by_scene(records, measure), by_scene(others, measure)
+    values = np.array([*mine.values()])
+    apart = np.array([value - theirs[scene] for scene, value in mine.items()])
+    errors = (float(standard_error(each)) for each in (values, apart))
+    return float(values.mean()), next(errors), float(apart.mean()), next(errors)
+
+
+def at(record: Record, seconds: float, what: str) -> float:
+    """A figure of an exploration after so many seconds: that of the last look that was over by then; 0 before any."""
+    done = sum(second <= seconds for second in record["seconds"])
+    return float(record[what][done - 1]) if done else 0.0
+
+
+def budgets(config: HeadConfig) -> list[float]:
+    """Seconds at which the tables tell what was reached."""
+    return sorted({second for second in (2.0, 5.0, 10.0) if second < config.seconds} | {config.seconds})
+
+
+def summary(records: list[Record], config: HeadConfig) -> str:
+    """Tables as Markdown."""
+    groups: dict[tuple[str, str], list[Record]] = defaultdict(list)
+    for record in records:
+        groups[record["task"], record["way"]].append(record)
+    what = {"panorama": "panoramas", "mosaic": "mosaics"}[config.scene]
+    lines: list[str] = []
+    searches = {way: group for (task, way), group in groups.items() if task == "search"}
+    if searches:
+        lines += _searching(searches, config, what)
+    explorations = {way: group for (task, way), group in groups.items() if task == "exploration"}
+    if explorations:
+        lines += _exploring(explorations, config, what)
+    return "\n".join(lines)
+
+
+def _searching(searches: dict[str, list[Record]], config: HeadConfig, what: str) -> list[str]:
+    limit, ours = config.seconds, searches[OURS]
+    times = budgets(config)
+    rows = [["", *(f"found in {second:g} s, %" for second in times), "seconds", "less ours", "passes", "less ours"]]
+    for way, group in searches.items():
+        row = [way]
+        for second in times:
+            mean, error, *_ = compared(group, ours, lambda r, s=second: float(r["found"] and r["seconds"] <= s))  # type: ignore[misc]
+            row.append(percent(mean, error))
+        for measure in (
+            lambda r: r["seconds"] if r["found"] else limit,
+            lambda r: float(r["passes"]) if r["found"] else float(config.passes),
+        ):
+            mean, error, apart, error_apart = compared(group, ours, measure)
+            row += [f"{mean:.2f} ± {error:.2f}", "" if way == OURS else f"{apart:.2f} ± {error_apart:.2f}"]
+        rows.append(row)
+    scenes = len({record["scene"] for record in ours})
+    return [
+        f"{len(ours)} searches in {scenes} {what}, until the gaze rests on a cell that a target overlaps. One that "
+        f"does not get there within {limit:g} s and {config.passes} passes counts with these. Means over {what} and "
+        "their standard errors; `less ours`: how much more than ours, paired by scene.",
+        "",
+        *table(rows),
+        "",
+    ]
+
+
+def _exploring(explorations: dict[str, list[Record]], config: HeadConfig, what: str) -> list[str]:
+    ours, times = explorations[OURS], budgets(config)
+    last = times[-1]
+    rows = [
+        ["", *(f"after {second:g} s" for second in times), f"less ours, after {last:g} s", "objects alone", "looks"]
+    ]
+    for way, group in explorations.items():
+        row = [way]
+        for second in times:
+            mean, error, apart, error_apart = compared(group, ours, lambda r, s=second: at(r, s, "success"))  # type: ignore[misc]
+            row.append(percent(mean, error))
+        row.append("" if way == OURS else f"{100 * apart:.1f} ± {100 * error_apart:.1f}")
+        mean, error, *_ = compared(group, ours, lambda r: at(r, last, "objects"))
+        looks, _, *_ = compared(group, ours, lambda r: float(len(r["seconds"])))
+        rows.append([*row, percent(mean, error), f"{looks:.1f}"])
+    return [
+        f"Explorations of {len(ours)} {what}: share of the cells with objects, by area, whose most probable class of "
+        "all, background included, is an object's there, %. `objects alone`: background left out of the answer, after "
+        f"{last:g} s.",
+        "",
+        *table(rows),
+        "",
+    ]
+
+
+def _curves(records: list[Record], config: HeadConfig):  # type: ignore[no-untyped-def]
+    from matplotlib.figure import Figure
+
+    seconds = np.linspace(0, config.seconds, 101)
+    wanted: dict[str, tuple[str, Callable[..., float]]] = {
+        "search": ("found, share", lambda r, s=0.0: float(r["found"] and r["seconds"] <= s)),
+        "exploration": ("cells named right, share", lambda r, s: at(r, s, "success")),
+    }
+    written = []
+    for task, (title, measure) in wanted.items():
+        ways = [*dict.fromkeys(record["way"] for record in records if record["task"] == task)]
+        if not ways:
+            continue
+        figure = Figure(figsize=(6, 4), layout="constrained")
+        axes = figure.subplots()
+        for order, way in enumerate(ways):
+            group = [record for record in records if record["task"] == task and record["way"] == way]
+            line = [np.mean([*by_scene(group, partial(measure, s=s)).values()]) for s in seconds]
+            axes.plot(seconds, line, label=way, **line_style(order, len(ways)))
+        axes.set(xlabel="seconds", ylabel=title, ylim=(0, None))
+        axes.legend(fontsize="small")
+        written.append(save_figure(figure, config.out / f"{task}.png"))
+    return written

@@ -1,0 +1,298 @@
+"""Scenes larger than the field of an eye, seen through a window that a head moves."""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semfov.belief.grid import Grid
+from semfov.data.inputs import ImageLike, as_image
+from semfov.data.large import LargePicture, open_large
+from semfov.errors import check
+from semfov.sensor.perspective import even_rows, go_around, sample
+from semfov.sensor.sphere import Camera, Regions, angle_between, panorama_directions, panorama_points
+
+VIEW = (416, 312)
+"""`(width, height)` in pixels of what the eye sees at once."""
+
+
+class Places(Protocol):
+    """What objects cover of a scene."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: Tensor) -> "Places":
+        """Some of them."""
+
+    def samples(self, count: int = 9) -> Tensor:
+        """Points all over each, its borders included, `(M, count², D)`."""
+
+    def contain(self, points: Tensor, /) -> Tensor:
+        """Which points `(N, D)` lie in each, `(M, N)` boolean."""
+
+
+class World(ABC):
+    """Base of scenes that a head looks around in.
+
+    A pose of the head is three numbers, where the window is and how wide: its field of view in degrees is the last. A
+    point of the scene has D coordinates.
+
+    Attributes:
+        scene: cells over the whole scene, in its own pixels.
+        size: `(w, h)` of a view.
+        centres: `(S, D)`, points in the middle of the cells.
+        area: `(S,)`, of the cells, 1 on average.
+    """
+
+    scene: Grid
+    size: tuple[int, int]
+    centres: Tensor
+    area: Tensor
+
+    @abstractmethod
+    def view(self, pose: Tensor) -> Tensor:
+        """What is seen from a pose `(3,)`, `(3, h, w)`."""
+
+    @abstractmethod
+    def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Where points `(N, D)` are in the view from a pose `(3,)`, `(N, 2)`, and whether they are inside, `(N,)`."""
+
+    @abstractmethod
+    def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Points of the scene `(N, D)` that pixels `(N, 2)` of the view from a pose show."""
+
+    @abstractmethod
+    def cell_of(self, points: Tensor) -> Tensor:
+        """Cells `(N,)` of the scene in which points `(N, D)` lie."""
+
+    @abstractmethod
+    def pixels_of(self, points: Tensor) -> Tensor:
+        """Pixels `(N, 2)` of the scene's picture where points `(N, D)` are."""
+
+    @abstractmethod
+    def turn(self, one: Tensor, other: Tensor) -> Tensor:
+        """Angles in degrees by which the head turns between poses `(..., 3)`, `(...)`."""
+
+    @abstractmethod
+    def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
+        """Angles in degrees between pixels `(..., 2)` of views with a field of view, seen by the eye, `(...)`."""
+
+    @abstractmethod
+    def poses(self, field: float) -> list[list[Tensor]]:
+        """Poses half a window apart, row by row; every second of every second row tile the scene."""
+
+    @abstractmethod
+    def places(self, boxes: Tensor, pose: Tensor) -> Places:
+        """What boxes `(M, 4)` in the view from a pose cover of the scene."""
+
+
+class Panorama(World):
+    """A panorama around the viewer, seen by a perspective camera (`semfov.sensor.sphere.Camera`).
+
+    Args:
+        image: equirectangular, of any common kind (`semfov.as_image`), an even number of columns.
+        size: `(w, h)` of a view in pixels.
+        cell: height of the scene's cells in degrees.
+        reach: how far up and down the head turns, in degrees.
+
+    >>> world = Panorama(torch.rand(3, 64, 128), (40, 30))
+    >>> world.view(torch.tensor([0.0, 0.0, 60.0])).shape, len(world.scene)
+    (torch.Size([3, 30, 40]), 1800)
+    """
+
+    def __init__(
+        self, image: ImageLike, size: tuple[int, int] = VIEW, *, cell: float = 6.0, reach: float = 60.0
+    ) -> None:
+        pixels = as_image(image)
+        check(pixels.shape[-1] % 2 == 0, "image", "an even number of columns", pixels.shape[-1])
+        check(0 < cell <= 90, "cell", "degrees from 0 to 90", cell)
+        check(0 <= reach <= 90, "reach", "degrees from 0 to 90", reach)
+        self.picture, self.size, self.reach = (pixels.shape[-1], pixels.shape[-2]), size, reach
+        self.scene = Grid(round(360 / cell), round(180 / cell), self.picture)
+        self.centres = panorama_directions(self.scene.centres, self.picture)
+        weight = torch.linalg.vector_norm(self.centres[:, ::2], dim=-1)
+        self.area = weight / weight.mean()
+        self._source = go_around(even_rows(pixels)[None])[0]
+
+    def view(self, pose: Tensor) -> Tensor:
+        """What the camera sees."""
+        return sample(self._source, pose, self.size).clamp(0, 1)
+
+    def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels in which directions are seen."""
+        return Camera(pose, self.size).points(points)
+
+    def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Directions in which pixels look."""
+        return Camera(pose, self.size).directions(points)
+
+    def cell_of(self, points: Tensor) -> Tensor:
+        """Cells in which directions lie."""
+        return self.scene.cell_of(self.pixels_of(points))
+
+    def pixels_of(self, points: Tensor) -> Tensor:
+        """Pixels of the panorama in these directions."""
+        return panorama_points(points, self.picture)
+
+    def turn(self, one: Tensor, other: Tensor) -> Tensor:
+        """Angle between the axes of cameras."""
+        middle = torch.tensor([[0.0, 0.0]])
+        return angle_between(*(Camera(pose, (1, 1)).directions(middle)[..., 0, :] for pose in (one, other)))
+
+    def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
+        """Angle between what pixels show."""
+        camera = Camera(torch.tensor([0.0, 0.0, field]), self.size)
+        rays = (camera.directions(points.reshape(-1, 2)).view(*points.shape[:-1], 3) for points in (one, other))
+        return angle_between(*rays)
+
+    def poses(self, field: float) -> list[list[Tensor]]:
+        """Rings around the viewer."""
+        high = 2 * math.degrees(math.atan(math.tan(math.radians(field / 2)) * self.size[1] / self.size[0]))
+        number = math.floor(self.reach / (high / 2))
+        rings = []
+        for row in range(-number, number + 1):
+            pitch = row * high / 2
+            # Of a ring that tiles, the sides of the windows meet down to their corners nearest to the horizon.
+            tiles = (row + number) % 2 == 0
+            low = max(abs(pitch) - high / 2, 0) if tiles else abs(pitch)
+            count = 2 * math.ceil(360 * math.cos(math.radians(low)) / field - 1e-9)
+            rings.append([torch.tensor([360 * n / count - 180, pitch, field]) for n in range(count)])
+        return rings
+
+    def places(self, boxes: Tensor, pose: Tensor) -> Regions:
+        """Regions of the sphere."""
+        return Regions(Camera(pose.expand(len(boxes), 3), self.size), boxes)
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """What boxes cover of a flat scene.
+
+    Attributes:
+        boxes: `(M, 4)` in pixels of the scene.
+    """
+
+    boxes: Tensor
+
+    def __len__(self) -> int:
+        """Number of boxes."""
+        return len(self.boxes)
+
+    def __getitem__(self, index: Tensor) -> "Boxes":
+        """Some of the boxes."""
+        return Boxes(self.boxes[index])
+
+    def samples(self, count: int = 9) -> Tensor:
+        """Points all over each box, `(M, count², 2)`."""
+        share = torch.linspace(0, 1, count).to(self.boxes)
+        y, x = torch.meshgrid(share, share, indexing="ij")
+        low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
+        return low + torch.stack([x, y], -1).flatten(0, 1) * (high - low) - 0.5
+
+    def contain(self, points: Tensor) -> Tensor:
+        """Which points `(N, 2)` lie in each box, `(M, N)`."""
+        low, high = self.boxes[:, None, :2] - 0.5, self.boxes[:, None, 2:] - 0.5
+        return ((points >= low) & (points <= high)).all(-1)
+
+
+class Flat(World):
+    """A large picture in front of the viewer, seen through a window that moves over it.
+
+    Pictures are taken to be far: so many pixels are a degree, all over. A pose is the point in the middle of the window
+    in pixels, and its width in degrees.
+
+    Args:
+        picture: of any common kind (`semfov.data.large.open_large`).
+        size: `(w, h)` of a view in pixels.
+        degree: pixels of the picture for each degree.
+        cell: height of the scene's cells in degrees.
+
+    >>> world = Flat(torch.rand(3, 480, 640), (40, 30), degree=8)
+    >>> world.view(torch.tensor([319.5, 239.5, 40.0])).shape, len(world.scene)
+    (torch.Size([3, 30, 40]), 130)
+    """
+
+    def __init__(
+        self,
+        picture: LargePicture | ImageLike,
+        size: tuple[int, int] = VIEW,
+        *,
+        degree: float = 640 / 60,
+        cell: float = 6.0,
+    ) -> None:
+        check(degree > 0, "degree", "a positive number of pixels", degree)
+        check(cell > 0, "cell", "a positive number of degrees", cell)
+        self.opened, self.size, self.degree = open_large(picture), size, degree
+        self.picture = self.opened.size
+        columns, rows = (max(1, round(side / degree / cell)) for side in self.picture)
+        self.scene = Grid(columns, rows, self.picture)
+        self.centres = self.scene.centres
+        self.area = torch.ones(len(self.scene))
+
+    def _box(self, pose: Tensor) -> tuple[int, int, int, int]:
+        """The window of a pose in whole pixels."""
+        x, y, field = pose.tolist()
+        width = field * self.degree
+        height = width * self.size[1] / self.size[0]
+        x1, y1 = round(x + 0.5 - width / 2), round(y + 0.5 - height / 2)
+        box = x1, y1, x1 + max(1, round(width)), y1 + max(1, round(height))
+        inside = x1 >= 0 and y1 >= 0 and box[2] <= self.picture[0] and box[3] <= self.picture[1]
+        check(inside, "pose", f"a window inside {self.picture[0]} × {self.picture[1]} pixels", box)
+        return box
+
+    def view(self, pose: Tensor) -> Tensor:
+        """The window, resampled."""
+        pixels = self.opened.read(self._box(pose)).float()[None] / 255
+        return F.interpolate(pixels, self.size[::-1], mode="bilinear", antialias=True)[0].clamp(0, 1)
+
+    def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels of the window where points of the picture are."""
+        x1, y1, x2, y2 = self._box(pose)
+        size = points.new_tensor(self.size)
+        seen = (points + 0.5 - points.new_tensor([x1, y1])) * size / points.new_tensor([x2 - x1, y2 - y1]) - 0.5
+        return seen, ((seen >= -0.5) & (seen <= size - 0.5)).all(-1)
+
+    def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Points of the picture that pixels of the window show."""
+        x1, y1, x2, y2 = self._box(pose)
+        extent = points.new_tensor([x2 - x1, y2 - y1])
+        return (points + 0.5) * extent / points.new_tensor(self.size) + points.new_tensor([x1, y1]) - 0.5
+
+    def cell_of(self, points: Tensor) -> Tensor:
+        """Cells in which points lie."""
+        return self.scene.cell_of(points)
+
+    def pixels_of(self, points: Tensor) -> Tensor:
+        """The points themselves."""
+        return points
+
+    def turn(self, one: Tensor, other: Tensor) -> Tensor:
+        """Distance between the middles of windows."""
+        return torch.linalg.vector_norm(one[..., :2] - other[..., :2], dim=-1) / self.degree
+
+    def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
+        """Distance between what pixels show."""
+        return torch.linalg.vector_norm(one - other, dim=-1) * (field / self.size[0])
+
+    def poses(self, field: float) -> list[list[Tensor]]:
+        """Windows that lie in the picture."""
+        width = field * self.degree
+        height = width * self.size[1] / self.size[0]
+        fits = round(width) <= self.picture[0] and round(height) <= self.picture[1]
+        check(fits, "field", "a window that the picture holds", f"{field} degrees, {width:.0f} × {height:.0f} pixels")
+
+        def middles(length: int, side: float) -> list[float]:
+            steps = 2 * math.ceil(length / side - 1 - 1e-9)
+            return [side / 2 - 0.5 + (length - side) * n / max(steps, 1) for n in range(steps + 1)]
+
+        across, down = (middles(*pair) for pair in zip(self.picture, (width, height), strict=True))
+        return [[torch.tensor([x, y, field]) for x in across] for y in down]
+
+    def places(self, boxes: Tensor, pose: Tensor) -> Boxes:
+        """Boxes of the picture."""
+        corners = self.to_scene(boxes.reshape(-1, 2) - 0.5, pose) + 0.5
+        return Boxes(corners.view(-1, 4))

@@ -1,0 +1,130 @@
+"""What a camera sees of a panorama: perspective views of any direction and field of view."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from semfov.errors import check, check_shape
+from semfov.sensor.sphere import Camera, panorama_points
+
+
+def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bool = True) -> Tensor:
+    r"""Views of an equirectangular panorama through a camera that turns and zooms.
+
+    Each pixel of a view is the bilinear sample of the panorama where it looks. Beyond the left and right border the
+    panorama goes on at the other one, and beyond a pole with the column half a turn away.
+
+    Where a view shrinks the panorama, each of its pixels is a mean of k × k samples, one for each panorama pixel in the
+    middle of the view. Towards the poles a panorama has more pixels in a row than the sphere has room for: with
+    `antialias` rows are first smoothed to one resolution (`even_rows`).
+
+    It is differentiable in the panorama, and in yaw, pitch and field of view.
+
+    Args:
+        panorama: `(B, C, H, W)`, an even number of columns; twice as wide as high where pixels are square.
+        pose: `(B, G, 3)`, or `(B, 3)` for one view of each: yaw, pitch and horizontal field of view in degrees
+            (`semfov.sensor.sphere.Camera`).
+        size: `(width, height)` of the views.
+        antialias: smooth what a view shrinks; false takes one bilinear sample for each pixel.
+
+    Returns:
+        `(B, G, C, height, width)`, or `(B, C, height, width)`.
+
+    Raises:
+        InputError: a shape does not fit, or a field of view is not between 0 and 180 degrees.
+
+    >>> perspective(torch.rand(1, 3, 64, 128), torch.tensor([[[0.0, 0.0, 60.0], [180.0, 45.0, 90.0]]]), (40, 30)).shape
+    torch.Size([1, 2, 3, 30, 40])
+    """
+    check_shape(panorama, "panorama", None, None, None, None)
+    check(panorama.is_floating_point(), "panorama", "floating-point pixels", panorama.dtype)
+    batch, wide = panorama.shape[0], panorama.shape[-1]
+    check(wide % 2 == 0, "panorama", "an even number of columns: a pole joins those half a turn apart", wide)
+    check_shape(pose, "pose", 3)
+    fits = pose.ndim in (2, 3) and pose.shape[0] == batch
+    check(fits, "pose", f"shape ({batch}, G, 3) or ({batch}, 3)", tuple(pose.shape))
+    poses = (pose if pose.ndim == 3 else pose[:, None]).to(panorama)
+    source = go_around(even_rows(panorama) if antialias else panorama)
+    views = [
+        torch.stack([sample(source[b], poses[b, g], size, antialias=antialias) for g in range(poses.shape[1])])
+        if poses.shape[1]
+        else panorama.new_zeros(0, panorama.shape[1], size[1], size[0])
+        for b in range(batch)
+    ]
+    result = torch.stack(views) if views else panorama.new_zeros(0, poses.shape[1], panorama.shape[1], size[1], size[0])
+    return result if pose.ndim == 3 else result[:, 0]
+
+
+def go_around(panorama: Tensor) -> Tensor:
+    """A panorama `(B, C, H, W)` with a border of one pixel, as it goes on beyond its sides and its poles."""
+    half = panorama.shape[-1] // 2
+    above, below = panorama[..., :1, :].roll(half, -1), panorama[..., -1:, :].roll(half, -1)
+    high = torch.cat([above, panorama, below], -2)
+    return torch.cat([high[..., -1:], high, high[..., :1]], -1)
+
+
+def even_rows(panorama: Tensor) -> Tensor:
+    r"""A panorama `(..., H, W)` as sharp along each row as it is along the horizon.
+
+    A pixel at latitude φ covers cos φ of the width of one at the horizon. Each becomes the mean of the row over
+    :math:`\min(1 / \cos\varphi, W)` pixels around it. The integral of a row is piecewise linear, so the mean is exact
+    for any width.
+    """
+    high, wide = panorama.shape[-2:]
+    latitude = (torch.arange(high, dtype=torch.float64, device=panorama.device) + 0.5) / high - 0.5
+    width = (1 / (latitude * torch.pi).cos()).clamp(max=wide)
+    # In float64, for a mean is a small difference of long sums.
+    twice = torch.cat([panorama, panorama], -1).double()
+    total = F.pad(twice.cumsum(-1), (1, 0))
+    middle = torch.arange(wide, dtype=torch.float64, device=panorama.device) + wide / 2 + 0.5
+
+    def up_to(place: Tensor) -> Tensor:
+        low = place.floor().long().clamp(0, 2 * wide - 1)
+        index = low.expand(*panorama.shape[:-2], high, wide)
+        return total.gather(-1, index) + (place - low) * twice.gather(-1, index)
+
+    means = (up_to(middle + width[:, None] / 2) - up_to(middle - width[:, None] / 2)) / width[:, None]
+    return means.roll(wide // 2, -1).to(panorama)
+
+
+def sample(source: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bool = True) -> Tensor:
+    """A view `(C, h, w)` of a panorama that goes around `(C, H + 2, W + 2)` (`go_around`); see `perspective`."""
+    (wide, high), (columns, rows) = (source.shape[-1] - 2, source.shape[-2] - 2), size
+    camera = Camera(pose, size)
+    shrink = wide / (2 * math.pi * float(camera.focal.detach()))
+    times = max(1, math.ceil(shrink - 1e-6)) if antialias else 1
+    y, x = (
+        (torch.arange(n * times, dtype=pose.dtype, device=pose.device) + 0.5) / times - 0.5 for n in (rows, columns)
+    )
+    grid = torch.stack(torch.broadcast_tensors(x, y[:, None]), -1)
+    points = panorama_points(camera.directions(grid.flatten(0, 1)), (wide, high)).unflatten(0, grid.shape[:2])
+    place = (2 * points + 3) / points.new_tensor([wide + 2, high + 2]) - 1
+    view = F.grid_sample(source[None], place[None].to(source), mode="bilinear", align_corners=False)
+    return F.avg_pool2d(view, times)[0] if times > 1 else view[0]
+
+
+class Perspective(nn.Module):
+    """A camera that sees views of a panorama, see `perspective`.
+
+    Args:
+        size: `(width, height)` of the views.
+        antialias: smooth what a view shrinks.
+
+    >>> Perspective((40, 30))(torch.rand(1, 3, 64, 128), torch.tensor([[30.0, 10.0, 60.0]])).shape
+    torch.Size([1, 3, 30, 40])
+    """
+
+    def __init__(self, size: tuple[int, int], *, antialias: bool = True) -> None:
+        super().__init__()
+        check(min(size) >= 1, "size", "(width, height) of at least one pixel", size)
+        self.size, self.antialias = size, antialias
+
+    def forward(self, panorama: Tensor, pose: Tensor) -> Tensor:
+        """Views `(B, G, C, h, w)` of panoramas `(B, C, H, W)` from poses `(B, G, 3)`."""
+        return perspective(panorama, pose, self.size, antialias=self.antialias)
+
+    def extra_repr(self) -> str:
+        """Settings, for `repr`."""
+        return f"size={self.size}, antialias={self.antialias}"

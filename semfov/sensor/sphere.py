@@ -1,0 +1,205 @@
+"""Directions on a sphere: pixels of a panorama, pixels of a camera that turns, and the boxes between them.
+
+Directions are unit vectors `(x, y, z)` as OpenCV has them: x to the right, y down, z ahead. Angles are in degrees.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.errors import check, check_shape, values_known
+
+
+def panorama_directions(points: Tensor, size: tuple[int, int]) -> Tensor:
+    r"""Where the pixels of an equirectangular panorama lie, `(..., 3)`.
+
+    .. math:: \lambda = 360° \frac{x + ½}{W} - 180°, \quad \varphi = 90° - 180° \frac{y + ½}{H}, \quad
+              d = (\cos\varphi \sin\lambda, -\sin\varphi, \cos\varphi \cos\lambda)
+
+    with the longitude λ, to the right from the middle, and the latitude φ, up from the horizon.
+
+    Args:
+        points: `(..., 2)`, pixel centres at integers.
+        size: `(W, H)` of the panorama.
+
+    >>> panorama_directions(torch.tensor([511.5, 255.5]), (1024, 512))
+    tensor([0., -0., 1.])
+    """
+    check_shape(points, "points", 2)
+    longitude = (points[..., 0] + 0.5) * (2 * torch.pi / size[0]) - torch.pi
+    latitude = torch.pi / 2 - (points[..., 1] + 0.5) * (torch.pi / size[1])
+    across = latitude.cos()
+    return torch.stack([across * longitude.sin(), -latitude.sin(), across * longitude.cos()], -1)
+
+
+def panorama_points(directions: Tensor, size: tuple[int, int]) -> Tensor:
+    """Pixels `(..., 2)` of a panorama that lie in directions `(..., 3)` of any length; see `panorama_directions`.
+
+    x is from -½ to W - ½. At a pole it can be any: no gradient flows through it there.
+
+    >>> panorama_points(torch.tensor([0.0, -1.0, 1.0]), (1024, 512))
+    tensor([511.5000, 127.5000])
+    """
+    check_shape(directions, "directions", 3)
+    x, y, z = directions.unbind(-1)
+    squared = x.square() + z.square()
+    pole = squared <= 1e-12 * (squared + y.square())
+    one, none = torch.ones_like(x), torch.zeros_like(x)
+    longitude = torch.atan2(torch.where(pole, none, x), torch.where(pole, one, z))
+    latitude = torch.atan2(-y, torch.where(pole, none, torch.where(pole, one, squared).sqrt()))
+    column = (longitude + torch.pi) * (size[0] / (2 * torch.pi)) - 0.5
+    # What is rounded up to half a turn is at the other end of the row.
+    column = torch.where(column >= size[0] - 0.5, column - size[0], column)
+    return torch.stack([column, (torch.pi / 2 - latitude) * (size[1] / torch.pi) - 0.5], -1)
+
+
+def angle_between(one: Tensor, other: Tensor) -> Tensor:
+    r"""Angle between directions `(..., 3)`, `(...)` in degrees: :math:`\operatorname{atan2}(|a × b|, a · b)`.
+
+    >>> angle_between(torch.tensor([0.0, 0.0, 2.0]), torch.tensor([1.0, 0.0, 0.0]))
+    tensor(90.)
+    """
+    one, other = torch.broadcast_tensors(one, other)
+    sine = torch.linalg.vector_norm(torch.linalg.cross(one, other), dim=-1)
+    return torch.rad2deg(torch.atan2(sine, (one * other).sum(-1)))
+
+
+@dataclass(frozen=True)
+class Camera:
+    r"""Perspective cameras at the centre of a sphere, that turn and zoom.
+
+    A camera turns by its yaw to the right, then by its pitch up, :math:`R = R_y(\text{yaw}) R_x(\text{pitch})`, and
+    never rolls. Its focal length in pixels is :math:`f = w / (2 \tan(\text{field} / 2))`. A pixel (u, v) looks along
+
+    .. math:: d = R \, \left(\frac{u + ½ - w/2}{f}, \frac{v + ½ - h/2}{f}, 1\right)
+
+    Args:
+        pose: `(..., 3)`, yaw, pitch and horizontal field of view in degrees.
+        size: `(w, h)` of its image in pixels.
+
+    >>> camera = Camera(torch.tensor([90.0, 0.0, 90.0]), (101, 101))
+    >>> camera.directions(torch.tensor([[50.0, 50.0]])).round(decimals=4)
+    tensor([[1., 0., 0.]])
+    """
+
+    pose: Tensor
+    size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        check_shape(self.pose, "pose", 3)
+        check(min(self.size) >= 1, "size", "(width, height) of at least one pixel", self.size)
+        if values_known(self.pose):
+            field = self.pose[..., 2].detach()
+            check(bool(((field > 0) & (field < 180)).all()), "field", "degrees between 0 and 180", field.tolist())
+
+    @property
+    def focal(self) -> Tensor:
+        """Focal length in pixels, `(...)`."""
+        return self.size[0] / (2 * torch.deg2rad(self.pose[..., 2] / 2).tan())
+
+    @property
+    def rotation(self) -> Tensor:
+        """R, `(..., 3, 3)`: from the frame of the camera to that of the sphere."""
+        yaw, pitch = torch.deg2rad(self.pose[..., :2]).unbind(-1)
+        (sy, cy), (sp, cp) = (yaw.sin(), yaw.cos()), (pitch.sin(), pitch.cos())
+        rows = [cy, sy * sp, sy * cp, torch.zeros_like(cy), cp, -sp, -sy, cy * sp, cy * cp]
+        return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+    def directions(self, points: Tensor) -> Tensor:
+        """Unit directions `(..., N, 3)` in which pixels `(..., N, 2)` or `(N, 2)` look."""
+        check_shape(points, "points", None, 2)
+        middle = points.new_tensor(self.size) / 2 - 0.5
+        flat = (points - middle) / self.focal[..., None, None]
+        rays = torch.cat([flat, torch.ones_like(flat[..., :1])], -1) @ self.rotation.mT
+        return rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
+
+    def points(self, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels in which directions are seen, and which are seen at all.
+
+        Args:
+            directions: `(..., N, 3)` or `(N, 3)`, of any length.
+
+        Returns:
+            `(..., N, 2)`, and `(..., N)` boolean: in front of the camera and inside its image. What lies behind has no
+            pixel, and infinite ones are given.
+        """
+        check_shape(directions, "directions", None, 3)
+        rays = directions @ self.rotation
+        ahead = rays[..., 2] > 0
+        depth = torch.where(ahead, rays[..., 2], torch.ones_like(rays[..., 2]))[..., None]
+        middle = rays.new_tensor(self.size) / 2 - 0.5
+        points = rays[..., :2] / depth * self.focal[..., None, None] + middle
+        inside = (points >= -0.5) & (points <= points.new_tensor(self.size) - 0.5)
+        return torch.where(ahead[..., None], points, torch.inf), ahead & inside.all(-1)
+
+
+@dataclass(frozen=True)
+class Regions:
+    """What boxes in the images of cameras cover of the sphere: exact, at the poles and across the seam too.
+
+    Attributes:
+        camera: of M poses.
+        boxes: `(M, 4)`, `(x1, y1, x2, y2)` in pixels of each camera's image, edges between pixels.
+    """
+
+    camera: Camera
+    boxes: Tensor
+
+    def __len__(self) -> int:
+        """Number of regions."""
+        return len(self.boxes)
+
+    def __getitem__(self, index: Tensor | slice) -> "Regions":
+        """Some of the regions."""
+        return Regions(Camera(self.camera.pose[index], self.camera.size), self.boxes[index])
+
+    def contain(self, directions: Tensor) -> Tensor:
+        """Which directions `(N, 3)` lie in each region, `(M, N)` boolean."""
+        points, _ = self.camera.points(directions)
+        low, high = self.boxes[:, None, :2] - 0.5, self.boxes[:, None, 2:] - 0.5
+        return ((points >= low) & (points <= high)).all(-1)
+
+    def samples(self, count: int = 9) -> Tensor:
+        """A grid of directions in each region, its borders included, `(M, count², 3)`."""
+        share = torch.linspace(0, 1, count).to(self.boxes)
+        y, x = torch.meshgrid(share, share, indexing="ij")
+        at = torch.stack([x, y], -1).flatten(0, 1)
+        low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
+        return self.camera.directions(low + at * (high - low) - 0.5)
+
+    def outlines(self, count: int = 33) -> Tensor:
+        """Directions along the borders of each region, closed, `(M, 4 · count, 3)`."""
+        share = torch.linspace(0, 1, count).to(self.boxes)
+        zero, one = torch.zeros_like(share), torch.ones_like(share)
+        sides = [(share, zero), (one, share), (1 - share, one), (zero, 1 - share)]
+        at = torch.cat([torch.stack(side, -1) for side in sides])
+        low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
+        return self.camera.directions(low + at * (high - low) - 0.5)
+
+    def panorama_boxes(self, size: tuple[int, int], count: int = 257) -> Tensor:
+        """Smallest boxes around the regions in an equirectangular panorama, `(M, 4)`, edges between pixels.
+
+        The edges of a region are curves there, and their extremes are found among `count` points of each. A box that
+        crosses the seam begins inside the panorama and ends beyond its right border. One that holds a pole is as wide
+        as the panorama.
+
+        Args:
+            size: `(width, height)` of the panorama.
+            count: points along each edge.
+        """
+        points = panorama_points(self.outlines(count), size)
+        x, y = points.unbind(-1)
+        width = float(size[0])
+        # Along its outline no two neighbours of a region are half a turn apart.
+        step = (x.diff(dim=-1) + width / 2) % width - width / 2
+        along = torch.cat([x[:, :1], x[:, :1] + step.cumsum(-1)], -1)
+        left, right = along.amin(-1), along.amax(-1)
+        poles = x.new_tensor([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
+        up, down = self.contain(poles).unbind(-1)
+        around = up | down
+        first = torch.where(around, torch.zeros_like(left), (left + 0.5) % width)
+        top = torch.where(up, 0.0, y.amin(-1) + 0.5)
+        bottom = torch.where(down, float(size[1]), y.amax(-1) + 0.5)
+        last = torch.where(around, torch.full_like(first, width), first + right - left)
+        return torch.stack([first, top, last, bottom], -1)

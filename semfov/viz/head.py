@@ -1,0 +1,149 @@
+"""Where eye and head looked in a scene, as a figure and as a film."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from semfov.errors import check
+from semfov.head.agent import HeadPath
+from semfov.viz.animation import Film, render
+from semfov.viz.drawing import draw_image, pixels_of
+from semfov.viz.style import FOUND, GAZE, OTHER, STYLE, TARGET, make_figure, only, styled
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def describe_head(path: HeadPath) -> str:
+    """What came of it, in a sentence."""
+    what = "exploration" if path.target is None else path.classes[path.target]
+    found = "" if path.target is None else (" found" if path.found else " not found")
+    looks = f"{len(path)} look{'s' if len(path) != 1 else ''}"
+    turns = f"{path.turns} turn{'s' if path.turns != 1 else ''} of the head"
+    return f"{what}{found} in {path.seconds[-1]:.1f} s: {looks}, {turns}"
+
+
+@styled
+def plot_head_path(path: HeadPath, image: Tensor, *, looks: int | None = None, ax: Axes | None = None) -> Figure:
+    """The windows that the head turned to, the fixations in their order, and the objects that were found.
+
+    Args:
+        path: of a search or an exploration.
+        image: `(3, h, w)`, RGB in [0, 1], the scene's picture at any size.
+        looks: draw the first so many; None draws all.
+        ax: axes to draw in; None makes a figure.
+    """
+    count = len(path) if looks is None else looks
+    check(1 <= count <= len(path), "looks", f"1 to {len(path)}", count)
+    width, height = path.views.world.scene.extent.tolist()
+    figure, (axes,) = make_figure(
+        1, 1, width=7.2, height=7.2 * height / width + 0.3, layout="compressed", given=only(ax)
+    )
+    draw_path(axes, path, image, count)
+    axes.set_title(describe_head(path), parse_math=False)
+    return figure
+
+
+def draw_path(axes: Axes, path: HeadPath, image: Tensor, count: int) -> None:
+    """The first so many looks, in pixels of the scene's picture."""
+    world = path.views.world
+    draw_image(axes, image, world.scene)
+    poses = list(dict.fromkeys(action // path.views.cells for action in path.actions[:count]))
+    for pose in poses:
+        now = pose == path.actions[count - 1] // path.views.cells
+        frame = world.places(torch.tensor([[0.0, 0.0, *map(float, world.size)]]), path.views.poses[pose])
+        _outline(axes, path, frame, color=GAZE, linewidth=1.6 if now else 0.7, alpha=1.0 if now else 0.6)
+    for look in range(count):
+        places, *_ = path.places(look, 0.3)
+        for number in range(len(places)):
+            colour = TARGET if path.target is not None else FOUND
+            _outline(axes, path, places[torch.tensor([number])], color=colour, linewidth=0.8)
+    points = torch.stack([world.pixels_of(path.gaze(look)[None])[0] for look in range(count)]) + 0.5
+    for one, other in pairwise(points):
+        x, y = _unwrapped(torch.stack([one, other]), path)
+        for shift in (0.0, float(world.scene.extent[0])):
+            axes.plot(x + shift, y, color=OTHER, linewidth=0.8)
+    for number, (x, y) in enumerate(points.tolist()):
+        last = number == count - 1
+        axes.text(x, y, str(number), color="white", fontsize=7 if last else 5, ha="center", va="center",
+                  bbox={"facecolor": TARGET if last else GAZE, "edgecolor": "none", "pad": 0.9,
+                        "boxstyle": "circle"})  # fmt: skip
+
+
+def _outline(axes: Axes, path: HeadPath, places: Any, **style: Any) -> None:
+    """The border of one region of the scene; what crosses the seam of a panorama is drawn at both ends."""
+    world = path.views.world
+    if hasattr(places, "outlines"):
+        points = world.pixels_of(places.outlines()[0]) + 0.5
+    else:
+        x1, y1, x2, y2 = places.boxes[0].tolist()
+        points = torch.tensor([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
+    x, y = _unwrapped(points, path)
+    wide = float(world.scene.extent[0])
+    for shift in (-wide, 0.0, wide):
+        axes.plot(x + shift, y, scalex=False, scaley=False, **style)
+
+
+def _unwrapped(points: Tensor, path: HeadPath) -> tuple[Any, Any]:
+    """x and y of a line, whose neighbours in a panorama are less than half a turn apart."""
+    x, y = points.unbind(-1)
+    if path.views.gaze.shape[-1] == 3:
+        wide = float(path.views.world.scene.extent[0])
+        step = (x.diff() + wide / 2) % wide - wide / 2
+        x = torch.cat([x[:1], x[:1] + step.cumsum(0)])
+    return x.numpy(), y.numpy()
+
+
+def animate_head(
+    path: HeadPath, image: Tensor, file: str | PathLike[str] | None = None, *, seconds: float = 0.8, hold: float = 2.0
+) -> Path | Film:
+    """A film of eye and head: for each look the scene with the windows so far, the view, and what is believed.
+
+    Args:
+        path: of a search or an exploration.
+        image: `(3, h, w)`, RGB in [0, 1], the scene's picture.
+        file: a GIF to write, with an MP4 beside it where ffmpeg is installed; None gives the film itself.
+        seconds: that each frame stays.
+        hold: that the last frame stays longer.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    from matplotlib import rc_context
+
+    with rc_context(STYLE):
+        film = Film(render(_frames(path, image)), seconds, hold, describe_head(path))
+    return film if file is None else film.save(file)[0]
+
+
+def _frames(path: HeadPath, image: Tensor) -> Iterator[Any]:
+    from matplotlib.figure import Figure
+
+    world = path.views.world
+    width, height = world.scene.extent.tolist()
+    high = 7.2 * height / width
+    for look, action in enumerate(path.actions):
+        figure = Figure(figsize=(7.2, high + 3.1), layout="constrained")
+        parts: Any = figure.subfigures(2, 1, height_ratios=[high, 2.9])
+        above, below = parts
+        axes = above.subplots()
+        draw_path(axes, path, image, look + 1)
+        axes.set_title(f"look {look}, {path.seconds[look]:.1f} s")
+        left, right = below.subplots(1, 2, width_ratios=[1, 1.25])
+        left.imshow(pixels_of(world.view(path.pose(look))))
+        x, y = path.views.view_grid.centres[action % path.views.cells].tolist()
+        left.plot([x], [y], marker="+", markersize=14, color=TARGET, markeredgewidth=2)
+        left.set(xticks=[], yticks=[], title="what the head sees")
+        cells = path.maps[look].view(world.scene.rows, world.scene.columns).numpy()
+        right.imshow(cells, extent=(0, width, height, 0), vmin=0, vmax=1, cmap="viridis")
+        what = "any object" if path.target is None else path.classes[path.target]
+        right.set(xticks=[], yticks=[], title=f"P({what})")
+        yield figure

@@ -1,0 +1,160 @@
+"""The experiment with a head that turns: the same with and without a store, resumed, its tables by hand."""
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from semfov.belief.map_evidence import MapEvidence
+from semfov.belief.target_evidence import TargetEvidence
+from semfov.data.scene import Annotation, Scene
+from semfov.detection.detector import Detector
+from semfov.detection.scores import Candidates
+from semfov.errors import InputError
+from semfov.experiments import head_report
+from semfov.experiments.head import HeadConfig, HeadRun, answers_of, raster
+from semfov.head.views import Views
+
+
+class Textures(Detector):
+    """Boxes of 16 px whose scores follow the colours under them."""
+
+    def __init__(self):
+        super().__init__("textures", ("person", "cat", "cup"), (96, 96))
+
+    def propose(self, canvas):
+        means = torch.nn.functional.avg_pool2d(canvas, 16)
+        rows, columns = means.shape[-2:]
+        y, x = torch.meshgrid(torch.arange(rows) * 16.0, torch.arange(columns) * 16.0, indexing="ij")
+        boxes = torch.stack([x, y, x + 16, y + 16], -1).reshape(1, -1, 4).expand(len(canvas), -1, -1)
+        classes = means.flatten(2).mT.clamp(0, 1) ** 2
+        return Candidates(boxes, classes, classes.amax(-1))
+
+
+class Noise:
+    """Five pictures of coloured noise with a box each: quick to make."""
+
+    classes, ids, fingerprint = ("person", "cat", "cup"), [0, 1, 2, 3, 4], "noise"
+
+    def __len__(self):
+        return 5
+
+    def __getitem__(self, index):
+        image = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(index))
+        annotation = self.annotation(index)
+        return Scene(index, f"noise {index}", image, annotation.boxes, annotation.labels)
+
+    def annotation(self, index):
+        boxes = torch.tensor([[8.0 * index, 10, 8.0 * index + 20, 30]])
+        return Annotation(boxes, torch.tensor([1 + index % 3]), torch.zeros(1, dtype=torch.bool), (64, 48))
+
+    def targets(self, index):
+        return [1 + index % 3]
+
+    def digest(self, index):
+        return f"noise {index}"
+
+
+@pytest.fixture(params=["panorama", "mosaic"])
+def config(request, tmp_path, monkeypatch):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Textures())
+    monkeypatch.setattr("semfov.experiments.head.make_scenes", lambda data, classes: Noise())
+    torch.manual_seed(0)
+    models = TargetEvidence(components=4).requires_grad_(False), MapEvidence(components=4).requires_grad_(False)
+    monkeypatch.setattr("semfov.experiments.head.make_target_evidence", lambda name, eye: models[0])
+    monkeypatch.setattr("semfov.experiments.head.make_map_evidence", lambda name, eye: models[1])
+    return HeadConfig(
+        scene=request.param,
+        scenes=2,
+        targets=1,
+        width=256,
+        passes=4,
+        seconds=3.0,
+        out=tmp_path / "out",
+        cache=tmp_path / "cache",
+        workers=1,
+    )
+
+
+def test_the_store_changes_nothing(config):
+    fresh = HeadRun(replace(config, store=False)).outcomes(0)[0]
+    written = HeadRun(config).outcomes(0)[0]
+    run = HeadRun(config)
+    run.eye.detector.propose = None  # nothing is looked at again
+    assert run.outcomes(0)[0] == written == fresh
+
+
+def test_tables_and_resuming(config, capsys):
+    head_report.head(config)
+    text = (config.out / "head.md").read_text()
+    assert text in capsys.readouterr().out
+    records = [json.loads(line) for line in (config.out / "records.jsonl").read_text().splitlines()]
+    assert {record["task"] for record in records} == {"search", "exploration"}
+    for record in records:
+        assert len(record["actions"]) <= config.passes
+        assert f"| {record['way']} " in text
+        if record["task"] == "search":
+            assert record["seconds"] <= config.seconds
+            assert record["passes"] == len(record["actions"])
+        else:
+            assert len(record["seconds"]) == len(record["success"]) == len(record["objects"])
+            assert max(record["success"] + record["objects"]) <= 1
+    parts = sorted((config.out / "parts").rglob("*.json"))
+    before = [part.stat().st_mtime_ns for part in parts]
+    parts[0].unlink()
+    head_report.head(config)
+    assert [part.stat().st_mtime_ns for part in parts[1:]] == before[1:]
+    assert (config.out / "head.md").read_text() == text
+
+
+def test_every_way_starts_alike_and_the_eye_alone_stays(config):
+    for task in ("search", "exploration"):
+        records = [record for record in HeadRun(config).outcomes(1)[0] if record["task"] == task]
+        assert len({record["actions"][0] for record in records}) == 1
+        (alone,) = (record for record in records if record["way"] == "eye alone")
+        assert len({action // 100 for action in alone["actions"]}) == 1
+
+
+def test_a_scan_visits_all_of_the_scene(config):
+    run = HeadRun(config)
+    views = Views(run.world(0))
+    order = raster(views, views.tiling[0][1][1])
+    assert order[0] == views.tiling[0][1][1]
+    assert sorted(order) == sorted(pose for row in views.tiling[0] for pose in row)
+    steps = [float(views.world.turn(views.poses[a], views.poses[b])) for a, b in pairwise(order)]
+    assert np.median(steps) <= 60.1
+
+
+def test_answers_are_where_objects_are(config):
+    run = HeadRun(config)
+    views, places, labels = Views(run.world(0)), run.places(0), run.scenes.annotation(0).labels
+    answers = answers_of(views, places, labels, 3)
+    inside = places.contain(views.world.centres)
+    for cell in range(0, len(views.world.scene), 11):
+        held = set(labels[inside[:, cell]].tolist()) if views.reachable[cell] else set()
+        assert held <= set(answers[cell].nonzero()[:, 0].tolist())
+    assert not answers[~views.reachable].any()
+    assert not answers[:, 0].any()
+
+
+def test_means_and_paired_differences_by_hand():
+    ours = [{"scene": 0, "v": 1.0}, {"scene": 0, "v": 3.0}, {"scene": 1, "v": 6.0}]
+    others = [{"scene": 0, "v": 5.0}, {"scene": 1, "v": 7.0}]
+    mean, error, apart, error_apart = head_report.compared(others, ours, lambda record: record["v"])
+    assert (mean, apart) == (6.0, 2.0)  # 5 and 7; 5 - 2 and 7 - 6
+    assert error == pytest.approx(np.std([5, 7], ddof=1) / np.sqrt(2))
+    assert error_apart == pytest.approx(np.std([3, 1], ddof=1) / np.sqrt(2))
+    record = {"seconds": [0.5, 1.0, 2.0], "success": [0.1, 0.2, 0.4]}
+    assert [head_report.at(record, s, "success") for s in (0.2, 0.5, 1.9, 9.0)] == [0.0, 0.1, 0.2, 0.4]
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [({"passes": 0}, "passes"), ({"seconds": 0.0}, "seconds"), ({"width": 3}, "width"), ({"dwell": 0}, "dwell")],
+)
+def test_settings_have_ranges(settings, told):
+    with pytest.raises(InputError, match=f"{told}: expected"):
+        HeadConfig(**settings)

@@ -1,0 +1,223 @@
+"""A scene seen one window at a time: what is believed of it, and what a look is worth."""
+
+from itertools import pairwise
+
+import pytest
+import torch
+
+from semfov.belief.observers import LearnedMap, Target
+from semfov.episode import rollout
+from semfov.errors import InputError
+from semfov.gaze.choice import Given
+from semfov.head import ExploreGain, Panorama, PerPrice, Scan, SceneObserver, SearchGain, Speeds, Views
+from semfov.head.episode import HeadLooks, live, look_around, rests_on
+from semfov.head.gain import OUT
+
+
+@pytest.fixture
+def views(panorama):
+    return Views(Panorama(panorama, (64, 48)))
+
+
+def episode(views, eye, observer, actions, target=None):
+    looks = HeadLooks(views, live(eye, views), target)
+    gain = SearchGain(views)
+    steps = rollout(
+        looks, observer, lambda _, cell: PerPrice(gain, None, int(cell)), torch.tensor(actions[:1]),
+        Given(torch.tensor([actions])), most=len(actions),
+    ) if target else rollout(
+        looks, observer, Scan(_Flat(views), [0], 1, 0), torch.tensor(actions[:1]), Given(torch.tensor([actions])),
+        most=len(actions),
+    )  # fmt: skip
+    return [step.belief for step in steps]
+
+
+class _Flat(SearchGain):
+    def forward(self, belief, here, poses):
+        return torch.zeros(len(self.views.grid))
+
+
+def ahead(views):
+    """Pose that looks ahead, at the horizon."""
+    return int((views.poses - torch.tensor([0.0, 0, 60])).abs().sum(-1).argmin())
+
+
+def test_a_view_is_believed_of_as_by_the_eye_alone(views, eye, models):
+    """The scene's cells have what the observer of a single picture says of the view, where they lie in it."""
+    evidence = models[0]
+    pose = ahead(views)
+    cells = [33, 66, 52]
+    belief = episode(views, eye, SceneObserver(Target(evidence), views), [pose * 100 + c for c in cells], 3)[-1]
+    image = views.world.view(views.poses[pose])[None]
+    inner, view = Target(evidence), eye.open(image)
+    alone = inner.start(1, views.view_grid, image)
+    for cell in cells:
+        point = views.view_grid.centres[cell][None]
+        alone = inner(alone, eye.look(view, point), point, views.view_grid, 3)
+    seen = views.seen[pose]
+    for number in range(0, len(seen.cells), 7):
+        # Bilinear by hand, between the four cells around the point.
+        at = (seen.points[number] + 0.5) / torch.tensor([6.4, 4.8]) - 0.5
+        at = at.clamp(0, 9)
+        low = at.floor().clamp(max=8).long()
+        share = at - low
+        table = alone.present.view(10, 10)
+        rows = [(1 - share[0]) * table[low[1] + k, low[0]] + share[0] * table[low[1] + k, low[0] + 1] for k in (0, 1)]
+        expected = (1 - share[1]) * rows[0] + share[1] * rows[1]
+        assert float(belief.probability(3)[0, seen.cells[number]]) == pytest.approx(float(expected), abs=1e-5)
+
+
+def test_cells_belong_to_the_view_that_saw_them_from_nearest(views, eye, models):
+    pose = ahead(views)
+    other = int((views.poses - torch.tensor([30.0, 0, 60])).abs().sum(-1).argmin())
+    actions = [pose * 100 + 50, other * 100 + 59, pose * 100 + 59]
+    beliefs = episode(views, eye, SceneObserver(Target(models[0]), views), actions, 1)
+    nearest = torch.full((len(views.world.scene),), torch.inf)
+    owner = nearest.long() * 0 - 1
+    for count, (belief, action) in enumerate(zip(beliefs, actions, strict=True), 1):
+        place, cell = divmod(action, 100)
+        centre = views.view_grid.centres[cell]
+        for number, point in zip(views.seen[place].cells.tolist(), views.seen[place].points, strict=True):
+            distance = torch.linalg.vector_norm(point - centre) / 64
+            if distance <= nearest[number]:
+                nearest[number], owner[number] = distance, place
+        torch.testing.assert_close(belief.closest[0], nearest, atol=1e-5, rtol=0)
+        assert torch.equal(belief.owner[0], owner)
+        assert int(belief.looks) == count
+    assert beliefs[-1].examined.sum() == len({int(views.gaze_cell[action]) for action in actions})
+
+
+def test_what_was_never_seen_has_the_prior(views, eye, models):
+    pose = ahead(views)
+    belief = episode(views, eye, SceneObserver(Target(models[0]), views, prior=0.07), [pose * 100 + 55], 1)[0]
+    unseen = belief.owner[0] < 0
+    assert unseen.any()
+    assert (belief.probability(1)[0, unseen] == 0.07).all()
+    assert torch.equal(unseen, belief.closest[0].isinf())
+
+
+def test_turning_the_world_turns_the_belief(eye, models, panorama):
+    """Nothing is special at the seam: the same scene by half a turn gives the same belief by half a turn."""
+    beliefs = []
+    for turned in (panorama, panorama.roll(180, -1)):
+        views = Views(Panorama(turned, (64, 48)))
+        yaw = 0.0 if turned is panorama else -180.0
+        pose = int((views.poses - torch.tensor([yaw, 0, 60])).abs().sum(-1).argmin())
+        belief = episode(views, eye, SceneObserver(Target(models[0]), views), [pose * 100 + 37], 3)[0]
+        beliefs.append(belief.probability(3).view(30, 60))
+    torch.testing.assert_close(beliefs[0].roll(30, -1), beliefs[1], atol=1e-4, rtol=0)
+
+
+def test_search_gain_by_brute_force(views, eye, models):
+    pose = ahead(views)
+    belief = episode(views, eye, SceneObserver(Target(models[0]), views), [pose * 100 + 55, pose * 100 + 12], 2)[-1]
+    gains = SearchGain(views, 0.7)(belief, pose, range(len(views)))
+    chance, fovea = belief.probability(2)[0], 100 / 640
+    for action in (pose * 100 + 55, pose * 100 + 89, 3, 1234):
+        place, cell = divmod(action, 100)
+        here = int(views.world.cell_of(views.gaze[action][None]))
+        value = 0.0 if belief.examined[0, here] else float(chance[here])
+        points, inside = views.world.to_view(views.world.centres, views.poses[place])
+        for x in inside.nonzero()[:, 0].tolist():
+            distance = float(torch.linalg.vector_norm(points[x] - views.view_grid.centres[cell])) / 64
+            closest = float(belief.closest[0, x])
+            more = 1 / (1 + distance / fovea) - 1 / (1 + closest / fovea)
+            value += 0.7 * float(views.world.area[x]) * float(chance[x]) * max(more, 0.0)
+        assert float(gains[action]) == pytest.approx(value, rel=1e-4, abs=1e-5)
+
+
+def test_gain_per_price_by_hand(views, eye, models):
+    pose = ahead(views)
+    here = pose * 100 + 55
+    belief = episode(views, eye, SceneObserver(Target(models[0]), views), [here], 2)[-1]
+    gain, speeds = SearchGain(views), Speeds()
+    visited = torch.zeros(1, len(views.grid), dtype=torch.bool)
+    gains = gain(belief, pose, range(len(views)))
+    torch.testing.assert_close(PerPrice(gain, speeds, here)(belief, visited)[0], gains / views.prices(here, speeds))
+    torch.testing.assert_close(PerPrice(gain, None, here)(belief, visited)[0], gains)
+
+
+def test_a_dear_head_stays_and_a_free_one_turns(views, eye, models):
+    """The eye has found nothing near: how far it goes is a matter of the price."""
+
+    def turned(speeds):
+        observer, gain, start = SceneObserver(Target(models[0]), views), SearchGain(views), ahead(views) * 100 + 55
+        steps = look_around(
+            views, live(eye, views), observer, lambda action: PerPrice(gain, speeds, action), start,
+            target=1, speeds=speeds, passes=6,
+        )  # fmt: skip
+        poses = [step.action // 100 for step in steps]
+        return sum(one != other for one, other in pairwise(poses))
+
+    assert turned(Speeds(head=1e-3, acceleration=1e-3)) == 0
+    assert turned(Speeds(head=1e6, acceleration=1e9)) == 5
+
+
+def test_an_exploration_by_brute_force(views, eye, models):
+    model, pose = models[1], ahead(views)
+    belief = episode(views, eye, SceneObserver(LearnedMap(model), views), [pose * 100 + 55, pose * 100 + 11])[-1]
+    gains = ExploreGain(views, model, 0.2)(belief, pose, [pose, 0])
+    area, fovea = views.world.area, 100 / 640
+    for action, allowed in ((pose * 100 + 3, True), (22, True), (3, False)):
+        if not allowed:
+            assert gains[action] == OUT
+            continue
+        place, cell = divmod(action, 100)
+        value = 0.0
+        for x, point in zip(views.seen[place].cells.tolist(), views.seen[place].points, strict=True):
+            distance = torch.linalg.vector_norm(point - views.view_grid.centres[cell]) / 64
+            if belief.owner[0, x] < 0:
+                value += float(area[x]) * 0.2 / (1 + float(distance) / fovea)
+            else:
+                told = belief.class_probabilities()[:, x : x + 1], belief.closest[:, x : x + 1], belief.looks
+                value += float(area[x] * model.gain(*told, distance[None, None, None])[0, 0, 0])
+        assert float(gains[action]) == pytest.approx(value, rel=1e-3, abs=1e-4)
+
+
+def test_a_scan_goes_through_its_poses_in_order(views, eye, models):
+    observer, gain = SceneObserver(Target(models[0]), views), SearchGain(views)
+    order = [5, 9, 30]
+    steps = look_around(
+        views, live(eye, views), observer, lambda action: Scan(gain, order, 2, action), 555, target=1, passes=8
+    )
+    assert [step.action // 100 for step in steps] == [5, 5, 9, 9, 30, 30, 5, 5]
+
+
+def test_seconds_are_those_of_the_movements(views, eye, models):
+    observer, gain, speeds = SceneObserver(Target(models[0]), views), SearchGain(views), Speeds()
+    found = look_around(
+        views, live(eye, views), observer, lambda action: PerPrice(gain, speeds, action), 555,
+        target=1, speeds=speeds, seconds=3.0,
+    )  # fmt: skip
+    steps = [*found]
+    total = speeds.look
+    for before, step in zip([None, *steps], steps, strict=False):
+        if before is not None:
+            total += float(views.prices(before.action, speeds)[step.action])
+        assert step.seconds == pytest.approx(total, abs=1e-5)
+    assert steps[-1].seconds <= 3.0
+    assert len({step.action for step in steps}) == len(steps)
+
+
+def test_the_gaze_rests_on_what_its_cell_overlaps(views):
+    """Boxes of the view itself, where both are rectangles."""
+    boxes = [(10.0, 10.0, 20.0, 20.0), (30.2, 30.3, 30.6, 30.7), (50.0, 0.0, 64.0, 48.0)]
+    pose, hits = ahead(views), 0
+    places = views.world.places(torch.tensor(boxes), views.poses[pose])
+    for cell in range(100):
+        x1, y1, x2, y2 = views.view_grid.edges[cell].tolist()
+        found = rests_on(views, pose * 100 + cell, places).tolist()
+        for rests, (left, top, right, bottom) in zip(found, boxes, strict=True):
+            gap = min(right - x1, x2 - left, bottom - y1, y2 - top)
+            if abs(gap) > 0.3:  # where they all but touch, rounding decides
+                assert rests == (gap > 0)
+            hits += rests
+    assert hits > 20
+
+
+def test_one_episode_at_a_time(views, models):
+    observer = SceneObserver(Target(models[0]), views)
+    with pytest.raises(InputError, match="batch: expected one episode at a time"):
+        observer.start(2, views.grid, torch.zeros(1))
+    with pytest.raises(InputError, match="prior: expected a probability"):
+        SceneObserver(Target(models[0]), views, prior=1.5)

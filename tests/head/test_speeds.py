@@ -1,0 +1,45 @@
+"""Seconds of eye and head: against published figures and a simulation."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.errors import InputError
+from semfov.head import Speeds
+
+
+def test_saccades_follow_the_main_sequence():
+    """21 ms and 2.2 ms for each degree (Carpenter, 1988); no saccade takes no time."""
+    found = Speeds().saccade(torch.tensor([0.0, 5.0, 10.0, 20.0]))
+    torch.testing.assert_close(found, torch.tensor([0.0, 0.032, 0.043, 0.065]))
+
+
+@given(st.floats(0.5, 180), st.floats(20, 400), st.floats(50, 2000))
+def test_the_head_turns_as_a_motor_with_bounded_speed_and_acceleration(angle, speed, acceleration):
+    found = float(Speeds(head=speed, acceleration=acceleration).turn(torch.tensor(angle, dtype=torch.float64)))
+    # Step by step: accelerate as long as there is room to brake.
+    step, time, done, pace = found / 20_000, 0.0, 0.0, 0.0
+    while done < angle and time < 2 * found:
+        braking = pace**2 / (2 * acceleration) >= angle - done
+        pace = max(pace - acceleration * step, 1e-9) if braking else min(pace + acceleration * step, speed)
+        done, time = done + pace * step, time + step
+        if braking and pace <= acceleration * step:
+            break
+    assert time == pytest.approx(found, rel=0.01)
+
+
+def test_movements_happen_at_once():
+    speeds = Speeds()
+    eye, head, zoom = torch.tensor(20.0), torch.tensor(90.0), torch.tensor(-3.0)
+    none = torch.tensor(0.0)
+    assert float(speeds.price(none, none, none)) == speeds.look
+    assert float(speeds.price(eye, head, none)) == pytest.approx(speeds.look + float(speeds.turn(head)))
+    assert float(speeds.price(eye, none, none)) == pytest.approx(speeds.look + float(speeds.saccade(eye)))
+    assert float(speeds.price(eye, head, zoom)) == pytest.approx(speeds.look + 3 * speeds.zoom)
+
+
+@pytest.mark.parametrize("settings", [{"look": 0.0}, {"head": -1.0}, {"eye": float("nan")}, {"acceleration": 0.0}])
+def test_speeds_that_cannot_be_are_refused(settings):
+    with pytest.raises(InputError, match=next(iter(settings))):
+        Speeds(**settings)

@@ -1,0 +1,127 @@
+"""Scenes seen through a window: pixels and points there and back, poses that cover all, boxes as regions."""
+
+import pytest
+import torch
+
+from semfov.errors import InputError
+from semfov.head import Flat, Panorama, Views
+from semfov.sensor.glimpse import glimpse
+from semfov.sensor.perspective import perspective
+
+
+@pytest.fixture(params=["panorama", "flat"])
+def world(request):
+    torch.manual_seed(0)
+    if request.param == "panorama":
+        return Panorama(torch.rand(3, 180, 360), (64, 48))
+    return Flat(torch.rand(3, 480, 640), (64, 48), degree=4)
+
+
+def test_points_there_and_back(world):
+    points = torch.rand(40, 2) * 40
+    for row in world.poses(60.0):
+        there = world.to_scene(points, row[0])
+        back, inside = world.to_view(there, row[0])
+        torch.testing.assert_close(back, points, atol=2e-3, rtol=0)
+        assert inside.all()
+
+
+def test_every_second_pose_of_every_second_row_tiles_the_scene(world):
+    """All of a flat scene, and of a panorama what the head can reach."""
+    rows = world.poses(60.0)
+    tiling = [pose for row in rows[::2] for pose in row[::2]]
+    seen = torch.stack([world.to_view(world.centres, pose)[1] for pose in tiling]).any(0)
+    if isinstance(world, Flat):
+        assert seen.all()
+    else:
+        latitude = torch.rad2deg(torch.asin(-world.centres[:, 1]))
+        assert seen[latitude.abs() < 60].all()
+
+
+def test_cells_hold_their_centres(world):
+    assert torch.equal(world.cell_of(world.centres), torch.arange(len(world.scene)))
+    torch.testing.assert_close(world.pixels_of(world.centres), world.scene.centres, atol=1e-3, rtol=0)
+    assert float(world.area.mean()) == pytest.approx(1)
+
+
+def test_boxes_come_back_as_places(world):
+    boxes = torch.tensor([[10.0, 5, 30, 25], [40, 20, 64, 48]])
+    pose = world.poses(60.0)[1][1]
+    places = world.places(boxes, pose)
+    for number, (x1, y1, x2, y2) in enumerate(boxes.tolist()):
+        inside = torch.tensor([[x1 + 0.5, y1 + 0.5], [x2 - 1.5, y2 - 1.5], [(x1 + x2) / 2, (y1 + y2) / 2]])
+        outside = torch.tensor([[x1 - 2, y1], [x1, y1 - 2]])
+        assert places.contain(world.to_scene(inside, pose))[number].all()
+        assert not places.contain(world.to_scene(outside, pose))[number].any()
+    back, _ = world.to_view(places.samples(2).flatten(0, 1), pose)
+    corners = back.view(2, 4, 2)[:, [0, 3]].flatten(1) + 0.5
+    torch.testing.assert_close(corners, boxes, atol=5e-2, rtol=0)
+
+
+def test_a_view_of_a_panorama_is_perspective():
+    torch.manual_seed(0)
+    image = torch.rand(3, 90, 180)
+    pose = torch.tensor([33.0, 20.0, 60.0])
+    expected = perspective(image[None], pose[None], (32, 24))[0]
+    torch.testing.assert_close(Panorama(image, (32, 24)).view(pose), expected.clamp(0, 1))
+
+
+def test_a_view_of_a_flat_scene_is_a_glimpse():
+    """Inside: at the border a glimpse shows what lies beyond."""
+    torch.manual_seed(0)
+    image = torch.rand(3, 120, 160).mul(255).round() / 255
+    pose = torch.tensor([79.5, 59.5, 16.0])
+    view = Flat(image, (32, 24), degree=5).view(pose)
+    expected = glimpse(image[None], torch.tensor([[40.0, 30, 120, 90]]), (32, 24))[0]
+    torch.testing.assert_close(view[:, 1:-1, 1:-1], expected[:, 1:-1, 1:-1], atol=1e-5, rtol=0)
+
+
+def test_angles_of_eye_and_head():
+    """Closed forms: a ring is turned through by its steps, and the eye sees from side to side the field of view."""
+    panorama = Panorama(torch.rand(3, 90, 180), (64, 48))
+    ring = torch.stack(panorama.poses(60.0)[2])
+    assert float(ring[0, 1]) == 0
+    torch.testing.assert_close(panorama.turn(ring[0].expand_as(ring), ring)[:4], torch.tensor([0.0, 30, 60, 90]))
+    sides = torch.tensor([[-0.5, 23.5], [63.5, 23.5]])
+    assert float(panorama.shift(sides[0], sides[1], 60.0)) == pytest.approx(60, abs=1e-3)
+    flat = Flat(torch.rand(3, 480, 640), (64, 48), degree=4)
+    assert float(flat.shift(sides[0], sides[1], 60.0)) == pytest.approx(60, abs=1e-3)
+    assert float(flat.turn(torch.tensor([0.0, 0, 60]), torch.tensor([30.0, 40, 60]))) == pytest.approx(12.5)
+
+
+def test_actions_are_cells_of_a_strip(world):
+    views = Views(world)
+    assert len(views.grid) == len(views.poses) * 100
+    centres = views.grid.centres
+    for action in (0, 137, 555, len(views.grid) - 1):
+        pose, point = views.action_of(centres[action])
+        assert pose == action // 100
+        torch.testing.assert_close(point, views.view_grid.centres[action % 100], atol=1e-3, rtol=0)
+        expected = world.to_scene(point[None], views.poses[pose])[0]
+        torch.testing.assert_close(views.gaze[action], expected, atol=1e-3, rtol=1e-4)
+
+
+def test_prices_by_brute_force(world):
+    from semfov.head import Speeds
+
+    views, speeds = Views(world, (40.0, 80.0) if isinstance(world, Panorama) else (60.0,)), Speeds()
+    here = 7 * 100 + 33
+    prices = views.prices(here, speeds)
+    generator = torch.Generator().manual_seed(0)
+    for action in torch.randint(len(views.grid), (20,), generator=generator).tolist():
+        one, other = views.poses[7], views.poses[action // 100]
+        points = views.view_grid.centres[[33, action % 100]]
+        eye = world.shift(points[0], points[1], float(other[2]))
+        expected = speeds.price(eye, world.turn(one, other), (other[2] / one[2]).log2())
+        assert float(prices[action]) == pytest.approx(float(expected), abs=1e-4)
+    assert float(prices[here]) == pytest.approx(speeds.look)
+
+
+def test_windows_beyond_a_picture_are_refused():
+    flat = Flat(torch.rand(3, 48, 64), (32, 24), degree=2)
+    with pytest.raises(InputError, match="pose: expected a window inside 64 × 48 pixels"):
+        flat.view(torch.tensor([0.0, 0.0, 20.0]))
+    with pytest.raises(InputError, match="field: expected a window that the picture holds"):
+        flat.poses(60.0)
+    with pytest.raises(InputError, match="fields: expected"):
+        Views(flat, (30.0, 20.0))
