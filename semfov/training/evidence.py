@@ -1,9 +1,8 @@
 """Training evidence for targets on the looks of whole searches."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -15,8 +14,7 @@ from semfov.belief.observers import Target, TargetBelief
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import nearly_fixated
 from semfov.episode import Step, rollout
-from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Weight, Workers
+from semfov.experiments.settings import Count, Positive, Share, Weight
 from semfov.experiments.summary import table
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Exploratory
@@ -24,7 +22,7 @@ from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.training.descent import descend
 from semfov.training.evidence_examples import ExampleLooks, Examples, LookingRun, make_examples
-from semfov.training.frame import Fit, fit_and_write, split
+from semfov.training.frame import Fit, FitOnLooksConfig, fit_and_write, split
 from semfov.training.outputs import training_of
 
 JUDGED = (1, 5, 15)
@@ -32,60 +30,29 @@ JUDGED = (1, 5, 15)
 
 
 @dataclass(frozen=True)
-class FitSearchConfig(Settings):
+class FitSearchConfig(FitOnLooksConfig):
     """Train the evidence for a target.
 
     Args:
-        data: photographs to learn from.
-        detector: which detector looks through the fovea.
-        sensor: the foveal sensor.
-        name: name of the model (None: the detector's).
         classes: classes that a photograph holds to learn from, at most.
         absent: classes that a photograph does not hold, at most (None: as many as it holds).
-        columns: cells in a row.
-        rows: cells in a column.
         max_target_area: classes that cover a larger share of the image are not searched for.
-        holdout: every n-th photograph is kept out and used to judge, and to choose thresholds by.
-        looks: of a search.
-        astray: share of the fixations that are drawn at random, so that all cells are learned from.
         landing: weight in the loss of landing on the target with the next fixation.
         presence: weight in the loss of telling whether the target is in the photograph.
         false_alarms: share of absent targets that may be called found, by which the threshold is chosen.
         surest: probability from which on a target counts as found at the latest, however many false alarms that makes.
         lost: share of the targets that may be missed because no cell is worth a look any more.
-        steps: steps of training.
-        batch: examples in a step.
-        rate: highest learning rate.
-        seed: of the choice of classes, first parameters and training.
-        out: folder for the model and the report.
-        cache: folder for what was seen from every cell, shared with `eval.search` (None: the user's cache).
-        workers: processes that look (None: one for each CPU core).
     """
 
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    name: Name | None = None
     classes: Count = 2
     absent: Count | None = None
-    columns: Side = 10
-    rows: Side = 10
     max_target_area: Positive = 0.2
-    holdout: Annotated[int, Range(2, 10**9)] = 5
-    looks: Annotated[int, Range(2, 10_000)] = 16
-    astray: Share = 0.3
     landing: Weight = 1.0
     presence: Weight = 0.5
     false_alarms: Share = 0.015
     surest: Share = 1.0
     lost: Share = 0.02
-    steps: Count = 500
-    batch: Count = 48
-    rate: Positive = 5e-3
-    seed: Seed = 0
     out: Path = Path("runs/fit_search")
-    cache: Path | None = None
-    workers: Workers | None = None
 
 
 def fit_search(config: FitSearchConfig) -> None:
