@@ -12,7 +12,7 @@ from semfov.belief import TargetEvidence
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Target, TargetBelief
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import nearly_fixated
+from semfov.decision import place_known
 from semfov.episode import Step, rollout
 from semfov.experiments.settings import Count, Positive, Share, Weight
 from semfov.experiments.summary import table
@@ -39,9 +39,11 @@ class FitSearchConfig(FitOnLooksConfig):
         max_target_area: classes that cover a larger share of the image are not searched for.
         landing: weight in the loss of landing on the target with the next fixation.
         presence: weight in the loss of telling whether the target is in the photograph.
+        gaze: weight in the loss of the cells that the gaze goes to next and that it would name.
         false_alarms: share of absent targets that may be called found, by which the threshold is chosen.
         surest: probability from which on a target counts as found at the latest, however many false alarms that makes.
-        lost: share of the targets that may be missed because no cell is worth a look any more.
+        lost: share of the targets that may be missed because their place is not known, and as many again because no
+            cell is worth a look any more.
     """
 
     classes: Count = 2
@@ -49,6 +51,7 @@ class FitSearchConfig(FitOnLooksConfig):
     max_target_area: Positive = 0.2
     landing: Weight = 1.0
     presence: Weight = 0.5
+    gaze: Weight = 1.0
     false_alarms: Share = 0.015
     surest: Share = 1.0
     lost: Share = 0.02
@@ -110,16 +113,23 @@ def searches(
 def objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
     r"""Cross-entropy of cells and of presence, and minus the log probability that a soft fixation lands on the target.
 
-    .. math:: \sum_x \mathrm{BCE}(P(t \in x)) / 25 + w_p \, \mathrm{BCE}(P(t)) - w_l \ln \frac{
-              \sum_{x \in \text{goal}} o(x)}{\sum_x o(x)}, \qquad o = p / (1 - p)
+    .. math:: \sum_x \mathrm{BCE}(P(t \in x)) / 25 + w_g \sum_{x \in \{a, b\}} \mathrm{BCE}(P(t \in x))
+              + w_p \, \mathrm{BCE}(P(t)) - w_l \ln \frac{\sum_{x \in \text{goal}} o(x)}{\sum_x o(x)},
+              \qquad o = p / (1 - p)
 
-    over cells that were not visited; cells count four times as much as one mean over them would.
+    over cells that were not visited in the last term; cells count four times as much as one mean over them would. The
+    cell a is the next one to be fixated, and b the most probable one of those that were. They are chosen because they
+    seem probable, so that what is right of cells in general is too much for them: they are learned from on their own.
     """
     belief = step.belief
     assert isinstance(belief, TargetBelief)
     cells, present = belief.present.logit(eps=1e-7), goal.any(-1).to(belief.anywhere)
     loss = 4 * F.binary_cross_entropy_with_logits(cells, goal.to(cells))
     loss = loss + config.presence * F.binary_cross_entropy(belief.anywhere, present)
+    named = cells.detach().masked_fill(~step.visited, -torch.inf).argmax(-1)
+    for chosen in (step.next_cell, named):
+        there = goal.gather(-1, chosen[:, None]).to(cells)
+        loss = loss + config.gaze * F.binary_cross_entropy_with_logits(cells.gather(-1, chosen[:, None]), there)
     # Where the target was fixated, the search would be over.
     some = goal.any(-1) & ~(goal & step.visited).any(-1)
     if some.any():
@@ -158,41 +168,55 @@ def judge(
                 "presence_ece": float(calibration_error(image, there)),
             }
         )
-    looked = nearly_fixated(torch.stack(present), torch.stack(visited))
-    return judged, choose_thresholds(config, torch.stack(anywhere), looked, torch.stack(following), there)
+    cells, seen = torch.stack(present), torch.stack(visited)
+    place = cells.masked_fill(~seen, 0).amax(-1) * place_known(cells, seen)
+    return judged, choose_thresholds(config, torch.stack(anywhere), place, torch.stack(following), there)
 
 
 def choose_thresholds(
-    config: FitSearchConfig, anywhere: Tensor, looked: Tensor, left: Tensor, there: Tensor
+    config: FitSearchConfig, anywhere: Tensor, place: Tensor, left: Tensor, there: Tensor
 ) -> Thresholds:
-    """The least confirmation with so few false alarms, and the largest price of a look that loses so few targets.
+    """Thresholds of a few false alarms and lost targets.
+
+    With every threshold of the place goes the least confirmation that has so few false alarms. Of these pairs that with
+    the surest place is taken that loses so few of the targets that are found wherever they are; then the largest price
+    of a look that loses so few.
 
     Args:
         config: of the fit.
         anywhere: `(n, E)`, probability of presence after each look of each search.
-        looked: `(n, E)` boolean, whether a cell about as probable as any was fixated.
-        left: `(n, E)`, greatest chance of a cell that was not.
+        place: `(n, E)`, greatest probability of a fixated cell; 0 where another cell is more probable by much.
+        left: `(n, E)`, greatest chance of a cell that was not fixated.
         there: `(E,)` boolean, whether the target is there.
     """
+    number = torch.arange(len(anywhere))[:, None]
 
-    def found(confirm: float, give_up: float) -> Tensor:
+    def found(chosen: Thresholds) -> Tensor:
         """Which searches end with the target found."""
-        sure, tired = (anywhere >= confirm) & looked, left < give_up
-        number = torch.arange(len(sure))[:, None]
+        sure = (anywhere >= chosen.confirm) & (place > 0) & (place >= chosen.place)
         first = torch.where(sure, number, len(sure)).amin(0)
-        return sure.any(0) & ~(tired & (number < first)).any(0)
+        return sure.any(0) & ~((left < chosen.give_up) & (number < first)).any(0)
 
-    confirm = 1.0
-    for candidate in torch.arange(0.99, 0.49, -0.01).tolist():
-        if float(found(candidate, 0.0)[~there].double().mean()) > config.false_alarms:
-            break
-        confirm = candidate
-    confirm = min(confirm, config.surest)
-    told = int(found(confirm, 0.0)[there].sum())
+    def hits(chosen: Thresholds) -> int:
+        return int(found(chosen)[there].sum())
+
+    def confirming(least: float) -> Thresholds:
+        """With a threshold of the place."""
+        confirm = 1.0
+        for candidate in torch.arange(0.99, 0.49, -0.01).tolist():
+            if float(found(Thresholds(candidate, 0.0, least))[~there].double().mean()) > config.false_alarms:
+                break
+            confirm = candidate
+        return Thresholds(min(confirm, config.surest), 0.0, least)
+
+    lost = config.lost * int(there.sum())
+    anyhow = confirming(0.0)
+    pairs = (confirming(least) for least in torch.arange(0.95, 0.04, -0.05).tolist())
+    chosen = next((pair for pair in pairs if hits(anyhow) - hits(pair) <= lost), anyhow)
     for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01):
-        if told - int(found(confirm, give_up)[there].sum()) <= config.lost * int(there.sum()):
-            return Thresholds(confirm, give_up)
-    return Thresholds(confirm, 0.0)
+        if hits(chosen) - hits(chosen.changed(give_up=give_up)) <= lost:
+            return chosen.changed(give_up=give_up)
+    return chosen
 
 
 def report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int, held_out: int) -> str:
@@ -226,7 +250,8 @@ def report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int,
             "",
             *table([head, *rows]),
             "",
-            f"Thresholds: found from {thresholds.confirm:.3f}, a cell is worth a look from {thresholds.give_up:.2f}.",
+            f"Thresholds: found from {thresholds.confirm:.3f}, in a cell from {thresholds.place:.2f}; a cell is worth "
+            f"a look from {thresholds.give_up:.2f}.",
             "",
         ]
     )

@@ -41,13 +41,15 @@ class EvidenceLook(Look):
 
     def __getitem__(self, index: Tensor | slice) -> Self:
         """Some of the looks."""
-        return replace(self, **{name: tensor[index] for name, tensor in self._tensors().items()})
+        chosen: dict[str, Any] = {name: tensor[index] for name, tensor in self._tensors().items()}
+        return replace(self, **chosen)
 
     @classmethod
     def join(cls, looks: Sequence[Self]) -> Self:
         """All looks of several batches."""
         names = looks[0]._tensors()
-        return replace(looks[0], **{name: torch.cat([getattr(look, name) for look in looks]) for name in names})
+        joined: dict[str, Any] = {name: torch.cat([getattr(look, name) for look in looks]) for name in names}
+        return replace(looks[0], **joined)
 
     def _tensors(self) -> dict[str, Tensor]:
         """All but the number of columns, which is the same for all looks."""
