@@ -241,10 +241,11 @@ def test_a_part_that_is_gone_is_fitted_again_alone(home, tmp_path, monkeypatch):
     assert again.read_bytes() == once.read_bytes()
 
 
-def test_the_demonstration_takes_the_folder(home, tmp_path, capsys):
+@pytest.mark.parametrize("agent", ["recommended", "published"])
+def test_the_demonstration_takes_the_folder(home, tmp_path, capsys, agent):
     photo = str(home / "photographs/0.png")
     given = [photo, "--target", "red", "--shifts", "0", "--models", str(home / "models"), "--out", str(tmp_path)]
-    assert demo(given) == 0
+    assert demo([*given, "--agent", agent]) == 0
     assert "0.png: “red”" in capsys.readouterr().out
 
 
