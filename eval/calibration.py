@@ -21,7 +21,7 @@ import torch
 import yaml
 
 import semfov
-from semfov.experiments.belief_calibration import LOOKS, BeliefCalibrationRun, published_model
+from semfov.experiments.belief_calibration import LOOKS, BeliefCalibrationRun
 from semfov.experiments.belief_calibration_report import write_belief_report
 from semfov.experiments.command import run_command
 from semfov.experiments.config import (
@@ -36,7 +36,7 @@ from semfov.experiments.parallel import rank
 from semfov.experiments.run import finish
 from semfov.experiments.samples import Samples, SampleSettings, collect
 from semfov.experiments.settings import Count, Seed, Settings, Share, Side, Workers
-from semfov.experiments.setup import make_observation, plain
+from semfov.experiments.setup import make_observation, plain, published_model
 from semfov.experiments.summary import announce, table
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration

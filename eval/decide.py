@@ -4,8 +4,9 @@
 
 Without photographs it uses the embedded scenes. In every photograph a class that is there and one that is not are
 searched for until the agent decides. The table has the area under the ROC of the last probability, hits at some shares
-of false alarms, and what came of the decisions; beside it the same belief under random gaze, and the largest score of
-one sharp look at the whole photograph. What is seen from every cell is shared with `python -m eval.search`.
+of false alarms, and what came of the decisions; beside it the same belief under random gaze, the published belief by
+the same rule and by that of its agent, and one sharp look at the whole photograph. What is seen from every cell is
+shared with `python -m eval.search`.
 """
 
 import json
@@ -26,7 +27,7 @@ from semfov.experiments.config import (
     SensorConfig,
 )
 from semfov.experiments.decision_report import SHARES, mean, percent, telling
-from semfov.experiments.decisions import DecisionConfig, DecisionRun
+from semfov.experiments.decisions import AGENT, LANDINGS, LANDINGS_TOLD, DecisionConfig, DecisionRun, landing_cells
 from semfov.experiments.fitted import with_models
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
@@ -50,6 +51,7 @@ class DecideConfig(Settings):
         protocol: gaze shifts, seed.
         confirm: probability that the image holds the target, from which on it counts as found (None: the model's).
         give_up: probability below which a cell is not worth a look (None: the model's).
+        place: probability that the cell must have that is named (None: the model's).
         prices: of a look in right decisions; for each, searches that end when looking on is not worth it.
         out: folder for table and records.
         cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
@@ -64,6 +66,7 @@ class DecideConfig(Settings):
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     confirm: Share | None = None
     give_up: Share | None = None
+    place: Share | None = None
     prices: tuple[Positive, ...] = (0.002, 0.005, 0.01, 0.02, 0.05)
     out: Path = Path("runs/decide")
     cache: Path | None = None
@@ -110,12 +113,11 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
     rows = [["", "area under ROC", *(f"hits at {share:.0%}" for share in SHARES)]]
     rows += [[name, *figures] for name, figures in zip(told, telling(told, there), strict=True)]
     decided = [["", "found, there", "found, not there", "undecided", "looks, there", "looks, not there", "place right",
-                "IoU", "p before and after landing"]]  # fmt: skip
+                "IoU"]]  # fmt: skip
     for name, group in groups.items():
         present = [record for record in group if record["present"]]
         absent = [record for record in group if not record["present"]]
         found = [record for record in present if record["outcome"] == "found"]
-        landings = [record["landing"] for record in present if record["landing"] is not None]
         places = [record["right_place"] for record in group if record["outcome"] == "found"]
         decided.append(
             [
@@ -127,9 +129,9 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
                 mean([record["looks"] for record in absent]),
                 percent(sum(places), len(places)),
                 mean([record["overlap"] for record in found if record["overlap"] is not None], 2),
-                " → ".join(mean(list(column), 2) for column in zip(*landings, strict=True)) or "-",
             ]
         )
+    decided.append(sharp_decisions(groups[names[0]]))
     return "\n".join(
         [
             f"Is the target there? {len(there)} searches ({sensed}), {int(there.sum())} for a class that is. "
@@ -137,14 +139,48 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
             "",
             *table(rows),
             "",
-            "Decisions in %, and mean looks; the place is right where the target overlaps the cell that is named. Rows "
-            "with a price end when looking on is not worth that, in right decisions a look, the others at thresholds.",
+            "Decisions in %, and mean looks; the place is right where the target overlaps the cell that is named, in "
+            "all searches that name one. Rows with a price end when looking on is not worth that, in right decisions a "
+            "look, and a detection at the gaze ends a search from a score of 0.5; the others end at thresholds. The "
+            f"sharp look says found from the score that gives it as many hits as {names[0]} has.",
             "",
             *table(decided),
+            "",
+            LANDINGS_TOLD,
+            "",
+            *table([["", *LANDINGS], *landings(groups)]),
             "",
             *worth(groups, prices),
         ]
     )
+
+
+def sharp_decisions(records: Sequence[Record]) -> list[str]:
+    """What one sharp look says, at the score from which it has as many hits as these searches."""
+    present = [record for record in records if record["present"]]
+    hits = sum(record["outcome"] == "found" for record in present)
+    least = sorted((record["sharp"] for record in present), reverse=True)[hits - 1] if hits else float("inf")
+    told = [record for record in records if record["sharp"] >= least and record["sharp_place"] is not None]
+    there = [record["sharp_place"]["overlap"] for record in told if record["present"]]
+    return [
+        "one sharp look",
+        percent(len(there), len(present)),
+        percent(len(told) - len(there), len(records) - len(present)),
+        "-",
+        "1.0",
+        "1.0",
+        percent(sum(record["sharp_place"]["right"] for record in told), len(told)),
+        mean(there, 2),
+    ]
+
+
+def landings(groups: dict[str, list[Record]]) -> list[list[str]]:
+    """Rows of the table of landings."""
+    landed = {name: [each for each in group if each["landing"] is not None] for name, group in groups.items()}
+    return [
+        [name, *landing_cells([(each["landing"], each["landing_seen"]) for each in group])]
+        for name, group in landed.items()
+    ]
 
 
 def worth(groups: dict[str, list[Record]], prices: Sequence[float]) -> list[str]:
@@ -154,7 +190,7 @@ def worth(groups: dict[str, list[Record]], prices: Sequence[float]) -> list[str]
     head = ["price of a look", "by thresholds", "by price"]
     rows = [head]
     for price in prices:
-        names = ("target-evidence", f"price {price:g}")
+        names = (AGENT, f"price {price:g}")
         rows.append([f"{price:g}", *(f"{utility(groups[name], price):.4f}" for name in names)])
     return [
         "Mean worth of a search: 1 where the decision is right, less the price of its looks; undecided is not right.",

@@ -154,7 +154,8 @@ def demo(config: DemoConfig) -> None:
 def make_agent(config: DemoConfig) -> ActivePerception:
     """The agent that the settings name."""
     if config.models is not None:
-        return ActivePerception.from_pretrained(config.models, **moved(config.detector))
+        own = ActivePerception.published if config.agent == "published" else ActivePerception.from_pretrained
+        return own(config.models, **moved(config.detector))
     if config.agent == "recommended":
         sensor = SENSORS[config.sensor or "gradual"]
         return ActivePerception.recommended(config.detector, sigma=sensor["sigma"], growth=sensor["growth"])

@@ -12,7 +12,10 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+from eval.calibration import CalibrationConfig, judge_beliefs
+from eval.decide import DecideConfig, search_and_decide
 from eval.explore import explore
 from eval.page import paper
 from eval.page.curves import OBJECTS
@@ -32,11 +35,12 @@ from eval.page.tables import (
     readings,
     study_table,
     summary,
+    told_table,
 )
 from eval.search import search
 from semfov.errors import DataError, lookup
 from semfov.experiments.command import run_command
-from semfov.experiments.config import SearchConfig
+from semfov.experiments.config import ExploreConfig, SearchConfig
 from semfov.experiments.presets import label
 from semfov.io.files import write_text
 
@@ -49,11 +53,7 @@ def results(config: ResultsConfig) -> None:
     chosen = list(runs) if config.only is None else [lookup(name, runs, "experiment") for name in config.only]
     for name in chosen:
         print(f"\n== {name}")
-        run = runs[name]
-        if isinstance(run, SearchConfig):
-            search(run)
-        else:
-            explore(run)
+        HANDLERS[type(runs[name])](runs[name])
     try:
         template = config.template.read_text(encoding="utf-8")
     except OSError as error:
@@ -95,6 +95,14 @@ WHOLE: dict[str, Callable[[Runs], list[str]]] = {
 
 EXPLORED = (1, 2, 3, 4, 10, 20)
 
+HANDLERS: dict[type, Callable[[Any], None]] = {
+    SearchConfig: search,
+    ExploreConfig: explore,
+    DecideConfig: search_and_decide,
+    CalibrationConfig: judge_beliefs,
+}
+"""What runs an experiment, by the kind of its settings."""
+
 TABLES: dict[str, Callable[[Path], list[str]]] = {
     "all": summary,
     "first": partial(summary, section=0),
@@ -105,6 +113,12 @@ TABLES: dict[str, Callable[[Path], list[str]]] = {
     "paired-learned": partial(paired, baseline=label(CENTRAL, "search"), shifts=(1, 5, 10, 15, 30)),
     "paired-explore": partial(paired, baseline="random-raw", shifts=EXPLORED),
     "paired-explore-calibrated": partial(paired, baseline="random-calibrated", shifts=EXPLORED),
+    "presence": partial(told_table, "decisions.md", 0),
+    "decisions": partial(told_table, "decisions.md", 1),
+    "landings": partial(told_table, "decisions.md", 2),
+    "prices": partial(told_table, "decisions.md", 3),
+    "by-looks": partial(told_table, "beliefs.md", 0),
+    "by-distance": partial(told_table, "beliefs.md", 1),
     "paired-map": paired_maps,
     "paired-map-objects": partial(paired_maps, field=OBJECTS),
 }

@@ -40,7 +40,6 @@ PUBLISHED_SENSORS = ("published", "published-narrow")
 PRICE = 0.1
 """How many more cells a look must be expected to name right, for an exploration by a learned map to go on."""
 
-
 MOST_SHIFTS = 10_000
 """More gaze shifts than any episode has."""
 
@@ -129,8 +128,7 @@ class ActivePerception(nn.Module):
             prior.check_compatible(detector.classes)
             observer = Context(observer, prior)
         mapping = LearnedMap(everything), Closer(sigma / eye.reference)
-        agent = cls(eye, (observer, NonPredictive()), mapping, grid=grid)
-        return agent.eval().requires_grad_(False)
+        return cls(eye, (observer, NonPredictive()), mapping, grid=grid).eval().requires_grad_(False)
 
     @classmethod
     def from_pretrained(cls, name: str | PathLike[str] = "yolov3-tiny", **options: Any) -> Self:
@@ -152,9 +150,9 @@ class ActivePerception(nn.Module):
     @classmethod
     def published(
         cls,
-        name: str = "yolov3-tiny",
+        name: str | PathLike[str] = "yolov3-tiny",
         *,
-        sensor: str = "published",
+        sensor: str | None = None,
         search: str = "predictive",
         calibrated: bool = True,
         **options: Any,
@@ -164,29 +162,33 @@ class ActivePerception(nn.Module):
         10 x 10 cells with a uniform prior of 0.5, every cell that a box overlaps updated by Kaplan's rule, scores
         calibrated by Dirichlets of maximum likelihood; exploration maximises the Kullback-Leibler divergence. The paper
         prints no width of its wide and its narrow fovea: ours are 100 and 50 pixels of 640. The detectors are smaller
-        than its YOLOv3.
+        than its YOLOv3. Of a folder of models it takes detector, sensor, grid and observation model.
 
         Args:
-            name: a detector for which models are shipped, `yolov3-tiny` or `yolox-nano`.
-            sensor: `published`, the wide fovea, or `published-narrow`.
+            name: a detector for which models are shipped, `yolov3-tiny` or `yolox-nano`, or a folder of models.
+            sensor: `published`, the wide fovea, or `published-narrow`; None: the wide one, or the folder's own.
             search: `predictive` or `non-predictive`.
             calibrated: whether scores go through the observation model before they are fused ("Modified Kaplan").
             options: of `semfov.load_detector`.
 
         Raises:
-            InputError: no models are shipped for a detector or a sensor of this name.
+            InputError: no models are shipped for a detector or a sensor of this name, or the folder has none.
             DataError: the weights cannot be had, or are damaged.
         """
-        lookup(sensor, PUBLISHED_SENSORS, "published sensor")
         lookup(search, ["predictive", "non-predictive"], "published search policy")
-        detector = load_detector(name, **options)
-        eye = Eye(named_sensor(sensor), detector)
-        shipped = shipped_model(FovealObservationModel, f"{detector.name}-{sensor}", name)
-        model = FovealObservationModel.from_pretrained(shipped)
-        model.check_compatible(eye.settings(), detector.classes)
-        observer = Semantic(len(detector.classes) + 1, model if calibrated else None)
+        folder = open_folder(name)
+        if folder is not None:
+            check(sensor is None, "sensor", "None beside a folder of models, which has its own", sensor)
+            eye, model, grid = folder.eye(**options), folder.observation(), folder.manifest.grid
+        else:
+            fovea, grid = lookup(sensor or "published", PUBLISHED_SENSORS, "published sensor"), (10, 10)
+            eye = Eye(named_sensor(fovea), load_detector(name, **options))
+            shipped = shipped_model(FovealObservationModel, f"{eye.detector.name}-{fovea}", fspath(name))
+            model = FovealObservationModel.from_pretrained(shipped)
+        model.check_compatible(eye.settings(), eye.detector.classes)
+        observer = Semantic(len(eye.detector.classes) + 1, model if calibrated else None)
         policy = Predictive(model) if search == "predictive" else NonPredictive()
-        return cls(eye, (observer, policy), (observer, KL(model))).eval().requires_grad_(False)
+        return cls(eye, (observer, policy), (observer, KL(model)), grid=grid).eval().requires_grad_(False)
 
     @classmethod
     def raw(cls, name: str = "yolov3-tiny", *, sensor: str = "published", **options: Any) -> Self:
@@ -201,9 +203,8 @@ class ActivePerception(nn.Module):
             InputError: the detector or the sensor is unknown.
             DataError: the weights cannot be had, or are damaged.
         """
-        detector = load_detector(name, **options)
-        observer = Semantic(len(detector.classes) + 1)
-        eye = Eye(named_sensor(sensor), detector)
+        eye = Eye(named_sensor(sensor), load_detector(name, **options))
+        observer = Semantic(len(eye.detector.classes) + 1)
         return cls(eye, (observer, NonPredictive()), (observer, Random())).eval().requires_grad_(False)
 
     @property

@@ -46,16 +46,16 @@ def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
     """Which searches end with this step, `(A,)`: 0 for none, else the number of the outcome in `OUTCOMES`.
 
     A search has found its target when it is probable enough that the image holds it, and a cell was fixated that is
-    about as probable as any: at least `NEARLY` times. It gives up when no cell is left that is worth a look, which
-    another would be if no fixated cell holds the target (`Belief.chance`); the target is then absent, unless the image
-    rather holds it than not.
+    about as probable as any, at least `NEARLY` times, and probable enough itself. It gives up when no cell is left that
+    is worth a look, which another would be if no fixated cell holds the target (`Belief.chance`); the target is then
+    absent, unless the image rather holds it than not.
 
     Args:
         step: of searches, from `semfov.episode.rollout`.
         target: class 1..K, or `(A,)`.
         thresholds: probabilities.
     """
-    looked = nearly_fixated(step.belief.probability(target), step.visited)
+    looked = place_known(step.belief.probability(target), step.visited, thresholds.place)
     left = step.belief.chance(target).masked_fill(step.visited, 0).amax(-1)
     return settle(step.belief.presence(target), looked, left, thresholds)
 
@@ -111,19 +111,21 @@ def decide_by_price(step: Step, target: int | Tensor, price: float) -> Tensor:
     return torch.where(on, 0, torch.where(presence[:, 0] >= 0.5, 1, 2))
 
 
-def nearly_fixated(cells: Tensor, visited: Tensor) -> Tensor:
-    """Whether a fixated cell is about as probable as the most probable one, `(..., )`.
+def place_known(cells: Tensor, visited: Tensor, place: float = 0.0) -> Tensor:
+    """Whether a fixated cell is about as probable as the most probable one, and as probable as `place`, `(..., )`.
 
     All cells of a large object are about as probable; to fixate each of them would tell nothing more.
 
     Args:
         cells: `(..., X·Y)`, probabilities.
         visited: `(..., X·Y)` boolean, cells that were fixated.
+        place: probability that the cell must have.
 
-    >>> nearly_fixated(torch.tensor([[0.95, 0.9, 0.1]]), torch.tensor([[False, True, False]]))
+    >>> place_known(torch.tensor([[0.95, 0.9, 0.1]]), torch.tensor([[False, True, False]]), 0.8)
     tensor([True])
     """
-    return cells.masked_fill(~visited, 0).amax(-1) >= NEARLY * cells.amax(-1)
+    fixated = cells.masked_fill(~visited, 0).amax(-1)
+    return (fixated >= NEARLY * cells.amax(-1)) & (fixated >= place)
 
 
 def conclude(

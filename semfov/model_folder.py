@@ -150,6 +150,19 @@ class ModelFolder:
         files = {part: self.file(part) for part in KINDS if self.used(part)}
         return {part: KINDS[part].from_pretrained(file) for part, file in files.items() if file is not None}
 
+    def observation(self) -> FovealObservationModel:
+        """The observation model, whether the agent goes by it or not.
+
+        Raises:
+            InputError: none was fitted.
+        """
+        file = self.file("observation")
+        if file is None:
+            raise InputError(
+                f"name: expected a folder with an observation model, which {self.path} lacks; fit one: {fit_command()}"
+            )
+        return FovealObservationModel.from_pretrained(file)
+
     def semantic(self) -> Semantic:
         """The belief about all classes that fuses scores: tempered, and calibrated, where that was found better."""
         components = len(self.manifest.classes) + 1

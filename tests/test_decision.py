@@ -89,6 +89,22 @@ def test_found_only_where_the_gaze_has_been():
     assert number([0.2, 0.4, 0.3], [1], 0.9) == 1
 
 
+def test_found_only_where_the_place_is_known():
+    assert number([0.2, 0.6, 0.3], [1], 0.9, Thresholds(0.8, 0.1, 0.6)) == 1
+    assert number([0.2, 0.599, 0.3], [1], 0.9, Thresholds(0.8, 0.1, 0.6)) == 0
+    # Nothing is left to look at: rather there, but it is not known where.
+    assert number([0.2, 0.5, 0.05], [0, 1], 0.9, Thresholds(0.8, 0.1, 0.6)) == 3
+    # The best cell that was fixated is not far behind the best one, and high enough itself.
+    assert number([0.2, 0.62, 0.65], [1], 0.9, Thresholds(0.8, 0.1, 0.6)) == 1
+    assert number([0.2, 0.59, 0.65], [1], 0.9, Thresholds(0.8, 0.1, 0.6)) == 0
+
+
+def test_thresholds_change_one_at_a_time():
+    assert AT.changed() == AT
+    assert AT.changed(0.0, None) == Thresholds(0.0, 0.1)
+    assert AT.changed(None, 0.0, 0.5) == Thresholds(0.8, 0.0, 0.5)
+
+
 def test_found_from_the_threshold_on():
     assert number([0.2, 0.8, 0.3], [1], 0.75, Thresholds(0.75, 0.1)) == 1
     assert number([0.2, 0.99, 0.3], [1], 0.799) == 0
@@ -137,13 +153,14 @@ def batches(draw):
         return [[draw(what) for _ in range(cells)] for _ in range(searches)]
 
     presence = [draw(probability) for _ in range(searches)]
-    return rows(probability), rows(st.booleans()), presence, Thresholds(draw(probability), draw(probability))
+    thresholds = Thresholds(draw(probability), draw(probability), draw(probability))
+    return rows(probability), rows(st.booleans()), presence, thresholds
 
 
 @given(batches())
 def test_a_batch_is_decided_as_a_loop_does(batch):
     cells, visited, presence, thresholds = batch
-    confirm, give_up = (float(value) for value in (thresholds.confirm, thresholds.give_up))
+    confirm, give_up, place = thresholds.confirm, thresholds.give_up, thresholds.place
     stated = SimpleNamespace(
         belief=Known(torch.tensor(cells).double(), torch.tensor(presence).double(), torch.zeros(())),
         visited=torch.tensor(visited),
@@ -154,7 +171,7 @@ def test_a_batch_is_decided_as_a_loop_does(batch):
         looked = max([0.0, *(value for value, seen in zip(exact, visited[row], strict=True) if seen)])
         left = [value for value, seen in zip(exact, visited[row], strict=True) if not seen]
         anywhere = float(torch.tensor(presence[row]).double())
-        if anywhere >= confirm and looked >= NEARLY * max(exact):
+        if anywhere >= confirm and looked >= place and looked >= NEARLY * max(exact):
             assert outcome == 1
         elif max([0.0, *left]) < give_up:
             assert outcome == (2 if anywhere < 0.5 else 3)

@@ -6,6 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from eval.calibration import CalibrationConfig
+from eval.decide import DecideConfig
 from semfov.experiments.config import (
     BeliefConfig,
     DataConfig,
@@ -90,6 +92,9 @@ BEYOND_EXPLORATION = (
     "closer-look-learned",
 )
 """Explorations with our own models."""
+
+Experiment = RunConfig | DecideConfig | CalibrationConfig
+"""Settings of an experiment of the page."""
 
 Changes = dict[str, dict[str, object]]
 
@@ -200,7 +205,7 @@ class ResultsConfig(Settings):
     workers: Workers | None = None
 
 
-def experiments(config: ResultsConfig) -> dict[str, RunConfig]:
+def experiments(config: ResultsConfig) -> dict[str, Experiment]:
     """The experiments of the page, by name."""
     runs = dict(_measured(config))
     if config.fit_root is not None:
@@ -214,7 +219,7 @@ def detector(name: str, config: ResultsConfig) -> DetectorConfig:
     return DetectorConfig(name="yolox-nano", weights=config.yolox) if name == "nano" else DetectorConfig()
 
 
-def _measured(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:
+def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
     """Experiments on the photographs that results are measured on, those of the paper first."""
     data = DataConfig(root=config.root, annotations=config.annotations, ids=config.ids, limit=config.limit)
     for name in DETECTORS:
@@ -231,6 +236,9 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:
         for control in ("wrong-class", "permuted"):
             protocol = ProtocolConfig(control=control)
             yield f"{control}-{name}", seek(policies=("random", "target-evidence"), protocol=protocol)
+        yield f"decide-{name}", DecideConfig(**common)
+        every = {**common, "data": replace(data, min_instances=0, max_target_area=None)}
+        yield f"beliefs-{name}", CalibrationConfig(**every)
         yield f"beyond-explore-{name}", tour(policies=BEYOND_EXPLORATION)
         yield f"beyond-explore-published-{name}", tour(policies=BEYOND_EXPLORATION, sensor=sensor)
         if name == "tiny":

@@ -1,6 +1,7 @@
 """Tables of the results page, from what the runs wrote."""
 
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -16,20 +17,22 @@ from eval.page.curves import (
     repetition_error,
     spans,
 )
-from eval.page.experiments import DETECTORS, FOVEAE, STUDIES
+from eval.page.experiments import DETECTORS, FOVEAE, STUDIES, Experiment
 from semfov.errors import DataError
-from semfov.experiments.config import RunConfig
 from semfov.experiments.presets import label as name_of
 from semfov.experiments.summary import table
 from semfov.metrics.averages import standard_error
 from semfov.metrics.search import random_search
 
-Runs = dict[str, RunConfig]
+Runs = dict[str, Experiment]
+
+TOLD = ("summary.md", "decisions.md", "beliefs.md")
+"""Where experiments leave their tables."""
 
 
-def finished(run: RunConfig | None) -> bool:
+def finished(run: Experiment | None) -> bool:
     """Whether a run has left its tables."""
-    return run is not None and (run.out / "summary.md").exists()
+    return run is not None and any((run.out / name).exists() for name in TOLD)
 
 
 def columns(kind: str, runs: Runs) -> dict[str, Path | None]:
@@ -109,6 +112,13 @@ def summary(folder: Path, section: int | None = None) -> list[str]:
     parts = ["**" + part.strip() for part in text.split("\n**")]
     parts[0] = parts[0].removeprefix("**")
     return text.splitlines() if section is None else parts[section].splitlines()
+
+
+def told_table(name: str, number: int, folder: Path) -> list[str]:
+    """A table of a file in Markdown, by its number there, without the text around it."""
+    lines = (folder / name).read_text(encoding="utf-8").splitlines()
+    tables = [list(rows) for is_table, rows in groupby(lines, lambda line: line.startswith("|")) if is_table]
+    return tables[number]
 
 
 def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "right", *, ending: str = "") -> list[str]:

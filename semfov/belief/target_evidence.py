@@ -1,7 +1,7 @@
 """Learned evidence for a target: what one look says of a cell, what all looks say of it, and of the whole image."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -28,17 +28,27 @@ class Thresholds:
             fixated.
         give_up: that a cell not fixated yet holds the target if no fixated cell does; where none reaches it, no look is
             worth its price.
+        place: that the fixated cell itself holds the target: where it is less, the image may well hold it, but it was
+            not seen where.
     """
 
     confirm: float
     give_up: float
+    place: float = 0.0
 
-    def changed(self, confirm: float | None, give_up: float | None) -> "Thresholds":
-        """The same with those that are given in their place."""
-        return Thresholds(self.confirm if confirm is None else confirm, self.give_up if give_up is None else give_up)
+    def changed(
+        self, confirm: float | None = None, give_up: float | None = None, place: float | None = None
+    ) -> "Thresholds":
+        """The same with those that are given instead."""
+        given = {"confirm": confirm, "give_up": give_up, "place": place}
+        return replace(self, **{name: value for name, value in given.items() if value is not None})
 
 
-THRESHOLDS = Maybe(Object({"confirm": Number(0, 1), "give_up": Number(0, 1)}, required=("confirm", "give_up")))
+THRESHOLDS = Maybe(
+    Object(
+        {"confirm": Number(0, 1), "give_up": Number(0, 1), "place": Number(0, 1)}, required=("confirm", "give_up")
+    )
+)
 """As a file keeps them."""
 
 

@@ -12,15 +12,13 @@ from typing import ClassVar, TypeVar
 import torch
 from torch import Tensor
 
-from semfov.agent import PUBLISHED_SENSORS
 from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap, Observer, Target
-from semfov.decision import confirms
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Step, Stopwatch, rollout
 from semfov.errors import InputError
-from semfov.experiments.config import DetectorConfig, PolicyConfig, SearchConfig, SensorConfig
-from semfov.experiments.decisions import landing
+from semfov.experiments.config import PolicyConfig, SearchConfig
+from semfov.experiments.decisions import landing, seen_on_landing
 from semfov.experiments.parts import Record
 from semfov.experiments.presets import label
 from semfov.experiments.run import Run
@@ -32,7 +30,6 @@ from semfov.gaze.acquisition import AcquisitionFunction, Uniform
 from semfov.gaze.choice import Choice, Given, Greedy, drawn_from
 from semfov.gaze.policies import NonPredictive, Task
 from semfov.metrics.calibration import BinarySums
-from semfov.observation.foveal import FovealObservationModel
 
 LOOKS = (1, 5, 15)
 """Looks after which beliefs are judged."""
@@ -167,13 +164,6 @@ class KnownLooks(Looks):
         return Sight(observer.weigh(detections, fixation, self.grid, self.target), lambda: detections, {})
 
 
-def published_model(detector: DetectorConfig, sensor: SensorConfig) -> str | None:
-    """Observation model of maximum likelihood for detector and sensor; None where none is shipped."""
-    name = f"{detector.name}-{sensor.name}"
-    shipped = (FovealObservationModel.shipped / f"{name}.safetensors").is_file()
-    return name if sensor.name in PUBLISHED_SENSORS and shipped else None
-
-
 def judge_cells(step: Step, target: int, goal: Tensor) -> Record:
     """Sums (`BinarySums.record`) over the cells of a search after a step, by group (`CELLS`); none of empty groups.
 
@@ -191,15 +181,3 @@ def judge_cells(step: Step, target: int, goal: Tensor) -> Record:
         for number, name in enumerate(CELLS)
         if (group == number).any()
     }
-
-
-def seen_on_landing(steps: list[Step], path: Tensor, goal: Tensor, target: int, grid: Grid) -> bool | None:
-    """Whether the look that lands on the target sees it: the best class of a detection over the fixated cell is it.
-
-    None where no look lands, or the first one is on the target already (`landing`).
-    """
-    hits = goal[path].nonzero()[:, 0].tolist()
-    if not hits or hits[0] == 0:
-        return None
-    step = steps[hits[0]]
-    return bool(confirms(step.detections, grid, step.cell, target, 0.0))

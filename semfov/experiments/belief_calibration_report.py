@@ -14,6 +14,7 @@ from torch import Tensor
 
 from semfov.errors import DataError
 from semfov.experiments.belief_calibration import BANDS, CELLS, MAP, BeliefCalibrationRun
+from semfov.experiments.decisions import LANDINGS, LANDINGS_TOLD, landing_cells
 from semfov.experiments.parts import Record
 from semfov.experiments.summary import gather, sensing, table
 from semfov.io.files import write_text
@@ -97,10 +98,9 @@ def summary(records: Sequence[Record], sums: Sums, run: BeliefCalibrationRun) ->
             "",
             *table(by_distance),
             "",
-            "Probability of the target in the cell of the first look that lands on it, before and after that look. It "
-            "is seen where the best class of a detection over that cell is the target.",
+            LANDINGS_TOLD,
             "",
-            *table([["belief", "landings", "p", "seen", "p, seen", "not seen", "p, not seen"], *landings(records)]),
+            *table([["belief", *LANDINGS], *landings(records)]),
             "",
             *[line for note in notes for line in (note, "")],
         ]
@@ -120,16 +120,10 @@ def figures(sums: BinarySums) -> list[str]:
 def landings(records: Sequence[Record]) -> list[list[str]]:
     """Rows of the table of landings."""
     landed = [record for record in records if record["seen"] is not None]
-    groups = [landed, *([record for record in landed if record["seen"] is seen] for seen in (True, False))]
-    rows = []
-    for belief in records[0]["beliefs"]:
-        row = [belief]
-        for group in groups:
-            pairs = [record["beliefs"][belief]["landing"] for record in group]
-            means = [sum(column) / len(column) for column in zip(*pairs, strict=True)]
-            row += [str(len(pairs)), " → ".join(f"{value:.3f}" for value in means) or "-"]
-        rows.append(row)
-    return rows
+    return [
+        [belief, *landing_cells([(record["beliefs"][belief]["landing"], record["seen"]) for record in landed])]
+        for belief in records[0]["beliefs"]
+    ]
 
 
 def beliefs_csv(sums: Sums) -> str:

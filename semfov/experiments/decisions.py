@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -14,24 +13,39 @@ from torch import Tensor
 
 from semfov.agent import Strategy
 from semfov.belief.belief import Belief
+from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
-from semfov.belief.observers import Target
+from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import conclude, decide, decide_by_price
+from semfov.decision import conclude, confirms, decide, decide_by_price
+from semfov.detection.detections import Detections
 from semfov.episode import Step, Stopwatch, StoredLooks, rollout
-from semfov.errors import check
+from semfov.errors import InputError, check
 from semfov.experiments.config import PolicyConfig, SearchConfig
 from semfov.experiments.parts import Record
 from semfov.experiments.run import Run
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.seeds import generator_for, noise_for
 from semfov.experiments.settings import Positive, Share
+from semfov.experiments.setup import make_observation, published_model
 from semfov.gaze.choice import Greedy, drawn_from
-from semfov.gaze.policies import NonPredictive, Random, Task
+from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
+from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 
-Rule = Callable[[Step, int], Tensor]
-"""Which searches for a class end with a step: numbers of their outcomes."""
+Rule = Callable[[Step, int, Grid], Tensor]
+"""Which searches for a class on a grid end with a step: numbers of their outcomes."""
+
+AGENT, RANDOM, PUBLISHED, AT_THE_GAZE = (
+    "target-evidence",
+    "random gaze",
+    "published belief",
+    "published belief, a detection at the gaze",
+)
+"""Ways to search: the agent's; its belief, but a gaze at random; and the paper's belief and gaze, by two rules."""
+
+SEEN_FROM = 0.5
+"""Score of a detection at the gaze from which on a belief without thresholds has found its target."""
 
 
 @dataclass(frozen=True)
@@ -41,17 +55,22 @@ class DecisionConfig(SearchConfig):
     Args:
         confirm: probability that the image holds the target, from which on it counts as found (None: the model's).
         give_up: probability below which a cell is not worth a look (None: the model's).
+        place: probability that the cell must have that is named (None: the model's).
         prices: of a look, for searches that end by `decide_by_price`, beside those that end by thresholds.
     """
 
     policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
     confirm: Share | None = None
     give_up: Share | None = None
+    place: Share | None = None
     prices: tuple[Positive, ...] = ()
 
 
 class DecisionRun(Run):
-    """Searches by learned target evidence, and by the same belief under random gaze.
+    """Searches by learned target evidence, by the same belief under random gaze, and by the published belief.
+
+    The published belief (calibrated scores, Kaplan's rule, predictive search) decides at the same thresholds, and once
+    more as its agent does, which has none: it has found its target when a detection at the gaze shows it.
 
     Args:
         config: of the run.
@@ -67,22 +86,41 @@ class DecisionRun(Run):
         evidence = self.models.evidence
         assert evidence is not None
         chosen = evidence.thresholds or Thresholds(0.9, 0.05)
-        self.thresholds = chosen.changed(config.confirm, config.give_up)
+        self.thresholds = chosen.changed(config.confirm, config.give_up, config.place)
         # One observer, so that all weigh the looks once.
         observer = Target(evidence)
         learned, random = Strategy(observer, NonPredictive()), Strategy(observer, Random())
-        by_thresholds = partial(decide, thresholds=self.thresholds)
         self.compared: dict[str, tuple[Strategy, Rule]] = {
-            "target-evidence": (learned, by_thresholds),
-            "random gaze": (random, by_thresholds),
-            **{f"price {price:g}": (learned, partial(decide_by_price, price=price)) for price in config.prices},
+            AGENT: (learned, self._by_thresholds),
+            RANDOM: (random, self._by_thresholds),
+            **{f"price {price:g}": (learned, by_price(price)) for price in config.prices},
         }
+        model = self._published()
+        if model is not None:
+            self.models = replace(self.models, observation=model)
+            self.make_key()
+            published = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Predictive(model))
+            self.compared |= {PUBLISHED: (published, self._by_thresholds), AT_THE_GAZE: (published, at_the_gaze)}
+
+    def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
+        return decide(step, target, self.thresholds)
+
+    def _published(self) -> FovealObservationModel | None:
+        """The observation model of the published belief; None where none is shipped, and none is named."""
+        name = self.config.belief.model
+        try:
+            return make_observation(name or published_model(self.config.detector, self.config.sensor), self.eye)
+        except InputError:
+            if name is not None:
+                raise
+            return None
 
     def _key(self) -> str:
         evidence, config = self.models.evidence, self.config
         assert evidence is not None
         chosen = asdict(evidence.thresholds) if evidence.thresholds else None
-        what = ["decisions", super()._key(), chosen, config.confirm, config.give_up, config.prices]
+        given = [config.confirm, config.give_up, config.place, config.prices]
+        what = ["decisions", super()._key(), chosen, given]
         return hashlib.sha256(json.dumps(what).encode()).hexdigest()
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
@@ -112,18 +150,22 @@ class DecisionRun(Run):
                 "present": bool(goal.any()),
                 "sharp": float(highest_score(sharp, target)),
                 "tiled": max(float(highest_score(seen, target)) for seen in (sharp, *tiles)),
+                "sharp_place": sharp_place(sharp, grid, target, goal, annotation.boxes[annotation.labels == target]),
             }
             looks = StoredLooks(detections, grid, torch.tensor([target]))
             for name, (strategy, judge) in self.compared.items():
 
                 def rule(step: Step, judge: Rule = judge, target: int = target) -> Tensor:
-                    return judge(step, target)
+                    return judge(step, target, grid)
 
                 with torch.inference_mode():
                     steps = search_steps(looks, strategy, target, cell, noise, rule)
                 last, seen = steps[-1], torch.cat([step.cell for step in steps])
                 ended = int(rule(last))
-                decision = conclude(ended, last.belief, [detections[cell] for cell in seen.split(1)], grid, target)
+                # What a detection at the gaze shows is where the gaze is.
+                place = int(last.cell) if judge is at_the_gaze else None
+                shown = [detections[cell] for cell in seen.split(1)]
+                decision = conclude(ended, last.belief, shown, grid, target, place)
                 records.append(
                     {
                         "policy": name,
@@ -134,10 +176,39 @@ class DecisionRun(Run):
                         "right_place": None if decision.cell is None else bool(goal[decision.cell]),
                         "overlap": overlap(decision.box, annotation.boxes[annotation.labels == target]),
                         "landing": landing([step.belief for step in steps], seen, goal, target),
+                        "landing_seen": seen_on_landing(steps, seen, goal, target, grid),
                     }
                 )
         watch.lap("search")
         return records, watch.seconds
+
+
+def by_price(price: float) -> Rule:
+    """The rule of `decide_by_price`."""
+    return lambda step, target, grid: decide_by_price(step, target, price)
+
+
+def at_the_gaze(step: Step, target: int, grid: Grid) -> Tensor:
+    """Which searches see their target at the gaze: its class is the best of a detection there, of `SEEN_FROM`."""
+    return confirms(step.detections, grid, step.cell, target, SEEN_FROM).long()
+
+
+def sharp_place(seen: Detections, grid: Grid, target: int, goal: Tensor, boxes: Tensor) -> Record | None:
+    """Whether the most confident detection of one look has its middle on the target, and how well its box fits.
+
+    Args:
+        seen: what the look shows, a batch of one.
+        grid: the cells.
+        target: class 1..K.
+        goal: `(X·Y,)` boolean, the cells that it overlaps.
+        boxes: `(M, 4)`, the target's.
+    """
+    score = seen.scores[0, :, target] * seen.mask[0]
+    if not bool((score > 0).any()):
+        return None
+    box = seen.boxes[0, int(score.argmax())]
+    cell = int(grid.footprint(box[None], "soft")[0].argmax())
+    return {"right": bool(goal[cell]), "overlap": overlap(box, boxes)}
 
 
 def search_steps(
@@ -179,3 +250,38 @@ def landing(beliefs: list[Belief], cells: Tensor, goal: Tensor, target: int) -> 
         return None
     pair = beliefs[hits[0] - 1 : hits[0] + 1]
     return [float(belief.probability(target)[0, cells[hits[0]]]) for belief in pair]
+
+
+def seen_on_landing(steps: list[Step], path: Tensor, goal: Tensor, target: int, grid: Grid) -> bool | None:
+    """Whether the look that lands on the target sees it: the best class of a detection over the fixated cell is it.
+
+    None where no look lands, or the first one is on the target already (`landing`).
+    """
+    hits = goal[path].nonzero()[:, 0].tolist()
+    if not hits or hits[0] == 0:
+        return None
+    step = steps[hits[0]]
+    return bool(confirms(step.detections, grid, step.cell, target, 0.0))
+
+
+LANDINGS = ["landings", "p", "seen", "p, seen", "not seen", "p, not seen"]
+"""Head of `landing_cells`."""
+
+LANDINGS_TOLD = (
+    "Probability of the target in the cell of the first look that lands on it, before and after that look. It is seen "
+    "where the best class of a detection over that cell is the target."
+)
+"""What the table of landings is."""
+
+
+def landing_cells(landed: Sequence[tuple[Sequence[float], bool]]) -> list[str]:
+    """Cells of a table's row: how many first looks land, and means before and after; of all, seen, and not seen.
+
+    Args:
+        landed: for each of them the probabilities before and after (`landing`), and whether the target was seen.
+    """
+    cells: list[str] = []
+    for group in (landed, [each for each in landed if each[1]], [each for each in landed if not each[1]]):
+        means = [sum(column) / len(column) for column in zip(*(pair for pair, _ in group), strict=True)]
+        cells += [str(len(group)), " → ".join(f"{value:.3f}" for value in means) or "-"]
+    return cells

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from semfov.agent import PUBLISHED_SENSORS
 from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
 from semfov.data.scene import Scenes
 from semfov.detection.detector import Detector
@@ -159,6 +160,13 @@ def make_zoom_observation(name: str | None, eye: ZoomEye) -> FovealObservationMo
     model = FovealObservationModel.from_pretrained(name or own)
     model.check_compatible(eye.settings(), eye.detector.classes)
     return model.requires_grad_(False)
+
+
+def published_model(detector: DetectorConfig, sensor: SensorConfig) -> str | None:
+    """Observation model of maximum likelihood for detector and sensor; None where none is shipped."""
+    name = f"{detector.name}-{sensor.name}"
+    shipped = (FovealObservationModel.shipped / f"{name}.safetensors").is_file()
+    return name if sensor.name in PUBLISHED_SENSORS and shipped else None
 
 
 def make_target_evidence(name: str | None, eye: Eye) -> TargetEvidence:

@@ -1,9 +1,9 @@
 """Training evidence for targets on the looks of whole searches."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -13,10 +13,9 @@ from semfov.belief import TargetEvidence
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Target, TargetBelief
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import nearly_fixated
+from semfov.decision import place_known
 from semfov.episode import Step, rollout
-from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Weight, Workers
+from semfov.experiments.settings import Count, Positive, Share, Weight
 from semfov.experiments.summary import table
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Exploratory
@@ -24,7 +23,7 @@ from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.training.descent import descend
 from semfov.training.evidence_examples import ExampleLooks, Examples, LookingRun, make_examples
-from semfov.training.frame import Fit, fit_and_write, split
+from semfov.training.frame import Fit, FitOnLooksConfig, fit_and_write, split
 from semfov.training.outputs import training_of
 
 JUDGED = (1, 5, 15)
@@ -32,60 +31,32 @@ JUDGED = (1, 5, 15)
 
 
 @dataclass(frozen=True)
-class FitSearchConfig(Settings):
+class FitSearchConfig(FitOnLooksConfig):
     """Train the evidence for a target.
 
     Args:
-        data: photographs to learn from.
-        detector: which detector looks through the fovea.
-        sensor: the foveal sensor.
-        name: name of the model (None: the detector's).
         classes: classes that a photograph holds to learn from, at most.
         absent: classes that a photograph does not hold, at most (None: as many as it holds).
-        columns: cells in a row.
-        rows: cells in a column.
         max_target_area: classes that cover a larger share of the image are not searched for.
-        holdout: every n-th photograph is kept out and used to judge, and to choose thresholds by.
-        looks: of a search.
-        astray: share of the fixations that are drawn at random, so that all cells are learned from.
         landing: weight in the loss of landing on the target with the next fixation.
         presence: weight in the loss of telling whether the target is in the photograph.
+        gaze: weight in the loss of the cells that the gaze goes to next and that it would name.
         false_alarms: share of absent targets that may be called found, by which the threshold is chosen.
         surest: probability from which on a target counts as found at the latest, however many false alarms that makes.
-        lost: share of the targets that may be missed because no cell is worth a look any more.
-        steps: steps of training.
-        batch: examples in a step.
-        rate: highest learning rate.
-        seed: of the choice of classes, first parameters and training.
-        out: folder for the model and the report.
-        cache: folder for what was seen from every cell, shared with `eval.search` (None: the user's cache).
-        workers: processes that look (None: one for each CPU core).
+        lost: share of the targets that may be missed because their place is not known, and as many again because no
+            cell is worth a look any more.
     """
 
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    name: Name | None = None
     classes: Count = 2
     absent: Count | None = None
-    columns: Side = 10
-    rows: Side = 10
     max_target_area: Positive = 0.2
-    holdout: Annotated[int, Range(2, 10**9)] = 5
-    looks: Annotated[int, Range(2, 10_000)] = 16
-    astray: Share = 0.3
     landing: Weight = 1.0
     presence: Weight = 0.5
+    gaze: Weight = 1.0
     false_alarms: Share = 0.015
     surest: Share = 1.0
     lost: Share = 0.02
-    steps: Count = 500
-    batch: Count = 48
-    rate: Positive = 5e-3
-    seed: Seed = 0
     out: Path = Path("runs/fit_search")
-    cache: Path | None = None
-    workers: Workers | None = None
 
 
 def fit_search(config: FitSearchConfig) -> None:
@@ -143,16 +114,23 @@ def searches(
 def objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
     r"""Cross-entropy of cells and of presence, and minus the log probability that a soft fixation lands on the target.
 
-    .. math:: \sum_x \mathrm{BCE}(P(t \in x)) / 25 + w_p \, \mathrm{BCE}(P(t)) - w_l \ln \frac{
-              \sum_{x \in \text{goal}} o(x)}{\sum_x o(x)}, \qquad o = p / (1 - p)
+    .. math:: \sum_x \mathrm{BCE}(P(t \in x)) / 25 + w_g \sum_{x \in \{a, b\}} \mathrm{BCE}(P(t \in x))
+              + w_p \, \mathrm{BCE}(P(t)) - w_l \ln \frac{\sum_{x \in \text{goal}} o(x)}{\sum_x o(x)},
+              \qquad o = p / (1 - p)
 
-    over cells that were not visited; cells count four times as much as one mean over them would.
+    over cells that were not visited in the last term; cells count four times as much as one mean over them would. The
+    cell a is the next one to be fixated, and b the most probable one of those that were. They are chosen because they
+    seem probable, so that what is right of cells in general is too much for them: they are learned from on their own.
     """
     belief = step.belief
     assert isinstance(belief, TargetBelief)
     cells, present = belief.present.logit(eps=1e-7), goal.any(-1).to(belief.anywhere)
     loss = 4 * F.binary_cross_entropy_with_logits(cells, goal.to(cells))
     loss = loss + config.presence * F.binary_cross_entropy(belief.anywhere, present)
+    named = cells.detach().masked_fill(~step.visited, -torch.inf).argmax(-1)
+    for chosen in (step.next_cell, named):
+        there = goal.gather(-1, chosen[:, None]).to(cells)
+        loss = loss + config.gaze * F.binary_cross_entropy_with_logits(cells.gather(-1, chosen[:, None]), there)
     # Where the target was fixated, the search would be over.
     some = goal.any(-1) & ~(goal & step.visited).any(-1)
     if some.any():
@@ -191,8 +169,9 @@ def judge(
                 "presence_ece": float(calibration_error(image, there)),
             }
         )
-    looked = nearly_fixated(torch.stack(present), torch.stack(visited))
-    return judged, choose_thresholds(config, torch.stack(anywhere), looked, torch.stack(following), there)
+    cells, seen = torch.stack(present), torch.stack(visited)
+    place = cells.masked_fill(~seen, 0).amax(-1) * place_known(cells, seen)
+    return judged, choose_thresholds(config, torch.stack(anywhere), place, torch.stack(following), there)
 
 
 class Bounds(Protocol):
@@ -214,35 +193,48 @@ class Bounds(Protocol):
         ...
 
 
-def choose_thresholds(config: Bounds, anywhere: Tensor, looked: Tensor, left: Tensor, there: Tensor) -> Thresholds:
-    """The least confirmation with so few false alarms, and the largest price of a look that loses so few targets.
+def choose_thresholds(config: Bounds, anywhere: Tensor, place: Tensor, left: Tensor, there: Tensor) -> Thresholds:
+    """Thresholds of a few false alarms and lost targets.
+
+    With every threshold of the place goes the least confirmation that has so few false alarms. Of these pairs that with
+    the surest place is taken that loses so few of the targets that are found wherever they are; then the largest price
+    of a look that loses so few.
 
     Args:
         config: how many mistakes are allowed.
         anywhere: `(n, E)`, probability of presence after each look of each search.
-        looked: `(n, E)` boolean, whether a cell about as probable as any was fixated.
-        left: `(n, E)`, greatest chance of a cell that was not.
+        place: `(n, E)`, greatest probability of a fixated cell; 0 where another cell is more probable by much.
+        left: `(n, E)`, greatest chance of a cell that was not fixated.
         there: `(E,)` boolean, whether the target is there.
     """
+    number = torch.arange(len(anywhere))[:, None]
 
-    def found(confirm: float, give_up: float) -> Tensor:
+    def found(chosen: Thresholds) -> Tensor:
         """Which searches end with the target found."""
-        sure, tired = (anywhere >= confirm) & looked, left < give_up
-        number = torch.arange(len(sure))[:, None]
+        sure = (anywhere >= chosen.confirm) & (place > 0) & (place >= chosen.place)
         first = torch.where(sure, number, len(sure)).amin(0)
-        return sure.any(0) & ~(tired & (number < first)).any(0)
+        return sure.any(0) & ~((left < chosen.give_up) & (number < first)).any(0)
 
-    confirm = 1.0
-    for candidate in torch.arange(0.99, 0.49, -0.01).tolist():
-        if float(found(candidate, 0.0)[~there].double().mean()) > config.false_alarms:
-            break
-        confirm = candidate
-    confirm = min(confirm, config.surest)
-    told = int(found(confirm, 0.0)[there].sum())
+    def hits(chosen: Thresholds) -> int:
+        return int(found(chosen)[there].sum())
+
+    def confirming(least: float) -> Thresholds:
+        """With a threshold of the place."""
+        confirm = 1.0
+        for candidate in torch.arange(0.99, 0.49, -0.01).tolist():
+            if float(found(Thresholds(candidate, 0.0, least))[~there].double().mean()) > config.false_alarms:
+                break
+            confirm = candidate
+        return Thresholds(min(confirm, config.surest), 0.0, least)
+
+    lost = config.lost * int(there.sum())
+    anyhow = confirming(0.0)
+    pairs = (confirming(least) for least in torch.arange(0.95, 0.04, -0.05).tolist())
+    chosen = next((pair for pair in pairs if hits(anyhow) - hits(pair) <= lost), anyhow)
     for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01):
-        if told - int(found(confirm, give_up)[there].sum()) <= config.lost * int(there.sum()):
-            return Thresholds(confirm, give_up)
-    return Thresholds(confirm, 0.0)
+        if hits(chosen) - hits(chosen.changed(give_up=give_up)) <= lost:
+            return chosen.changed(give_up=give_up)
+    return chosen
 
 
 def report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int, held_out: int) -> str:
@@ -276,7 +268,8 @@ def report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int,
             "",
             *table([head, *rows]),
             "",
-            f"Thresholds: found from {thresholds.confirm:.3f}, a cell is worth a look from {thresholds.give_up:.2f}.",
+            f"Thresholds: found from {thresholds.confirm:.3f}, in a cell from {thresholds.place:.2f}; a cell is worth "
+            f"a look from {thresholds.give_up:.2f}.",
             "",
         ]
     )

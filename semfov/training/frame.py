@@ -1,19 +1,63 @@
-"""What fits on the looks of whole photographs have in common: what is held out, and what is written."""
+"""What fits on the looks of whole photographs have in common: settings, what is held out, and what is written."""
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Generic, TypeVar
 
 from torch import Tensor
 
 from semfov.errors import DataError
+from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.parallel import rank
+from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Workers
 from semfov.io.pretrained import Pretrained
 from semfov.training.evidence_examples import LookingRun, looking
 from semfov.training.outputs import model_path, write_outputs
 
 Model = TypeVar("Model", bound=Pretrained)
+
+
+@dataclass(frozen=True)
+class FitOnLooksConfig(Settings):
+    """Base of the settings of fits on looks from every cell of photographs.
+
+    Args:
+        data: photographs to learn from.
+        detector: which detector looks through the fovea.
+        sensor: the foveal sensor.
+        name: name of the model (None: the detector's).
+        columns: cells in a row.
+        rows: cells in a column.
+        holdout: every n-th photograph is kept out and used to judge.
+        looks: of an episode.
+        astray: share of the fixations that are drawn at random, so that all cells are learned from.
+        steps: steps of training.
+        batch: examples in a step.
+        rate: highest learning rate.
+        seed: of the choice of classes, first parameters and training.
+        out: folder for the model and the report.
+        cache: folder for what was seen from every cell, shared with the evaluations (None: the user's cache).
+        workers: processes that look (None: one for each CPU core).
+    """
+
+    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    name: Name | None = None
+    columns: Side = 10
+    rows: Side = 10
+    holdout: Annotated[int, Range(2, 10**9)] = 5
+    looks: Annotated[int, Range(2, 10_000)] = 16
+    astray: Share = 0.3
+    steps: Count = 500
+    batch: Count = 48
+    rate: Positive = 5e-3
+    seed: Seed = 0
+    out: Path = Path("runs/fit")
+    cache: Path | None = None
+    workers: Workers | None = None
 
 
 @dataclass(frozen=True)
@@ -51,7 +95,7 @@ def split(scene: Tensor, holdout: int) -> Tensor:
     return held_out
 
 
-def fit_and_write(config: Any, fit: Callable[[Any, LookingRun], Fit[Any]]) -> None:
+def fit_and_write(config: FitOnLooksConfig, fit: Callable[[Any, LookingRun], Fit[Any]]) -> None:
     """Look from every cell, fit, and write model, report, settings and figures.
 
     Args:

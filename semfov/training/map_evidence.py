@@ -1,7 +1,7 @@
 """Training the map of all classes on the looks of whole explorations."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -14,8 +14,7 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap, MapBelief
 from semfov.episode import Step, rollout
 from semfov.errors import check
-from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
-from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Workers
+from semfov.experiments.settings import Count, Range, Share
 from semfov.experiments.summary import table
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.choice import Exploratory
@@ -23,7 +22,7 @@ from semfov.metrics.calibration import calibration_error
 from semfov.metrics.exploration import answers_of
 from semfov.training.descent import descend
 from semfov.training.evidence_examples import LookingRun
-from semfov.training.frame import Fit, fit_and_write, split
+from semfov.training.frame import Fit, FitOnLooksConfig, fit_and_write, split
 from semfov.training.map_examples import MapExampleLooks, MapExamples, make_map_examples
 from semfov.training.outputs import training_of
 
@@ -32,50 +31,23 @@ JUDGED = (1, 2, 3, 5, 10, 15)
 
 
 @dataclass(frozen=True)
-class FitMapConfig(Settings):
+class FitMapConfig(FitOnLooksConfig):
     """Train the map of all classes.
 
     Args:
-        data: photographs to learn from.
-        detector: which detector looks through the fovea.
-        sensor: the foveal sensor.
-        name: name of the model (None: the detector's).
         classes: classes of a photograph to learn from: those that it holds and those that score highest.
         others: how many of them are drawn from all the rest.
-        columns: cells in a row.
-        rows: cells in a column.
-        holdout: every n-th photograph is kept out and used to judge.
-        looks: of an exploration.
-        astray: share of the fixations that are drawn at random.
-        steps: steps of training.
         gain_steps: steps in which it is learned what a look will bring.
-        batch: photographs in a step.
-        rate: highest learning rate.
-        seed: of the choice of classes, first parameters and training.
-        out: folder for the model and the report.
-        cache: folder for what was seen from every cell, shared with `eval.explore` (None: the user's cache).
-        workers: processes that look (None: one for each CPU core).
     """
 
-    data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    name: Name | None = None
     classes: Annotated[int, Range(2, 10_000)] = 12
     others: Count = 3
-    columns: Side = 10
-    rows: Side = 10
-    holdout: Annotated[int, Range(2, 10**9)] = 5
     looks: Annotated[int, Range(2, 10_000)] = 12
     astray: Share = 0.5
     steps: Count = 1000
     gain_steps: Count = 200
     batch: Count = 12
-    rate: Positive = 5e-3
-    seed: Seed = 0
     out: Path = Path("runs/fit_map")
-    cache: Path | None = None
-    workers: Workers | None = None
 
 
 def fit_map(config: FitMapConfig) -> None:

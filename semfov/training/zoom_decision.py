@@ -113,7 +113,9 @@ def judge_searches(model: GlimpseEvidence, searches: Searches, bounds: Bounds) -
     """Set the thresholds by searches that were held out; returns lines of a table of how well presence is told."""
     anywhere = model.anywhere(searches.best, searches.case).sigmoid()
     there = searches.there
-    model.thresholds = choose_thresholds(bounds, anywhere.mT, searches.looked.mT, searches.left.mT, there)
+    chosen = choose_thresholds(bounds, anywhere.mT, searches.looked.mT.to(anywhere), searches.left.mT, there)
+    # A window was looked at closely enough or was not: there is no probability of its place to choose from.
+    model.thresholds = chosen.changed(place=0.0)
     rows = [["looks", "area under ROC", "NLL", "Brier", "ECE", "ECE of the highest score"]]
     for number in (each for each in (*JUDGED, anywhere.shape[1]) if each <= anywhere.shape[1]):
         told = BinarySums.of(anywhere[:, number - 1], there)

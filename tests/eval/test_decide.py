@@ -13,7 +13,13 @@ from semfov.experiments.config import BeliefConfig, DataConfig, DetectorConfig, 
 from semfov.experiments.setup import make_eye
 from semfov.metrics.presence import area_under_roc, hits_at
 
-POLICIES = ["target-evidence", "random gaze", "price 0.05"]
+POLICIES = [
+    "target-evidence",
+    "random gaze",
+    "price 0.05",
+    "published belief",
+    "published belief, a detection at the gaze",
+]
 SHARP = ["one sharp look, highest score", "sharp look and its quarters, highest score"]
 
 
@@ -56,20 +62,21 @@ def records_in(out):
 @pytest.mark.weights
 def test_run_leaves_table_and_records(finished):
     records = records_in(finished)
-    assert len(records) == 12
+    assert len(records) == 20
     for record in records:
         assert record["policy"] in POLICIES
         assert record["outcome"] in OUTCOMES
         assert 1 <= record["looks"] <= 6
         assert 0 < record["probability"] < 1
-    assert [record["present"] for record in records] == 2 * [*[True] * 3, *[False] * 3]
+    assert [record["present"] for record in records] == 2 * [*[True] * 5, *[False] * 5]
     text = (finished / "decisions.md").read_text()
     rows = rows_of(text)
-    assert [row[0] for row in rows] == [*POLICIES, *SHARP, *POLICIES, "price of a look", "0.05"]
+    places, lands = [*POLICIES, "one sharp look"], POLICIES
+    assert [row[0] for row in rows] == [*POLICIES, *SHARP, *places, *lands, "price of a look", "0.05"]
     assert (finished / "roc.png").stat().st_size > 1000
     assert "4 searches" in text
     assert "2 for a class that is" in text
-    for row in rows[:3]:
+    for row in rows[:5]:
         group = [record for record in records if record["policy"] == row[0]]
         score = torch.tensor([record["probability"] for record in group])
         there = torch.tensor([record["present"] for record in group])
@@ -93,7 +100,7 @@ def test_finished_scenes_are_not_searched_again(finished, arguments, tmp_path):
     for name in ("episodes.jsonl", "decisions.md"):
         assert (out / name).read_bytes() == (finished / name).read_bytes()
     part = json.loads(second.read_text())
-    assert part["records"] == records_in(finished)[6:]
+    assert part["records"] == records_in(finished)[10:]
 
 
 @pytest.mark.weights
@@ -115,7 +122,8 @@ def test_help_and_defaults(capsys):
 
 
 def record(policy, present, outcome, probability, looks, **more):
-    base = {"right_place": None, "overlap": None, "landing": None, "sharp": probability / 2, "tiled": probability / 4}
+    base = {"right_place": None, "overlap": None, "landing": None, "landing_seen": None, "sharp_place": None}
+    base |= {"sharp": probability / 2, "tiled": probability / 4}
     return {"policy": policy, "present": present, "outcome": outcome, "probability": probability, "looks": looks} | (
         base | more
     )
@@ -124,18 +132,25 @@ def record(policy, present, outcome, probability, looks, **more):
 def test_the_table_by_hand():
     """Four searches for what is there, two for what is not; the second policy finds nothing."""
     first = [
-        record("a", True, "found", 0.9, 3, right_place=True, overlap=0.75, landing=[0.2, 0.8]),
-        record("a", True, "found", 0.8, 5, right_place=False, overlap=0.25, landing=[0.4, 0.9]),
-        record("a", True, "absent", 0.3, 4, landing=[0.3, 0.1]),
+        record("a", True, "found", 0.9, 3, right_place=True, overlap=0.75, landing=[0.2, 0.8], landing_seen=True),
+        record("a", True, "found", 0.8, 5, right_place=False, overlap=0.25, landing=[0.4, 0.9], landing_seen=True),
+        record("a", True, "absent", 0.3, 4, landing=[0.3, 0.1], landing_seen=False),
         record("a", True, "undecided", 0.6, 8),
         record("a", False, "found", 0.85, 2, right_place=False),
         record("a", False, "absent", 0.1, 3),
     ]
+    # Half of the four hits of `a` are two: from a score of 0.4 on, which the one of 0.425 that is not there has too.
+    fits = {
+        0: {"right": True, "overlap": 0.5},
+        1: {"right": False, "overlap": 0.1},
+        4: {"right": False, "overlap": None},
+    }
+    first = [{**each, "sharp_place": fits.get(number)} for number, each in enumerate(first)]
     second = [record("b", each["present"], "undecided", 0.5, 9) for each in first]
     third = [{**each, "policy": "price 0.1"} for each in first]
     text = summary([*first, *second, *third], "sensed", [])
     assert "6 searches (sensed), 4 for a class that is." in text
-    area, other, _, sharp, tiled, a, b, _ = rows_of(text)
+    area, other, _, sharp, tiled, a, b, _, look, landed, nowhere, _ = rows_of(text)
     there = torch.tensor([each["present"] for each in first])
     score = torch.tensor([each["probability"] for each in first])
     hits = [f"{100 * hits_at(score, there, share):.0f}" for share in (0.01, 0.02, 0.05)]
@@ -145,8 +160,11 @@ def test_the_table_by_hand():
     assert other == ["b", "0.500", "0", "0", "0"]
     assert sharp == [SHARP[0], "0.625", *hits]
     assert tiled == [SHARP[1], "0.625", *hits]
-    assert a == ["a", "50.0", "50.0", "16.7", "5.0", "2.5", "33.3", "0.50", "0.30 → 0.60"]
-    assert b == ["b", "0.0", "0.0", "100.0", "9.0", "9.0", "-", "-", "-"]
+    assert a == ["a", "50.0", "50.0", "16.7", "5.0", "2.5", "33.3", "0.50"]
+    assert b == ["b", "0.0", "0.0", "100.0", "9.0", "9.0", "-", "-"]
+    assert look == ["one sharp look", "50.0", "50.0", "-", "1.0", "1.0", "33.3", "0.30"]
+    assert landed == ["a", "3", "0.300 → 0.600", "2", "0.300 → 0.850", "1", "0.300 → 0.100"]
+    assert nowhere == ["b", "0", "-", "0", "-", "0", "-"]
 
 
 def test_the_worth_of_searches_by_hand():

@@ -14,7 +14,7 @@ from eval.page.findings import FINDINGS, gain, overtaken
 from eval.page.tables import agreement, central, first_fixations, paired, summary
 from eval.results import TABLES, WHOLE, fill
 from semfov.errors import InputError
-from semfov.experiments.config import SearchConfig
+from semfov.experiments.config import ExploreConfig, SearchConfig, SensorConfig
 from semfov.experiments.presets import label
 
 ROOT = Path(__file__).parents[2]
@@ -70,6 +70,8 @@ def searched(runs):
 
 def test_every_policy_of_the_page_is_known(runs):
     for run in runs.values():
+        if not isinstance(run, SearchConfig | ExploreConfig):
+            continue
         task = "search" if isinstance(run, SearchConfig) else "exploration"
         labels = [label(choice, task) for choice in run.policies]
         assert len(set(labels)) == len(labels) > 0
@@ -108,6 +110,27 @@ def test_lines_become_tables(searched):
         fill("@@ beyond-search-tin first\n", runs)
     with pytest.raises(InputError, match="table"):
         fill("@@ beyond-search-tiny third\n", runs)
+
+
+def test_tables_of_decisions_and_beliefs(runs):
+    """Tables by their number in the file; the prose around them is the page's own."""
+    assert fill("@@ decide-tiny presence\n", runs) == "*Not run yet.*\n"
+    for name, file in (("decide-tiny", "decisions.md"), ("beliefs-nano", "beliefs.md")):
+        runs[name].out.mkdir(parents=True)
+        parts = [f"Some words.\n\n| {number} |\n|---|\n| x |\n" for number in range(4)]
+        (runs[name].out / file).write_text("\n".join(parts))
+    for number, kind in enumerate(("presence", "decisions", "landings", "prices")):
+        assert fill(f"@@ decide-tiny {kind}\n", runs) == f"| {number} |\n|---|\n| x |\n"
+    for number, kind in enumerate(("by-looks", "by-distance")):
+        assert fill(f"@@ beliefs-nano {kind}\n", runs) == f"| {number} |\n|---|\n| x |\n"
+
+
+def test_decisions_and_beliefs_are_measured_on_all_photographs_of_the_page(runs):
+    for name, detector in (("nano", "yolox-nano"), ("tiny", "yolov3-tiny")):
+        decide, beliefs = runs[f"decide-{name}"], runs[f"beliefs-{name}"]
+        assert decide.detector.name == beliefs.detector.name == detector
+        assert decide.sensor == beliefs.sensor == SensorConfig("gradual")
+        assert (decide.data.max_target_area, beliefs.target_area) == (0.2, 0.2)
 
 
 def test_every_line_of_the_template_is_known(runs):

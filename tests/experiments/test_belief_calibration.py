@@ -10,7 +10,7 @@ from semfov import DataError, InputError
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.episode import StoredLooks, rollout
-from semfov.experiments.belief_calibration import BANDS, CELLS, LOOKS, BeliefCalibrationRun, published_model
+from semfov.experiments.belief_calibration import BANDS, CELLS, LOOKS, BeliefCalibrationRun
 from semfov.experiments.belief_calibration_report import add_up, curves, landings, pooled, write_belief_report
 from semfov.experiments.config import (
     BeliefConfig,
@@ -23,7 +23,7 @@ from semfov.experiments.config import (
 from semfov.experiments.run import finish
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.seeds import generator_for, noise_for
-from semfov.experiments.setup import make_eye
+from semfov.experiments.setup import make_eye, published_model
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.metrics.calibration import BinarySums

@@ -7,9 +7,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semfov import DirichletBelief
+from semfov import DataError, Detections, DirichletBelief, Grid, InputError
 from semfov.belief import TargetEvidence
-from semfov.belief.observers import Target
+from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, conclude, decide
 from semfov.episode import StoredLooks, rollout
@@ -20,14 +20,17 @@ from semfov.experiments.config import (
     ProtocolConfig,
     SensorConfig,
 )
-from semfov.experiments.decisions import DecisionConfig, DecisionRun, landing, overlap, quarters
+from semfov.experiments.decisions import DecisionConfig, DecisionRun, landing, overlap, quarters, sharp_place
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.seeds import generator_for, noise_for
 from semfov.experiments.setup import make_eye
 from semfov.gaze.acquisition import TargetPosterior, Uniform
 from semfov.gaze.choice import Greedy, drawn_from
+from semfov.gaze.policies import Predictive
+from semfov.observation.foveal import FovealObservationModel
 
 AT = Thresholds(0.5, 0.375)
+PUBLISHED = ["published belief", "published belief, a detection at the gaze"]
 
 
 def write_evidence(path, thresholds, seed=2):
@@ -89,28 +92,36 @@ def test_quarters_cover_the_picture_once():
 @pytest.mark.weights
 def test_searches_by_price_stand_beside_those_by_thresholds(config):
     run = DecisionRun(replace(config, prices=(0.01, 0.2), confirm=0.6))
-    assert list(run.compared) == ["target-evidence", "random gaze", "price 0.01", "price 0.2"]
+    assert list(run.compared) == ["target-evidence", "random gaze", "price 0.01", "price 0.2", *PUBLISHED]
     assert run.thresholds == Thresholds(0.6, AT.give_up)
     records, _ = run.outcomes(0)
     looks = {name: sum(r["looks"] for r in records if r["policy"] == name) for name in run.compared}
     assert looks["price 0.2"] <= looks["price 0.01"]
 
 
+def shows(step, grid, target, least=0.5):
+    """1 where the best class of a detection over the fixated cell is the target, detection by detection."""
+    detections = step.detections
+    for box, scores, there in zip(detections.boxes[0], detections.scores[0], detections.mask[0], strict=True):
+        over = bool(grid.footprint(box[None])[0, int(step.cell)])
+        if bool(there) and over and int(scores.argmax()) == target and float(scores[target]) >= least:
+            return 1
+    return 0
+
+
 @pytest.mark.weights
 def test_records_are_those_of_searches_by_hand(run):
-    outcomes = set()
-    evidence = run.models.evidence
+    outcomes, evidence = set(), run.models.evidence
     for index in range(3):
         records, seconds = run.outcomes(index)
         assert set(seconds) == {"look", "search"}
         annotation, grid, scene = run.scenes.annotation(index), run.grid(index), run.scenes.ids[index]
         targets = choose_classes(run.scenes, index, annotation, 1, 0.5, 0)
         assert [(r["target"], r["policy"]) for r in records] == [
-            (target, policy) for target in targets for policy in ("target-evidence", "random gaze")
+            (target, policy) for target in targets for policy in ("target-evidence", "random gaze", *PUBLISHED)
         ]
-        assert [r["present"] for r in records] == [True, True, False, False]
-        detections = run.detections(index)
-        sharp = run.eye.detector(run.scenes[index].image[None])
+        assert [r["present"] for r in records] == [True] * 4 + [False] * 4
+        detections, sharp = run.detections(index), run.eye.detector(run.scenes[index].image[None])
         for record in records:
             target = record["target"]
             assert record["scene"] == scene
@@ -121,24 +132,28 @@ def test_records_are_those_of_searches_by_hand(run):
             start = torch.randint(12, (1,), generator=generator_for("start", 0, scene, target))
             noise = noise_for(run.config.protocol, 12, scene, target, 0)[None]
             acquisition = Uniform() if record["policy"] == "random gaze" else TargetPosterior(target)
+            observer, at_the_gaze = Target(evidence), record["policy"] == PUBLISHED[1]
+            if record["policy"] in PUBLISHED:
+                model = run.models.observation
+                observer, acquisition = Semantic(81, model), Predictive(model)(target, grid)
             looks = StoredLooks(detections, grid, torch.tensor([target]))
             steps, ended = [], 0
             with torch.inference_mode():
                 choice = Greedy(drawn_from(noise))
-                for step in rollout(looks, Target(evidence), acquisition, start, choice, most=7):
+                for step in rollout(looks, observer, acquisition, start, choice, most=7):
                     steps.append(step)
-                    ended = int(decide(step, target, AT))
+                    ended = shows(step, grid, target) if at_the_gaze else int(decide(step, target, AT))
                     if ended:
                         break
             belief, seen = steps[-1].belief, [int(step.cell) for step in steps]
             assert record["looks"] == len(steps)
             assert record["outcome"] == OUTCOMES[ended]
-            assert record["probability"] == pytest.approx(float(belief.anywhere), abs=1e-6)
+            assert record["probability"] == pytest.approx(float(belief.presence(target)), abs=1e-6)
             outcomes.add(record["outcome"])
             goal = grid.footprint(annotation.boxes)[annotation.labels == target].any(0)
             if record["outcome"] == "found":
                 parts = [detections[cell : cell + 1] for cell in seen]
-                decision = conclude(ended, belief, parts, grid, target)
+                decision = conclude(ended, belief, parts, grid, target, seen[-1] if at_the_gaze else None)
                 assert record["right_place"] == bool(goal[decision.cell])
                 assert record["overlap"] == overlap(decision.box, annotation.boxes[annotation.labels == target])
             else:
@@ -147,8 +162,9 @@ def test_records_are_those_of_searches_by_hand(run):
             if hit == 0:
                 assert record["landing"] is None
             else:
-                before, after = (float(steps[n].belief.present[0, seen[hit]]) for n in (hit - 1, hit))
+                before, after = (float(steps[n].belief.probability(target)[0, seen[hit]]) for n in (hit - 1, hit))
                 assert record["landing"] == pytest.approx([before, after], abs=1e-6)
+                assert record["landing_seen"] == bool(shows(steps[hit], grid, target, 0.0))
     assert {"found", "absent"} <= outcomes
 
 
@@ -166,13 +182,14 @@ def test_parts_are_of_what_decisions_depend_on(config, run, folder):
         key(protocol=ProtocolConfig(shifts=7)),
         key(confirm=0.52),
         key(give_up=0.2),
+        key(place=0.3),
         key(prices=(0.01,)),
         key(data=DataConfig(limit=2, max_target_area=0.5)),
         with_model(write_evidence(folder / "seed.safetensors", AT, seed=1)),
         with_model(write_evidence(folder / "confirm.safetensors", Thresholds(0.51, 0.375))),
         with_model(write_evidence(folder / "none.safetensors", None)),
     ]
-    assert len({run.key, *others}) == 9
+    assert len({run.key, *others}) == 10
 
 
 @pytest.mark.weights
@@ -180,7 +197,30 @@ def test_a_model_without_thresholds_still_decides(config, folder):
     path = write_evidence(folder / "none.safetensors", None)
     run = DecisionRun(replace(config, belief=replace(config.belief, target_model=str(path))))
     records, _ = run.outcomes(0)
-    assert len(records) == 4
+    assert len(records) == 8
+
+
+@pytest.mark.weights
+def test_without_an_observation_model_the_published_belief_is_left_out(config, monkeypatch):
+    monkeypatch.setattr(FovealObservationModel, "shipped", config.out / "none")
+    assert list(DecisionRun(config).compared) == ["target-evidence", "random gaze"]
+    named = replace(config, belief=replace(config.belief, model="nowhere.safetensors"))
+    with pytest.raises((InputError, DataError), match="nowhere"):
+        DecisionRun(named)
+
+
+def test_the_place_of_a_sharp_look():
+    """Of two boxes the surer one counts, masked ones do not, and its middle is in the third cell of the second row."""
+    grid = Grid(4, 3, (80, 60))
+    boxes = torch.tensor([[[42.0, 22, 58, 38], [0, 0, 20, 20], [60, 40, 80, 60]]])
+    scores = torch.tensor([[[0.4, 0.6], [0.5, 0.5], [0.1, 0.9]]])
+    seen = Detections(boxes, scores, torch.tensor([[True, True, False]]))
+    goal = torch.zeros(12, dtype=torch.bool)
+    goal[6] = True
+    told = sharp_place(seen, grid, 1, goal, torch.tensor([[42.0, 22, 58, 54]]))
+    assert told == {"right": True, "overlap": pytest.approx(0.5)}
+    assert sharp_place(seen, grid, 1, ~goal, boxes[0, :0]) == {"right": False, "overlap": None}
+    assert sharp_place(Detections.empty(1, 1), grid, 1, goal, boxes[0]) is None
 
 
 corner = st.floats(0, 50)

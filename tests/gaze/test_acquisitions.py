@@ -68,7 +68,7 @@ def beliefs():
 def told_of(present, following, closest):
     """A belief about one target that says this of it, and anything of the rest."""
     others, rest = rand(4, 3, 12, seed=7), rand(3, 3, seed=8)
-    return TargetBelief(present, following, rest[0], closest, *others, *rest[1:], visits())
+    return TargetBelief(closest, *others, *rest[1:], visits(), present, following, rest[0])
 
 
 def about_one_target():

@@ -28,6 +28,6 @@ def test_gradients():
 
 def test_a_belief_about_one_target_is_refused():
     cells, one = torch.zeros(1, 3), torch.zeros(1)
-    about_one = TargetBelief(cells, cells, one, cells, cells, cells, cells, cells, one, one, cells.bool())
+    about_one = TargetBelief(cells, cells, cells, cells, cells, one, one, cells.bool(), cells, cells, one)
     with pytest.raises(InputError, match="all classes"):
         ObjectEvidence()(about_one, torch.zeros(1, 3, dtype=torch.bool))

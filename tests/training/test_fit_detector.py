@@ -21,10 +21,11 @@ from semfov.experiments.config import DataConfig, DetectorConfig, ExploreConfig,
 from semfov.experiments.fitted import with_models
 from semfov.experiments.progress import Whole, task_bar, track
 from semfov.experiments.search_protocol import choose_classes
-from semfov.gaze.policies import Closer, Random
+from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
 from semfov.io.files import sha256
 from semfov.io.manifest import Manifest, Part
 from semfov.model_folder import ModelFolder
+from semfov.observation.foveal import FovealObservationModel
 from semfov.training import detector_parts
 from semfov.training.detector_report import thin_classes
 from semfov.training.detector_settings import FitDetectorConfig
@@ -169,6 +170,30 @@ def test_the_agent_of_the_folder_finds_what_is_there(home):
     assert len(agent.explore(image, shifts=3).cells) >= 1
 
 
+@pytest.mark.parametrize("search", ["predictive", "non-predictive"])
+def test_the_published_agent_takes_the_folder(home, search):
+    folder = ModelFolder(home / "models")
+    agent = ActivePerception.published(home / "models", search=search)
+    assert (agent.columns, agent.rows) == folder.manifest.grid
+    assert agent.eye.settings() == folder.eye().settings()
+    fitted = FovealObservationModel.from_pretrained(folder.file("observation")).state_dict()
+    used = agent.searching.observer.observation.state_dict()
+    assert all(torch.equal(used[name], value) for name, value in fitted.items())
+    assert isinstance(agent.searching.policy, Predictive if search == "predictive" else NonPredictive)
+    assert isinstance(agent.exploring.policy, KL)
+    image = torch.rand(3, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
+    assert len(agent.search(image, "blue", shifts=2, confirm=1.0).cells) == 3
+    with pytest.raises(InputError, match="sensor: expected None beside a folder of models"):
+        ActivePerception.published(home / "models", sensor="published")
+
+
+def test_the_published_agent_needs_an_observation_model(home, tmp_path):
+    folder = copied(home, tmp_path)
+    rewrite(folder, observation=replace(Manifest.read(folder).parts["observation"], file=None, used=False))
+    with pytest.raises(InputError, match=r"observation model, which .* lacks; fit one: python -m train\.fit_detector"):
+        ActivePerception.published(folder)
+
+
 def test_searches_of_the_folder_are_those_of_the_report(home, capsys):
     """`eval.search` on the held-out photographs alone gives the same cumulative performance, by other code."""
     (home / "ids.txt").write_text("0 4 8 12 16")
@@ -216,10 +241,11 @@ def test_a_part_that_is_gone_is_fitted_again_alone(home, tmp_path, monkeypatch):
     assert again.read_bytes() == once.read_bytes()
 
 
-def test_the_demonstration_takes_the_folder(home, tmp_path, capsys):
+@pytest.mark.parametrize("agent", ["recommended", "published"])
+def test_the_demonstration_takes_the_folder(home, tmp_path, capsys, agent):
     photo = str(home / "photographs/0.png")
     given = [photo, "--target", "red", "--shifts", "0", "--models", str(home / "models"), "--out", str(tmp_path)]
-    assert demo(given) == 0
+    assert demo([*given, "--agent", agent]) == 0
     assert "0.png: “red”" in capsys.readouterr().out
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -142,9 +143,13 @@ def test_objective_equals_its_formula(held):
     for row, places in enumerate(held):
         goal[row, places] = True
     visited[:, [4, 9]] = True
-    config = FitSearchConfig(landing=0.7, presence=0.4)
-    entropy, telling, landing = [], [], []
+    following_cell = torch.tensor([2, 0, 7])
+    config = FitSearchConfig(landing=0.7, presence=0.4, gaze=0.3)
+    entropy, telling, landing, gazing = [], [], [], []
     for row in range(3):
+        for cell in (int(following_cell[row]), max((4, 9), key=lambda c: float(cells[row, c]))):
+            p = float(cells[row, cell])
+            gazing.append(-math.log(p if cell in held[row] else 1 - p))
         for cell in range(CELLS):
             p = float(cells[row, cell])
             entropy.append(-math.log(p if cell in held[row] else 1 - p))
@@ -154,14 +159,12 @@ def test_objective_equals_its_formula(held):
             odds = {c: float(following[row, c] / (1 - following[row, c])) for c in range(CELLS) if c not in (4, 9)}
             landing.append(-math.log(sum(odds[c] for c in held[row]) / sum(odds.values())))
     expected = 4 * sum(entropy) / len(entropy) + 0.4 * sum(telling) / 3
+    expected += 0.3 * sum(gazing) / 3
     expected += 0.7 * sum(landing) / len(landing) if landing else 0
     belief = Target(TargetEvidence(4, 4)).start(3, GRID, cells)
-    belief = type(belief)(cells, following, anywhere, *[getattr(belief, name) for name in REST])
-    got = objective(config, SimpleNamespace(belief=belief, visited=visited), goal)
+    belief = replace(belief, present=cells, following=following, anywhere=anywhere)
+    got = objective(config, SimpleNamespace(belief=belief, visited=visited, next_cell=following_cell), goal)
     assert float(got) == pytest.approx(expected, rel=1e-6)
-
-
-REST = ("closest", "nearest", "best", "total", "weight", "score", "looks", "visited")
 
 
 def test_gradients_of_certain_beliefs_are_finite():
@@ -170,19 +173,23 @@ def test_gradients_of_certain_beliefs_are_finite():
     goal = torch.zeros(2, CELLS, dtype=torch.bool)
     goal[0, 2] = True
     belief = Target(TargetEvidence(4, 4)).start(2, GRID, cells.detach())
-    belief = type(belief)(cells, cells, cells[:, 0], *[getattr(belief, name) for name in REST])
-    loss = objective(FitSearchConfig(), SimpleNamespace(belief=belief, visited=goal.new_zeros(2, CELLS)), goal)
+    belief = replace(belief, present=cells, following=cells, anywhere=cells[:, 0])
+    visited, following_cell = goal.new_zeros(2, CELLS), torch.tensor([0, 1])
+    visited[:, [2, 3]] = True
+    step = SimpleNamespace(belief=belief, visited=visited, next_cell=following_cell)
+    loss = objective(FitSearchConfig(), step, goal)
     loss.backward()
     assert bool(loss.isfinite())
     assert bool(cells.grad.isfinite().all())
 
 
-def brute_force(config, anywhere, looked, left, there):
+def brute_force(config, anywhere, place, left, there):
     """All searches at all thresholds, look by look."""
 
-    def found(search, confirm, give_up):
+    def found(search, confirm, least, give_up):
         for look in range(len(anywhere)):
-            if float(anywhere[look, search]) >= confirm and bool(looked[look, search]):
+            known = float(place[look, search])
+            if float(anywhere[look, search]) >= confirm and known > 0 and known >= least:
                 return True
             if float(left[look, search]) < give_up:
                 return False
@@ -190,19 +197,27 @@ def brute_force(config, anywhere, looked, left, there):
 
     holding = there.nonzero()[:, 0].tolist()
     others = (~there).nonzero()[:, 0].tolist()
-    passing = []
-    for confirm in torch.arange(0.99, 0.49, -0.01).tolist():
-        if sum(found(search, confirm, 0.0) for search in others) > config.false_alarms * len(others):
-            break
-        passing.append(confirm)
-    confirm = min(passing, default=1.0)
-    told = sum(found(search, confirm, 0.0) for search in holding)
+
+    def surest(least):
+        passing = []
+        for confirm in torch.arange(0.99, 0.49, -0.01).tolist():
+            if sum(found(search, confirm, least, 0.0) for search in others) > config.false_alarms * len(others):
+                break
+            passing.append(confirm)
+        confirm = min(passing, default=1.0)
+        return confirm, sum(found(search, confirm, least, 0.0) for search in holding)
+
+    wherever, least = surest(0.0)[1], 0.0
+    for candidate in torch.arange(0.95, 0.04, -0.05).tolist():
+        if candidate > least and wherever - surest(candidate)[1] <= config.lost * len(holding):
+            least = candidate
+    confirm, told = surest(least)
     kept = [
         give_up
         for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01)
-        if told - sum(found(search, confirm, give_up) for search in holding) <= config.lost * len(holding)
+        if told - sum(found(search, confirm, least, give_up) for search in holding) <= config.lost * len(holding)
     ]
-    return Thresholds(confirm, max(kept, default=0.0))
+    return Thresholds(confirm, max(kept, default=0.0), least)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -218,21 +233,23 @@ def test_thresholds_equal_trying_all(seed):
     anywhere = (draw(looks, searched) * 0.5 + 0.5 * there) * (scale if seed % 2 else 1)
     left = draw(looks, searched).pow(2 + 4 * (seed % 3)) * draw(searched)
     looked = draw(looks, searched) < torch.linspace(0.2, 0.9, looks)[:, None]
+    place = looked * (0.3 * draw(looks, searched) + 0.7 * anywhere)
     config = FitSearchConfig(false_alarms=(0.0, 0.03, 0.2)[seed % 3], lost=(0.0, 0.05)[seed % 2])
-    got = choose_thresholds(config, anywhere, looked, left, there)
-    assert got == brute_force(config, anywhere, looked, left, there)
+    got = choose_thresholds(config, anywhere, place, left, there)
+    assert got == brute_force(config, anywhere, place, left, there)
 
 
 def test_thresholds_at_the_ends():
     """Searches that tell nothing confirm nothing; those that tell all are confirmed from a half on."""
     there = torch.tensor([True, False])
-    looked, left = torch.tensor([[True, True]]), torch.tensor([[0.4, 0.005]])
+    place, left = torch.tensor([[0.72, 0.72]]), torch.tensor([[0.4, 0.005]])
     config = FitSearchConfig()
-    blind = choose_thresholds(config, torch.tensor([[1.0, 1.0]]), looked, left, there)
+    blind = choose_thresholds(config, torch.tensor([[1.0, 1.0]]), place, left, there)
     assert blind.confirm == 1
-    sharp = choose_thresholds(config, torch.tensor([[1.0, 0.0]]), looked, left, there)
+    sharp = choose_thresholds(config, torch.tensor([[1.0, 0.0]]), place, left, there)
     assert sharp.confirm == pytest.approx(0.5, abs=0.001)
     assert sharp.give_up == 0.3
+    assert sharp.place == pytest.approx(0.7, abs=0.001)
 
 
 @pytest.mark.usefixtures("one_thread")

@@ -1,14 +1,12 @@
 """What an observer is: it turns looks into a belief."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import ClassVar, Self, TypeVar
 
 from torch import Tensor, nn
 
-from semfov.belief.belief import Belief, one_by_one
-from semfov.belief.evidence import Evidence, farther
+from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
@@ -88,40 +86,6 @@ class Observer(nn.Module, ABC):
     ) -> Belief:
         """`update` by what `weigh` makes of the looks."""
         return self.update(belief, self.weigh(detections, fixation, grid, target))
-
-
-class Gatherer(Observer):
-    """Base of the observers that weigh what all looks say by networks.
-
-    Args:
-        together: compute all episodes of a batch at once: faster, but how figures are rounded depends on the batch.
-    """
-
-    model: Evidence
-
-    def __init__(self, together: bool) -> None:
-        super().__init__()
-        self.together = together
-
-    def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> Belief:
-        r"""What looks gathered counts less, and a closest look counts as one from farther away; see `Observer.fade`.
-
-        With r = -ln k, what is gathered for a cell moves by :math:`e \leftarrow e_0 + k (e - e_0)` towards the evidence
-        :math:`e_0` of a look from far away that shows nothing. Looks count by their nearness :math:`e^{-d/R}`
-        (`semfov.belief.evidence.nearness`), which fades with them: so does that of the closest look, by
-        :math:`d \leftarrow d + r R`, and a fresh look from farther takes its place in time.
-        """
-        if keep == 1:
-            return belief
-        known: dict[str, Tensor] = vars(belief)
-        unseen = self.model.unseen(belief.closest)
-        faded = {name: unseen + keep * (known[name] - unseen) for name in ("nearest", "best")}
-        faded |= {name: keep * known[name] for name in ("total", "weight", "score", "looks")}
-        return replace(belief, **faded, closest=known["closest"] + farther(keep), visited=visited)  # type: ignore[type-var]
-
-    def each(self, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-        """`function` of the rows of tensors `(B, ...)`, each alone (`one_by_one`) or all at once."""
-        return function(*rows) if self.together else one_by_one(function, *rows)
 
 
 def own(value: object, kind: type[Kind], argument: str) -> Kind:

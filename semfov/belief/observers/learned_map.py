@@ -1,80 +1,42 @@
 """The observer that learned to tell what is where: every class, and none, in every cell."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from semfov.belief.belief import Belief, pick
-from semfov.belief.evidence import Gathered, nearness
+from semfov.belief.evidence import Gathered
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
 from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.observers.base import Gatherer, Look, own
+from semfov.belief.observers.base import Look, own
+from semfov.belief.observers.gathering import EvidenceLook, GatheredBelief, Gatherer
 from semfov.detection.detections import Detections
 
 
 @dataclass(frozen=True)
-class MapLook(Look):
-    """What looks say about T classes in every cell.
+class MapLook(EvidenceLook):
+    """What looks say about T classes in every cell; attributes as for T classes in `EvidenceLook`, and:
 
     Attributes:
-        evidence: `(B, T, X·Y)`, log odds.
-        distance: `(B, X·Y)`, from the fixation, in longer sides of the image.
-        score: `(B, T)`, highest score of each class in any detection.
-        fixated: `(B,)`, cell that holds the fixation.
-        targets: `(B, T)`, the classes.
-        columns: cells in a row.
         stands_for: `(B, T)`, how many classes each one stands for; 1 where all are given.
     """
 
-    evidence: Tensor
-    distance: Tensor
-    score: Tensor
-    fixated: Tensor
-    targets: Tensor
-    columns: int
     stands_for: Tensor
-
-    def __getitem__(self, index: Tensor | slice) -> "MapLook":
-        """Some of the looks."""
-        said = self.evidence[index], self.distance[index], self.score[index], self.fixated[index], self.targets[index]
-        return MapLook(*said, self.columns, self.stands_for[index])
-
-    @classmethod
-    def join(cls, looks: Sequence["MapLook"]) -> "MapLook":
-        """All looks of several batches."""
-        names = ("evidence", "distance", "score", "fixated", "targets", "stands_for")
-        tensors = {name: torch.cat([getattr(look, name) for look in looks]) for name in names}
-        return cls(**tensors, columns=looks[0].columns)
 
 
 @dataclass(frozen=True)
-class MapBelief(Belief):
-    """Belief about all classes, as marginal probabilities: several classes can share a cell.
+class MapBelief(GatheredBelief):
+    """Belief about all classes, as marginal probabilities; attributes as for K classes in `GatheredBelief`, and:
+
+    Several classes can share a cell.
 
     Attributes:
         probabilities: `(B, X·Y, K+1)`, that a cell holds each class; the first is that it holds none.
-        closest: `(B, X·Y)`, see `Belief`.
-        nearest: `(B, K, X·Y)`, evidence of the closest look at each cell.
-        best: `(B, K, X·Y)`, strongest evidence of any look.
-        total: `(B, K, X·Y)`, evidence of all looks, each counted by its nearness.
-        weight: `(B, X·Y)`, sum of the nearness of all looks.
-        score: `(B, K)`, highest score of each class in any detection.
-        looks: `(B,)`, number of looks.
-        visited: `(B, X·Y)` boolean, cells that were fixated.
     """
 
     probabilities: Tensor
-    closest: Tensor
-    nearest: Tensor
-    best: Tensor
-    total: Tensor
-    weight: Tensor
-    score: Tensor
-    looks: Tensor
-    visited: Tensor
 
     def class_probabilities(self) -> Tensor:
         """Probabilities of all classes; they need not sum to 1."""
@@ -83,11 +45,6 @@ class MapBelief(Belief):
     def probability(self, target: int | Tensor) -> Tensor:
         """Probability that each cell holds the target, `(B, X·Y)`."""
         return pick(self.probabilities, torch.as_tensor(target))
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> "MapBelief":
-        """The belief with all tensors replaced."""
-        gathered = self.nearest, self.best, self.total, self.weight, self.score, self.looks, self.visited
-        return MapBelief(*map(function, (self.probabilities, self.closest, *gathered)))
 
 
 class LearnedMap(Gatherer):
@@ -107,12 +64,9 @@ class LearnedMap(Gatherer):
     def start(self, batch: int, grid: Grid, like: Tensor) -> MapBelief:
         """The same for every class in every cell, and nothing gathered."""
         classes = len(self.model.prior) - 1
-        cells, episodes = like.new_zeros(batch, len(grid)), like.new_zeros(batch)
-        # One row for all classes: it broadcasts over those that the first look tells of.
-        each, never = like.new_zeros(batch, 1, len(grid)), cells + torch.inf
         even = like.new_full((batch, len(grid), classes + 1), 1 / (classes + 1))
-        gathered = each, each - torch.inf, each, cells, like.new_zeros(batch, 1), episodes, cells.bool()
-        return MapBelief(even, never, *gathered)
+        # One row for all classes: it broadcasts over those that the first look tells of.
+        return MapBelief(**self.nothing(batch, grid, like, 1), probabilities=even)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> MapLook:
         """What looks from `fixation` `(B, 2)` say about all classes, whatever `target` is."""
@@ -130,17 +84,10 @@ class LearnedMap(Gatherer):
     def update(self, belief: Belief, look: Look) -> MapBelief:
         """Belief after a look in each episode."""
         known, said = own(belief, MapBelief, "belief"), own(look, MapLook, "look")
-        nearest = torch.where((said.distance < known.closest)[:, None], said.evidence, known.nearest)
-        best = torch.maximum(said.evidence, known.best)
-        closest = torch.minimum(said.distance, known.closest)
-        near = self.each(nearness, said.distance)
-        total, weight = known.total + near[:, None] * said.evidence, known.weight + near
-        score, looks = torch.maximum(said.score, known.score), known.looks + 1
-        visited = known.visited.scatter(-1, said.fixated[:, None], True)
-        mean = total / weight[:, None]
-        gathered = nearest, best, mean, closest, score, looks, visited, said.targets, said.stands_for
+        all_looks = self.gather(known, said)
+        gathered = *self.read(all_looks), said.target, said.stands_for
         probabilities = self.each(lambda *rows: self._read(*rows, columns=said.columns), *gathered)
-        return MapBelief(probabilities, closest, nearest, best, total, weight, score, looks, visited)
+        return MapBelief(**all_looks, probabilities=probabilities)
 
     def _read(
         self,

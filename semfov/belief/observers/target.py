@@ -1,84 +1,39 @@
 """The observer of a searcher that knows what it wants: only where the target is."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from semfov.belief.belief import Belief
-from semfov.belief.evidence import Gathered, nearness
+from semfov.belief.evidence import Gathered
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
-from semfov.belief.observers.base import Gatherer, Look, own
+from semfov.belief.observers.base import Look, own
+from semfov.belief.observers.gathering import EvidenceLook, GatheredBelief, Gatherer
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
 
 
 @dataclass(frozen=True)
-class TargetLook(Look):
-    """What looks say about the target in every cell.
-
-    Attributes:
-        evidence: `(B, X·Y)`, log odds.
-        distance: `(B, X·Y)`, from the fixation, in longer sides of the image.
-        score: `(B,)`, highest score of the target in any detection.
-        fixated: `(B,)`, cell that holds the fixation.
-        target: `(B,)`, class that is searched for.
-        columns: cells in a row.
-    """
-
-    evidence: Tensor
-    distance: Tensor
-    score: Tensor
-    fixated: Tensor
-    target: Tensor
-    columns: int
-
-    def __getitem__(self, index: Tensor | slice) -> "TargetLook":
-        """Some of the looks."""
-        evidence, distance = self.evidence[index], self.distance[index]
-        which = self.fixated[index], self.target[index]
-        return TargetLook(evidence, distance, self.score[index], *which, self.columns)
-
-    @classmethod
-    def join(cls, looks: Sequence["TargetLook"]) -> "TargetLook":
-        """All looks of several batches."""
-        names = ("evidence", "distance", "score", "fixated", "target")
-        tensors = {name: torch.cat([getattr(look, name) for look in looks]) for name in names}
-        return cls(**tensors, columns=looks[0].columns)
+class TargetLook(EvidenceLook):
+    """What looks say about the target in every cell; attributes as for one class in `EvidenceLook`."""
 
 
 @dataclass(frozen=True)
-class TargetBelief(Belief):
-    """Belief about one target alone.
+class TargetBelief(GatheredBelief):
+    """Belief about one target alone; attributes as for one class in `GatheredBelief`, and:
 
     Attributes:
         present: `(B, X·Y)`, probability that a cell holds the target.
         following: `(B, X·Y)`, the same if no fixated cell holds it.
         anywhere: `(B,)`, probability that the image holds it.
-        closest: `(B, X·Y)`, see `Belief`.
-        nearest: `(B, X·Y)`, evidence of the closest look at each cell.
-        best: `(B, X·Y)`, strongest evidence of any look.
-        total: `(B, X·Y)`, evidence of all looks, each counted by its nearness.
-        weight: `(B, X·Y)`, sum of the nearness of all looks.
-        score: `(B,)`, highest score of the target in any detection.
-        looks: `(B,)`, number of looks.
-        visited: `(B, X·Y)` boolean, cells that were fixated.
     """
 
     present: Tensor
     following: Tensor
     anywhere: Tensor
-    closest: Tensor
-    nearest: Tensor
-    best: Tensor
-    total: Tensor
-    weight: Tensor
-    score: Tensor
-    looks: Tensor
-    visited: Tensor
 
     def chance(self, target: int | Tensor) -> Tensor:
         """As for `probability`, if no fixated cell holds the target."""
@@ -91,12 +46,6 @@ class TargetBelief(Belief):
     def presence(self, target: int | Tensor) -> Tensor:
         """Probability that the target that was searched for is anywhere, `(B,)`, whatever `target` is."""
         return self.anywhere
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> "TargetBelief":
-        """The belief with all tensors replaced."""
-        told = self.present, self.following, self.anywhere
-        gathered = self.closest, self.nearest, self.best, self.total, self.weight, self.score, self.looks, self.visited
-        return TargetBelief(*map(function, (*told, *gathered)))
 
 
 class Target(Gatherer):
@@ -121,10 +70,8 @@ class Target(Gatherer):
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> TargetBelief:
         """Even odds in every cell, and nothing gathered."""
-        cells, episodes = like.new_zeros(batch, len(grid)), like.new_zeros(batch)
-        even, never = cells + 0.5, cells + torch.inf
-        gathered = never, cells, -never, cells, cells, episodes, episodes, cells.bool()
-        return TargetBelief(even, even, episodes + 0.5, *gathered)
+        even, anywhere = like.new_full((batch, len(grid)), 0.5), like.new_full((batch,), 0.5)
+        return TargetBelief(**self.nothing(batch, grid, like), present=even, following=even, anywhere=anywhere)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> TargetLook:
         """What looks from `fixation` `(B, 2)` say about the target."""
@@ -138,25 +85,15 @@ class Target(Gatherer):
     def update(self, belief: Belief, look: Look) -> TargetBelief:
         """Belief after a look in each episode."""
         known, said = own(belief, TargetBelief, "belief"), own(look, TargetLook, "look")
-        closer = said.distance < known.closest
-        nearest = torch.where(closer, said.evidence, known.nearest)
-        best = torch.maximum(said.evidence, known.best)
-        closest = torch.minimum(said.distance, known.closest)
-        near = self.each(nearness, said.distance)
-        total, weight = known.total + near * said.evidence, known.weight + near
-        score, looks = torch.maximum(said.score, known.score), known.looks + 1
-
-        visited = known.visited.scatter(-1, said.fixated[:, None], True)
-        columns = said.columns
+        all_looks = self.gather(known, said)
 
         def probabilities(*gathered: Tensor) -> Tensor:
             what = Gathered(*gathered)
-            cells = self.model.log_odds(what, columns)
+            cells = self.model.log_odds(what, said.columns)
             image = self.model.presence(cells, what)[:, None]
-            return torch.cat([cells, self.model.chance(what, columns), image], -1).sigmoid()
+            return torch.cat([cells, self.model.chance(what, said.columns), image], -1).sigmoid()
 
-        gathered = nearest, best, total / weight, closest, score, looks, visited, said.target
-        told = self.each(probabilities, *gathered)
-        number = nearest.shape[-1]
+        told = self.each(probabilities, *self.read(all_looks), said.target)
+        number = all_looks["closest"].shape[-1]
         present, following, anywhere = told[:, :number], told[:, number:-1], told[:, -1]
-        return TargetBelief(present, following, anywhere, closest, nearest, best, total, weight, score, looks, visited)
+        return TargetBelief(**all_looks, present=present, following=following, anywhere=anywhere)

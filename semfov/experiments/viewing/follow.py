@@ -10,7 +10,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Look, Observer
-from semfov.belief.observers.base import Gatherer
+from semfov.belief.observers.gathering import Gatherer
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Stopwatch, rollout
 from semfov.experiments.candidates import Candidate

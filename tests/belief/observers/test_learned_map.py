@@ -159,7 +159,7 @@ def test_looks_are_weighed_alike_alone_and_in_a_batch(random_looks, toy_map):
         assert torch.equal(getattr(batch[index], part.name), tensor[index]), part.name
         assert torch.equal(getattr(batch[1:3], part.name), tensor[1:3]), part.name
     assert torch.equal(batch.fixated, torch.tensor(FIXATED))
-    assert torch.equal(batch.targets, CLASSES.expand(4, -1))
+    assert torch.equal(batch.target, CLASSES.expand(4, -1))
     assert bool((batch.stands_for == 1).all())
     assert torch.equal(batch.score, highest_score(looks, CLASSES))
     assert torch.equal(batch.distance, GRID.distance(FIXATIONS))
