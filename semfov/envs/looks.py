@@ -7,7 +7,7 @@ from torch import Tensor
 
 from semfov.belief.observers.base import Look, Observer
 from semfov.detection.detections import Detections
-from semfov.episode import Looks, Sight, StoredLooks, Stopwatch
+from semfov.episode import Looks, Sight, Stopwatch, StoredLooks
 
 
 class SceneLooks(Looks):

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from semfov.detection.detections import Detections
+from semfov.detection.detector import Detector
 from semfov.envs.gazes import Explorations, Gazes, Searches
 from semfov.envs.scenery import Scenery
 from semfov.errors import check_whole
@@ -85,7 +87,7 @@ def glimpses(gazes: Gazes, rows: Tensor, side: int) -> NDArray[np.uint8]:
 
 
 def tell(gazes: Gazes, rows: Tensor, *, detections: bool) -> Arrays:
-    """Infos of some episodes, each array `(n, ...)`; padding of detections is masked out."""
+    """Infos of some episodes, each array `(n, ...)`."""
     passes = gazes.shift[rows] + 1
     told: Arrays = {
         "passes": passes.numpy(),
@@ -95,19 +97,25 @@ def tell(gazes: Gazes, rows: Tensor, *, detections: bool) -> Arrays:
         "scene": np.array([gazes.episodes[row].scene for row in rows.tolist()]),
     }
     if detections:
-        seen = gazes.seen(rows)
-        told["detections"] = {
-            "boxes": seen.boxes.float().numpy(),
-            "scores": seen.scores.float().numpy(),
-            "mask": seen.mask.numpy(),
-        }
+        told["detections"] = detected(gazes.seen(rows), gazes.scenery.run.eye.detector)
     return told
 
 
+def detected(seen: Detections, detector: Detector) -> Arrays:
+    """Detections as arrays of one shape, `(n, L, ...)`, L the most that the detector gives: what is beyond is masked.
+
+    Gymnasium's own vectorised environments take no infos of changing shapes.
+    """
+    number, count = seen.mask.shape
+    limit, components = max(detector.selection.limit, count), seen.scores.shape[-1]
+    boxes = np.zeros((number, limit, 4), np.float32)
+    scores = np.zeros((number, limit, components), np.float32)
+    mask = np.zeros((number, limit), bool)
+    boxes[:, :count], scores[:, :count], mask[:, :count] = seen.boxes.numpy(), seen.scores.numpy(), seen.mask.numpy()
+    return {"boxes": boxes, "scores": scores, "mask": mask}
+
+
 def first(arrays: Arrays) -> Arrays:
-    """The first episode's part of arrays; its detections without padding."""
+    """The first episode's part of arrays."""
     one = {name: first(value) if isinstance(value, dict) else value[0] for name, value in arrays.items()}
-    if "mask" in one:
-        kept = one.pop("mask")
-        return {name: value[kept] for name, value in one.items()}
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in one.items()}

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap, Observer, Target
 from semfov.data.classes import class_index
 from semfov.data.mosaics import Mosaics
@@ -69,6 +68,8 @@ class Scenery:
         self.scenes = [scene for scene in range(len(run.scenes)) if self._asked(scene)]
         # Kept for as long as there are environments: what they go by, whoever asks.
         self.episodes = cache(self._episodes)
+        self.grid = cache(run.grid)
+        self.answers = cache(self._answers)
         self.open = cache(self._open)
         self.together = cache(self._together)
         self.view = lru_cache(_VIEWS)(lambda scene: run.eye.open(self.image(scene)[None]))
@@ -135,11 +136,11 @@ class Scenery:
         """What is seen from every cell of a scene."""
         asked = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Episode)})
         targets = torch.tensor(asked) if asked else None
-        return StoredLooks(self.run.detections(scene), self.run.grid(scene), targets)
+        return StoredLooks(self.run.detections(scene), self.grid(scene), targets)
 
-    def answers(self, scene: int) -> Tensor:
+    def _answers(self, scene: int) -> Tensor:
         """Which classes are right for each cell of a scene, `(X·Y, K+1)`."""
-        return answers_of(self.run.scenes.annotation(scene), self.run.grid(scene), len(self.classes))
+        return answers_of(self.run.scenes.annotation(scene), self.grid(scene), len(self.classes))
 
     def noise(self, episode: Episode | Exploration) -> Tensor:
         """Random numbers that break an episode's ties, `(shifts+1, X·Y)`: those of `eval.search` and `eval.explore`."""
@@ -147,10 +148,6 @@ class Scenery:
         if isinstance(episode, Episode):
             return tie_noise(self.run.scenes, episode, cells, protocol)
         return explore_noise(self.run.scenes, episode, cells, protocol)
-
-    def grid(self, scene: int) -> Grid:
-        """The cells over a scene."""
-        return self.run.grid(scene)
 
     def image(self, scene: int) -> Tensor:
         """Pixels of a scene, `(3, H, W)`."""

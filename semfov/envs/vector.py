@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -38,8 +38,8 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         glimpse: observations have what the eye is shown, so many pixels wide and high; None leaves it out.
         detections: infos have what was detected.
         together: compute learned beliefs of all episodes at once.
-        autoreset_mode: when episodes that are over restart: in the `NextStep`, Gymnasium's default, in the `SameStep`, or
-            when a reset names them (`Disabled`); they rest until then.
+        autoreset_mode: when episodes that are over restart: in the `NextStep`, Gymnasium's default, in the `SameStep`,
+            or when a reset names them (`Disabled`); they rest until then.
         options: of `open_scenery`, where no scenery is given.
     """
 

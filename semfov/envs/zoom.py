@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch.nn.functional import adaptive_avg_pool2d, adaptive_max_pool2d, interpolate
 
-from semfov.envs.observation import Arrays, glimpse_space
+from semfov.envs.observation import Arrays, detected, first, glimpse_space
 from semfov.envs.zoom_scenery import ZoomScenery, open_zoom_scenery
 from semfov.errors import InputError, check, check_number, check_whole
 from semfov.experiments.zoom_orders import overview
@@ -158,7 +158,8 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
 
     def _tell(self) -> Arrays:
         lattice = self.glances.lattice
-        free = np.ones(len(lattice), dtype=np.int8)
+        free = np.zeros(self.scenery.windows, dtype=np.int8)
+        free[: len(lattice)] = 1
         for window in self.done:
             free[lattice.number(window.level, *window.cells[:2])] = 0
         seen = next(glance for glance in self.seen if glance.window == self.window).detections
@@ -168,7 +169,7 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
             "action_mask": free,
             "result": self.result,
             "scene": self.scene,
-            "detections": {"boxes": seen.boxes[0].numpy().copy(), "scores": seen.scores[0].numpy().copy()},
+            "detections": first(detected(seen, self.scenery.run.eye.detector)),
         }
 
     def planes(self) -> NDArray[np.float32]:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from semfov.data.classes import class_index
+from semfov.data.large import open_large
 from semfov.data.pictures import Pictures
 from semfov.data.scene import Annotation, Scenes
 from semfov.data.sources import PHOTOGRAPHS
@@ -22,6 +21,7 @@ from semfov.experiments.zoom import SHOWN, ZoomConfig, ZoomRun, found_in
 from semfov.experiments.zoom_orders import overview
 from semfov.experiments.zoom_store import StoredGlances
 from semfov.zoom.glances import Glance
+from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 
 _TRIES = 1000
@@ -58,6 +58,16 @@ class ZoomScenery:
         """That a look shows the detector."""
         wide, high = self.run.eye.detector.input_size
         return wide * high
+
+    @cached_property
+    def windows(self) -> int:
+        """Most windows that any of the pictures has."""
+        scenes, eye = self.run.scenes, self.run.eye
+        if isinstance(scenes, Pictures):
+            sizes = [open_large(scenes.root / str(name)).size for name in scenes.ids]
+        else:
+            sizes = [scenes.annotation(index).size for index in range(len(scenes))]
+        return max(len(Lattice.over(size, eye.detector.input_size, finest=eye.finest)) for size in set(sizes))
 
     def _glances(self, scene: int) -> StoredGlances:
         return self.run.glances(scene)
