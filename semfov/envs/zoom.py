@@ -179,7 +179,11 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
         most = torch.stack(expected).amax(0) if expected else torch.zeros(lattice.rows, lattice.columns)
         # Objects of each place: the mean of its cells times their number.
         count = adaptive_avg_pool2d(most[None], self.shape) * most.numel() / (self.shape[0] * self.shape[1])
-        near = adaptive_max_pool2d((self.belief.source + 1)[None].float(), self.shape) / lattice.levels
+        looked = torch.zeros(1, lattice.rows, lattice.columns)
+        for window in self.done:
+            x1, y1, x2, y2 = window.cells
+            looked[0, y1:y2, x1:x2] = looked[0, y1:y2, x1:x2].clamp(min=(window.level + 1) / lattice.levels)
+        near = adaptive_max_pool2d(looked, self.shape)
         found: NDArray[np.float32] = torch.cat([1 - torch.exp(-count), near]).clamp(0, 1).numpy()
         return found
 
