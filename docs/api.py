@@ -25,6 +25,7 @@ MODULES = (
     "semfov.scanpath",
     "semfov.viz",
     "semfov.zoom",
+    "semfov.envs",
     "semfov.data",
     "semfov.data.fixations",
     "semfov.metrics.scanpath",

@@ -31,7 +31,7 @@ class GazeEnv(gymnasium.Env[Arrays, np.int64]):
         options: of `open_scenery`, where none is given.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 2}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 (Gymnasium has it so)
     task: ClassVar[str]
     default_price: ClassVar[float]
 
@@ -51,7 +51,7 @@ class GazeEnv(gymnasium.Env[Arrays, np.int64]):
         self.scenery = open_scenery(self.task, **options) if scenery is None else scenery
         worth = {"price": self.default_price if price is None else price, "find": find}
         self.gazes = GAZES[self.task](self.scenery, 1, **worth, together=False)
-        self.shown = {"belief": belief, "glimpse": glimpse}
+        self.shown: dict[str, Any] = {"belief": belief, "glimpse": glimpse}
         self.observation_space = observation_space(self.scenery, self.task, belief=belief, glimpse=glimpse)
         self.action_space = spaces.Discrete(self.scenery.shape[0] * self.scenery.shape[1])
         self.render_mode = render_mode
@@ -85,7 +85,7 @@ class GazeEnv(gymnasium.Env[Arrays, np.int64]):
         observation, info = self._told()
         return observation, float(moved.reward), terminated, truncated, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """The last look as a picture `(H, W, 3)`: the path of the gaze, what the eye sees, what is believed."""
         if self._film is None:
             return None

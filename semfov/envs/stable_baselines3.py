@@ -13,9 +13,10 @@ from semfov.envs.vector import GazeVectorEnv
 from semfov.errors import DataError, check
 
 try:
+    import sb3_contrib as _contrib  # noqa: F401
     from stable_baselines3.common.vec_env import VecEnv
 except ImportError:
-    raise DataError('semfov.envs.stable_baselines3: needs it; pip install "semfov[agents]"') from None
+    raise DataError('semfov.envs.stable_baselines3: needs it and sb3-contrib; pip install "semfov[agents]"') from None
 
 
 class StableVecEnv(VecEnv):

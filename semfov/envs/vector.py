@@ -71,7 +71,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         self.scenery = open_scenery(task, **options) if scenery is None else scenery
         worth = {"price": PRICES[task] if price is None else price, "find": find}
         self.gazes = GAZES[task](self.scenery, num_envs, **worth, together=together)
-        self.shown = {"belief": belief, "glimpse": glimpse}
+        self.shown: dict[str, Any] = {"belief": belief, "glimpse": glimpse}
         self.single_observation_space = observation_space(self.scenery, task, belief=belief, glimpse=glimpse)
         self.single_action_space = spaces.Discrete(self.scenery.shape[0] * self.scenery.shape[1])
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -82,7 +82,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         self._ended = torch.zeros(2, num_envs, dtype=torch.bool)
         self._randoms: list[np.random.Generator] = [seeding.np_random()[0] for _ in range(num_envs)]
 
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Arrays, Arrays]:
         """Start an episode in every environment.
@@ -112,7 +112,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
     def step(self, actions: NDArray[np.int64]) -> tuple[Arrays, NDArray[Any], NDArray[Any], NDArray[Any], Arrays]:
         """Shift all gazes, and look."""
         chosen = torch.as_tensor(np.asarray(actions), dtype=torch.int64)
-        cells = int(self.single_action_space.n)
+        cells = self.scenery.shape[0] * self.scenery.shape[1]
         inside = chosen.shape == (self.num_envs,) and bool(((chosen >= 0) & (chosen < cells)).all())
         check(inside, "actions", f"{self.num_envs} cells from 0 to {cells - 1}", actions)
         mode, over = self.metadata["autoreset_mode"], self._ended.any(0)

@@ -19,7 +19,7 @@ from semfov.errors import InputError
 _ROW = torch.tensor([0])
 
 
-class BeliefObservation(gymnasium.ObservationWrapper[NDArray[np.float32], np.int64, Arrays]):
+class BeliefObservation(gymnasium.ObservationWrapper[Any, np.int64, Arrays]):
     """The belief as the observation: `(C + 2, Y, X)`, for convolutions over the cells.
 
     The planes are the probability of the target (of every class, in an exploration), which cells were fixated, and
@@ -44,7 +44,7 @@ class BeliefObservation(gymnasium.ObservationWrapper[NDArray[np.float32], np.int
         return found
 
 
-class GlimpseObservation(gymnasium.ObservationWrapper[NDArray[np.uint8], np.int64, Arrays]):
+class GlimpseObservation(gymnasium.ObservationWrapper[Any, np.int64, Arrays]):
     """What the eye is shown as the observation: a picture `(side, side, 3)`.
 
     Args:

@@ -47,7 +47,7 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
         options: of `open_zoom_scenery`, where none is given.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 2}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 (Gymnasium has it so)
     task: ClassVar[str]
     default_price: ClassVar[float]
     OWN: ClassVar[tuple[str, ...]] = ("price", "find", "belief", "grid", "glimpse", "render_mode")
@@ -201,7 +201,7 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
         level = window.level / max(lattice.levels - 1, 1)
         return np.clip([(x + 0.5) / lattice.size[0], (y + 0.5) / lattice.size[1], level], 0, 1).astype(np.float32)
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """The windows that were looked at, and the objects that were found, as a picture `(H, W, 3)`."""
         if self.render_mode is None:
             return None

@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from semfov.envs import GazeVectorEnv, MaskedRandom, PolicyAgent, Scenery, open_scenery, run_agent
-from semfov.envs.agents import Agent, Ran
 from semfov.errors import check
 from semfov.experiments.config import (
     BeliefConfig,
@@ -28,6 +26,10 @@ from semfov.io.files import inside
 from semfov.metrics.averages import standard_error
 from semfov.metrics.search import cumulative_performance
 from semfov.training.outputs import write_outputs
+
+if TYPE_CHECKING:
+    from semfov.envs.agents import Agent, Ran
+    from semfov.envs.scenery import Scenery
 
 _AT = (1, 3, 5, 10)
 """Gaze shifts after which searches are counted."""
@@ -85,6 +87,8 @@ class FitAgentConfig(Settings):
 
     def scenery(self, data: DataConfig, starts: int) -> Scenery:
         """The world with these scenes."""
+        from semfov.envs import open_scenery
+
         config = SearchConfig(
             data=data,
             detector=self.detector,
@@ -99,6 +103,8 @@ class FitAgentConfig(Settings):
 
 def fit_agent(config: FitAgentConfig) -> None:
     """Train, judge beside random gaze and the hand-made policy, and write everything."""
+    from semfov.envs import GazeVectorEnv, MaskedRandom, PolicyAgent, run_agent
+
     for data in (config.data, config.judged):
         check_sources(data, config.detector)
     check(config.data != config.judged, "judged", "other scenes than those to learn from", "the same")
@@ -126,10 +132,9 @@ def fit_agent(config: FitAgentConfig) -> None:
 
 def train(config: FitAgentConfig, scenery: Scenery) -> tuple[Any, list[float]]:
     """The trained model, and the mean return of the episodes that ended before each update."""
-    from sb3_contrib import MaskablePPO
-
-    from semfov.envs.stable_baselines3 import StableVecEnv
-    from semfov.training.agent_network import CellPolicy, Returns
+    from semfov.envs import GazeVectorEnv
+    from semfov.envs.stable_baselines3 import StableVecEnv  # before those that it tells the lack of
+    from semfov.training.agent_network import CellPolicy, MaskablePPO, Returns
 
     together = GazeVectorEnv(
         "search", config.environments, scenery, price=config.price, belief=True, detections=False,

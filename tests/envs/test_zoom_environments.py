@@ -23,7 +23,6 @@ KINDS = {"search": ZoomSearch, "exploration": ZoomExplore}
 EVERYTHING = {"belief": True, "grid": (6, 4), "glimpse": 32, "render_mode": "rgb_array"}
 
 
-
 @given(
     size=st.tuples(st.integers(200, 9000), st.integers(200, 9000)),
     place=st.tuples(*[st.floats(0, 1)] * 3),
