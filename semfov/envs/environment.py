@@ -10,7 +10,17 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from semfov.envs.observation import GAZES, Arrays, first, observation_space, observe, tell
+from semfov.envs.observation import (
+    GAZES,
+    Arrays,
+    belief_space,
+    believed,
+    first,
+    glimpses,
+    observation_space,
+    observe,
+    tell,
+)
 from semfov.envs.rendering import Film
 from semfov.envs.scenery import Scenery, open_scenery
 from semfov.errors import InputError, check, check_whole
@@ -95,6 +105,21 @@ class GazeEnv(gymnasium.Env[Arrays, np.int64]):
         """Which cells were not fixated, as `sb3_contrib.MaskablePPO` asks for it."""
         free: NDArray[np.bool_] = (~self.gazes.memory.visited[0]).numpy()
         return free
+
+    @property
+    def belief_space(self) -> spaces.Box:
+        """Of `planes`."""
+        return belief_space(self.scenery, self.task)
+
+    def planes(self) -> NDArray[np.float32]:
+        """The belief as planes `(C + 2, Y, X)`: probabilities, which cells were fixated, and where the gaze is."""
+        found: NDArray[np.float32] = believed(self.gazes, _ROW)[0]
+        return found
+
+    def glimpse(self, side: int) -> NDArray[np.uint8]:
+        """What the eye is shown, `(side, side, 3)`."""
+        found: NDArray[np.uint8] = glimpses(self.gazes, _ROW, side)[0]
+        return found
 
     def _told(self) -> tuple[Arrays, Arrays]:
         return first(observe(self.gazes, _ROW, **self.shown)), first(tell(self.gazes, _ROW, detections=True))

@@ -78,7 +78,7 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
             "step": spaces.Discrete(self.scenery.passes),
         }
         if belief:
-            shown["belief"] = spaces.Box(0, 1, (2, *self.shape), np.float32)
+            shown["belief"] = self.belief_space
         if glimpse is not None:
             shown["glimpse"] = glimpse_space(glimpse)
         self.observation_space = spaces.Dict(shown)
@@ -171,6 +171,11 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
             "scene": self.scene,
             "detections": first(detected(seen, self.scenery.run.eye.detector)),
         }
+
+    @property
+    def belief_space(self) -> spaces.Box:
+        """Of `planes`."""
+        return spaces.Box(0, 1, (2, *self.shape), np.float32)
 
     def planes(self) -> NDArray[np.float32]:
         """`(2, Y, X)`: the probability that closer looks find an object in a place, and how close it was looked at."""

@@ -226,7 +226,7 @@ def test_wrappers_show_the_belief_or_the_glimpse_alone(sceneries):
     envs = VectorBeliefObservation(GazeVectorEnv("search", 2, scenery, together=False))
     observations, _ = envs.reset(seed=0)
     assert np.array_equal(observations[0], env.reset(seed=0)[0])
-    with pytest.raises(InputError, match=r"env: expected a GazeEnv, got CartPoleEnv"):
+    with pytest.raises(InputError, match=r"env: expected a GazeEnv or a ZoomEnv, got CartPoleEnv"):
         BeliefObservation(gymnasium.make("CartPole-v1"))
 
 

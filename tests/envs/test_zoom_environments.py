@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from semfov import InputError
+from semfov.envs import BeliefObservation, GlimpseObservation
 from semfov.envs.registration import IDS
 from semfov.envs.zoom import ZoomExplore, ZoomPolicyAgent, ZoomSearch, window_of
 from semfov.envs.zoom_scenery import open_zoom_scenery
@@ -115,6 +116,9 @@ def test_observations_and_infos_follow_the_windows(zoom_scenery):
     assert near.max() == near[0, 0] == 1
     assert near.min() == pytest.approx(1 / lattice.levels)
     assert 0 < expected.max() <= 1
+    for wrapper, key in ((BeliefObservation(env), "belief"), (GlimpseObservation(env, 32), "glimpse")):
+        assert wrapper.observation_space == env.observation_space[key]
+        assert np.array_equal(wrapper.observation(observation), observation[key])
     same, reward, _, _, told = env.step(closest)
     assert reward == -0.01
     assert np.array_equal(same["belief"], observation["belief"])
