@@ -26,6 +26,7 @@ MODULES = (
     "semfov.viz",
     "semfov.zoom",
     "semfov.head",
+    "semfov.envs",
     "semfov.data",
     "semfov.data.fixations",
     "semfov.metrics.scanpath",

@@ -4,7 +4,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -100,14 +100,21 @@ class StoredLooks(Looks):
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """What the store has of the cells; the fixations are their centres."""
         watch = Stopwatch()
-        row = cell
-        if observer.by_target and self.targets is not None:
-            # One row for each target and cell.
-            order = torch.searchsorted(self.targets.new_tensor(self._classes), self.targets[episodes])
-            row = order * len(self.grid) + cell
-        look = self.weighed(observer)[row]
+        targets = None if self.targets is None else self.targets[episodes]
+        look = self.weighed(observer)[self.first_row(observer, targets) + cell]
         watch.lap("weigh")
         return Sight(look, lambda: self.detections[cell], watch.seconds)
+
+    def first_row(self, observer: Observer, targets: Tensor | None) -> Tensor:
+        """Row of `weighed` that has the look from cell 0, for each of the targets `(A,)`."""
+        if not observer.by_target or targets is None:
+            return torch.zeros((), dtype=torch.int64)
+        # One row for each target and cell.
+        return torch.searchsorted(targets.new_tensor(self._classes), targets) * len(self.grid)
+
+    def rows(self, observer: Observer) -> int:
+        """How many rows `weighed` has."""
+        return len(self.grid) * (len(self._classes) if observer.by_target and self._classes else 1)
 
     def weighed(self, observer: Observer) -> Look:
         """What looks from all cells say, target by target where the observer goes by it."""
@@ -192,6 +199,73 @@ class Step:
         return self.sight.detections()
 
 
+@dataclass(frozen=True)
+class Memory:
+    """What episodes keep from one look to the next.
+
+    Attributes:
+        belief: of A episodes.
+        visited: `(A, X·Y)` boolean, cells that inhibition of return keeps the gaze from.
+        age: `(A, X·Y)`, looks since each cell was fixated, where anything is forgotten; infinity for never.
+    """
+
+    belief: Belief
+    visited: Tensor
+    age: Tensor
+
+    @classmethod
+    def empty(cls, looks: Looks, observer: Observer, episodes: int) -> "Memory":
+        """Before the first look."""
+        cells, device = len(looks.grid), looks.like.device
+        visited = torch.zeros(episodes, cells, dtype=torch.bool, device=device)
+        age = torch.full(visited.shape, torch.inf, device=device)
+        return cls(observer.start(episodes, looks.grid, looks.like), visited, age)
+
+    def __getitem__(self, index: Tensor) -> "Memory":
+        """That of some of the episodes."""
+        return Memory(self.belief[index], self.visited[index], self.age[index])
+
+    def put(self, index: Tensor, other: "Memory") -> "Memory":
+        """The memory in which the episodes `index` `(n,)` have another's; both have had a look."""
+        visited, age = self.visited.index_copy(0, index, other.visited), self.age.index_copy(0, index, other.age)
+        return Memory(self.belief.put(index, other.belief), visited, age)
+
+
+def attend(
+    looks: Looks,
+    observer: Observer,
+    memory: Memory,
+    episodes: Tensor,
+    cell: Tensor,
+    fixation: Tensor,
+    forgetting: Forgetting | None = None,
+) -> tuple[Sight, Memory]:
+    """One look of each episode, and the memory with it: the step that `rollout` and the environments share.
+
+    Args:
+        looks: what is looked at.
+        observer: turns looks into belief.
+        memory: of the A episodes.
+        episodes: `(A,)`, their numbers.
+        cell: `(A,)`, that each fixates.
+        fixation: `(A, 2)`, the points.
+        forgetting: see `rollout`.
+    """
+    sight = looks.see(observer, episodes, cell, fixation)
+    watch = Stopwatch(sight.seconds)
+    belief, age = memory.belief, memory.age
+    if forgetting is not None:
+        age = age + 1
+        belief = observer.fade(belief, sight.look, forgetting.keep, forgetting.visited(age))
+    belief = observer.update(belief, sight.look)
+    watch.lap("update belief")
+    visited = memory.visited.scatter(-1, cell[:, None], True)
+    if forgetting is not None:
+        age = age.scatter(-1, cell[:, None], 0)
+        visited = forgetting.visited(age)
+    return Sight(sight.look, sight.detections, watch.seconds), Memory(belief, visited, age)
+
+
 def rollout(
     looks: Looks,
     observer: Observer,
@@ -232,21 +306,11 @@ def rollout(
     acquire = (lambda episodes, cell: acquisition) if isinstance(acquisition, AcquisitionFunction) else acquisition
     centres = looks.grid.centres.to(looks.like)
     episodes, cell, fixation = torch.arange(len(start), device=start.device), start, centres[start]
-    belief = observer.start(len(start), looks.grid, looks.like)
-    visited = torch.zeros(len(start), len(looks.grid), dtype=torch.bool, device=start.device)
-    age = torch.full(visited.shape, torch.inf, device=start.device)
+    memory = Memory.empty(looks, observer, len(start))
     for shift in range(most):
-        sight = looks.see(observer, episodes, cell, fixation)
+        sight, memory = attend(looks, observer, memory, episodes, cell, fixation, forgetting)
+        belief, visited = memory.belief, memory.visited
         watch = Stopwatch(sight.seconds)
-        if forgetting is not None:
-            age = age + 1
-            belief = observer.fade(belief, sight.look, forgetting.keep, forgetting.visited(age))
-        belief = observer.update(belief, sight.look)
-        watch.lap("update belief")
-        visited = visited.scatter(-1, cell[:, None], True)
-        if forgetting is not None:
-            age = age.scatter(-1, cell[:, None], 0)
-            visited = forgetting.visited(age)
         values = acquire(episodes, cell)(belief, visited)
         next_fixation, next_cell = choice(shift, episodes, values, visited, centres)
         watch.lap("choose")
@@ -269,11 +333,10 @@ def rollout(
         if not going.any():
             return
         if window is not None and (shift + 1) % window == 0:
-            belief, next_fixation = belief.detach(), next_fixation.detach()
+            memory, next_fixation = replace(memory, belief=belief.detach()), next_fixation.detach()
         cell, fixation = next_cell, next_fixation
         if not going.all():
-            episodes, cell, fixation = episodes[going], cell[going], fixation[going]
-            belief, visited, age = belief[going], visited[going], age[going]
+            episodes, cell, fixation, memory = episodes[going], cell[going], fixation[going], memory[going]
 
 
 class Stopwatch:

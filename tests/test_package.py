@@ -76,6 +76,7 @@ ROOMS = [
     "viz",
     "report",
     "experiments",
+    "envs",
     "training",
 ]
 OUTSIDE = ("eval", "train", "tests", "benchmarks", "examples", "docs", "hubconf")
@@ -87,7 +88,10 @@ def test_public_surface():
         assert getattr(semfov, name) is not None
 
 
-HEAVY = ["kornia", "onnx", "onnxruntime", "pycocotools", "torchvision", "matplotlib", "skimage", "cv2", "torch._dynamo"]
+HEAVY = [
+    *["kornia", "onnx", "onnxruntime", "pycocotools", "torchvision", "matplotlib", "skimage", "cv2", "torch._dynamo"],
+    "gymnasium",
+]
 
 
 def test_import_is_light():

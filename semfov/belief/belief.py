@@ -60,6 +60,24 @@ class Belief(ABC):
         """Beliefs of some of the episodes."""
         return self.map(lambda tensor: tensor[index])
 
+    def put(self, index: Tensor, other: Self) -> Self:
+        """The belief in which the episodes `index` `(n,)` believe what those of `other` do.
+
+        >>> before = DirichletBelief(torch.ones(2, 1, 2))
+        >>> before.put(torch.tensor([1]), DirichletBelief(torch.tensor([[[1.0, 3.0]]]))).probability(1)
+        tensor([[0.5000],
+                [0.7500]])
+        """
+        theirs: list[Tensor] = []
+
+        def collect(tensor: Tensor) -> Tensor:
+            theirs.append(tensor)
+            return tensor
+
+        other.map(collect)
+        rows = iter(theirs)
+        return self.map(lambda tensor: tensor.index_copy(0, index, next(rows)))
+
     def detach(self) -> Self:
         """The same belief as a constant, through which no gradient flows."""
         return self.map(Tensor.detach)

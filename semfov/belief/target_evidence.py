@@ -45,9 +45,7 @@ class Thresholds:
 
 
 THRESHOLDS = Maybe(
-    Object(
-        {"confirm": Number(0, 1), "give_up": Number(0, 1), "place": Number(0, 1)}, required=("confirm", "give_up")
-    )
+    Object({"confirm": Number(0, 1), "give_up": Number(0, 1), "place": Number(0, 1)}, required=("confirm", "give_up"))
 )
 """As a file keeps them."""
 

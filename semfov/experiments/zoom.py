@@ -119,7 +119,7 @@ class ZoomRun:
         self.evidence = GlimpseEvidence.from_pretrained(config.model or detector.name).requires_grad_(False)
         self.evidence.check_compatible(self.eye.settings())
         self.observation = make_zoom_observation(config.observation, self.eye)
-        photographs = make_scenes(config.data, detector.classes)
+        photographs = self.open_scenes(detector.classes)
         if not len(photographs):
             raise DataError("data: no photograph passes the selection; lower data.min_instances or raise data.limit")
         self.scenes: Scenes = photographs
@@ -133,6 +133,10 @@ class ZoomRun:
         self.store = GlanceStore(cache_folder(config.cache) / "glances", self.eye.settings(), len(names))
         self.settings_key, self.code = self._key(), digest_of([package_digest(), versions()])
         self.key = f"{self.settings_key[:16]}-{self.code[:16]}"
+
+    def open_scenes(self, classes: tuple[str, ...]) -> Scenes:
+        """The photographs of the run; a subclass may have others."""
+        return make_scenes(self.config.data, classes)
 
     def _key(self) -> str:
         settings = asdict(self.config)

@@ -6,6 +6,7 @@ from typing import Literal, Protocol, get_args
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from semfov.belief.belief import Belief, DirichletBelief, dirichlet_belief
 from semfov.belief.evidence import farther
@@ -48,10 +49,15 @@ class SemanticLook(Look):
 
     @classmethod
     def join(cls, looks: Sequence["SemanticLook"]) -> "SemanticLook":
-        """All looks of several batches with equally many detections."""
+        """All looks of several batches; what has fewer detections is filled up with some that concern no cell."""
+        most = max(look.likelihood.shape[-2] for look in looks)
+
+        def filled(values: Tensor, value: float) -> Tensor:
+            return pad(values, (0, 0, 0, most - values.shape[-2]), value=value)
+
         return cls(
-            torch.cat([look.likelihood for look in looks]),
-            torch.cat([look.footprint for look in looks]),
+            torch.cat([filled(look.likelihood, 1.0) for look in looks]),
+            torch.cat([filled(look.footprint, 0.0) for look in looks]),
             torch.cat([look.distance for look in looks]),
         )
 

@@ -1,0 +1,148 @@
+"""Steps of the environments in a second: `python -m benchmarks.environments`.
+
+Episodes are in embedded scenes whose looks are stored, on 10 x 10 cells. Each step takes a cell at random that was not
+fixated, and every episode that ends is followed by another: all that is counted. Beside it, the agent that looks itself
+makes the same number of steps with the detector in them.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from numpy.typing import NDArray
+
+import semfov
+from benchmarks.images import use_threads
+from benchmarks.machine import describe
+from benchmarks.tables import RESULTS, number, table, write
+from benchmarks.timing import Run, Spread, clock_for, interleaved
+from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, Scenery, open_scenery
+
+STEPS = 20
+WORLDS = {
+    "search, recommended": ("search", "recommended", (64, 256)),
+    "search, Kaplan's rule": ("search", "non-predictive-raw", (64, 256)),
+    "exploration, recommended": ("exploration", "recommended", (8, 32)),
+    "exploration, Kaplan's rule": ("exploration", "kl-raw", (64, 256)),
+}
+"""The beliefs that environments keep: task, policy, and how many episodes are run side by side."""
+
+
+def steps(envs: Any, seed: int) -> Run:
+    """A program of some steps of environments side by side."""
+    random = np.random.default_rng(seed)
+    state: dict[str, Any] = {"infos": envs.reset(seed=seed)[1]}
+
+    def run() -> None:
+        for _ in range(STEPS):
+            state["infos"] = envs.step(any_free(random, state["infos"]["action_mask"]))[4]
+
+    return run
+
+
+def any_free(random: np.random.Generator, masks: NDArray[np.int8]) -> NDArray[np.int64]:
+    """A cell at random of each row that was not fixated."""
+    chosen: NDArray[np.int64] = (random.random(masks.shape, dtype=np.float32) * masks).argmax(-1)
+    return chosen
+
+
+def alone(env: GazeSearch | GazeExplore, seed: int) -> Run:
+    """A program of some steps of one environment."""
+    random = np.random.default_rng(seed)
+    state: dict[str, Any] = {"info": env.reset(seed=seed)[1]}
+
+    def run() -> None:
+        for _ in range(STEPS):
+            action = any_free(random, state["info"]["action_mask"][None])[0]
+            _, _, terminated, truncated, state["info"] = env.step(action)
+            if terminated or truncated:
+                state["info"] = env.reset()[1]
+
+    return run
+
+
+def looking(task: str, scenery: Scenery) -> Run:
+    """The recommended agent's own looks, as many as the steps."""
+    agent = semfov.ActivePerception.recommended()
+    image = scenery.image(0)
+    if task == "search":
+        # Thresholds that nothing passes: the search goes on.
+        return lambda: agent.search(image, "person", start=0, shifts=STEPS - 1, confirm=1.0, give_up=0.0)
+    return lambda: agent.explore(image, start=0, shifts=STEPS - 1, until=0.0)
+
+
+def programs(task: str, scenery: Scenery, sizes: Sequence[int]) -> dict[str, tuple[Run, int]]:
+    """Every program, and how many episodes it has side by side."""
+    kind = GazeSearch if task == "search" else GazeExplore
+    # Restarts come on top of the steps.
+    restarts = AutoresetMode.SAME_STEP
+    wide: Callable[..., Any] = partial(GazeVectorEnv, task, scenery=scenery, autoreset_mode=restarts)
+    found: dict[str, tuple[Run, int]] = {
+        "one, `gymnasium.make`": (alone(kind(scenery), 0), 1),
+        f"{sizes[0]}, one after another (`SyncVectorEnv`)": (
+            steps(SyncVectorEnv([lambda: kind(scenery)] * sizes[0], autoreset_mode=restarts), 0),
+            sizes[0],
+        ),
+    }
+    for size in sizes:
+        found[f"{size}, `gymnasium.make_vec`"] = steps(wide(size), 0), size
+    found[f"{sizes[-1]}, with the belief shown, no detections"] = (
+        steps(wide(sizes[-1], belief=True, detections=False), 0),
+        sizes[-1],
+    )
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure all rows and write the table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.environments", description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", type=int, default=8)
+    parser.add_argument("--only", choices=list(WORLDS), nargs="+", default=list(WORLDS))
+    parser.add_argument("--cache", type=Path, help="of what is seen from every cell")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=6.0, help="for each belief, at least")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    options = parser.parse_args(arguments)
+    use_threads(options.threads)
+    clock, times = clock_for(options.threads)
+    about = describe() | {"times": times}
+    rows, figures = [], {}
+    for name in options.only:
+        task, policy, sizes = WORLDS[name]
+        scenery = open_scenery(task, count=options.scenes, policy=policy, cache=options.cache)
+        for scene in scenery.scenes:
+            scenery.open(scene)
+        todo = programs(task, scenery, sizes)
+        if policy == "recommended":
+            todo["one that looks itself"] = looking(task, scenery), 1
+        found = interleaved({program: run for program, (run, _) in todo.items()}, options.seconds, clock)
+        for program, (_, size) in todo.items():
+            rates = Spread.of([1e3 * STEPS * size / each for each in found[program]])
+            rows.append([name, program, *(number(value) for value in (rates.middle, rates.low, rates.high))])
+            figures[f"{name}: {program}"] = asdict(rates)
+            print(" | ".join(rows[-1]), flush=True)
+    text = "\n".join(
+        [
+            "# Environments",
+            "",
+            f"Written by `python -m benchmarks.environments`. Steps a second in {options.scenes} embedded scenes, on",
+            "10 x 10 cells: median and quartiles over repetitions. What is seen from every cell was stored before.",
+            "Episodes that end are followed by others, whose first looks come on top of the steps. One that looks",
+            "itself runs YOLOv3-tiny in every step.",
+            "",
+            *(f"- {key}: {value}" for key, value in about.items()),
+            "",
+            table(["belief", "episodes side by side", "steps a second", "lower quartile", "upper quartile"], rows),
+            "",
+        ]
+    )
+    write(options.out, "environments", text, {"machine": about, "steps_per_second": figures})
+
+
+if __name__ == "__main__":
+    main()

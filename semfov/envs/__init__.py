@@ -1,0 +1,46 @@
+"""Gymnasium environments of search and exploration: `pip install "semfov[envs]"`.
+
+`gymnasium.make("semfov.envs:semfov/GazeSearch-v0")` and `gymnasium.make("semfov.envs:semfov/GazeExplore-v0")` make one,
+and so do the names alone once this package was imported.
+"""
+
+from semfov.errors import DataError
+
+try:
+    import gymnasium as _gymnasium  # noqa: F401
+except ImportError:
+    raise DataError('semfov.envs: needs Gymnasium; pip install "semfov[envs]"') from None
+
+from semfov.envs.agents import MaskedRandom, PolicyAgent, Ran, run_agent
+from semfov.envs.environment import GazeEnv, GazeExplore, GazeSearch
+from semfov.envs.registration import register
+from semfov.envs.scenery import Scenery, open_scenery
+from semfov.envs.vector import GazeVectorEnv
+from semfov.envs.wrappers import BeliefObservation, GlimpseObservation, VectorBeliefObservation
+from semfov.envs.zoom import ZoomEnv, ZoomExplore, ZoomPolicyAgent, ZoomSearch
+from semfov.envs.zoom_scenery import ZoomScenery, open_zoom_scenery
+
+register()
+
+__all__ = [
+    "BeliefObservation",
+    "GazeEnv",
+    "GazeExplore",
+    "GazeSearch",
+    "GazeVectorEnv",
+    "GlimpseObservation",
+    "MaskedRandom",
+    "PolicyAgent",
+    "Ran",
+    "Scenery",
+    "VectorBeliefObservation",
+    "ZoomEnv",
+    "ZoomExplore",
+    "ZoomPolicyAgent",
+    "ZoomScenery",
+    "ZoomSearch",
+    "open_scenery",
+    "open_zoom_scenery",
+    "register",
+    "run_agent",
+]

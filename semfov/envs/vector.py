@@ -1,0 +1,173 @@
+"""Many episodes at a time: vectorised environments on the batched loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+from torch import Tensor
+
+from semfov.envs.environment import GazeExplore, GazeSearch, choose
+from semfov.envs.observation import GAZES, Arrays, observation_space, observe, tell
+from semfov.envs.scenery import Scenery, open_scenery
+from semfov.errors import check, check_whole, lookup
+
+PRICES = {"search": GazeSearch.default_price, "exploration": GazeExplore.default_price}
+
+
+class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
+    """Episodes that go on side by side, each in a scene of its own; one step of all is one step of the batched loop.
+
+    Environment i, seeded with s, does what a `GazeEnv` does that is seeded with s + i. With `together`, the default,
+    learned beliefs of all episodes are computed at once, which is faster, but rounded by the batch.
+
+    Args:
+        task: `search` or `exploration`.
+        num_envs: how many episodes.
+        scenery: scenes, looks and belief, to be shared; None opens one.
+        price: of a look.
+        find: what is to be found is worth.
+        belief: observations have the belief.
+        glimpse: observations have what the eye is shown, so many pixels wide and high; None leaves it out.
+        detections: infos have what was detected.
+        together: compute learned beliefs of all episodes at once.
+        autoreset_mode: when episodes that are over restart: in the `NextStep`, Gymnasium's default, in the `SameStep`,
+            or when a reset names them (`Disabled`); they rest until then.
+        options: of `open_scenery`, where no scenery is given.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        scenery: Scenery | None = None,
+        *,
+        price: float | None = None,
+        find: float = 1.0,
+        belief: bool = False,
+        glimpse: int | None = None,
+        detections: bool = True,
+        together: bool = True,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        **options: Any,
+    ) -> None:
+        check_whole(num_envs, "num_envs", 1, 1_000_000)
+        check(scenery is None or not options, "scenery", "no other options beside it", ", ".join(options))
+        lookup(
+            str(getattr(autoreset_mode, "value", autoreset_mode)),
+            [mode.value for mode in AutoresetMode],
+            "autoreset_mode",
+        )
+        mode = AutoresetMode(autoreset_mode)
+        self.metadata = {"render_modes": [], "autoreset_mode": mode}
+        self.num_envs, self.task = num_envs, task
+        self.scenery = open_scenery(task, **options) if scenery is None else scenery
+        worth = {"price": PRICES[task] if price is None else price, "find": find}
+        self.gazes = GAZES[task](self.scenery, num_envs, **worth, together=together)
+        self.shown: dict[str, Any] = {"belief": belief, "glimpse": glimpse}
+        self.single_observation_space = observation_space(self.scenery, task, belief=belief, glimpse=glimpse)
+        self.single_action_space = spaces.Discrete(self.scenery.shape[0] * self.scenery.shape[1])
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._detections = detections
+        self._rows = torch.arange(num_envs)
+        # Whether each was terminated, and truncated, in a step before.
+        self._ended = torch.zeros(2, num_envs, dtype=torch.bool)
+        self._randoms: list[np.random.Generator] = [seeding.np_random()[0] for _ in range(num_envs)]
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Arrays, Arrays]:
+        """Start an episode in every environment.
+
+        Args:
+            seed: s, for s, s + 1, …; or one for each.
+            options: `reset_mask`, a boolean for each, to reset some alone; `episodes`, one of the protocol for each of
+                these (`Scenery.episodes`); else as for `GazeEnv.reset`.
+        """
+        if seed is not None:
+            given = [seed + row for row in range(self.num_envs)] if isinstance(seed, int) else list(seed)
+            check(len(given) == self.num_envs, "seed", f"{self.num_envs} of them", len(given))
+            for row, one in enumerate(given):
+                if one is not None:
+                    self._randoms[row] = seeding.np_random(one)[0]
+        asked = dict(options or {})
+        mask = asked.pop("reset_mask", None)
+        rows = self._rows if mask is None else torch.from_numpy(np.flatnonzero(mask))
+        episodes = asked.pop("episodes", None)
+        if episodes is None:
+            episodes = [choose(self.scenery, self._randoms[row], asked) for row in rows.tolist()]
+        check(len(episodes) == len(rows), "episodes", f"{len(rows)} of them", len(episodes))
+        self.gazes.begin(rows, episodes)
+        self._ended[:, rows] = False
+        return self._told()
+
+    def step(self, actions: NDArray[np.int64]) -> tuple[Arrays, NDArray[Any], NDArray[Any], NDArray[Any], Arrays]:
+        """Shift all gazes, and look."""
+        chosen = torch.as_tensor(np.asarray(actions), dtype=torch.int64)
+        cells = self.scenery.shape[0] * self.scenery.shape[1]
+        inside = chosen.shape == (self.num_envs,) and bool(((chosen >= 0) & (chosen < cells)).all())
+        check(inside, "actions", f"{self.num_envs} cells from 0 to {cells - 1}", actions)
+        mode, over = self.metadata["autoreset_mode"], self._ended.any(0)
+        reward, last = torch.zeros(self.num_envs, dtype=torch.float64), {}
+        going, resting = (~over).nonzero()[:, 0], over.nonzero()[:, 0]
+        if len(going):
+            moved = self.gazes.move(going, chosen[going])
+            reward[going], self._ended[:, going] = moved.reward, torch.stack([moved.terminated, moved.truncated])
+        if mode == AutoresetMode.NEXT_STEP:
+            self._restart(resting)
+            self._ended[:, resting] = False
+        terminated, truncated = self._ended.numpy().copy()
+        if mode == AutoresetMode.SAME_STEP:
+            ended = self._ended.any(0).nonzero()[:, 0]
+            if len(ended):
+                last = self._last(ended)
+                self._restart(ended)
+                self._ended[:] = False
+        observation, info = self._told()
+        return observation, reward.numpy(), terminated, truncated, info | last
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Which cells were not fixated, `(num_envs, X·Y)`."""
+        free: NDArray[np.bool_] = (~self.gazes.memory.visited).numpy()
+        return free
+
+    def _restart(self, rows: Tensor) -> None:
+        if len(rows):
+            self.gazes.begin(rows, [self.scenery.draw(self._randoms[row]) for row in rows.tolist()])
+
+    def _last(self, rows: Tensor) -> Arrays:
+        """Observations and infos at the end of episodes, as Gymnasium has them where a reset follows at once."""
+        ended = np.zeros(self.num_envs, dtype=bool)
+        ended[rows.numpy()] = True
+        seen = observe(self.gazes, rows, **self.shown)
+        shown = np.full(self.num_envs, None, dtype=object)
+        for number, row in enumerate(rows.tolist()):
+            shown[row] = {name: value[number] for name, value in seen.items()}
+        told = tell(self.gazes, self._rows, detections=self._detections)
+        return {
+            "final_obs": shown,
+            "_final_obs": ended,
+            "final_info": _marked(told, ended),
+            "_final_info": ended.copy(),
+        }
+
+    def _told(self) -> tuple[Arrays, Arrays]:
+        told = tell(self.gazes, self._rows, detections=self._detections)
+        return observe(self.gazes, self._rows, **self.shown), _marked(told, np.ones(self.num_envs, dtype=bool))
+
+
+def _marked(infos: Arrays, which: NDArray[np.bool_]) -> Arrays:
+    """Infos, each with a mask of the environments that it is of."""
+    marked: Arrays = {}
+    for name, value in infos.items():
+        marked[name] = _marked(value, which) if isinstance(value, dict) else value
+        marked[f"_{name}"] = which.copy()
+    return marked

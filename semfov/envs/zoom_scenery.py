@@ -1,0 +1,209 @@
+"""The world of environments with large pictures: what windows of them show, computed once and kept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache, cached_property
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from semfov.data.classes import class_index
+from semfov.data.large import open_large
+from semfov.data.pictures import Pictures
+from semfov.data.scene import Annotation, Scenes
+from semfov.data.sources import PHOTOGRAPHS
+from semfov.envs.scenery import Source
+from semfov.errors import DataError, InputError, check, check_whole
+from semfov.experiments.config import DataConfig, DetectorConfig
+from semfov.experiments.zoom import SHOWN, ZoomConfig, ZoomRun, found_in
+from semfov.experiments.zoom_orders import overview
+from semfov.experiments.zoom_store import StoredGlances
+from semfov.zoom.glances import Glance
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.objects import merge
+
+_TRIES = 1000
+
+
+class ZoomScenery:
+    """Large pictures and an eye that zooms, which any number of environments share: `open_zoom_scenery` makes one.
+
+    Args:
+        run: the experiment whose pictures, looks and evidence these are.
+        targets: classes that are searched for; None for all that a picture allows.
+    """
+
+    def __init__(self, run: ZoomRun, targets: Sequence[str | int] | None = None) -> None:
+        self.run = run
+        self.known = not isinstance(run.scenes, Pictures)
+        names = run.eye.detector.classes
+        self._wanted = None if targets is None else sorted({class_index(each, names, "targets") for each in targets})
+        self.glances = cache(self._glances)
+        self.episodes = cache(self._episodes)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes, background first."""
+        return ("background", *self.run.eye.detector.classes)
+
+    @property
+    def passes(self) -> int:
+        """Most looks of an episode, the overview among them."""
+        return self.run.config.passes
+
+    @property
+    def pixels(self) -> int:
+        """That a look shows the detector."""
+        wide, high = self.run.eye.detector.input_size
+        return wide * high
+
+    @cached_property
+    def windows(self) -> int:
+        """Most windows that any of the pictures has."""
+        scenes, eye = self.run.scenes, self.run.eye
+        if isinstance(scenes, Pictures):
+            sizes = [open_large(scenes.root / str(name)).size for name in scenes.ids]
+        else:
+            sizes = [scenes.annotation(index).size for index in range(len(scenes))]
+        return max(len(Lattice.over(size, eye.detector.input_size, finest=eye.finest)) for size in set(sizes))
+
+    def _glances(self, scene: int) -> StoredGlances:
+        return self.run.glances(scene)
+
+    def targets(self, scene: int) -> list[int]:
+        """Classes that a picture may be searched for."""
+        if not self.known:
+            if self._wanted is None:
+                raise InputError("targets: expected classes to search for in pictures without annotations, got none")
+            return self._wanted
+        return [each for each in self.run.scenes.targets(scene) if self._wanted is None or each in self._wanted]
+
+    def _episodes(self, scene: int) -> list[int]:
+        """Targets of all searches of a picture: those that the overview does not show already."""
+        glances = self.glances(scene)
+        first = glances.see([overview(glances)])[0]
+        return [target for target in self.targets(scene) if not self.found([first], scene, target)]
+
+    def draw(self, random: np.random.Generator, task: str, scene: int | None = None) -> tuple[int, int]:
+        """A picture at random, or the given one, and a target in it; 0 for an exploration."""
+        for _ in range(_TRIES):
+            picture = int(random.integers(len(self.run.scenes))) if scene is None else scene
+            if task != "search":
+                if not self.known or len(self.run.scenes.annotation(picture).boxes):
+                    return picture, 0
+            elif targets := self.episodes(picture):
+                return picture, targets[random.integers(len(targets))]
+        raise DataError("scenes: expected pictures with anything to look for, found none; give others")
+
+    def found(self, looks: Sequence[Glance], scene: int, target: int) -> bool:
+        """Whether an object of the target is found: by its box, or by its score where boxes are not known."""
+        if not self.known:
+            return any(float(glance.show[target - 1]) >= SHOWN for glance in looks)
+        return bool(found_in(looks, self._of(scene, target), target).any())
+
+    def share(self, looks: Sequence[Glance], scene: int) -> float:
+        """Share of the objects that are found, or how many are where boxes are not known."""
+        if not self.known:
+            return float(len(merge(looks, None, score=SHOWN)))
+        return float(found_in(looks, self.run.scenes.annotation(scene)).float().mean())
+
+    def boxes(self, scene: int, target: int) -> Tensor:
+        """Where objects of the target, or all, really are, as far as that is known."""
+        return (self._of(scene, target) if target else self.run.scenes.annotation(scene)).boxes
+
+    def _of(self, scene: int, target: int) -> Annotation:
+        every = self.run.scenes.annotation(scene)
+        kept = every.labels == target
+        return Annotation(every.boxes[kept], every.labels[kept], every.crowd[kept], every.size)
+
+    def image(self, scene: int) -> Tensor:
+        """Pixels of a picture, `(3, H, W)`."""
+        return self.run.scenes[scene].image
+
+
+class _Given(ZoomRun):
+    """Large pictures that are given, or of a folder without annotations."""
+
+    def __init__(self, config: ZoomConfig, scenes: Source) -> None:
+        self._chosen = scenes
+        super().__init__(config)
+
+    def open_scenes(self, classes: tuple[str, ...]) -> Scenes:
+        """The given ones, or all pictures of the folder."""
+        if self._chosen is not None and not isinstance(self._chosen, str | Path):
+            return self._chosen
+        if self._chosen is None or self.config.data.annotations is not None:
+            return super().open_scenes(classes)
+        root = Path(self._chosen)
+        if not root.is_dir():
+            raise DataError(f"scenes: no such folder: {root}; check the path")
+        names = [path.name for path in root.iterdir() if path.suffix.lower() in PHOTOGRAPHS]
+        if not names:
+            raise DataError(f"scenes: expected pictures ({', '.join(PHOTOGRAPHS)}) in {root}, found none")
+        return Pictures(root, names, classes)
+
+
+def open_zoom_scenery(
+    scenes: Source = None,
+    annotations: str | Path | None = None,
+    *,
+    count: int | None = None,
+    mosaics: int | None = None,
+    tiles: tuple[int, int] = (4, 4),
+    targets: Sequence[str | int] | None = None,
+    detector: str = "yolov3-tiny",
+    weights: str | Path | None = None,
+    passes: int = 24,
+    seed: int = 0,
+    cache: str | Path | None = None,
+    store: bool = True,
+) -> ZoomScenery:
+    """Open large pictures for environments.
+
+    Args:
+        scenes: embedded scenes (None), a folder of large pictures, or any `Scenes` with the detector's classes.
+        annotations: COCO-format instances file of the folder; without one nothing is known to be in the pictures, and
+            what the detector shows with a score of 0.3 counts.
+        count: use only the first so many scenes (None: all of a folder, 8 embedded ones).
+        mosaics: number of mosaics to compose of the scenes; 0 takes them as they are (None: 8 of embedded scenes, else
+            0).
+        tiles: photographs in a row and in a column of a mosaic.
+        targets: classes to search for, by name or index; None: all that a picture allows.
+        detector: by name; one that evidence by magnification is shipped for.
+        weights: file with its weights.
+        passes: most looks of an episode, the overview among them.
+        seed: of embedded scenes and mosaics.
+        cache: folder for what is seen (None: the user's cache).
+        store: keep what is seen on disk.
+
+    Raises:
+        InputError: an argument does not fit.
+        DataError: pictures, annotations or weights are missing or damaged.
+    """
+    check_whole(passes, "passes", 2, 100_000)
+    folder = Path(scenes) if isinstance(scenes, str | Path) else None
+    data = DataConfig(
+        None if annotations is None else folder,
+        None if annotations is None else Path(annotations),
+        count,
+        min_instances=0,
+        max_target_area=0.2 if annotations is not None else None,
+        scene_seed=seed,
+    )
+    config = ZoomConfig(
+        data=data,
+        detector=DetectorConfig(detector, None if weights is None else Path(weights)),
+        mosaics=(8 if scenes is None else 0) if mosaics is None else mosaics,
+        columns=tiles[0],
+        rows=tiles[1],
+        passes=passes,
+        seed=seed,
+        cache=None if cache is None else Path(cache),
+        store=store,
+    )
+    run = _Given(config, scenes)
+    names = run.eye.detector.classes
+    check(run.scenes.classes == names, "scenes", "classes of the detector", f"{len(run.scenes.classes)} others")
+    return ZoomScenery(run, targets)

@@ -1,0 +1,322 @@
+"""The environments against Gymnasium's own checker, its own vectorised environments, and what scenes really hold."""
+
+import subprocess
+import sys
+import tomllib
+from importlib import import_module
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from semfov import DataError, EmbeddedScenes, Grid, InputError
+from semfov.envs import (
+    BeliefObservation,
+    GazeExplore,
+    GazeSearch,
+    GazeVectorEnv,
+    GlimpseObservation,
+    MaskedRandom,
+    VectorBeliefObservation,
+    open_scenery,
+    run_agent,
+)
+from semfov.envs.registration import IDS
+from semfov.metrics.search import random_search
+
+pytestmark = [pytest.mark.weights, pytest.mark.slow]
+
+ROOT = Path(__file__).parents[2]
+KINDS = {"search": GazeSearch, "exploration": GazeExplore}
+TASKS = list(KINDS)
+
+
+def equal(one, other):
+    """Whether observations or infos are the same, to the bit."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(equal(one[name], other[name]) for name in one)
+    return np.array_equal(one, other)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "more", [{}, {"belief": True, "glimpse": 32, "render_mode": "rgb_array"}], ids=["plain", "all"]
+)
+def test_gymnasiums_checker_has_nothing_to_say(world, task, more):
+    """Warnings are errors."""
+    env = gymnasium.make(IDS[task], **world, **more)
+    assert isinstance(env.unwrapped, KINDS[task])
+    check_env(env.unwrapped)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_episodes_side_by_side_are_those_of_gymnasiums_own(sceneries, task):
+    """Reset for reset and step for step, with the ends of episodes in between."""
+    options = {"belief": True, "scenery": sceneries[task]}
+    ours = gymnasium.make_vec(IDS[task], num_envs=3, together=False, **options)
+    assert isinstance(ours, GazeVectorEnv)
+    theirs = SyncVectorEnv([lambda: KINDS[task](**options)] * 3)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    check_side_by_side(ours, theirs, steps=15)
+
+
+def test_episodes_that_restart_at_once_are_those_of_gymnasiums_own(sceneries):
+    mode = AutoresetMode.SAME_STEP
+    options = {"belief": True, "scenery": sceneries["search"]}
+    ours = GazeVectorEnv("search", 3, together=False, autoreset_mode=mode, **options)
+    theirs = SyncVectorEnv([lambda: GazeSearch(**options)] * 3, autoreset_mode=mode)
+    check_side_by_side(ours, theirs, steps=15)
+
+
+def check_side_by_side(ours, theirs, steps):
+    observations, infos = zip(ours.reset(seed=4), theirs.reset(seed=4), strict=True)
+    assert equal(*observations)
+    assert equal(*infos)
+    random, ends = np.random.default_rng(0), 0
+    for _ in range(steps):
+        actions = random.integers(ours.single_action_space.n, size=3)
+        mine, other = ours.step(actions), theirs.step(actions)
+        assert equal(mine[0], other[0])
+        assert mine[1] == pytest.approx(other[1])
+        assert np.array_equal(mine[2], other[2])
+        assert np.array_equal(mine[3], other[3])
+        final = mine[4].pop("final_obs", None), other[4].pop("final_obs", None)
+        assert (final[0] is None) == (final[1] is None)
+        if final[0] is not None:
+            ended = np.flatnonzero(mine[4]["_final_obs"])
+            assert all(equal(final[0][row], final[1][row]) for row in ended)
+            mine[4]["final_info"], other[4]["final_info"] = (
+                of_rows(told[4]["final_info"], ended) for told in (mine, other)
+            )
+        assert equal(mine[4], other[4])
+        ends += int((mine[2] | mine[3]).sum())
+    assert ends > 2
+
+
+def of_rows(infos, rows):
+    """Infos of some environments: what others are filled with has no meaning."""
+    return {name: of_rows(each, rows) if isinstance(each, dict) else each[rows] for name, each in infos.items()}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_seeds_repeat_episodes_and_different_seeds_do_not(sceneries, task):
+    def episode(seed):
+        env, random = KINDS[task](sceneries[task], belief=True), MaskedRandom(0)
+        observation, info = env.reset(seed=seed)
+        told = [observation]
+        for _ in range(4):
+            observation, reward, terminated, _, info = env.step(random(observation, info))
+            told.append({**observation, "reward": reward})
+            if terminated:
+                break
+        return told
+
+    first, second = episode(5), episode(5)
+    assert len(first) == len(second)
+    assert all(equal(a, b) for a, b in zip(first, second, strict=True))
+    starts = {tuple(episode(seed)[0]["gaze"].tolist()) for seed in range(8)}
+    assert len(starts) > 2
+
+
+def test_a_search_is_over_on_the_cells_that_a_box_overlaps_and_nowhere_else(sceneries):
+    """By a loop over the boxes of the scene, for every cell."""
+    scenery = sceneries["search"]
+    env, scenes = GazeSearch(scenery, price=0.25, find=3.0), EmbeddedScenes(scenery.classes[1:], count=2)
+    hits = 0
+    for scene in scenery.scenes:
+        episode = scenery.episodes(scene)[0]
+        annotation = scenes.annotation(scene)
+        for cell in range(20):
+            left, top = cell % 5 * 128.0, cell // 5 * 120.0
+            hit = any(
+                label == episode.target and x1 < left + 128 and x2 > left and y1 < top + 120 and y2 > top
+                for (x1, y1, x2, y2), label in zip(annotation.boxes.tolist(), annotation.labels.tolist(), strict=True)
+            )
+            observation, _ = env.reset(options={"episode": episode})
+            assert observation["target"] == episode.target
+            _, reward, terminated, truncated, info = env.step(cell)
+            assert (terminated, truncated, info["result"]) == (hit, False, float(hit))
+            assert reward == pytest.approx(3.0 * hit - 0.25)
+            assert info["passes"] == 2
+            assert info["pixels"] == 2 * 416 * 416
+            hits += hit
+    assert 0 < hits < 40
+
+
+def test_random_gaze_finds_as_often_as_the_formula_says(world):
+    """1 - C(N - m, n) / C(N, n) for m target cells; 500 episodes, four standard errors."""
+    scenery = open_scenery("search", **{**world, "starts": 500, "policy": "random", "shifts": 3}, targets=["cat"])
+    scene = scenery.scenes[0]
+    episodes = scenery.episodes(scene)
+    envs = GazeVectorEnv("search", 100, scenery, detections=False, autoreset_mode="Disabled")
+    ran = run_agent(envs, MaskedRandom(1), episodes)
+    expected = random_search(len(episodes[0].goal), 3, cells=20)
+    for shifts in (1, 2, 3):
+        share = np.mean([0 < each.found_at <= shifts for each in ran])
+        error = np.sqrt(expected[shifts] * (1 - expected[shifts]) / len(ran))
+        assert share == pytest.approx(expected[shifts], abs=4 * error)
+
+
+def test_rewards_of_an_exploration_add_up_to_its_success(sceneries):
+    env, random = GazeExplore(sceneries["exploration"], price=0.02, find=2.0), MaskedRandom(3)
+    observation, info = env.reset(seed=1)
+    before, total, steps = info["result"], 0.0, 0
+    truncated = False
+    while not truncated:
+        observation, reward, _, truncated, info = env.step(random(observation, info))
+        total, steps = total + reward, steps + 1
+    assert steps == 6
+    assert total == pytest.approx(2.0 * (info["result"] - before) - 0.02 * steps, abs=1e-6)
+    assert info["result"] != before
+
+
+def test_looking_twice_costs_and_shows_nothing_new(sceneries):
+    env = GazeSearch(sceneries["search"], belief=True)
+    observation, info = env.reset(seed=2)
+    cell = int(np.flatnonzero(info["action_mask"] == 0)[0])
+    again, reward, _, _, told = env.step(cell)
+    assert reward == -0.05
+    assert np.array_equal(again["belief"], observation["belief"])
+    assert equal(told["detections"], info["detections"])
+    assert told["passes"] == 2
+
+
+def test_infos_have_what_the_detector_saw_there(sceneries):
+    scenery = sceneries["search"]
+    env = GazeSearch(scenery)
+    _, info = env.reset(seed=0)
+    _, _, _, _, info = env.step(7)
+    seen = info["detections"]
+    grid = Grid(5, 4, (640, 480))
+    with torch.inference_mode():
+        live = scenery.run.eye(scenery.image(info["scene"])[None], grid.centres[7][None])
+    assert int(live.count) == seen["mask"].sum() > 0
+    assert seen["boxes"][seen["mask"]] == pytest.approx(live.boxes[0].numpy(), abs=1e-3)
+    assert seen["scores"][seen["mask"]] == pytest.approx(live.scores[0].numpy(), abs=1e-4)
+
+
+def test_wrappers_show_the_belief_or_the_glimpse_alone(sceneries):
+    scenery = sceneries["search"]
+    env = BeliefObservation(gymnasium.make(IDS["search"], scenery=scenery))
+    observation, info = env.reset(seed=0)
+    assert observation in env.observation_space
+    chance, visited, here = observation.reshape(3, -1)
+    assert np.array_equal(visited, 1 - info["action_mask"])
+    assert np.array_equal(visited, here)
+    assert chance[visited == 1] == 0
+    env.step(0 if here[0] == 0 else 1)
+    target = env.unwrapped.gazes.targets
+    believed = env.unwrapped.gazes.belief.chance(target)[0].clone()
+    moved = env.observation({}).reshape(3, -1)
+    assert moved[0][moved[1] == 0] == pytest.approx(believed.numpy()[moved[1] == 0])
+    assert (moved[1].sum(), moved[2].sum()) == (2, 1)
+
+    glimpse = GlimpseObservation(GazeSearch(scenery), side=48)
+    observation, info = glimpse.reset(seed=0)
+    assert observation in glimpse.observation_space
+    picture = scenery.image(info["scene"]).permute(1, 2, 0).mul(255).numpy()
+    assert abs(observation.mean() - picture.mean()) < 6
+    assert observation.std() > 10
+
+    envs = VectorBeliefObservation(GazeVectorEnv("search", 2, scenery, together=False))
+    observations, _ = envs.reset(seed=0)
+    assert np.array_equal(observations[0], env.reset(seed=0)[0])
+    with pytest.raises(InputError, match=r"env: expected a GazeEnv or a ZoomEnv, got CartPoleEnv"):
+        BeliefObservation(gymnasium.make("CartPole-v1"))
+
+
+def test_a_picture_shows_the_episode_as_it_goes_on(sceneries):
+    env = GazeSearch(sceneries["search"], render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert first.dtype == np.uint8
+    assert first.shape[2] == 3
+    assert min(first.shape[:2]) > 200
+    env.step(3)
+    assert not np.array_equal(env.render(), first)
+    assert GazeSearch(sceneries["search"]).render() is None
+
+
+def test_mosaics_photographs_and_targets_make_environments(world, tmp_path):
+    scenery = open_scenery("search", **world, mosaics=1, tiles=(2, 1), targets=["cup"])
+    assert scenery.grid(0).extent.tolist() == [1280, 480]
+    assert {episode.target for episode in scenery.episodes(0)} == {scenery.classes.index("cup")}
+    env = GazeSearch(scenery)
+    assert env.reset(seed=0)[0] in env.observation_space
+    with pytest.raises(DataError, match="expected some with anything to look for"):
+        open_scenery("search", **world, targets=["zebra"])
+    with pytest.raises(InputError, match="did you mean 'cat'"):
+        open_scenery("search", **world, targets=["catt"])
+    with pytest.raises(DataError, match=r"data.root: no such folder"):
+        open_scenery("search", tmp_path / "nosuch", tmp_path / "nosuch.json")
+
+
+def test_mistakes_are_told(sceneries):
+    scenery = sceneries["search"]
+    env = GazeSearch(scenery)
+    with pytest.raises(InputError, match="step: expected a call of reset"):
+        env.step(0)
+    env.reset()
+    with pytest.raises(InputError, match="action: expected a whole number from 0 to 19"):
+        env.step(20)
+    with pytest.raises(InputError, match="options: expected episode or scene, got start"):
+        env.reset(options={"start": 3})
+    with pytest.raises(InputError, match="scenery: expected no other options beside it, got count"):
+        GazeSearch(scenery, count=3)
+    with pytest.raises(InputError, match="render_mode: expected 'rgb_array' or None"):
+        GazeSearch(scenery, render_mode="human")
+    with pytest.raises(InputError, match="price"):
+        GazeSearch(scenery, price=-1.0)
+    envs = GazeVectorEnv("search", 2, scenery)
+    envs.reset()
+    with pytest.raises(InputError, match="actions: expected 2 cells from 0 to 19"):
+        envs.step(np.array([0, 20]))
+    with pytest.raises(InputError, match="autoreset_mode='Disabled'"):
+        run_agent(envs, MaskedRandom(), scenery.episodes(0))
+    with pytest.raises(InputError, match="unknown action 'pixel'"):
+        gymnasium.make(IDS["search"], action="pixel")
+
+
+def test_environments_rest_until_a_reset_names_them(sceneries):
+    scenery = sceneries["search"]
+    envs = GazeVectorEnv("search", 2, scenery, autoreset_mode="Disabled")
+    episode = scenery.episodes(0)[0]
+    envs.reset(options={"episodes": [episode, episode]})
+    away = next(cell for cell in range(20) if cell not in episode.goal and cell != episode.start)
+    _, rewards, terminated, _, infos = envs.step(np.array([episode.goal[0], away]))
+    assert terminated.tolist() == [True, False]
+    _, rewards, terminated, _, infos = envs.step(np.array([away, away]))
+    assert (rewards[0], terminated[0], infos["passes"].tolist()) == (0, True, [2, 3])
+    _, infos = envs.reset(options={"reset_mask": np.array([True, False])})
+    assert infos["passes"].tolist() == [1, 3]
+
+
+def test_the_entry_point_registers_the_names():
+    """That of the project's file; in a process of its own, where nothing was registered before."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    module, function = project["entry-points"]["gymnasium.envs"]["__root__"].split(":")
+    assert callable(getattr(import_module(module), function))
+    code = (
+        f"import gymnasium, {module} as entry\n"
+        f"for name in {list(IDS.values())}: gymnasium.registry.pop(name)\n"
+        f"entry.{function}(); entry.{function}()\n"
+        f"print(sorted(name for name in gymnasium.registry if 'semfov' in name))"
+    )
+    call = [sys.executable, "-W", "error::UserWarning", "-c", code]
+    told = subprocess.run(call, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert told.strip() == str(sorted(IDS.values()))
+
+
+def test_without_gymnasium_the_error_has_the_command():
+    code = (
+        "import sys; sys.modules['gymnasium'] = None\n"
+        "from semfov.errors import DataError\n"
+        "try:\n    import semfov.envs\nexcept DataError as error:\n    print(error)"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert 'pip install "semfov[envs]"' in told

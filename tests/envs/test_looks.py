@@ -1,0 +1,112 @@
+"""One table of looks for many scenes, and episodes that come and go, against each scene's own loop."""
+
+import pytest
+import torch
+
+from semfov import Detections, Grid
+from semfov.belief import DirichletBelief, TargetEvidence
+from semfov.belief.observers import Semantic, SemanticLook, Target
+from semfov.envs.looks import SceneLooks
+from semfov.episode import Memory, StoredLooks, attend, rollout
+from semfov.gaze import Given
+from semfov.gaze.acquisition import Uniform
+
+SIZES = [(90, 60), (60, 80), (120, 30)]
+CELLS = 6
+TARGETS = [[1, 3], [2], [1, 2]]
+
+
+def stored(scene, dtype):
+    """What is seen from every cell of a scene; more in one scene than in another, and from some cells nothing."""
+    generator = torch.Generator().manual_seed(scene)
+    most = 2 + scene
+    size = torch.tensor(SIZES[scene], dtype=torch.float64)
+    corner = torch.rand(CELLS, most, 2, generator=generator, dtype=torch.float64) * size * 0.7
+    boxes = torch.cat([corner, corner + 2 + size * 0.3 * torch.rand(CELLS, most, 2, generator=generator)], -1)
+    scores = (3 * torch.rand(CELLS, most, 4, generator=generator, dtype=torch.float64)).softmax(-1)
+    mask = torch.arange(most) < torch.randint(most + 1, (CELLS, 1), generator=generator)
+    seen = Detections(boxes.to(dtype), scores.to(dtype), mask)
+    return StoredLooks(seen, Grid(3, 2, SIZES[scene]), torch.tensor(TARGETS[scene]))
+
+
+def evidence(dtype):
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return TargetEvidence(6, 5).to(dtype).eval().requires_grad_(False)
+
+
+OBSERVERS = {
+    "map": lambda dtype: Semantic(4),
+    "soft": lambda dtype: Semantic(4, footprint="soft", tempering=0.5, memory="closest"),
+    "target": lambda dtype: Target(evidence(dtype)),
+}
+
+
+def tensors(belief):
+    found = []
+    belief.map(lambda tensor: found.append(tensor) or tensor)
+    return found
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_episodes_in_many_scenes_are_those_of_each_alone(kind, dtype):
+    """Two episodes go on in other scenes halfway; a scene is first entered then, and its looks are more."""
+    observer = OBSERVERS[kind](dtype)
+    looks = SceneLooks(lambda scene: stored(scene, dtype), observer, 4)
+    paths = torch.tensor([[0, 4, 2, 1], [5, 1, 0, 3], [3, 2, 4, 5], [1, 0, 5, 2]])
+    places = [(0, 1), (1, 2), (0, 3), (1, 2)]
+    rows = torch.arange(4)
+
+    def look(memory, rows, turn):
+        sight, memory = attend(looks, observer, memory, rows, paths[rows, turn], torch.zeros(len(rows), 2))
+        return sight, memory
+
+    def enter(rows):
+        chosen = [places[row] for row in rows.tolist()]
+        looks.enter(rows, [scene for scene, _ in chosen], torch.tensor([target for _, target in chosen]))
+        return Memory.empty(looks, observer, len(rows))
+
+    memory = look(enter(rows), rows, 0)[1]
+    memory = look(memory, rows, 1)[1]
+    places[1], places[2] = (2, 2), (2, 1)
+    some = torch.tensor([1, 2])
+    memory = memory.put(some, look(enter(some), some, 0)[1])
+    others = torch.tensor([0, 3])
+    memory = memory.put(others, look(memory[others], others, 2)[1])
+    sight, memory = look(memory, rows, 3)
+    for row, (scene, target) in enumerate(places):
+        turns = [0, 3] if row in (1, 2) else [0, 1, 2, 3]
+        path, own = paths[row, turns][None], stored(scene, dtype)
+        own = StoredLooks(own.detections, own.grid, torch.tensor([target]))
+        *_, last = rollout(own, observer, Uniform(), path[:, 0], Given(path), most=len(turns))
+        assert torch.equal(memory.visited[row], last.visited[0])
+        for mine, theirs in zip(tensors(memory.belief), tensors(last.belief), strict=True):
+            assert torch.equal(mine[row], theirs[0])
+        seen, expected = sight.detections()[row : row + 1], last.detections
+        count = int(expected.count)
+        assert int(seen.count) == count
+        assert torch.equal(seen.boxes[0, :count], expected.boxes[0, expected.mask[0]])
+
+
+def test_looks_with_fewer_detections_are_filled_up_with_some_that_concern_no_cell():
+    few = SemanticLook(torch.rand(2, 1, 4), torch.ones(2, 1, 6, dtype=torch.bool), torch.zeros(2, 6))
+    many = SemanticLook(torch.rand(1, 3, 4), torch.ones(1, 3, 6, dtype=torch.bool), torch.ones(1, 6))
+    joined = SemanticLook.join([few, many])
+    assert joined.likelihood.shape == (3, 3, 4)
+    assert torch.equal(joined.likelihood[:2, :1], few.likelihood)
+    assert torch.equal(joined.likelihood[2:], many.likelihood)
+    assert joined.footprint.dtype == torch.bool
+    assert not joined.footprint[:2, 1:].any()
+    assert torch.equal(joined.distance, torch.cat([few.distance, many.distance]))
+
+
+def test_what_is_put_into_a_belief_leaves_the_others_and_the_belief_before():
+    before = DirichletBelief(torch.rand(4, 6, 3) + 1, torch.rand(4, 6))
+    other = DirichletBelief(torch.rand(2, 6, 3) + 3, torch.rand(2, 6))
+    kept = before.beta.clone()
+    after = before.put(torch.tensor([3, 0]), other)
+    assert torch.equal(before.beta, kept)
+    for row, source in ((3, other[0:1]), (0, other[1:2]), (1, before[1:2]), (2, before[2:3])):
+        assert torch.equal(after.beta[row], source.beta[0])
+        assert torch.equal(after.closest[row], source.closest[0])

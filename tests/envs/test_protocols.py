@@ -1,0 +1,103 @@
+"""Hand-made policies as agents make the fixations that the evaluations record, whatever they are run in."""
+
+from dataclasses import replace
+
+import gymnasium
+import pytest
+
+from semfov.envs import GazeExplore, GazeSearch, GazeVectorEnv, PolicyAgent, open_scenery, run_agent
+from semfov.experiments.config import PolicyConfig
+from semfov.experiments.runs import ExploreRun, SearchRun
+
+pytestmark = [pytest.mark.weights, pytest.mark.slow]
+
+SEARCHES = [
+    "recommended",
+    "random",
+    "non-predictive-raw",
+    "predictive-calibrated",
+    "vocus2",
+    PolicyConfig("non-predictive", "calibrated", tempering=0.25, memory="closest", footprint="soft", misses=True),
+]
+EXPLORATIONS = ["recommended", "random-raw", "kl-calibrated"]
+
+
+def evaluated(kind, scenery):
+    """What the evaluation records of the same settings, scene by scene: its own run, no part of the environment."""
+    run = kind(scenery.run.config)
+    return [record for scene in range(len(run.scenes)) for record in run.outcomes(scene)[0]]
+
+
+def all_episodes(scenery):
+    return [episode for scene in scenery.scenes for episode in scenery.episodes(scene)]
+
+
+def one_at_a_time(env, episodes):
+    """Fixated cells, the shift that found the target, and the results of every look."""
+    agent, ran = PolicyAgent(env), []
+    for episode in episodes:
+        observation, info = env.reset(options={"episode": episode})
+        cells, results, found, over = [episode.start], [info["result"]], -1, False
+        while not over:
+            action = agent(observation, info)
+            observation, _, terminated, truncated, info = env.step(action)
+            cells.append(int(action))
+            results.append(info["result"])
+            over = terminated or truncated
+            found = len(cells) - 1 if terminated else -1
+        ran.append((cells, found, results))
+    return ran
+
+
+@pytest.mark.parametrize("policy", SEARCHES, ids=str)
+def test_searches_equal_the_records_of_the_evaluation(world, policy):
+    scenery = open_scenery("search", **world, policy=policy)
+    records, episodes = evaluated(SearchRun, scenery), all_episodes(scenery)
+    assert len(records) == len(episodes) >= 12
+    wanted = [(record["cells"], record["found_at"]) for record in records]
+    assert len({found for _, found in wanted}) > 1  # They do end at different times.
+    assert [(cells, found) for cells, found, _ in one_at_a_time(GazeSearch(scenery), episodes)] == wanted
+    envs = GazeVectorEnv("search", 5, scenery, together=False, autoreset_mode="Disabled")
+    assert [(list(ran.cells), ran.found_at) for ran in run_agent(envs, PolicyAgent(envs), episodes)] == wanted
+
+
+@pytest.mark.parametrize("policy", EXPLORATIONS)
+def test_explorations_equal_the_records_of_the_evaluation(world, policy):
+    scenery = open_scenery("exploration", **world, policy=policy)
+    records, episodes = evaluated(ExploreRun, scenery), all_episodes(scenery)
+    records = [record for record in records if record["policy"] == scenery.policy]
+    assert len(records) == len(episodes) == 6
+    wanted = [(record["cells"], [right / record["object_cells"] for right in record["right"]]) for record in records]
+    assert any(len(set(results)) > 2 for _, results in wanted)
+    for (cells, _, results), (path, rates) in zip(one_at_a_time(GazeExplore(scenery), episodes), wanted, strict=True):
+        assert cells == path
+        assert results == pytest.approx(rates, abs=1e-6)
+    envs = GazeVectorEnv("exploration", 4, scenery, together=False, autoreset_mode="Disabled")
+    for ran, (path, rates) in zip(run_agent(envs, PolicyAgent(envs), episodes), wanted, strict=True):
+        assert list(ran.cells) == path
+        assert list(ran.results) == pytest.approx(rates, abs=1e-6)
+
+
+def test_beliefs_computed_together_agree_up_to_rounding(sceneries):
+    scenery = sceneries["search"]
+    episodes = all_episodes(scenery)[:7]
+    beliefs = []
+    for together in (False, True):
+        envs = GazeVectorEnv("search", 7, scenery, together=together, belief=True, autoreset_mode="Disabled")
+        envs.reset(options={"episodes": episodes})
+        beliefs.append(envs.step(envs.scenery.shape[1] + envs.action_space.sample() * 0)[0]["belief"])
+    assert beliefs[0] == pytest.approx(beliefs[1], abs=1e-5)
+    assert beliefs[0].std() > 0.01
+
+
+def test_the_agent_is_found_behind_wrappers(sceneries):
+    env = gymnasium.wrappers.TimeLimit(GazeSearch(sceneries["search"]), 3)
+    observation, info = env.reset(seed=0)
+    assert info["action_mask"][PolicyAgent(env)(observation, info)] == 1
+
+
+def test_settings_of_the_evaluation_make_an_environment(sceneries):
+    config = sceneries["search"].run.config
+    scenery = open_scenery("search", config=replace(config, policies=("random",)))
+    assert scenery.policy == "random"
+    assert scenery.shape == (4, 5)

@@ -1,0 +1,177 @@
+"""Environments with large pictures: the checker, the zoom's own choices, and what boxes and scores say was found."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import SyncVectorEnv
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from semfov import InputError
+from semfov.envs import BeliefObservation, GlimpseObservation
+from semfov.envs.registration import IDS
+from semfov.envs.zoom import ZoomExplore, ZoomPolicyAgent, ZoomSearch, window_of
+from semfov.envs.zoom_scenery import open_zoom_scenery
+from semfov.experiments.zoom_orders import overview
+from semfov.zoom.glances import on_lattice
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.search import find_everything, look_for
+
+KINDS = {"search": ZoomSearch, "exploration": ZoomExplore}
+EVERYTHING = {"belief": True, "grid": (6, 4), "glimpse": 32, "render_mode": "rgb_array"}
+
+
+@given(
+    size=st.tuples(st.integers(200, 9000), st.integers(200, 9000)),
+    place=st.tuples(*[st.floats(0, 1)] * 3),
+    number=st.integers(0, 10**6),
+)
+def test_an_action_goes_to_the_nearest_window_and_back(size, place, number):
+    """Of its level, by the distance between the middles of windows, tried one by one."""
+    lattice = Lattice.over(size, (416, 416))
+    window = window_of(lattice, np.array(place))
+    assert window.level == round(place[2] * (lattice.levels - 1))
+    middle = np.array(place[:2]) * size
+    actions = lattice.actions[lattice.actions[:, 0] == window.level]
+    boxes = lattice.boxes(actions).double().numpy()
+    away = np.abs((boxes[:, :2] + boxes[:, 2:]) / 2 - middle).max(-1)
+    mine = np.abs(np.array(window.fixation[:2]) + 0.5 - middle).max()
+    assert mine <= away.min() + 1e-2
+    level, column, row = lattice.actions[number % len(lattice)].tolist()
+    same = on_lattice(lattice, (level, column, row))
+    x, y = (np.array(same.fixation[:2]) + 0.5) / size
+    share = np.clip([x, y, level / max(lattice.levels - 1, 1)], 0, 1).astype(np.float32)
+    assert window_of(lattice, share.astype(np.float64)) == same
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+@pytest.mark.parametrize("task", KINDS)
+def test_gymnasiums_checker_has_nothing_to_say(cache, task):
+    env = gymnasium.make(IDS[task], action="window", mosaics=1, tiles=(3, 2), passes=6, cache=cache, **EVERYTHING)
+    assert isinstance(env.unwrapped, KINDS[task])
+    check_env(env.unwrapped)
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_the_zooms_own_search_is_made_in_the_environment(zoom_scenery):
+    """Window for window, until an object is found by its box."""
+    env = ZoomSearch(zoom_scenery)
+    agent, lengths = ZoomPolicyAgent(env), set()
+    targets = zoom_scenery.episodes(0)
+    assert targets
+    for target in targets:
+        env.reset(options={"scene": 0, "target": target})
+        over = False
+        while not over:
+            _, reward, terminated, truncated, info = env.step(agent())
+            over = terminated or truncated
+        seen = [glance.window for glance in env.seen]
+        steps = look_for(zoom_scenery.glances(0), zoom_scenery.run.evidence, target, confirm=2.0)
+        assert seen == [glance.window for (glance, *_), _ in zip(steps, seen, strict=False)]
+        assert terminated == zoom_scenery.found(env.seen, 0, target)
+        assert not zoom_scenery.found(env.seen[:-1], 0, target)
+        assert reward == pytest.approx(terminated - 0.05)
+        assert info["passes"] == len(seen)
+        lengths.add(len(seen))
+    assert min(lengths) >= 2
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_the_zooms_own_exploration_is_made_in_the_environment(zoom_scenery):
+    env = ZoomExplore(zoom_scenery, price=0.5, find=10.0)
+    agent = ZoomPolicyAgent(env)
+    _, info = env.reset(seed=0)
+    before, total, truncated = info["result"], 0.0, False
+    while not truncated:
+        _, reward, _, truncated, info = env.step(agent())
+        total += reward
+    assert len(env.seen) == info["passes"] == 6
+    steps = find_everything(zoom_scenery.glances(0), zoom_scenery.run.evidence)
+    expected = [glance.window for (glance, _), _ in zip(steps, range(6), strict=False)]
+    assert [glance.window for glance in env.seen] == expected
+    assert total == pytest.approx(10 * (info["result"] - before) - 0.5 * 5)
+    assert info["result"] > before
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_observations_and_infos_follow_the_windows(zoom_scenery):
+    env = ZoomExplore(zoom_scenery, **EVERYTHING)
+    observation, info = env.reset(seed=0)
+    lattice = env.glances.lattice
+    assert lattice.levels >= 3
+    assert info["action_mask"].sum() == len(lattice) - 1
+    closest = np.array([0.0, 0.0, 1.0], np.float32)
+    observation, _, _, _, info = env.step(closest)
+    assert observation["gaze"][2] == 1
+    assert info["action_mask"][lattice.number(lattice.levels - 1, 0, 0)] == 0
+    assert info["pixels"] == 2 * 416 * 416
+    expected, near = observation["belief"]
+    assert near.max() == near[0, 0] == 1
+    assert near.min() == pytest.approx(1 / lattice.levels)
+    assert 0 < expected.max() <= 1
+    for wrapper, key in ((BeliefObservation(env), "belief"), (GlimpseObservation(env, 32), "glimpse")):
+        assert wrapper.observation_space == env.observation_space[key]
+        assert np.array_equal(wrapper.observation(observation), observation[key])
+    same, reward, _, _, told = env.step(closest)
+    assert reward == -0.01
+    assert np.array_equal(same["belief"], observation["belief"])
+    assert told["passes"] == 3
+    with pytest.raises(InputError, match=r"action: expected \(x, y, magnification\)"):
+        env.step(np.array([0.0, 1.5, 0.0]))
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_a_folder_of_pictures_about_which_nothing_is_known(zoom_scenery, cache, tmp_path):
+    """What a look shows with a score of 0.3 counts; pictures may have any size."""
+    picture = zoom_scenery.image(0).permute(1, 2, 0).mul(255).byte().numpy()
+    Image.fromarray(picture).save(tmp_path / "a.png")
+    Image.fromarray(picture[:900, :1100]).save(tmp_path / "b.png")
+    scenery = open_zoom_scenery(tmp_path, passes=5, targets=["cat", "person"], cache=cache)
+    assert not scenery.known
+    env = ZoomSearch(scenery)
+    for seed in range(3):
+        env.reset(seed=seed)
+        over = False
+        while not over:
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            over = terminated or truncated
+        shown = [float(glance.show[env.target - 1]) for glance in env.seen]
+        assert max(shown[:-1]) < 0.3
+        assert terminated == (shown[-1] >= 0.3)
+    explore = ZoomExplore(scenery)
+    _, info = explore.reset(seed=0)
+    assert info["result"] == int(info["result"])
+
+    envs = gymnasium.make_vec(IDS["exploration"], num_envs=2, action="window", scenery=scenery, belief=True)
+    assert isinstance(envs, SyncVectorEnv)
+    observations, infos = envs.reset(seed=[0, 3])
+    assert observations["belief"].shape == (2, 2, 10, 10)
+    assert infos["action_mask"].shape == (2, scenery.windows)
+
+    with pytest.raises(InputError, match="targets: expected classes to search for"):
+        ZoomSearch(open_zoom_scenery(tmp_path, cache=cache)).reset(seed=0)
+
+
+@pytest.mark.weights
+@pytest.mark.slow
+def test_looks_are_kept_between_worlds(zoom_scenery, cache, monkeypatch):
+    """A second world of the same pictures needs no detector for what the first has seen."""
+    env = ZoomExplore(zoom_scenery)
+    env.reset(seed=0)
+    env.close()
+    again = open_zoom_scenery(mosaics=1, tiles=(3, 2), passes=6, cache=cache)
+
+    def refuse(*given, **options):
+        raise AssertionError("the detector was asked")
+
+    monkeypatch.setattr(again.run.eye, "glance", refuse)
+    kept = again.glances(0).see([overview(again.glances(0))])[0]
+    assert torch.equal(kept.show, env.seen[0].show)
