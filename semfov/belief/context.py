@@ -188,7 +188,7 @@ class ContextPrior(Pretrained):
             path: CSV with the names of other classes in its first row, and of targets in its first column; an empty
                 cell is unknown.
             classes: names of the detector's classes; the table's are matched to them by name, in any spelling, or by
-                their synonyms (`semfov.data.classes.alike`).
+                their synonyms (`semfov.data.naming.alike`).
             source: where the table comes from; it is kept in the metadata, with the table's sha256.
             places: CSV with the names of classes in its first column, and how likely they are at each height of a
                 picture, as log odds from the top row to the bottom one; None knows of no places.

@@ -82,48 +82,6 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
     raise _unknown(argument, name, [classes[keys.index(key)] for key in (*meant, *near)], classes)
 
 
-def alike(name: str, names: Sequence[str]) -> list[int]:
-    """Places of the names that stand for the same class, from 0: the name in any spelling, or else its synonyms.
-
-    >>> alike("tvmonitor", ["cat", "TV"]), alike("cup", ["glass", "mug", "cow"]), alike("cup", ["Cups", "mug"])
-    ([1], [0, 1], [0])
-    """
-    wanted, keys = _key(name), [_key(known) for known in names]
-    forms = {wanted, *_other_numbers(wanted)}
-    same = [place for place, key in enumerate(keys) if key in forms or wanted in _other_numbers(key)]
-    if same:
-        return same
-    return [place for place, key in enumerate(keys) if _calls(key, wanted) or _calls(wanted, key)]
-
-
-def named_in(text: str, classes: Sequence[str]) -> set[str]:
-    """Classes that a text names, in singular or plural, by their names or their synonyms.
-
-    >>> sorted(named_in("Knives, mugs and a hot dog.", ["knife", "cup", "dog", "hot dog"]))
-    ['cup', 'hot dog', 'knife']
-    """
-    keys = {_key(name): name for name in classes}
-    meant: dict[str, set[str]] = {}
-    for key, name in keys.items():
-        others = [other for other, called in SYNONYMS.items() if other not in keys and key in map(_key, called)]
-        for word in (key, *others):
-            for form in {word, *_other_numbers(word)}:
-                meant.setdefault(form, set()).add(name)
-    words, found, start = re.findall(r"[a-z]+", text.lower()), set[str](), 0
-    while start < len(words):
-        # Who says hot dog does not speak of dogs.
-        runs = (run for run in (3, 2, 1) if "".join(words[start : start + run]) in meant)
-        length = min(next(runs, 1), len(words) - start)
-        found |= meant.get("".join(words[start : start + length]), set())
-        start += length
-    return found
-
-
-def _calls(other: str, key: str) -> bool:
-    """Whether people call a class by another name."""
-    return key in map(_key, SYNONYMS.get(other, ()))
-
-
 def _index(value: object, classes: int, argument: str) -> int:
     """An index 1..K from whatever counts as a whole number."""
     value = value.item() if isinstance(value, Tensor) and value.ndim == 0 else value

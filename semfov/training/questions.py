@@ -7,7 +7,8 @@ from os import PathLike
 from pathlib import Path
 from string import Formatter
 
-from semfov.data.classes import canonical_name, named_in
+from semfov.data.classes import canonical_name
+from semfov.data.naming import named_in
 from semfov.errors import DataError
 from semfov.io.files import check_regular
 
