@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import multiprocessing
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -153,10 +154,10 @@ def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
     return model
 
 
-def make_context(name: str, eye: Eye) -> ContextPrior:
+def make_context(name: str, classes: Sequence[str]) -> ContextPrior:
     """The context of searches, checked to know the detector's classes."""
     prior = ContextPrior.from_pretrained(name)
-    prior.check_compatible(eye.detector.classes)
+    prior.check_compatible(classes)
     return prior.requires_grad_(False)
 
 

@@ -16,6 +16,7 @@ from semfov.experiments.parallel import rank
 from semfov.experiments.samples import SampleSettings, collect
 from semfov.experiments.setup import make_scenes
 from semfov.experiments.summary import table
+from semfov.io.files import inside
 from semfov.training.context_weights import fit_weights, make_cases
 from semfov.training.outputs import model_path, training_of, write_outputs
 from semfov.training.places import FitContextConfig, Places, read_places
@@ -53,6 +54,7 @@ def fit_context(config: FitContextConfig) -> None:
     )
     path = model_path(config, "context")
     model.save(path)
+    write_table(inside(config.out, "pictures.csv"), scenes.classes, scenes.classes, shared_pictures(known))
     text = report(judged, weights, len(known), config)
     write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
 
@@ -75,7 +77,7 @@ def table_prior(config: FitContextConfig, classes: Sequence[str]) -> ContextPrio
         vectors = WordVectors.read(config.embeddings, classes)
         if vectors.missing:
             print(f"not in {config.embeddings}: {', '.join(vectors.missing)}")
-        table = config.out / "similarities.csv"
+        table = inside(config.out, "similarities.csv")
         write_table(table, classes, classes, vectors.similarity(classes, classes))
         source = source or f"cosines of word vectors, {config.embeddings.name}, sha256 {vectors.digest}"
     if table is None:
@@ -118,6 +120,20 @@ def occupation(places: Sequence[Places], smoothing: float) -> Tensor:
         raise DataError("data: no photograph has a class to search for; relax max_target_area")
     average = (there.sum(0) + 0.5) / (pictures.sum() + 1)
     return (there + smoothing * average) / (pictures[:, None] + smoothing)
+
+
+def shared_pictures(places: Sequence[Places], smoothing: float = 5.0) -> Tensor:
+    r"""How much likelier two classes are to be in one picture than by chance, as log ratios `(K, K)`, NaN for itself.
+
+    .. math:: v_{tj} = \ln \frac{n_{tj} + s}{n_t n_j / n + s}
+
+    with :math:`n_t` of n pictures that hold t, and :math:`n_{tj}` that hold both: context of windows
+    (`semfov.zoom.WindowContext`).
+    """
+    there = torch.stack([place.occupied.any(0)[1:] for place in places]).float()
+    alone = there.sum(0)
+    ratio = ((there.mT @ there + smoothing) / (alone[:, None] * alone / len(there) + smoothing)).log()
+    return ratio.fill_diagonal_(torch.nan)
 
 
 def count_pairs(places: Sequence[Places], chance: Tensor, edges: Sequence[float]) -> tuple[Tensor, Tensor]:

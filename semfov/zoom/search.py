@@ -7,6 +7,7 @@ import torch
 
 from semfov.decision import Decision
 from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance, Glances, Window, on_lattice
 from semfov.zoom.lattice import Lattice
@@ -50,6 +51,7 @@ def look_for(
     confirm: float = 0.3,
     slices: Sequence[Window] | None = None,
     closest: bool = False,
+    context: WindowContext | None = None,
 ) -> Iterator[tuple[Glance, float, float]]:
     """Look for one object of a class, glance by glance; ends when a look confirms it, or nothing is left to look at.
 
@@ -60,11 +62,12 @@ def look_for(
         confirm: score that confirms it.
         slices: if given, only looks at these confirm it; else looks at all magnifications do.
         closest: only looks at the largest magnification confirm it.
+        context: what else is known of what is beside what.
 
     Yields:
         The glance, what it was worth, and what the best look is worth now: the probability that it shows the target.
     """
-    belief, done = ZoomBelief(glances.lattice, evidence, target), set[Window]()
+    belief, done = ZoomBelief(glances.lattice, evidence, target, context), set[Window]()
     window, worth = on_lattice(glances.lattice, (0, 0, 0)), float("inf")
     allowed = None if slices is None else set(slices)
     while True:
@@ -115,6 +118,7 @@ def search(
     passes: int = 24,
     confirm: float = 0.3,
     give_up: float = 0.005,
+    context: WindowContext | None = None,
 ) -> ZoomPath:
     """Search a picture for one object of a class, and decide.
 
@@ -130,11 +134,12 @@ def search(
         passes: of the detector, at most.
         confirm: see above.
         give_up: see above.
+        context: as for `look_for`.
     """
     seen: list[Glance] = []
     values: list[float] = []
     outcome: Decision | None = None
-    for glance, value, ahead in look_for(glances, evidence, target, confirm=confirm):
+    for glance, value, ahead in look_for(glances, evidence, target, confirm=confirm, context=context):
         seen.append(glance)
         values.append(value)
         score = float(glance.show[target - 1])
