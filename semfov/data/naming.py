@@ -2,9 +2,9 @@
 
 import re
 from collections.abc import Sequence
+from functools import cache
 
-from semfov.data.classes import _key as plain_key
-from semfov.data.classes import _other_numbers as other_numbers
+from semfov.data.classes import other_numbers, plain_key
 from semfov.data.synonyms import SYNONYMS
 
 
@@ -28,21 +28,27 @@ def named_in(text: str, classes: Sequence[str]) -> set[str]:
     >>> sorted(named_in("Knives, mugs and a hot dog.", ["knife", "cup", "dog", "hot dog"]))
     ['cup', 'hot dog', 'knife']
     """
-    keys = {plain_key(name): name for name in classes}
-    meant: dict[str, set[str]] = {}
-    for key, name in keys.items():
-        others = [other for other, called in SYNONYMS.items() if other not in keys and key in map(plain_key, called)]
-        for word in (key, *others):
-            for form in {word, *other_numbers(word)}:
-                meant.setdefault(form, set()).add(name)
+    meant = _vocabulary(tuple(classes))
     words, found, start = re.findall(r"[a-z]+", text.lower()), set[str](), 0
     while start < len(words):
         # Who says hot dog does not speak of dogs.
         runs = (run for run in (3, 2, 1) if "".join(words[start : start + run]) in meant)
         length = min(next(runs, 1), len(words) - start)
-        found |= meant.get("".join(words[start : start + length]), set())
+        found |= meant.get("".join(words[start : start + length]), frozenset())
         start += length
     return found
+
+
+@cache
+def _vocabulary(classes: tuple[str, ...]) -> dict[str, frozenset[str]]:
+    """What each word means, without spaces, in singular and plural."""
+    keys = {plain_key(name): name for name in classes}
+    called = {other: {*map(plain_key, meant)} & keys.keys() for other, meant in SYNONYMS.items() if other not in keys}
+    said: dict[str, set[str]] = {}
+    for word, meant in [*((key, {key}) for key in keys), *called.items()]:
+        for form in {word, *other_numbers(word)}:
+            said.setdefault(form, set()).update(keys[key] for key in meant)
+    return {word: frozenset(names) for word, names in said.items() if names}
 
 
 def _calls(other: str, key: str) -> bool:

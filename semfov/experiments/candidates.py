@@ -93,7 +93,7 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
         if any(by_evidence(policy, task) for policy in policies)
         else None,
         {
-            name: make_context(name, eye.detector.classes)
+            name: make_context(name, eye)
             for name in dict.fromkeys(
                 _of(policy.context_model, belief.context_model)
                 for policy in policies

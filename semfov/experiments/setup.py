@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import multiprocessing
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from semfov.io.files import check_regular
 from semfov.io.shipped import shipped_model
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor import Foveation
+from semfov.zoom import ZoomEye
 
 
 def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
@@ -154,10 +154,10 @@ def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
     return model
 
 
-def make_context(name: str, classes: Sequence[str]) -> ContextPrior:
+def make_context(name: str, eye: Eye | ZoomEye) -> ContextPrior:
     """The context of searches, checked to know the detector's classes."""
     prior = ContextPrior.from_pretrained(name)
-    prior.check_compatible(classes)
+    prior.check_compatible(eye.detector.classes)
     return prior.requires_grad_(False)
 
 

@@ -126,7 +126,7 @@ class ZoomRun:
         names = detector.classes
         self.contexts: dict[str, WindowContext] = {}
         for each in config.contexts:
-            prior = make_context(each, names)
+            prior = make_context(each, self.eye)
             for label, kind in ((Path(each).stem, prior), (f"{Path(each).stem}, permuted", prior.permuted())):
                 check(label not in self.contexts, "contexts", "files of different names", label)
                 self.contexts[label] = WindowContext(kind, config.context_weight)
