@@ -225,7 +225,7 @@ class ContextPrior(Pretrained):
 
 def _digest(path: str | PathLike[str]) -> str:
     try:
-        return sha256(path)
+        return sha256(Path(path))
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
 

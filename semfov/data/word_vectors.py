@@ -68,7 +68,7 @@ class WordVectors:
         except OSError as error:
             raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
         check(bool(found), "embeddings", f"a file with some of the words {', '.join(wanted)}", f"{path} with none")
-        return cls(found, [word for word in wanted if word not in found], sha256(path))
+        return cls(found, [word for word in wanted if word not in found], sha256(Path(path)))
 
     def vector(self, name: str) -> Tensor:
         """Mean vector of a name's words, `(D,)`.

@@ -23,9 +23,17 @@ _BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
 class Seen(Protocol):
     """What `semfov.Detections` are made of."""
 
-    boxes: Tensor
-    scores: Tensor
-    mask: Tensor
+    @property
+    def boxes(self) -> Tensor:
+        """`(..., L, 4)`."""
+
+    @property
+    def scores(self) -> Tensor:
+        """`(..., L, K+1)`."""
+
+    @property
+    def mask(self) -> Tensor:
+        """`(..., L)`."""
 
 
 def header(stamp: Any, frame: str) -> Values:

@@ -130,7 +130,12 @@ class Answers:
 
     def add(self, key: str, question: Question, reply: Reply) -> None:
         """Keep an answer, on the disk before anything else is done."""
-        entry = {"key": key, "section": question.section, "name": question.name, "option": question.option}
+        entry: dict[str, str | int | None] = {
+            "key": key,
+            "section": question.section,
+            "name": question.name,
+            "option": question.option,
+        }
         entry |= {"prompt": question.text, "answer": reply.text, "model": reply.model}
         entry |= {"prompt_tokens": reply.prompt_tokens, "completion_tokens": reply.completion_tokens}
         try:
