@@ -3,6 +3,7 @@
     python -m eval.demo                                  # lists the classes that can be searched for
     python -m eval.demo --target cup                     # an embedded scene, no photograph needed
     python -m eval.demo PHOTO.jpg --target "wine glass"  # your own photograph; a folder or a video will do, too
+    python -m eval.demo PHOTO.jpg --target "something to drink from" --embeddings glove.6B.300d.txt
     python -m eval.demo PHOTO.jpg --explore              # no target: learn what is where
     python -m eval.demo --camera 0 --target cup          # live, from a camera, until Ctrl-C
     python -m eval.demo PHOTO.jpg --target cup --report cup.html
@@ -31,8 +32,9 @@ from eval.stream import watch
 from semfov import ActivePerception, Scanpath, viz
 from semfov.data.classes import class_index
 from semfov.data.sources import Picture, Stream, embedded_picture, is_video, open_pictures, open_stream
+from semfov.data.word_vectors import WordVectors, spread
 from semfov.detection.load import check_detector
-from semfov.errors import check
+from semfov.errors import InputError, check
 from semfov.experiments.command import run_command
 from semfov.experiments.settings import Range, Seed, Settings, Share, Shifts, Weight, Whole
 from semfov.io.manifest import Manifest
@@ -57,6 +59,8 @@ class DemoConfig(Settings):
     Args:
         photo: photograph, folder of photographs or video (none: an embedded scene).
         target: class to search for; none, and no --explore, lists the classes.
+        embeddings: file of word vectors (GloVe's or word2vec's text), by which a target that is no class is spread over
+            the classes that it may mean.
         explore: look around without a target.
         camera: look at what the camera of this number shows.
         agent: `recommended` (learned models, where they are shipped for the detector), `published` (the paper's:
@@ -86,6 +90,7 @@ class DemoConfig(Settings):
 
     photo: Path | None = None
     target: str | None = None
+    embeddings: Path | None = None
     explore: bool = False
     camera: Whole | None = None
     agent: Literal["recommended", "published", "raw"] = "recommended"
@@ -118,12 +123,15 @@ def demo(config: DemoConfig) -> None:
         print(f"Choose a class with --target, or --explore. {config.models or config.detector} knows:\n")
         print(columns(classes))
         return
+    wanted: dict[str, float] = {}
     if config.target is not None:
-        config = replace(config, target=classes[class_index(config.target, classes, "target") - 1])
+        wanted = meant(config, classes)
+        config = replace(config, target=next(iter(wanted)))
     stream = open_live(config)
     watched = opened(pictures(config, classes)) if stream is None else iter(())
     agent = make_agent(config) if agent is None else agent
     if stream is not None:
+        only_likeliest(wanted)
         given = {name: getattr(config, name) for name in ("rate", "start", "seed", "confirm", "give_up")}
         path = watch(agent.live(config.target, **given), stream, config.out / "live")
         print(f"written:\n  {path}")
@@ -134,9 +142,10 @@ def demo(config: DemoConfig) -> None:
     for number, picture in enumerate(watched):
         if zooming is not None and zooming.pays(picture.image):
             folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
+            only_likeliest(wanted)
             written += zoom_in(zooming, picture, config, folder)
             continue
-        scanpath = look_at(agent, picture, config)
+        scanpath = look_at(agent, picture, config, wanted)
         print(told(picture.name, scanpath))
         folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
         views = shown(scanpath, config)
@@ -234,7 +243,29 @@ def opened(pictures: Iterator[Picture]) -> Iterator[Picture]:
     return chain([first], pictures)
 
 
-def look_at(agent: ActivePerception, picture: Picture, config: DemoConfig) -> Scanpath:
+def meant(config: DemoConfig, classes: Sequence[str]) -> dict[str, float]:
+    """The classes that a target may mean, each with a weight, the likeliest first."""
+    target = config.target or ""
+    try:
+        return {classes[class_index(target, classes, "target") - 1]: 1.0}
+    except InputError as error:
+        if config.embeddings is None:
+            raise InputError(f"{error}; a description needs --embeddings, a file of word vectors") from None
+    vectors = WordVectors.read(config.embeddings, [target, *classes])
+    found = spread(target, classes, vectors)
+    print(f"“{target}” may mean: {', '.join(f'{name} {weight:.2f}' for name, weight in found.items())}")
+    if vectors.missing:
+        print(f"  not in {config.embeddings}: {', '.join(vectors.missing)}")
+    return found
+
+
+def only_likeliest(wanted: dict[str, float]) -> None:
+    """Say where a description is no more than its likeliest class."""
+    if len(wanted) > 1:
+        print(f"videos, cameras and large pictures are searched for one class: {next(iter(wanted))}")
+
+
+def look_at(agent: ActivePerception, picture: Picture, config: DemoConfig, wanted: dict[str, float]) -> Scanpath:
     """Search or explore a picture."""
     common: dict[str, Any] = {"start": start_cell(agent, picture, config), "seed": config.seed}
     with torch.inference_mode():
@@ -243,7 +274,8 @@ def look_at(agent: ActivePerception, picture: Picture, config: DemoConfig) -> Sc
             return agent.explore(picture.image, shifts=shifts, until=config.until, **common)
         shifts = 30 if config.shifts is None else config.shifts
         common |= {"confirm": config.confirm, "give_up": config.give_up, "price": config.price}
-        return agent.search(picture.image, config.target, shifts=shifts, **common)
+        target = wanted if len(wanted) > 1 else config.target
+        return agent.search(picture.image, target, shifts=shifts, **common)
 
 
 def start_cell(agent: ActivePerception, picture: Picture, config: DemoConfig) -> int | None:

@@ -1,7 +1,7 @@
 """An agent with a foveal sensor: it searches an image for a class, or explores it."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
 from typing import Any, Self
@@ -10,13 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from semfov.belief.context import ContextPrior
-from semfov.belief.grid import Grid
+from semfov.belief.grid import Grid, check_cells
 from semfov.belief.map_evidence import MapEvidence
-from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
+from semfov.belief.observers import AnyBelief, AnyOf, Context, LearnedMap, Observer, Semantic, Target
+from semfov.belief.observers.any_of import TargetLike, weights_by_class
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike, as_image
-from semfov.decision import check_thresholds, conclude, confirms, decide, decide_by_price, goal_cells
+from semfov.decision import check_thresholds, conclude, goal_cells, outcome_of
 from semfov.detection.load import load_detector
 from semfov.episode import LiveLooks, Step, rollout
 from semfov.errors import InputError, check, check_whole, lookup
@@ -85,7 +86,7 @@ class ActivePerception(nn.Module):
         self.eye = eye
         self.searching = Strategy(*search)
         self.exploring = Strategy(*explore)
-        _check_cells(grid)
+        check_cells(grid)
         self.columns, self.rows = grid
 
     @classmethod
@@ -114,7 +115,7 @@ class ActivePerception(nn.Module):
             DataError: the weights cannot be had, or are damaged.
         """
         check_shipped_sensor(sigma, growth)
-        _check_cells(grid)
+        check_cells(grid)
         detector = load_detector(name, **options)
         eye = Eye(Foveation(sigma, growth=growth), detector)
         name = shipped_model(TargetEvidence, learned_for(detector.name, growth), name)
@@ -215,7 +216,7 @@ class ActivePerception(nn.Module):
     def search(
         self,
         image: ImageLike,
-        target: str | int,
+        target: TargetLike,
         *,
         start: int | None = None,
         shifts: int = 30,
@@ -239,7 +240,8 @@ class ActivePerception(nn.Module):
 
         Args:
             image: a picture of any common kind (`semfov.as_image`): a path, an image of Pillow's, an array or a tensor.
-            target: name or index (1..K) of the class.
+            target: name or index (1..K) of the class; or several, each with the probability that it is meant (`AnyOf`,
+                `semfov.data.spread`): the scanpath's is then the most probable of them.
             start: first cell; None draws one.
             shifts: most gaze shifts to make.
             seed: of the generator that draws the start and breaks ties.
@@ -254,7 +256,7 @@ class ActivePerception(nn.Module):
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
             DataError: the image's file cannot be read.
         """
-        index = class_index(target, self.classes[1:], "target")
+        strategy, index, wanted = self._sought(target)
         check_thresholds(confirm, give_up)
         check(price is None or (is_number(price) and price >= 0), "price", "0 or more right decisions", price)
         image, grid = self._frame(image)
@@ -264,17 +266,10 @@ class ActivePerception(nn.Module):
             raise InputError("price: expected None, with thresholds or for a belief that tells no presence")
         thresholds = None if chosen is None else chosen.changed(confirm, give_up)
 
-        def outcome(step: Step) -> Tensor:
-            if goal is not None:
-                return goal[step.cell].long()
-            if price is not None:
-                return decide_by_price(step, index, price)
-            if thresholds is not None:
-                return decide(step, index, thresholds)
-            return confirms(step.detections, grid, step.cell, index, 0.5 if confirm is None else confirm).long()
-
-        scanpath, ended, last = self._gaze(image, grid, self.searching, index, start, shifts, seed, outcome)
-        scanpath = replace(scanpath, found=ended == 1)
+        outcome = outcome_of(wanted, grid, goal, price, thresholds, 0.5 if confirm is None else confirm)
+        scanpath, ended, last = self._gaze(image, grid, strategy, index, start, shifts, seed, outcome)
+        index = int(last.belief.likeliest()) if isinstance(last.belief, AnyBelief) else index
+        scanpath = replace(scanpath, found=ended == 1, target=index)
         if goal is not None:
             return replace(scanpath, ending="box") if ended else scanpath
         if ended:
@@ -347,6 +342,17 @@ class ActivePerception(nn.Module):
             thresholds=None if chosen is None else chosen.changed(confirm, give_up),
         )
 
+    def _sought(self, target: TargetLike) -> tuple[Strategy, int, dict[int, float]]:
+        """How to search for a target, the class that is most wanted, and the weights of all that are."""
+        if not isinstance(target, Mapping):
+            index = class_index(target, self.classes[1:], "target")
+            return self.searching, index, {index: 1.0}
+        wanted, policy = weights_by_class(target, self.classes[1:]), self.searching.policy
+        suits = isinstance(policy, NonPredictive | Random) or policy.by_place
+        check(suits, "target", f"one class, for policy {policy.name!r}, which does not go by probability", dict(target))
+        several = Strategy(AnyOf(self.searching.observer, wanted), policy)
+        return several, max(wanted, key=wanted.__getitem__), wanted
+
     def _frame(self, picture: ImageLike) -> tuple[Tensor, Grid]:
         """The image as a batch of one, and the grid over it."""
         image = as_image(picture, like=self.eye.sensor.like)[None]
@@ -390,10 +396,3 @@ class ActivePerception(nn.Module):
         assert ended is not None
         ending: Ending = "cells" if bool(ended[1].visited.all()) else "shifts"
         return replace(scanpath, ending=ending, stimulus=Stimulus.of(self.eye, image)), *ended
-
-
-def _check_cells(grid: tuple[int, int]) -> None:
-    """Raise `InputError` unless this is a grid."""
-    check(isinstance(grid, Sequence) and len(grid) == 2, "grid", "(columns, rows)", grid)
-    for side in grid:
-        check_whole(side, "grid", 1, 200)

@@ -1,7 +1,7 @@
 """What a search decides: whether the target is there, where, and how sure that is."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -186,6 +186,43 @@ def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, scor
     sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score) & detections.mask
     there = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
     return (there & sure).any(-1)
+
+
+def outcome_of(
+    wanted: Mapping[int, float],
+    grid: Grid,
+    goal: Tensor | None,
+    price: float | None,
+    thresholds: Thresholds | None,
+    confirm: float,
+) -> Callable[[Step], Tensor]:
+    """What tells which searches end with a step, as numbers in `OUTCOMES`, `(A,)`.
+
+    Args:
+        wanted: by class 1..K the probability that it is what is meant; the belief is about all of them.
+        grid: the cells.
+        goal: `(X·Y,)`, cells on which a search ends; None decides.
+        price: of a look, to decide by; None decides by thresholds.
+        thresholds: of the belief; None where it has none, and detections confirm.
+        confirm: score of such a detection, times the probability that its class is meant.
+    """
+    first = next(iter(wanted))
+
+    def outcome(step: Step) -> Tensor:
+        if goal is not None:
+            return goal[step.cell].long()
+        if price is not None:
+            return decide_by_price(step, first, price)
+        if thresholds is not None:
+            return decide(step, first, thresholds)
+        seen = [
+            confirms(step.detections, grid, step.cell, index, confirm / weight)
+            for index, weight in wanted.items()
+            if weight > 0
+        ]
+        return torch.stack(seen).any(0).long()
+
+    return outcome
 
 
 def goal_cells(boxes: Tensor | Sequence[Sequence[float]], grid: Grid, like: Tensor) -> Tensor:

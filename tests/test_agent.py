@@ -70,6 +70,26 @@ def test_search_goes_to_the_target(agent, image):
     assert len(set(scanpath.cells.tolist())) == len(scanpath)
 
 
+def test_search_for_any_of_several_finds_the_one_that_is_there(agent, image):
+    image[:, 8:28, 8:28] = 0.4  # nothing red is left
+    scanpath = agent.search(image, {"red": 1.0, "green": 0.8}, start=0)
+    assert scanpath.found
+    assert scanpath.classes[scanpath.target] == "green"
+    corner = scanpath.decision.box.tolist()
+    assert corner == pytest.approx([130, 100, 140, 110], abs=6)
+    alone = agent.search(image, "green", start=0)
+    assert torch.equal(agent.search(image, {"green": 1.0}, start=0).cells, alone.cells)
+    # A class that is hardly meant confirms nothing.
+    assert not agent.search(image, {"red": 1.0, "green": 0.1}, start=0, shifts=6).found
+
+
+def test_policies_that_look_ahead_search_for_one_class(image):
+    model = FovealObservationModel.identity(["red", "green"], [0.2])
+    ahead = ActivePerception(squares_eye(), (Semantic(3), Predictive(model)), (Semantic(3), Random()), grid=(8, 6))
+    with pytest.raises(InputError, match="one class, for policy 'predictive'"):
+        ahead.search(image, {"red": 1.0, "green": 0.8})
+
+
 def test_boxes_decide_what_is_found(agent, image):
     nowhere = torch.tensor([[60.0, 60, 61, 61]])
     scanpath = agent.search(image, "green", start=0, boxes=nowhere, shifts=5)

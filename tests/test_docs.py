@@ -38,6 +38,11 @@ def test_guides_to_ones_own_show_the_whole_example(what):
     assert f"```python\n{example}```" in (DOCS / "guides" / f"write_your_own_{what}.md").read_text(encoding="utf-8")
 
 
+def test_guide_to_robots_shows_the_whole_node():
+    node = (DOCS.parent / "examples" / "ros_node.py").read_text(encoding="utf-8")
+    assert f"```py\n{node}```" in (DOCS / "guides" / "robots.md").read_text(encoding="utf-8")
+
+
 def test_there_is_a_guide_for_every_room():
     rooms = {"sensor", "detection", "observation", "belief", "gaze", "evaluation"}
     assert {guide.stem for guide in GUIDES} >= rooms

@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.belief.context_table import company_of, places_of, read_table
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
-from semfov.errors import check, check_shape, lookup, values_known
+from semfov.errors import DataError, check, check_shape, lookup, values_known
 from semfov.io import compatibility
+from semfov.io.files import sha256
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import CLASSES, Array, Field, Number, Object, Pair, Schema
 
@@ -151,6 +153,65 @@ class ContextPrior(Pretrained):
         settings = {"weights": record["weights"], "metadata": record["metadata"]}
         return cls(record["classes"], *tables, record["edges"], **settings)
 
+    def permuted(self, seed: int = 0) -> "ContextPrior":
+        """The same tables with the classes exchanged at random: a control that knows as much, of the wrong things."""
+        generator = torch.Generator().manual_seed(seed)
+        order = torch.cat(
+            [torch.zeros(1, dtype=torch.long), 1 + torch.randperm(len(self.classes), generator=generator)]
+        )
+        tables = self.place[order], self.cooccurrence[order][:, order]
+        metadata = {**self.metadata, "permuted": seed}
+        return ContextPrior(self.classes, *tables, self.edges, weights=self.weights, metadata=metadata)
+
+    @classmethod
+    def from_table(
+        cls,
+        path: str | PathLike[str],
+        classes: Sequence[str],
+        *,
+        source: str,
+        places: str | PathLike[str] | None = None,
+        sha256: str | None = None,
+        edges: Sequence[float] = (0.0, 0.15, 0.35),
+    ) -> Self:
+        r"""Context from any table of classes by classes: from language, from a person, from another data set.
+
+        .. math:: r_{tjn} = b_n \bigl(v_{tj} - \bar v_{t\cdot} - \bar v_{\cdot j} + \bar v\bigr), \qquad
+                  b_n = 1 - \frac{2 n}{N - 1}
+
+        with v the table's value of class j beside a target t, on any scale, the larger the more they belong together.
+        It counts by comparison alone, with what either class has beside others; so does a place with others of its
+        class. What is unknown counts nothing. How much the table should count is another matter: `train.fit_context`
+        fits the weights, which are 1 here.
+
+        Args:
+            path: CSV with the names of other classes in its first row, and of targets in its first column; an empty
+                cell is unknown.
+            classes: names of the detector's classes; the table's are matched to them by name, in any spelling, or by
+                their synonyms (`semfov.data.naming.alike`).
+            source: where the table comes from; it is kept in the metadata, with the table's sha256.
+            places: CSV with the names of classes in its first column, and how likely they are at each height of a
+                picture, as log odds from the top row to the bottom one; None knows of no places.
+            sha256: that the table must have.
+            edges: upper borders of all bands of distance but the last, in longer sides of the image.
+
+        Raises:
+            DataError: a file is missing, no such table, or not the one of the checksum.
+            InputError: it knows none of the classes, or an argument does not fit.
+        """
+        check(bool(source.strip()), "source", "where the table comes from", repr(source))
+        digest = _digest(path)
+        if sha256 is not None and sha256.lower() != digest:
+            raise DataError(f"{path}: expected a table with sha256 {sha256}, got {digest}; fetch it again")
+        company, missing = company_of(read_table(path), classes, len(edges) + 1)
+        place = torch.zeros(len(classes) + 1, 1, 1)
+        told: dict[str, Any] = {"source": source, "sha256": digest, "missing": missing}
+        if places is not None:
+            place = places_of(read_table(places), classes)
+            told["places_sha256"] = _digest(places)
+        weights = dict.fromkeys(("evidence", "map"), (1.0, 1.0))
+        return cls(classes, place, company, edges, weights=weights, metadata={"table": told})
+
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str] = "coco") -> Self:
         """A prior that is shipped with the package, by name, or one that `save` wrote, by path; in `eval` mode.
@@ -160,6 +221,13 @@ class ContextPrior(Pretrained):
             DataError: the file is missing, damaged or not such a prior.
         """
         return super().from_pretrained(name_or_path)
+
+
+def _digest(path: str | PathLike[str]) -> str:
+    try:
+        return sha256(Path(path))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def presence_of(detections: Detections, grid: Grid) -> Tensor:

@@ -1,12 +1,13 @@
 """The grid of cells over an image: centres, which cells a box covers, distances to the fixation."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
-from semfov.errors import check, check_finite, check_shape, lookup, values_known
+from semfov.errors import check, check_finite, check_shape, check_whole, lookup, values_known
 
 Footprint = Literal["overlap", "centre", "box_centre", "soft"]
 
@@ -182,3 +183,10 @@ def _check_numbers(values: Tensor, argument: str) -> None:
 def _overlaps(borders: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Which intervals between successive `borders` share a positive length with `low`..`high`."""
     return (borders[..., :-1] < high) & (borders[..., 1:] > low)
+
+
+def check_cells(grid: tuple[int, int]) -> None:
+    """Raise `InputError` unless this is a grid, `(columns, rows)`."""
+    check(isinstance(grid, Sequence) and len(grid) == 2, "grid", "(columns, rows)", grid)
+    for side in grid:
+        check_whole(side, "grid", 1, 200)

@@ -7,6 +7,7 @@ from semfov.data.images import read_image
 from semfov.data.inputs import as_image
 from semfov.data.scene import Annotation, Scene, Scenes, box_coverage, legal_targets
 from semfov.data.scenes import EmbeddedScenes
+from semfov.data.word_vectors import WordVectors, spread
 
 if TYPE_CHECKING:
     from semfov.data.coco import CocoScenes
@@ -17,12 +18,14 @@ __all__ = [
     "EmbeddedScenes",
     "Scene",
     "Scenes",
+    "WordVectors",
     "as_image",
     "box_coverage",
     "canonical_name",
     "class_index",
     "legal_targets",
     "read_image",
+    "spread",
 ]
 
 

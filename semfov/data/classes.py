@@ -66,8 +66,8 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
         return _index(name, len(classes), argument)
     if name in classes:
         return list(classes).index(name) + 1
-    wanted, keys = _key(name), [_key(known) for known in classes]
-    forms = [set().union(*map(_other_numbers, (key, *_SPELT.get(key, ())))) for key in keys]
+    wanted, keys = plain_key(name), [plain_key(known) for known in classes]
+    forms = [set().union(*map(other_numbers, (key, *_SPELT.get(key, ())))) for key in keys]
     for fits in (
         [index for index, key in enumerate(keys, 1) if key == wanted],
         [index for index, form in enumerate(forms, 1) if wanted in form],
@@ -76,8 +76,8 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
             return fits[0]
         if fits:
             raise _unknown(argument, name, [classes[index - 1] for index in fits], classes)
-    singular = [word for word in SYNONYMS if wanted in _other_numbers(word)]
-    meant = [key for word in (wanted, *singular) for key in map(_key, SYNONYMS.get(word, ())) if key in keys]
+    singular = [word for word in SYNONYMS if wanted in other_numbers(word)]
+    meant = [key for word in (wanted, *singular) for key in map(plain_key, SYNONYMS.get(word, ())) if key in keys]
     near = get_close_matches(wanted, keys, n=3, cutoff=0.8 if meant else 0.6)
     raise _unknown(argument, name, [classes[keys.index(key)] for key in (*meant, *near)], classes)
 
@@ -96,13 +96,13 @@ def _unknown(argument: str, name: str, meant: Sequence[str], classes: Sequence[s
     return InputError(f"{argument}: unknown class {name!r}; {hint}")
 
 
-def _key(name: str) -> str:
+def plain_key(name: str) -> str:
     """A name without what people write it with or without."""
     plain = re.sub(r"[\s_-]+", "", name.lower())
     return re.sub(r"\s", "", ALIASES.get(plain, plain))
 
 
-def _other_numbers(key: str) -> set[str]:
+def other_numbers(key: str) -> set[str]:
     """The plural of a class as English makes it, or the singular of one that has only a plural."""
     forms = {f"{key}s", f"{key}es", _IRREGULAR.get(key, f"{key}s")}
     for end, plural in (("y", "ies"), ("f", "ves"), ("fe", "ves")):

@@ -86,3 +86,13 @@ SYNONYMS = _read(_TABLE)
 >>> SYNONYMS["mug"], SYNONYMS["glass"]
 (('cup',), ('wine glass', 'cup'))
 """
+
+
+def names_of(name: str) -> tuple[str, ...]:
+    """What else a class is called, as it is written.
+
+    >>> names_of("fork"), names_of("kite")
+    (('cutlery',), ())
+    """
+    lines = (line.partition(": ") for line in _TABLE.strip().splitlines())
+    return next((tuple(others.split(", ")) for known, _, others in lines if known == name), ())

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import torch
@@ -71,11 +71,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Models:
-    """Fitted models that the policies of a run need; None for those that none of them does."""
+    """Fitted models that the policies of a run need, contexts by name; None for those that none of them does."""
 
     observation: FovealObservationModel | None = None
     evidence: TargetEvidence | None = None
-    context: ContextPrior | None = None
+    context: Mapping[str, ContextPrior] = field(default_factory=dict)
     gaze: LearnedGaze | None = None
     map: MapEvidence | None = None
     templates: ClassTemplates | None = None
@@ -92,9 +92,14 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
         make_target_evidence(belief.target_model, eye)
         if any(by_evidence(policy, task) for policy in policies)
         else None,
-        make_context(belief.context_model, eye)
-        if any(_of(policy.context, belief.context) != "none" for policy in policies)
-        else None,
+        {
+            name: make_context(name, eye)
+            for name in dict.fromkeys(
+                _of(policy.context_model, belief.context_model)
+                for policy in policies
+                if _of(policy.context, belief.context) != "none"
+            )
+        },
         make_learned_gaze(config.gaze_model, eye) if gazes and isinstance(config, SearchConfig) else None,
         make_map_evidence(belief.map_model, eye)
         if any(policy.scores == "learned" and not by_evidence(policy, task) for policy in policies)
@@ -139,7 +144,7 @@ def make_strategy(
     if task != "search" or policy.policy not in (TARGET_EVIDENCE, NonPredictive.name):
         raise InputError(f"context: expected a search by the probability of the target, got policy {policy.policy!r}")
     inner = _strategy(policy, task, belief, components, models, fovea)
-    prior = _given(models.context, "context", "a fitted context")
+    prior = _given(models.context.get(_of(policy.context_model, belief.context_model)), "context", "a fitted context")
     place, company = prior.weights_for("evidence" if inner.observer.by_target else "map")
     weights = place * (context != "cooccurrence"), company * (context != "place")
     return Strategy(Context(inner.observer, prior, weights), inner.policy)

@@ -188,6 +188,7 @@ class PolicyConfig(Settings):
         misses: take account of cells in which nothing was detected.
         saliency: saliency map that it goes by, or has as a prior over the cells: `vocus2` or `itti-koch`.
         context: what is added to the log odds of a target: `none`, `place`, `cooccurrence` or `both`.
+        context_model: fitted context, by name or file.
     """
 
     policy: str
@@ -198,6 +199,7 @@ class PolicyConfig(Settings):
     misses: bool | None = None
     saliency: SaliencyModel | None = None
     context: Context | None = None
+    context_model: str | None = None
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ class Run(ABC):
                 ("gaze", models.gaze),
             )
         }
-        fitted["context"] = None if models.context is None else models.context.digest()
+        contexts = {name: prior.digest() for name, prior in models.context.items()}
         if models.templates is not None:
             fitted["templates"] = checksum(models.templates.state_dict())
         if models.map is not None:
@@ -112,7 +112,9 @@ class Run(ABC):
         belief = {name: value for name, value in asdict(config.belief).items() if not name.endswith("model")}
         protocol = {name: value for name, value in asdict(config.protocol).items() if name != "batch"}
         saliency = asdict(config.saliency) if self.saliency_stores else None
-        policies = {name: asdict(policy) for name, policy in self.policies.items()}
+        policies = {name: {**asdict(policy), "context_model": None} for name, policy in self.policies.items()}
+        for name, policy in self.policies.items():
+            policies[name]["context_model"] = contexts.get(policy.context_model or config.belief.context_model)
         seen = [self.eye.settings(), self.scenes.fingerprint]
         return digest_of([self.task, seen, belief, fitted, protocol, policies, saliency])
 

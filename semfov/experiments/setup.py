@@ -199,7 +199,7 @@ def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
     return model
 
 
-def make_context(name: str, eye: Eye) -> ContextPrior:
+def make_context(name: str, eye: Eye | ZoomEye) -> ContextPrior:
     """The context of searches, checked to know the detector's classes."""
     prior = ContextPrior.from_pretrained(name)
     prior.check_compatible(eye.detector.classes)

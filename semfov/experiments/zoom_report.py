@@ -3,7 +3,9 @@
 import json
 from collections import defaultdict
 from statistics import mean, median
+from typing import Any
 
+import numpy as np
 import torch
 
 from semfov.errors import DataError
@@ -11,9 +13,10 @@ from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.run import finish
 from semfov.experiments.summary import announce, table
-from semfov.experiments.zoom import ZoomConfig, ZoomRun
+from semfov.experiments.zoom import FREE, UNSEEN, ZoomConfig, ZoomRun
 from semfov.experiments.zoom_decisions import decision_tables, probabilities
 from semfov.io.files import write_text
+from semfov.metrics.averages import standard_error
 from semfov.viz.reliability import plot_reliability
 from semfov.viz.style import save_figure
 
@@ -71,6 +74,7 @@ def summary(records: list[Record], run: ZoomRun) -> str:
             "",
             *table(rows),
             "",
+            *_paired(hits),
         ]
     if decided := groups.get(("decision", "ours")):
         lines += decision_tables(decided)
@@ -96,6 +100,34 @@ def recalls(finding: dict[str, list[Record]], run: ZoomRun) -> list[str]:
         *table(rows),
         "",
     ]
+
+
+def _paired(hits: dict[str, list[Record]]) -> list[str]:
+    """What contexts change, search by search, as lines of Markdown; of searches whose overview shows nothing, too."""
+    contexts = [way for way in hits if way.startswith("context ")]
+    if not contexts:
+        return []
+    rows = [["", "passes less than without", "where the overview shows no hint", "searches"]]
+    for way in contexts:
+        pairs = list(zip(hits[FREE], hits[way], strict=True))
+        saved = [[a["passes"] - b["passes"], a["scene"]] for a, b in pairs]
+        unseen = [each for each, (a, _) in zip(saved, pairs, strict=True) if a["overview"] < UNSEEN]
+        rows.append([way, _by_scene(saved), _by_scene(unseen), f"{len(saved)}, {len(unseen)}"])
+    return [
+        f"The same searches with context and without ({FREE}), mean ± standard error over pictures.",
+        "",
+        *table(rows),
+        "",
+    ]
+
+
+def _by_scene(values: list[list[Any]]) -> str:
+    """Mean of values that scenes have several of, and its standard error over scenes."""
+    scenes: dict[Any, list[float]] = defaultdict(list)
+    for value, scene in values:
+        scenes[scene].append(value)
+    means = np.array([mean(group) for group in scenes.values()])
+    return f"{means.mean():+.3f} ± {float(standard_error(means)):.3f}" if len(means) else ""
 
 
 def _curves(records: list[Record], run: ZoomRun):  # type: ignore[no-untyped-def]

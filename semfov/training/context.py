@@ -8,12 +8,15 @@ from torch import Tensor
 
 from semfov.belief import ContextPrior
 from semfov.belief.context import reaches
+from semfov.belief.context_table import write_table
+from semfov.data.word_vectors import WordVectors
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.errors import DataError, check
 from semfov.experiments.parallel import rank
 from semfov.experiments.samples import SampleSettings, collect
 from semfov.experiments.setup import make_scenes
 from semfov.experiments.summary import table
+from semfov.io.files import inside
 from semfov.training.context_weights import fit_weights, make_cases
 from semfov.training.outputs import model_path, training_of, write_outputs
 from semfov.training.places import FitContextConfig, Places, read_places
@@ -22,6 +25,8 @@ from semfov.training.places import FitContextConfig, Places, read_places
 def fit_context(config: FitContextConfig) -> None:
     """Count, judge on held-out photographs, fit the weights, and write everything."""
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
+    check(config.table is None or config.embeddings is None, "table", "none with embeddings", config.table)
+    check(config.heights is None or config.table is not None, "heights", "none without a table", config.heights)
     sampler, samples, scenes = None, None, None
     if config.weigh:
         settings = SampleSettings.of(config)
@@ -33,13 +38,14 @@ def fit_context(config: FitContextConfig) -> None:
     places = read_places(scenes, config)
     held_out = [index % config.holdout == 0 for index in range(len(places))]
     known = [place for place, out in zip(places, held_out, strict=True) if not out]
-    prior = fit(known, scenes.classes, config)
+    told = table_prior(config, scenes.classes)
+    prior = fit(known, scenes.classes, config) if told is None else told
     judged = judge(prior, [place for place, out in zip(places, held_out, strict=True) if out], config.min_objects)
     weights = dict.fromkeys(("evidence", "map"), (1.0, 1.0))
-    metadata = training_of(config, scenes)
+    metadata = training_of(config, scenes, "table", "source", "heights", "embeddings") | prior.metadata
     if sampler is not None and samples is not None:
         usable = [index for index, out in enumerate(held_out) if not out]
-        folds = cross_fit(places, usable, scenes.classes, config)
+        folds = cross_fit(places, usable, scenes.classes, config, told)
         for kind in weights:
             weights[kind] = fit_weights(make_cases(kind, sampler, samples, folds, places, config))
         metadata |= sampler.eye.settings()
@@ -48,6 +54,7 @@ def fit_context(config: FitContextConfig) -> None:
     )
     path = model_path(config, "context")
     model.save(path)
+    write_table(inside(config.out, "pictures.csv"), scenes.classes, scenes.classes, shared_pictures(known))
     text = report(judged, weights, len(known), config)
     write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
 
@@ -63,17 +70,37 @@ def fit(places: Sequence[Places], classes: Sequence[str], config: FitContextConf
     return ContextPrior(classes, place, ratio.log(), config.edges)
 
 
+def table_prior(config: FitContextConfig, classes: Sequence[str]) -> ContextPrior | None:
+    """The prior of the table that the settings name, or of the cosines of word vectors; None where all is counted."""
+    table, source, heights = config.table, config.source, config.heights
+    if config.embeddings is not None:
+        vectors = WordVectors.read(config.embeddings, classes)
+        if vectors.missing:
+            print(f"not in {config.embeddings}: {', '.join(vectors.missing)}")
+        table = inside(config.out, "similarities.csv")
+        write_table(table, classes, classes, vectors.similarity(classes, classes))
+        source = source or f"cosines of word vectors, {config.embeddings.name}, sha256 {vectors.digest}"
+    if table is None:
+        return None
+    return ContextPrior.from_table(table, classes, source=source or table.name, places=heights, edges=config.edges)
+
+
 def cross_fit(
-    places: Sequence[Places], usable: Sequence[int], classes: Sequence[str], config: FitContextConfig
+    places: Sequence[Places],
+    usable: Sequence[int],
+    classes: Sequence[str],
+    config: FitContextConfig,
+    told: ContextPrior | None = None,
 ) -> list[tuple[ContextPrior, list[int]]]:
-    """Priors, each with the photographs to weigh it on, none of which it has counted."""
+    """Priors, each with the photographs to weigh it on, none of which it has counted; what a table told is one."""
     rich = [index for index in usable if places[index].objects >= config.min_objects]
     chosen = rich[:: max(1, len(rich) // config.weigh)][: config.weigh]
     folds = []
     for fold in range(config.folds):
         part = [index for position, index in enumerate(chosen) if position % config.folds == fold]
         kept = set(usable).difference(part)
-        folds.append((fit([places[index] for index in sorted(kept)], classes, config), part))
+        prior = fit([places[index] for index in sorted(kept)], classes, config) if told is None else told
+        folds.append((prior, part))
     return folds
 
 
@@ -93,6 +120,20 @@ def occupation(places: Sequence[Places], smoothing: float) -> Tensor:
         raise DataError("data: no photograph has a class to search for; relax max_target_area")
     average = (there.sum(0) + 0.5) / (pictures.sum() + 1)
     return (there + smoothing * average) / (pictures[:, None] + smoothing)
+
+
+def shared_pictures(places: Sequence[Places], smoothing: float = 5.0) -> Tensor:
+    r"""How much likelier two classes are to be in one picture than by chance, as log ratios `(K, K)`, NaN for itself.
+
+    .. math:: v_{tj} = \ln \frac{n_{tj} + s}{n_t n_j / n + s}
+
+    with :math:`n_t` of n pictures that hold t, and :math:`n_{tj}` that hold both: context of windows
+    (`semfov.zoom.WindowContext`).
+    """
+    there = torch.stack([place.occupied.any(0)[1:] for place in places]).float()
+    alone = there.sum(0)
+    ratio = ((there.mT @ there + smoothing) / (alone[:, None] * alone / len(there) + smoothing)).log()
+    return ratio.fill_diagonal_(torch.nan)
 
 
 def count_pairs(places: Sequence[Places], chance: Tensor, edges: Sequence[float]) -> tuple[Tensor, Tensor]:
@@ -144,15 +185,23 @@ def judge(prior: ContextPrior, places: Sequence[Places], min_objects: int) -> li
     r"""How well context tells where a class is when all other objects are known.
 
     The mean of :math:`\ln \sum_{x \in \text{goal}} \mathrm{softmax}(c)(x)` over pairs of photograph and class: the log
-    probability that one fixation, drawn by context alone, lands on the target.
+    probability that one fixation, drawn by context alone, lands on the target. Of
+    other classes: `ContextPrior.permuted`.
     """
-    choices = {"nothing": (0.0, 0.0), "place": (1.0, 0.0), "co-occurrence": (0.0, 1.0), "both": (1.0, 1.0)}
+    other = prior.permuted()
+    choices = {
+        "nothing": (prior, (0.0, 0.0)),
+        "place": (prior, (1.0, 0.0)),
+        "co-occurrence": (prior, (0.0, 1.0)),
+        "both": (prior, (1.0, 1.0)),
+        "both, of other classes": (other, (1.0, 1.0)),
+    }
     rows: list[dict[str, object]] = []
-    for name, weights in choices.items():
+    for name, (context, weights) in choices.items():
         gained = []
         for place in places:
             for target in place.targets if place.objects >= min_objects else ():
-                value = prior(place.occupied[None].float(), place.grid, target, weights)[0]
+                value = context(place.occupied[None].float(), place.grid, target, weights)[0]
                 gained.append(value[place.occupied[:, target]].logsumexp(0) - value.logsumexp(0))
         if not gained:
             raise DataError("data: no photograph to judge by was held out; give more photographs")
@@ -166,10 +215,13 @@ def report(
     """What was fitted, and how it does on photographs that were held out, as Markdown."""
     rows = [[str(row["context"]), f"{row['log_likelihood']:.3f}"] for row in judged]
     beside = [[kind, f"{place:.2g}", f"{company:.2g}"] for kind, (place, company) in weights.items()]
+    counted = (
+        f"Counted on {known} photographs" if config.table is None and config.embeddings is None else "From a table"
+    )
     fitted = f"fitted on looks at {config.weigh} of" if config.weigh else "not fitted on looks at"
     return "\n".join(
         [
-            f"Counted on {known} photographs, judged on {judged[0]['pairs']} pairs of photograph and class of those "
+            f"{counted}, judged on {judged[0]['pairs']} pairs of photograph and class of those "
             f"that were held out (every {config.holdout}th): mean log probability that a fixation drawn by context "
             "alone lands on the target, where all other objects are known.",
             "",

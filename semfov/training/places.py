@@ -51,6 +51,10 @@ class FitContextConfig(Settings):
         out: folder for the model and the report.
         cache: folder for the looks (None: `out`).
         workers: processes that look (None: one for each CPU core).
+        table: CSV of classes by classes to take in place of counting (`ContextPrior.from_table`).
+        source: where the table comes from (None: its name).
+        heights: CSV of classes by heights in a picture, beside a table.
+        embeddings: file of word vectors (GloVe's or word2vec's text) whose cosines make such a table.
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
@@ -74,6 +78,10 @@ class FitContextConfig(Settings):
     out: Path = Path("runs/fit_context")
     cache: Path | None = None
     workers: Workers | None = None
+    table: Path | None = None
+    source: str | None = None
+    heights: Path | None = None
+    embeddings: Path | None = None
 
 
 @dataclass(frozen=True)

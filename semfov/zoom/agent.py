@@ -11,6 +11,7 @@ from semfov.data.large import LargePicture
 from semfov.decision import check_thresholds
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
+from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, ZoomEye
 from semfov.zoom.glances import LiveGlances
@@ -28,6 +29,7 @@ class ZoomAgent(nn.Module):
     Args:
         eye: glimpses and detects.
         evidence: what glances say of closer ones.
+        context: what is beside what, for searches; None goes by the evidence alone.
 
     Example::
 
@@ -36,13 +38,16 @@ class ZoomAgent(nn.Module):
         print(path.objects.boxes, path.passes)
     """
 
-    def __init__(self, eye: ZoomEye, evidence: GlimpseEvidence) -> None:
+    def __init__(self, eye: ZoomEye, evidence: GlimpseEvidence, context: WindowContext | None = None) -> None:
         super().__init__()
         kinds = len(eye.detector.classes)
         check(evidence.classes == kinds, "evidence", f"one for the detector's {kinds} classes", evidence.classes)
         evidence.check_compatible(eye.settings())
+        if context is not None:
+            context.prior.check_compatible(eye.detector.classes)
         self.eye = eye
         self.evidence = evidence
+        self.context = context
 
     @classmethod
     def recommended(cls, name: str = "yolox-nano", *, finest: float = 1.0, cut: Cut = "keep", **options: Any) -> Self:
@@ -98,7 +103,14 @@ class ZoomAgent(nn.Module):
         index = class_index(target, self.classes[1:], "target")
         with torch.inference_mode():
             return search(
-                self._open(picture), self.evidence, self.classes, index, passes=passes, confirm=confirm, give_up=give_up
+                self._open(picture),
+                self.evidence,
+                self.classes,
+                index,
+                passes=passes,
+                confirm=confirm,
+                give_up=give_up,
+                context=self.context,
             )
 
     def find_all(

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool, pool_all
 from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Window
@@ -63,10 +64,11 @@ class ZoomBelief:
         lattice: of the picture.
         evidence: learned, by magnification. What tells rates alone is enough to look for all objects.
         target: class 1..K, or 0 for any.
+        context: what is added to the odds of a class for what windows show of others; None adds nothing.
     """
 
-    def __init__(self, lattice: Lattice, evidence: Rates, target: int) -> None:
-        self.lattice, self.target = lattice, target
+    def __init__(self, lattice: Lattice, evidence: Rates, target: int, context: WindowContext | None = None) -> None:
+        self.lattice, self.target, self.context = lattice, target, context
         self._rates = evidence
         shape = lattice.rows, lattice.columns
         self.rate = torch.zeros(STEPS, *shape)
@@ -191,7 +193,7 @@ class ZoomBelief:
         steps, changes = torch.tensor([level - look.level]), len(self._changes)
         if kept is None:
             pooled, summary = pool_all(look.scores * part[..., None], span)
-            odds = self.evidence.presence(pooled, summary, steps.expand(len(pooled)), self.target, before)
+            odds = self._presence(pooled, summary, steps.expand(len(pooled)), before)
             return _Table(part, pooled, summary, before, odds, changes)
         pooled, summary, odds = kept.pooled, kept.summary, kept.odds
         stale = torch.zeros(len(odds), dtype=torch.bool)
@@ -210,8 +212,13 @@ class ZoomBelief:
         if bool(stale.any()):
             some = None if before is None else before[stale]
             times = steps.expand(int(stale.sum()))
-            odds[stale] = self.evidence.presence(pooled[stale], summary[stale], times, self.target, some)
+            odds[stale] = self._presence(pooled[stale], summary[stale], times, some)
         return _Table(part, pooled, summary, before, odds, changes)
+
+    def _presence(self, pooled: Tensor, summary: Tensor, steps: Tensor, before: Tensor | None) -> Tensor:
+        """Log odds of the evidence (`GlimpseEvidence.presence`), with those of the context."""
+        odds = self.evidence.presence(pooled, summary, steps, self.target, before)
+        return odds if self.context is None else odds + self.context(pooled, self.target)
 
     def _left_of(self, look: Gist) -> Tensor:
         """What is left to see in the cells of a look, `(rows, columns)`: 0 where they were looked at closely."""
@@ -242,10 +249,8 @@ class ZoomBelief:
             )
             pooled, summary = pool(look.scores, box)
             with torch.no_grad():
-                value = self.evidence.presence(
-                    pooled[None], summary[None], torch.tensor([steps]), self.target,
-                    None if value is None or look.level == 0 else value.view(1, 1),
-                )  # fmt: skip
+                known = None if value is None or look.level == 0 else value.view(1, 1)
+                value = self._presence(pooled[None], summary[None], torch.tensor([steps]), known)
         self._told[window] = float("-inf") if value is None else float(value)
         return self._told[window]
 

@@ -9,6 +9,7 @@ import torch
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, Decision, settle
 from semfov.zoom.belief import Rates, ZoomBelief
+from semfov.zoom.context import WindowContext
 from semfov.zoom.drawing import path_html
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.gist import FOUND
@@ -121,6 +122,7 @@ def look_for(
     confirm: float = 0.3,
     slices: Sequence[Window] | None = None,
     closest: bool = False,
+    context: WindowContext | None = None,
 ) -> Iterator[Turn]:
     """Look for one object of a class, glance by glance; ends when a look confirms it, or nothing is left to look at.
 
@@ -131,8 +133,9 @@ def look_for(
         confirm: score that confirms it.
         slices: if given, only looks at these confirm it; else looks at all magnifications do.
         closest: only looks at the largest magnification confirm it.
+        context: what else is known of what is beside what.
     """
-    belief, done = ZoomBelief(glances.lattice, evidence, target), set[Window]()
+    belief, done = ZoomBelief(glances.lattice, evidence, target, context), set[Window]()
     window, worth = on_lattice(glances.lattice, (0, 0, 0)), float("inf")
     allowed = None if slices is None else set(slices)
     while True:
@@ -183,6 +186,7 @@ def search(
     passes: int = 24,
     confirm: float | None = None,
     give_up: float | None = None,
+    context: WindowContext | None = None,
 ) -> ZoomPath:
     """Search a picture for one object of a class, and decide (`semfov.decision.settle`).
 
@@ -198,13 +202,14 @@ def search(
         passes: of the detector, at most.
         confirm: probability that the picture holds the target (None: the evidence's).
         give_up: probability that a look shows it (None: the evidence's).
+        context: as for `look_for`.
     """
     thresholds = (evidence.thresholds or DEFAULTS).changed(confirm, give_up)
     seen: list[Glance] = []
     values: list[float] = []
     tally: Tally | None = None
     ended, presence = 0, 0.0
-    for glance, value, ahead, belief in look_for(glances, evidence, target, confirm=float("inf")):
+    for glance, value, ahead, belief in look_for(glances, evidence, target, confirm=float("inf"), context=context):
         tally = tally or Tally(belief)
         tally.add(glance)
         seen.append(glance)

@@ -79,6 +79,28 @@ def test_search(run, photo, tmp_path):
     assert not (tmp_path / "out" / "belief_bars.png").exists()
 
 
+def test_a_description_is_spread_over_the_classes(run, photo, tmp_path):
+    vectors = tmp_path / "vectors.txt"
+    vectors.write_text("red 1 0.1\nwine 0 1\nglass 0.5 1\ncrimson 1 0\n")
+    described = ["--target", "something crimson", "--embeddings", vectors]
+    code, printed = run(photo, *described, "--start", 47, "--draw", "[]")
+    assert code == 0
+    assert "“something crimson” may mean: red 1.00" in printed.out
+    assert "“red” found after 1 gaze shift" in printed.out
+    vectors.write_text("red 1 0.8\nwine 0.8 1\nglass 1 1\ncrimson 1 0.9\n")
+    code, printed = run(photo, *described, "--start", 47, "--draw", "[]")
+    assert code == 0
+    assert re.search(r"may mean: (red|wine glass) 1\.00, (red|wine glass) 0\.\d\d", printed.out)
+    assert "“red” found" in printed.out
+    code, printed = run(photo, "--target", "something crimson")
+    assert code == 1
+    assert "unknown class" in printed.err
+    assert "--embeddings" in printed.err
+    code, printed = run(photo, "--target", "zebra stripes", "--embeddings", vectors)
+    assert code == 1
+    assert "zebra stripes" in printed.err
+
+
 @pytest.mark.parametrize("task", ["search", "exploration"])
 def test_only_what_is_asked_for_is_drawn(run, photo, tmp_path, task):
     arguments = (photo, "--target", "red", "--start", 47) if task == "search" else (photo, "--explore", "--shifts", 1)

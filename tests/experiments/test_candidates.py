@@ -1,5 +1,6 @@
 """From a policy's settings to observer, policy and models."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -113,7 +114,7 @@ def test_a_run_loads_what_its_policies_need_and_nothing_else(asked):
         gaze_model="gaze",
     )
     models = load_models(every, "search", eye)
-    assert models == Models("observation", "target_evidence", "context", "learned_gaze")
+    assert models == Models("observation", "target_evidence", {"company": "context"}, "learned_gaze")
     assert sorted(asked) == [
         ("context", "company"),
         ("learned_gaze", "gaze"),
@@ -126,12 +127,24 @@ def test_context_is_loaded_where_a_policy_or_the_run_asks_for_it(asked):
     eye = SimpleNamespace()
 
     def loads(belief, *choices):
-        return load_models(SearchConfig(policies=choices, belief=belief), "search", eye).context is not None
+        return list(load_models(SearchConfig(policies=choices, belief=belief), "search", eye).context)
 
-    assert loads(BeliefConfig(), "random", PolicyConfig("target-evidence", context="both"))
-    assert loads(BeliefConfig(context="place"), "target-evidence")
-    assert not loads(BeliefConfig(), "target-evidence", PolicyConfig("non-predictive", footprint="soft"))
-    assert not loads(BeliefConfig(context="place"), PolicyConfig("target-evidence", context="none"))
+    both = PolicyConfig("target-evidence", context="both")
+    assert loads(BeliefConfig(), "random", both) == ["coco"]
+    assert loads(BeliefConfig(context="place"), "target-evidence") == ["coco"]
+    assert loads(BeliefConfig(), "target-evidence", PolicyConfig("non-predictive", footprint="soft")) == []
+    assert loads(BeliefConfig(context="place"), PolicyConfig("target-evidence", context="none")) == []
+    own = replace(both, context_model="mine")
+    assert loads(BeliefConfig(context_model="theirs"), both, own, both) == ["theirs", "mine"]
+
+
+def test_every_policy_has_its_own_context(context):
+    evidence = TargetEvidence(8, 6, components=3)
+    other = context.permuted(1)
+    given = {"coco": context, "mine": other}
+    for name, prior in ((None, context), ("mine", other)):
+        policy = PolicyConfig("target-evidence", context="both", context_model=name)
+        assert strategy(policy, evidence=evidence, context=given).observer.prior is prior
 
 
 @pytest.mark.parametrize("config", [SearchConfig, ExploreConfig])
@@ -199,7 +212,7 @@ def test_learned_beliefs_come_with_their_policies():
 
 
 def test_context_is_added_where_a_policy_asks_for_it(context):
-    given = {"context": context, "evidence": TargetEvidence(4, 4)}
+    given = {"context": {"coco": context}, "evidence": TargetEvidence(4, 4)}
     assert isinstance(strategy("non-predictive-raw", **given).observer, observers.Semantic)
     parts = {"both": (1.0, 2.0), "place": (1.0, 0.0), "cooccurrence": (0.0, 2.0)}
     for part, expected in parts.items():

@@ -86,10 +86,11 @@ def test_labels_are_unique(task):
 def test_labels_say_what_differs_from_a_preset():
     central = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
     assert label(central, "search") == "non-predictive-raw, tempering 0.25, footprint box_centre"
-    everything = PolicyConfig("predictive", "calibrated", 1.0, "soft", "closest", True, "vocus2", "none")
-    assert len(fields(PolicyConfig)) == 8
+    everything = PolicyConfig("predictive", "calibrated", 1.0, "soft", "closest", True, "vocus2", "none", "mine")
+    assert len(fields(PolicyConfig)) == 9
     expected = (
-        "predictive-calibrated, tempering 1, footprint soft, memory closest, misses, saliency vocus2, context none"
+        "predictive-calibrated, tempering 1, footprint soft, memory closest, misses, saliency vocus2, "
+        "context none, context_model mine"
     )
     assert label(everything, "search") == expected
     assert label(PolicyConfig("saliency", saliency="itti-koch", misses=False), "search") == "itti-koch, misses false"

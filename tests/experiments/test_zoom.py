@@ -1,10 +1,12 @@
 """The experiment with large pictures: the same with and without a store, resumed, and its orders."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 
+from semfov.belief import ContextPrior
 from semfov.detection.detector import Detector
 from semfov.detection.scores import Candidates
 from semfov.errors import InputError
@@ -53,8 +55,6 @@ def config(tmp_path, monkeypatch):
 
 
 def test_the_store_changes_nothing(config):
-    from dataclasses import replace
-
     fresh = ZoomRun(replace(config, store=False)).outcomes(0)[0]
     written = ZoomRun(config).outcomes(0)[0]
     run = ZoomRun(config)
@@ -185,3 +185,30 @@ def test_slices_are_those_of_sahi():
     corners = [window.within for window in windows]
     assert corners[0] == (0, 0, 640, 640)
     assert corners[-1] == (3200, 1520, 3840, 2160)
+
+
+def test_contexts_are_compared_search_by_search(config, tmp_path):
+    generator = torch.Generator().manual_seed(1)
+    pairs = torch.randn(4, 4, 1, generator=generator)
+    prior = ContextPrior(["person", "cat", "cup"], torch.zeros(4, 1, 1), pairs, [])
+    prior.save(tmp_path / "noise.safetensors")
+    config = replace(config, contexts=(str(tmp_path / "noise.safetensors"),), context_weight=5.0)
+    run = ZoomRun(config)
+    assert list(run.contexts) == ["noise", "noise, permuted"]
+    records = [record for index in range(len(run.scenes)) for record in run.outcomes(index)[0]]
+    hits = {}
+    for record in records:
+        if record["measure"] == "first hit":
+            hits.setdefault(record["way"], []).append(record)
+    without, noise = hits["ours, free windows"], hits["context noise"]
+    assert [(r["scene"], r["target"]) for r in noise] == [(r["scene"], r["target"]) for r in without]
+    scenes = {}
+    for a, b in zip(without, noise, strict=True):
+        scenes.setdefault(a["scene"], []).append(a["passes"] - b["passes"])
+    means = [sum(each) / len(each) for each in scenes.values()]
+    text = zoom_report.summary(records, run)
+    row = next(line for line in text.splitlines() if line.startswith("| context noise ") and "±" in line)
+    assert f"{sum(means) / len(means):+.3f} ± " in row
+    plain = replace(config, contexts=())
+    assert ZoomRun(plain).settings_key != run.settings_key
+    assert "± standard error" not in zoom_report.summary([r for r in records if "context" not in r["way"]], run)

@@ -1,13 +1,15 @@
 """`python -m train.fit_context`: counts and ratios against loops, weights against a search, the command itself."""
 
 import json
+import math
 
 import pytest
 import torch
 
 from semfov import Grid
 from semfov.belief import ContextPrior
-from semfov.training.context import count_pairs, cross_fit, judge, occupation, shrunk_ratio
+from semfov.belief.context_table import read_table
+from semfov.training.context import count_pairs, cross_fit, judge, occupation, shared_pictures, shrunk_ratio
 from semfov.training.context_weights import SIZES, Cases, fit_weights, hit, landed, likeliest_weights
 from semfov.training.places import FitContextConfig, Places
 from train.fit_context import main
@@ -139,5 +141,42 @@ def test_command_writes_a_prior_from_annotations(tmp_path):
     assert prior.weights == {"evidence": (1.0, 1.0), "map": (1.0, 1.0)}
     assert prior.place.shape == (81, 10, 10)
     rows = json.loads((tmp_path / "judged.json").read_text())
-    assert [row["context"] for row in rows] == ["nothing", "place", "co-occurrence", "both"]
+    names = ["nothing", "place", "co-occurrence", "both", "both, of other classes"]
+    assert [row["context"] for row in rows] == names
     assert "not fitted on looks" in (tmp_path / "report.md").read_text()
+    # What it counted by pictures is a table that the same command takes.
+    table = ["--table", str(tmp_path / "pictures.csv"), "--source", "pictures", "--name", "shared"]
+    assert main([*call[:-1], str(tmp_path / "again"), *table]) == 0
+    shared = ContextPrior.from_pretrained(tmp_path / "again" / "shared.safetensors")
+    assert shared.metadata["table"]["source"] == "pictures"
+    assert str(tmp_path) not in json.dumps(shared.metadata)
+    assert "From a table" in (tmp_path / "again" / "report.md").read_text()
+
+
+def test_shared_pictures_equal_a_loop(places):
+    got = shared_pictures(places, 2.0)
+    sets = [set(place.occupied.any(0).nonzero()[:, 0].tolist()) for place in places]
+    for t in range(1, 4):
+        for j in range(1, 4):
+            both = sum(t in each and j in each for each in sets)
+            alone = sum(t in each for each in sets) * sum(j in each for each in sets) / len(sets)
+            expected = math.nan if t == j else math.log((both + 2) / (alone + 2))
+            assert float(got[t - 1, j - 1]) == pytest.approx(expected, abs=1e-5, nan_ok=True)
+
+
+def test_word_vectors_make_a_table(tmp_path):
+    words = {"person": "1 0", "dog": "1 1", "cat": "1 0.9", "car": "-1 0"}
+    vectors = tmp_path / "vectors.txt"
+    vectors.write_text("".join(f"{word} {vector}\n" for word, vector in words.items()))
+    call = ["--data.limit", "8", "--holdout", "2", "--min_objects", "1", "--out", str(tmp_path / "out")]
+    assert main([*call, "--embeddings", str(vectors)]) == 0
+    prior = ContextPrior.from_pretrained(tmp_path / "out" / "coco.safetensors")
+    table = read_table(tmp_path / "out" / "similarities.csv")
+    dog, cat, bus = (table.rows.index(name) for name in ("dog", "cat", "bus"))
+    cosine = 1.9 / math.sqrt(2 * 1.81)
+    assert float(table.values[dog, cat]) == pytest.approx(cosine, abs=1e-4)
+    assert table.values[bus].isnan().all()
+    near = prior.cooccurrence[1:, 1:, 0]
+    assert float(near[dog, cat]) > float(near[dog, table.rows.index("car")])
+    assert bool((near[bus] == 0).all())
+    assert main([*call, "--embeddings", str(vectors), "--table", str(vectors)]) == 1

@@ -1,5 +1,6 @@
 """Observers: how looks become a belief, and which looks count."""
 
+from semfov.belief.observers.any_of import AnyBelief, AnyLook, AnyOf
 from semfov.belief.observers.base import Look, Observer
 from semfov.belief.observers.context import Context, ContextBelief
 from semfov.belief.observers.landing import Landing, LandingBelief, LandingLook
@@ -8,6 +9,9 @@ from semfov.belief.observers.semantic import Memory, Semantic, SemanticLook
 from semfov.belief.observers.target import Target, TargetBelief
 
 __all__ = [
+    "AnyBelief",
+    "AnyLook",
+    "AnyOf",
     "Context",
     "ContextBelief",
     "Landing",

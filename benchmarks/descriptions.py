@@ -1,0 +1,57 @@
+"""Whether word vectors know what a description means: `python -m benchmarks.descriptions --embeddings FILE`.
+
+Other names of COCO's classes (`semfov.data.synonyms`) stand for descriptions: of each the class is known. The first
+table has how often the class is among the nearest ones, the second the mean log probability of the right class by the
+temperature of `semfov.data.spread`. Names that share a word with their class, and those that mean several, are left
+out.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from benchmarks.tables import table
+from semfov.data.naming import alike
+from semfov.data.synonyms import names_of
+from semfov.data.word_vectors import TEMPERATURE, WordVectors, words_of
+from semfov.detection.coco_classes import COCO_CLASSES
+
+NEAREST = (1, 3, 5, 10)
+TEMPERATURES = (0.04, 0.06, 0.08, 0.1, 0.15)
+
+
+def cases() -> list[tuple[str, int]]:
+    """Other names, each with the place of its one class."""
+    pairs = [(other, alike(other, COCO_CLASSES)) for name in COCO_CLASSES for other in names_of(name)]
+    return [
+        (other, places[0])
+        for other, places in pairs
+        if len(places) == 1 and not set(words_of(other)) & set(words_of(COCO_CLASSES[places[0]]))
+    ]
+
+
+def main() -> None:
+    """Measure, and print tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--embeddings", type=Path, required=True, help="word vectors in GloVe's or word2vec's text format"
+    )
+    path = parser.parse_args().embeddings
+    asked = cases()
+    vectors = WordVectors.read(path, [*COCO_CLASSES, *(other for other, _ in asked)])
+    known = [(other, place) for other, place in asked if vectors.knows(other)]
+    near = vectors.similarity([other for other, _ in known], COCO_CLASSES).nan_to_num(-1)
+    right = torch.tensor([place for _, place in known])
+    rank = (near >= near.gather(1, right[:, None])).sum(1)
+    missing = ", ".join(vectors.missing) or "none"
+    print(f"{len(known)} other names of COCO's classes, {path.name}; words without a vector: {missing}\n")
+    shares = [f"{100 * float((rank <= count).double().mean()):.1f}" for count in NEAREST]
+    print(table(["", *(f"among the nearest {count}, %" for count in NEAREST)], [["right class", *shares]]))
+    chances = [(near / t).log_softmax(-1).gather(1, right[:, None]).mean() for t in TEMPERATURES]
+    head = [f"{t:g}{' (used)' if t == TEMPERATURE else ''}" for t in TEMPERATURES]
+    print("", table(["temperature", *head], [["log probability", *(f"{float(c):.3f}" for c in chances)]]), sep="\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,48 @@
+"""A ROS 2 node that searches what a camera sees: it publishes what it saw, and where the camera should look next.
+
+Run it where ROS 2 is sourced: python -m examples.ros_node --ros-args -p target:=cup -r image:=/camera/image_raw
+"""
+
+import rclpy
+from geometry_msgs.msg import PointStamped
+from rclpy.node import Node
+from sensor_msgs.msg import Image
+from vision_msgs.msg import Detection2D, Detection2DArray, ObjectHypothesisWithPose
+
+import semfov
+from semfov.io import ros
+
+
+class GazeNode(Node):
+    """Looks once at every image, and moves its gaze."""
+
+    def __init__(self) -> None:
+        super().__init__("semfov_gaze")
+        target = self.declare_parameter("target", "cup").value
+        detector = self.declare_parameter("detector", "yolov3-tiny").value
+        self.agent = semfov.ActivePerception.recommended(detector)
+        self.live = self.agent.live(target)
+        self.seen = self.create_publisher(Detection2DArray, "detections", 1)
+        self.gaze = self.create_publisher(PointStamped, "gaze", 1)
+        self.create_subscription(Image, "image", self.look, 1)
+
+    def look(self, message: Image) -> None:
+        """See, believe, and say where to look next."""
+        moment = self.live.step(ros.picture(message))
+        of = {"stamp": message.header.stamp, "frame": message.header.frame_id}
+        found = ros.detection_array(moment.detections, self.agent.classes[1:], **of)
+        self.seen.publish(ros.fill(Detection2DArray(), found, Detection2D, ObjectHypothesisWithPose))
+        following = moment.grid.centres[moment.next_cell]
+        self.gaze.publish(ros.fill(PointStamped(), ros.gaze_point(following, **of)))
+        if moment.decision is not None and moment.decision.outcome == "found":
+            self.get_logger().info(f"found, probability {moment.decision.probability:.2f}")
+
+
+def main() -> None:
+    """Look until the node is stopped."""
+    rclpy.init()
+    rclpy.spin(GazeNode())
+
+
+if __name__ == "__main__":
+    main()

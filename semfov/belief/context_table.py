@@ -1,0 +1,129 @@
+"""Tables of classes by classes, or by places, as context is made of."""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from semfov.data.naming import alike
+from semfov.errors import DataError, InputError
+from semfov.io.files import check_regular, write_text
+
+_MOST = 10_000
+_LARGEST = 1e3
+
+
+@dataclass(frozen=True)
+class NamedTable:
+    """A table of numbers.
+
+    Attributes:
+        rows: names of the rows.
+        columns: names of the columns.
+        values: `(rows, columns)`, NaN where unknown.
+    """
+
+    rows: tuple[str, ...]
+    columns: tuple[str, ...]
+    values: Tensor
+
+
+def read_table(path: str | PathLike[str]) -> NamedTable:
+    """A table from CSV: names in the first row and in the first column, numbers or nothing elsewhere.
+
+    Raises:
+        DataError: the file is missing, or is no such table; the message has the line.
+    """
+    check_regular(path)
+    try:
+        with Path(path).open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file)
+            lines = [(reader.line_num, line) for line in reader if any(cell.strip() for cell in line)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"{path}: cannot be read as CSV: {error}") from error
+    if not 2 <= len(lines) <= _MOST + 1 or not 2 <= len(lines[0][1]) <= _MOST + 1:
+        raise DataError(f"{path}: expected names in the first row and in the first column, and 1 to {_MOST:,} of each")
+    columns = [name.strip() for name in lines[0][1][1:]]
+    rows, values = [], []
+    for number, (name, *cells) in lines[1:]:
+        if len(cells) != len(columns):
+            raise DataError(f"{path}, line {number}: expected {len(columns)} values after the name, got {len(cells)}")
+        rows.append(name.strip())
+        values.append([_number(cell, f"{path}, line {number}") for cell in cells])
+    for names, what in ((rows, "column"), (columns, "row")):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice or "" in names:
+            raise DataError(
+                f"{path}: expected different names in the first {what}, got {', '.join(twice) or 'no name'}"
+            )
+    return NamedTable(tuple(rows), tuple(columns), torch.tensor(values))
+
+
+def write_table(path: Path, rows: Sequence[str], columns: Sequence[str], values: Tensor) -> None:
+    """Write a table as `read_table` reads it, whole or not at all; NaN is left empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["", *columns])
+    for name, line in zip(rows, values.tolist(), strict=True):
+        writer.writerow([name, *("" if math.isnan(value) else f"{value:.6g}" for value in line)])
+    write_text(path, text.getvalue())
+
+
+def _number(cell: str, where: str) -> float:
+    if not cell.strip():
+        return math.nan
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.inf
+    if not abs(value) <= _LARGEST:
+        raise DataError(f"{where}: expected numbers from -1000 to 1000, or nothing where unknown, got {cell[:40]!r}")
+    return value
+
+
+def company_of(table: NamedTable, classes: Sequence[str], bands: int) -> tuple[Tensor, list[str]]:
+    """Log ratios `(K+1, K+1, N)` of `ContextPrior.from_table`, and the classes that the table does not know.
+
+    Args:
+        table: of targets by other classes.
+        classes: names of the K classes.
+        bands: N.
+
+    Raises:
+        InputError: it knows none of them.
+    """
+    known = _picked(_picked(table.values, table.rows, classes).mT, table.columns, classes).mT
+    known.fill_diagonal_(torch.nan)
+    missing = [name for name, row, column in zip(classes, known, known.mT, strict=True)
+               if row.isnan().all() and column.isnan().all()]  # fmt: skip
+    if len(missing) == len(classes):
+        some = ", ".join(table.rows[:5])
+        raise InputError(f"classes: expected some that the table knows ({some}, …), got {', '.join(classes[:5])}, …")
+    relative = known - known.nanmean(1, keepdim=True) - known.nanmean(0, keepdim=True) + known.nanmean()
+    profile = torch.linspace(1, -1, bands) if bands > 1 else torch.ones(1)
+    company = torch.zeros(len(classes) + 1, len(classes) + 1, bands)
+    company[1:, 1:] = relative.nan_to_num(0)[..., None] * profile
+    return company, missing
+
+
+def places_of(table: NamedTable, classes: Sequence[str]) -> Tensor:
+    """Log odds of places `(K+1, R, R)`, each less the mean of its class, from a table of classes by heights."""
+    known = _picked(table.values, table.rows, classes)
+    relative = (known - known.nanmean(1, keepdim=True)).nan_to_num(0)
+    rows = relative.shape[1]
+    place = torch.zeros(len(classes) + 1, rows, rows)
+    place[1:] = relative[..., None].expand(-1, -1, rows)
+    return place
+
+
+def _picked(values: Tensor, names: Sequence[str], classes: Sequence[str]) -> Tensor:
+    """Rows for the classes: of the name itself, or the mean of those of its synonyms; NaN where there is none."""
+    nothing = torch.full_like(values[0], torch.nan)
+    found = [alike(name, names) for name in classes]
+    return torch.stack([values[places].nanmean(0) if places else nothing for places in found])

@@ -1,0 +1,176 @@
+"""What is seen, and where the gaze is, in the shape of ROS 2 messages: dictionaries, and messages filled from them.
+
+Nothing here imports ROS. The dictionaries have the fields of `vision_msgs/Detection2DArray` (version 4 of the package)
+and `geometry_msgs/PointStamped`; a node of its own is in `examples/ros_node.py`.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from semfov.errors import check, check_number, check_shape
+
+Values = dict[str, Any]
+Message = TypeVar("Message")
+
+_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
+_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
+
+
+class Seen(Protocol):
+    """What `semfov.Detections` are made of."""
+
+    @property
+    def boxes(self) -> Tensor:
+        """`(..., L, 4)`."""
+
+    @property
+    def scores(self) -> Tensor:
+        """`(..., L, K+1)`."""
+
+    @property
+    def mask(self) -> Tensor:
+        """`(..., L)`."""
+
+
+def header(stamp: Any, frame: str) -> Values:
+    """A `std_msgs/Header`.
+
+    Args:
+        stamp: seconds, or another message's `header.stamp`.
+        frame: name of the frame of reference.
+
+    >>> header(1.5, "camera")
+    {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'camera'}
+    """
+    if hasattr(stamp, "nanosec"):
+        return {"stamp": {"sec": int(stamp.sec), "nanosec": int(stamp.nanosec)}, "frame_id": frame}
+    check_number(stamp, "stamp", 0, 2**31 - 1)
+    total = round(float(stamp) * 1e9)
+    return {"stamp": {"sec": total // 10**9, "nanosec": total % 10**9}, "frame_id": frame}
+
+
+def detection_array(
+    detections: Seen, classes: Sequence[str], *, stamp: Any, frame: str, least: float = 0.1, most: int = 5
+) -> Values:
+    """A `vision_msgs/Detection2DArray`: boxes in pixels, each with its likeliest classes.
+
+    Args:
+        detections: `semfov.Detections` of one image, with or without a dimension of the batch.
+        classes: names of the K classes, without background.
+        stamp: of the image, as for `header`.
+        frame: of the image.
+        least: detections and hypotheses of a smaller score are left out.
+        most: hypotheses of a detection.
+
+    Raises:
+        InputError: the detections are of several images, or of other classes.
+    """
+    boxes, scores, mask = detections.boxes, detections.scores, detections.mask
+    check(mask.ndim == 1 or len(mask) == 1, "detections", "those of one image", f"a batch of {len(mask)}")
+    check_shape(scores, "detections.scores", None, len(classes) + 1)
+    if mask.ndim > 1:
+        boxes, scores, mask = boxes[0], scores[0], mask[0]
+    head, found = header(stamp, frame), []
+    for box, each in zip(boxes[mask].tolist(), scores[mask, 1:], strict=True):
+        top = each.topk(min(most, len(classes)))
+        hypotheses = [
+            {"hypothesis": {"class_id": classes[index], "score": score}}
+            for score, index in zip(top.values.tolist(), top.indices.tolist(), strict=True)
+            if score >= least
+        ]
+        if hypotheses:
+            found.append({"header": head, "results": hypotheses, "bbox": _bounds(box), "id": ""})
+    return {"header": head, "detections": found}
+
+
+def _bounds(box: Sequence[float]) -> Values:
+    """A `vision_msgs/BoundingBox2D`; its centre is in pixels from the image's left and upper edge, as the box is."""
+    x1, y1, x2, y2 = box
+    position = {"x": (x1 + x2) / 2, "y": (y1 + y2) / 2}
+    return {"center": {"position": position, "theta": 0.0}, "size_x": x2 - x1, "size_y": y2 - y1}
+
+
+def gaze_point(
+    fixation: Tensor | Sequence[float],
+    *,
+    stamp: Any,
+    frame: str,
+    camera: tuple[float, float, float, float] | None = None,
+) -> Values:
+    r"""A `geometry_msgs/PointStamped`: where the gaze is.
+
+    .. math:: \left( \frac{u - c_x}{f_x}, \; \frac{v - c_y}{f_y}, \; 1 \right)
+
+    in the camera's optical frame (z ahead, x right, y down), for a pinhole camera; a head that turns there looks at it.
+
+    Args:
+        fixation: `(u, v)` in pixels, centres at integers.
+        stamp: of the image, as for `header`.
+        frame: of the image; with a camera, its optical frame.
+        camera: `(f_x, f_y, c_x, c_y)` in pixels, of `sensor_msgs/CameraInfo.k`; None leaves the point in pixels, z 0.
+
+    >>> gaze_point((420.0, 240.0), stamp=0, frame="camera_optical", camera=(500.0, 500.0, 320.0, 240.0))["point"]
+    {'x': 0.2, 'y': 0.0, 'z': 1.0}
+    """
+    u, v = (float(value) for value in fixation)
+    point = {"x": u, "y": v, "z": 0.0}
+    if camera is not None:
+        width, height, centre_x, centre_y = (float(value) for value in camera)
+        check(width > 0 and height > 0, "camera", "focal lengths above 0", (width, height))
+        point = {"x": (u - centre_x) / width, "y": (v - centre_y) / height, "z": 1.0}
+    return {"header": header(stamp, frame), "point": point}
+
+
+def fill(message: Message, values: Mapping[str, Any], *kinds: type) -> Message:
+    """Fill a message from a dictionary, field by field, and return it.
+
+    Args:
+        message: an instance of a message class of ROS 2; it tells the kinds of its fields itself
+            (`get_fields_and_field_types`), which is how lists get elements of the right kind.
+        values: by field; what is not among them stays as it is.
+        kinds: message classes that lists have as elements, such as `Detection2D` and `ObjectHypothesisWithPose`.
+
+    Raises:
+        InputError: the message has no such field, or the class of a list's elements is not among the kinds.
+    """
+    fields: Mapping[str, str] = message.get_fields_and_field_types()  # type: ignore[attr-defined]
+    for name, value in values.items():
+        check(name in fields, "values", f"fields of {type(message).__name__} ({', '.join(fields)})", repr(name))
+        if isinstance(value, Mapping):
+            fill(getattr(message, name), value, *kinds)
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            wanted = fields[name].removeprefix("sequence<").partition(">")[0].partition("/")[2].split(",")[0]
+            kind = next((kind for kind in kinds if kind.__name__ == wanted), None)
+            check(
+                kind is not None, "kinds", f"{wanted} among them", ", ".join(each.__name__ for each in kinds) or "none"
+            )
+            assert kind is not None
+            setattr(message, name, [fill(kind(), each, *kinds) for each in value])
+        else:
+            setattr(message, name, value)
+    return message
+
+
+def picture(message: Any) -> NDArray[np.uint8]:
+    """The pixels of a `sensor_msgs/Image`, RGB `(h, w, 3)`, as `semfov.as_image` takes them.
+
+    Args:
+        message: with `encoding` rgb8, bgr8, rgba8, bgra8 or mono8; rows may be padded.
+
+    Raises:
+        InputError: it has another encoding, or fewer bytes than its size needs.
+    """
+    encoding, step = str(message.encoding), int(message.step)
+    height, width = int(message.height), int(message.width)
+    check(
+        encoding in _CHANNELS, "encoding", ", ".join(_CHANNELS), f"{encoding!r}; convert it by image_proc or cv_bridge"
+    )
+    size, data = _BYTES[encoding], np.frombuffer(bytes(message.data), np.uint8)
+    whole = height > 0 and width > 0 and step >= width * size and len(data) >= height * step
+    check(whole, "data", f"{width} × {height} pixels of {size} bytes", f"{len(data)} bytes, {step} in a row")
+    rows = data[: height * step].reshape(height, step)[:, : width * size].reshape(height, width, size)
+    return np.ascontiguousarray(rows[..., list(_CHANNELS[encoding])])

@@ -1,0 +1,157 @@
+"""A language model behind the common chat-completions interface: one question, one answer, tokens counted."""
+
+import http.client
+import json
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlsplit
+
+from semfov.errors import DataError, InputError, check
+
+_MOST = 1 << 20  # bytes of a response
+_AGAIN = (408, 409, 425, 429, 500, 502, 503, 504, 529)
+_LONGEST_WAIT = 60.0
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What a server answers.
+
+    Attributes:
+        text: the answer.
+        model: that the server says has answered.
+        prompt_tokens: of the question, as the server counts them; 0 where it does not.
+        completion_tokens: of the answer, likewise.
+    """
+
+    text: str
+    model: str
+    prompt_tokens: int
+    completion_tokens: int
+
+
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """A key must not go to where an answer points."""
+
+    def redirect_request(self, *args: Any) -> None:
+        """Follow nothing."""
+        return
+
+
+class ChatServer:
+    """A server with the chat-completions interface, asked at temperature 0.
+
+    Args:
+        url: of the interface, up to `/v1`; `/chat/completions` is added.
+        model: name of the model, as the server knows it.
+        key: that the server wants; None for none.
+        tokens: of an answer, at most.
+        timeout: seconds to wait for an answer.
+        retries: times that a question is asked again, where the server is busy, fails or cannot be reached.
+        wait: seconds before the first of them; each further wait is twice as long.
+        sleep: what waits.
+
+    Example::
+
+        server = ChatServer("http://127.0.0.1:8080/v1", "my-model")
+        print(server.ask("What is usually beside a fork?").text)
+    """
+
+    def __init__(
+        self,
+        url: str,
+        model: str,
+        key: str | None = None,
+        *,
+        tokens: int = 120,
+        timeout: float = 60.0,
+        retries: int = 5,
+        wait: float = 1.0,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        parts = urlsplit(url)
+        check(parts.scheme in ("http", "https") and bool(parts.netloc), "url", "http://… or https://…", repr(url))
+        check(key is None or (key.isascii() and key.isprintable()), "key", "one line of plain characters", "others")
+        self.url, self.model = f"{url.rstrip('/')}/chat/completions", model
+        self.tokens, self.timeout, self.retries, self.wait = tokens, timeout, retries, wait
+        self._sleep = sleep
+        self._headers = {"Content-Type": "application/json"} | ({"Authorization": f"Bearer {key}"} if key else {})
+        self._opener = urllib.request.build_opener(_NoRedirects)
+
+    def request(self, prompt: str) -> dict[str, Any]:
+        """What is sent for a question."""
+        messages = [{"role": "user", "content": prompt}]
+        return {"model": self.model, "messages": messages, "temperature": 0, "max_tokens": self.tokens}
+
+    def ask(self, prompt: str) -> Reply:
+        """The answer to a question.
+
+        Raises:
+            InputError: the server refuses the key, or does not know the address or the model.
+            DataError: it cannot be reached, refuses the question, or answers what is no chat completion.
+        """
+        body = json.dumps(self.request(prompt)).encode()
+        for attempt in range(self.retries + 1):
+            try:
+                message = urllib.request.Request(self.url, body, self._headers)
+                with self._opener.open(message, timeout=self.timeout) as response:
+                    return _reply(response.read(_MOST), self.url, self.model)
+            except urllib.error.HTTPError as error:
+                told = _told(error)
+                if error.code not in _AGAIN:
+                    raise _refusal(error.code, told, self.url, self.model) from None
+                failure, asked = f"HTTP {error.code}{told}", error.headers.get("Retry-After", "")
+            except (OSError, http.client.HTTPException) as error:
+                failure, asked = str(getattr(error, "reason", None) or error or type(error).__name__), ""
+            if attempt < self.retries:
+                pause = float(asked) if asked.isdecimal() else self.wait * 2**attempt
+                self._sleep(min(pause, _LONGEST_WAIT))
+        raise DataError(
+            f"{self.url}: no answer after {self.retries + 1} tries, the last: {failure}; is the server running? The "
+            "same command goes on where this one stopped"
+        )
+
+
+def _reply(body: bytes, url: str, model: str) -> Reply:
+    try:
+        answer = json.loads(body)
+        text = answer["choices"][0]["message"]["content"]
+        usage = answer.get("usage") or {}
+        counts = [int(usage.get(name) or 0) for name in ("prompt_tokens", "completion_tokens")]
+        if not isinstance(text, str):
+            raise TypeError("no text")
+        return Reply(text, str(answer.get("model") or model), *counts)
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        start = body[:120].decode(errors="replace")
+        raise DataError(f"{url}: expected a chat completion with choices[0].message.content, got {start!r}") from None
+
+
+def _told(error: urllib.error.HTTPError) -> str:
+    """What the server says is wrong."""
+    try:
+        body = error.read(_MOST)
+    except (OSError, http.client.HTTPException):
+        return ""
+    try:
+        told = json.loads(body)["error"]
+        message = told["message"] if isinstance(told, dict) else told
+    except (ValueError, LookupError, TypeError, RecursionError):
+        message = body.decode(errors="replace")
+    plain = " ".join(str(message).split())
+    return f" ({plain[:200]})" if plain else ""
+
+
+def _refusal(code: int, told: str, url: str, model: str) -> InputError | DataError:
+    if code in (401, 403):
+        return InputError(
+            f"key: {url} refuses it with HTTP {code}{told}; set the environment variable that `key` names"
+        )
+    if code == 404:
+        return InputError(f"url, model: {url} knows no such address, or no model {model!r}: HTTP 404{told}")
+    if 300 <= code < 400:
+        return InputError(f"url: {url} points elsewhere with HTTP {code}, which is not followed; give that address")
+    return DataError(f"{url}: the question is refused with HTTP {code}{told}")

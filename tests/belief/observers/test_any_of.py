@@ -1,0 +1,102 @@
+"""Searches for any of several classes: their beliefs together, against the one observer for each."""
+
+import pytest
+import torch
+
+from semfov import Detections, Grid
+from semfov.belief import TargetEvidence
+from semfov.belief.observers import AnyOf, Semantic, Target
+from semfov.belief.observers.any_of import weights_by_class
+from semfov.belief.target_evidence import Thresholds
+from semfov.errors import InputError
+
+GRID = Grid(5, 4, (100, 60))
+FIXATIONS = GRID.centres[torch.tensor([0, 13, 7])]
+WEIGHTS = {1: 1.0, 3: 0.4}
+
+
+@pytest.fixture(params=["evidence", "map"])
+def inner(request):
+    torch.manual_seed(3)
+    if request.param == "map":
+        return Semantic(4, tempering=0.25)
+    model = TargetEvidence(8, 6, components=4, thresholds=Thresholds(0.8, 0.1))
+    return Target(model.eval().requires_grad_(False))
+
+
+@pytest.fixture
+def looks():
+    generator = torch.Generator().manual_seed(2)
+    corner = torch.rand(3, 4, 2, generator=generator) * 40
+    boxes = torch.cat([corner, corner + 5 + torch.rand(3, 4, 2, generator=generator) * 15], -1)
+    return Detections(boxes, torch.rand(3, 4, 4, generator=generator).softmax(-1), torch.ones(3, 4, dtype=torch.bool))
+
+
+def believed(observer, looks, target):
+    belief = observer.start(1, GRID, looks.scores)
+    for look in range(3):
+        part = slice(look, look + 1)
+        belief = observer(belief, looks[part], FIXATIONS[part], GRID, target)
+    return belief
+
+
+def test_it_is_one_of_them_unless_it_is_none(inner, looks):
+    several = believed(AnyOf(inner, WEIGHTS), looks, None)
+    for what in ("probability", "chance", "presence"):
+        missing = 1.0
+        for index, weight in WEIGHTS.items():
+            missing = missing * (1 - weight * getattr(believed(inner, looks, index), what)(index))
+        for asked in (1, 2, 3):
+            torch.testing.assert_close(getattr(several, what)(asked), 1 - missing)
+
+
+def test_of_one_class_it_is_the_other_observer(inner, looks):
+    alone, single = believed(inner, looks, 2), believed(AnyOf(inner, {2: 1.0, 1: 0.0}), looks, None)
+    torch.testing.assert_close(single.probability(2), alone.probability(2))
+    torch.testing.assert_close(single.presence(2), alone.presence(2))
+    torch.testing.assert_close(single.closest, alone.closest)
+    assert single.likeliest().tolist() == [2]
+    assert AnyOf(inner, {2: 1.0}).thresholds == inner.thresholds
+
+
+def test_the_likeliest_class_counts_its_weight(inner, looks):
+    peaks = {index: float(believed(inner, looks, index).probability(index).max()) for index in (1, 2, 3)}
+    for low in (1.0, 0.01):
+        weights = {1: low, 2: 1.0, 3: low}
+        best = max(weights, key=lambda index: weights[index] * peaks[index])
+        assert believed(AnyOf(inner, weights), looks, None).likeliest().tolist() == [best]
+
+
+def test_looks_are_taken_apart_and_joined(inner, looks):
+    observer = AnyOf(inner, WEIGHTS)
+    whole = observer.weigh(looks, FIXATIONS, GRID)
+    parts = [whole[torch.tensor([n])] for n in range(3)]
+    start = observer.start(3, GRID, looks.scores)
+    both = observer.update(start, type(whole).join(parts))
+    for row in range(3):
+        alone = observer.update(start[row : row + 1], parts[row])
+        torch.testing.assert_close(both[row : row + 1].probability(1), alone.probability(1))
+
+
+def test_what_is_known_fades_as_the_other_observer_has_it(inner, looks):
+    observer = AnyOf(inner, WEIGHTS)
+    visited = torch.zeros(1, 20, dtype=torch.bool)
+    look = observer.weigh(looks[:1], FIXATIONS[:1], GRID)
+    faded = observer.update(observer.fade(believed(observer, looks, None), look, 0.5, visited), look)
+    missing = 1.0
+    for index, weight in WEIGHTS.items():
+        part = inner.weigh(looks[:1], FIXATIONS[:1], GRID, index)
+        one = inner.update(inner.fade(believed(inner, looks, index), part, 0.5, visited), part)
+        missing = missing * (1 - weight * one.probability(index))
+    torch.testing.assert_close(faded.probability(1), 1 - missing)
+
+
+def test_bad_input(inner):
+    for weights in ({}, {1: 0.0}, {1: 1.5}, {1: -0.1, 2: 1.0}):
+        with pytest.raises(InputError, match="weights"):
+            AnyOf(inner, weights)
+    classes = ("cup", "wine glass")
+    assert weights_by_class({"Cups": 1, 2: 0.5}, classes) == {1: 1, 2: 0.5}
+    for target, message in (({}, "several"), ({"cup": 1, 1: 1}, "twice"), ({"cat": 1}, "unknown class")):
+        with pytest.raises(InputError, match=message):
+            weights_by_class(target, classes)

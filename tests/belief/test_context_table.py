@@ -1,0 +1,130 @@
+"""Context from tables: values and alignment against loops, what cannot be read, and the control."""
+
+import hashlib
+import math
+
+import pytest
+import torch
+
+from semfov.belief import ContextPrior
+from semfov.belief.context_table import read_table, write_table
+from semfov.errors import DataError, InputError
+
+CLASSES = ("cup", "dining table", "cow", "zebra")
+TABLE = ",mug,desk,cow\nglass,,2,0\ncup,,1,0.5\ntable,3,,-1\ncattle,0,0,\n"
+
+
+@pytest.fixture
+def path(tmp_path):
+    file = tmp_path / "table.csv"
+    file.write_text(TABLE, encoding="utf-8")
+    return file
+
+
+def test_values_count_by_comparison(path):
+    prior = ContextPrior.from_table(path, CLASSES, source="a test", edges=(0.0, 0.2))
+    # The table's cup is the class itself, and so its glass is not asked; its desk and mug are synonyms.
+    values = {(1, 2): 1.0, (1, 3): 0.5, (2, 1): 3.0, (2, 3): -1.0, (3, 1): 0.0, (3, 2): 0.0}
+    rows = {t: [v for (a, _), v in values.items() if a == t] for t in (1, 2, 3)}
+    columns = {j: [v for (_, b), v in values.items() if b == j] for j in (1, 2, 3)}
+    every = sum(values.values()) / 6
+    for t in range(5):
+        for j in range(5):
+            expected = 0.0
+            if (t, j) in values:
+                expected = values[t, j] - sum(rows[t]) / 2 - sum(columns[j]) / 2 + every
+            got = prior.cooccurrence[t, j]
+            torch.testing.assert_close(got, expected * torch.tensor([1.0, 0.0, -1.0]))
+    assert not prior.place.any()
+    assert prior.weights == {"evidence": (1.0, 1.0), "map": (1.0, 1.0)}
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert prior.metadata == {"table": {"source": "a test", "sha256": digest, "missing": ["zebra"]}}
+
+
+def test_a_constant_or_a_scale_of_classes_is_no_context(tmp_path):
+    names = [f"thing {chr(97 + n)}" for n in range(5)]
+    one, other = torch.randn(2, 5, generator=torch.Generator().manual_seed(0))
+    values = (one[:, None] + other).fill_diagonal_(math.nan)
+    for full in (values, values.nan_to_num(0.7)):
+        write_table(tmp_path / "t.csv", names, names, full)
+        near = ContextPrior.from_table(tmp_path / "t.csv", names, source="s").cooccurrence
+        # Means leave out the diagonal, and so a sum of rows and columns is only about taken away.
+        assert float(near.abs().max()) < 0.5 * float(values[~values.isnan()].abs().max())
+    write_table(tmp_path / "t.csv", names, names, torch.full((5, 5), 3.0))
+    assert float(ContextPrior.from_table(tmp_path / "t.csv", names, source="s").cooccurrence.abs().max()) < 1e-6
+
+
+def test_places_are_rows_of_the_picture(path, tmp_path):
+    heights = tmp_path / "heights.csv"
+    heights.write_text("class,top,middle,bottom\ncow,0,1,5\nCUP,2,,\n", encoding="utf-8")
+    prior = ContextPrior.from_table(path, CLASSES, source="a test", places=heights)
+    assert prior.place.shape == (5, 3, 3)
+    torch.testing.assert_close(prior.place[3], torch.tensor([-2.0, -1, 3])[:, None].expand(3, 3))
+    assert not prior.place[[0, 1, 2, 4]].any()
+    assert prior.metadata["table"]["places_sha256"] == hashlib.sha256(heights.read_bytes()).hexdigest()
+
+
+def test_permuted_is_the_same_of_other_classes(path):
+    prior = ContextPrior.from_table(path, CLASSES, source="a test")
+    control = prior.permuted(3)
+    assert torch.equal(control.cooccurrence.flatten().sort().values, prior.cooccurrence.flatten().sort().values)
+    assert not torch.equal(control.cooccurrence, prior.cooccurrence)
+    order = next(
+        [0, *each]
+        for each in torch.cartesian_prod(*[torch.arange(1, 5)] * 4).tolist()
+        if len(set(each)) == 4 and torch.equal(control.cooccurrence[1:, 1:], prior.cooccurrence[each][:, each])
+    )
+    assert order != [0, 1, 2, 3, 4]
+    assert torch.equal(prior.permuted(3).cooccurrence, control.cooccurrence)
+    assert control.metadata["permuted"] == 3
+    assert control.digest() != prior.digest()
+
+
+def test_saved_and_loaded_it_keeps_where_it_comes_from(path, tmp_path):
+    prior = ContextPrior.from_table(path, CLASSES, source="a test")
+    prior.save(tmp_path / "p.safetensors")
+    assert ContextPrior.from_pretrained(tmp_path / "p.safetensors").metadata == prior.metadata
+
+
+def test_a_table_is_written_as_it_is_read(tmp_path):
+    names, values = ["cup", 'a "b", c'], torch.tensor([[math.nan, 0.125], [-3.5, 7.0]])
+    write_table(tmp_path / "t.csv", names, names, values)
+    table = read_table(tmp_path / "t.csv")
+    assert (table.rows, table.columns) == (tuple(names), tuple(names))
+    torch.testing.assert_close(table.values, values, equal_nan=True)
+
+
+def test_checksum_and_source_are_asked_for(path):
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    ContextPrior.from_table(path, CLASSES, source="s", sha256=digest.upper())
+    with pytest.raises(DataError, match="fetch it again"):
+        ContextPrior.from_table(path, CLASSES, source="s", sha256="0" * 64)
+    with pytest.raises(InputError, match="source"):
+        ContextPrior.from_table(path, CLASSES, source=" ")
+    with pytest.raises(InputError, match="spoon"):
+        ContextPrior.from_table(path, ["spoon", "zebra"], source="s")
+    with pytest.raises(DataError, match="missing"):
+        ContextPrior.from_table(path.parent / "missing.csv", CLASSES, source="s")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "names in the first row"),
+        (",cup\n", "names in the first row"),
+        (",cup,cow\ncup,1\n", "line 2: expected 2 values"),
+        (",cup\ncup,much\n", "line 2: expected numbers"),
+        (",cup\ncup,inf\n", "line 2: expected numbers"),
+        (",cup\ncup,nan\n", "line 2: expected numbers"),
+        (",cup,cup\ncow,1,2\n", "first row, got cup"),
+        (",cup\n,2\n", "no name"),
+        (",cup\ncup,1\ncup,2\n", "first column, got cup"),
+    ],
+)
+def test_what_is_no_table_is_told_by_line(path, text, message):
+    path.write_text(text)
+    with pytest.raises(DataError, match=message):
+        read_table(path)
+    path.write_bytes(b"\xff\xfe,cup\n")
+    with pytest.raises(DataError, match="CSV"):
+        read_table(path)

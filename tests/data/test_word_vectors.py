@@ -1,0 +1,123 @@
+"""Vectors of words: both formats, names of several words, and descriptions spread over classes, against numpy."""
+
+import hashlib
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov.data import WordVectors, spread
+from semfov.data.naming import alike, named_in
+from semfov.data.word_vectors import words_of
+from semfov.detection.coco_classes import COCO_CLASSES
+from semfov.errors import DataError, InputError
+
+VECTORS = np.random.default_rng(0).normal(size=(6, 5))
+WORDS = ("cup", "wine", "glass", "drink", "cow", "Dog")
+
+
+@pytest.fixture(params=["glove", "word2vec"])
+def path(request, tmp_path):
+    lines = [f"{word} {' '.join(map(repr, map(float, row)))}" for word, row in zip(WORDS, VECTORS, strict=True)]
+    if request.param == "word2vec":
+        lines.insert(0, f"{len(WORDS)} 5")
+    file = tmp_path / "vectors.txt"
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return file
+
+
+def test_only_what_is_asked_for_is_read_and_the_rest_is_named(path):
+    words = WordVectors.read(path, ["Wine_Glass", "dog", "toaster oven"])
+    assert set(words.vectors) == {"wine", "glass", "dog"}
+    assert words.missing == ("oven", "toaster")
+    assert words.digest == hashlib.sha256(path.read_bytes()).hexdigest()
+    expected = (VECTORS[1] + VECTORS[2]) / 2
+    np.testing.assert_allclose(words.vector("wine glass"), expected, rtol=1e-5)
+    # Of a name that is half known, the half counts.
+    half = WordVectors.read(path, ["cow shed"])
+    np.testing.assert_allclose(half.vector("cow shed"), VECTORS[4], rtol=1e-5)
+    assert not words.knows("toaster")
+
+
+def test_similarity_is_the_cosine(path):
+    names, others = ["cup", "wine glass"], ["cow", "toaster", "drink"]
+    got = WordVectors.read(path, [*names, *others]).similarity(names, others)
+    rows = {"cup": VECTORS[0], "wine glass": VECTORS[1:3].mean(0), "cow": VECTORS[4], "drink": VECTORS[3]}
+    for row, name in enumerate(names):
+        for column, other in enumerate(others):
+            if other not in rows:
+                assert got[row, column].isnan()
+                continue
+            a, b = rows[name], rows[other]
+            assert float(got[row, column]) == pytest.approx(a @ b / np.sqrt((a @ a) * (b @ b)), abs=1e-6)
+
+
+def test_a_word_in_lower_case_goes_before_a_name(tmp_path):
+    file = tmp_path / "vectors.txt"
+    file.write_text("Turkey 1 0\nturkey 0 1\nTURKEY 1 1\n")
+    assert WordVectors.read(file, ["turkey"]).vectors["turkey"].tolist() == [0, 1]
+
+
+@given(st.floats(0.02, 1), st.integers(0, 2**31))
+def test_weights_are_a_softmax_whose_largest_is_one(temperature, seed):
+    generator = torch.Generator().manual_seed(seed)
+    names = ("cup", "cow", "car", "cat")
+    words = WordVectors({word: torch.randn(6, generator=generator) for word in (*names, "drink")})
+    got = spread("something to drink", names, words, temperature=temperature, least=0.0)
+    cosines = words.similarity(["drink"], names)[0]
+    expected = (cosines / temperature).softmax(0)
+    for name, weight in got.items():
+        assert weight == pytest.approx(float(expected[names.index(name)] / expected.max()), rel=1e-4, abs=1e-12)
+    assert list(got.values()) == sorted(got.values(), reverse=True)
+    assert next(iter(got.values())) == 1
+    few = spread("something to drink", names, words, temperature=temperature, least=0.5)
+    assert few == {name: weight for name, weight in got.items() if weight >= 0.5}
+
+
+@pytest.mark.parametrize(
+    ("description", "words"),
+    [("something to drink from", ["drink"]), ("Fire-Hydrant", ["fire", "hydrant"]), ("one of it", ["one", "of", "it"])],
+)
+def test_little_words_do_not_count_unless_there_are_no_others(description, words):
+    assert words_of(description) == words
+
+
+def test_damage_is_told_by_file_and_line(path, tmp_path):
+    with pytest.raises(DataError, match=r"nothing\.txt"):
+        WordVectors.read(tmp_path / "nothing.txt", ["cup"])
+    with pytest.raises(InputError, match="zebra"):
+        WordVectors.read(path, ["zebra"])
+    lines = path.read_text().splitlines()
+    where = next(number for number, line in enumerate(lines) if line.startswith("cow"))
+    for damaged in ("cow 1 2 3", "cow 1 2 3 4 x", "cow", "cow 1 2 3 4 nan"):
+        path.write_text("\n".join([*lines[:where], damaged, *lines[where + 1 :]]))
+        with pytest.raises(DataError, match=f"line {where + 1}: expected a word and 5 numbers"):
+            WordVectors.read(path, ["cup", "cow"])
+    words = WordVectors({"cup": torch.ones(2)})
+    with pytest.raises(InputError, match="'zebra'"):
+        words.vector("zebra")
+    with pytest.raises(InputError, match="target"):
+        spread("a zebra", ["cup"], words)
+    with pytest.raises(InputError, match="classes"):
+        spread("a cup", ["zebra"], words)
+    for options, name in (({"temperature": 0.0}, "temperature"), ({"least": 2}, "least")):
+        with pytest.raises(InputError, match=name):
+            spread("cup", ["cup"], words, **options)
+
+
+def test_every_class_is_alike_to_itself_alone():
+    for place, name in enumerate(COCO_CLASSES):
+        for spelling in (name, name.upper(), name.replace(" ", "_")):
+            assert alike(spelling, COCO_CLASSES) == [place]
+        assert named_in(f"There is a {name}, I think.", COCO_CLASSES) == {name}
+    assert alike("sofa", COCO_CLASSES) == [COCO_CLASSES.index("couch")]
+    assert alike("spaceship", COCO_CLASSES) == []
+
+
+def test_longer_names_hide_the_shorter_ones_in_them():
+    text = "1. A hot dog\n2. Wine glasses and forks\n3. People, TVs, a fridge; mugs."
+    expected = {"hot dog", "wine glass", "fork", "person", "tv", "refrigerator", "cup"}
+    assert named_in(text, COCO_CLASSES) == expected
+    assert named_in("", COCO_CLASSES) == named_in("nothing of that", COCO_CLASSES) == set()
