@@ -91,7 +91,7 @@ def check_settings(config: type[Any], values: Any, prefix: str = "", *, nested: 
         prefix: before the names.
         nested: also check settings that are dataclasses themselves.
     """
-    hints = _hints(config)
+    hints = _hints(config)  # type: ignore[arg-type]
     for field in fields(config):
         if field.name not in values:
             continue
