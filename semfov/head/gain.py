@@ -18,14 +18,11 @@ FORESIGHT = 0.5
 """Share of what a look shows from aside that counts towards a find."""
 
 
-PRIOR = 0.01
+PRIOR = 0.03
 """Probability that a cell that was never seen holds the target of a search."""
 
-UNSEEN = 0.1
-"""Cells of an exploration that are named right when they are first fixated, a share of all."""
-
-FIRST = 0.3
-"""Exponent of the acuity with which cells are seen for the first time."""
+UNSEEN = 1.0
+"""Cells of an exploration that are expected to be named right where they are first fixated."""
 
 OUT = -1e6
 """Value of actions that are not to be chosen."""
@@ -107,7 +104,7 @@ class ExploreGain(Gain):
     def __init__(self, views: Views, model: MapEvidence, unseen: float = UNSEEN) -> None:
         super().__init__(views)
         self.model, self.unseen = model, unseen
-        self._first = [views.acuity(distance) ** FIRST for distance in views.distances]
+        self._acuity = [views.acuity(distance) for distance in views.distances]
         third = torch.tensor([SIDE // 5, SIDE // 2, SIDE - 1 - SIDE // 5])
         self._landings = (third[:, None] * SIDE + third).flatten()
 
@@ -121,7 +118,7 @@ class ExploreGain(Gain):
         for pose in poses:
             cells = views.seen[pose].cells
             rows = torch.arange(views.cells) if pose == here else self._landings
-            total = self._first[pose][rows] @ worth[cells]
+            total = self._acuity[pose][rows] @ worth[cells]
             some = known[cells]
             if bool(some.any()):
                 old = cells[some]
