@@ -58,7 +58,6 @@ class HeadConfig(Settings):
         targets: classes to search for in each scene, drawn by the seed; 0 leaves searches out.
         explore: whether scenes are explored, too.
         fields: fields of view in degrees; several let the head zoom.
-        overlap: whether poses are half a window apart; false takes those alone whose views tile the scene.
         width: of a scene in pixels: of the 360 degrees of a panorama, or of a mosaic, which is 240 degrees wide.
         passes: looks of an episode, at most.
         seconds: of an episode, at most.
@@ -81,7 +80,6 @@ class HeadConfig(Settings):
     targets: Whole = 3
     explore: bool = True
     fields: tuple[Degrees, ...] = (60.0,)
-    overlap: bool = True
     width: Annotated[int, Range(64, 65_536)] = 2560
     passes: Annotated[int, Range(1, 10_000)] = 60
     seconds: Positive = 20.0
@@ -131,7 +129,7 @@ class HeadRun:
                 seed=config.seed,
             )
         )
-        looks = {"eye": self.eye.settings(), "fields": config.fields, "overlap": config.overlap}
+        looks = {"eye": self.eye.settings(), "fields": config.fields}
         self.store = HeadStore(cache_folder(config.cache) / "head", looks, len(self.eye.detector.classes))
         self.settings_key, self.code = self._key(), digest_of([package_digest(), versions()])
         self.key = f"{self.settings_key[:16]}-{self.code[:16]}"
@@ -160,7 +158,7 @@ class HeadRun:
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
         """Records of a scene: searches and an exploration, for every way of moving eye and head."""
         watch, config = Stopwatch(), self.config
-        views = Views(self.world(index), config.fields, overlap=config.overlap, fovea=self.fovea)
+        views = Views(self.world(index), config.fields, fovea=self.fovea)
         store = self.store if config.store else None
         looks = StoredLooksAround(lambda: live(self.eye, views), store, self.scenes.digest(index))
         watch.lap("scene")
@@ -181,6 +179,7 @@ class HeadRun:
         shuffled = np.random.Generator(np.random.PCG64([config.seed, start])).permutation(order[1:]).tolist()
         return {
             OURS: lambda action: PerPrice(gain, config.speeds, action),
+            "ours, half a view apart": lambda action: PerPrice(gain, config.speeds, action, range(len(views))),
             "ours, blind to prices": lambda action: PerPrice(gain, None, action),
             "head in raster order": lambda action: Scan(gain, order, config.dwell, action),
             "head in random order": lambda action: Scan(gain, [pose, *shuffled], config.dwell, action),

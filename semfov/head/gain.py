@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from itertools import chain
 
 import torch
 from torch import Tensor, nn
@@ -136,17 +137,24 @@ class PerPrice(AcquisitionFunction):
         gain: of a look.
         speeds: of eye and head; None values gains alone, whatever they cost.
         action: where eye and head are.
+        poses: to which the head may turn; None takes those whose views tile the scene.
     """
 
-    def __init__(self, gain: Gain, speeds: Speeds | None, action: int) -> None:
+    def __init__(self, gain: Gain, speeds: Speeds | None, action: int, poses: Sequence[int] | None = None) -> None:
         super().__init__()
         self.gain, self.speeds, self.action = gain, speeds, action
+        tiling = chain.from_iterable(chain.from_iterable(gain.views.tiling))
+        self.poses = [*tiling] if poses is None else [*poses]
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(1, A)`."""
         views = self.gain.views
-        values = self.gain(own(belief, SceneBelief, "belief"), self.action // views.cells, range(len(views)))
-        return (values if self.speeds is None else values / views.prices(self.action, self.speeds))[None]
+        values = self.gain(own(belief, SceneBelief, "belief"), self.action // views.cells, self.poses)
+        if self.speeds is not None:
+            values = values / views.prices(self.action, self.speeds)
+        allowed = torch.zeros(len(views), dtype=torch.bool)
+        allowed[self.poses] = True
+        return torch.where(allowed.repeat_interleave(views.cells), values, OUT)[None]
 
 
 class Scan(AcquisitionFunction):

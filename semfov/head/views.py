@@ -39,7 +39,6 @@ class Views:
     Args:
         world: the scene.
         fields: of view in degrees, narrowest first; several of them let the head zoom.
-        overlap: whether poses are half a window apart; false takes those alone whose views tile the scene.
         fovea: width σ of the fovea in longer sides of a view.
 
     Attributes:
@@ -52,20 +51,18 @@ class Views:
         seen: for each pose, what it shows of the scene.
     """
 
-    def __init__(
-        self, world: World, fields: Sequence[float] = (60.0,), *, overlap: bool = True, fovea: float = 100 / 640
-    ) -> None:
+    def __init__(self, world: World, fields: Sequence[float] = (60.0,), *, fovea: float = 100 / 640) -> None:
         check(len(fields) > 0 and list(fields) == sorted(fields), "fields", "fields of view, narrowest first", fields)
         check(fovea > 0, "fovea", "a positive share of the longer side", fovea)
         self.world, self.fields, self.fovea = world, tuple(fields), fovea
         poses: list[Tensor] = []
         self.tiling: list[list[list[int]]] = []
         for field in fields:
-            step, numbers = 1 if overlap else 2, []
-            for row in world.poses(field)[::step]:
-                numbers.append([*range(len(poses), len(poses) + len(row[::step]))])
-                poses += row[::step]
-            self.tiling.append([row[:: 3 - step] for row in numbers[:: 3 - step]])
+            rows, numbers = world.poses(field), []
+            for row in rows:
+                numbers.append([*range(len(poses), len(poses) + len(row))])
+                poses += row
+            self.tiling.append([row[::2] for row in numbers[::2]])
         self.poses = torch.stack(poses)
         wide, high = world.size
         self.view_grid = Grid(SIDE, SIDE, (wide, high))

@@ -38,13 +38,6 @@ def test_every_second_pose_of_every_second_row_tiles_the_scene(world):
         assert seen[latitude.abs() < 60].all()
 
 
-def test_without_overlap_the_poses_are_the_tiling(world):
-    half, tiling = Views(world), Views(world, overlap=False)
-    expected = [half.poses[pose] for row in half.tiling[0] for pose in row]
-    torch.testing.assert_close(tiling.poses, torch.stack(expected))
-    assert [pose for row in tiling.tiling[0] for pose in row] == [*range(len(tiling))]
-
-
 def test_cells_hold_their_centres(world):
     assert torch.equal(world.cell_of(world.centres), torch.arange(len(world.scene)))
     torch.testing.assert_close(world.pixels_of(world.centres), world.scene.centres, atol=1e-3, rtol=0)
