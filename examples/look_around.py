@@ -38,7 +38,7 @@ def main() -> None:
         x, y, z = path.gaze(number).tolist()
         print(f"{seconds:5.2f} s: head at yaw {yaw:.0f}°, pitch {pitch:.0f}°; gaze along ({x:.2f}, {y:.2f}, {z:.2f})")
     print(path)
-    plot_head_path(path, image).savefig(arguments.out, dpi=110)
+    plot_head_path(path, image).savefig(arguments.out, dpi=88)
     if arguments.film:
         animate_head(path, image, arguments.film)
 

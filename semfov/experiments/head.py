@@ -179,6 +179,7 @@ class HeadRun:
         shuffled = np.random.Generator(np.random.PCG64([config.seed, start])).permutation(order[1:]).tolist()
         return {
             OURS: lambda action: PerPrice(gain, config.speeds, action),
+            "ours, half a view apart": lambda action: PerPrice(gain, config.speeds, action, range(len(views))),
             "ours, blind to prices": lambda action: PerPrice(gain, None, action),
             "head in raster order": lambda action: Scan(gain, order, config.dwell, action),
             "head in random order": lambda action: Scan(gain, [pose, *shuffled], config.dwell, action),

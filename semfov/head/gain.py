@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from itertools import chain
 
 import torch
 from torch import Tensor, nn
@@ -18,14 +19,11 @@ FORESIGHT = 0.5
 """Share of what a look shows from aside that counts towards a find."""
 
 
-PRIOR = 0.01
+PRIOR = 0.03
 """Probability that a cell that was never seen holds the target of a search."""
 
-UNSEEN = 0.1
-"""Cells of an exploration that are named right when they are first fixated, a share of all."""
-
-FIRST = 0.3
-"""Exponent of the acuity with which cells are seen for the first time."""
+UNSEEN = 1.0
+"""Cells of an exploration that are expected to be named right where they are first fixated."""
 
 OUT = -1e6
 """Value of actions that are not to be chosen."""
@@ -107,7 +105,7 @@ class ExploreGain(Gain):
     def __init__(self, views: Views, model: MapEvidence, unseen: float = UNSEEN) -> None:
         super().__init__(views)
         self.model, self.unseen = model, unseen
-        self._first = [views.acuity(distance) ** FIRST for distance in views.distances]
+        self._acuity = [views.acuity(distance) for distance in views.distances]
         third = torch.tensor([SIDE // 5, SIDE // 2, SIDE - 1 - SIDE // 5])
         self._landings = (third[:, None] * SIDE + third).flatten()
 
@@ -121,7 +119,7 @@ class ExploreGain(Gain):
         for pose in poses:
             cells = views.seen[pose].cells
             rows = torch.arange(views.cells) if pose == here else self._landings
-            total = self._first[pose][rows] @ worth[cells]
+            total = self._acuity[pose][rows] @ worth[cells]
             some = known[cells]
             if bool(some.any()):
                 old = cells[some]
@@ -139,17 +137,24 @@ class PerPrice(AcquisitionFunction):
         gain: of a look.
         speeds: of eye and head; None values gains alone, whatever they cost.
         action: where eye and head are.
+        poses: to which the head may turn; None takes those whose views tile the scene.
     """
 
-    def __init__(self, gain: Gain, speeds: Speeds | None, action: int) -> None:
+    def __init__(self, gain: Gain, speeds: Speeds | None, action: int, poses: Sequence[int] | None = None) -> None:
         super().__init__()
         self.gain, self.speeds, self.action = gain, speeds, action
+        tiling = chain.from_iterable(chain.from_iterable(gain.views.tiling))
+        self.poses = [*tiling] if poses is None else [*poses]
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
         """Values `(1, A)`."""
         views = self.gain.views
-        values = self.gain(own(belief, SceneBelief, "belief"), self.action // views.cells, range(len(views)))
-        return (values if self.speeds is None else values / views.prices(self.action, self.speeds))[None]
+        values = self.gain(own(belief, SceneBelief, "belief"), self.action // views.cells, self.poses)
+        if self.speeds is not None:
+            values = values / views.prices(self.action, self.speeds)
+        allowed = torch.zeros(len(views), dtype=torch.bool)
+        allowed[self.poses] = True
+        return torch.where(allowed.repeat_interleave(views.cells), values, OUT)[None]
 
 
 class Scan(AcquisitionFunction):

@@ -133,8 +133,15 @@ def test_gain_per_price_by_hand(views, eye, models):
     gain, speeds = SearchGain(views), Speeds()
     visited = torch.zeros(1, len(views.grid), dtype=torch.bool)
     gains = gain(belief, pose, range(len(views)))
-    torch.testing.assert_close(PerPrice(gain, speeds, here)(belief, visited)[0], gains / views.prices(here, speeds))
-    torch.testing.assert_close(PerPrice(gain, None, here)(belief, visited)[0], gains)
+    every = range(len(views))
+    torch.testing.assert_close(
+        PerPrice(gain, speeds, here, every)(belief, visited)[0], gains / views.prices(here, speeds)
+    )
+    torch.testing.assert_close(PerPrice(gain, None, here, every)(belief, visited)[0], gains)
+    tiling = PerPrice(gain, None, here)(belief, visited)[0].view(len(views), 100)
+    side_by_side = [pose for row in views.tiling[0] for pose in row]
+    torch.testing.assert_close(tiling[side_by_side], gains.view(len(views), 100)[side_by_side])
+    assert (tiling > OUT).any(-1).nonzero()[:, 0].tolist() == sorted(side_by_side)
 
 
 def test_a_dear_head_stays_and_a_free_one_turns(views, eye, models):
