@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,6 +18,7 @@ from semfov.experiments.samples import SampleSettings, collect
 from semfov.experiments.setup import make_scenes
 from semfov.experiments.summary import table
 from semfov.io.files import inside
+from semfov.metrics.averages import standard_error
 from semfov.training.context_weights import fit_weights, make_cases
 from semfov.training.outputs import model_path, training_of, write_outputs
 from semfov.training.places import FitContextConfig, Places, read_places
@@ -185,8 +187,8 @@ def judge(prior: ContextPrior, places: Sequence[Places], min_objects: int) -> li
     r"""How well context tells where a class is when all other objects are known.
 
     The mean of :math:`\ln \sum_{x \in \text{goal}} \mathrm{softmax}(c)(x)` over pairs of photograph and class: the log
-    probability that one fixation, drawn by context alone, lands on the target. Of
-    other classes: `ContextPrior.permuted`.
+    probability that one fixation, drawn by context alone, lands on the target; and what is gained over nothing, with
+    the standard error over photographs. Of other classes: `ContextPrior.permuted`.
     """
     other = prior.permuted()
     choices = {
@@ -196,24 +198,39 @@ def judge(prior: ContextPrior, places: Sequence[Places], min_objects: int) -> li
         "both": (prior, (1.0, 1.0)),
         "both, of other classes": (other, (1.0, 1.0)),
     }
+    judges = [place for place in places if place.targets and place.objects >= min_objects]
+    if not judges:
+        raise DataError("data: no photograph to judge by was held out; give more photographs")
     rows: list[dict[str, object]] = []
+    without: list[Tensor] = []
     for name, (context, weights) in choices.items():
-        gained = []
-        for place in places:
-            for target in place.targets if place.objects >= min_objects else ():
-                value = context(place.occupied[None].float(), place.grid, target, weights)[0]
-                gained.append(value[place.occupied[:, target]].logsumexp(0) - value.logsumexp(0))
-        if not gained:
-            raise DataError("data: no photograph to judge by was held out; give more photographs")
-        rows.append({"context": name, "log_likelihood": float(torch.stack(gained).mean()), "pairs": len(gained)})
+        told = [
+            torch.stack([_landing(context, place, target, weights) for target in place.targets]) for place in judges
+        ]
+        without = without or told
+        gains = np.array([float((own - plain).mean()) for own, plain in zip(told, without, strict=True)])
+        mean, pairs = float(torch.cat(told).mean()), sum(map(len, told))
+        error = float(standard_error(gains))
+        rows.append(
+            {"context": name, "log_likelihood": mean, "gain": float(gains.mean()), "error": error, "pairs": pairs}
+        )
     return rows
+
+
+def _landing(context: ContextPrior, place: Places, target: int, weights: tuple[float, float]) -> Tensor:
+    """Log probability that a fixation drawn by context lands on the target."""
+    value = context(place.occupied[None].float(), place.grid, target, weights)[0]
+    return value[place.occupied[:, target]].logsumexp(0) - value.logsumexp(0)
 
 
 def report(
     judged: list[dict[str, object]], weights: dict[str, tuple[float, float]], known: int, config: FitContextConfig
 ) -> str:
     """What was fitted, and how it does on photographs that were held out, as Markdown."""
-    rows = [[str(row["context"]), f"{row['log_likelihood']:.3f}"] for row in judged]
+    rows = [
+        [str(row["context"]), f"{row['log_likelihood']:.3f}", f"{row['gain']:+.3f} ± {row['error']:.3f}"]
+        for row in judged
+    ]
     beside = [[kind, f"{place:.2g}", f"{company:.2g}"] for kind, (place, company) in weights.items()]
     counted = (
         f"Counted on {known} photographs" if config.table is None and config.embeddings is None else "From a table"
@@ -223,9 +240,9 @@ def report(
         [
             f"{counted}, judged on {judged[0]['pairs']} pairs of photograph and class of those "
             f"that were held out (every {config.holdout}th): mean log probability that a fixation drawn by context "
-            "alone lands on the target, where all other objects are known.",
+            "alone lands on the target, where all other objects are known; and what is gained, mean over photographs.",
             "",
-            *table([["context", "log likelihood"], *rows]),
+            *table([["context", "log likelihood", "gain ± standard error"], *rows]),
             "",
             f"Weights beside a belief, {fitted} the photographs:",
             "",

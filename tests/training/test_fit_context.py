@@ -86,6 +86,21 @@ def test_judging_without_context_is_the_share_of_target_cells(places):
     for row in judge(prior, places, 4):
         assert row["log_likelihood"] == pytest.approx(float(torch.stack(shares).mean()), abs=1e-5)
         assert row["pairs"] == len(shares)
+        assert (row["gain"], row["error"]) == pytest.approx((0, 0), abs=1e-6)
+
+
+def test_gain_is_the_mean_over_photographs(places):
+    place = torch.randn(4, 2, 2, generator=torch.Generator().manual_seed(5))
+    prior = ContextPrior(["a", "b", "c"], place, torch.zeros(4, 4, 3), EDGES)
+    judged = {row["context"]: row for row in judge(prior, places, 4)}
+    gains = []
+    for each in places:
+        values = [prior.place_at(each.grid)[k].softmax(0)[each.occupied[:, k]].sum().log() for k in each.targets]
+        shares = [each.occupied[:, k].float().mean().log() for k in each.targets]
+        gains += [sum(float(v - s) for v, s in zip(values, shares, strict=True)) / len(values)] if values else []
+    row = judged["place"]
+    assert row["gain"] == pytest.approx(sum(gains) / len(gains), abs=1e-5)
+    assert row["error"] == pytest.approx(torch.tensor(gains).std().item() / len(gains) ** 0.5, abs=1e-5)
 
 
 def test_no_prior_is_weighed_on_what_it_counted(places):
