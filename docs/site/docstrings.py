@@ -42,9 +42,8 @@ def _fenced_example(match: re.Match[str]) -> str:
 
 def _arguments(thing: griffe.Object) -> set[str]:
     """Names of a function's arguments, and of a class's attributes, which its text may mean."""
-    if thing.is_function:
-        return {argument.name for argument in thing.parameters} | {thing.name}
-    return set(thing.members) | {argument.name for argument in getattr(thing, "parameters", ())} | {thing.name}
+    arguments = thing.parameters if isinstance(thing, griffe.Function | griffe.Class) else ()
+    return {thing.name, *(argument.name for argument in arguments), *thing.members}
 
 
 class Docstrings(griffe.Extension):

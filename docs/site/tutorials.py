@@ -2,6 +2,7 @@
 
 import base64
 import os
+import re
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -105,7 +106,7 @@ def page(notebook: Any, name: str, folder: Path) -> str:
                 picture.write_bytes(base64.b64decode(data["image/png"]))
                 parts.append(f"![{cell.metadata['alt']}]({picture.name})")
             elif "text/html" in data:
-                parts.append(f'<div class="output">{data["text/html"]}</div>')
+                parts.append(re.sub(r"<table[^>]*>", "<table>", data["text/html"]))  # the site's tables have no class
             else:
                 parts.append(f"```text\n{output.get('text') or data['text/plain']}\n```")
     head = parts[1:2] + parts[:1] + parts[2:]  # the title first

@@ -10,9 +10,8 @@ from semfov import viz
 
 agent = semfov.ActivePerception.recommended("yolov3-tiny")
 scene = semfov.EmbeddedScenes(agent.classes[1:])[6]
-scanpath = agent.search(
-    scene.image, "cat", start=99
-)  # a path, or a picture of Pillow's, NumPy's or torch's, will do, too
+# A path, or a picture of Pillow's, NumPy's or torch's, will do, too.
+scanpath = agent.search(scene.image, "cat", start=99)
 print(scanpath)
 
 # %% alt="The gaze's way over a collage of photographs to the cat, beside what the eye saw and believed at each fixation"

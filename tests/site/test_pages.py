@@ -1,10 +1,14 @@
 """What pages are made of: names that lead on, docstrings, formulas, links between files."""
 
+import doctest
 import xml.etree.ElementTree as etree
 
 import markdown
 import pytest
 
+import docs.api
+import docs.site.formulas
+import docs.site.stage
 from docs.site.docstrings import markdown as docstring
 from docs.site.formulas import mathml
 from docs.site.names import Names
@@ -146,6 +150,13 @@ def test_links_lead_to_where_files_are_on_the_site(tmp_path):
     assert moved == "[a](../repository/examples/own_policy.py.md) [b](gaze.md#x) [c](https://d.org)"
     assert place_of("README.md") == "index.md"
     assert place_of("docs/tutorials/search.py") == "tutorials/search.md"
+
+
+@pytest.mark.parametrize("module", [docs.api, docs.site.formulas, docs.site.stage], ids=lambda module: module.__name__)
+def test_examples_of_the_tools(module):
+    failed, tried = doctest.testmod(module)
+    assert failed == 0
+    assert tried > 0
 
 
 def test_there_are_five_tutorials():
