@@ -12,6 +12,10 @@ from markdown import Extension, Markdown
 from markdown.inlinepatterns import InlineProcessor
 
 PATTERN = r"(?<![\\$\w])(\$\$?)(?!\s*\$)(.+?)\1(?![\w$])"
+_BEFORE = re.compile(r"(?<=[\w)}\]])\s+(\\(?:ln|log|exp)(?![A-Za-z]))")
+_AFTER = re.compile(r"(\\(?:ln|log(?:_\w|_\{\w+\})?|exp))(?![A-Za-z])(?!\s*(?:[({_^]|\\left|\\[bB]igl))\s*")
+"""Where TeX sets a thin space, before a function and after it, and the converter sets none."""
+
 _BEFORE_ESCAPES = 185  # after code (190), so that `$` in code stays what it is
 
 
@@ -27,6 +31,7 @@ def mathml(formula: str, *, block: bool) -> str:
     formula = " ".join(formula.split()).replace(r"\arg", r"\operatorname{arg}")
     if "&=" in formula:
         formula = rf"\begin{{aligned}}{formula}\end{{aligned}}"
+    formula = _AFTER.sub(r"\1 \\, ", _BEFORE.sub(r" \\, \1", formula))
     result = convert(formula, display="block" if block else "inline")
     if unknown := re.findall(r"\\[A-Za-z]+", result):
         raise ValueError(f"no MathML for {', '.join(unknown)} in {formula}")

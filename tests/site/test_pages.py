@@ -121,6 +121,21 @@ def test_mathml_has_the_structure_of_the_formula():
     assert tree.find(f".//{SPACE}msqrt") is not None
 
 
+@pytest.mark.parametrize(
+    ("formula", "spaces"),
+    [
+        (r"\ln x", 1),
+        (r"w \ln x", 2),
+        (r"w \ln(x)", 1),
+        (r"\log_2 p", 1),
+        (r"\exp\left(x\right)", 0),
+        (r"\ln\Gamma(x)", 1),
+    ],
+)
+def test_functions_stand_apart_as_in_tex(formula, spaces):
+    assert len(etree.fromstring(mathml(formula, block=False)).findall(f".//{SPACE}mspace")) == spaces
+
+
 def test_a_command_that_has_no_mathml_is_told():
     with pytest.raises(ValueError, match="foo"):
         mathml(r"\foo{a}", block=False)
