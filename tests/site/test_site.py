@@ -138,16 +138,22 @@ def test_tutorials_have_pictures_worth_looking_at(site, can_run, source):
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (apt-get install chromium, or set $CHROMIUM)")
-def test_a_browser_draws_formulas_and_asks_for_nothing(site):
+def test_a_browser_draws_formulas_searches_and_asks_for_nothing(site):
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install playwright)")
     asked = []
     with playwright.sync_playwright() as program:
         browser = program.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_page()
+        page.set_default_timeout(120_000)  # a busy machine is no mistake of the page's
         page.on("request", lambda request: asked.append(request.url))
         page.goto((site / "api" / "semfov.sensor.html").as_uri())
         fraction = page.locator("math mfrac").first.bounding_box()
         number = page.locator("math mn").first.bounding_box()
+        page.goto((site / "index.html").as_uri())
+        page.wait_for_load_state("networkidle")
+        page.keyboard.press("Control+k")
+        page.keyboard.type("Kaplan")
+        page.get_by_text(re.compile(r"\d+ results")).wait_for(timeout=120_000)
         browser.close()
     assert fraction["height"] > 1.3 * number["height"]
     assert [address for address in asked if not address.startswith(("file:", "data:", "blob:"))] == []
