@@ -41,9 +41,6 @@ def build(*, run: bool) -> None:
     said = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr)
     if done.returncode or _COMPLAINT.search(said):
         raise ValueError(f"the site has warnings\n{said}")
-    # The search reads this where pages are files and nothing may be fetched.
-    index = (SITE / "search.json").read_text(encoding="utf-8")
-    (SITE / "search.js").write_text(f"var __index = {index};", encoding="utf-8")
     print(f"written: {SITE / 'index.html'}, {time.monotonic() - began:.0f} s in all")
 
 
