@@ -48,4 +48,4 @@ constraints: $(STAMP)
 	$(BIN)/python .ci/constraints.py
 
 clean:
-	rm -rf $(VENV) build dist runs
+	rm -rf $(VENV) .cache build dist runs
