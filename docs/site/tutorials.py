@@ -15,8 +15,8 @@ from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
-LIMIT = 120
-"""Seconds that a cell may take."""
+LIMIT = 300
+"""Seconds that a cell may take, on a busy machine too."""
 
 _PREPARE = """
 %config InlineBackend.figure_formats = ["png"]
