@@ -4,23 +4,28 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup search test test-all lint types clean
+.PHONY: help setup search test test-all test-quick docs lint types constraints clean
 
 help:
-	@echo "make search   set up, fetch the default detector, search the embedded scenes, write tables and pictures"
-	@echo "make test     set up, then lint, types and tests"
-	@echo "make test-all the same, with the tests that take minutes"
-	@echo "make clean    remove the environment and run outputs"
+	@echo "make search      set up, fetch the default detector, search the embedded scenes, write tables and pictures"
+	@echo "make test        set up, then lint, types, tests and the site"
+	@echo "make test-all    the same, with the tests that take minutes"
+	@echo "make docs        set up, then build the site in build/site"
+	@echo "make constraints write the versions of this environment down as those that are tested"
+	@echo "make clean       remove the environment, the site and run outputs"
 
 setup: $(STAMP)
 
-$(STAMP): pyproject.toml
+$(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
 	@touch $@
 
 search: $(STAMP)
 	$(BIN)/python -m eval.search
+
+docs: $(STAMP)
+	$(BIN)/python -m docs.site
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -29,11 +34,18 @@ lint: $(STAMP)
 types: $(STAMP)
 	$(BIN)/mypy
 
+# tests/docs builds the site.
 test: lint types
 	$(BIN)/python -m pytest -n 2
 
 test-all: lint types
 	$(BIN)/python -m pytest -n 2 -m ""
 
+test-quick: $(STAMP)
+	$(BIN)/python -m pytest -n 2 -m "not slow and not long"
+
+constraints: $(STAMP)
+	$(BIN)/python .ci/constraints.py
+
 clean:
-	rm -rf $(VENV) runs
+	rm -rf $(VENV) .cache build dist runs

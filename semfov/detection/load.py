@@ -103,7 +103,7 @@ def load_yolo(
         classes: class names, or a text file with one on each line; None means the 80 of COCO.
         input_size: canvas in pixels, one side or `(width, height)`; None takes the cfg's.
         stride: pad the canvas only to a multiple of it; None pads to `input_size`.
-        background: background policy of the scores (`semfov.score_vectors`).
+        background: background policy of the scores (`semfov.detection.score_vectors`).
         threshold: see `Selection`, as for `iou`, `limit` and `per_class`.
         runtime: what computes the network: `"torch"`, `"onnxruntime"` on a CPU without gradients, or `"auto"`, which
             takes onnxruntime where it can, as it is faster, and else torch (`semfov.detection.yolo.YoloV3`).

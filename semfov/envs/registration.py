@@ -1,4 +1,4 @@
-"""The names of the environments: Gymnasium's plugin entry point calls `register` when it is imported."""
+"""The names of the environments."""
 
 IDS = {"search": "semfov/GazeSearch-v0", "exploration": "semfov/GazeExplore-v0"}
 

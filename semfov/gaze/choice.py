@@ -104,10 +104,9 @@ class Relaxed(Choice):
 
     Args:
         noise: draws.
-        centres: of the cells.
+        cell_of: cell of a soft point.
         temperature: of the softmax.
         hard: straight-through, or the soft point.
-        cell_of: cell of a soft point.
     """
 
     def __init__(

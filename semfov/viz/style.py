@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from functools import cache, wraps
 from pathlib import Path
@@ -65,9 +66,24 @@ def styled(plot: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
             # caller's own is left for him to draw.
             if all(options.get(name) is None for name in _PLACES) and figure not in _laid_out:
                 figure.draw_without_rendering()
+            teach_notebook()
             return figure
 
     return draw
+
+
+def teach_notebook() -> None:
+    """Let a notebook show a figure that is a cell's last value: it learns to only when pyplot makes one."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    if shell is None:
+        return
+    from IPython.core.pylabtools import print_figure
+    from matplotlib.figure import Figure
+
+    pictures = shell.display_formatter.formatters["image/png"]
+    if Figure not in pictures.type_printers:
+        pictures.for_type(Figure, print_figure)
 
 
 def lay_out(figure: Figure) -> None:

@@ -2,8 +2,6 @@
 
 import subprocess
 import sys
-import tomllib
-from importlib import import_module
 from pathlib import Path
 
 import gymnasium
@@ -296,16 +294,13 @@ def test_environments_rest_until_a_reset_names_them(sceneries):
     assert infos["passes"].tolist() == [1, 3]
 
 
-def test_the_entry_point_registers_the_names():
-    """That of the project's file; in a process of its own, where nothing was registered before."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    module, function = project["entry-points"]["gymnasium.envs"]["__root__"].split(":")
-    assert callable(getattr(import_module(module), function))
+def test_importing_registers_the_names_once():
+    """In a process of its own, where nothing was registered before."""
     code = (
-        f"import gymnasium, {module} as entry\n"
-        f"for name in {list(IDS.values())}: gymnasium.registry.pop(name)\n"
-        f"entry.{function}(); entry.{function}()\n"
-        f"print(sorted(name for name in gymnasium.registry if 'semfov' in name))"
+        "import gymnasium, semfov.envs\n"
+        "from semfov.envs.registration import register\n"
+        "register()\n"
+        "print(sorted(name for name in gymnasium.registry if 'semfov' in name))"
     )
     call = [sys.executable, "-W", "error::UserWarning", "-c", code]
     told = subprocess.run(call, capture_output=True, text=True, check=True, cwd=ROOT).stdout

@@ -1,0 +1,1 @@
+"""The site: how it is put together and built."""

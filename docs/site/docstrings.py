@@ -1,0 +1,63 @@
+"""What mkdocstrings is given of a docstring: formulas, examples and names in Markdown. An extension of Griffe's."""
+
+import re
+from collections.abc import Container
+from typing import Any
+
+import griffe
+
+from docs.site.names import Names
+
+_MATH = re.compile(r"(?m)^( *)\.\. math::[ \n]*((?:.*)(?:\n+\1 +.*)*)")
+_ROLE = re.compile(r":math:`([^`]*)`")
+_SESSION = re.compile(r"(?m)^( *)>>> .*(?:\n\1\S.*|\n\1 +\S.*)*")
+_EXAMPLE = re.compile(r"(?m)^( *)Example::\n\n((?:\1    .*\n|\n)*\1    .*)")
+
+
+def markdown(text: str, names: Names, module: str = "", arguments: Container[str] = ()) -> str:
+    """A docstring as Markdown; its sections stay Google's.
+
+    Args:
+        text: the docstring.
+        names: where names lead to.
+        module: that it is in.
+        arguments: names of the function's own.
+
+    Raises:
+        LookupError: it names something of the package's that does not exist.
+    """
+    text = _MATH.sub(lambda m: f"{m[1]}$$ {' '.join(m[2].split())} $$", text)
+    text = _ROLE.sub(lambda m: f"${' '.join(m[1].split())}$", text)
+    text = _EXAMPLE.sub(_fenced_example, text)
+    text = _SESSION.sub(lambda m: f"{m[1]}```pycon\n{m[0]}\n{m[1]}```", text)
+    parts = re.split(r"(?ms)^( *```.*?^ *```$)", text)
+    parts[::2] = [names.link(names.link_neighbours(part, module, arguments)) for part in parts[::2]]
+    return "".join(parts)
+
+
+def _fenced_example(match: re.Match[str]) -> str:
+    indent, code = match[1], re.sub(rf"(?m)^{match[1]}    ", match[1], match[2])
+    return f"{indent}**Example**\n\n{indent}```python\n{code}\n{indent}```"
+
+
+def _arguments(thing: griffe.Object) -> set[str]:
+    """Names of a function's arguments, and of a class's attributes, which its text may mean."""
+    arguments = thing.parameters if isinstance(thing, griffe.Function | griffe.Class) else ()
+    return {thing.name, *(argument.name for argument in arguments), *thing.members}
+
+
+class Docstrings(griffe.Extension):
+    """Rewrites every docstring once, when it is read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names = Names()
+
+    def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
+        """A module, class, function or attribute was loaded."""
+        if obj.docstring and not obj.is_alias:
+            try:
+                text, module = obj.docstring.value, obj.module.path
+                obj.docstring.value = markdown(text, self.names, module, _arguments(obj))
+            except LookupError as error:
+                griffe.logger.warning(f"{obj.path}: {error}")

@@ -1,0 +1,125 @@
+"""Where a name in the text leads to: the place of every public thing in the reference."""
+
+import importlib
+import inspect
+import re
+from collections.abc import Container
+from contextlib import suppress
+from functools import cached_property
+from typing import Any
+
+from docs.api import MODULES, entries, place
+
+NAME = re.compile(r"(?<![`\[\w])`((?:semfov|[A-Z]\w*)(?:\.\w+)*)((?:\([^`]*\))?)`(?![`\]])")
+"""A name in code: a full one, or a class by itself, with or without a call."""
+
+_BARE = re.compile(r"(?<![`\[\w])`([a-z]\w*)(?:\(\))?`(?![`\]])")
+
+
+class Names:
+    """Finds what is meant by a name."""
+
+    @cached_property
+    def places(self) -> dict[int, str]:
+        """The place of a public class or function, by its identity."""
+        return {id(thing): place(module, name, thing) for module, things in entries().items() for name, thing in things}
+
+    @cached_property
+    def classes(self) -> dict[str, str]:
+        """The place of a public class, by its bare name, where only one has it."""
+        found: dict[str, list[str]] = {}
+        for things in entries().values():
+            for name, thing in things:
+                if inspect.isclass(thing):
+                    found.setdefault(name, []).append(self.places[id(thing)])
+        return {name: places[0] for name, places in found.items() if len(places) == 1}
+
+    def place(self, name: str) -> str | None:
+        """Where the reference explains a name; nothing where it does not.
+
+        Raises:
+            LookupError: it is a name of the package's that does not exist.
+        """
+        if not name.startswith("semfov"):
+            first, _, rest = name.partition(".")
+            if first not in self.classes:
+                return None
+            name = self.classes[first] + (f".{rest}" if rest else "")
+        if name in MODULES:
+            return name
+        thing, owner = resolve(name)
+        if id(thing) in self.places:
+            return self.places[id(thing)]
+        if owner is None or id(owner) not in self.places:
+            return None
+        member = name.rpartition(".")[2]
+        return self.places[id(owner)] + (f".{member}" if _shown(owner, member) else "")
+
+    def link_neighbours(self, text: str, module: str, but: Container[str] = ()) -> str:
+        """Text in which bare names of a module's public functions are links, but for some (a function's arguments)."""
+        neighbours = {
+            thing.__name__: self.places[id(thing)]
+            for things in entries().values()
+            for _, thing in things
+            if inspect.isfunction(thing) and thing.__module__ == module and thing.__name__ not in but
+        }
+        return _BARE.sub(lambda m: f"[{m[0]}][{neighbours[m[1]]}]" if m[1] in neighbours else m[0], text)
+
+    def link(self, text: str, internals: set[str] | None = None) -> str:
+        """Text whose names are links; names that are not public are added to `internals`, and lead there.
+
+        Raises:
+            LookupError: as for `place`.
+        """
+
+        def linked(match: re.Match[str]) -> str:
+            name = match[1]
+            found = self.place(name)
+            if found is None and internals is not None and name.startswith("semfov."):
+                found = _internal(name)
+                internals.update([found] if found else [])
+            return f"[{match[0]}][{found}]" if found else match[0]
+
+        return NAME.sub(linked, text)
+
+
+def resolve(name: str) -> tuple[Any, Any]:
+    """What a full name stands for, and the class that it is a member of.
+
+    Raises:
+        LookupError: there is no such thing.
+    """
+    parts = name.split(".")
+    for length in range(1, len(parts) + 1):  # a function may hide the module that it is in
+        try:
+            thing = importlib.import_module(".".join(parts[:length]))
+        except ModuleNotFoundError:
+            break
+        with suppress(AttributeError):
+            return _member(thing, parts[length:])
+    raise LookupError(f"{name} does not exist")
+
+
+def _member(thing: Any, names: list[str]) -> tuple[Any, Any]:
+    owner = None
+    for name in names:
+        owner = thing if inspect.isclass(thing) else None
+        annotated = name in getattr(thing, "__annotations__", ())
+        thing = getattr(thing, name, None) if annotated else getattr(thing, name)
+    return thing, owner
+
+
+def _shown(owner: type, member: str) -> bool:
+    """Whether the reference shows a member: a documented method or property of the class itself."""
+    thing = inspect.getattr_static(owner, member, None)
+    thing = getattr(thing, "__func__", None) or getattr(thing, "fget", None) or thing
+    return member in vars(owner) and inspect.isfunction(thing) and bool(thing.__doc__) and not member.startswith("_")
+
+
+def _internal(name: str) -> str | None:
+    """The place of a class or function that is not public: where it is defined."""
+    thing, owner = resolve(name)
+    thing = owner or thing
+    if not (inspect.isclass(thing) or inspect.isfunction(thing)):
+        return None
+    return f"{thing.__module__}.{thing.__qualname__}"

@@ -1,0 +1,94 @@
+# %% [markdown]
+# # A belief in ten lines
+#
+# A detector that sees a blurred picture is often wrong, and says so with scores that are no probabilities. What it
+# reports from several fixations is gathered in a belief: a Dirichlet over the classes for every cell of a grid. This
+# tutorial writes that belief out, and then shows the module that does the same.
+
+# %%
+import matplotlib.pyplot as plt
+import torch
+
+import semfov
+from semfov.sensor import named_sensor
+
+torch.set_grad_enabled(False)
+detector = semfov.load_detector("yolov3-tiny")
+model = semfov.FovealObservationModel.from_pretrained("yolov3-tiny")
+eye = semfov.Eye(named_sensor("gradual"), detector).eval()
+
+scene = semfov.EmbeddedScenes(detector.classes)[1]  # made of photographs that installed packages carry
+view = eye.open(scene.image[None])
+grid = semfov.Grid(10, 10, scene.size)
+fixations = (scene.boxes[:, :2] + scene.boxes[:, 2:]) / 2 - 0.5  # one on each of its five objects
+
+# %% [markdown]
+# ## What the looks show
+
+# %% alt="Five foveated views of the same collage of photographs, each sharp around its fixation"
+figure, axes = plt.subplots(1, 5, figsize=(12, 2.1), layout="compressed")
+for axis, picture, (x, y) in zip(axes, eye.foveated(view, fixations), fixations.tolist()):
+    axis.imshow(picture.permute(1, 2, 0).clamp(0, 1).numpy())
+    axis.set(title=f"from ({x:.0f}, {y:.0f})", xticks=[], yticks=[])
+
+# %% [markdown]
+# ## The ten lines
+#
+# Every detection is a point of the simplex: scores of background and of all classes, which sum to 1. The observation
+# model knows how such scores are distributed, given the class and the distance to the fovea, and turns them into
+# likelihoods of the classes. Kaplan's rule fuses these into the Dirichlets of the cells that the box overlaps. Where
+# boxes share cells, the most confident comes first.
+
+# %%
+beta = torch.full((len(grid), 81), 0.5)  # a flat prior for every cell
+beliefs = []
+for fixation in fixations:
+    seen = eye.look(view, fixation[None])[0]
+    distance = grid.box_distance(seen.boxes, fixation)
+    likelihood = model.calibrate(seen.scores, distance)
+    for box, footprint in enumerate(grid.footprint(seen.boxes)):
+        beta[footprint] = semfov.fusion.kaplan(beta[footprint], likelihood[box].expand(int(footprint.sum()), -1))
+    beliefs.append(beta.clone())
+
+# %% [markdown]
+# What a cell holds, by its belief, is the mean of its Dirichlet. Here is the probability of a person after each look.
+# A flat prior of 0.5 for each of 81 classes weighs as much as forty looks, so it climbs slowly. What counts is which
+# class is ahead.
+
+# %% alt="The collage in grey with the probability of a person in each cell, after each of five looks"
+person = detector.classes.index("person") + 1  # 0 is background
+maps = torch.stack([belief[:, person] / belief.sum(-1) for belief in beliefs]).reshape(-1, 10, 10)
+figure, axes = plt.subplots(1, 5, figsize=(12, 2.3), layout="compressed")
+for number, (axis, probability) in enumerate(zip(axes, maps), start=1):
+    axis.imshow(scene.image.mean(0).numpy(), cmap="gray", extent=(0, 640, 480, 0))
+    strength = (0.9 * (probability / maps.max()).sqrt()).numpy()
+    drawn = axis.imshow(
+        probability.numpy(), cmap="plasma", alpha=strength, vmin=0, vmax=float(maps.max()), extent=(0, 640, 480, 0)
+    )
+    axis.plot(*fixations[:number].T.numpy(), ".", color="white", markeredgecolor="black", markersize=10)
+    axis.set(title=f"person, look {number}", xticks=[], yticks=[])
+_ = figure.colorbar(drawn, ax=axes, label="probability")
+
+# %%
+cells = grid.cell_of(fixations)
+leaders = beliefs[-1][cells, 1:].argmax(-1)
+for label, leader in zip(scene.labels.tolist(), leaders.tolist()):
+    print(f"there is a {detector.classes[label - 1]}; ahead is {detector.classes[leader]}")
+
+# %% [markdown]
+# ## The module that does the same
+#
+# `semfov.observers.Semantic` is this belief for batches of episodes, and for all detections of a look at once. It
+# gives the same numbers.
+
+# %%
+observer = semfov.observers.Semantic(81, model)
+belief = observer.start(1, grid, fixations)
+for fixation in fixations:
+    belief = observer(belief, eye.look(view, fixation[None]), fixation[None], grid)
+torch.testing.assert_close(belief.beta[0], beta, rtol=1e-3, atol=1e-3)
+print("largest difference", float((belief.beta[0] - beta).abs().max()))
+
+# %% [markdown]
+# Next: [search a photograph](search.py) with a belief that was learned, and the guide to
+# [beliefs](../guides/belief.md).

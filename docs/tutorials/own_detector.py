@@ -1,0 +1,123 @@
+# %% [markdown]
+# # Your detector
+#
+# The eye needs a detector: anything that returns boxes with a score for every class. An ONNX file takes no code at
+# all ([detectors](../detectors.md)). Here is the other way, a detector that is written down in twenty lines. It knows
+# two classes, large and small coins, by thresholding, and has no weights.
+
+# %%
+import matplotlib.pyplot as plt
+import torch
+from matplotlib.patches import Rectangle
+from skimage import data, filters, measure, morphology
+
+import semfov
+from semfov import viz
+from semfov.detection import Candidates
+
+torch.set_grad_enabled(False)
+
+
+class CoinDetector(semfov.Detector):
+    """Bright discs, by Otsu's threshold; the score falls with their contrast, the class goes by their diameter."""
+
+    def __init__(self) -> None:
+        super().__init__("coins", ("large coin", "small coin"), (384, 303))
+
+    def propose(self, canvas: torch.Tensor) -> Candidates:
+        """Every disc on a canvas."""
+        boxes, classes, objectness = [], [], []
+        for picture in canvas:
+            grey = picture.mean(0).cpu().double().numpy()
+            level = grey - filters.gaussian(grey, 40)
+            disc = morphology.remove_small_holes(
+                morphology.opening(level > filters.threshold_otsu(level)), max_size=400
+            )
+            found = [region for region in measure.regionprops(measure.label(disc), level) if region.area > 250]
+            edges = filters.sobel(grey)
+            rims = [edges[tuple(region.coords.T)].max() for region in found]
+            large = [1 / (1 + 2.718 ** (48 - region.equivalent_diameter_area)) for region in found]
+            boxes.append(torch.tensor([[r.bbox[1], r.bbox[0], r.bbox[3], r.bbox[2]] for r in found]).reshape(-1, 4))
+            classes.append(torch.tensor([[p, 1 - p] for p in large]).reshape(-1, 2))
+            objectness.append(torch.tensor(rims).mul(2.5).clamp(max=0.99))
+        stack = [torch.nn.utils.rnn.pad_sequence(part, batch_first=True) for part in (boxes, classes, objectness)]
+        return Candidates(*(part.to(canvas) for part in stack))
+
+
+image = semfov.as_image(data.coins())  # a photograph that scikit-image carries
+detector = CoinDetector().eval()
+print(detector.classes, image.shape)
+
+
+# %% alt="A photograph of Roman coins: sharp all over, and seen from one fixation, with the boxes that the detector finds"
+def show(axis, picture, seen, title):
+    """A picture with boxes, one colour for each class, as opaque as their scores are high."""
+    axis.imshow(picture.permute(1, 2, 0).clamp(0, 1).numpy())
+    for (x1, y1, x2, y2), scores in zip(seen.boxes.tolist(), seen.scores):
+        label = int(scores[1:].argmax())
+        colour = {0: "#E69F00", 1: "#56B4E9"}[label]
+        place = (x1, y1), x2 - x1, y2 - y1
+        axis.add_patch(Rectangle(*place, fill=False, edgecolor=colour, linewidth=2, alpha=float(scores[1:].max())))
+    axis.set(title=title, xticks=[], yticks=[])
+
+
+eye = semfov.Eye(semfov.Foveation(40.0), detector, reference=384.0).eval()
+gaze = torch.tensor([[290.0, 60.0]])
+view = eye.open(image[None])
+sharp, foveal = detector(image[None])[0], eye.look(view, gaze)[0]
+figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), layout="compressed")
+show(axes[0], image, sharp, f"sharp: {len(sharp.boxes)} coins")
+show(axes[1], eye.foveated(view, gaze)[0], foveal, f"from (290, 60): {len(foveal.boxes)} coins")
+
+# %% [markdown]
+# ## What are its scores worth away from the fovea?
+#
+# Blurred coins have soft rims, and score less. An observation model learns how scores are distributed, by class and
+# distance to the fovea. We take what the detector says of the sharp picture as the truth, look around at random, and
+# fit.
+
+# %%
+from semfov.observation import match
+
+edges = [0.1, 0.2, 0.3, 0.5]  # borders of the levels of distance, in longer sides of the picture
+truth, labels = sharp.boxes, sharp.scores[:, 1:].argmax(-1) + 1
+statistics = semfov.DirichletStatistics((3, len(edges) + 1), components=3)
+grid = semfov.Grid(10, 8, (384, 303))
+fixations = torch.rand(60, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([384.0, 303.0])
+model = semfov.FovealObservationModel.identity(detector.classes, edges)
+for fixation in fixations:
+    seen = eye.look(view, fixation[None])[0]
+    level = model.level(grid.box_distance(seen.boxes, fixation))
+    statistics.update(seen.scores, (match(seen.boxes, truth, labels), level))
+model.fit(statistics, minimum=1, prior=True, **eye.settings()).eval().requires_grad_(False)
+print(int(statistics.count.sum()), "detections")
+
+# %% alt="Scores to expect of large coins, small coins and background, by level of distance to the fovea"
+expected = model.expected_scores()
+figure, axes = plt.subplots(1, 3, figsize=(9, 2.8), layout="compressed", sharey=True)
+for axis, name, scores in zip(axes, ("background", *detector.classes), expected):
+    for component, label in enumerate(("background", *detector.classes)):
+        axis.plot(range(len(edges) + 1), scores[:, component].numpy(), "o-", label=f"score of {label}")
+    axis.set(title=f"what is a {name}" if name != "background" else "what is no coin", xlabel="level of distance")
+axes[0].set(ylabel="expected score")
+_ = axes[0].legend()
+
+# %% [markdown]
+# ## Search with it
+#
+# An agent is the eye with an observer and a policy. With its own observation model it knows what a blurred coin is
+# worth.
+
+# %% alt="The gaze's way over the coins to a large one, with what the eye saw and the probability of large coins at each fixation"
+observer = semfov.observers.Semantic(3, model)
+search, explore = semfov.policies.NonPredictive(), semfov.policies.KL(model)
+agent = semfov.ActivePerception(eye, (observer, search), (observer, explore), grid=(10, 8)).eval()
+scanpath = agent.search(image, "large coin", start=0)
+print(scanpath)
+viz.plot_episode(scanpath)
+
+# %% [markdown]
+# For a detector of real use, fit on thousands of photographs: `python -m train.fit_detector` fits everything that the
+# recommended agent needs ([your detector in three commands](../detectors.md#your-detector-in-three-commands)).
+#
+# Next: [your policy](own_policy.py).

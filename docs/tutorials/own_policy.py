@@ -1,0 +1,90 @@
+# %% [markdown]
+# # Your policy
+#
+# A policy chooses where to look next. It gives an acquisition function, which gives every cell a value; the next
+# fixation is the best cell not visited. This one explores by keeping away from all that was seen: it goes where the
+# closest fixation is farthest. It asks nothing of what was detected.
+
+# %%
+import matplotlib.pyplot as plt
+import torch
+
+import semfov
+from semfov import policies, viz
+from semfov.metrics.exploration import answers_of, count_right
+
+torch.set_grad_enabled(False)
+
+
+class Farthest(semfov.acquisition.AcquisitionFunction):
+    """Distance to the closest fixation so far."""
+
+    def forward(self, belief: semfov.Belief, visited: torch.Tensor) -> torch.Tensor:
+        """Values `(B, X·Y)`."""
+        return belief.closest  # every belief keeps it
+
+
+class KeepAway(policies.Policy):
+    """Explore by `Farthest`; the definition of the class registers it under its name."""
+
+    name = "keep-away"
+    tasks = ("exploration",)
+
+    def forward(self, target: int | None, grid: semfov.Grid) -> semfov.acquisition.AcquisitionFunction:
+        """The acquisition function on a grid."""
+        return Farthest()
+
+
+print(policies.policy_names("exploration"))
+
+# %% [markdown]
+# ## Put it into an agent
+#
+# An agent is an eye with one way to search and one to explore. We take the recommended one for the published fovea
+# apart, and give its eye and its learned map the new policy.
+
+# %% alt="The way of the gaze over a collage of photographs by the new policy, with what the eye saw and what the map names"
+recommended = semfov.ActivePerception.recommended("yolov3-tiny", sigma=100, growth=1)
+search = recommended.searching.observer, recommended.searching.policy
+mapper, closer = recommended.exploring.observer, recommended.exploring.policy
+agents = {
+    policy.name: semfov.ActivePerception(recommended.eye, search, (mapper, policy)).eval()
+    for policy in (KeepAway(), closer, policies.Random())
+}
+scenes = semfov.EmbeddedScenes(recommended.classes[1:], count=4)
+explored = agents["keep-away"].explore(scenes[1].image, start=0, shifts=6, until=0)
+viz.plot_episode(explored)
+
+# %% [markdown]
+# ## Was that wise?
+#
+# We count the cells with objects that the map names right after each look, in four scenes, from two corners. Names
+# are those of the most probable class but background.
+
+# %%
+looks = 8
+right = {name: torch.zeros(looks + 1) for name in agents}
+cells = 0
+for index in range(len(scenes)):
+    scene = scenes[index]
+    answers = answers_of(scenes.annotation(index), explored.grid, len(recommended.classes))[:, 1:]
+    for start in (0, 99):
+        cells += int(answers.any(-1).sum())
+        for name, agent in agents.items():
+            path = agent.explore(scene.image, start=start, shifts=looks, until=0)
+            right[name] += count_right(path.probabilities[..., 1:], answers)
+share = {name: counts / cells for name, counts in right.items()}
+print({name: f"{100 * counts[-1]:.0f} %" for name, counts in share.items()})
+
+# %% alt="Share of the cells that are named right, by number of gaze shifts, for three policies"
+figure, axis = plt.subplots(figsize=(6, 3.4), layout="compressed")
+for name, counts in share.items():
+    axis.plot(100 * counts.numpy(), "o-", label=name)
+axis.set(xlabel="gaze shifts", ylabel="cells named right (%)")
+axis.grid(alpha=0.3)
+_ = axis.legend()
+
+# %% [markdown]
+# These scenes are a toy: five objects each, as large as the fovea. For figures that mean something, name the
+# registered policy in the settings of `eval.explore`, and measure it on photographs: [write your own
+# policy](../guides/write_your_own_policy.md) shows how, with a policy of search.

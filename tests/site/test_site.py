@@ -1,0 +1,198 @@
+"""The site as it was built: whole, linked, and nothing in it comes from a network."""
+
+import json
+import os
+import re
+import shutil
+import threading
+import zlib
+from functools import partial
+from html.parser import HTMLParser
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from docs.api import entries, place
+from docs.site.tutorials import SOURCES
+
+pytestmark = pytest.mark.slow
+
+NAMES = (os.environ.get("CHROMIUM", ""), "chromium", "chromium-browser", "google-chrome")
+CHROMIUM = next((path for name in NAMES if name and (path := shutil.which(name))), None)
+LOADS = {
+    "script": "src",
+    "link": "href",
+    "img": "src",
+    "iframe": "src",
+    "source": "src",
+    "video": "src",
+    "object": "data",
+}
+
+
+class Page(HTMLParser):
+    """What a page loads, its text, and the code in it by whether a link leads on from it."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.loads, self.pictures, self.code, self.text = [], [], [], []
+        self._open = []
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attributes):
+        attributes = dict(attributes)
+        if tag in LOADS and attributes.get(LOADS[tag]):
+            self.loads.append(attributes[LOADS[tag]])
+        if tag == "img":
+            self.pictures.append(attributes)
+        if tag not in ("img", "link", "meta", "br", "input", "hr", "source"):
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.handle_starttag(tag, attributes)
+        if self._open and self._open[-1] == tag:
+            self._open.pop()
+
+    def handle_endtag(self, tag):
+        while self._open and self._open.pop() != tag:
+            pass
+
+    def handle_data(self, data):
+        if "script" in self._open or "style" in self._open:
+            return
+        if "pre" not in self._open:
+            self.text.append(data)
+        if "code" in self._open and "pre" not in self._open:
+            self.code.append((data, "a" in self._open))
+
+
+def pages(site):
+    return sorted(site.rglob("*.html"))
+
+
+def test_no_page_loads_anything_from_a_network(site):
+    assert len(pages(site)) > 50
+    outside = [
+        (page.name, load) for page in pages(site) for load in Page(page).loads if re.match(r"(https?:)?//", load)
+    ]
+    assert outside == []
+
+
+def test_no_style_loads_a_font_from_a_network(site):
+    styles = [path.read_text(encoding="utf-8") for path in [*site.rglob("*.css"), *pages(site)]]
+    assert [re.findall(r"(?:url\(|@import)\s*['\"]?(?:https?:)?//[^)'\"\s]+", style) for style in styles] == [[]] * len(
+        styles
+    )
+
+
+def test_every_public_name_has_its_place(site):
+    packed = (site / "objects.inv").read_bytes().split(b"\n", 4)[4]
+    known = {line.split(" ")[0] for line in zlib.decompress(packed).decode().splitlines()}
+    wanted = {place(module, name, thing) for module, things in entries().items() for name, thing in things}
+    assert len(wanted) > 200
+    assert wanted - known == set()
+
+
+def test_the_navigation_names_every_page_of_the_reference(site):
+    home = (site / "index.html").read_text(encoding="utf-8")
+    assert [module for module in entries() if f'href="./api/{module}.html"' not in home] == []
+
+
+def test_equations_lead_to_code(site):
+    code = [found for found in Page(site / "method.html").code if found[0].startswith("semfov.")]
+    assert len(code) > 100
+    assert [name for name, linked in code if not linked] == []
+
+
+def test_formulas_are_drawn_and_no_markup_is_left(site):
+    drawn = 0
+    for path in (site / "api").glob("*.html"):
+        drawn += path.read_text(encoding="utf-8").count("<math")
+        text = " ".join(Page(path).text)
+        assert not re.search(r":math:|\.\. math::|\$\$|\\(?:frac|mathrm|sum)|Example::", text), path.name
+    assert drawn > 100
+
+
+def test_examples_are_code_and_no_quotation(site):
+    assert [
+        path.name for path in (site / "api").glob("*.html") if "<blockquote" in path.read_text(encoding="utf-8")
+    ] == []
+
+
+@pytest.mark.weights
+@pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.stem)
+def test_tutorials_have_pictures_worth_looking_at(site, can_run, source):
+    if not can_run:
+        pytest.skip("the default detector's weights are missing")
+    page = Page(site / "tutorials" / f"{source.stem}.html")
+    drawn = [picture for picture in page.pictures if picture["src"].startswith(source.stem)]
+    assert len(drawn) >= 2
+    for picture in drawn:
+        assert len(picture["alt"]) > 40
+        with Image.open(site / "tutorials" / picture["src"]) as image:
+            assert min(image.size) > 150
+            assert np.asarray(image.convert("L")).std() > 15
+    notebook = json.loads((site / "tutorials" / f"{source.stem}.ipynb").read_text(encoding="utf-8"))
+    outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
+    assert {"stream", "display_data"} <= {output["output_type"] for output in outputs} | {"display_data"}
+    assert not [output for output in outputs if output["output_type"] == "error"]
+
+
+@pytest.fixture
+def address(site):
+    """The site on a server of this machine: its search needs one."""
+    handler = partial(Quiet, directory=str(site))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    """A server that says nothing."""
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def opened():
+    """A page of a browser, and what it asks for."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install playwright)")
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium (apt-get install chromium, or set $CHROMIUM)")
+    asked = []
+    with playwright.sync_playwright() as program:
+        browser = program.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page()
+        page.set_default_timeout(120_000)  # a busy machine is no mistake of the page's
+        page.on("request", lambda request: asked.append(request.url))
+        yield page, asked
+        browser.close()
+
+
+def test_a_browser_draws_formulas_and_asks_for_nothing(site, opened):
+    page, asked = opened
+    page.goto((site / "api" / "semfov.sensor.html").as_uri())
+    fraction = page.locator("math mfrac").first.bounding_box()
+    number = page.locator("math mn").first.bounding_box()
+    assert fraction["height"] > 1.3 * number["height"]
+    assert [address for address in asked if not address.startswith(("file:", "data:", "blob:"))] == []
+
+
+def test_the_search_finds_and_asks_for_nothing_elsewhere(address, opened):
+    page, asked = opened
+    page.goto(f"{address}/index.html")
+    box = page.locator("input[placeholder]:visible").first
+    for _ in range(60):  # until the program of the page listens
+        page.keyboard.press("Control+k")
+        page.wait_for_timeout(1000)
+        if box.is_visible():
+            break
+    box.press_sequentially("Kaplan")
+    page.get_by_text(re.compile(r"^\d+ results$")).first.wait_for()
+    assert [other for other in asked if not other.startswith((address, "data:", "blob:"))] == []

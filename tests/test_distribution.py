@@ -1,0 +1,109 @@
+"""Sdist and wheel, built without a network and installed where nothing else of this checkout can be seen."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import semfov
+
+pytest.importorskip("hatchling", reason="needs hatchling (pip install hatchling)")
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "semfov"
+DATA = {".safetensors", ".css", ".html", ".js", ".json", ".typed", ".cfg", ".txt", ".md"}
+
+CODE = """
+import sys
+from pathlib import Path
+import torch
+import semfov
+from semfov.report.page import page_html
+from semfov.report.episode import Pool
+
+home = Path(semfov.__file__).parent
+assert Path(sys.prefix) in home.parents, home
+models = sorted(path for path in home.rglob("*.safetensors"))
+assert len(models) > 15, models
+semfov.FovealObservationModel.from_pretrained("yolov3-tiny")
+semfov.TargetEvidence.from_pretrained("yolov3-tiny")
+semfov.MapEvidence.from_pretrained("yolov3-tiny")
+assert "<script" in page_html("a page", [], Pool())
+view = semfov.foveate(torch.rand(1, 3, 8, 8), (4.0, 4.0), sigma=2.0)
+print(semfov.__version__, view.shape[-1])
+"""
+
+
+def run(*call, cwd, **environment):
+    clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP"))}
+    done = subprocess.run(
+        [str(part) for part in call], cwd=cwd, env={**clean, **environment}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Sdist of the checkout, and the wheel that is made from it, in a folder."""
+    folder = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", folder, cwd=ROOT)
+    (sdist,) = folder.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(folder, filter="data")
+    unpacked = folder / sdist.name.removesuffix(".tar.gz")
+    run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder, cwd=unpacked)
+    return folder
+
+
+def names_in(built, kind):
+    (file,) = built.glob(kind)
+    if file.suffix == ".whl":
+        with zipfile.ZipFile(file) as archive:
+            return set(archive.namelist())
+    with tarfile.open(file) as archive:
+        return {name.partition("/")[2] for name in archive.getnames()}
+
+
+def tracked(folder):
+    """Files of the package that are no by-products."""
+    files = [path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    return {path.relative_to(ROOT).as_posix() for path in files if path.suffix in {".py", *DATA}}
+
+
+def test_the_wheel_has_the_package_and_all_its_data_and_nothing_else(built):
+    names = {name for name in names_in(built, "*.whl") if ".dist-info/" not in name}
+    assert names == tracked(PACKAGE)
+    assert sum(name.endswith(".safetensors") for name in names) > 15
+
+
+def test_the_wheel_carries_its_licence(built):
+    assert any(name.endswith("licenses/LICENSE") for name in names_in(built, "*.whl"))
+
+
+def test_the_sdist_has_what_the_tests_need(built):
+    names = names_in(built, "*.tar.gz")
+    assert {"pyproject.toml", "LICENSE", "README.md", "CHANGELOG.md", "constraints.txt", "Makefile"} <= names
+    assert {"tests/conftest.py", "eval/search.py", "train/fit_fom.py", "docs/api.py", "mkdocs.yml"} <= names
+    assert not [name for name in names if name.startswith((".venv/", "build/", "runs/", ".git/"))]
+
+
+def test_the_wheel_works_in_an_environment_of_its_own(built, tmp_path):
+    """Dependencies are those of this environment, by a path that does not run what else it would add to the search."""
+    home = tmp_path / "environment"
+    venv.create(home, with_pip=False, symlinks=os.name != "nt")
+    python = home / "bin" / "python"
+    site = Path(run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=tmp_path).strip())
+    (wheel,) = built.glob("*.whl")
+    install = ["--python", python, "install", "--no-index", "--no-deps", "--no-build-isolation", "--quiet", wheel]
+    run(sys.executable, "-m", "pip", *install, cwd=tmp_path)
+    libraries = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
+    (site / "dependencies.pth").write_text("\n".join(sorted(libraries)) + "\n", encoding="utf-8")
+    assert run(python, "-W", "error", "-c", CODE, cwd=tmp_path).split() == [semfov.__version__, "8"]

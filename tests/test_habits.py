@@ -1,0 +1,94 @@
+"""What keeps the project in order agrees with itself: versions, pins, checks before a commit and on the server."""
+
+import re
+import runpy
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
+
+import semfov
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+MAKE = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+PINS = dict(
+    line.split("==") for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines() if line[0] != "#"
+)
+
+
+def read(path):
+    return yaml.safe_load((ROOT / path).read_text(encoding="utf-8"))
+
+
+def required(*extras):
+    """Requirements of the package and of some extras, with those of the extras that these name."""
+    texts = [*PROJECT["dependencies"], *(text for extra in extras for text in PROJECT["optional-dependencies"][extra])]
+    for requirement in map(Requirement, texts):
+        if requirement.name == PROJECT["name"]:
+            yield from required(*requirement.extras)
+        else:
+            yield requirement
+
+
+def test_the_version_is_written_once_and_cited_right():
+    assert PROJECT["dynamic"] == ["version"]
+    assert read("CITATION.cff")["version"] == semfov.__version__
+    released = re.findall(r"^## (\d+\.\d+\.\d+), (\d{4}-\d\d-\d\d)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert released[0] == (semfov.__version__, read("CITATION.cff")["date-released"].isoformat())
+
+
+@pytest.mark.parametrize("requirement", {str(each): each for each in required("dev")}.values(), ids=str)
+def test_what_the_tests_need_is_pinned_to_a_version_that_users_may_have(requirement):
+    assert PINS[canonicalize_name(requirement.name)] in requirement.specifier
+
+
+def test_setup_takes_the_pins():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert '--constraint constraints.txt --editable ".[dev]"' in makefile
+    assert "$(STAMP): pyproject.toml constraints.txt" in makefile
+
+
+def test_the_oldest_versions_are_the_lower_bounds():
+    oldest = runpy.run_path(str(ROOT / ".ci" / "oldest.py"))["oldest"](PROJECT["dependencies"])
+    assert [line.partition("==")[0] for line in oldest] == [Requirement(text).name for text in PROJECT["dependencies"]]
+    assert all(
+        line.partition("==")[2] in Requirement(text).specifier
+        for line, text in zip(oldest, PROJECT["dependencies"], strict=True)
+    )
+
+
+def test_what_is_checked_before_a_commit_is_checked_by_make_test():
+    hooks = [hook for repo in read(".pre-commit-config.yaml")["repos"] for hook in repo["hooks"]]
+    targets = [hook["entry"].removeprefix("make ") for hook in hooks]
+    assert {"lint", "types"} <= set(targets) <= MAKE
+    assert re.search(r"^test: lint types$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+
+
+def test_the_workflows_run_what_is_there():
+    jobs = {
+        name: job for path in ("test", "docs") for name, job in read(f".github/workflows/{path}.yml")["jobs"].items()
+    }
+    steps = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
+    assert ".ci/run" in steps
+    assert {step.removeprefix("make ") for step in steps if step.startswith("make ")} <= MAKE
+    assert all((ROOT / name).is_file() for step in steps for name in re.findall(r"\.ci/[\w.]+", step))
+    assert jobs["tested"]["strategy"]["matrix"]["os"] == ["ubuntu-latest", "macos-latest"]
+
+
+def test_the_workflows_have_the_oldest_python_and_a_newer_one():
+    supported = SpecifierSet(PROJECT["requires-python"])
+    text = (ROOT / ".github/workflows/test.yml").read_text(encoding="utf-8")
+    versions = re.findall(r'python-version: "([\d.]+)"', text)
+    assert all(version in supported for version in versions)
+    assert f">={min(versions)}" == PROJECT["requires-python"] != f">={max(versions)}"
+
+
+def test_templates_can_be_read():
+    for path in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml"):
+        form = read(path.relative_to(ROOT))
+        assert path.stem == "config" or {"name", "description", "body"} <= set(form)

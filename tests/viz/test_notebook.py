@@ -1,0 +1,27 @@
+"""A figure as the last value of a notebook's cell."""
+
+import subprocess
+import sys
+
+import pytest
+
+CODE = """
+from IPython.core.interactiveshell import InteractiveShell
+from matplotlib.figure import Figure
+
+from semfov.viz import plot_reliability
+import torch
+
+shell = InteractiveShell.instance()
+plain, _ = shell.display_formatter.format(Figure().add_subplot().figure)
+figure = plot_reliability({"model": (torch.rand(50, 3).softmax(-1), torch.randint(3, (50,)))})
+drawn, _ = shell.display_formatter.format(figure)
+print("image/png" in plain, drawn["image/png"][:4] == b"\\x89PNG", drawn["image/png"].count(b"IEND"))
+"""
+
+
+def test_a_figure_shows_itself_before_pyplot_is_used():
+    """Matplotlib's own figures do not: a notebook learns to show them from pyplot."""
+    pytest.importorskip("IPython", reason="needs IPython (pip install semfov[docs])")
+    done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "True", "1"]
