@@ -265,7 +265,9 @@ def only_likeliest(wanted: dict[str, float]) -> None:
         print(f"videos, cameras and large pictures are searched for one class: {next(iter(wanted))}")
 
 
-def look_at(agent: ActivePerception, picture: Picture, config: DemoConfig, wanted: dict[str, float]) -> Scanpath:
+def look_at(
+    agent: ActivePerception, picture: Picture, config: DemoConfig, wanted: dict[str, float] | None = None
+) -> Scanpath:
     """Search or explore a picture."""
     common: dict[str, Any] = {"start": start_cell(agent, picture, config), "seed": config.seed}
     with torch.inference_mode():
@@ -274,7 +276,7 @@ def look_at(agent: ActivePerception, picture: Picture, config: DemoConfig, wante
             return agent.explore(picture.image, shifts=shifts, until=config.until, **common)
         shifts = 30 if config.shifts is None else config.shifts
         common |= {"confirm": config.confirm, "give_up": config.give_up, "price": config.price}
-        target = wanted if len(wanted) > 1 else config.target
+        target = wanted if wanted and len(wanted) > 1 else config.target
         return agent.search(picture.image, target, shifts=shifts, **common)
 
 
