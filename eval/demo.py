@@ -164,7 +164,7 @@ def make_agent(config: DemoConfig) -> ActivePerception:
     return make(config.detector, sensor=config.sensor or "published")
 
 
-def moved(detector: str) -> dict[str, str]:
+def moved(detector: str) -> dict[str, Any]:
     """Where a detector lies now that a folder of models names, if that is told."""
     return {} if detector == DemoConfig().detector else {"detector": detector}
 
