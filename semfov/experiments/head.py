@@ -162,13 +162,15 @@ class HeadRun:
         store = self.store if config.store else None
         looks = StoredLooksAround(lambda: live(self.eye, views), store, self.scenes.digest(index))
         watch.lap("scene")
-        with torch.inference_mode():
-            records = self._searches(index, views, looks)
-            watch.lap("search")
-            if config.explore:
-                records += self._explorations(index, views, looks)
-            watch.lap("exploration")
-        looks.save()
+        try:
+            with torch.inference_mode():
+                records = self._searches(index, views, looks)
+                watch.lap("search")
+                if config.explore:
+                    records += self._explorations(index, views, looks)
+                watch.lap("exploration")
+        finally:
+            looks.save()  # of a run that is stopped, too
         return records, watch.seconds
 
     def ways(self, gain: Gain, start: int) -> dict[str, Callable[[int], AcquisitionFunction]]:
