@@ -63,6 +63,7 @@ class FovealTrainingConfig(Settings):
         fit_fixations: random fixations in each photograph of the fit.
         fixations: random fixations in each photograph, to measure recall and calibration.
         rate: false boxes in a look, on average, at which found objects are counted.
+        searched: search only the first so many photographs, for each of which every cell is looked at (None: all).
         policy: that searches, as for `eval.search`, without `-raw` or `-calibrated`.
         grid: `[columns, rows]` of the beliefs.
         protocol: the searches.
@@ -80,6 +81,7 @@ class FovealTrainingConfig(Settings):
     fit_fixations: Count = 2
     fixations: Count = 6
     rate: Positive = 1.0
+    searched: Count | None = None
     policy: str = "non-predictive"
     grid: tuple[Side, Side] = (10, 10)
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
@@ -124,7 +126,7 @@ def arms(config: FovealTrainingConfig, name: str, detector: DetectorConfig) -> d
         cache=config.cache,
         workers=config.workers,
     )
-    return arms_of(fit, search, config.policy, config.fixations, config.rate)
+    return arms_of(fit, search, config.policy, config.fixations, config.rate, config.searched)
 
 
 def training_minutes(tuned: Path) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -88,7 +88,9 @@ def fitted(config: FitConfig) -> tuple[FovealObservationModel, Path, float]:
     return model, path, minutes
 
 
-def arms_of(fit: FitConfig, search: SearchConfig, policy: str, fixations: int, rate: float) -> dict[str, Arm]:
+def arms_of(
+    fit: FitConfig, search: SearchConfig, policy: str, fixations: int, rate: float, most: int | None = None
+) -> dict[str, Arm]:
     """The arms of a detector, `raw` and `calibrated`.
 
     Args:
@@ -97,13 +99,15 @@ def arms_of(fit: FitConfig, search: SearchConfig, policy: str, fixations: int, r
         policy: that searches.
         fixations: random fixations in each photograph, by which recall and calibration are measured.
         rate: false boxes in a look at which objects are counted as found.
+        most: photographs that are searched, the first ones; None: all.
     """
     model, path, minutes = fitted(fit)
     settings = SampleSettings(search.data, search.detector, search.sensor, fixations, fit.iou, search.protocol.seed)
     sampler, samples = collect(settings, search.out / "samples", search.workers, "looking")
     with torch.inference_mode():
         calibrated = model.calibrate(samples.scores, samples.distance)
-    curves, by_chance = searched(search, path, policy)
+    limit = min((n for n in (most, search.data.limit) if n is not None), default=None)
+    curves, by_chance = searched(replace(search, data=replace(search.data, limit=limit)), path, policy)
     arms = {}
     for name, probabilities in zip(SCORES, (samples.scores, calibrated), strict=True):
         recall, objects = recall_of(sampler.scenes, samples, probabilities, model.edges, fit.iou, rate)

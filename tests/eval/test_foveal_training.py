@@ -118,6 +118,14 @@ def test_the_same_command_again_does_nothing_twice(finished):
     assert (out / "compared" / "foveal_training.md").read_text() == text
 
 
+def test_fewer_photographs_may_be_searched_than_seen(finished):
+    out, arguments = finished
+    assert main([*arguments, "--searched", "1"]) == 0
+    text = (out / "compared" / "foveal_training.md").read_text()
+    assert "search (1 photographs" in text
+    assert "fixation in longer sides (2 photographs" in text
+
+
 def test_curves_are_by_photograph():
     curves = curves_of({"b": [1, -1], "a": [0, 2, 2]}, 2)
     np.testing.assert_allclose(curves, [cumulative_performance(np.array(f), 2) for f in ([0, 2, 2], [1, -1])])
