@@ -42,7 +42,9 @@ def test_the_version_is_written_once_and_cited_right():
     assert released[0] == (semfov.__version__, read("CITATION.cff")["date-released"].isoformat())
 
 
-@pytest.mark.parametrize("requirement", {str(each): each for each in required("dev")}.values(), ids=str)
+@pytest.mark.parametrize(
+    "requirement", sorted({str(each): each for each in required("dev")}.values(), key=str), ids=str
+)
 def test_what_the_tests_need_is_pinned_to_a_version_that_users_may_have(requirement):
     assert PINS[canonicalize_name(requirement.name)] in requirement.specifier
 
