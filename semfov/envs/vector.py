@@ -93,7 +93,9 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
                 these (`Scenery.episodes`); else as for `GazeEnv.reset`.
         """
         if seed is not None:
-            given = [seed + row for row in range(self.num_envs)] if isinstance(seed, int) else list(seed)
+            given = (
+                [int(seed) + row for row in range(self.num_envs)] if isinstance(seed, int | np.integer) else list(seed)
+            )
             check(len(given) == self.num_envs, "seed", f"{self.num_envs} of them", len(given))
             for row, one in enumerate(given):
                 if one is not None:
