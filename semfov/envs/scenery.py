@@ -67,7 +67,7 @@ class Scenery:
         self._wanted = None if targets is None else {class_index(target, names, "targets") for target in targets}
         self.scenes = [scene for scene in range(len(run.scenes)) if self._asked(scene)]
         # Kept for as long as there are environments: what they go by, whoever asks.
-        self.episodes = cache(self._episodes)
+        self._listed = cache(self._list)
         self.grid = cache(run.grid)
         self.answers = cache(self._answers)
         self.open = cache(self._open)
@@ -84,8 +84,11 @@ class Scenery:
         found: list[int] = self.run.scenes.annotation(scene).labels.tolist()
         return found
 
-    def _episodes(self, scene: int) -> list[Any]:
-        """All episodes of a scene."""
+    def episodes(self, scene: int) -> list[Any]:
+        """All episodes of a scene: its searches or explorations, as the protocol draws their starts."""
+        return self._listed(scene)
+
+    def _list(self, scene: int) -> list[Any]:
         run, protocol, belief = self.run, self.run.config.protocol, self.run.config.belief
         if isinstance(run, SearchRun):
             return list(episodes_of(run.scenes, scene, belief.columns, belief.rows, protocol, self._asked(scene)))

@@ -41,7 +41,7 @@ class ZoomScenery:
         names = run.eye.detector.classes
         self._wanted = None if targets is None else sorted({class_index(each, names, "targets") for each in targets})
         self.glances = cache(self._glances)
-        self.episodes = cache(self._episodes)
+        self._listed = cache(self._list)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -80,8 +80,11 @@ class ZoomScenery:
             return self._wanted
         return [each for each in self.run.scenes.targets(scene) if self._wanted is None or each in self._wanted]
 
-    def _episodes(self, scene: int) -> list[int]:
+    def episodes(self, scene: int) -> list[int]:
         """Targets of all searches of a picture: those that the overview does not show already."""
+        return self._listed(scene)
+
+    def _list(self, scene: int) -> list[int]:
         glances = self.glances(scene)
         first = glances.see([overview(glances)])[0]
         return [target for target in self.targets(scene) if not self.found([first], scene, target)]
