@@ -134,7 +134,9 @@ def zooming(tmp_path, monkeypatch):
 
 
 def test_a_large_picture_is_looked_at_in_windows(run, large, zooming, tmp_path):
-    code, printed = run(large, "--target", "red", "--shifts", 5, "--start", 3, "--report", tmp_path / "page.html")
+    code, printed = run(
+        large, "--target", "red", "--confirm", 0.7, "--shifts", 5, "--start", 3, "--report", tmp_path / "page.html"
+    )
     assert code == 0
     assert "field.png, 1280 × 960 px, looked at in windows: red: found" in printed.out
     assert "not used for a picture of this size: start, report" in printed.out

@@ -16,12 +16,12 @@ from docs.api import entries
 from semfov import Eye, FovealObservationModel, Foveation, Grid, acquisition, fusion, policies, saliency
 from semfov.agent import ActivePerception
 from semfov.belief import ContextPrior, DirichletBelief, MapEvidence, TargetEvidence
-from semfov.belief.observers import Context, Landing, LearnedMap, Observer, Semantic, Target
+from semfov.belief.observers import AnyOf, Context, Landing, LearnedMap, Observer, Semantic, Target
 from semfov.detection import Candidates, Detections, Detector, Selection
 from semfov.gaze import IVSN, GazeHabits, LearnedGaze, Policy, select_fixation
 from semfov.gaze.templates import ClassTemplates
 from semfov.observation import FoldedObservationModel
-from semfov.sensor import Glimpse, LogPolar, RandomFoveation
+from semfov.sensor import Glimpse, LogPolar, Perspective, RandomFoveation
 from semfov.zoom import GlimpseEvidence
 
 CLASSES = ("cat", "cup", "person")
@@ -292,6 +292,8 @@ OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], tuple[Tensor, ...]
     "Target": (lambda: Watching(Target(TargetEvidence(4, 4).eval())), look),
     "Context": (lambda: Watching(Context(observing(), context())), look),
     "Landing": (lambda: Watching(Landing(3)), look),
+    "AnyOf": (lambda: Watching(AnyOf(Target(TargetEvidence(4, 4).eval()), {1: 0.3, 2: 1.0})), look),
+    "AnyOf, of one map": (lambda: Watching(AnyOf(LearnedMap(mapping()), {1: 0.3, 2: 1.0})), look),
     "ClassTemplates": (lambda: ClassTemplates(rand(3, 5), rand(5), CLASSES), lambda: (rand(2, 5, 4, 6),)),
     "VOCUS2": (saliency.VOCUS2, lambda: (rand(1, 3, 40, 60),)),
     "IttiKoch": (saliency.IttiKoch, lambda: (rand(1, 3, 64, 96),)),
@@ -311,6 +313,10 @@ BRANCHING = {
     "Eye": (Scores, lambda: (rand(1, 3, 48, 64), torch.tensor([[20.0, 30.0], [5.0, 6.0]]))),
     "RandomFoveation": (Augmenting, lambda: (rand(2, 3, 48, 64), 40 * rand(2, 2), torch.tensor([5.0, 9.0]))),
     "ActivePerception": (Exploring, lambda: (rand(1, 3, 48, 64),)),
+    "Perspective": (
+        lambda: Perspective((20, 16)),
+        lambda: (rand(1, 3, 32, 64), torch.tensor([[[30.0, 10.0, 60.0], [170.0, -80.0, 90.0]]])),
+    ),
     "Glimpse": (
         lambda: Glimpse((32, 24)),
         lambda: (rand(1, 3, 48, 64), torch.tensor([[[20.0, 30.0], [50.0, 9.0]]]), torch.tensor([[0.5, 1.0]])),
@@ -331,6 +337,8 @@ BRANCHING = {
 }
 # They take pictures of bytes, from files too, and keep them so: tests/zoom has theirs.
 OF_BYTES = {"ZoomAgent", "ZoomEye"}
+# They act in a scene of their own, one episode at a time: tests/head has theirs.
+OF_SCENES = {"ExploreGain", "HeadAgent", "PerPrice", "Scan", "SceneObserver", "SearchGain"}
 TENSORS = OTHERS | {name: (partial(valuing, make), memory) for name, make in ACQUISITIONS.items()}
 DECISIONS = {name: (partial(lambda make: Deciding(make()), make), memory) for name, make in DECIDERS.items()}
 PARTS = TENSORS | BRANCHING | DECISIONS
@@ -367,7 +375,7 @@ def test_all_modules_are_tested():
         for name, thing in things
         if isclass(thing) and issubclass(thing, nn.Module) and not isabstract(thing)
     }
-    assert modules <= {name.split(",")[0] for name in PARTS} | OF_BYTES
+    assert modules <= {name.split(",")[0] for name in PARTS} | OF_BYTES | OF_SCENES
 
 
 def test_state_dict(part):
