@@ -187,7 +187,7 @@ def test_both_kinds_exist_for_every_detector():
     assert {path.stem for path in TARGET} == {path.stem for path in MAPS} == learned
     kinds = ("", "-sharp", "-published", "-published-narrow")
     every = {name + kind for name in names for kind in kinds}
-    assert {path.stem for path in OBSERVATION} == every | {"yolox-nano-zoom"}
+    assert {path.stem for path in OBSERVATION} == every | {f"{name}-zoom" for name in names}
 
 
 @pytest.mark.parametrize("growth", [1.0, 2.0])

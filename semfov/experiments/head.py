@@ -20,11 +20,10 @@ from semfov.episode import Stopwatch
 from semfov.errors import DataError, check
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.head_store import HeadStore, StoredLooksAround
-from semfov.experiments.parts import Parts, Record
-from semfov.experiments.run import cache_folder, digest_of
+from semfov.experiments.parts import Record
+from semfov.experiments.run import SceneRun, cache_folder, digest_of
 from semfov.experiments.settings import Count, Positive, Range, Seed, Settings, Share, Weight, Whole, Workers
 from semfov.experiments.setup import make_eye, make_map_evidence, make_scenes, make_target_evidence
-from semfov.experiments.store import versions
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
 from semfov.head.episode import Detect, HeadStep, live, look_around, rests_on
@@ -33,7 +32,6 @@ from semfov.head.panoramas import Panoramas
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
 from semfov.head.world import Boxes, Flat, Panorama, Places, World
-from semfov.io.code import package_digest
 from semfov.io.storage import checksum
 from semfov.metrics.exploration import right_cells
 
@@ -95,15 +93,14 @@ class HeadConfig(Settings):
     workers: Workers | None = None
 
 
-class HeadRun:
+class HeadRun(SceneRun):
     """Everything that a run is made of, built from its settings in each process.
 
     Attributes:
         scenes: panoramas or mosaics.
-        settings_key: sha256 of all settings, models and pictures that the outcomes depend on.
-        code: sha256 of all code that they depend on.
-        key: of both; parts of another run are never mixed in.
     """
+
+    config: HeadConfig
 
     def __init__(self, config: HeadConfig) -> None:
         self.config = config
@@ -131,19 +128,13 @@ class HeadRun:
         )
         looks = {"eye": self.eye.settings(), "fields": config.fields}
         self.store = HeadStore(cache_folder(config.cache) / "head", looks, len(self.eye.detector.classes))
-        self.settings_key, self.code = self._key(), digest_of([package_digest(), versions()])
-        self.key = f"{self.settings_key[:16]}-{self.code[:16]}"
+        self.make_key()
 
     def _key(self) -> str:
         besides = ("out", "cache", "store", "workers", "data", "detector")
         protocol = {name: value for name, value in asdict(self.config).items() if name not in besides}
         models = [checksum(model.state_dict()) for model in (self.target_evidence, self.map_evidence)]
         return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, models])
-
-    @property
-    def parts(self) -> Parts:
-        """Outcomes of finished scenes."""
-        return Parts(self.config.out / "parts", self.key, self.scenes.digest)
 
     def world(self, index: int) -> World:
         """The scene, as a head looks around in it."""

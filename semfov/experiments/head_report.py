@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.errors import DataError
 from semfov.experiments.head import OURS, HeadConfig, HeadRun
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.run import finish
-from semfov.experiments.summary import announce, percent, table
+from semfov.experiments.summary import announce, gather, percent, table
 from semfov.io.files import write_text
 from semfov.metrics.averages import standard_error
 from semfov.viz.style import line_style, save_figure
@@ -31,12 +30,7 @@ def head(config: HeadConfig) -> None:
     finish(run, "looking around")
     if rank() > 0:
         return
-    records: list[Record] = []
-    for index in range(len(run.scenes)):
-        part = run.parts.load(index)
-        if part is None:
-            raise DataError(f"{run.parts.path(index)}: this part is gone; give the same command again")
-        records += part["records"]
+    records, _ = gather(run)
     text = summary(records, config)
     write_text(config.out / "head.md", text)
     write_text(config.out / "records.jsonl", "".join(json.dumps(record) + "\n" for record in records))

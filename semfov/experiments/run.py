@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -34,18 +34,56 @@ from semfov.io.storage import checksum
 _log = logging.getLogger(__name__)
 
 
-class Run(ABC):
-    """Everything that a run is made of, built from its settings in each process.
+class SceneRun(ABC):
+    """An experiment that is made of its settings alone, in any process, and whose scenes are finished one by one.
 
     Attributes:
-        task: what episodes are for.
-        policies: settings of the policies under comparison, by what tables call them.
+        config: settings.
+        scenes: in their order.
         settings_key: sha256 of all settings, models and scenes that the outcomes depend on.
         code: sha256 of all code that they depend on.
         key: of both; parts of another run are never mixed in.
     """
 
+    config: Any
+    scenes: Scenes
+
+    def make_key(self) -> None:
+        """Set the keys from what the run is made of; asked for again where a subclass makes more of it."""
+        self.settings_key, self.code = self._key(), self._code()
+        self.key = f"{self.settings_key[:16]}-{self.code[:16]}"
+
+    @abstractmethod
+    def _key(self) -> str: ...
+
+    def _code(self) -> str:
+        """Of the whole package and the libraries below it."""
+        return digest_of([package_digest(), versions()])
+
+    @property
+    def parts(self) -> Parts:
+        """Outcomes of finished scenes."""
+        return Parts(self.config.out / "parts", self.key, self.digest)
+
+    def digest(self, index: int) -> str:
+        """sha256 of what the pixels of a scene depend on."""
+        return self.scenes.digest(index)
+
+    @abstractmethod
+    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
+        """Records of a scene, and the seconds that they took."""
+
+
+class Run(SceneRun):
+    """Everything that a run is made of, built from its settings in each process.
+
+    Attributes:
+        task: what episodes are for.
+        policies: settings of the policies under comparison, by what tables call them.
+    """
+
     task: ClassVar[Task]
+    config: RunConfig
 
     def __init__(self, config: RunConfig) -> None:
         self.config = config
@@ -83,11 +121,6 @@ class Run(ABC):
         """The scenes of the run; a subclass may have others."""
         return make_scenes(self.config.data, self.eye.detector.classes)
 
-    def make_key(self) -> None:
-        """Set the keys from what the run is made of; asked for again where a subclass makes more of it."""
-        self.settings_key, self.code = self._key(), self._code()
-        self.key = f"{self.settings_key[:16]}-{self.code[:16]}"
-
     def _code(self) -> str:
         """Of the whole package and the libraries below it, and of policies that the user registered."""
         chosen = {policy.policy for policy in self.policies.values()} & POLICIES.keys()
@@ -117,11 +150,6 @@ class Run(ABC):
             policies[name]["context_model"] = contexts.get(policy.context_model or config.belief.context_model)
         seen = [self.eye.settings(), self.scenes.fingerprint]
         return digest_of([self.task, seen, belief, fitted, protocol, policies, saliency])
-
-    @property
-    def parts(self) -> Parts:
-        """Outcomes of finished scenes."""
-        return Parts(self.config.out / "parts", self.key, self.digest)
 
     def digest(self, index: int) -> str:
         """sha256 of what the pixels of a scene depend on."""
@@ -185,21 +213,7 @@ def cache_folder(chosen: Path | None) -> Path:
     return user_cache()
 
 
-class Resumable(Protocol):
-    """An experiment that is made of its settings alone, in any process, and whose scenes are finished one by one."""
-
-    config: Any
-    scenes: Scenes
-
-    @property
-    def parts(self) -> Parts:
-        """Outcomes of finished scenes."""
-
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """Records of a scene, and the seconds that they took."""
-
-
-def finish(run: Resumable, title: str) -> None:
+def finish(run: SceneRun, title: str) -> None:
     """Run all scenes that have no part yet, this rank its share of them, and wait for the other ranks."""
     parts = run.parts
     todo = [index for index in mine(range(len(run.scenes))) if parts.load(index) is None]
@@ -230,10 +244,10 @@ def digest_of(what: object) -> str:
     return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
 
-_process: dict[str, Resumable] = {}
+_process: dict[str, SceneRun] = {}
 
 
-def prepare_process(make: Callable[[Any], Resumable], config: Any) -> None:
+def prepare_process(make: Callable[[Any], SceneRun], config: Any) -> None:
     """Build the run once in this process."""
     prepare_worker()
     _process["run"] = make(config)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from semfov.errors import DataError
 from semfov.experiments.parts import Record
-from semfov.experiments.run import Run
+from semfov.experiments.run import Run, SceneRun
 from semfov.experiments.setup import fovea_of, plain
 from semfov.io.compatibility import recommended
 from semfov.io.files import inside, write_text
@@ -76,7 +76,7 @@ def collect(run: Run) -> tuple[list[Record], dict[str, float]]:
     return records, seconds
 
 
-def gather(run: Run) -> tuple[list[Record], dict[str, float]]:
+def gather(run: SceneRun) -> tuple[list[Record], dict[str, float]]:
     """Records of all scenes in their order, and the seconds spent by stage."""
     records: list[Record] = []
     seconds: dict[str, float] = defaultdict(float)

@@ -18,16 +18,14 @@ from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch
 from semfov.errors import DataError, check
 from semfov.experiments.config import DataConfig, DetectorConfig
-from semfov.experiments.parts import Parts, Record
-from semfov.experiments.run import cache_folder, digest_of
+from semfov.experiments.parts import Record
+from semfov.experiments.run import SceneRun, cache_folder, digest_of
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.settings import Count, Range, Seed, Settings, Side, Weight, Whole, Workers
 from semfov.experiments.setup import make_context, make_detector, make_scenes, make_zoom_observation
-from semfov.experiments.store import versions
 from semfov.experiments.zoom_decisions import decide_all
 from semfov.experiments.zoom_orders import oracle, quad_tree, ranked, raster, shuffled, slices
 from semfov.experiments.zoom_store import GlanceStore, StoredGlances, open_scene
-from semfov.io.code import package_digest
 from semfov.io.storage import checksum
 from semfov.observation.matching import box_iou
 from semfov.zoom.context import WindowContext
@@ -114,15 +112,14 @@ class ZoomConfig(Settings):
     workers: Workers | None = None
 
 
-class ZoomRun:
+class ZoomRun(SceneRun):
     """Everything that a run is made of, built from its settings in each process.
 
     Attributes:
         scenes: mosaics or photographs.
-        settings_key: sha256 of all settings, models and pictures that the outcomes depend on.
-        code: sha256 of all code that they depend on.
-        key: of both; parts of another run are never mixed in.
     """
+
+    config: ZoomConfig
 
     def __init__(self, config: ZoomConfig) -> None:
         self.config = config
@@ -149,8 +146,7 @@ class ZoomRun:
                 self.contexts[label] = WindowContext(kind, config.context_weight)
         self.target = None if config.target is None else class_index(config.target, names, "target")
         self.store = GlanceStore(cache_folder(config.cache) / "glances", self.eye.settings(), len(names))
-        self.settings_key, self.code = self._key(), digest_of([package_digest(), versions()])
-        self.key = f"{self.settings_key[:16]}-{self.code[:16]}"
+        self.make_key()
 
     def open_scenes(self, classes: tuple[str, ...]) -> Scenes:
         """The photographs of the run; a subclass may have others."""
@@ -166,11 +162,6 @@ class ZoomRun:
         model = [checksum(evidence.state_dict()), evidence.patience, evidence.foresight, thresholds]
         observed = None if self.observation is None else checksum(self.observation.state_dict())
         return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, model, observed])
-
-    @property
-    def parts(self) -> Parts:
-        """Outcomes of finished scenes."""
-        return Parts(self.config.out / "parts", self.key, self.scenes.digest)
 
     def glances(self, index: int) -> StoredGlances:
         """Looks at a scene."""

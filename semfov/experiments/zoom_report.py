@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from semfov.errors import DataError
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.run import finish
-from semfov.experiments.summary import announce, table
+from semfov.experiments.summary import announce, gather, table
 from semfov.experiments.zoom import FREE, UNSEEN, ZoomConfig, ZoomRun
 from semfov.experiments.zoom_decisions import decision_tables, probabilities
 from semfov.io.files import write_text
@@ -27,12 +26,7 @@ def zoom(config: ZoomConfig) -> None:
     finish(run, "zooming")
     if rank() > 0:
         return
-    records: list[Record] = []
-    for index in range(len(run.scenes)):
-        part = run.parts.load(index)
-        if part is None:
-            raise DataError(f"{run.parts.path(index)}: this part is gone; give the same command again")
-        records += part["records"]
+    records, _ = gather(run)
     text = summary(records, run)
     write_text(config.out / "zoom.md", text)
     write_text(config.out / "records.jsonl", "".join(json.dumps(record) + "\n" for record in records))
