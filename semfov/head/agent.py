@@ -30,7 +30,7 @@ from semfov.sensor.foveation import Foveation
 SIGMA = 100.0
 """Width of the fovea, in pixels of a view of 640, that the shipped evidence was learned with."""
 
-CONFIRM = 0.5
+CONFIRM = 0.7
 
 
 @dataclass(frozen=True)

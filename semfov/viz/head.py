@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from semfov.data.inputs import ImageLike, as_image
 from semfov.errors import check
 from semfov.head.agent import HeadPath
 from semfov.viz.animation import Film, render
@@ -32,12 +33,12 @@ def describe_head(path: HeadPath) -> str:
 
 
 @styled
-def plot_head_path(path: HeadPath, image: Tensor, *, looks: int | None = None, ax: Axes | None = None) -> Figure:
+def plot_head_path(path: HeadPath, image: ImageLike, *, looks: int | None = None, ax: Axes | None = None) -> Figure:
     """The windows that the head turned to, the fixations in their order, and the objects that were found.
 
     Args:
         path: of a search or an exploration.
-        image: `(3, h, w)`, RGB in [0, 1], the scene's picture at any size.
+        image: the scene's picture at any size, of any common kind (`semfov.as_image`).
         looks: draw the first so many; None draws all.
         ax: axes to draw in; None makes a figure.
     """
@@ -47,7 +48,7 @@ def plot_head_path(path: HeadPath, image: Tensor, *, looks: int | None = None, a
     figure, (axes,) = make_figure(
         1, 1, width=7.2, height=7.2 * height / width + 0.3, layout="compressed", given=only(ax)
     )
-    draw_path(axes, path, image, count)
+    draw_path(axes, path, as_image(image), count)
     axes.set_title(describe_head(path), parse_math=False)
     return figure
 
@@ -103,13 +104,13 @@ def _unwrapped(points: Tensor, path: HeadPath) -> tuple[Any, Any]:
 
 
 def animate_head(
-    path: HeadPath, image: Tensor, file: str | PathLike[str] | None = None, *, seconds: float = 0.8, hold: float = 2.0
+    path: HeadPath, image: ImageLike, file: str | PathLike[str] | None = None, *, seconds: float = 0.8, hold: float = 2.0
 ) -> Path | Film:
     """A film of eye and head: for each look the scene with the windows so far, the view, and what is believed.
 
     Args:
         path: of a search or an exploration.
-        image: `(3, h, w)`, RGB in [0, 1], the scene's picture.
+        image: the scene's picture, of any common kind (`semfov.as_image`).
         file: a GIF to write, with an MP4 beside it where ffmpeg is installed; None gives the film itself.
         seconds: that each frame stays.
         hold: that the last frame stays longer.
@@ -120,7 +121,7 @@ def animate_head(
     from matplotlib import rc_context
 
     with rc_context(STYLE):
-        film = Film(render(_frames(path, image)), seconds, hold, describe_head(path))
+        film = Film(render(_frames(path, as_image(image))), seconds, hold, describe_head(path))
     return film if file is None else film.save(file)[0]
 
 
