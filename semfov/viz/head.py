@@ -104,7 +104,12 @@ def _unwrapped(points: Tensor, path: HeadPath) -> tuple[Any, Any]:
 
 
 def animate_head(
-    path: HeadPath, image: ImageLike, file: str | PathLike[str] | None = None, *, seconds: float = 0.8, hold: float = 2.0
+    path: HeadPath,
+    image: ImageLike,
+    file: str | PathLike[str] | None = None,
+    *,
+    seconds: float = 0.8,
+    hold: float = 2.0,
 ) -> Path | Film:
     """A film of eye and head: for each look the scene with the windows so far, the view, and what is believed.
 
