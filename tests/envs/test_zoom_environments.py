@@ -139,12 +139,13 @@ def test_a_folder_of_pictures_about_which_nothing_is_known(zoom_scenery, cache, 
     env = ZoomSearch(scenery)
     for seed in range(3):
         env.reset(seed=seed)
+        env.action_space.seed(seed)
         over = False
         while not over:
             _, _, terminated, truncated, _ = env.step(env.action_space.sample())
             over = terminated or truncated
         shown = [float(glance.show[env.target - 1]) for glance in env.seen]
-        assert max(shown[:-1]) < 0.3
+        assert max(shown[:-1], default=0) < 0.3
         assert terminated == (shown[-1] >= 0.3)
     explore = ZoomExplore(scenery)
     _, info = explore.reset(seed=0)
