@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
@@ -12,11 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semfov.experiments.head import OURS, HeadConfig, HeadRun
-from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
-from semfov.experiments.run import finish
-from semfov.experiments.summary import announce, gather, percent, table
-from semfov.io.files import write_text
+from semfov.experiments.summary import announce, by_scene, complete, percent, table, write_summary
 from semfov.metrics.averages import standard_error
 from semfov.viz.style import line_style, save_figure
 
@@ -27,27 +23,21 @@ Measure = Callable[[Record], float]
 def head(config: HeadConfig) -> None:
     """Run all scenes that have no part yet, and write tables, records and curves."""
     run = HeadRun(config)
-    finish(run, "looking around")
-    if rank() > 0:
+    records = complete(run, "looking around")
+    if records is None:
         return
-    records, _ = gather(run)
     text = summary(records, config)
-    write_text(config.out / "head.md", text)
-    write_text(config.out / "records.jsonl", "".join(json.dumps(record) + "\n" for record in records))
-    announce(text, [config.out / "head.md", config.out / "records.jsonl", *_curves(records, config)])
+    announce(text, [*write_summary(config.out, "head", text, records), *_curves(records, config)])
 
 
-def by_scene(records: list[Record], measure: Measure) -> dict[Any, float]:
+def measured(records: list[Record], measure: Measure) -> dict[Any, float]:
     """Mean of a figure of merit in each scene."""
-    scenes: dict[Any, list[float]] = defaultdict(list)
-    for record in records:
-        scenes[record["scene"]].append(measure(record))
-    return {scene: float(np.mean(values)) for scene, values in scenes.items()}
+    return by_scene((record["scene"], measure(record)) for record in records)
 
 
 def compared(records: list[Record], others: list[Record], measure: Measure) -> tuple[float, float, float, float]:
     """Mean over scenes and its standard error, and those of the paired differences to others in the same scenes."""
-    mine, theirs = by_scene(records, measure), by_scene(others, measure)
+    mine, theirs = measured(records, measure), measured(others, measure)
     values = np.array([*mine.values()])
     apart = np.array([value - theirs[scene] for scene, value in mine.items()])
     errors = (float(standard_error(each)) for each in (values, apart))
@@ -150,7 +140,7 @@ def _curves(records: list[Record], config: HeadConfig):  # type: ignore[no-untyp
         axes = figure.subplots()
         for order, way in enumerate(ways):
             group = [record for record in records if record["task"] == task and record["way"] == way]
-            line = [np.mean([*by_scene(group, partial(measure, s=s)).values()]) for s in seconds]
+            line = [np.mean([*measured(group, partial(measure, s=s)).values()]) for s in seconds]
             axes.plot(seconds, line, label=way, **line_style(order, len(ways)))
         axes.set(xlabel="seconds", ylabel=title, ylim=(0, None))
         axes.legend(fontsize="small")

@@ -18,8 +18,9 @@ import yaml
 from numpy.typing import NDArray
 
 from semfov.errors import DataError
+from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
-from semfov.experiments.run import Run, SceneRun
+from semfov.experiments.run import Run, SceneRun, finish
 from semfov.experiments.setup import fovea_of, plain
 from semfov.io.compatibility import recommended
 from semfov.io.files import inside, write_text
@@ -76,6 +77,24 @@ def collect(run: Run) -> tuple[list[Record], dict[str, float]]:
     return records, seconds
 
 
+def complete(run: SceneRun, title: str) -> list[Record] | None:
+    """Run all scenes that have no part yet; records of all, or None in a process that leaves the report to another."""
+    finish(run, title)
+    return gather(run)[0] if rank() == 0 else None
+
+
+def by_scene(values: Iterable[tuple[Any, float]]) -> dict[Any, float]:
+    """Mean of the values of each scene, from pairs of scene and value.
+
+    >>> by_scene([(7, 1.0), (7, 2.0), (8, 5.0)])
+    {7: 1.5, 8: 5.0}
+    """
+    scenes: dict[Any, list[float]] = defaultdict(list)
+    for scene, value in values:
+        scenes[scene].append(value)
+    return {scene: float(np.mean(group)) for scene, group in scenes.items()}
+
+
 def gather(run: SceneRun) -> tuple[list[Record], dict[str, float]]:
     """Records of all scenes in their order, and the seconds spent by stage."""
     records: list[Record] = []
@@ -88,6 +107,14 @@ def gather(run: SceneRun) -> tuple[list[Record], dict[str, float]]:
         for stage, value in part["seconds"].items():
             seconds[stage] += value
     return records, dict(seconds)
+
+
+def write_summary(out: Path, name: str, text: str, records: list[Record]) -> list[Path]:
+    """Write tables as Markdown, and the records that they are made of; returns their paths."""
+    files = {f"{name}.md": text, "records.jsonl": "".join(json.dumps(record) + "\n" for record in records)}
+    for file, content in files.items():
+        write_text(out / file, content)
+    return [out / file for file in files]
 
 
 def write_files(

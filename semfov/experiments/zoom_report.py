@@ -1,20 +1,17 @@
 """Finishing an experiment with large pictures, and its tables."""
 
-import json
 from collections import defaultdict
+from collections.abc import Iterable
 from statistics import mean, median
 from typing import Any
 
 import numpy as np
 import torch
 
-from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
-from semfov.experiments.run import finish
-from semfov.experiments.summary import announce, gather, table
+from semfov.experiments.summary import announce, by_scene, complete, table, write_summary
 from semfov.experiments.zoom import FREE, UNSEEN, ZoomConfig, ZoomRun
 from semfov.experiments.zoom_decisions import decision_tables, probabilities
-from semfov.io.files import write_text
 from semfov.metrics.averages import standard_error
 from semfov.viz.reliability import plot_reliability
 from semfov.viz.style import save_figure
@@ -23,14 +20,11 @@ from semfov.viz.style import save_figure
 def zoom(config: ZoomConfig) -> None:
     """Run all scenes that have no part yet, and write tables, records and curves."""
     run = ZoomRun(config)
-    finish(run, "zooming")
-    if rank() > 0:
+    records = complete(run, "zooming")
+    if records is None:
         return
-    records, _ = gather(run)
     text = summary(records, run)
-    write_text(config.out / "zoom.md", text)
-    write_text(config.out / "records.jsonl", "".join(json.dumps(record) + "\n" for record in records))
-    written = [config.out / "zoom.md", config.out / "records.jsonl"]
+    written = write_summary(config.out, "zoom", text, records)
     if "recall" in config.measures:
         written.append(_curves(records, run))
     if decided := [record for record in records if record["measure"] == "decision"]:
@@ -104,9 +98,9 @@ def _paired(hits: dict[str, list[Record]]) -> list[str]:
     rows = [["", "passes less than without", "where the overview shows no hint", "searches"]]
     for way in contexts:
         pairs = list(zip(hits[FREE], hits[way], strict=True))
-        saved = [[a["passes"] - b["passes"], a["scene"]] for a, b in pairs]
+        saved = [(a["scene"], a["passes"] - b["passes"]) for a, b in pairs]
         unseen = [each for each, (a, _) in zip(saved, pairs, strict=True) if a["overview"] < UNSEEN]
-        rows.append([way, _by_scene(saved), _by_scene(unseen), f"{len(saved)}, {len(unseen)}"])
+        rows.append([way, _over_scenes(saved), _over_scenes(unseen), f"{len(saved)}, {len(unseen)}"])
     return [
         f"The same searches with context and without ({FREE}), mean ± standard error over pictures.",
         "",
@@ -115,12 +109,9 @@ def _paired(hits: dict[str, list[Record]]) -> list[str]:
     ]
 
 
-def _by_scene(values: list[list[Any]]) -> str:
-    """Mean of values that scenes have several of, and its standard error over scenes."""
-    scenes: dict[Any, list[float]] = defaultdict(list)
-    for value, scene in values:
-        scenes[scene].append(value)
-    means = np.array([mean(group) for group in scenes.values()])
+def _over_scenes(values: Iterable[tuple[Any, float]]) -> str:
+    """Mean over scenes, and its standard error."""
+    means = np.array([*by_scene(values).values()])
     return f"{means.mean():+.3f} ± {float(standard_error(means)):.3f}" if len(means) else ""
 
 

@@ -11,27 +11,10 @@ import torch
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.target_evidence import TargetEvidence
 from semfov.data.scene import Annotation, Scene
-from semfov.detection.detector import Detector
-from semfov.detection.scores import Candidates
 from semfov.errors import InputError
 from semfov.experiments import head_report
 from semfov.experiments.head import HeadConfig, HeadRun, answers_of, raster
 from semfov.head.views import Views
-
-
-class Textures(Detector):
-    """Boxes of 16 px whose scores follow the colours under them."""
-
-    def __init__(self):
-        super().__init__("textures", ("person", "cat", "cup"), (96, 96))
-
-    def propose(self, canvas):
-        means = torch.nn.functional.avg_pool2d(canvas, 16)
-        rows, columns = means.shape[-2:]
-        y, x = torch.meshgrid(torch.arange(rows) * 16.0, torch.arange(columns) * 16.0, indexing="ij")
-        boxes = torch.stack([x, y, x + 16, y + 16], -1).reshape(1, -1, 4).expand(len(canvas), -1, -1)
-        classes = means.flatten(2).mT.clamp(0, 1) ** 2
-        return Candidates(boxes, classes, classes.amax(-1))
 
 
 class Noise:
@@ -59,8 +42,8 @@ class Noise:
 
 
 @pytest.fixture(params=["panorama", "mosaic"])
-def config(request, tmp_path, monkeypatch):
-    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Textures())
+def config(request, tmp_path, monkeypatch, textures):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures())
     monkeypatch.setattr("semfov.experiments.head.make_scenes", lambda data, classes: Noise())
     torch.manual_seed(0)
     models = TargetEvidence(components=4).requires_grad_(False), MapEvidence(components=4).requires_grad_(False)

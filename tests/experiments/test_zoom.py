@@ -7,8 +7,6 @@ import pytest
 import torch
 
 from semfov.belief import ContextPrior
-from semfov.detection.detector import Detector
-from semfov.detection.scores import Candidates
 from semfov.errors import InputError
 from semfov.experiments import zoom_report
 from semfov.experiments.config import DataConfig
@@ -20,24 +18,9 @@ from semfov.zoom import GlimpseEvidence
 from semfov.zoom.lattice import Lattice
 
 
-class Textures(Detector):
-    """Boxes of 16 px whose scores follow the colours under them."""
-
-    def __init__(self):
-        super().__init__("textures", ("person", "cat", "cup"), (96, 96))
-
-    def propose(self, canvas):
-        means = torch.nn.functional.avg_pool2d(canvas, 16)
-        rows, columns = means.shape[-2:]
-        y, x = torch.meshgrid(torch.arange(rows) * 16.0, torch.arange(columns) * 16.0, indexing="ij")
-        boxes = torch.stack([x, y, x + 16, y + 16], -1).reshape(1, -1, 4).expand(len(canvas), -1, -1)
-        classes = means.flatten(2).mT.clamp(0, 1) ** 2
-        return Candidates(boxes, classes, classes.amax(-1))
-
-
 @pytest.fixture
-def config(tmp_path, monkeypatch):
-    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Textures())
+def config(tmp_path, monkeypatch, textures):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures())
     torch.manual_seed(0)
     GlimpseEvidence(3, 8).save(tmp_path / "model.safetensors")
     return ZoomConfig(

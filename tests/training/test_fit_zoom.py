@@ -8,8 +8,6 @@ import torch
 
 from semfov.data.mosaics import Mosaics
 from semfov.data.scenes import EmbeddedScenes
-from semfov.detection.detector import Detector
-from semfov.detection.scores import Candidates
 from semfov.errors import InputError
 from semfov.experiments.config import DataConfig
 from semfov.experiments.zoom_samples import MosaicSettings
@@ -24,23 +22,8 @@ from semfov.zoom import GlimpseEvidence, ZoomEye
 from semfov.zoom.lattice import Lattice
 
 
-class Bright(Detector):
-    """Boxes of 16 px whose scores follow the colours under them."""
-
-    def __init__(self):
-        super().__init__("bright", ("person", "cat", "cup"), (96, 96))
-
-    def propose(self, canvas):
-        means = torch.nn.functional.avg_pool2d(canvas, 16)
-        rows, columns = means.shape[-2:]
-        y, x = torch.meshgrid(torch.arange(rows) * 16.0, torch.arange(columns) * 16.0, indexing="ij")
-        boxes = torch.stack([x, y, x + 16, y + 16], -1).reshape(1, -1, 4).expand(len(canvas), -1, -1)
-        classes = means.flatten(2).mT.clamp(0, 1) ** 2
-        return Candidates(boxes, classes, classes.amax(-1))
-
-
-def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Bright())
+def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, textures):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures("bright"))
     config = FitZoomConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
         mosaics=1, far=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=96, steps=3,
@@ -48,7 +31,7 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
     )  # fmt: skip
     fit_zoom(config)
     model = GlimpseEvidence.from_pretrained(tmp_path / "out" / "bright.safetensors")
-    model.check_compatible(ZoomEye(Bright()).settings())
+    model.check_compatible(ZoomEye(textures("bright")).settings())
     assert model.metadata["training"]["steps"] == 3
     figures = json.loads((tmp_path / "out" / "figures.json").read_text())
     assert all(map(math.isfinite, figures.values()))
@@ -59,7 +42,7 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
     assert model.patience == min(passes, key=passes.get)
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     # Looks come from the store, and a fit of the same seed is the same.
-    monkeypatch.setattr(Bright, "propose", None)
+    monkeypatch.setattr(textures, "propose", None)
     fit_zoom(config)
     again = GlimpseEvidence.from_pretrained(tmp_path / "out" / "bright.safetensors")
     assert all(torch.equal(before[name], tensor) for name, tensor in again.state_dict().items())
@@ -72,8 +55,8 @@ def tried(report):
     return recalls, {float(row[1]): float(row[4]) for row in rows if row[0] == "patience"}
 
 
-def test_examples_are_the_same_from_a_store(tmp_path):
-    eye = ZoomEye(Bright())
+def test_examples_are_the_same_from_a_store(tmp_path, textures):
+    eye = ZoomEye(textures("bright"))
     mosaics = Mosaics(EmbeddedScenes(("person", "cat", "cup"), count=3), 2, 2, tile=(96, 72), count=1)
     store = GlanceStore(tmp_path, eye.settings(), 3)
     glances = open_scene(eye, mosaics, 0, store)
@@ -97,8 +80,8 @@ def test_settings_have_ranges():
         FitZoomConfig(steps=0)
 
 
-def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Bright())
+def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys, textures):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures("bright"))
     config = FitConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
         mosaics=2, fixations=1, levels=4, holdout=2, shard=1, method="newton", name="bright-zoom",
@@ -109,7 +92,7 @@ def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, 
     model = FovealObservationModel.from_pretrained(tmp_path / "out" / "bright-zoom.safetensors")
     assert model.edges.tolist() == [0.5, 1.5, 2.5]
     assert model.metadata["sensor"]["glimpse"] == "antialiased bilinear"
-    model.check_compatible(ZoomEye(Bright()).settings())
+    model.check_compatible(ZoomEye(textures("bright")).settings())
     # One of the two mosaics was fitted on, the other judged; all that it shows is counted.
     sampler = MosaicSettings.of(config).sampler()
     samples = sampler.load(tmp_path / "out" / "samples", 1)
