@@ -1,1 +1,1 @@
-"""Fitting semfov's models to photographs with boxes."""
+"""Fit semfov's models to photographs with annotated boxes."""

@@ -1,4 +1,4 @@
-"""Training an agent in the search environment by Stable-Baselines3's PPO, and judging it on other scenes."""
+"""Train an agent in the search environment with Stable-Baselines3's PPO, and evaluate it on other scenes."""
 
 from __future__ import annotations
 
@@ -32,35 +32,35 @@ if TYPE_CHECKING:
     from semfov.envs.scenery import Scenery
 
 _AT = (1, 3, 5, 10)
-"""Gaze shifts after which searches are counted."""
+"""Numbers of gaze shifts after which the share of successful searches is reported."""
 
 
 @dataclass(frozen=True)
 class FitAgentConfig(Settings):
-    """Train an agent that searches, by masked PPO on the belief of the environment.
+    """Train a search agent with masked PPO, with the belief of the environment as its observation.
 
     Args:
-        data: scenes to learn from; none of them given, 48 embedded ones.
-        judged: scenes to judge by; none of them given, 24 embedded ones by another seed.
-        detector: which detector looks through the fovea.
+        data: scenes to learn from (by default 48 embedded scenes).
+        judged: scenes to evaluate on (by default 24 embedded scenes with another seed).
+        detector: the detector that processes the foveated views.
         sensor: the foveal sensor.
-        policy: preset of `eval.search` whose belief the agent sees, and that it is compared with.
-        columns: cells in a row.
-        rows: cells in a column.
-        shifts: most gaze shifts of an episode.
-        price: of a look, where the find is worth 1.
-        environments: episodes side by side.
-        steps: gaze shifts to learn from, of all environments together.
+        policy: preset of `eval.search`. The agent sees the belief of this preset and is compared with its policy.
+        columns: columns of the grid.
+        rows: rows of the grid.
+        shifts: maximum number of gaze shifts in an episode.
+        price: cost of each look, relative to the reward of 1 for finding the target.
+        environments: number of episodes that run in parallel.
+        steps: total number of gaze shifts to learn from, over all environments.
         horizon: gaze shifts of each environment between two updates.
-        epochs: passes over them in an update.
-        minibatch: gaze shifts of a gradient.
-        rate: of learning.
-        discount: of a reward one gaze shift later.
-        width: channels of the network.
-        starts: of each judged scene and target.
-        seed: of parameters, episodes and draws.
-        cache: folder for what the detector sees from every cell (None: the user's cache).
-        out: folder for the parameters and the report.
+        epochs: passes over the collected gaze shifts in each update.
+        minibatch: gaze shifts in one gradient step.
+        rate: learning rate.
+        discount: factor by which a reward counts less for every gaze shift that it comes later.
+        width: channels of the network's hidden layers.
+        starts: starting points for each evaluated scene and target.
+        seed: seed of the initial parameters, the episodes and all random draws.
+        cache: folder for the detections from every cell (None: the user's cache).
+        out: folder for the trained parameters and the report.
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(limit=48, min_instances=0))
@@ -86,7 +86,15 @@ class FitAgentConfig(Settings):
     out: Path = Path("runs/fit_agent")
 
     def scenery(self, data: DataConfig, starts: int) -> Scenery:
-        """The world with these scenes."""
+        """Open the environment's scenery for some scenes.
+
+        Args:
+            data: the scenes.
+            starts: starting points for each scene and target.
+
+        Returns:
+            The scenery, with the detections from every cell computed.
+        """
         from semfov.envs import open_scenery
 
         config = SearchConfig(
@@ -102,12 +110,12 @@ class FitAgentConfig(Settings):
 
 
 def fit_agent(config: FitAgentConfig) -> None:
-    """Train, judge beside random gaze and the hand-made policy, and write everything."""
+    """Train the agent, compare it with random gaze and the hand-made policy, and write all results."""
     from semfov.envs import GazeVectorEnv, MaskedRandom, PolicyAgent, run_agent
 
     for data in (config.data, config.judged):
         check_sources(data, config.detector)
-    check(config.data != config.judged, "judged", "other scenes than those to learn from", "the same")
+    check(config.data != config.judged, "judged", "scenes other than those of `data`", "the same scenes")
     prepare_worker()
     learned_from, judged = config.scenery(config.data, 100), config.scenery(config.judged, config.starts)
     model, returns = train(config, learned_from)
@@ -122,7 +130,7 @@ def fit_agent(config: FitAgentConfig) -> None:
     scenes = np.array([episode.scene for episode in episodes])
     figures = {name: summary(each, scenes, config) for name, each in ran.items()}
     path = inside(config.out, "agent.safetensors")
-    # What the policy calls by two names is kept once.
+    # The policy lists its feature extractors under two names; one copy is enough.
     tensors = {name: each for name, each in model.policy.state_dict().items() if not name.startswith("features")}
     storage.write(path, tensors, {"kind": "semfov-agent", "policy": config.policy, "width": config.width})
     found = {name: [each.found_at for each in rows] for name, rows in ran.items()}
@@ -131,9 +139,17 @@ def fit_agent(config: FitAgentConfig) -> None:
 
 
 def train(config: FitAgentConfig, scenery: Scenery) -> tuple[Any, list[float]]:
-    """The trained model, and the mean return of the episodes that ended before each update."""
+    """Train a network with masked PPO.
+
+    Args:
+        config: the settings.
+        scenery: the scenes to learn from.
+
+    Returns:
+        The trained model, and for each update the mean return of the last episodes that ended before it.
+    """
     from semfov.envs import GazeVectorEnv
-    from semfov.envs.stable_baselines3 import StableVecEnv  # before those that it tells the lack of
+    from semfov.envs.stable_baselines3 import StableVecEnv  # first, as its error names the missing package
     from semfov.training.agent_network import CellPolicy, MaskablePPO, Returns
 
     together = GazeVectorEnv(
@@ -160,25 +176,34 @@ def train(config: FitAgentConfig, scenery: Scenery) -> tuple[Any, list[float]]:
 
 
 class TrainedAgent:
-    """A model of Stable-Baselines3 as an agent that takes its most probable action.
+    """Wrap a Stable-Baselines3 model as an agent that takes the most probable action.
 
     Args:
-        model: that was trained on the belief alone.
+        model: a model that was trained on the belief alone.
     """
 
     def __init__(self, model: Any) -> None:
         self._model = model
 
     def __call__(self, observations: Any, infos: dict[str, Any]) -> Any:
-        """The next cell of every episode."""
+        """Choose the next cell of every episode."""
         masks = infos["action_mask"].astype(bool)
-        # Of an episode that is over all cells may have been fixated.
+        # When an episode is over, all of its cells may have been fixated, but the model needs one allowed action.
         masks |= ~masks.any(-1, keepdims=True)
         return self._model.predict(observations["belief"], action_masks=masks, deterministic=True)[0]
 
 
 def summary(ran: list[Ran], scenes: Any, config: FitAgentConfig) -> dict[str, tuple[float, float]]:
-    """Figures of merit, each with its standard error over scenes."""
+    """Compute performance measures of an agent, each with its standard error over scenes.
+
+    Args:
+        ran: the finished episodes.
+        scenes: the scene of each episode, `(E,)`.
+        config: the settings.
+
+    Returns:
+        For each measure its mean over scenes and the standard error of that mean.
+    """
     found = np.array([each.found_at for each in ran])
     spent = np.array([len(each.cells) - 1 for each in ran])
     measures = {f"CP@{n}": 100 * cumulative_performance(found[:, None], n)[:, -1] for n in _AT if n <= config.shifts}
@@ -198,7 +223,7 @@ def report(
     episodes: int,
     model: Any,
 ) -> str:
-    """The table as Markdown."""
+    """Write the comparison of the agents as Markdown."""
     names = list(next(iter(figures.values())))
     rows = [["agent", *names]]
     for agent, found in figures.items():
@@ -206,10 +231,10 @@ def report(
     parameters = sum(each.numel() for each in model.policy.parameters())
     return "\n".join(
         [
-            f"An agent of {parameters:,} parameters, trained by masked PPO over {model.num_timesteps:,} gaze shifts in "
-            f"{learned_from} scenes on the belief of `{config.policy}`, judged in {episodes} searches of {judged} "
-            "other scenes. CP@n is the percentage found after n gaze shifts; standard errors are over scenes. The same "
-            "starts for all.",
+            f"An agent with {parameters:,} parameters was trained with masked PPO over {model.num_timesteps:,} gaze "
+            f"shifts in {learned_from} scenes. It sees the belief of `{config.policy}`. All agents are evaluated in "
+            f"the same {episodes} searches in {judged} other scenes, from the same starting points. CP@n is the "
+            "percentage of targets found after n gaze shifts. Standard errors are over scenes.",
             "",
             *table(rows),
             "",

@@ -1,4 +1,4 @@
-"""The network of a trained agent, for Stable-Baselines3: convolutions over the cells."""
+"""The network of a trained agent for Stable-Baselines3: convolutions over the cells of the belief."""
 
 from typing import Any
 
@@ -13,11 +13,11 @@ __all__ = ["CellFeatures", "CellPolicy", "MaskablePPO", "Returns"]
 
 
 class CellFeatures(BaseFeaturesExtractor):
-    """A number for every cell, from the planes of the belief around it.
+    """Compute one number for every cell from the belief in its neighbourhood.
 
     Args:
-        observation_space: planes `(C, Y, X)`.
-        width: channels between the layers.
+        observation_space: Gymnasium's space of the belief planes, of shape `(C, Y, X)`.
+        width: channels of the hidden layers.
     """
 
     def __init__(self, observation_space: Any, width: int = 16) -> None:
@@ -33,17 +33,20 @@ class CellFeatures(BaseFeaturesExtractor):
         )
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Numbers `(B, X·Y)`."""
+        """Map belief planes `(B, C, Y, X)` to one number per cell, `(B, X·Y)`."""
         found: Tensor = self.layers(observations)
         return found
 
 
 class CellPolicy(MaskableActorCriticPolicy):
-    """A policy whose logit of a cell is that cell's number, and a value from numbers of its own.
+    """A policy that uses the numbers of `CellFeatures` as the logits of the cells.
+
+    The value function has its own copy of `CellFeatures`, followed by a hidden layer.
 
     Args:
-        width: of `CellFeatures`.
-        options: of `MaskableActorCriticPolicy`.
+        given: positional arguments of `MaskableActorCriticPolicy`.
+        width: channels of the hidden layers of `CellFeatures`.
+        options: keyword arguments of `MaskableActorCriticPolicy`.
     """
 
     def __init__(self, *given: Any, width: int = 16, **options: Any) -> None:
@@ -59,7 +62,7 @@ class CellPolicy(MaskableActorCriticPolicy):
 
 
 class Returns(BaseCallback):
-    """Keeps the mean return of the last episodes before each update."""
+    """Record the mean return of the last episodes before each update."""
 
     def __init__(self) -> None:
         super().__init__()

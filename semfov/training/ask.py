@@ -1,4 +1,4 @@
-"""Filling tables of context from a language model's answers."""
+"""Fill context tables with the answers of a language model."""
 
 import hashlib
 import json
@@ -29,21 +29,21 @@ from semfov.training.questions import HEIGHTS, SHIPPED, Question, answer_values,
 
 @dataclass(frozen=True)
 class AskConfig(Settings):
-    """Ask a language model what is beside what, and where in a picture.
+    """Ask a language model which objects occur together, and at which height in a picture.
 
     Args:
-        url: of a server with the chat-completions interface, up to /v1.
-        model: name of the model, as the server knows it.
-        key: name of the environment variable that holds the server's key; where it is not set, none is sent.
-        prompts: file of prompts (none: the one that comes with the package).
-        classes: file with a class on each line (none: the 80 of COCO).
-        tokens: of an answer, at most.
+        url: address of a server with the chat-completions interface, up to and including /v1.
+        model: name of the model on the server.
+        key: name of the environment variable that holds the server's API key. No key is sent if it is not set.
+        prompts: file with the prompts (None: the file that comes with the package).
+        classes: file with one class name on each line (None: the 80 classes of COCO).
+        tokens: maximum number of tokens in an answer.
         timeout: seconds to wait for an answer.
-        retries: times that a question is asked again.
-        parallel: questions that are under way at a time.
-        input_price: of a million tokens of questions.
-        output_price: of a million tokens of answers.
-        budget: most that all answers may cost; when it is reached, no more is asked.
+        retries: how often a question is asked again after a failure.
+        parallel: number of questions that are sent at the same time.
+        input_price: price of a million input tokens (questions).
+        output_price: price of a million output tokens (answers).
+        budget: maximum cost of all answers together. No further question is sent once it is reached (None: no limit).
         out: folder for the answers, the tables and the report.
     """
 
@@ -63,7 +63,7 @@ class AskConfig(Settings):
 
 
 def ask_language_model(config: AskConfig) -> None:
-    """Ask what was not answered yet, and write answers, tables and a report."""
+    """Ask the questions that have no answer yet, and write the answers, the tables and a report."""
     classes = read_classes(config.classes) if config.classes is not None else COCO_CLASSES
     prompts = config.prompts or SHIPPED
     questions = questions_of(read_prompts(prompts), classes)
@@ -93,13 +93,16 @@ def ask_language_model(config: AskConfig) -> None:
 
 
 class Answers:
-    """Answers in a file of JSON lines, each written when it comes; what a killed command has is there.
+    """A file of answers in JSON Lines format.
+
+    Each answer is written as soon as it arrives, so a killed command loses no answer that it has received.
 
     Args:
-        path: the file; what it has is read.
+        path: the file. Answers that it holds already are read.
 
     Raises:
-        DataError: a line of it, other than a last one that was cut off, is no answer.
+        DataError: the file cannot be read, or a complete line of it is not an answer. An incomplete last line is
+            removed instead.
     """
 
     def __init__(self, path: Path) -> None:
@@ -123,13 +126,23 @@ class Answers:
                 self.known[str(entry["key"])] = entry
             except (ValueError, LookupError, TypeError, RecursionError):
                 raise DataError(
-                    f"{path}, line {number}: expected an answer as this command writes it; remove the line to ask again"
+                    f"{path}, line {number}: expected a JSON object with the keys that this command writes (key, "
+                    "answer, prompt_tokens, completion_tokens, …); remove the line to ask this question again"
                 ) from None
         if len(whole) < len(lines):
             write_text(path, "".join(whole))
 
     def add(self, key: str, question: Question, reply: Reply) -> None:
-        """Keep an answer, on the disk before anything else is done."""
+        """Append an answer to the file and flush it to the disk.
+
+        Args:
+            key: identifies the question (`key_of`).
+            question: the question.
+            reply: the server's answer.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
         entry: dict[str, str | int | None] = {
             "key": key,
             "section": question.section,
@@ -150,12 +163,18 @@ class Answers:
 
 
 def key_of(server: ChatServer, question: Question) -> str:
-    """sha256 of what an answer depends on: all that is sent."""
+    """Return the sha256 of the whole request, which is everything that an answer depends on."""
     return hashlib.sha256(json.dumps(server.request(question.text), sort_keys=True).encode()).hexdigest()
 
 
 def ask_all(server: ChatServer, questions: dict[str, Question], answers: Answers, config: AskConfig) -> None:
-    """Ask what has no answer yet, some questions at a time.
+    """Ask all questions that have no answer yet, several at the same time.
+
+    Args:
+        server: the server to ask.
+        questions: the questions by their keys.
+        answers: the answers so far. New answers are added.
+        config: the settings.
 
     Raises:
         InputError: the budget is spent.
@@ -170,7 +189,10 @@ def ask_all(server: ChatServer, questions: dict[str, Question], answers: Answers
                 for key, question in _next(todo, config.parallel - len(under_way)):
                     spent = cost(list(answers.known.values()), config)
                     if config.budget is not None and spent >= config.budget:
-                        raise InputError(f"budget: {config.budget:g} is spent ({spent:.4g}); what was answered is kept")
+                        raise InputError(
+                            f"budget: the answers have cost {spent:.4g}, which reaches the limit of {config.budget:g}; "
+                            "all answers so far are kept, and a higher budget continues from them"
+                        )
                     under_way[pool.submit(server.ask, question.text)] = key, question
                 if not under_way:
                     return
@@ -191,17 +213,25 @@ def _next(todo: Iterator[tuple[str, Question]], most: int) -> Iterator[tuple[str
 
 
 def cost(entries: Sequence[dict[str, Any]], config: AskConfig) -> float:
-    """What answers have cost, by the prices of a million tokens."""
+    """Return the cost of the answers, computed from their tokens and the prices in the settings."""
     asked, told = (sum(entry[name] for entry in entries) for name in ("prompt_tokens", "completion_tokens"))
     return (asked * config.input_price + told * config.output_price) / 1e6
 
 
 def tables_of(answers: Sequence[tuple[Question, str]], classes: Sequence[str]) -> tuple[Tensor, Tensor, int]:
-    r"""Tables of what is beside what `(K, K)`, and of heights `(K, 3)`, and how many answers cannot be read.
+    r"""Turn answers into a table of co-occurrence and a table of heights.
 
     .. math:: v_{tj} = \tfrac12 (\bar a_{tj} + \bar a_{jt}), \qquad h_{ty} = \ln(\bar a_{ty} + 0.1)
 
-    with the means of what all readable answers say, in [0, 1]; NaN where none says anything.
+    where :math:`\bar a \in [0, 1]` is the mean of all readable answers about a pair of classes, or about a class and
+    a height. Entries without any readable answer are NaN.
+
+    Args:
+        answers: questions with their answers.
+        classes: names of the K classes.
+
+    Returns:
+        The table of co-occurrence `(K, K)`, the table of heights `(K, 3)`, and the number of unreadable answers.
     """
     said: dict[tuple[str, str, str], list[float]] = defaultdict(list)
     unread = 0
@@ -224,24 +254,30 @@ def tables_of(answers: Sequence[tuple[Question, str]], classes: Sequence[str]) -
 
 
 def read_classes(path: Path) -> tuple[str, ...]:
-    """Names of classes, one on each line.
+    """Read the names of classes from a text file with one name on each line.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The names, in the order of the file.
 
     Raises:
-        DataError: the file cannot be read, or has no names.
-        InputError: a name is there twice.
+        DataError: the file cannot be read.
+        InputError: the file has fewer than two names, or a name occurs twice.
     """
     check_regular(path)
     try:
         names = tuple(line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip())
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: cannot be read: {error}") from error
-    check(len(names) >= 2, "classes", "a file with two names or more", f"{path} with {len(names)}")
+    check(len(names) >= 2, "classes", "a file with at least two names", f"{path} with {len(names)}")
     class_indices(names)
     return names
 
 
 def report(entries: Sequence[dict[str, Any]], unread: int, beside: Tensor, config: AskConfig, prompts: str) -> str:
-    """What was asked, what it cost, and how much of the table is known, as Markdown."""
+    """Report the number of answers, their cost and the coverage of the table as Markdown."""
     asked, told = (sum(entry[name] for entry in entries) for name in ("prompt_tokens", "completion_tokens"))
     models = ", ".join(sorted({str(entry["model"]) for entry in entries}))
     named = int((beside > 0).sum()) // 2
@@ -250,11 +286,11 @@ def report(entries: Sequence[dict[str, Any]], unread: int, beside: Tensor, confi
         ["model", models],
         ["sha256 of the prompts", prompts],
         ["answers", str(len(entries))],
-        ["of these not readable", str(unread)],
-        ["tokens of questions", str(asked)],
-        ["tokens of answers", str(told)],
+        ["unreadable answers", str(unread)],
+        ["input tokens (questions)", str(asked)],
+        ["output tokens (answers)", str(told)],
         ["cost", f"{cost(entries, config):.4g}" if config.input_price or config.output_price else "no prices given"],
-        ["pairs of classes beside each other", f"{named} of {len(beside) * (len(beside) - 1) // 2}"],
+        ["pairs of classes with a value above 0", f"{named} of {len(beside) * (len(beside) - 1) // 2}"],
     ]
     how = f"python -m train.fit_context … --table {config.out / 'beside.csv'} --source {models!r}"
-    return "\n".join([*table(rows), "", f"To judge it and to fit its weights: {how}", ""])
+    return "\n".join([*table(rows), "", f"To evaluate the tables and to fit their weights: {how}", ""])

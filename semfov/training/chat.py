@@ -1,4 +1,4 @@
-"""A language model behind the common chat-completions interface: one question, one answer, tokens counted."""
+"""Ask a language model through the common chat-completions interface, one question at a time."""
 
 import http.client
 import json
@@ -19,13 +19,13 @@ _LONGEST_WAIT = 60.0
 
 @dataclass(frozen=True)
 class Reply:
-    """What a server answers.
+    """A server's answer to one question.
 
     Attributes:
         text: the answer.
-        model: that the server says has answered.
-        prompt_tokens: of the question, as the server counts them; 0 where it does not.
-        completion_tokens: of the answer, likewise.
+        model: name of the model that answered, according to the server.
+        prompt_tokens: number of tokens in the question as the server counts them, 0 if it does not count.
+        completion_tokens: number of tokens in the answer, likewise.
     """
 
     text: str
@@ -35,25 +35,25 @@ class Reply:
 
 
 class _NoRedirects(urllib.request.HTTPRedirectHandler):
-    """A key must not go to where an answer points."""
+    """Refuse redirects, so that the API key is never sent to another address."""
 
     def redirect_request(self, *args: Any) -> None:
-        """Follow nothing."""
+        """Do not follow the redirect."""
         return
 
 
 class ChatServer:
-    """A server with the chat-completions interface, asked at temperature 0.
+    """A client for a server with the chat-completions interface. It asks at temperature 0.
 
     Args:
-        url: of the interface, up to `/v1`; `/chat/completions` is added.
-        model: name of the model, as the server knows it.
-        key: that the server wants; None for none.
-        tokens: of an answer, at most.
+        url: address of the interface up to and including `/v1`; `/chat/completions` is added to it.
+        model: name of the model on the server.
+        key: API key of the server (None: no key is sent).
+        tokens: maximum number of tokens in an answer.
         timeout: seconds to wait for an answer.
-        retries: times that a question is asked again, where the server is busy, fails or cannot be reached.
-        wait: seconds before the first of them; each further wait is twice as long.
-        sleep: what waits.
+        retries: how often a question is asked again when the server is busy, fails or cannot be reached.
+        wait: seconds before the first retry. Each further wait is twice as long, unless the server names a time.
+        sleep: function that waits for a number of seconds.
 
     Example::
 
@@ -75,7 +75,8 @@ class ChatServer:
     ) -> None:
         parts = urlsplit(url)
         check(parts.scheme in ("http", "https") and bool(parts.netloc), "url", "http://… or https://…", repr(url))
-        check(key is None or (key.isascii() and key.isprintable()), "key", "one line of plain characters", "others")
+        printable = key is None or (key.isascii() and key.isprintable())
+        check(printable, "key", "one line of printable ASCII characters", "a key with other characters")
         self.url, self.model = f"{url.rstrip('/')}/chat/completions", model
         self.tokens, self.timeout, self.retries, self.wait = tokens, timeout, retries, wait
         self._sleep = sleep
@@ -83,16 +84,22 @@ class ChatServer:
         self._opener = urllib.request.build_opener(_NoRedirects)
 
     def request(self, prompt: str) -> dict[str, Any]:
-        """What is sent for a question."""
+        """Return the body of the request for a question."""
         messages = [{"role": "user", "content": prompt}]
         return {"model": self.model, "messages": messages, "temperature": 0, "max_tokens": self.tokens}
 
     def ask(self, prompt: str) -> Reply:
-        """The answer to a question.
+        """Ask one question and wait for the answer.
+
+        Args:
+            prompt: the question.
+
+        Returns:
+            The answer.
 
         Raises:
             InputError: the server refuses the key, or does not know the address or the model.
-            DataError: it cannot be reached, refuses the question, or answers what is no chat completion.
+            DataError: the server cannot be reached, refuses the question, or its answer is not a chat completion.
         """
         body = json.dumps(self.request(prompt)).encode()
         for attempt in range(self.retries + 1):
@@ -111,8 +118,8 @@ class ChatServer:
                 pause = float(asked) if asked.isdecimal() else self.wait * 2**attempt
                 self._sleep(min(pause, _LONGEST_WAIT))
         raise DataError(
-            f"{self.url}: no answer after {self.retries + 1} tries, the last: {failure}; is the server running? The "
-            "same command goes on where this one stopped"
+            f"{self.url}: no answer after {self.retries + 1} attempts (the last failed with: {failure}); check that "
+            "the server is running, then repeat the command to continue where it stopped"
         )
 
 
@@ -131,7 +138,7 @@ def _reply(body: bytes, url: str, model: str) -> Reply:
 
 
 def _told(error: urllib.error.HTTPError) -> str:
-    """What the server says is wrong."""
+    """Return the server's own error message, in parentheses."""
     try:
         body = error.read(_MOST)
     except (OSError, http.client.HTTPException):
@@ -148,10 +155,15 @@ def _told(error: urllib.error.HTTPError) -> str:
 def _refusal(code: int, told: str, url: str, model: str) -> InputError | DataError:
     if code in (401, 403):
         return InputError(
-            f"key: {url} refuses it with HTTP {code}{told}; set the environment variable that `key` names"
+            f"key: {url} refuses the API key with HTTP {code}{told}; set the environment variable that `key` names"
         )
     if code == 404:
-        return InputError(f"url, model: {url} knows no such address, or no model {model!r}: HTTP 404{told}")
+        return InputError(
+            f"url, model: {url} answers HTTP 404{told}; check the address, and that the server has the model {model!r}"
+        )
     if 300 <= code < 400:
-        return InputError(f"url: {url} points elsewhere with HTTP {code}, which is not followed; give that address")
-    return DataError(f"{url}: the question is refused with HTTP {code}{told}")
+        return InputError(
+            f"url: {url} redirects to another address with HTTP {code}; redirects are not followed, so give the final "
+            "address"
+        )
+    return DataError(f"{url}: the server refuses the question with HTTP {code}{told}")

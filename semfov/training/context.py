@@ -1,4 +1,4 @@
-"""Counting the context of searches: where classes are, and beside what."""
+"""Count the context of searches: in which cells the classes occur, and which classes occur near each other."""
 
 import json
 from collections.abc import Sequence
@@ -25,10 +25,12 @@ from semfov.training.places import FitContextConfig, Places, read_places
 
 
 def fit_context(config: FitContextConfig) -> None:
-    """Count, judge on held-out photographs, fit the weights, and write everything."""
+    """Count the context, evaluate it on held-out photographs, fit its weights, and write all results."""
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
-    check(config.table is None or config.embeddings is None, "table", "none with embeddings", config.table)
-    check(config.heights is None or config.table is not None, "heights", "none without a table", config.heights)
+    one_source = config.table is None or config.embeddings is None
+    check(one_source, "table", "no table when `embeddings` is given (choose one of the two)", config.table)
+    has_table = config.heights is None or config.table is not None
+    check(has_table, "heights", "no heights unless `table` is given too", config.heights)
     sampler, samples, scenes = None, None, None
     if config.weigh:
         settings = SampleSettings.of(config)
@@ -40,14 +42,14 @@ def fit_context(config: FitContextConfig) -> None:
     places = read_places(scenes, config)
     held_out = [index % config.holdout == 0 for index in range(len(places))]
     known = [place for place, out in zip(places, held_out, strict=True) if not out]
-    told = table_prior(config, scenes.classes)
-    prior = fit(known, scenes.classes, config) if told is None else told
+    given = table_prior(config, scenes.classes)
+    prior = fit(known, scenes.classes, config) if given is None else given
     judged = judge(prior, [place for place, out in zip(places, held_out, strict=True) if out], config.min_objects)
     weights = dict.fromkeys(("evidence", "map"), (1.0, 1.0))
     metadata = training_of(config, scenes, "table", "source", "heights", "embeddings") | prior.metadata
     if sampler is not None and samples is not None:
         usable = [index for index, out in enumerate(held_out) if not out]
-        folds = cross_fit(places, usable, scenes.classes, config, told)
+        folds = cross_fit(places, usable, scenes.classes, config, given)
         for kind in weights:
             weights[kind] = fit_weights(make_cases(kind, sampler, samples, folds, places, config))
         metadata |= sampler.eye.settings()
@@ -62,7 +64,16 @@ def fit_context(config: FitContextConfig) -> None:
 
 
 def fit(places: Sequence[Places], classes: Sequence[str], config: FitContextConfig) -> ContextPrior:
-    """The prior that these photographs tell."""
+    """Count the context prior of photographs.
+
+    Args:
+        places: the objects of each photograph, on the grid.
+        classes: names of the K classes.
+        config: the settings.
+
+    Returns:
+        The prior, with log-odds of the place and log-ratios of co-occurrence.
+    """
     chance = occupation(places, config.place_smoothing)
     odds = chance.logit()
     size = config.resolution, config.resolution
@@ -73,12 +84,20 @@ def fit(places: Sequence[Places], classes: Sequence[str], config: FitContextConf
 
 
 def table_prior(config: FitContextConfig, classes: Sequence[str]) -> ContextPrior | None:
-    """The prior of the table that the settings name, or of the cosines of word vectors; None where all is counted."""
+    """Make the prior from the table in the settings, or from the cosine similarities of word vectors.
+
+    Args:
+        config: the settings.
+        classes: names of the K classes.
+
+    Returns:
+        The prior, or None if the settings name neither a table nor word vectors.
+    """
     table, source, heights = config.table, config.source, config.heights
     if config.embeddings is not None:
         vectors = WordVectors.read(config.embeddings, classes)
         if vectors.missing:
-            print(f"not in {config.embeddings}: {', '.join(vectors.missing)}")
+            print(f"no vector in {config.embeddings} for: {', '.join(vectors.missing)}")
         table = inside(config.out, "similarities.csv")
         write_table(table, classes, classes, vectors.similarity(classes, classes))
         source = source or f"cosines of word vectors, {config.embeddings.name}, sha256 {vectors.digest}"
@@ -92,26 +111,48 @@ def cross_fit(
     usable: Sequence[int],
     classes: Sequence[str],
     config: FitContextConfig,
-    told: ContextPrior | None = None,
+    given: ContextPrior | None = None,
 ) -> list[tuple[ContextPrior, list[int]]]:
-    """Priors, each with the photographs to weigh it on, none of which it has counted; what a table told is one."""
+    """Pair priors with photographs to fit their weights on, such that no prior was counted on its photographs.
+
+    Args:
+        places: the objects of all photographs.
+        usable: indices of the photographs that are not held out.
+        classes: names of the K classes.
+        config: the settings.
+        given: a prior that was not counted on photographs; it is used in every fold.
+
+    Returns:
+        For each fold the prior, and the indices of the photographs to fit its weights on.
+    """
     rich = [index for index in usable if places[index].objects >= config.min_objects]
     chosen = rich[:: max(1, len(rich) // config.weigh)][: config.weigh]
     folds = []
     for fold in range(config.folds):
         part = [index for position, index in enumerate(chosen) if position % config.folds == fold]
         kept = set(usable).difference(part)
-        prior = fit([places[index] for index in sorted(kept)], classes, config) if told is None else told
+        prior = fit([places[index] for index in sorted(kept)], classes, config) if given is None else given
         folds.append((prior, part))
     return folds
 
 
 def occupation(places: Sequence[Places], smoothing: float) -> Tensor:
-    r"""Probability that a class that is in a picture is in each of its cells, `(K+1, X·Y)`.
+    r"""Estimate the probability that a class occupies each cell, given that it is in the picture.
 
     .. math:: P(k \in x) = \frac{n_k(x) + s \, \bar P(x)}{n_k + s}
 
-    with n pictures that hold the class (at x), and P̄ the same over all classes.
+    where :math:`n_k` pictures contain the class, :math:`n_k(x)` of them in cell x, and :math:`\bar P` is the same
+    ratio over all classes together.
+
+    Args:
+        places: the objects of the photographs.
+        smoothing: s, the number of pictures that the average over classes counts as.
+
+    Returns:
+        Probabilities `(K+1, X·Y)`.
+
+    Raises:
+        DataError: no photograph contains a class to search for.
     """
     cells, components = places[0].occupied.shape
     there, pictures = torch.zeros(components, cells), torch.zeros(components)
@@ -119,18 +160,24 @@ def occupation(places: Sequence[Places], smoothing: float) -> Tensor:
         there[place.targets] += place.occupied[:, place.targets].t().float()
         pictures[place.targets] += 1
     if not pictures.any():
-        raise DataError("data: no photograph has a class to search for; relax max_target_area")
+        raise DataError("data: no photograph contains a class that may be searched for; raise max_target_area")
     average = (there.sum(0) + 0.5) / (pictures.sum() + 1)
     return (there + smoothing * average) / (pictures[:, None] + smoothing)
 
 
 def shared_pictures(places: Sequence[Places], smoothing: float = 5.0) -> Tensor:
-    r"""How much likelier two classes are to be in one picture than by chance, as log ratios `(K, K)`, NaN for itself.
+    r"""Compute how much more often two classes share a picture than chance predicts, for `semfov.zoom.WindowContext`.
 
     .. math:: v_{tj} = \ln \frac{n_{tj} + s}{n_t n_j / n + s}
 
-    with :math:`n_t` of n pictures that hold t, and :math:`n_{tj}` that hold both: context of windows
-    (`semfov.zoom.WindowContext`).
+    where :math:`n_t` of the n pictures contain class t, and :math:`n_{tj}` contain both classes.
+
+    Args:
+        places: the objects of the pictures.
+        smoothing: s, pictures added to both counts.
+
+    Returns:
+        Log ratios `(K, K)`, NaN on the diagonal.
     """
     there = torch.stack([place.occupied.any(0)[1:] for place in places]).float()
     alone = there.sum(0)
@@ -139,12 +186,21 @@ def shared_pictures(places: Sequence[Places], smoothing: float = 5.0) -> Tensor:
 
 
 def count_pairs(places: Sequence[Places], chance: Tensor, edges: Sequence[float]) -> tuple[Tensor, Tensor]:
-    r"""Cells of k by the band of the nearest j: how many there are, and how many place alone would make expect.
+    r"""Count the cells of class k by their distance to the nearest object of class j.
 
     .. math:: O_{kjn} = \sum_i \sum_{x \in k} [\text{band}_j(x) = n], \qquad
               E_{kjn} = \sum_i \sum_x \frac{|k| \, P(k \in x)}{\sum_y P(k \in y)} [\text{band}_j(x) = n]
 
-    over the pictures i that hold both, j ≠ k. Both `(K+1, K+1, N)`.
+    The sums run over the pictures i that contain both classes, j ≠ k. O is the observed count. E is the count expected
+    if the position of k depended on its usual place alone.
+
+    Args:
+        places: the objects of the photographs.
+        chance: `(K+1, X·Y)`, probability of each class in each cell (`occupation`).
+        edges: `(N-1,)`, borders between the bands of distance.
+
+    Returns:
+        Observed and expected counts, both `(K+1, K+1, N)`.
     """
     components = len(chance)
     observed = torch.zeros(components, components, len(edges) + 1)
@@ -165,12 +221,22 @@ def count_pairs(places: Sequence[Places], chance: Tensor, edges: Sequence[float]
 
 
 def shrunk_ratio(observed: Tensor, expected: Tensor, class_smoothing: float, pair_smoothing: float) -> Tensor:
-    r"""Ratio of observed to expected cells, `(K+1, K+1, N)`; 1 for background, and for a class beside itself.
+    r"""Compute the ratio of observed to expected counts, shrunk so that rare pairs do not give extreme values.
 
-    A pair is drawn towards what its two classes do beside any other, and these towards what all do:
+    The ratio of a pair is shrunk towards the average ratios of its two classes, and these towards the average over all
+    classes:
 
     .. math:: \rho_{kjn} = \frac{O_{kjn} + s \, \rho_{k \cdot n} \rho_{\cdot jn} / \rho_n}{E_{kjn} + s}, \qquad
               \rho_{k \cdot n} = \frac{\sum_j O_{kjn} + s' \rho_n}{\sum_j E_{kjn} + s'}
+
+    Args:
+        observed: O, `(K+1, K+1, N)`.
+        expected: E, `(K+1, K+1, N)`.
+        class_smoothing: s', the weight of the average over all classes, in cells.
+        pair_smoothing: s, the weight of the averages of the two classes, in cells.
+
+    Returns:
+        Ratios `(K+1, K+1, N)`, 1 for background and on the diagonal.
     """
     every = (observed.sum((0, 1)) + 1) / (expected.sum((0, 1)) + 1)
     towards = [
@@ -184,11 +250,23 @@ def shrunk_ratio(observed: Tensor, expected: Tensor, class_smoothing: float, pai
 
 
 def judge(prior: ContextPrior, places: Sequence[Places], min_objects: int) -> list[dict[str, object]]:
-    r"""How well context tells where a class is when all other objects are known.
+    r"""Evaluate how well context predicts the position of a class when all other objects are known.
 
-    The mean of :math:`\ln \sum_{x \in \text{goal}} \mathrm{softmax}(c)(x)` over pairs of photograph and class: the log
-    probability that one fixation, drawn by context alone, lands on the target; and what is gained over nothing, with
-    the standard error over photographs. Of other classes: `ContextPrior.permuted`.
+    The measure is the mean of :math:`\ln \sum_{x \in \text{goal}} \mathrm{softmax}(c)(x)` over pairs of photograph and
+    class: the log probability that one fixation, drawn from context c alone, lands on the target. The control uses the
+    context of other classes (`ContextPrior.permuted`).
+
+    Args:
+        prior: the context.
+        places: the objects of the held-out photographs.
+        min_objects: photographs with fewer objects are left out.
+
+    Returns:
+        For each kind of context: its name, the mean log probability, the gain over no context with its standard error
+        over photographs, and the number of pairs.
+
+    Raises:
+        DataError: no held-out photograph has enough objects.
     """
     other = prior.permuted()
     choices = {
@@ -200,16 +278,19 @@ def judge(prior: ContextPrior, places: Sequence[Places], min_objects: int) -> li
     }
     judges = [place for place in places if place.targets and place.objects >= min_objects]
     if not judges:
-        raise DataError("data: no photograph to judge by was held out; give more photographs")
+        raise DataError(
+            f"data: none of the held-out photographs has a target and {min_objects} objects or more; give more "
+            "photographs or lower min_objects"
+        )
     rows: list[dict[str, object]] = []
     without: list[Tensor] = []
     for name, (context, weights) in choices.items():
-        told = [
+        logs = [
             torch.stack([_landing(context, place, target, weights) for target in place.targets]) for place in judges
         ]
-        without = without or told
-        gains = np.array([float((own - plain).mean()) for own, plain in zip(told, without, strict=True)])
-        mean, pairs = float(torch.cat(told).mean()), sum(map(len, told))
+        without = without or logs
+        gains = np.array([float((own - plain).mean()) for own, plain in zip(logs, without, strict=True)])
+        mean, pairs = float(torch.cat(logs).mean()), sum(map(len, logs))
         error = float(standard_error(gains))
         rows.append(
             {"context": name, "log_likelihood": mean, "gain": float(gains.mean()), "error": error, "pairs": pairs}
@@ -218,7 +299,7 @@ def judge(prior: ContextPrior, places: Sequence[Places], min_objects: int) -> li
 
 
 def _landing(context: ContextPrior, place: Places, target: int, weights: tuple[float, float]) -> Tensor:
-    """Log probability that a fixation drawn by context lands on the target."""
+    """Log probability that a fixation drawn from the context lands on the target."""
     value = context(place.occupied[None].float(), place.grid, target, weights)[0]
     return value[place.occupied[:, target]].logsumexp(0) - value.logsumexp(0)
 
@@ -226,27 +307,28 @@ def _landing(context: ContextPrior, place: Places, target: int, weights: tuple[f
 def report(
     judged: list[dict[str, object]], weights: dict[str, tuple[float, float]], known: int, config: FitContextConfig
 ) -> str:
-    """What was fitted, and how it does on photographs that were held out, as Markdown."""
+    """Report the fitted context and its evaluation on held-out photographs as Markdown."""
     rows = [
         [str(row["context"]), f"{row['log_likelihood']:.3f}", f"{row['gain']:+.3f} ± {row['error']:.3f}"]
         for row in judged
     ]
-    beside = [[kind, f"{place:.2g}", f"{company:.2g}"] for kind, (place, company) in weights.items()]
+    weighed = [[kind, f"{place:.2g}", f"{co_occurrence:.2g}"] for kind, (place, co_occurrence) in weights.items()]
     counted = (
         f"Counted on {known} photographs" if config.table is None and config.embeddings is None else "From a table"
     )
     fitted = f"fitted on looks at {config.weigh} of" if config.weigh else "not fitted on looks at"
     return "\n".join(
         [
-            f"{counted}, judged on {judged[0]['pairs']} pairs of photograph and class of those "
-            f"that were held out (every {config.holdout}th): mean log probability that a fixation drawn by context "
-            "alone lands on the target, where all other objects are known; and what is gained, mean over photographs.",
+            f"{counted}, evaluated on {judged[0]['pairs']} pairs of photograph and class from held-out photographs "
+            f"(one in {config.holdout}). The log likelihood is the mean log probability that a fixation drawn from "
+            "context alone lands on the target, when all other objects are known. The gain is the improvement over no "
+            "context, as a mean over photographs.",
             "",
             *table([["context", "log likelihood", "gain ± standard error"], *rows]),
             "",
-            f"Weights beside a belief, {fitted} the photographs:",
+            f"Weights of the context when it is combined with a belief, {fitted} the photographs:",
             "",
-            *table([["belief", "place", "co-occurrence"], *beside]),
+            *table([["belief", "place", "co-occurrence"], *weighed]),
             "",
         ]
     )

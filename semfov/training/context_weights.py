@@ -1,4 +1,4 @@
-"""How much context should count beside a belief: two weights, fitted on series of looks at photographs."""
+"""Fit the two weights with which context is added to a belief, on series of looks at photographs."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class Cases:
     """Beliefs after some looks, one for each photograph and class.
 
     Attributes:
-        log_odds: `(E, X·Y)`, of the target without context.
-        place: `(E, X·Y)`, what place would add.
-        company: `(E, X·Y)`, what co-occurrence would add.
+        log_odds: `(E, X·Y)`, log-odds of the target in each cell without context.
+        place: `(E, X·Y)`, contribution of the usual places of the class, at weight 1.
+        co_occurrence: `(E, X·Y)`, contribution of co-occurring classes, at weight 1.
         goal: `(E, X·Y)` boolean, cells with the target.
-        visited: `(E, X·Y)` boolean.
+        visited: `(E, X·Y)` boolean, cells that were fixated.
     """
 
     log_odds: Tensor
     place: Tensor
-    company: Tensor
+    co_occurrence: Tensor
     goal: Tensor
     visited: Tensor
 
@@ -46,15 +46,18 @@ def make_cases(
     places: Sequence[Places],
     config: FitContextConfig,
 ) -> Cases:
-    """Beliefs of one kind, `evidence` or `map`, after a random number of random looks off the target.
+    """Compute beliefs after a random number of looks at random cells without the target.
 
     Args:
-        kind: of the belief.
-        sampler: what looked.
-        samples: what it saw.
-        folds: priors, each with the photographs to use it on.
-        places: where the objects are.
-        config: of the fit.
+        kind: kind of belief, `evidence` or `map`.
+        sampler: the sampler that looked at the photographs.
+        samples: the labelled detections of its looks.
+        folds: priors, each with the indices of the photographs to use it on.
+        places: the objects of all photographs.
+        config: settings of the fit.
+
+    Returns:
+        The beliefs with the contributions of context.
     """
     observer: Observer = Semantic(len(sampler.scenes.classes) + 1, tempering=0.25, footprint="box_centre")
     if kind == "evidence":
@@ -75,9 +78,9 @@ def make_cases(
             number = int(torch.randint(1, len(free) + 1, (1,), generator=generator))
             used = free[torch.randperm(len(free), generator=generator)[:number]]
             belief = observer.start(1, place.grid, presence)
-            said = observer.weigh(seen, fixations, place.grid, target)
+            evidence = observer.weigh(seen, fixations, place.grid, target)
             for look in used.split(1):
-                belief = observer.update(belief, said[look])
+                belief = observer.update(belief, evidence[look])
             present = belief.chance(target)[0]
             shown = presence[used].amax(0, keepdim=True)
             alone = [prior(shown, place.grid, target, weights)[0] for weights in ((1.0, 0.0), (0.0, 1.0))]
@@ -87,27 +90,41 @@ def make_cases(
 
 
 SIZES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
-"""Shares of the likeliest weights that are tried; the smallest do little but break ties."""
+"""Factors of the maximum-likelihood weights that are tried. The smallest do little more than break ties."""
 
 
 def fit_weights(cases: Cases) -> tuple[float, float]:
-    """Weights of place and co-occurrence: as the likelihood has them to each other, as large as serves the gaze.
+    """Fit the weights of place and co-occurrence.
 
-    A belief that is not calibrated, such as a fused map, asks for large weights to be likely, under which the most
-    probable cell holds the target less often; of `SIZES` the one is taken that lands on the target most often.
+    Maximum likelihood gives the ratio of the two weights. Their common size is chosen from `SIZES` such that the next
+    fixation lands on the target most often. For a belief that is not calibrated, such as a fused map, maximum
+    likelihood gives weights so large that the most probable cell contains the target less often.
+
+    Args:
+        cases: beliefs to fit on.
+
+    Returns:
+        The weights of place and of co-occurrence.
     """
-    place, company = likeliest_weights(cases)
-    size = max(SIZES, key=lambda size: landed(cases, size * place, size * company))
-    return size * place, size * company
+    place, co_occurrence = likeliest_weights(cases)
+    size = max(SIZES, key=lambda size: landed(cases, size * place, size * co_occurrence))
+    return size * place, size * co_occurrence
 
 
 def likeliest_weights(cases: Cases) -> tuple[float, float]:
-    r"""Weights of place and co-occurrence that make a soft next fixation land on the target most likely.
+    r"""Fit weights by maximum likelihood of landing on the target with a next fixation drawn from a softmax.
 
     .. math:: \max_{\gamma, w} \sum \ln \sum_{x \in \text{goal}}
               \mathrm{softmax}\bigl(\gamma (\ell + w_1 a + w_2 r)\bigr)(x)
 
-    γ makes up for beliefs that are not calibrated; the next fixation does not depend on it.
+    with the log-odds ℓ of the belief, the contribution a of place and r of co-occurrence. The factor γ compensates for
+    beliefs that are not calibrated; it does not change which cell is the most probable.
+
+    Args:
+        cases: beliefs to fit on.
+
+    Returns:
+        The weights of place and of co-occurrence, relative to the log-odds of the belief, which have weight 1.
     """
     parameters = torch.tensor([1.0, 0.0, 0.0], requires_grad=True)
     optimiser = torch.optim.LBFGS([parameters], max_iter=100, line_search_fn="strong_wolfe")
@@ -119,18 +136,29 @@ def likeliest_weights(cases: Cases) -> tuple[float, float]:
         return value
 
     optimiser.step(loss)
-    gamma, place, company = parameters.tolist()
-    return place / gamma, company / gamma
+    gamma, place, co_occurrence = parameters.tolist()
+    return place / gamma, co_occurrence / gamma
 
 
-def landed(cases: Cases, place: float, company: float) -> float:
-    """How often the most probable cell not visited holds the target, ties broken at random (`select_fixation`)."""
-    tied = best_cells(cases.log_odds + place * cases.place + company * cases.company, cases.visited)
+def landed(cases: Cases, place: float, co_occurrence: float) -> float:
+    """Return how often the most probable unvisited cell contains the target.
+
+    Ties are broken at random, as in `select_fixation`: each of the tied cells counts with the same share.
+
+    Args:
+        cases: the beliefs.
+        place: weight of place.
+        co_occurrence: weight of co-occurrence.
+
+    Returns:
+        The share of cases, from 0 to 1.
+    """
+    tied = best_cells(cases.log_odds + place * cases.place + co_occurrence * cases.co_occurrence, cases.visited)
     return float(((tied & cases.goal).sum(-1) / tied.sum(-1)).mean())
 
 
-def hit(cases: Cases, gamma: Tensor, place: Tensor, company: Tensor) -> Tensor:
-    """Mean log probability of landing on the target."""
-    value = gamma * cases.log_odds + place * cases.place + company * cases.company
+def hit(cases: Cases, gamma: Tensor, place: Tensor, co_occurrence: Tensor) -> Tensor:
+    """Compute the mean log probability of landing on the target (the objective of `likeliest_weights`)."""
+    value = gamma * cases.log_odds + place * cases.place + co_occurrence * cases.co_occurrence
     value = value.masked_fill(cases.visited, -torch.inf)
     return (value.masked_fill(~cases.goal, -torch.inf).logsumexp(-1) - value.logsumexp(-1)).mean()

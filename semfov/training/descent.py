@@ -1,4 +1,4 @@
-"""The loop of training small networks: one cycle of the learning rate, by a loss that is made anew in each step."""
+"""A training loop for small networks: AdamW with one cycle of the learning rate."""
 
 from collections.abc import Callable, Iterable
 from contextlib import closing
@@ -19,15 +19,15 @@ def descend(
     decay: float = 1e-2,
     title: str = "training",
 ) -> None:
-    """Train by AdamW, with one cycle of the learning rate (Smith and Topin, 2019).
+    """Train with AdamW and one cycle of the learning rate (Smith and Topin, 2019).
 
     Args:
-        parameters: to train.
-        loss_of: the loss of a step, by its number.
-        steps: how many.
+        parameters: the parameters to train.
+        loss_of: computes the loss of a step from the number of the step.
+        steps: number of steps.
         rate: highest learning rate.
-        clip: norm that gradients are cut to; None leaves them.
-        decay: of weights, in AdamW's sense.
+        clip: maximum norm of the gradient; larger gradients are scaled down (None: no limit).
+        decay: AdamW's weight decay.
         title: label of the progress bar.
     """
     trained = list(parameters)

@@ -1,4 +1,4 @@
-"""Fitting everything that the agent needs to a detector of one's own."""
+"""Fit all models that the agent needs to a detector of the user."""
 
 import logging
 import time
@@ -28,7 +28,7 @@ from semfov.training.evidence_examples import LookingRun, looking_run
 _log = logging.getLogger(__name__)
 
 SETTINGS = ("holdout", "fixations", "steps", "map_steps", "seed")
-"""Settings that a folder tells."""
+"""Settings that the manifest of a model folder records."""
 
 
 def fit_detector(
@@ -41,24 +41,30 @@ def fit_detector(
     workers: int = 1,
     **settings: Any,
 ) -> ActivePerception:
-    """Fit everything that the recommended agent needs to a detector, and return the agent.
+    """Fit all models that the recommended agent needs to a detector, and return the agent.
 
-    The same as `python -m train.fit_detector`: looks at every photograph from every cell, fits an observation model,
-    the exponent of its likelihoods, target evidence and a map of all classes, and compares each with raw scores on
-    photographs that were held out. `ActivePerception.from_pretrained(out)` loads the agent again.
+    This is `python -m train.fit_detector` as a function. The detector looks at every photograph from every cell. Then
+    an observation model, the exponent of its likelihoods, target evidence and a map of all classes are fitted, and each
+    of them is compared with raw scores on held-out photographs. `ActivePerception.from_pretrained(out)` loads the agent
+    again.
 
     Args:
         model: the detector: a name or a file, as for `semfov.load_detector`.
         root: folder of the photographs.
-        annotations: their boxes, a file in COCO's format; categories are matched to the detector's classes by name.
-        out: folder of models to write; the same call goes on where one was stopped.
-        limit: most photographs.
-        workers: processes that look; more than one needs a script whose work is under `if __name__ == "__main__"`.
-        settings: others of `FitDetectorConfig` (`holdout`, `steps`, `seed`, …), and of the detector (`classes`, `head`,
-            `weights`, `threshold`, …: `DetectorConfig`).
+        annotations: annotation file with their boxes, in COCO's format. Its categories are matched to the detector's
+            classes by name.
+        out: folder to write the models to. After an interruption, the same call continues where it stopped.
+        limit: maximum number of photographs (None: all).
+        workers: number of processes that look. More than one requires a script that calls this function under
+            `if __name__ == "__main__"`.
+        settings: other settings of `FitDetectorConfig` (`holdout`, `steps`, `seed`, …) and of the detector (`classes`,
+            `head`, `weights`, `threshold`, …: `DetectorConfig`).
+
+    Returns:
+        The agent with the fitted models. It does not use models that were no better than raw scores.
 
     Raises:
-        InputError: a setting is unknown or out of range, or the detector is.
+        InputError: a setting is unknown or out of range, or there is no such detector.
         DataError: a file is missing or damaged, or none of the annotated categories is a class of the detector.
 
     Example::
@@ -70,7 +76,7 @@ def fit_detector(
     of_fit = {each.name for each in fields(FitDetectorConfig)} - {"model", "data", "detector", "out", "workers"}
     unknown = sorted(settings.keys() - of_detector - of_fit)
     if unknown:
-        raise InputError(f"settings: expected some of {', '.join(sorted(of_detector | of_fit))}, got {unknown[0]!r}")
+        raise InputError(f"settings: expected names among {', '.join(sorted(of_detector | of_fit))}, got {unknown[0]!r}")
     given = {name: value for name, value in settings.items() if name in of_detector}
     if given.get("classes") is not None:
         given["classes"] = tuple(given["classes"])
@@ -89,7 +95,7 @@ def fit_detector(
 
 
 def fit_folder(config: FitDetectorConfig) -> None:
-    """Look, fit all parts, and write the folder, its report and its figures."""
+    """Look at all photographs, fit all parts, and write the model folder with its report and figures."""
     config = config.named()
     started = time.monotonic()
     run = looking_run(replace(config, out=config.out / "progress"))
@@ -117,7 +123,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
 
 
 def seconds_of_looks(run: LookingRun) -> float:
-    """About how many seconds the looks take that are still to be made."""
+    """Estimate the seconds that the remaining looks will take, from the time of one look."""
     left = [index for index in range(len(run.scenes)) if run.store.load(run.digest(index)) is None]
     if not left:
         return 1.0
@@ -132,13 +138,13 @@ def seconds_of_looks(run: LookingRun) -> float:
 
 
 def _tell(counts: dict[str, int]) -> None:
-    """Warn of classes that no photograph shows."""
+    """Warn about classes without any object in the photographs."""
     missing = [name for name, count in counts.items() if not count]
     if missing:
         some = ", ".join(missing[:8]) + (", …" if len(missing) > 8 else "")
         _log.warning(
-            "%d of the detector's %d classes have no box in the photographs (%s): what is fitted knows them only by "
-            "what it learns of the others",
+            "%d of the detector's %d classes have no box in the photographs (%s): the fitted models can only apply to "
+            "them what they learn from the other classes",
             len(missing),
             len(counts),
             some,
@@ -146,7 +152,16 @@ def _tell(counts: dict[str, int]) -> None:
 
 
 def manifest_of(config: FitDetectorConfig, run: LookingRun, shop: Workshop) -> Manifest:
-    """The record of the folder."""
+    """Build the manifest of the model folder.
+
+    Args:
+        config: the settings.
+        run: the finished looks.
+        shop: the fitted parts.
+
+    Returns:
+        The manifest.
+    """
     detector, sensor = run.eye.detector, config.sensor
     options = plain(detector_options(config.detector))
     weights = options.pop("weights", None)
@@ -174,6 +189,6 @@ def manifest_of(config: FitDetectorConfig, run: LookingRun, shop: Workshop) -> M
 
 
 def given_of(sensor: SensorConfig) -> dict[str, float]:
-    """Settings of a sensor that differ from those that its name stands for."""
+    """Return the sensor settings that were given explicitly instead of by the sensor's name."""
     given = {"sigma": sensor.sigma, "growth": sensor.growth}
     return {name: value for name, value in given.items() if value is not None}

@@ -1,4 +1,4 @@
-"""The parts of what is fitted to a detector: each is fitted, judged beside raw scores, and written."""
+"""The models that are fitted to a detector: each part is fitted, compared with raw scores, and written."""
 
 from __future__ import annotations
 
@@ -42,24 +42,25 @@ from semfov.viz.style import save_figure
 SHIFTS = 5
 """Gaze shifts after which searches and explorations are compared."""
 LONGEST = 15
-"""Gaze shifts that they have."""
+"""Maximum number of gaze shifts in them."""
 ABSENT = 1000
-"""About so many searches for classes that are not there choose the thresholds, at most 20 in a photograph."""
+"""Thresholds are chosen on about this many searches for absent classes, at most 20 in a photograph."""
 SUREST, SUREST_OF_FEW = 0.99, 0.9
-"""The highest threshold of finding; the second where few false alarms are expected among so many searches.
+"""Upper limit of the threshold for reporting a target as found. The second value is for few expected false alarms.
 
-One that no search reaches would never find anything; and among few searches one false alarm decides.
+If the threshold were higher than any search reaches, nothing would ever be found. With few searches, a single false
+alarm could push it that high.
 """
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A part, and what is told of it.
+    """A fitted part with its report.
 
     Attributes:
-        part: as the folder's record has it.
-        report: Markdown.
-        figures: files in the folder.
+        part: the part's entry in the manifest of the folder.
+        report: report in Markdown.
+        figures: names of its figures in the folder.
     """
 
     part: Part
@@ -68,11 +69,11 @@ class Fitted:
 
 
 class Workshop:
-    """Fits the parts to a detector that has looked at all photographs; parts that were finished before are read back.
+    """Fit the parts to a detector. Parts that an earlier run finished are read from the folder.
 
     Args:
-        config: settings.
-        run: that has looked from every cell.
+        config: the settings.
+        run: the finished looks from every cell of all photographs.
     """
 
     def __init__(self, config: FitDetectorConfig, run: LookingRun) -> None:
@@ -84,7 +85,7 @@ class Workshop:
 
     @property
     def stages(self) -> dict[str, dict[str, float]]:
-        """Tasks of each part, with about how many seconds they take on one core."""
+        """The tasks of each part, with an estimate of their seconds on one core."""
         photographs, judged = len(self.run.scenes), min(len(self.held_out), self.config.judged)
         described = {"describing looks": 0.05 * photographs}
         config = self.config
@@ -97,13 +98,13 @@ class Workshop:
             "map": {
                 **described,
                 "training": 0.25 * everything.steps,
-                "learning what looks bring": 0.1 * everything.gain_steps,
+                "learning the gain of looks": 0.1 * everything.gain_steps,
                 "exploring": judged,
             },
         }
 
     def _settings(self, name: str) -> list[Any]:
-        """What a part is made from and judged by, beside the looks."""
+        """List everything except the looks that a part and its evaluation depend on."""
         if name == "evidence":
             own: Any = self.config.evidence(self.components - 1)
         else:
@@ -113,7 +114,7 @@ class Workshop:
         return [name, _plain(asdict(own)), self.config.judged, before]
 
     def fit(self, name: str) -> Fitted:
-        """Fit a part, or read back what the same settings, photographs and code made of it before."""
+        """Fit a part, or read it from the folder if it was fitted with the same settings, photographs and code."""
         key = digest_of([self.run.key, self._settings(name)])
         kept = self._kept(name, key)
         if kept is None:
@@ -136,24 +137,24 @@ class Workshop:
             whole = record["key"] == key
             whole = whole and (part.file is None or sha256(self.config.out / part.file) == part.sha256)
             whole = whole and all((self.config.out / figure).is_file() for figure in record["figures"])
-        except Exception:  # whatever is wrong with it, it can be made again
+        except Exception:  # a damaged record is no problem, as the part can be fitted again
             return None
         return Fitted(part, record["report"], record["figures"]) if whole else None
 
     def _write(self, name: str, model: Model, used: bool, why: str) -> Part:
-        """Write the model of a part."""
+        """Write the model of a part and return its entry in the manifest."""
         file = f"{name}.safetensors"
         model.save(self.config.out / file)
         return Part(file, sha256(self.config.out / file), used, why)
 
     def model(self, name: str) -> Model | None:
-        """The model of a part that was fitted and is to be used."""
+        """Return the model of a part, or None if the part has no model or the agent should not use it."""
         part = self.parts[name].part
         return KINDS[name].from_pretrained(self.config.out / part.file) if part.used and part.file else None
 
     @property
     def semantic(self) -> Semantic:
-        """The belief that fuses scores in the best way that was found."""
+        """The belief that fuses scores with the best exponent."""
         part = self.parts["tempering"].part
         if not part.used:
             return Semantic(self.components)
@@ -167,7 +168,7 @@ class Workshop:
 
     @cached_property
     def samples(self) -> Samples:
-        """Labelled detections of some of the looks at each photograph."""
+        """Labelled detections from a few random cells of each photograph."""
         parts, run = [], self.run
         for index in range(len(run.scenes)):
             grid = run.grid(index)
@@ -182,7 +183,10 @@ class Workshop:
         held_out = samples.scene % config.holdout == 0
         judged = samples[held_out]
         if not len(judged) or len(judged) == len(samples):
-            raise DataError(f"too few detections to fit on and to judge by ({len(samples)}); give more photographs")
+            raise DataError(
+                f"data: expected detections both in the training and in the held-out photographs, got {len(samples)} "
+                "detections in all; give more photographs"
+            )
         model = fit_model(config, run, samples[~held_out])
         fitted_on = {index for index in range(len(run.scenes)) if index % config.holdout}
         cells = cells_of(self.config.columns, self.config.rows)
@@ -190,30 +194,32 @@ class Workshop:
         model.miss_rate = misses.rates().to(model.edges)
         raw = FovealObservationModel.identity(run.scenes.classes, config.edges).eval()
         with torch.inference_mode():
-            told = {name: m.calibrate(judged.scores, judged.distance) for name, m in (("raw", raw), ("fitted", model))}
-        cost = {name: surprisal(p.double().gather(1, judged.labels[:, None])[:, 0]) for name, p in told.items()}
+            posteriors = {
+                name: m.calibrate(judged.scores, judged.distance) for name, m in (("raw", raw), ("fitted", model))
+            }
+        cost = {name: surprisal(p.double().gather(1, judged.labels[:, None])[:, 0]) for name, p in posteriors.items()}
         photographs = judged.scene.unique().tolist()
         means = {
             name: torch.stack([each[judged.scene == scene].mean() for scene in photographs]).numpy()
             for name, each in cost.items()
         }
         gain = Difference.of(means["raw"], means["fitted"])
-        figures = {name: calibration(p, judged.labels) for name, p in told.items()}
+        figures = {name: calibration(p, judged.labels) for name, p in posteriors.items()}
         rows = [["scores", "NLL", "Brier", "ECE", "accuracy"]]
         rows += [
             [name, f"{f.nll:.3f}", f"{f.brier:.3f}", f"{f.ece:.3f}", f"{f.accuracy:.3f}"] for name, f in figures.items()
         ]
         why = (
-            f"negative log likelihood of the true class {figures['fitted'].nll:.3f}, of raw scores "
+            f"negative log likelihood of the true class {figures['fitted'].nll:.3f}, with raw scores "
             f"{figures['raw'].nll:.3f}; {in_words(gain, 'nats gained')}"
         )
         from semfov.viz import plot_reliability
 
-        figure = plot_reliability({name: (p, judged.labels) for name, p in told.items()})
+        figure = plot_reliability({name: (p, judged.labels) for name, p in posteriors.items()})
         save_figure(figure, self.config.out / "reliability.png")
         report = section(
-            f"How likely the true class of a detection is told to be: {len(samples) - len(judged)} detections to learn "
-            f"from, {len(judged)} of {len(photographs)} photographs that were held out.",
+            f"Predicted probability of the true class of a detection: fitted on {len(samples) - len(judged)} "
+            f"detections, evaluated on {len(judged)} detections in {len(photographs)} held-out photographs.",
             rows,
         )
         part = self._write("observation", model, gain.better, why)
@@ -247,8 +253,8 @@ class Workshop:
         rows = [["scores", "exponent", "next fixations that hit, %"], ["raw, every cell of a box", "1", share(before)]]
         rows += [[way[0], f"{way[1]:g}", share(mean["held_out"])] for way, mean in means.items()]
         report = section(
-            f"The exponent with which scores are fused ({scores}, {exponent:g}) was chosen on the photographs to learn "
-            f"from; these are figures of {len(held_out)} that were held out.",
+            f"The exponent with which scores are fused ({scores}, {exponent:g}) was chosen on the training "
+            f"photographs; the table shows results on {len(held_out)} held-out photographs.",
             rows,
         )
         settings = {"scores": scores, "exponent": exponent, "footprint": config.footprint}
@@ -258,7 +264,7 @@ class Workshop:
         config, run = self.config.evidence(self.components - 1), self.run
         fit = fit_evidence(config, run)
         grid = Grid(config.columns, config.rows, (config.columns, config.rows))
-        # Absent classes are many: with more of them, the share of false alarms is known better.
+        # More searches for absent classes give a more precise share of false alarms, and absent classes are plenty.
         each = max(config.classes, min(20, ABSENT // len(self.held_out)))
         area, scenes = config.max_target_area, self.held_out
         wide = make_examples(run, config.classes, area, config.seed, absent=each, scenes=scenes)
@@ -276,12 +282,12 @@ class Workshop:
         judged = self.held_out[: self.config.judged]
         curves = search_curves(run, judged, ways, protocol, config.max_target_area)
         if not len(curves["raw"]):
-            raise DataError("no photograph that was held out has a class to search for; give more photographs")
+            raise DataError("data: none of the held-out photographs contains a class to search for; give more of them")
         at = min(SHIFTS, protocol.shifts)
         gain = Difference.of(curves["fitted"][:, at], curves["raw"][:, at])
         why = (
             f"{100 * curves['fitted'][:, at].mean():.1f} % of the targets are found in {at} gaze shifts, "
-            f"{100 * curves['raw'][:, at].mean():.1f} % by raw scores; {in_words(gain, 'points gained', 100)}"
+            f"{100 * curves['raw'][:, at].mean():.1f} % with raw scores; {in_words(gain, 'points gained', 100)}"
         )
         rules: dict[str, tuple[Strategy, Rule]] = {
             "fitted": (learned, partial(_by_thresholds, thresholds=thresholds)),
@@ -291,25 +297,26 @@ class Workshop:
         shifts = (1, at, protocol.shifts)
         rows = [["belief", *(f"CP@{n}" for n in shifts)]]
         rows += [[name, *(mean_percent(curve[:, n]) for n in shifts)] for name, curve in curves.items()]
-        told = [["belief", "found, there, %", "found, not there, %", "undecided, %", "looks"]]
-        told += [
+        outcomes = [["belief", "found, present, %", "found, absent, %", "undecided, %", "looks"]]
+        outcomes += [
             [name, share(d.found), share(d.false_alarms), share(d.undecided), f"{d.looks:.1f}"]
             for name, d in decided.items()
         ]
         report = "\n".join(
             [
                 section(
-                    f"Targets found after n gaze shifts, in %, on {len(curves['raw'])} photographs that were held out, "
-                    f"{protocol.starts} starts for each target (`raw`: scores as they are; `fused`: as under "
-                    "tempering).",
+                    f"Targets found after n gaze shifts, in %, on {len(curves['raw'])} held-out photographs with "
+                    f"{protocol.starts} starting points for each target. `raw` fuses the raw scores; `fused` uses the "
+                    "exponent chosen under Tempering.",
                     rows,
                 ),
                 section(
-                    f"What {decided['fitted'].searches} searches for classes that are there and that are not decide. "
-                    f"The thresholds (found from {thresholds.confirm:.2f}, a look is worth it from "
-                    f"{thresholds.give_up:.2f}) were chosen on the same photographs; raw searches count a score of 0.5 "
-                    "as found, and never give up.",
-                    told,
+                    f"Decisions of {decided['fitted'].searches} searches for present and for absent classes. A target "
+                    f"counts as found from a probability of {thresholds.confirm:.2f} on, and a search gives up when no "
+                    f"cell has a probability of {thresholds.give_up:.2f} or more. These thresholds were chosen on the "
+                    "same photographs. With raw scores, a score of 0.5 in the fixated cell counts as found, and no "
+                    "search gives up.",
+                    outcomes,
                 ),
                 judged_report(fit.judged, thresholds, fit.trained, fit.held_out),
             ]
@@ -322,7 +329,7 @@ class Workshop:
     def _map(self) -> Fitted:
         config, run = self.config.map, self.run
         if self.components < 3:
-            raise InputError("a map of all classes needs a detector of two classes or more")
+            raise InputError("detector: a map of all classes needs at least 2 classes, got a detector with 1 class")
         fit = fit_map_evidence(config, run)
         fovea = self.config.sensor.fovea
         ways = {
@@ -335,13 +342,14 @@ class Workshop:
         at = min(SHIFTS, protocol.shifts)
         every, objects = curves["all"], curves["objects"]
         if not len(objects["raw"]):
-            raise DataError("no photograph that was held out has an object; give more photographs")
+            raise DataError("data: none of the held-out photographs contains an object; give more photographs")
         gain = Difference.of(objects["fitted"][:, at], objects["raw"][:, at])
-        # A map that says background everywhere would be right of most cells, and one that never does of all objects.
+        # A map that answers background everywhere is right for most cells, and one that never answers background may
+        # be right for all objects. Therefore both measures are compared.
         loss = Difference.of(every["raw"][:, at], every["fitted"][:, at])
         why = (
-            f"{100 * objects['fitted'][:, at].mean():.1f} % of the cells with objects are named right after {at} gaze "
-            f"shifts, {100 * objects['raw'][:, at].mean():.1f} % by raw scores and random gaze; "
+            f"{100 * objects['fitted'][:, at].mean():.1f} % of the cells with objects are classified correctly after "
+            f"{at} gaze shifts, {100 * objects['raw'][:, at].mean():.1f} % with raw scores and random gaze; "
             f"{in_words(gain, 'points gained', 100)}; of all cells {100 * every['fitted'][:, at].mean():.1f} and "
             f"{100 * every['raw'][:, at].mean():.1f} %"
         )
@@ -352,10 +360,11 @@ class Workshop:
                 [name, *(mean_percent(curve[:, n]) for n in (1, at, protocol.shifts))]
                 for name, curve in curves[what].items()
             ]
-            sections.append(section(f"Named right after n gaze shifts, in % of {words}:", rows))
+            sections.append(section(f"Classified correctly after n gaze shifts, in % of {words}:", rows))
         head = (
-            f"On {len(objects['raw'])} photographs that were held out (`raw`: scores as they are, random gaze; "
-            "`fused`: as under tempering, with the fitted map's gaze). The answer for a cell may be background.\n"
+            f"On {len(objects['raw'])} held-out photographs. `raw` fuses raw scores with random gaze; `fused` uses the "
+            "exponent chosen under Tempering, with the gaze policy of the fitted map. The answer for a cell may be "
+            "background.\n"
         )
         save_figure(curves_figure(objects, "exploration"), self.config.out / "explore.png")
         part = self._write("map", fit.model, gain.better and not loss.better, why)
@@ -371,6 +380,6 @@ def _by_thresholds(step: Step, target: int, grid: Grid, *, thresholds: Any) -> t
 
 
 def _plain(settings: dict[str, Any]) -> Any:
-    """Settings that a part depends on."""
+    """Return the settings that a part depends on, as JSON values."""
     left_out = ("out", "cache", "workers")
     return json.loads(json.dumps({name: each for name, each in settings.items() if name not in left_out}, default=str))

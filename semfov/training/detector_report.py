@@ -1,4 +1,4 @@
-"""What is told of everything that was fitted to a detector."""
+"""The report about all models that were fitted to a detector."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ TITLES = {
     "evidence": "Target evidence (searches)",
     "map": "Learned map (explorations)",
 }
-"""What reports call the parts."""
+"""Titles of the parts in reports."""
 
 
 def class_counts(run: LookingRun, scenes: Any) -> dict[str, int]:
-    """Objects of each class in some photographs."""
+    """Count the objects of each class in the photographs with the given indices."""
     count = torch.zeros(len(run.scenes.classes) + 1, dtype=torch.int64)
     for index in scenes:
         count += torch.bincount(run.scenes.annotation(index).labels, minlength=len(count))
@@ -30,12 +30,22 @@ def class_counts(run: LookingRun, scenes: Any) -> dict[str, int]:
 
 
 def report(config: FitDetectorConfig, run: LookingRun, parts: dict[str, Fitted], seconds: float) -> str:
-    """How everything that was fitted does, as Markdown."""
+    """Write the report as Markdown.
+
+    Args:
+        config: the settings.
+        run: the finished looks.
+        parts: the fitted parts by their names.
+        seconds: duration of this run.
+
+    Returns:
+        The text.
+    """
     photographs = len(run.scenes)
     holdout = config.observation.holdout
     held_out = [index for index in range(photographs) if index % holdout == 0]
     counts = class_counts(run, (index for index in range(photographs) if index % holdout))
-    rows = [["part", "used", "because on held-out photographs"]]
+    rows = [["part", "used", "result on held-out photographs"]]
     rows += [[TITLES[name], "yes" if each.part.used else "no, raw", each.part.why] for name, each in parts.items()]
     lines = [
         f"# Models of {run.eye.detector.name}",
@@ -44,15 +54,16 @@ def report(config: FitDetectorConfig, run: LookingRun, parts: dict[str, Fitted],
         f"{len(counts)} classes; {config.columns} × {config.rows} cells; "
         f"sensor {config.sensor.name}; {seconds / 60:.1f} minutes in this run.",
         "",
-        "A part is used where it is better than raw scores by more than one standard error, paired over the "
-        "photographs that were held out; else the agent does without it.",
+        "The agent uses a part only if it is better than raw scores by more than one standard error of the paired "
+        "difference over the held-out photographs.",
         "",
         *table(rows),
         "",
         *thin_classes(counts, config.thin),
     ]
     if len(held_out) < 10:
-        lines += [f"Only {len(held_out)} photographs judge: take the figures as rough.", ""]
+        number = "only 1 photograph" if len(held_out) == 1 else f"only {len(held_out)} photographs"
+        lines += [f"The figures are rough, because {number} could be held out.", ""]
     for name, fitted in parts.items():
         lines += [f"## {TITLES[name]}", "", fitted.report, ""]
         lines += [line for figure in fitted.figures for line in (f"![{figure}]({figure})", "")]
@@ -60,7 +71,15 @@ def report(config: FitDetectorConfig, run: LookingRun, parts: dict[str, Fitted],
 
 
 def thin_classes(counts: dict[str, int], thin: int) -> list[str]:
-    """Lines that warn of classes with few objects to learn from."""
+    """Write warnings about classes with few objects to learn from.
+
+    Args:
+        counts: objects of each class in the training photographs.
+        thin: a class with fewer objects is listed.
+
+    Returns:
+        Lines of Markdown.
+    """
     none = [name for name, count in counts.items() if count == 0]
     few = [f"{name} {count}" for name, count in counts.items() if 0 < count < thin]
     lines = []
@@ -70,15 +89,16 @@ def thin_classes(counts: dict[str, int], thin: int) -> list[str]:
         lines += [f"**Fewer than {thin} objects to learn from** ({len(few)} classes): {', '.join(few)}.", ""]
     if lines:
         lines += [
-            "Evidence and map weigh scores of all classes by one network, with one number for how frequent each class "
-            "is; the observation model leaves scores of a class without examples much as they are.",
+            "The target evidence and the map process the scores of all classes with one network; only one number per "
+            "class, its frequency, is separate. The observation model changes the scores of a class without examples "
+            "very little.",
             "",
         ]
     return lines
 
 
 def next_commands(config: FitDetectorConfig, run: LookingRun) -> str:
-    """What to do with the folder."""
+    """Return example commands that use the model folder."""
     out = fspath(config.out)
     target = max(class_counts(run, range(len(run.scenes))).items(), key=lambda pair: pair[1])[0]
     quoted = f'"{target}"' if " " in target else target

@@ -1,4 +1,4 @@
-"""Settings of fitting everything to a detector."""
+"""Settings for fitting all models to a detector."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,34 +13,34 @@ from semfov.training.observation_settings import FitConfig
 from semfov.training.tempering import FitTemperingConfig
 
 FEW = 8
-"""Detectors of fewer classes learn from photographs without any of them, too."""
+"""Detectors with fewer classes also learn from photographs that contain none of them."""
 MANY = 100
-"""From so many photographs on, every fifth is held out, and training takes all its steps."""
+"""With at least this many photographs, one in five is held out and training takes all its steps."""
 
 
 @dataclass(frozen=True)
 class FitDetectorConfig(Settings):
-    """Fit everything that the agent needs to a detector of your own.
+    """Fit all models that the agent needs to your own detector.
 
     Args:
         model: the detector: a name or a file, as for `semfov.load_detector`.
-        data: photographs with boxes to learn from; all of them, unless `data.limit` or `data.ids` says otherwise.
-        detector: how the detector is used; its name is `model`.
+        data: photographs with boxes to learn from. All of them are used unless `data.limit` or `data.ids` selects some.
+        detector: options of the detector; `model` gives its name.
         sensor: the foveal sensor.
-        columns: cells in a row.
-        rows: cells in a column.
+        columns: columns of the grid.
+        rows: rows of the grid.
         max_target_area: classes that cover a larger share of the image are not searched for.
-        holdout: every n-th photograph is kept out, to judge and to choose thresholds by (None: every fifth, every third
-            of fewer than 100).
-        judged: most of these photographs on which searches and explorations are compared with raw ones.
-        fixations: looks at each photograph that the observation model is fitted to.
-        steps: steps of training for searches (None: 500, fewer for fewer than 100 photographs).
-        map_steps: steps of training for maps (None: 1000, fewer for fewer than 100 photographs).
-        thin: classes with fewer objects in the photographs to learn from are named in the report.
-        seed: of every choice that is drawn.
-        out: folder of models to write.
-        cache: folder for what was seen from every cell, shared with `eval.search` (None: the user's cache).
-        workers: processes that look (None: one for each CPU core).
+        holdout: one in every n photographs is held out for the evaluation and for choosing thresholds (None: one in 5,
+            or one in 3 if there are fewer than 100 photographs).
+        judged: maximum number of held-out photographs on which searches and explorations are compared with raw scores.
+        fixations: looks at each photograph to fit the observation model to.
+        steps: training steps of the target evidence (None: 500, fewer with fewer than 100 photographs).
+        map_steps: training steps of the map of all classes (None: 1000, fewer with fewer than 100 photographs).
+        thin: the report lists classes with fewer objects than this in the training photographs.
+        seed: seed of all random choices.
+        out: folder to write the models to.
+        cache: folder for the detections from every cell, shared with `eval.search` (None: the user's cache).
+        workers: number of processes that look (None: one for each CPU core).
     """
 
     model: Path | None = None
@@ -62,22 +62,28 @@ class FitDetectorConfig(Settings):
     workers: Workers | None = None
 
     def named(self) -> "FitDetectorConfig":
-        """The same, with the model as the detector's name, and photographs of all sizes of targets.
+        """Return these settings with `model` as the detector's name, and with targets of all sizes in the photographs.
+
+        Returns:
+            The settings.
 
         Raises:
-            InputError: there is no model, or two.
+            InputError: no model is given, or `detector.name` names another one.
         """
         default = DetectorConfig().name
         if self.model is None:
-            raise InputError("model: expected the detector's name or file, got none")
+            raise InputError("model: expected the name or the file of a detector, got none")
         if self.detector.name not in (default, str(self.model)):
-            raise InputError(f"detector.name: expected none beside the model {str(self.model)!r}")
-        # Photographs without a target teach what it looks like where there is none.
+            raise InputError(
+                f"detector.name: expected nothing, as model already names the detector ({str(self.model)!r}), got "
+                f"{self.detector.name!r}"
+            )
+        # Photographs without the target are needed as negative examples.
         data = replace(self.data, max_target_area=None)
         return replace(self, data=data, detector=replace(self.detector, name=str(self.model)))
 
     def sized(self, photographs: int) -> "FitDetectorConfig":
-        """The same, with what is left open as it suits so many photographs; fits are made from this."""
+        """Return these settings with defaults that suit the number of photographs where a setting is None."""
         few = photographs < MANY
         share = min(photographs / MANY, 1)
         return replace(
@@ -99,7 +105,7 @@ class FitDetectorConfig(Settings):
 
     @property
     def tempering(self) -> FitTemperingConfig:
-        """Settings of the exponents that are tried."""
+        """Settings for choosing the exponent of the likelihoods."""
         return FitTemperingConfig(
             **self._common,  # type: ignore[arg-type]
             fixations=self.fixations,
@@ -110,7 +116,7 @@ class FitDetectorConfig(Settings):
         )
 
     def evidence(self, classes: int) -> FitSearchConfig:
-        """Settings of the target evidence, for a detector of so many classes."""
+        """Return the settings of the target evidence for a detector with so many classes."""
         return FitSearchConfig(
             **self._common,  # type: ignore[arg-type]
             absent=2 if classes < FEW else None,

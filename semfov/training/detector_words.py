@@ -1,4 +1,4 @@
-"""Figures in words, tables and pictures, for the report of a fit."""
+"""Format the figures of a fit as text, tables and plots for its report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,16 @@ from semfov.training.held_out import Array, Difference
 
 
 def in_words(gain: Difference, unit: str, scale: float = 1.0) -> str:
-    """A difference in words."""
+    """Format a paired difference with its standard error and number of photographs.
+
+    Args:
+        gain: the difference.
+        unit: unit to print after the number.
+        scale: factor from the difference to that unit.
+
+    Returns:
+        The text.
+    """
     digits = 1 if scale > 1 else 3
     return (
         f"{scale * gain.mean:+.{digits}f} ± {scale * gain.error:.{digits}f} {unit} "
@@ -20,26 +29,26 @@ def in_words(gain: Difference, unit: str, scale: float = 1.0) -> str:
 
 
 def mean_percent(values: Array) -> str:
-    """Mean of shares `(P,)` in percent, with its standard error."""
+    """Format the mean of shares `(P,)` in percent, with its standard error."""
     return percent(float(values.mean()), float(standard_error(values)))
 
 
 def share(value: float) -> str:
-    """A share in percent."""
+    """Format a share in percent."""
     return f"{100 * value:.1f}"
 
 
 def section(text: str, rows: list[list[str]]) -> str:
-    """Words, and a table below them where there are rows."""
+    """Return a paragraph of Markdown, followed by a table if there are rows."""
     return "\n".join([text, "", *(table(rows) if rows else []), *([""] if rows else [])])
 
 
 def curves_figure(curves: dict[str, Array], task: Task) -> Any:
-    """Means of curves `(P, shifts+1)` over photographs, with their standard errors."""
+    """Plot the means of curves `(P, shifts+1)` over photographs, with their standard errors."""
     from semfov.viz import plot_cumulative_performance, plot_success_rate
 
     means = {name: curve.mean(0) for name, curve in curves.items()}
     errors = {name: standard_error(curve) for name, curve in curves.items()}
-    title = f"Photographs that were held out ({len(curves['raw'])})"
+    title = f"Held-out photographs ({len(curves['raw'])})"
     plot = plot_cumulative_performance if task == "search" else plot_success_rate
     return plot(means, errors, title=title)

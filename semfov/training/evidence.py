@@ -1,4 +1,4 @@
-"""Training evidence for targets on the looks of whole searches."""
+"""Train the target evidence on the looks of whole searches."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ from semfov.training.frame import Fit, FitOnLooksConfig, fit_and_write, split
 from semfov.training.outputs import training_of
 
 JUDGED = (1, 5, 15)
-"""Looks after which a belief is judged."""
+"""Numbers of looks after which a belief is evaluated."""
 
 
 @dataclass(frozen=True)
@@ -35,16 +35,16 @@ class FitSearchConfig(FitOnLooksConfig):
     """Train the evidence for a target.
 
     Args:
-        classes: classes that a photograph holds to learn from, at most.
-        absent: classes that a photograph does not hold, at most (None: as many as it holds).
+        classes: maximum number of present classes to learn from in each photograph.
+        absent: maximum number of absent classes to learn from in each photograph (None: as many as present ones).
         max_target_area: classes that cover a larger share of the image are not searched for.
-        landing: weight in the loss of landing on the target with the next fixation.
-        presence: weight in the loss of telling whether the target is in the photograph.
-        gaze: weight in the loss of the cells that the gaze goes to next and that it would name.
-        false_alarms: share of absent targets that may be called found, by which the threshold is chosen.
-        surest: probability from which on a target counts as found at the latest, however many false alarms that makes.
-        lost: share of the targets that may be missed because their place is not known, and as many again because no
-            cell is worth a look any more.
+        landing: weight of the loss term for landing on the target with the next fixation.
+        presence: weight of the loss term for predicting whether the target is in the photograph.
+        gaze: weight of the loss term for two selected cells: the next one to fixate, and the most probable fixated one.
+        false_alarms: maximum share of absent targets that may be reported as found; it determines the threshold.
+        surest: upper limit of that threshold, even if more false alarms result.
+        lost: maximum share of the targets that may be missed because their cell is not certain enough, and maximum
+            further share that may be missed because the search gives up.
     """
 
     classes: Count = 2
@@ -60,12 +60,20 @@ class FitSearchConfig(FitOnLooksConfig):
 
 
 def fit_search(config: FitSearchConfig) -> None:
-    """Look from every cell, train, judge on held-out photographs, and write everything."""
+    """Look from every cell, train, evaluate on held-out photographs, and write all results."""
     fit_and_write(config, fit_evidence)
 
 
 def fit_evidence(config: FitSearchConfig, run: LookingRun) -> Fit[TargetEvidence]:
-    """The model with its thresholds, from a run that has looked."""
+    """Fit the model and its thresholds.
+
+    Args:
+        config: the settings.
+        run: the finished looks from every cell.
+
+    Returns:
+        The model with its evaluation.
+    """
     examples = make_examples(run, config.classes, config.max_target_area, config.seed, absent=config.absent)
     held_out = split(examples.scene, config.holdout)
     grid = Grid(config.columns, config.rows, (config.columns, config.rows))
@@ -79,7 +87,18 @@ def fit_evidence(config: FitSearchConfig, run: LookingRun) -> Fit[TargetEvidence
 def train(
     config: FitSearchConfig, examples: Examples, grid: Grid, metadata: dict[str, object], components: int
 ) -> TargetEvidence:
-    """The model, trained on searches that it makes itself, with fixations astray among them."""
+    """Train the model on searches that it makes itself. Some of their fixations are random.
+
+    Args:
+        config: the settings.
+        examples: the training examples.
+        grid: the grid of cells.
+        metadata: metadata of the model.
+        components: number of classes with background, K+1.
+
+    Returns:
+        The trained model.
+    """
     generator = torch.Generator().manual_seed(config.seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
@@ -87,7 +106,7 @@ def train(
 
     def loss_of(number: int) -> Tensor:
         chosen = examples[torch.randint(len(examples), (config.batch,), generator=generator)]
-        # At first the model knows nothing, and where it would look does not matter.
+        # At first the model has learned nothing, so its own choice of fixations would be no better than random ones.
         astray = 1.0 if number < config.steps // 20 else config.astray * (number % 2)
         counted = torch.randint(2, config.looks + 1, (2,), generator=generator).tolist()
         loss = chosen.score.new_zeros(())
@@ -103,7 +122,19 @@ def train(
 def searches(
     model: TargetEvidence, examples: Examples, grid: Grid, looks: int, astray: float, generator: torch.Generator
 ) -> Iterator[Step]:
-    """A search of every example from a start at random, which does not end on its target."""
+    """Search every example from a random start. The searches continue after they reach their target.
+
+    Args:
+        model: the target evidence.
+        examples: the examples, one search each.
+        grid: the grid of cells.
+        looks: number of looks in a search.
+        astray: share of the fixations that are drawn at random.
+        generator: source of random numbers.
+
+    Returns:
+        The steps of all searches together.
+    """
     count = len(examples)
     start = torch.randint(len(grid), (count,), generator=generator)
     choice = Exploratory(lambda _, episodes: torch.rand(len(episodes), len(grid), generator=generator), astray)
@@ -112,15 +143,27 @@ def searches(
 
 
 def objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
-    r"""Cross-entropy of cells and of presence, and minus the log probability that a soft fixation lands on the target.
+    r"""Compute the training loss after a look.
 
     .. math:: \sum_x \mathrm{BCE}(P(t \in x)) / 25 + w_g \sum_{x \in \{a, b\}} \mathrm{BCE}(P(t \in x))
               + w_p \, \mathrm{BCE}(P(t)) - w_l \ln \frac{\sum_{x \in \text{goal}} o(x)}{\sum_x o(x)},
               \qquad o = p / (1 - p)
 
-    over cells that were not visited in the last term; cells count four times as much as one mean over them would. The
-    cell a is the next one to be fixated, and b the most probable one of those that were. They are chosen because they
-    seem probable, so that what is right of cells in general is too much for them: they are learned from on their own.
+    The terms are the cross-entropy of all cells (four times their mean for 100 cells), the cross-entropy of two
+    selected cells, the cross-entropy of presence in the photograph, and minus the log probability that a fixation drawn
+    in proportion to the odds o of the unvisited cells lands on the target.
+
+    The cell a is the next one to fixate, and b is the most probable fixated cell. Both are selected because of their
+    high probability, which biases them: a model that is calibrated over all cells overestimates these two. Therefore
+    they have a term of their own.
+
+    Args:
+        config: the weights of the terms.
+        step: the step after the look.
+        goal: `(E, X·Y)` boolean, cells with the target.
+
+    Returns:
+        The loss, a scalar.
     """
     belief = step.belief
     assert isinstance(belief, TargetBelief)
@@ -131,7 +174,7 @@ def objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
     for chosen in (step.next_cell, named):
         there = goal.gather(-1, chosen[:, None]).to(cells)
         loss = loss + config.gaze * F.binary_cross_entropy_with_logits(cells.gather(-1, chosen[:, None]), there)
-    # Where the target was fixated, the search would be over.
+    # A real search ends when it fixates the target, so there is no next fixation to learn.
     some = goal.any(-1) & ~(goal & step.visited).any(-1)
     if some.any():
         odds = belief.following.logit(eps=1e-7)[some].masked_fill(step.visited[some], -torch.inf)
@@ -144,7 +187,17 @@ def objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
 def judge(
     config: FitSearchConfig, model: TargetEvidence, examples: Examples, grid: Grid
 ) -> tuple[list[dict[str, float]], Thresholds]:
-    """How well the model does on held-out searches after some looks, and the thresholds that they ask for."""
+    """Evaluate the model on held-out searches and choose its thresholds.
+
+    Args:
+        config: the settings.
+        model: the target evidence.
+        examples: the held-out examples.
+        grid: the grid of cells.
+
+    Returns:
+        The measures after each number of looks in `JUDGED`, and the thresholds.
+    """
     generator = torch.Generator().manual_seed(config.seed)
     looks = max(*JUDGED, config.looks)
     goal, visited, present, anywhere, following = examples.goal, [], [], [], []
@@ -175,42 +228,45 @@ def judge(
 
 
 class Bounds(Protocol):
-    """What thresholds are chosen by: see `FitSearchConfig`."""
+    """Limits on wrong decisions, by which thresholds are chosen (see `FitSearchConfig`)."""
 
     @property
     def false_alarms(self) -> float:
-        """Share of absent targets that may be called found."""
+        """Maximum share of absent targets that may be reported as found."""
         ...
 
     @property
     def surest(self) -> float:
-        """Probability from which on a target counts as found at the latest."""
+        """Upper limit of the probability from which on a target counts as found."""
         ...
 
     @property
     def lost(self) -> float:
-        """Share of the targets that may be missed because no look is worth its price any more."""
+        """Maximum share of the targets that may be missed because the search gives up."""
         ...
 
 
 def choose_thresholds(config: Bounds, anywhere: Tensor, place: Tensor, left: Tensor, there: Tensor) -> Thresholds:
-    """Thresholds of a few false alarms and lost targets.
+    """Choose thresholds with few false alarms and few missed targets.
 
-    With every threshold of the place goes the least confirmation that has so few false alarms. Of these pairs that with
-    the surest place is taken that loses so few of the targets that are found wherever they are; then the largest price
-    of a look that loses so few.
+    For each candidate of the `place` threshold, the lowest `confirm` threshold is computed that respects the limit on
+    false alarms. Of these pairs, the one with the highest `place` is taken that misses few enough of the targets found
+    without a `place` threshold. Then the highest `give_up` is taken that misses few enough of the targets still found.
 
     Args:
-        config: how many mistakes are allowed.
+        config: the limits on wrong decisions.
         anywhere: `(n, E)`, probability of presence after each look of each search.
-        place: `(n, E)`, greatest probability of a fixated cell; 0 where another cell is more probable by much.
-        left: `(n, E)`, greatest chance of a cell that was not fixated.
-        there: `(E,)` boolean, whether the target is there.
+        place: `(n, E)`, highest probability of a fixated cell; 0 if another cell is much more probable.
+        left: `(n, E)`, highest probability of a cell that was not fixated.
+        there: `(E,)` boolean, whether the target is present.
+
+    Returns:
+        The thresholds.
     """
     number = torch.arange(len(anywhere))[:, None]
 
     def found(chosen: Thresholds) -> Tensor:
-        """Which searches end with the target found."""
+        """Return which searches report the target as found, `(E,)` boolean."""
         sure = (anywhere >= chosen.confirm) & (place > 0) & (place >= chosen.place)
         first = torch.where(sure, number, len(sure)).amin(0)
         return sure.any(0) & ~((left < chosen.give_up) & (number < first)).any(0)
@@ -219,7 +275,7 @@ def choose_thresholds(config: Bounds, anywhere: Tensor, place: Tensor, left: Ten
         return int(found(chosen)[there].sum())
 
     def confirming(least: float) -> Thresholds:
-        """With a threshold of the place."""
+        """Return the thresholds with the lowest `confirm` for a `place` threshold."""
         confirm = 1.0
         for candidate in torch.arange(0.99, 0.49, -0.01).tolist():
             if float(found(Thresholds(candidate, 0.0, least))[~there].double().mean()) > config.false_alarms:
@@ -238,7 +294,7 @@ def choose_thresholds(config: Bounds, anywhere: Tensor, place: Tensor, left: Ten
 
 
 def report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int, held_out: int) -> str:
-    """How the model does, as Markdown."""
+    """Report the evaluation and the thresholds as Markdown."""
     head = [
         "looks",
         "gaze on target, %",
@@ -261,15 +317,17 @@ def report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int,
     ]
     return "\n".join(
         [
-            f"Trained on {trained} pairs of photograph and class, half of them without the class, judged on {held_out} "
-            "of photographs that were held out, in searches that go by the model: how often the gaze has been on the "
-            "target, negative log likelihood and expected calibration error of the probability of the target in every "
-            "cell, that of fixated cells alone, and how well the probability that the class is there tells.",
+            f"Trained on {trained} pairs of photograph and class, and evaluated on {held_out} pairs from held-out "
+            "photographs. In about half of the pairs the class is absent. The searches follow the model. The table "
+            "shows how often the gaze has reached the target; negative log likelihood (NLL) and expected calibration "
+            "error (ECE) of the probability of the target in each cell; the ECE for fixated cells alone; and how well "
+            "the probability of presence separates present from absent classes.",
             "",
             *table([head, *rows]),
             "",
-            f"Thresholds: found from {thresholds.confirm:.3f}, in a cell from {thresholds.place:.2f}; a cell is worth "
-            f"a look from {thresholds.give_up:.2f}.",
+            f"Thresholds: the target counts as found when it is present with a probability of {thresholds.confirm:.3f} "
+            f"and in one cell with {thresholds.place:.2f}. The search gives up when no other cell has a probability of "
+            f"{thresholds.give_up:.2f} or more.",
             "",
         ]
     )

@@ -1,4 +1,4 @@
-"""Photographs to learn evidence from: what looks from every cell show of a class, and where the class really is."""
+"""Training examples for target evidence: the looks from every cell of a photograph, and the true cells of a class."""
 
 from __future__ import annotations
 
@@ -26,21 +26,24 @@ from semfov.gaze.policies import Task
 
 
 class LookingRun(Run):
-    """Looks at every scene from every cell, and keeps what was seen; there are no episodes."""
+    """A run that looks at every scene from every cell and stores the detections. It has no episodes."""
 
     task: ClassVar[Task] = "search"
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """No records."""
+        """Look at a scene and return no records."""
         self.detections(index)
         return [], {}
 
 
 def looking_run(config: Any) -> LookingRun:
-    """A run that is to look at all photographs of a fit from every cell.
+    """Prepare a run that will look at all photographs of a fit from every cell.
 
     Args:
         config: settings of the fit: data, detector, sensor, columns, rows, out, cache and workers.
+
+    Returns:
+        The run, which has not looked yet.
     """
     return LookingRun(
         SearchConfig(
@@ -57,7 +60,7 @@ def looking_run(config: Any) -> LookingRun:
 
 
 def looking(config: Any) -> LookingRun:
-    """A run that has looked (`looking_run`)."""
+    """Make a run (`looking_run`) and let it look at all photographs."""
     run = looking_run(config)
     finish(run, "looking")
     return run
@@ -65,13 +68,13 @@ def looking(config: Any) -> LookingRun:
 
 @dataclass(frozen=True)
 class Examples:
-    """One example for each photograph and class to search for, the class in the photograph or not.
+    """One example for each pair of photograph and class to search for. The class may be absent.
 
     Attributes:
-        features: `(E, X·Y, X·Y, F)`, of `look_features`, for looks from every cell; half precision.
-        score: `(E, X·Y)`, highest score of the class in looks from every cell.
-        distance: `(E, X·Y, X·Y)`, from every cell to every cell, in longer sides.
-        goal: `(E, X·Y)` boolean, cells that an object of the class overlaps; none where it is absent.
+        features: `(E, X·Y, X·Y, F)`, `look_features` of the looks from every cell, in half precision.
+        score: `(E, X·Y)`, highest score of the class in the look from each cell.
+        distance: `(E, X·Y, X·Y)`, distance from every cell to every cell, in units of the image's longer side.
+        goal: `(E, X·Y)` boolean, cells that an object of the class overlaps; all False if the class is absent.
         target: `(E,)`, the class.
         scene: `(E,)`, index of the photograph.
     """
@@ -87,16 +90,16 @@ class Examples:
         return len(self.scene)
 
     def __getitem__(self, index: Tensor) -> Examples:
-        """Some of the examples."""
+        """Select examples by index or mask."""
         return Examples(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 class ExampleLooks(Looks):
-    """Looks at many photographs at once, an episode at each.
+    """Looks at many photographs at once, with one episode for each photograph.
 
     Args:
-        examples: the photographs, one for each episode.
-        grid: cells, as many as theirs.
+        examples: the examples, one for each episode.
+        grid: the grid of cells, of the examples' size.
     """
 
     def __init__(self, examples: Examples, grid: Grid) -> None:
@@ -104,7 +107,7 @@ class ExampleLooks(Looks):
         self.like = examples.score
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
-        """What looks from the cells show, weighed by the model that is being trained."""
+        """Look up the looks from some cells, processed by the model in training."""
         known, model = self.examples, own(observer, Target, "observer").model
         evidence = model.evidence(known.features[episodes, cell].float())
         look = TargetLook(
@@ -119,7 +122,7 @@ class ExampleLooks(Looks):
 
 
 def no_detections() -> Detections:
-    """What examples have of detections: none, only what was made of them."""
+    """Raise an error: examples store features of detections, but not the detections."""
     raise NotImplementedError("examples keep no detections")
 
 
@@ -132,15 +135,21 @@ def make_examples(
     absent: int | None = None,
     scenes: Sequence[int] | None = None,
 ) -> Examples:
-    """Examples from photographs of a run: up to `classes` classes that are there, and as many that are not.
+    """Make examples from photographs for present and for absent classes.
 
     Args:
-        run: that has looked.
-        classes: of each kind, at most.
+        run: the finished looks from every cell.
+        classes: maximum number of present classes in a photograph.
         max_area: classes that cover a larger share of the image are left out.
-        seed: of the choice of classes.
-        absent: most classes that are not there; None: as many as there are of the others.
-        scenes: indices of the photographs; None takes all.
+        seed: seed of the random choice of classes.
+        absent: maximum number of absent classes in a photograph (None: as many as present ones).
+        scenes: indices of the photographs (None: all).
+
+    Returns:
+        The examples.
+
+    Raises:
+        DataError: no photograph has a class that may be searched for.
     """
     parts = []
     for index in track(range(len(run.scenes)) if scenes is None else scenes, "describing looks", "scene"):

@@ -1,4 +1,4 @@
-"""Training the heads of a detector on foveal views."""
+"""Train the heads of a detector on foveal views."""
 
 from __future__ import annotations
 
@@ -30,12 +30,15 @@ KIND = "foveal-training"
 
 
 class Trainer:
-    """Trains the tail of a detector, epoch by epoch, and keeps where it is after each.
+    """Train the tail of a detector, epoch by epoch, with a checkpoint after each epoch.
 
     Args:
-        config: settings.
-        viewer: that has looked.
-        views: of all photographs, in order.
+        config: the settings.
+        viewer: the viewer, whose detector is trained.
+        views: the views of all photographs, in order.
+
+    Raises:
+        DataError: there are too few photographs to train on and to hold out.
     """
 
     def __init__(self, config: FinetuneConfig, viewer: Viewer, views: Sequence[Views]) -> None:
@@ -52,13 +55,23 @@ class Trainer:
             for number in range(len(views[index]))
         ]
         if not self.trained:
-            raise DataError(f"data: too few photographs to train and to judge by ({len(views)}); give more")
+            raise DataError(
+                f"data: expected at least 2 photographs, one to train on and one to hold out, got {len(views)}"
+            )
         self.history: list[Epoch] = []
         self.kept = self.base
         self.moments: dict[str, Tensor] = {}
 
     def batches(self, chosen: Sequence[tuple[int, int]], generator: torch.Generator | None) -> Iterator[Views]:
-        """Views in batches of canvases of one size, in random order where there is a generator."""
+        """Group views into batches of canvases of the same size.
+
+        Args:
+            chosen: index of the photograph and number of the view, for each view.
+            generator: source of the random order (None: keep the order).
+
+        Yields:
+            One batch of views.
+        """
         order = range(len(chosen)) if generator is None else torch.randperm(len(chosen), generator=generator).tolist()
         sizes: dict[tuple[int, int], list[tuple[int, int]]] = {}
         for place in order:
@@ -70,12 +83,12 @@ class Trainer:
             yield Views.join([(self.views[index], number) for index, number in parts[turn]])
 
     def losses(self, batch: Views) -> Losses:
-        """Of the detector as it is now."""
+        """Compute the loss of a batch with the current weights."""
         maps = self.tail(batch.features)
         return yolo_loss(maps, self.heads, batch.canvas, batch.boxes, batch.labels, ignore=self.config.ignore)
 
     def judge(self) -> tuple[float, float, float]:
-        """Mean losses of a held-out view: objectness, classes and boxes."""
+        """Compute the mean loss of a held-out view, as objectness, classes and boxes."""
         total = torch.zeros(3, dtype=torch.float64)
         with torch.inference_mode():
             for batch in self.batches(self.held_out, None):
@@ -85,7 +98,12 @@ class Trainer:
         return objectness, classes, boxes
 
     def train(self, rate: float, trial: bool) -> None:
-        """One epoch; its weights are kept if no epoch before it was as good."""
+        """Train for one epoch, and keep its weights if its loss is lower than that of all epochs before.
+
+        Args:
+            rate: learning rate.
+            trial: start from the original weights, to try this learning rate; otherwise from the best weights so far.
+        """
         started = processor_seconds()
         self._set(self.base if trial else self.kept)
         optimiser = torch.optim.Adam(self.parameters.values(), lr=rate)
@@ -113,7 +131,12 @@ class Trainer:
             self.moments = _moments(optimiser, list(self.parameters))
 
     def run(self, path: Path, key: str) -> None:
-        """Train to the end, from wherever `path` says that it was; the detector then has the weights that were kept."""
+        """Train to the end. Afterwards the detector has the best weights.
+
+        Args:
+            path: checkpoint file. Training continues from it if it exists.
+            key: identifies the training (`training_key`).
+        """
         self.load(path, key)
         if not self.history:
             started = processor_seconds()
@@ -126,12 +149,12 @@ class Trainer:
         self._set(self.kept)
 
     def save(self, path: Path, key: str) -> None:
-        """Keep where training is."""
+        """Write a checkpoint."""
         record = {"kind": KIND, "key": key, "history": [asdict(epoch) for epoch in self.history]}
         write(path, {**self.kept, **self.moments}, record)
 
     def load(self, path: Path, key: str) -> None:
-        """Go on from where a file says that training was; from the beginning where there is none of this training."""
+        """Continue from a checkpoint. Start from the beginning if there is none, or if it has another key."""
         try:
             tensors, record = read(path, KIND)
             history = [Epoch(**epoch) for epoch in record["history"]]
@@ -148,7 +171,7 @@ class Trainer:
                 parameter.copy_(weights[name])
 
     def _restore(self, optimiser: torch.optim.Adam) -> None:
-        """Adam's means of the gradients and of their squares as they were with the weights that were kept."""
+        """Restore Adam's averages of the gradients and their squares as they were at the best weights."""
         for name, parameter in self.parameters.items():
             for what in _MOMENTS:
                 if f"{what} {name}" in self.moments:
@@ -168,7 +191,7 @@ def _moments(optimiser: torch.optim.Adam, names: Sequence[str]) -> dict[str, Ten
 
 
 def finetune(config: FinetuneConfig) -> None:
-    """Look, train, and write the new detector and its report."""
+    """Compute the views, train, and write the new detector and its report."""
     viewer = Viewer(config)
     views, seconds = look(viewer)
     trainer = Trainer(config, viewer, views)
@@ -178,6 +201,6 @@ def finetune(config: FinetuneConfig) -> None:
 
 
 def training_key(config: FinetuneConfig, viewer: Viewer) -> str:
-    """sha256 of all that the training depends on."""
-    told = training_of(config, viewer.scenes, "name")
-    return digest_of([viewer.store.key, told, versions(), modules_digest(__name__)])
+    """Return the sha256 of everything that the training depends on."""
+    settings = training_of(config, viewer.scenes, "name")
+    return digest_of([viewer.store.key, settings, versions(), modules_digest(__name__)])

@@ -1,4 +1,4 @@
-"""Calibrating beside training: what a detector sees and finds, raw and with an observation model fitted to it."""
+"""Compare calibration with fine-tuning: evaluate a detector with raw scores and with a fitted observation model."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ SCORES = ("raw", "calibrated")
 
 @dataclass(frozen=True)
 class Arm:
-    """A detector with one kind of scores: what it said of photographs that nothing was fitted on, and what it found.
+    """Results of a detector with one kind of scores, on photographs that nothing was fitted on.
 
     Attributes:
-        probabilities: `(M, K+1)`, of the classes of its detections.
-        labels: `(M,)`, their true classes, 0 where they show no object.
-        level: `(M,)`, level of their distance to the fixation.
-        recall: share of the objects found with `rate` false boxes a look: by photograph and level, `(P, N)`, and over
-            all levels, `(P,)`, NaN where there is no object.
-        objects: `(N,)`, objects of all looks by level.
-        curves: cumulative performance of its searches by photograph, `(S, shifts+1)`.
-        chance: what random gaze finds by the formula, `(shifts+1,)`.
-        minutes: of processors that the fit of its observation model took; 0 for raw scores.
+        probabilities: `(M, K+1)`, class probabilities of the detections.
+        labels: `(M,)`, true classes of the detections, 0 for detections that show no object.
+        level: `(M,)`, level of the distance between each detection and the fixation.
+        recall: share of the objects found with `rate` false boxes per look: by photograph and level, `(P, N)`, and
+            over all levels, `(P,)`; NaN where there is no object.
+        objects: `(N,)`, number of objects by level, summed over all looks.
+        curves: cumulative performance of the searches by photograph, `(S, shifts+1)`.
+        chance: expected cumulative performance of random gaze, `(shifts+1,)`.
+        minutes: processor minutes that the fit of the observation model took, 0 for raw scores.
     """
 
     probabilities: Tensor
@@ -62,10 +62,14 @@ class Arm:
 
 
 def fitted(config: FitConfig) -> tuple[FovealObservationModel, Path, float]:
-    """An observation model of all photographs of the settings, its file, and the minutes of processors that it took.
+    """Fit an observation model to all photographs of the settings, or read it if an earlier call has fitted it.
 
-    It is fitted once, and read back by later calls with the same settings. (The minutes are those of the call that
-    fitted it: of a run that was stopped while it looked, the last part.)
+    Args:
+        config: settings of the fit.
+
+    Returns:
+        The model, its file, and the processor minutes that the fit took. If the call that fitted it continued an
+        interrupted one, the minutes before the interruption are not included.
     """
     path, record = config.out / "observation.safetensors", config.out / "fit.json"
     settings = plain(asdict(config)) | {
@@ -74,9 +78,9 @@ def fitted(config: FitConfig) -> tuple[FovealObservationModel, Path, float]:
         "versions": plain(versions()),
     }
     try:
-        told = json.loads(record.read_text(encoding="utf-8"))
-        if told["settings"] == settings:
-            return FovealObservationModel.from_pretrained(path), path, float(told["minutes"])
+        known = json.loads(record.read_text(encoding="utf-8"))
+        if known["settings"] == settings:
+            return FovealObservationModel.from_pretrained(path), path, float(known["minutes"])
     except (OSError, ValueError, KeyError, TypeError):
         pass
     started = processor_seconds()
@@ -91,15 +95,18 @@ def fitted(config: FitConfig) -> tuple[FovealObservationModel, Path, float]:
 def arms_of(
     fit: FitConfig, search: SearchConfig, policy: str, fixations: int, rate: float, most: int | None = None
 ) -> dict[str, Arm]:
-    """The arms of a detector, `raw` and `calibrated`.
+    """Evaluate a detector with raw and with calibrated scores.
 
     Args:
-        fit: settings of the fit of its observation model.
+        fit: settings for fitting its observation model.
         search: settings of the searches, without policies and model.
-        policy: that searches.
-        fixations: random fixations in each photograph, by which recall and calibration are measured.
-        rate: false boxes in a look at which objects are counted as found.
-        most: photographs that are searched, the first ones; None: all.
+        policy: the search policy.
+        fixations: random fixations in each photograph for measuring recall and calibration.
+        rate: number of false boxes per look at which recall is measured.
+        most: search only the first so many photographs (None: all).
+
+    Returns:
+        The results under `raw` and `calibrated`.
     """
     model, path, minutes = fitted(fit)
     settings = SampleSettings(search.data, search.detector, search.sensor, fixations, fit.iou, search.protocol.seed)
@@ -120,7 +127,16 @@ def arms_of(
 
 
 def searched(config: SearchConfig, model: Path, policy: str) -> tuple[dict[str, Array], Array]:
-    """Cumulative performance of a policy with raw and calibrated scores, by photograph, and that of random gaze."""
+    """Search with a policy on raw and on calibrated scores.
+
+    Args:
+        config: settings of the searches.
+        model: file of the observation model.
+        policy: the search policy.
+
+    Returns:
+        Cumulative performance by photograph for both kinds of scores, and the expected one of random gaze.
+    """
     policies = tuple(f"{policy}-{scores}" for scores in SCORES)
     belief = BeliefConfig(config.belief.columns, config.belief.rows, model=str(model))
     run = SearchRun(SearchConfig(**{**vars(config), "policies": policies, "belief": belief}))
@@ -135,7 +151,15 @@ def searched(config: SearchConfig, model: Path, policy: str) -> tuple[dict[str, 
 
 
 def curves_of(scenes: Mapping[str, list[int]], shifts: int) -> Array:
-    """Cumulative performance of each photograph, in the order of their ids as text, from the shifts that found."""
+    """Compute the cumulative performance of each photograph.
+
+    Args:
+        scenes: for each photograph's id, the gaze shift at which each search found its target.
+        shifts: number of gaze shifts.
+
+    Returns:
+        Curves `(P, shifts+1)`, sorted by the ids as text.
+    """
     return np.stack([cumulative_performance(np.array(scenes[scene]), shifts) for scene in sorted(scenes)])
 
 
@@ -143,19 +167,22 @@ def curves_of(scenes: Mapping[str, list[int]], shifts: int) -> Array:
 def recall_of(
     scenes: Scenes, samples: Samples, probabilities: Tensor, edges: Tensor, iou: float, rate: float
 ) -> tuple[tuple[Array, Array], Tensor]:
-    """Share of the objects that are found and named right, at a score that leaves `rate` false boxes a look.
+    """Compute the recall of objects at the score threshold that leaves `rate` false boxes per look.
+
+    An object counts as found if a detection overlaps it and has the right class.
 
     Args:
-        scenes: that were looked at.
-        samples: what was seen.
-        probabilities: `(M, K+1)`, of the classes of the samples.
-        edges: `(N-1,)`, between levels of distance from the fixation to an object's centre, in longer sides.
-        iou: least overlap.
-        rate: false boxes in a look.
+        scenes: the photographs.
+        samples: the labelled detections of the looks at them.
+        probabilities: `(M, K+1)`, class probabilities of the detections.
+        edges: `(N-1,)`, borders between levels of the distance from the fixation to an object's centre, in units of the
+            image's longer side.
+        iou: least overlap of a detection with the object, as intersection over union.
+        rate: false boxes per look.
 
     Returns:
-        By photograph and level, `(P, N)`, and by photograph, `(P,)`, NaN where no object is; and how many objects all
-        looks had in view by level, `(N,)`.
+        The recall by photograph and level, `(P, N)`, and by photograph, `(P,)`, NaN where there is no object; and the
+        number of objects by level, summed over all looks, `(N,)`.
     """
     looks, levels = len(samples.scenes), len(edges) + 1
     ends = torch.searchsorted(samples.look, torch.arange(looks + 1)).tolist()

@@ -1,4 +1,4 @@
-"""Which epoch of training comes next, from what came of those before."""
+"""Decide on the next epoch of training from the results of the epochs before."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from dataclasses import dataclass
 from semfov.training.foveal_settings import FinetuneConfig
 
 LESS = 3.0
-"""What the learning rate is divided by after an epoch that was no better."""
+"""Divisor of the learning rate after an epoch without improvement."""
 
 
 @dataclass(frozen=True)
 class Epoch:
-    """What came of an epoch.
+    """The results of an epoch.
 
     Attributes:
-        rate: learning rate; 0 for the detector as it was.
-        trial: whether it began with the detector as it was, to try a rate.
-        training: mean loss of a view while training.
-        objectness: mean of this part of the loss over held-out views, after the epoch.
-        classes: the same of this part.
-        boxes: and of this one.
-        seconds: of a processor that it took.
+        rate: learning rate; 0 for the original detector.
+        trial: whether the epoch started from the original detector, to try a learning rate.
+        training: mean loss of a training view during the epoch.
+        objectness: objectness loss after the epoch, as a mean over held-out views.
+        classes: classification loss after the epoch, as a mean over held-out views.
+        boxes: box loss after the epoch, as a mean over held-out views.
+        seconds: processor seconds that the epoch took.
     """
 
     rate: float
@@ -35,24 +35,27 @@ class Epoch:
 
     @property
     def loss(self) -> float:
-        """Mean loss of a held-out view, by which epochs are chosen."""
+        """Mean loss of a held-out view, the criterion for choosing epochs."""
         return self.objectness + self.classes + self.boxes
 
 
 def best_of(history: Sequence[Epoch]) -> int:
-    """The epoch whose weights are kept: the first of the least loss."""
+    """Return the number of the epoch with the lowest loss on held-out views, the first one if there are several."""
     return min(range(len(history)), key=lambda number: history[number].loss)
 
 
 def next_epoch(history: Sequence[Epoch], config: FinetuneConfig) -> tuple[float, bool] | None:
-    """Learning rate of the next epoch and whether it is a trial; None at the end.
+    """Choose the learning rate of the next epoch.
 
-    Every rate is tried for an epoch from the detector as it was; then training goes on from the best epoch yet, with a
-    third of the rate after each epoch that was no better.
+    First, each learning rate is tried for one epoch from the original detector. Then training continues from the best
+    epoch so far. After each epoch without improvement, the learning rate is divided by 3.
 
     Args:
-        history: what came of the epochs; the first is the detector as it was.
-        config: settings.
+        history: results of the epochs so far. The first entry is the original detector.
+        config: the settings.
+
+    Returns:
+        The learning rate and whether the epoch is a trial, or None if training is over.
     """
     tried = sum(epoch.trial for epoch in history)
     if tried < len(config.rates):

@@ -1,4 +1,4 @@
-"""Settings of training a detector's heads on foveal views."""
+"""Settings for training a detector's heads on foveal views."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,27 +10,29 @@ from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Sett
 
 @dataclass(frozen=True)
 class FinetuneConfig(Settings):
-    """Train the heads of a Darknet detector on photographs with boxes, seen through the fovea.
+    """Train the heads of a Darknet detector on foveated photographs with boxes.
 
     Args:
-        data: photographs to train on (all of them: no selection by number of objects).
-        detector: which detector, one of Darknet's; what it keeps of its boxes plays no part.
+        data: photographs to train on (by default all of them, however many objects they have).
+        detector: the Darknet detector to train. Its thresholds for keeping boxes do not affect the training.
         sensor: the foveal sensor.
-        name: name of the new detector (None: the detector's, and `-foveal`).
-        depth: how many convolutions before each head are trained, the last ones; 1 is the map alone.
-        fixations: views of each photograph, fixated at random.
+        name: name of the new detector (None: the detector's name with `-foveal`).
+        depth: number of convolutions to train before each head, counted from the last; 1 trains only the last one.
+        fixations: number of views of each photograph, each with a random fixation.
         foveated: share of the views that are foveated; the others are sharp.
-        rates: learning rates to try, an epoch each; the one with the least loss on held-out photographs goes on.
-        epochs: most epochs, those of the trials among them.
-        patience: training ends after so many epochs that were no better on held-out photographs; each of them is
-            undone, and the learning rate divided by 3.
-        batch: views in a step.
-        ignore: a box that overlaps an object by more is no background (`semfov.training.yolo_loss`).
-        holdout: every n-th photograph is kept out of the training, and chooses rate and epoch.
-        seed: of the fixations, and of the order of the views.
+        rates: learning rates to try for one epoch each. Training continues with the one that has the lowest loss on
+            held-out photographs.
+        epochs: maximum number of epochs, trials included.
+        patience: training ends after this many epochs in a row without a lower loss on held-out photographs. Such
+            epochs are undone, and the learning rate is divided by 3.
+        batch: number of views in a step.
+        ignore: a predicted box is not trained as background if its overlap (IoU) with an object is higher
+            (`semfov.training.yolo_loss`).
+        holdout: one in every n photographs is held out, to choose the learning rate and the epoch.
+        seed: seed of the fixations and of the order of the views.
         out: folder for the detector and the report.
-        cache: folder for what the rest of the network gives, which is removed in the end (None: `out`).
-        workers: processes that look (None: one for each CPU core); training has one.
+        cache: folder for the features of the untrained layers, which are removed at the end (None: `out`).
+        workers: number of processes that compute the views (None: one for each CPU core). Training uses one.
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))

@@ -1,4 +1,4 @@
-"""Foveal views to train on: what the part of a network that stays gives for them, looked at once and kept."""
+"""Foveal views to train on: the features of the network's untrained layers are computed once and stored."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from semfov.training.foveal_settings import FinetuneConfig
 from semfov.training.tail import Tail
 
 SOURCES = ("semfov.sensor.augmentation", "semfov.training.tail", __name__)
-"""Modules that views depend on beside those of a look."""
+"""Modules that the views depend on, in addition to those that a look depends on."""
 
 
 @dataclass(frozen=True)
 class Views:
-    """Views of one photograph, or of several with canvases of one size.
+    """V views of one photograph, or of several photographs with canvases of the same size.
 
     Attributes:
-        features: by number of the layer that gives them, each `(V, C, h, w)`.
+        features: `(V, C, h, w)` for each layer whose output the tail reads, by the layer's number.
         canvas: `(width, height)` in pixels.
-        boxes: of the objects in each view, `(M, 4)`, in canvas pixels.
-        labels: of the same, `(M,)`, classes 1..K.
+        boxes: boxes `(M, 4)` of the objects in each view, in canvas pixels.
+        labels: classes `(M,)` of the objects in each view, 1..K.
     """
 
     features: dict[int, Tensor]
@@ -47,7 +47,14 @@ class Views:
 
     @classmethod
     def join(cls, parts: Sequence[tuple[Views, int]]) -> Views:
-        """Some views of several photographs, in single precision."""
+        """Join single views of several photographs into one batch in single precision.
+
+        Args:
+            parts: views of a photograph, and the number of the view to take.
+
+        Returns:
+            The batch.
+        """
         first = parts[0][0]
         features = {
             layer: torch.stack([views.features[layer][number] for views, number in parts]).float()
@@ -58,14 +65,17 @@ class Views:
 
 
 class Viewer:
-    """Looks at photographs through `RandomFoveation`, and keeps what the tail of the network reads of each view.
+    """Look at photographs through `RandomFoveation`, and store the features that the tail of the network reads.
+
+    Args:
+        config: the settings.
 
     Attributes:
-        detector: computed in torch.
-        eye: it, and the sensor.
-        tail: what is trained of it.
+        detector: the detector, which runs in torch.
+        eye: the sensor and the detector.
+        tail: the layers to train.
         scenes: the photographs.
-        store: of what was seen.
+        store: store of the views.
     """
 
     def __init__(self, config: FinetuneConfig) -> None:
@@ -94,7 +104,7 @@ class Viewer:
         self.store = SceneStore(folder, what, looks_digest(*SOURCES), Schema(fields | more))
 
     def see(self, index: int) -> None:
-        """Look at a photograph and keep the views."""
+        """Compute the views of a photograph and store them."""
         started = processor_seconds()
         with one_thread(), torch.inference_mode():
             tensors = self._see(index)
@@ -120,7 +130,16 @@ class Viewer:
         }
 
     def foveated(self, canvas: Tensor, opened: Opened, scene: int | str) -> Tensor:
-        """Random views of a canvas `(1, 3, h, w)`, `(F, 3, h, w)`: the same for the same scene, whatever was before."""
+        """Foveate a canvas at random points, which depend only on the seed in the settings and on the scene's id.
+
+        Args:
+            canvas: `(1, 3, h, w)`.
+            opened: the sensor's state for the canvas, which has the width of the fovea.
+            scene: id of the scene.
+
+        Returns:
+            Views `(F, 3, h, w)`.
+        """
         from semfov.sensor import RandomFoveation
 
         sensor, config = self.config.sensor.make(), self.config
@@ -134,7 +153,14 @@ class Viewer:
         return views
 
     def load(self, index: int) -> tuple[Views, float] | None:
-        """Views of a photograph, in half precision, and a processor's seconds for them; None where they are missing."""
+        """Read the views of a photograph.
+
+        Args:
+            index: index of the photograph.
+
+        Returns:
+            The views in half precision and the processor seconds that they took, or None if they are not stored.
+        """
         tensors = self.store.read(self.scenes.digest(index))
         if tensors is None:
             return None
@@ -159,7 +185,17 @@ def _see(index: int) -> int:
 
 
 def look(viewer: Viewer) -> tuple[list[Views], float]:
-    """Views of all photographs in order, looked at where they are missing, and the processors' seconds for all."""
+    """Read the views of all photographs, and compute the missing ones.
+
+    Args:
+        viewer: the viewer.
+
+    Returns:
+        The views in the order of the photographs, and the processor seconds that they took.
+
+    Raises:
+        DataError: views that were stored cannot be read.
+    """
     found = [viewer.load(index) for index in range(len(viewer.scenes))]
     todo = [index for index, views in enumerate(found) if views is None]
     done = run_tasks(
@@ -175,5 +211,5 @@ def look(viewer: Viewer) -> tuple[list[Views], float]:
         found[index] = viewer.load(index)
     whole = [views for views in found if views is not None]
     if len(whole) < len(found):
-        raise DataError(f"{viewer.store.folder}: views are missing or damaged; give the same command again")
+        raise DataError(f"{viewer.store.folder}: stored views are missing or damaged; run the same command again")
     return [views for views, _ in whole], sum(seconds for _, seconds in whole)

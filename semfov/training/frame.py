@@ -1,4 +1,4 @@
-"""What fits on the looks of whole photographs have in common: settings, what is held out, and what is written."""
+"""The common frame of fits on looks from every cell: their settings, the held-out photographs and their outputs."""
 
 import json
 from collections.abc import Callable
@@ -25,21 +25,21 @@ class FitOnLooksConfig(Settings):
 
     Args:
         data: photographs to learn from.
-        detector: which detector looks through the fovea.
+        detector: the detector that processes the foveated views.
         sensor: the foveal sensor.
-        name: name of the model (None: the detector's).
-        columns: cells in a row.
-        rows: cells in a column.
-        holdout: every n-th photograph is kept out and used to judge.
-        looks: of an episode.
-        astray: share of the fixations that are drawn at random, so that all cells are learned from.
-        steps: steps of training.
-        batch: examples in a step.
+        name: name of the model (None: the detector's name).
+        columns: columns of the grid.
+        rows: rows of the grid.
+        holdout: one in every n photographs is held out for the evaluation.
+        looks: number of looks in a training episode.
+        astray: share of the fixations in training that are drawn at random, so that the model learns from all cells.
+        steps: number of training steps.
+        batch: number of examples in a step.
         rate: highest learning rate.
-        seed: of the choice of classes, first parameters and training.
+        seed: seed of the choice of classes, the initial parameters and the training.
         out: folder for the model and the report.
-        cache: folder for what was seen from every cell, shared with the evaluations (None: the user's cache).
-        workers: processes that look (None: one for each CPU core).
+        cache: folder for the detections from every cell, shared with the evaluations (None: the user's cache).
+        workers: number of processes that look (None: one for each CPU core).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=2, max_target_area=None))
@@ -62,14 +62,14 @@ class FitOnLooksConfig(Settings):
 
 @dataclass(frozen=True)
 class Fit(Generic[Model]):
-    """What a fit gives.
+    """The result of a fit.
 
     Attributes:
-        model: fitted to the photographs that were not held out.
-        judged: figures on those that were, after some looks.
-        trained: examples that it was trained on.
-        held_out: examples that it was judged on.
-        report: the figures as Markdown.
+        model: the model, fitted to the photographs that are not held out.
+        judged: measures on the held-out photographs after some looks.
+        trained: number of training examples.
+        held_out: number of held-out examples.
+        report: the measures as Markdown.
     """
 
     model: Model
@@ -80,27 +80,33 @@ class Fit(Generic[Model]):
 
 
 def split(scene: Tensor, holdout: int) -> Tensor:
-    """Which examples are held out, `(E,)` boolean: those of every so many-th photograph.
+    """Select the examples to hold out.
 
     Args:
         scene: `(E,)`, index of the photograph of each example.
-        holdout: every n-th photograph is held out, the first among them.
+        holdout: one in every n photographs is held out, beginning with the first.
+
+    Returns:
+        Whether each example is held out, `(E,)` boolean.
 
     Raises:
-        DataError: all are held out, or none is.
+        DataError: all examples are held out, or none is.
     """
     held_out = scene % holdout == 0
     if held_out.all() or not held_out.any():
-        raise DataError(f"data: too few photographs to train and to judge by ({len(scene)} examples); give more")
+        raise DataError(
+            "data: expected examples both to train on and to hold out, got all of one kind "
+            f"({len(scene)} examples); give more photographs"
+        )
     return held_out
 
 
 def fit_and_write(config: FitOnLooksConfig, fit: Callable[[Any, LookingRun], Fit[Any]]) -> None:
-    """Look from every cell, fit, and write model, report, settings and figures.
+    """Look from every cell, fit, and write the model, the report, the settings and the measures.
 
     Args:
         config: settings of the fit.
-        fit: makes the model from the settings and a run that has looked.
+        fit: makes the model from the settings and the finished looks.
     """
     run = looking(config)
     if rank() > 0:

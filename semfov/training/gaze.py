@@ -1,4 +1,4 @@
-"""Training a gaze policy end to end, through whole searches."""
+"""Train a gaze policy end to end, through whole searches."""
 
 import hashlib
 import json
@@ -40,27 +40,29 @@ class FitGazeConfig(Settings):
 
     Args:
         data: photographs to learn from.
-        detector: which detector looks through the fovea; gradients pass through it, so not an ONNX model.
+        detector: the detector that processes the foveated views. It must not be an ONNX model, as gradients have to
+            pass through it.
         sensor: the foveal sensor.
-        name: name of the model (None: the detector's).
-        columns: cells in a row.
-        rows: cells in a column.
+        name: name of the model (None: the detector's name).
+        columns: columns of the grid.
+        rows: rows of the grid.
         width: channels of the network.
-        learn_sigma: learn the width of the fovea too.
-        shifts: gaze shifts of a search.
-        window: gaze shifts that a gradient flows through (truncated backpropagation through time).
-        temperature: of the Gumbel-softmax.
-        discount: weight of a gaze shift in the loss against the one before it.
-        posterior: weight in the loss of the target's posterior on the target.
-        others: weight in the loss of the photograph's other classes, for which the same looks teach where to look.
-        steps: steps of training.
-        photographs: in a step.
-        searches: in each of them, with targets and starts at random.
+        learn_sigma: learn the width of the fovea as well.
+        shifts: number of gaze shifts in a search.
+        window: number of gaze shifts that a gradient flows through (truncated backpropagation through time).
+        temperature: temperature of the Gumbel-softmax.
+        discount: factor by which the loss of each gaze shift counts less than that of the one before.
+        posterior: weight of the loss term for the posterior probability of the target's cells.
+        others: weight of the loss term for the other classes in the photograph. The same looks also show where these
+            classes are.
+        steps: number of training steps.
+        photographs: number of photographs in a step.
+        searches: number of searches in each of these photographs, with random targets and starting points.
         rate: highest learning rate.
-        holdout: every n-th photograph is kept out and used to judge.
-        judged: so many of them, at most.
-        seed: of first parameters, of photographs and searches, and of choices.
-        save_every: steps between checkpoints.
+        holdout: one in every n photographs is held out for the evaluation.
+        judged: maximum number of held-out photographs to evaluate on.
+        seed: seed of the initial parameters, the selection of photographs and searches, and the choices of the policy.
+        save_every: number of steps between checkpoints.
         out: folder for the model, the checkpoint and the report.
     """
 
@@ -90,12 +92,12 @@ class FitGazeConfig(Settings):
 
     @property
     def relaxation(self) -> Relaxation:
-        """How searches are made differentiable."""
+        """Settings of the differentiable searches."""
         return Relaxation(self.shifts, self.window, self.temperature, self.discount, self.posterior, self.others)
 
 
 def fit_gaze(config: FitGazeConfig) -> None:
-    """Train, judge on held-out photographs beside the start, and write everything."""
+    """Train, compare the policy with its starting point on held-out photographs, and write all results."""
     for name in ("shifts", "window", "steps", "photographs", "searches", "judged", "save_every"):
         check(getattr(config, name) >= 1, name, "1 or more", getattr(config, name))
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
@@ -106,7 +108,9 @@ def fit_gaze(config: FitGazeConfig) -> None:
     held_out = list(range(0, len(scenes), config.holdout))[: config.judged]
     trained_on = [index for index in range(len(scenes)) if index % config.holdout]
     if not trained_on:
-        raise DataError(f"data: too few photographs to train and to judge by ({len(scenes)})")
+        raise DataError(
+            f"data: expected at least 2 photographs, one to train on and one to hold out, got {len(scenes)}"
+        )
     metadata = {**eye.settings(), **training_of(config, scenes, "save_every", "judged")}
     fovea = fovea_of(eye)
     start, width = first_model(config, metadata), float(fovea.sigma)
@@ -124,7 +128,7 @@ def fit_gaze(config: FitGazeConfig) -> None:
 
 
 def first_model(config: FitGazeConfig, metadata: dict[str, object]) -> LearnedGaze:
-    """The policy before training: non-predictive search."""
+    """Make the policy before training, which is equivalent to non-predictive search."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         return LearnedGaze(config.width, metadata=metadata)
@@ -133,9 +137,20 @@ def first_model(config: FitGazeConfig, metadata: dict[str, object]) -> LearnedGa
 def train(
     config: FitGazeConfig, eye: Eye, scenes: Scenes, trained_on: Sequence[int], metadata: dict[str, object]
 ) -> tuple[LearnedGaze, list[float]]:
-    """The trained policy, and the loss of every step; goes on from the checkpoint in `out` where there is one.
+    """Train the policy, continuing from the checkpoint in `out` if there is one.
 
-    Random numbers are seeded step by step, so that a run that was stopped ends as if it had not been.
+    Random numbers are seeded anew in each step, so that an interrupted run gives the same result as an uninterrupted
+    one.
+
+    Args:
+        config: the settings.
+        eye: the sensor and the detector.
+        scenes: the photographs.
+        trained_on: indices of the training photographs.
+        metadata: metadata of the model.
+
+    Returns:
+        The trained policy, and the loss of every step.
     """
     gaze = first_model(config, metadata)
     parameters = dict(gaze.named_parameters())
@@ -153,7 +168,7 @@ def train(
         optimiser.zero_grad()
         losses.append(take_step(config, gaze, eye, scenes, trained_on, generator))
         norm = torch.nn.utils.clip_grad_norm_(parameters.values(), 1.0)
-        # A saturated score has no gradient: such a step is left out.
+        # A saturated score can give a gradient that is not finite. Such a step is skipped.
         if norm.isfinite():
             optimiser.step()
         if (step + 1) % config.save_every == 0 or step + 1 == config.steps:
@@ -171,7 +186,19 @@ def take_step(
     trained_on: Sequence[int],
     generator: torch.Generator,
 ) -> float:
-    """Search a few photographs and leave the gradient of their mean loss; returns the loss."""
+    """Search a few photographs and add the gradient of their mean loss to the parameters.
+
+    Args:
+        config: the settings.
+        gaze: the policy.
+        eye: the sensor and the detector.
+        scenes: the photographs.
+        trained_on: indices of the training photographs.
+        generator: source of random numbers.
+
+    Returns:
+        The mean loss.
+    """
     loss = 0.0
     for place in torch.randint(len(trained_on), (config.photographs,), generator=generator).tolist():
         size = config.columns, config.rows
@@ -183,7 +210,7 @@ def take_step(
 
 
 def learning_rate(config: FitGazeConfig, step: int) -> float:
-    """Up for a twentieth of the steps, then down along a cosine."""
+    """Compute the learning rate of a step: a linear increase over a twentieth of the steps, then a cosine decay."""
     warm = max(1, config.steps // 20)
     if step < warm:
         return config.rate * (step + 1) / warm
@@ -191,12 +218,12 @@ def learning_rate(config: FitGazeConfig, step: int) -> float:
 
 
 class Checkpoint:
-    """State of a training in one file of tensors and JSON, written whole or not at all.
+    """The state of a training in one file, which is written atomically.
 
     Args:
         path: the file.
-        settings: what the training depends on; a checkpoint of other settings is refused.
-        code: sha256 of the code that it depends on; what other code left is told of, and not gone on from.
+        settings: the settings that the training depends on. A checkpoint with other settings is an error.
+        code: sha256 of the code that the training depends on. A checkpoint of other code is ignored with a warning.
     """
 
     def __init__(self, path: Path, settings: dict[str, object], code: str) -> None:
@@ -204,22 +231,38 @@ class Checkpoint:
         self.key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
     def save(self, parameters: Mapping[str, Tensor], optimiser: torch.optim.Optimizer, losses: list[float]) -> None:
-        """Keep parameters, the optimiser's averages, and the losses so far."""
+        """Write the parameters, the optimiser's averages, and the losses so far."""
         tensors = {f"parameter.{name}": parameter for name, parameter in parameters.items()}
         for name, parameter in parameters.items():
             tensors |= {f"{key}.{name}": torch.as_tensor(v) for key, v in optimiser.state[parameter].items()}
         storage.write(self.path, tensors, {"kind": _CHECKPOINT, "key": self.key, "code": self.code, "losses": losses})
 
     def load(self, parameters: Mapping[str, Tensor], optimiser: torch.optim.Optimizer) -> list[float]:
-        """Put back what `save` kept, in place; returns the losses so far, none where there is no file."""
+        """Restore the parameters and the optimiser's averages in place.
+
+        Args:
+            parameters: the parameters to restore.
+            optimiser: the optimiser to restore.
+
+        Returns:
+            The losses so far; an empty list if there is no usable checkpoint.
+
+        Raises:
+            DataError: the file is damaged, or its settings are different.
+        """
         if not self.path.exists():
             return []
         tensors, record = storage.read(self.path, _CHECKPOINT)
         if record.get("key") != self.key:
-            raise DataError(f"{self.path}: a checkpoint of other settings; remove it, or give another --out")
+            raise DataError(
+                f"{self.path}: the checkpoint was written with other settings; remove it, or choose another folder "
+                "with --out"
+            )
         if record.get("code") != self.code:
             _log.warning(
-                "%s: made by other code (this package or a library has changed since); training starts anew", self.path
+                "%s: the checkpoint was written by another version of this package or of a library; training starts "
+                "from the beginning",
+                self.path,
             )
             return []
         _checkpoint_schema(parameters).check(tensors, record)
@@ -232,7 +275,7 @@ class Checkpoint:
 
 
 def _checkpoint_schema(parameters: Mapping[str, Tensor]) -> Schema:
-    """What a checkpoint holds: parameters, and of those that a step has moved the optimiser's averages."""
+    """Describe the content of a checkpoint: all parameters, and the optimiser's averages of those already updated."""
     tensors = {}
     for name, parameter in parameters.items():
         tensors[f"parameter.{name}"] = Field(tuple(parameter.shape))
@@ -245,7 +288,22 @@ def _checkpoint_schema(parameters: Mapping[str, Tensor]) -> Schema:
 def judge(
     config: FitGazeConfig, gaze: LearnedGaze, eye: Eye, scenes: Scenes, indices: Sequence[int], title: str
 ) -> Tensor:
-    """Gaze shift at which each of the same held-out searches found its target, `(photographs, searches)`."""
+    """Search held-out photographs with a policy. The searches are the same for each policy.
+
+    Args:
+        config: the settings.
+        gaze: the policy.
+        eye: the sensor and the detector.
+        scenes: the photographs.
+        indices: indices of the held-out photographs.
+        title: label of the progress bar.
+
+    Returns:
+        The gaze shift at which each search found its target, `(photographs, searches)`.
+
+    Raises:
+        DataError: none of the photographs has a class to search for.
+    """
     found = []
     for index in tqdm(indices, desc=title, unit="scene", dynamic_ncols=True):
         generator = generator_for("judge", config.seed, scenes.ids[index])
@@ -254,7 +312,7 @@ def judge(
             noise = torch.rand(config.shifts, *searches.goal.shape, generator=generator)
             found.append(found_at(gaze, eye, searches, noise))
     if not found:
-        raise DataError("data: nothing can be searched for in the held-out photographs; give more photographs")
+        raise DataError("data: none of the held-out photographs contains a class to search for; give more of them")
     return torch.stack(found)
 
 
@@ -266,7 +324,19 @@ def report(
     held_out: int,
     sigma: tuple[float, float],
 ) -> str:
-    """How training went, as Markdown."""
+    """Report the training and the evaluation as Markdown.
+
+    Args:
+        config: the settings.
+        judged: results of `judge` for the policy before training (`start`) and after it (`learned`).
+        losses: the loss of every training step.
+        trained: number of training photographs.
+        held_out: number of held-out photographs.
+        sigma: width of the fovea before and after training, in pixels.
+
+    Returns:
+        The text.
+    """
     shifts = [n for n in (1, 2, 3, 5, 9, 15, 30) if n <= config.shifts]
     hits = {name: torch.stack([(f <= n).double().mean(1) for n in shifts], 1) for name, f in judged.items()}
     rows = [[name, *(f"{100 * h:.1f}" for h in hit.mean(0))] for name, hit in hits.items()]
@@ -277,14 +347,14 @@ def report(
     return "\n".join(
         [
             f"Trained on {trained} photographs ({config.steps} steps of {config.photographs} × {config.searches} "
-            f"searches), judged on {config.searches} searches in each of {held_out} that were held out: targets found "
-            "within so many gaze shifts (%), and the gain over the policy that training started from, with its "
-            "standard error over photographs.",
+            f"searches) and evaluated on {config.searches} searches in each of {held_out} held-out photographs. The "
+            "table shows the targets found within so many gaze shifts (%), and the gain over the policy before "
+            "training with its standard error over photographs.",
             "",
             *table([["policy", *(f"{n}" for n in shifts)], *rows]),
             "",
-            f"Mean loss of the first quarter of the steps {sum(losses[:quarter]) / quarter:.3f}, of the last "
-            f"{sum(losses[-quarter:]) / quarter:.3f}. σ of the fovea {sigma[0]:.1f} → {sigma[1]:.1f}.",
+            f"Mean loss over the first quarter of the steps: {sum(losses[:quarter]) / quarter:.3f}; over the last "
+            f"quarter: {sum(losses[-quarter:]) / quarter:.3f}. σ of the fovea: {sigma[0]:.1f} → {sigma[1]:.1f}.",
             "",
         ]
     )

@@ -1,4 +1,4 @@
-"""Whole searches as differentiable functions of the policy: look, believe, choose softly, look again."""
+"""Whole searches as differentiable functions of the policy: look, update the belief, choose softly, look again."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from semfov.gaze.policies import Learned
 
 @dataclass(frozen=True)
 class Searches:
-    """Searches in one photograph.
+    """F searches in one photograph.
 
     Attributes:
-        view: the photograph, as the eye holds it.
-        grid: the cells over it.
+        view: the photograph, opened by the eye.
+        grid: the grid of cells.
         targets: `(F,)`, classes to search for.
-        goal: `(F, X·Y)` boolean, cells that an object of the class overlaps.
-        start: `(F,)`, first cells, none of them in the goal.
+        goal: `(F, X·Y)` boolean, cells that an object of the target class overlaps.
+        start: `(F,)`, first cells. None of them is a goal cell.
         classes: `(K,)`, all classes that may be searched for in the photograph.
-        goals: `(K, X·Y)` boolean, cells that their objects overlap.
+        goals: `(K, X·Y)` boolean, cells that the objects of these classes overlap.
     """
 
     view: View
@@ -43,17 +43,17 @@ class Searches:
 
 @dataclass(frozen=True)
 class Relaxation:
-    """How searches are made differentiable, and what their loss weighs.
+    """Settings of differentiable searches and of their loss.
 
     Attributes:
-        shifts: gaze shifts of a search, at most.
-        window: shifts that a gradient flows through; at the border of two windows the belief is a constant
-            (truncated backpropagation through time).
-        temperature: of the Gumbel-softmax.
-        discount: γ, weight of a shift against the one before.
-        posterior: weight of the belief's term.
-        others: weight of the classes that are not searched for.
-        hard: straight-through fixations, or soft points between the cells.
+        shifts: maximum number of gaze shifts in a search.
+        window: number of gaze shifts that a gradient flows through. Between two windows the belief is treated as a
+            constant (truncated backpropagation through time).
+        temperature: temperature of the Gumbel-softmax.
+        discount: γ, the factor by which each gaze shift counts less than the one before.
+        posterior: w, weight of the loss term for the belief.
+        others: weight of the loss term for classes that are not searched for.
+        hard: use straight-through fixations (True), or soft points between the cells (False).
     """
 
     shifts: int = 9
@@ -68,7 +68,19 @@ class Relaxation:
 def draw_searches(
     eye: Eye, scenes: Scenes, index: int, grid: tuple[int, int], count: int, generator: torch.Generator
 ) -> Searches | None:
-    """So many searches in a photograph, targets and starts at random; None where nothing can be searched for."""
+    """Draw searches in a photograph with random targets and starting points.
+
+    Args:
+        eye: the sensor and the detector.
+        scenes: the photographs.
+        index: index of the photograph.
+        grid: columns and rows of the grid.
+        count: number of searches.
+        generator: source of random numbers.
+
+    Returns:
+        The searches, or None if the photograph contains no class to search for.
+    """
     annotation = scenes.annotation(index)
     cells = Grid(*grid, annotation.size)
     covered = cells.footprint(annotation.boxes)
@@ -86,15 +98,18 @@ def draw_searches(
 def backpropagate(
     gaze: LearnedGaze, eye: Eye, searches: Searches, noise: Tensor, how: Relaxation, share: float = 1.0
 ) -> float:
-    """Add the gradient of `share` times the mean loss of the searches to the parameters; returns that loss.
+    """Add the gradient of `share` times the mean loss of the searches to the parameters.
 
     Args:
         gaze: the policy.
-        eye: sensor and detector.
-        searches: in one photograph.
-        noise: `(shifts, F, X·Y)`, uniform in [0, 1).
-        how: settings.
+        eye: the sensor and the detector.
+        searches: the searches in one photograph.
+        noise: `(shifts, F, X·Y)`, random numbers, uniform in [0, 1).
+        how: settings of the searches.
         share: weight of these searches in a batch.
+
+    Returns:
+        The loss, multiplied by `share`.
     """
     total = 0.0
 
@@ -117,17 +132,26 @@ def unroll(
     how: Relaxation,
     finish: Callable[[Tensor], None],
 ) -> None:
-    r"""Search, and hand the loss of every window of shifts to `finish`, after which nothing refers to it any more.
+    r"""Run the searches and pass the loss of every window of gaze shifts to `finish`.
 
     .. math:: L = \sum_t \gamma^{t-1} \left( -\ln \sum_{x \in \text{goal}} \mathrm{softmax}(\ell_t)(x)
               - w \ln \frac{\sum_{x \in \text{goal}} p_t(x)}{\sum_x p_t(x)} \right),
 
-    the first term for the chance that the next fixation lands on the target, the second for what the looks so far have
-    made of the belief: its gradient comes by way of the views alone. A search ends on its target. The loss is the
-    mean over searches.
+    with the policy's logits ℓ and the belief's probabilities p of the target. The first term is the probability that
+    the next fixation lands on the target. The second term rewards fixations that concentrate the belief on the target;
+    its gradient flows through the foveated views alone. A search ends on its target. The loss is the mean over
+    searches.
 
-    The belief is about all classes, so the same looks teach where to look for the others, too: the mean of their first
-    terms is added, without a gradient through the fovea, which is not moved for them.
+    The belief covers all classes, so the same looks also show where to look for other classes. The mean of their first
+    terms is added, without a gradient through the fovea, because the gaze does not move for them.
+
+    Args:
+        gaze: the policy.
+        eye: the sensor and the detector.
+        searches: the searches in one photograph.
+        noise: `(shifts, F, X·Y)`, random numbers, uniform in [0, 1).
+        how: settings of the searches.
+        finish: receives the loss of each window. Afterwards its graph is released.
     """
     count = len(searches.targets)
     loss = searches.view.canvas.new_zeros(())
@@ -156,7 +180,7 @@ def unroll(
 def _episodes(
     gaze: LearnedGaze, eye: Eye, searches: Searches, choice: Choice, most: int, window: int | None = None
 ) -> Iterator[Step]:
-    """Steps of the searches, each of which ends when its next fixation is on its target."""
+    """Run the searches; each of them ends when its next fixation is on its target."""
     policy = Learned(gaze)
     return rollout(
         LiveLooks(eye, searches.view, searches.grid),
@@ -177,7 +201,18 @@ def _lands(searches: Searches, step: Step) -> Tensor:
 def others_loss(
     gaze: LearnedGaze, searches: Searches, belief: DirichletBelief, visited: Tensor, target: Tensor
 ) -> Tensor:
-    """Sum over searches of the mean first term of the loss for classes other than `target`, not yet found."""
+    """Compute the loss for classes that are not searched for and were not found yet.
+
+    Args:
+        gaze: the policy.
+        searches: the searches.
+        belief: the beliefs of B running searches.
+        visited: `(B, X·Y)` boolean, cells that were fixated.
+        target: `(B,)`, the classes that are searched for.
+
+    Returns:
+        The mean of the first loss term over these classes, summed over the searches.
+    """
     found = (searches.goals & visited[:, None]).any(-1)
     row, other = (~found & (searches.classes != target[:, None])).nonzero(as_tuple=True)
     if not len(row):
@@ -189,7 +224,15 @@ def others_loss(
 
 
 def log_share(log_weights: Tensor, goal: Tensor) -> Tensor:
-    """Logarithm of the goal's share in weights `(B, X·Y)`, `(B,)`; an empty goal (all of it visited) gives 0."""
+    """Compute the logarithm of the goal's share of the total weight.
+
+    Args:
+        log_weights: `(B, X·Y)`, logarithms of the weights of the cells.
+        goal: `(B, X·Y)` boolean, the goal cells.
+
+    Returns:
+        `(B,)`; 0 if no goal cell has a finite logarithm, because all of them were visited.
+    """
     inside = log_weights.masked_fill(~goal, -torch.inf)
     open_goal = inside.isfinite().any(-1)
     inside = torch.where(open_goal[:, None], inside, 0.0)
@@ -198,8 +241,17 @@ def log_share(log_weights: Tensor, goal: Tensor) -> Tensor:
 
 @torch.no_grad()
 def found_at(gaze: LearnedGaze, eye: Eye, searches: Searches, noise: Tensor) -> Tensor:
-    """Gaze shift at which each search finds its target as an agent makes it, `(F,)`; one more than `noise` allows for
-    where it does not."""
+    """Run the searches as an agent does, without relaxation.
+
+    Args:
+        gaze: the policy.
+        eye: the sensor and the detector.
+        searches: F searches.
+        noise: `(shifts, F, X·Y)`, random numbers, uniform in [0, 1), for breaking ties.
+
+    Returns:
+        The gaze shift at which each search finds its target, `(F,)`; `shifts + 1` if it does not find it.
+    """
     found = torch.full((len(searches.targets),), len(noise) + 1)
     choice = Greedy(lambda shift, episodes: noise[shift, episodes])
     for step in _episodes(gaze, eye, searches, choice, len(noise)):

@@ -1,4 +1,4 @@
-"""The terms of gaze habits, fitted one after another on half of the people and pictures, and judged on the others."""
+"""Fit the terms of gaze habits on half of the people and pictures, and evaluate them on the other half."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from semfov.metrics.averages import standard_error
 from semfov.training.viewings import Choices
 
 EDGES = (0.05, 0.11, 0.16, 0.22, 0.3, 0.4, 0.55)
-"""Borders of the bins of saccade length, in longer sides of the image; the first bin holds the cell itself."""
+"""Borders of the bins of saccade length, in units of the image's longer side. The first bin is the cell itself."""
 AGES = (1.0, 2.0, 3.0, 6.0)
-"""Last ages of the bins of inhibition of return but the last, in fixations."""
+"""Upper limits of the age bins of inhibition of return, in fixations. The last bin has no limit."""
 
 Term = Literal["policy", "centre", "steps", "return"]
 ORDER: tuple[Term, ...] = ("policy", "centre", "steps", "return")
@@ -28,14 +28,15 @@ ORDER: tuple[Term, ...] = ("policy", "centre", "steps", "return")
 
 @dataclass(frozen=True)
 class Halves:
-    """Choices to fit on, and those of other people in other pictures.
+    """The choices to fit on, and the choices of other people in other pictures.
 
     Attributes:
-        fitted: to fit on.
-        held_out: to judge by.
-        place: `(X·Y)`, log of how often people of the fitted half fixated each cell.
-        grid: the cells; distances are in longer sides, so one size of picture stands for all of its shape.
-        sizes: choices, people and pictures of both, for metadata.
+        fitted: choices to fit on.
+        held_out: choices to evaluate on.
+        place: `(X·Y)`, logarithm of the frequency with which people of the fitted half fixated each cell.
+        grid: the grid of cells. Distances are in units of the longer side, so one grid serves all pictures of the same
+            shape.
+        sizes: numbers of choices, people and pictures in both halves, for metadata.
     """
 
     fitted: Choices
@@ -45,12 +46,15 @@ class Halves:
 
     @classmethod
     def of(cls, choices: Choices, grid: Grid, smoothing: float) -> Halves:
-        """People of odd numbers on every other picture, and people of even numbers on the pictures between.
+        """Split choices into people with odd numbers in every other picture, and the other people in the other ones.
 
         Args:
-            choices: all of them.
-            grid: the cells.
-            smoothing: fixations that every cell is given before they are counted.
+            choices: all choices.
+            grid: the grid of cells.
+            smoothing: number of fixations added to every cell when the centre bias is counted.
+
+        Returns:
+            The two halves.
 
         Raises:
             DataError: there are too few people or pictures for two halves.
@@ -59,13 +63,16 @@ class Halves:
         between = choices.picture % 2 == 1
         fitted, held_out = choices[~other & ~between], choices[other & between]
         if not len(fitted) or not len(held_out):
-            raise DataError("fixations: too few to fit and to judge by; expected two people and two pictures at least")
+            raise DataError(
+                "fixations: expected at least two people and two pictures, as one half is fitted and the other half "
+                f"held out; got {len(fitted)} fixations to fit and {len(held_out)} to hold out"
+            )
         counts = torch.bincount(fitted.taken, minlength=len(grid)).double() + smoothing
         return cls(fitted, held_out, (counts / counts.sum()).log(), grid)
 
     @property
     def sizes(self) -> dict[str, int]:
-        """How much there is to fit on and to judge by."""
+        """Numbers of choices, people and pictures in both halves."""
         return {
             f"{half}_{what}": size
             for half, some in (("fitted", self.fitted), ("held_out", self.held_out))
@@ -79,16 +86,17 @@ class Halves:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Some terms, fitted together.
+    """Some terms of the model, fitted together.
 
     Attributes:
-        policy: whose values are in; None for none.
-        terms: that are in.
-        weights: `(F,)`.
-        fitted: bits that a fixation of the fitted half gains over one that is even over the cells.
-        even: the same of the held-out half.
-        gain: bits over the centre bias alone, of the held-out half, mean over pictures.
-        error: its standard error over pictures.
+        policy: policy whose values are a term, or None.
+        terms: the terms of the model.
+        weights: `(F,)`, weights of the features.
+        fitted: information gain over a uniform choice among the cells, in bits per fixation, on the fitted half.
+        even: the same on the held-out half.
+        gain: information gain over the centre bias alone, in bits per fixation, as a mean over the pictures of the
+            held-out half.
+        error: standard error of `gain` over pictures.
     """
 
     policy: str | None
@@ -100,17 +108,20 @@ class Fitted:
     error: float
 
     def figures(self) -> dict[str, Any]:
-        """As JSON values."""
+        """Return the attributes as JSON values."""
         return {**vars(self), "terms": list(self.terms), "weights": self.weights.tolist()}
 
 
 def fit_terms(halves: Halves, policy: str | None, ridge: float) -> list[Fitted]:
-    """The terms added one after another, fitted anew each time.
+    """Add the terms one after another, and fit all of them again each time.
 
     Args:
-        halves: choices to fit on and to judge by.
-        policy: whose values the first term is; None leaves it out.
-        ridge: see `fit_log_linear`.
+        halves: choices to fit on and to evaluate on.
+        policy: policy whose values are the first term (None: no such term).
+        ridge: penalty on the squares of the weights (`fit_log_linear`).
+
+    Returns:
+        The model after each added term.
     """
     order = ORDER if policy is not None else ORDER[1:]
     base = _bits(halves, None, ("centre",), _fit(halves, None, ("centre",), ridge))[1]
@@ -128,7 +139,17 @@ def fit_terms(halves: Halves, policy: str | None, ridge: float) -> list[Fitted]:
 
 
 def features_of(choices: Choices, halves: Halves, policy: str | None, terms: tuple[Term, ...]) -> Tensor:
-    """Features of every cell for every choice, `(n, X·Y, F)`: one for policy and centre each, one for each bin."""
+    """Compute the features of every cell for every choice.
+
+    Args:
+        choices: n choices.
+        halves: the halves, for the centre bias and the grid.
+        policy: policy whose values are a feature.
+        terms: the terms of the model.
+
+    Returns:
+        Features `(n, X·Y, F)`: one for the policy, one for the centre bias, and one for each bin of the other terms.
+    """
     shape = len(choices), len(halves.grid)
     parts = []
     for term in terms:
@@ -147,7 +168,7 @@ def features_of(choices: Choices, halves: Halves, policy: str | None, terms: tup
 
 
 def habits_of(model: Fitted, halves: Halves) -> GazeHabits:
-    """The model with all of its terms, as what draws fixations."""
+    """Convert a fitted model with all terms into a `GazeHabits`, which draws fixations."""
     assert model.terms == ORDER
     pull, centre, *rest = model.weights.tolist()
     step, back = torch.tensor(rest[: len(EDGES) + 1]), torch.tensor(rest[len(EDGES) + 1 :])
@@ -156,7 +177,7 @@ def habits_of(model: Fitted, halves: Halves) -> GazeHabits:
 
 
 def mean_by_picture(values: Tensor, picture: Tensor) -> Tensor:
-    """Mean of the values of each picture."""
+    """Compute the mean of the values of each picture."""
     _, number = picture.unique(return_inverse=True)
     count = torch.bincount(number)
     return torch.zeros(len(count), dtype=values.dtype).index_add(0, number, values) / count
@@ -167,9 +188,9 @@ def _fit(halves: Halves, policy: str | None, terms: tuple[Term, ...], ridge: flo
 
 
 def _bits(halves: Halves, policy: str | None, terms: tuple[Term, ...], weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Bits of every choice over an even one, of both halves."""
-    told = []
+    """Compute the information gain of every choice over a uniform one, in bits, for both halves."""
+    bits = []
     for choices in (halves.fitted, halves.held_out):
         log = log_probability(features_of(choices, halves, policy, terms), choices.taken, weights)
-        told.append((log + math.log(len(halves.grid))) / math.log(2))
-    return told[0], told[1]
+        bits.append((log + math.log(len(halves.grid))) / math.log(2))
+    return bits[0], bits[1]

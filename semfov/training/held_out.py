@@ -1,4 +1,4 @@
-"""How fitted ways to search and to explore do beside raw ones, on photographs that were held out."""
+"""Compare fitted strategies for search and exploration with raw scores on held-out photographs."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ from semfov.training.evidence_examples import LookingRun
 
 Array = NDArray[np.float64]
 Ways = Mapping[str, Strategy]
-"""Ways to go about a task, by what reports call them."""
+"""Strategies for a task, by their names in reports."""
 
 
 class Rule(Protocol):
-    """Which searches for a class end with a step."""
+    """A rule that decides after each step which searches end."""
 
     def __call__(self, step: Step, target: int, grid: Grid) -> Tensor:
-        """Numbers of their outcomes (`semfov.decision.OUTCOMES`), 0 for those that go on."""
+        """Return the number of each search's outcome (`semfov.decision.OUTCOMES`), 0 for searches that continue."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How much greater a fitted figure is than the raw one, paired over photographs.
+    """The difference between a measure with fitted models and with raw scores, paired over photographs.
 
     Attributes:
-        mean: over photographs.
-        error: its standard error; NaN for fewer than two photographs.
-        photographs: how many.
+        mean: mean difference over photographs, fitted minus raw.
+        error: standard error of the mean; NaN for fewer than two photographs.
+        photographs: number of photographs.
     """
 
     mean: float
@@ -58,27 +58,30 @@ class Difference:
 
     @classmethod
     def of(cls, fitted: Array, raw: Array) -> Difference:
-        """The difference of figures `(P,)`, one for each photograph."""
+        """Compute the paired difference of two measures `(P,)`, with one value for each photograph."""
         paired = np.asarray(fitted, dtype=np.float64) - np.asarray(raw, dtype=np.float64)
         return cls(float(paired.mean()), float(standard_error(paired)), len(paired))
 
     @property
     def better(self) -> bool:
-        """Whether it is greater than its standard error, so that chance alone is an unlikely reason."""
+        """Whether the mean is positive and greater than its standard error."""
         return math.isfinite(self.error) and self.mean > 0 and self.mean > self.error
 
 
 def search_curves(
     run: LookingRun, scenes: Sequence[int], ways: Ways, protocol: ProtocolConfig, max_area: float
 ) -> dict[str, Array]:
-    """Cumulative performance of each way to search, `(P, shifts+1)`, of every photograph with a target.
+    """Measure the cumulative performance of search strategies on every photograph with a target.
 
     Args:
-        run: that has looked.
+        run: the finished looks from every cell.
         scenes: indices of the photographs.
-        ways: to search.
-        protocol: starts, shifts and seed.
+        ways: the strategies.
+        protocol: starting points, gaze shifts and seed.
         max_area: classes that cover a larger share of the image are not searched for.
+
+    Returns:
+        For each strategy the curve of each photograph, `(P, shifts+1)`.
     """
     columns, rows = run.config.belief.columns, run.config.belief.rows
     curves: dict[str, list[Array]] = {name: [] for name in ways}
@@ -108,10 +111,19 @@ def search_curves(
 def explore_curves(
     run: LookingRun, scenes: Sequence[int], ways: Ways, protocol: ProtocolConfig
 ) -> dict[str, dict[str, Array]]:
-    """Shares of cells that are named right by each way to explore, `(P, shifts+1)`: `objects`, and `all` cells.
+    """Measure the share of cells that exploration strategies classify correctly.
 
-    `objects` is the published success rate, over cells with objects; the answer for all cells may be background, which
-    is right where no object is. Arguments as for `search_curves`.
+    The answer for a cell may be background, which is correct if the cell contains no object.
+
+    Args:
+        run: the finished looks from every cell.
+        scenes: indices of the photographs.
+        ways: the strategies.
+        protocol: starting points, gaze shifts and seed.
+
+    Returns:
+        Curves `(P, shifts+1)` of each strategy: under `objects` over the cells with objects (the published success
+        rate), and under `all` over all cells.
     """
     curves: dict[str, dict[str, list[Array]]] = {what: {name: [] for name in ways} for what in ("objects", "all")}
     for index in track(scenes, "exploring", "scene"):
@@ -147,7 +159,15 @@ def explore_curves(
 
 @dataclass(frozen=True)
 class Decided:
-    """What searches for classes that are there, and for classes that are not, decided: shares, and mean looks."""
+    """The decisions of searches for present and for absent classes.
+
+    Attributes:
+        found: share of the present classes that were reported as found.
+        false_alarms: share of the absent classes that were reported as found.
+        undecided: share of all searches without a decision.
+        looks: mean number of looks.
+        searches: number of searches.
+    """
 
     found: float
     false_alarms: float
@@ -164,17 +184,20 @@ def decisions(
     classes: int,
     max_area: float,
 ) -> dict[str, Decided]:
-    """What each way to search, with its rule of deciding, decides.
+    """Evaluate the decisions of search strategies.
 
     Args:
-        run: that has looked.
+        run: the finished looks from every cell.
         scenes: indices of the photographs.
-        ways: to search, with their rules.
-        protocol: shifts and seed.
-        classes: of each photograph that it holds, and that it does not hold, at most.
+        ways: the strategies, with their decision rules.
+        protocol: gaze shifts and seed.
+        classes: maximum number of present classes, and of absent classes, to search for in each photograph.
         max_area: classes that cover a larger share of the image are left out.
+
+    Returns:
+        The decisions of each strategy.
     """
-    told: dict[str, list[tuple[bool, str, int]]] = {name: [] for name in ways}
+    results: dict[str, list[tuple[bool, str, int]]] = {name: [] for name in ways}
     for index in track(scenes, "deciding", "scene"):
         annotation, grid = run.scenes.annotation(index), run.grid(index)
         chosen = choose_classes(run.scenes, index, annotation, classes, max_area, protocol.seed, classes)
@@ -189,21 +212,21 @@ def decisions(
             for name, (strategy, rule) in ways.items():
                 ends = partial(rule, target=target, grid=grid)
                 outcome, count = _search(looks, strategy, target, start, noise, ends)
-                told[name].append((there, outcome, count))
-    return {name: _decided(each) for name, each in told.items()}
+                results[name].append((there, outcome, count))
+    return {name: _decided(each) for name, each in results.items()}
 
 
 @torch.inference_mode()
 def _search(
     looks: StoredLooks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
 ) -> tuple[str, int]:
-    """What one search decides, and after how many looks."""
+    """Run one search and return its outcome and its number of looks."""
     steps = search_steps(looks, strategy, target, start, noise, rule)
     return OUTCOMES[int(rule(steps[-1]))], len(steps)
 
 
 def by_detection(step: Step, target: int, grid: Grid) -> Tensor:
-    """The rule of agents without models: found with a detection of a score of 0.5 in the fixated cell."""
+    """Apply the rule of agents without fitted models: a detection with a score of 0.5 in the fixated cell is a find."""
     return confirms(step.detections, grid, step.cell, target, 0.5).long()
 
 

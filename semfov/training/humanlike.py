@@ -1,4 +1,4 @@
-"""Fitting how people choose their next fixation, and asking other people whether it is so."""
+"""Fit a model of how people choose their next fixation, and evaluate it on other people and pictures."""
 
 from __future__ import annotations
 
@@ -41,23 +41,24 @@ from semfov.training.viewings import Choices, cells_of, choices_in, values_in
 
 @dataclass(frozen=True)
 class FitHumanlikeConfig(Settings):
-    """Fit how people choose their next fixation.
+    """Fit a model of how people choose their next fixation.
 
     Args:
         root: folder of the pictures.
-        fixations: JSON file of people's fixations in them, as OSIE's (`semfov.data.fixations.write_osie`).
-        detector: which detector looks through the fovea.
+        fixations: JSON file of people's fixations in the pictures, in OSIE's format
+            (`semfov.data.fixations.write_osie`).
+        detector: the detector that processes the foveated views.
         sensor: the foveal sensor.
-        belief: the grid of beliefs.
-        saliency: the saliency baselines.
-        policies: explorations to compare, as those of `eval.explore`.
-        save: which of them the model that is written is for (None: the one that predicts best on the fitted half).
+        belief: the grid of the beliefs.
+        saliency: settings of the saliency policies.
+        policies: exploration policies to compare, as in `eval.explore`.
+        save: policy whose model is written (None: the policy that predicts the fitted half best).
         limit: use only the first so many pictures (None: all).
         ridge: penalty on the squares of the weights.
-        smoothing: fixations that every cell is given before the centre bias is counted.
-        name: name of the model (None: the detector's).
+        smoothing: number of fixations added to every cell when the centre bias is counted.
+        name: name of the model (None: the detector's name).
         out: folder for the model and the report.
-        cache: folder for what the detector saw from every cell, shared with other runs (None: the user's cache).
+        cache: folder for the detections from every cell, shared with other runs (None: the user's cache).
     """
 
     root: Path
@@ -77,7 +78,7 @@ class FitHumanlikeConfig(Settings):
 
 
 def fit_humanlike(config: FitHumanlikeConfig) -> None:
-    """Gather people's choices, fit half of the people on half of the pictures, and judge by the others."""
+    """Gather people's choices, fit half of the people on half of the pictures, and evaluate on the others."""
     check(len(config.policies) > 0, "policies", "at least one policy", "none")
     prepare_worker()
     names = [label(choice, "exploration") for choice in config.policies]
@@ -100,10 +101,16 @@ def fit_humanlike(config: FitHumanlikeConfig) -> None:
 
 
 def gather(config: FitHumanlikeConfig) -> tuple[Choices, tuple[int, int], Eye]:
-    """All choices with the values that every policy gives; the size of the pictures; the eye.
+    """Gather people's choices with the value that every policy gives to each cell.
+
+    Args:
+        config: the settings.
+
+    Returns:
+        All choices, the size `(width, height)` of the pictures, and the eye.
 
     Raises:
-        DataError: pictures are missing, or of another size than the fixations.
+        DataError: pictures are missing, or their size differs from that in the file of fixations.
     """
     people = by_picture(read_osie(config.fixations))
     viewer = Viewer(config, list(people)[: config.limit])
@@ -115,11 +122,11 @@ def gather(config: FitHumanlikeConfig) -> tuple[Choices, tuple[int, int], Eye]:
 
 
 class Viewer:
-    """What policies make of pictures, whenever somebody chose where to look next.
+    """Compute the values that policies give to the cells of pictures whenever a person chose the next fixation.
 
     Args:
-        config: of the fit.
-        names: of the pictures.
+        config: settings of the fit.
+        names: file names of the pictures.
     """
 
     def __init__(self, config: FitHumanlikeConfig, names: list[str]) -> None:
@@ -138,10 +145,25 @@ class Viewer:
         self.store = DetectionStore(cache_folder(config.cache) / "looks", self.eye.settings(), *size, components)
 
     def choices(self, number: int, records: list[Fixations], size: tuple[int, int]) -> Choices:
-        """The choices of all people in a picture."""
+        """Gather the choices of all people in a picture.
+
+        Args:
+            number: number of the picture.
+            records: people's fixations in it.
+            size: `(width, height)` that all pictures should have.
+
+        Returns:
+            The choices with the values of all policies.
+
+        Raises:
+            DataError: the picture or its fixations have another size.
+        """
         image, digest = self.pictures[number].image, self.pictures.digest(number)
         if any((each.size, (image.shape[-1], image.shape[-2])) != (size, size) for each in records):
-            raise DataError(f"{self.config.fixations}: expected pictures of {size} pixels, {records[0].picture} is not")
+            raise DataError(
+                f"{self.config.fixations}: expected all pictures to have {size[0]} × {size[1]} pixels, got another "
+                f"size for {records[0].picture}"
+            )
         grid = Grid(self.config.belief.columns, self.config.belief.rows, size)
         seen = self.store.load(digest)
         if seen is None:
@@ -158,7 +180,7 @@ class Viewer:
         return replace(choices_in(cells, count, grid, number, subject), values=values)
 
     def candidate(self, name: str, image: Tensor, grid: Grid) -> Candidate:
-        """A policy in a picture."""
+        """Prepare a policy for a picture."""
         policy, saliency = self.policies[name], self.config.saliency
         if policy.saliency is None:
             return Candidate(self.strategies[name])

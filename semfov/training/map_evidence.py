@@ -1,4 +1,4 @@
-"""Training the map of all classes on the looks of whole explorations."""
+"""Train the map of all classes on the looks of whole explorations."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ from semfov.training.map_examples import MapExampleLooks, MapExamples, make_map_
 from semfov.training.outputs import training_of
 
 JUDGED = (1, 2, 3, 5, 10, 15)
-"""Looks after which a map is judged."""
+"""Numbers of looks after which a map is evaluated."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,10 @@ class FitMapConfig(FitOnLooksConfig):
     """Train the map of all classes.
 
     Args:
-        classes: classes of a photograph to learn from: those that it holds and those that score highest.
-        others: how many of them are drawn from all the rest.
-        gain_steps: steps in which it is learned what a look will bring.
+        classes: number of classes to learn from in each photograph. The present classes and those with the highest
+            scores come first.
+        others: how many of these classes are drawn at random from the remaining ones.
+        gain_steps: number of training steps for predicting the gain of a look.
     """
 
     classes: Annotated[int, Range(2, 10_000)] = 12
@@ -51,13 +52,21 @@ class FitMapConfig(FitOnLooksConfig):
 
 
 def fit_map(config: FitMapConfig) -> None:
-    """Look from every cell, train, judge on held-out photographs, and write everything."""
+    """Look from every cell, train, evaluate on held-out photographs, and write all results."""
     check(config.others < config.classes, "others", f"from 1 to {config.classes - 1}", config.others)
     fit_and_write(config, fit_map_evidence)
 
 
 def fit_map_evidence(config: FitMapConfig, run: LookingRun) -> Fit[MapEvidence]:
-    """The model, from a run that has looked."""
+    """Fit the model.
+
+    Args:
+        config: the settings.
+        run: the finished looks from every cell.
+
+    Returns:
+        The model with its evaluation.
+    """
     examples = make_map_examples(run, config.classes, config.others, config.seed)
     held_out = split(examples.scene, config.holdout)
     grid = Grid(config.columns, config.rows, (config.columns, config.rows))
@@ -75,11 +84,14 @@ def fit_map_evidence(config: FitMapConfig, run: LookingRun) -> Fit[MapEvidence]:
 
 
 def frequencies(run: LookingRun, holdout: int) -> Tensor:
-    """How often a cell holds each class in the photographs to learn from, `(K+1,)`: its log odds, scaled to unit size.
+    """Count how often a cell contains each class in the training photographs.
 
     Args:
-        run: of the photographs.
-        holdout: every n-th one is left out.
+        run: the run over the photographs.
+        holdout: one in every n photographs is left out, as it is held out.
+
+    Returns:
+        `ℓ / 4 + 1` with the log-odds ℓ of each class, `(K+1,)`; the values are of the order of 1.
     """
     components, cells = len(run.scenes.classes) + 1, 0
     count = torch.zeros(components)
@@ -92,7 +104,7 @@ def frequencies(run: LookingRun, holdout: int) -> Tensor:
 
 
 def train(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> None:
-    """Train on explorations that go by the model, with fixations astray among them."""
+    """Train on explorations that follow the model. Some of their fixations are random."""
     generator = torch.Generator().manual_seed(config.seed)
 
     def loss_of(_: int) -> Tensor:
@@ -110,7 +122,19 @@ def train(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid:
 def explorations(
     model: MapEvidence, examples: MapExamples, grid: Grid, looks: int, astray: float, generator: torch.Generator
 ) -> Iterator[Step]:
-    """An exploration of every example from a start at random."""
+    """Explore every example from a random start.
+
+    Args:
+        model: the map evidence.
+        examples: the examples, one exploration each.
+        grid: the grid of cells.
+        looks: number of looks in an exploration.
+        astray: share of the fixations that are drawn at random.
+        generator: source of random numbers.
+
+    Returns:
+        The steps of all explorations together.
+    """
     count = len(examples)
     start = torch.randint(len(grid), (count,), generator=generator)
     choice = Exploratory(lambda _, episodes: torch.rand(len(episodes), len(grid), generator=generator), astray)
@@ -119,7 +143,10 @@ def explorations(
 
 
 def objective(step: Step, examples: MapExamples) -> Tensor:
-    """Cross-entropy of every class, and of none, in every cell: summed over classes, those drawn for all they stand."""
+    """Compute the cross-entropy of every class and of background, as a mean over cells and a sum over classes.
+
+    A class that was drawn at random counts as often as the number of classes that it represents.
+    """
     belief = step.belief
     assert isinstance(belief, MapBelief)
     weight = torch.cat([torch.ones_like(examples.stands_for[:, :1]), examples.stands_for], 1)
@@ -129,7 +156,10 @@ def objective(step: Step, examples: MapExamples) -> Tensor:
 
 
 def train_gain(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> None:
-    """Train what a look is expected to bring, by least squares on what looks have brought in each cell."""
+    """Train the prediction of a look's gain by least squares.
+
+    The gain of a look in a cell is the change of the cell's answer from wrong to right (1) or from right to wrong (-1).
+    """
     generator = torch.Generator().manual_seed(config.seed + 1)
 
     def loss_of(_: int) -> Tensor:
@@ -149,12 +179,12 @@ def train_gain(config: FitMapConfig, model: MapEvidence, examples: MapExamples, 
             before = step
         return loss
 
-    title = "learning what looks bring"
+    title = "learning the gain of looks"
     descend(model.worth.parameters(), loss_of, config.gain_steps, config.rate, clip=None, title=title)
 
 
 def right(step: Step, answers: Tensor) -> Tensor:
-    """Cells whose most probable answer is right, `(B, X·Y)`, 1 or 0."""
+    """Return 1 for cells whose most probable answer is right and 0 for the others, `(B, X·Y)`."""
     belief = step.belief
     assert isinstance(belief, MapBelief)
     best = belief.probabilities.argmax(-1, keepdim=True)
@@ -163,7 +193,17 @@ def right(step: Step, answers: Tensor) -> Tensor:
 
 @torch.no_grad()
 def judge(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid: Grid) -> list[dict[str, float]]:
-    """How well the model does on held-out explorations after some looks."""
+    """Evaluate the model on held-out explorations.
+
+    Args:
+        config: the settings.
+        model: the map evidence.
+        examples: the held-out examples.
+        grid: the grid of cells.
+
+    Returns:
+        The measures after each number of looks in `JUDGED`.
+    """
     generator = torch.Generator().manual_seed(config.seed)
     judged = []
     answers = examples.answers
@@ -199,7 +239,7 @@ def judge(config: FitMapConfig, model: MapEvidence, examples: MapExamples, grid:
 
 
 def report(judged: list[dict[str, float]], trained: int, held_out: int) -> str:
-    """How the model does, as Markdown."""
+    """Report the evaluation as Markdown."""
     head = [
         "looks",
         "cells right, %",
@@ -208,8 +248,8 @@ def report(judged: list[dict[str, float]], trained: int, held_out: int) -> str:
         "NLL",
         "ECE",
         "ECE, background",
-        "expected of the last look, cells",
-        "brought by it",
+        "expected gain, cells",
+        "gain, cells",
     ]
     rows = [
         [
@@ -222,11 +262,12 @@ def report(judged: list[dict[str, float]], trained: int, held_out: int) -> str:
     ]
     return "\n".join(
         [
-            f"Trained on {trained} photographs, judged on {held_out} that were held out, in explorations by the closer "
-            "look: share of the cells whose most probable answer is right, background among the answers; of the cells "
-            "with objects, background an answer or not; negative log likelihood and expected calibration error of the "
-            "probabilities of the classes at hand and of background; and how many cells more the last look was "
-            "expected to name right, and did.",
+            f"Trained on {trained} photographs and evaluated on {held_out} held-out photographs, in explorations with "
+            "the policy of the closer look. The first three measures are the share of cells whose most probable answer "
+            "is right: over all cells; over cells with objects; and over cells with objects when background is not "
+            "allowed as an answer. Then follow the negative log likelihood (NLL) and the expected calibration error "
+            "(ECE) of the probabilities of the example's classes and of background. The last two columns show how many "
+            "more cells were expected to be right after the last look, and how many more were right.",
             "",
             *table([head, *rows]),
             "",

@@ -1,4 +1,4 @@
-"""Photographs to learn a map from: what looks from every cell show of some classes, and where those really are."""
+"""Training examples for the map of all classes: the looks from every cell, and the true cells of some classes."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ from semfov.training.evidence_examples import LookingRun, no_detections
 
 @dataclass(frozen=True)
 class MapExamples:
-    """One example for each photograph, with T of its classes: those that it holds or seems to, and a few others.
+    """One example for each photograph, with T classes: present ones, those with the highest scores, and a few others.
 
     Attributes:
-        features: `(E, X·Y, T, X·Y, F)`, of `class_features`, for looks from every cell; half precision.
-        score: `(E, X·Y, T)`, highest score of each class in looks from every cell.
-        distance: `(E, X·Y, X·Y)`, from every cell to every cell, in longer sides.
-        answers: `(E, X·Y, T+1)` boolean, classes of the objects that overlap a cell; the first is that none does.
+        features: `(E, X·Y, T, X·Y, F)`, `class_features` of the looks from every cell, in half precision.
+        score: `(E, X·Y, T)`, highest score of each class in the look from each cell.
+        distance: `(E, X·Y, X·Y)`, distance from every cell to every cell, in units of the image's longer side.
+        answers: `(E, X·Y, T+1)` boolean, whether a cell is background (first), and whether an object of each class
+            overlaps it.
         targets: `(E, T)`, the classes.
-        stands_for: `(E, T)`, how many classes of the photograph each one stands for.
+        stands_for: `(E, T)`, number of classes that each class represents.
         scene: `(E,)`, index of the photograph.
     """
 
@@ -45,16 +46,16 @@ class MapExamples:
         return len(self.scene)
 
     def __getitem__(self, index: Tensor) -> MapExamples:
-        """Some of the examples."""
+        """Select examples by index or mask."""
         return MapExamples(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 class MapExampleLooks(Looks):
-    """Looks at many photographs at once, an episode at each.
+    """Looks at many photographs at once, with one episode for each photograph.
 
     Args:
-        examples: the photographs, one for each episode.
-        grid: cells, as many as theirs.
+        examples: the examples, one for each episode.
+        grid: the grid of cells, of the examples' size.
     """
 
     def __init__(self, examples: MapExamples, grid: Grid) -> None:
@@ -62,7 +63,7 @@ class MapExampleLooks(Looks):
         self.like = examples.score
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
-        """What looks from the cells show, weighed by the model that is being trained."""
+        """Look up the looks from some cells, processed by the model in training."""
         known, model = self.examples, own(observer, LearnedMap, "observer").model
         look = MapLook(
             model.evidence(known.features[episodes, cell].float()),
@@ -77,13 +78,20 @@ class MapExampleLooks(Looks):
 
 
 def make_map_examples(run: LookingRun, classes: int, others: int, seed: int) -> MapExamples:
-    """Examples from all photographs of a run that hold an object.
+    """Make examples from all photographs with objects.
 
     Args:
-        run: that has looked.
-        classes: how many of each photograph: those that it holds, then those with the highest scores, then others.
-        others: how many of these are drawn at random; together they stand for all the rest.
-        seed: of the draw.
+        run: the finished looks from every cell.
+        classes: number of classes in each example: the present ones, then those with the highest scores, then random
+            ones.
+        others: number of random classes. Together they represent all classes that are not in the example.
+        seed: seed of the random choice.
+
+    Returns:
+        The examples.
+
+    Raises:
+        DataError: no photograph has an object.
     """
     parts = []
     components = len(run.scenes.classes) + 1
@@ -113,5 +121,5 @@ def make_map_examples(run: LookingRun, classes: int, others: int, seed: int) -> 
         row = features, score[:, chosen], grid.cell_distance, answers, every[chosen], stands_for, torch.tensor(index)
         parts.append(row)
     if not parts:
-        raise DataError("data: no photograph has an object; lower data.min_instances or raise data.limit")
+        raise DataError("data: none of the photographs contains an object; raise data.limit or give other photographs")
     return MapExamples(*(torch.stack(column) for column in zip(*parts, strict=True)))

@@ -1,4 +1,4 @@
-"""Counting what the detector does not see."""
+"""Count the cells in which the detector misses objects."""
 
 import torch
 from torch import Tensor
@@ -9,14 +9,17 @@ from semfov.observation import MissCounts
 
 
 def count_misses(photographs: Scenes, samples: Samples, scenes: set[int], edges: Tensor, cells: Cells) -> MissCounts:
-    """Cells in which nothing was detected, over all looks at the given scenes (`MissCounts`).
+    """Count cells without any detection over all looks at some photographs.
 
     Args:
-        photographs: that were looked at.
-        samples: what was seen.
-        scenes: indices of those that count.
-        edges: between the levels of distance, or of magnification.
-        cells: in which misses are counted.
+        photographs: the photographs.
+        samples: the labelled detections of the looks.
+        scenes: indices of the photographs to count.
+        edges: `(N-1,)`, borders between levels of distance, or of magnification.
+        cells: gives the cells of each look in which misses are counted.
+
+    Returns:
+        The counts by class and level.
     """
     counts = torch.bincount(samples.look, minlength=len(samples.scenes)).tolist()
     misses = MissCounts(samples.scores.shape[-1], len(edges) + 1)

@@ -1,4 +1,4 @@
-"""Fitting a foveal observation model to labelled detections."""
+"""Fit a foveal observation model to labelled detections."""
 
 import warnings
 from typing import Any, Protocol
@@ -21,7 +21,7 @@ from semfov.zoom.eye import ZoomEye
 
 
 def fit_fom(config: FitConfig) -> None:
-    """Collect labelled detections, fit the model, judge it on held-out photographs, and write everything."""
+    """Collect labelled detections, fit the model, evaluate it on held-out photographs, and write all results."""
     check(config.holdout >= 2, "holdout", "2 or more", config.holdout)
     kind = MosaicSettings if config.mosaics else SampleSettings
     settings = kind.of(config)
@@ -30,7 +30,10 @@ def fit_fom(config: FitConfig) -> None:
         return
     held_out = samples.scene % config.holdout == 0
     if not held_out.any() or held_out.all():
-        raise DataError(f"data: too few detections to fit on and to judge by ({len(samples)}); give more photographs")
+        raise DataError(
+            f"data: expected detections both in the training and in the held-out photographs, got {len(samples)} "
+            "detections in all; give more photographs"
+        )
     model = fit_model(config, sampler, samples[~held_out])
     fitted_on = {index for index in range(len(sampler.scenes)) if index % config.holdout != 0}
     misses = count_misses(sampler.scenes, samples, fitted_on, model.edges, sampler.cells)
@@ -46,18 +49,27 @@ def fit_fom(config: FitConfig) -> None:
 
 
 class Looker(Protocol):
-    """What has looked at photographs: a `Sampler`, or a run over the looks from every cell."""
+    """The source of the detections: a `Sampler`, or a run with looks from every cell."""
 
     @property
     def eye(self) -> Eye | ZoomEye:
-        """What looked."""
+        """The eye that looked."""
         ...
 
     scenes: Scenes
 
 
 def fit_model(config: FitConfig, sampler: Looker, samples: Samples) -> FovealObservationModel:
-    """The model of the method that the settings name."""
+    """Fit the model with the method in the settings.
+
+    Args:
+        config: the settings.
+        sampler: the source of the detections.
+        samples: the labelled detections to fit on.
+
+    Returns:
+        The model.
+    """
     if config.method != "discriminative":
         return published_model(config, sampler, samples, config.method)
     start = published_model(config, sampler, samples, "newton", expected="empirical")
@@ -71,11 +83,24 @@ def published_model(
     method: Method,
     **options: Any,
 ) -> FovealObservationModel:
-    """Dirichlets of maximum likelihood where a cell has enough detections, as published; others are shrunk."""
+    """Fit Dirichlet distributions to the scores of each class and level.
+
+    A pair of class and level with enough detections is fitted by maximum likelihood, as published. Others are shrunk.
+
+    Args:
+        config: the settings.
+        sampler: the source of the detections.
+        samples: the labelled detections to fit on.
+        method: method of the maximum-likelihood fit.
+        options: further options of `FovealObservationModel.fit`.
+
+    Returns:
+        The model.
+    """
     classes = sampler.eye.detector.classes
     model = FovealObservationModel.identity(classes, config.edges)
     with warnings.catch_warnings():
-        # The report tells which levels fell back.
+        # The report lists the levels that take the parameters of another level.
         warnings.simplefilter("ignore", UserWarning)
         return model.fit(
             statistics_of(model, samples),
@@ -93,7 +118,7 @@ def published_model(
 
 
 def statistics_of(model: FovealObservationModel, samples: Samples) -> DirichletStatistics:
-    """Sufficient statistics of samples by class and level."""
+    """Compute the sufficient statistics of samples by class and level."""
     components, levels = model.alpha.shape[:2]
     statistics = DirichletStatistics((components, levels), components, epsilon=model.epsilon)
     return statistics.update(samples.scores, (samples.labels, model.level(samples.distance)))
@@ -102,7 +127,7 @@ def statistics_of(model: FovealObservationModel, samples: Samples) -> DirichletS
 def fit_all(
     config: FitConfig, sampler: Looker, samples: Samples, model: FovealObservationModel
 ) -> dict[str, FovealObservationModel]:
-    """The models that the report compares: raw scores, the published estimators, and the model that was asked for."""
+    """Fit the models that the report compares: raw scores, the published estimators, and the requested model."""
     edges, classes = config.edges, sampler.eye.detector.classes
     models = {"raw scores": FovealObservationModel.identity(classes, edges).eval()}
     methods: tuple[Method, ...] = ("newton", "fixed_point", "gradient")

@@ -1,4 +1,4 @@
-"""What a fit leaves besides the model: figures on held-out photographs, counts, and a reliability diagram."""
+"""The report on a fitted observation model: measures on held-out photographs, counts, and a reliability diagram."""
 
 import csv
 import io
@@ -30,7 +30,18 @@ Models = dict[str, FovealObservationModel]
 def write_report(
     config: FitConfig, model: FovealObservationModel, models: Models, samples: Samples, held_out: torch.Tensor
 ) -> list[Path]:
-    """Judge the models on held-out samples, print the table, and write the report; returns the files."""
+    """Evaluate the models on held-out samples, print the tables, and write the report.
+
+    Args:
+        config: the settings.
+        model: the fitted model.
+        models: all models to compare, the fitted one last.
+        samples: all labelled detections.
+        held_out: `(M,)` boolean, which of them are held out.
+
+    Returns:
+        The files that were written.
+    """
     judged = samples[held_out]
     with torch.inference_mode():
         predictions = {name: m.calibrate(judged.scores, judged.distance) for name, m in models.items()}
@@ -60,7 +71,19 @@ def report_markdown(
     by_level: list[list[str]],
     fitted: int,
 ) -> str:
-    """The report: figures of each model, then counts by level."""
+    """Write the report as Markdown: the measures of each model, then counts and measures by level.
+
+    Args:
+        config: the settings.
+        model: the fitted model.
+        figures: calibration of each model on the held-out samples.
+        likelihood: mean log likelihood of the held-out scores under each model.
+        by_level: cells of the table by level (`figures_by_level`).
+        fitted: number of samples to fit on.
+
+    Returns:
+        The text.
+    """
     judged = next(iter(figures.values())).count
     head = ["model", "log likelihood", "NLL", "Brier", "ECE", "classwise ECE", "accuracy"]
     rows = [
@@ -82,19 +105,23 @@ def report_markdown(
         ]
         for n, (low, high) in enumerate(pairwise(edges))
     ]
-    what = "octaves that the picture is reduced by" if config.mosaics else "distance"
-    where = what if config.mosaics else "distance to the fixation in longer sides of the image"
-    head = [what, "background", "objects", "takes those of level", "NLL, raw", "NLL", "ECE, raw", "ECE"]
+    axis = "reduction in octaves" if config.mosaics else "distance"
+    where = (
+        "the number of octaves by which the picture is reduced"
+        if config.mosaics
+        else "distance to the fixation in units of the image's longer side"
+    )
+    head = [axis, "background", "objects", "uses level", "NLL, raw", "NLL", "ECE, raw", "ECE"]
     return "\n".join(
         [
-            f"Fitted on {fitted} detections, judged on {judged} of photographs that were held out "
-            f"(every {config.holdout}th). Log likelihood of the scores given the true class, and figures of the "
-            "posterior of the class, background included.",
+            f"Fitted on {fitted} detections, evaluated on {judged} detections in held-out photographs (one in "
+            f"{config.holdout}). The log likelihood is that of the scores given the true class. The other measures are "
+            "of the posterior of the class, background included.",
             "",
             *summary,
             "",
-            f"Detections that the fit saw, by {where}; levels with too few objects take the parameters of another "
-            "level. Beside them figures of raw scores and of the model on what was held out.",
+            f"Number of detections in the fit, by {where}. Levels with too few objects use the parameters of another "
+            "level. NLL and ECE are measured on the held-out detections, for raw scores and for the fitted model.",
             "",
             *table([head, *levels]),
             "",
@@ -103,7 +130,16 @@ def report_markdown(
 
 
 def figures_by_level(model: FovealObservationModel, predictions: dict[str, Tensor], judged: Samples) -> list[list[str]]:
-    """NLL and ECE of raw scores and of the model that was asked for, level by level."""
+    """Compute NLL and ECE of raw scores and of the fitted model at each level.
+
+    Args:
+        model: the fitted model.
+        predictions: class probabilities `(M, K+1)` of each model, raw scores first and the fitted model last.
+        judged: the held-out samples.
+
+    Returns:
+        Cells of a table, one row for each level.
+    """
     first, *_, last = predictions.values()
     level = model.level(judged.distance)
     rows = []
@@ -112,13 +148,13 @@ def figures_by_level(model: FovealObservationModel, predictions: dict[str, Tenso
         if not here.any():
             rows.append([""] * 4)
             continue
-        raw, own = (calibration(told[here], judged.labels[here]) for told in (first, last))
+        raw, own = (calibration(each[here], judged.labels[here]) for each in (first, last))
         rows.append([f"{value:.3f}" for value in (raw.nll, own.nll, raw.ece, own.ece)])
     return rows
 
 
 def counts_csv(model: FovealObservationModel) -> str:
-    """Detections of each true class at each level that the fit saw."""
+    """Write the number of detections of each true class at each level in the fit as CSV."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(["class", *(f"level {n}" for n in range(len(model.edges) + 1))])
@@ -128,7 +164,7 @@ def counts_csv(model: FovealObservationModel) -> str:
 
 
 def manifest(model: FovealObservationModel, figures: dict[str, Calibration]) -> dict[str, object]:
-    """Where the figures come from."""
+    """Record the command, the commit, the versions and the model that the measures come from."""
     known = {key: value for key, value in model.metadata.items() if key != "counts"}
     return {
         "command": ["python", "-m", "train.fit_fom", *sys.argv[1:]],

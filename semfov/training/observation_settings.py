@@ -1,4 +1,4 @@
-"""Settings of the fit of a foveal observation model."""
+"""Settings for fitting a foveal observation model."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,31 +13,34 @@ class FitConfig(Settings):
     """Fit p(scores | class, distance to the fovea) on photographs with boxes.
 
     Args:
-        data: photographs to fit on (all of them: no selection by number of objects).
-        detector: which detector looks through the fovea.
+        data: photographs to fit on (by default all of them, however many objects they have).
+        detector: the detector that processes the foveated views.
         sensor: the foveal sensor.
-        name: name of the model (None: the detector's).
-        method: `newton`, `fixed_point` (both Minka's; the paper does not say which) and `gradient` maximise the
-            likelihood, where `enough` lets them;
-            `discriminative` trains the posterior of the class itself, which is what calibration needs.
-        mosaics: mosaics of 8 × 6 photographs to look at in windows, for pictures larger than the detector's input
-            (0: photographs, through the fovea). Levels are then octaves that the picture is reduced by, and `width` and
-            `sensor` are of no account.
-        fixations: random fixations in each photograph; of a mosaic, windows at each magnification.
-        levels: levels of distance, each `width` wide and the last one open.
-        width: width of a level for a fovea of 100 pixels, in pixels of an image whose longer side is 640; it grows
+        name: name of the model (None: the detector's name).
+        method: how the model is fitted. `newton`, `fixed_point` (both by Minka; the paper does not say which it uses)
+            and `gradient` maximise the likelihood of the scores, for classes and levels with `enough` detections.
+            `discriminative` maximises the posterior probability of the true class instead, which gives better
+            calibrated posteriors.
+        mosaics: number of mosaics of 8 × 6 photographs to look at in windows, for pictures larger than the detector's
+            input (0: photographs, through the fovea). The levels are then octaves by which the picture is reduced, and
+            `width` and `sensor` are ignored.
+        fixations: random fixations in each photograph, or windows of a mosaic at each magnification.
+        levels: number of levels of distance. Each is `width` wide; the last one has no upper limit.
+        width: width of a level for a fovea of 100 pixels, in pixels of an image whose longer side is 640. It is scaled
             with the fovea.
-        minimum: objects that a level needs, or it takes the parameters of its inner neighbour (0: none does).
-        shrinkage: detections of a class's other levels that a level is given, so that few do not decide.
-        enough: detections of a class at a level from which that cell is not shrunk, but fitted by maximum likelihood
-            alone, as published (None: all are shrunk).
-        holdout: every n-th photograph is kept out of the fit and used to judge it.
-        iou: overlap from which a detection shows an object.
-        seed: of the fixations.
-        shard: photographs in a unit of work; a run that is stopped loses no more than one for each worker.
+        minimum: number of objects that a level needs. A level with fewer takes the parameters of the next inner level
+            (0: no level does).
+        shrinkage: weight of a class's other levels in each of its levels, as a number of detections. It stabilises
+            levels with few detections.
+        enough: a class with at least so many detections at a level is fitted there by maximum likelihood alone, as
+            published, without shrinkage (None: shrinkage everywhere).
+        holdout: one in every n photographs is held out for the evaluation.
+        iou: least overlap (IoU) at which a detection counts as showing an object.
+        seed: seed of the fixations.
+        shard: number of photographs in a unit of work. An interrupted run loses at most one unit for each worker.
         out: folder for the model, the report and the figures.
         cache: folder for the labelled detections (None: `out`).
-        workers: processes (None: one for each CPU core).
+        workers: number of processes (None: one for each CPU core).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
@@ -62,7 +65,7 @@ class FitConfig(Settings):
 
     @property
     def edges(self) -> list[float]:
-        """Borders between the levels, in longer sides of the image; of mosaics, in octaves."""
+        """Borders between the levels, in units of the image's longer side, or in octaves for mosaics."""
         if self.mosaics:
             return [n - 0.5 for n in range(1, self.levels)]
         step = self.width / 100.0 * self.sensor.fovea

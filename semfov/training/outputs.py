@@ -1,4 +1,4 @@
-"""What every fit leaves: what the model says of its training, a report, the settings, and the report's figures."""
+"""The outputs of every fit: metadata about the training, a report, the settings, and the report's measures as JSON."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -12,14 +12,17 @@ from semfov.io.files import inside, write_text
 
 
 def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
-    """What a model keeps of its training: the photographs, and the settings that it depends on.
+    """Build the metadata of a model about its training: the photographs, and the settings that the model depends on.
 
-    Detector and sensor are not among them, nor where files lie: they are told by `Eye.settings()`.
+    The settings of detector and sensor are left out, because `Eye.settings()` provides them. Paths are left out too.
 
     Args:
         config: dataclass of the settings.
         scenes: the photographs.
-        besides: further settings that the model does not depend on.
+        besides: further settings to leave out, because the model does not depend on them.
+
+    Returns:
+        The metadata.
     """
     left_out = {"out", "cache", "workers", "data", "detector", "sensor", *besides}
     settings = {name: value for name, value in plain(asdict(config)).items() if name not in left_out}
@@ -27,18 +30,18 @@ def training_of(config: Any, scenes: Scenes, *besides: str) -> dict[str, Any]:
 
 
 def model_path(config: Any, detector: str) -> Path:
-    """Where a fitted model is written: under its name in the settings, or the detector's, in `config.out`."""
+    """Return the file of a fitted model in `config.out`, named after the settings' `name` or else the detector."""
     return inside(config.out, f"{config.name or detector}.safetensors")
 
 
 def write_outputs(config: Any, report: str, figures: tuple[str, str], model: Path | None = None) -> None:
-    """Print the report, write it, the settings and the figures to `config.out`, and name all that was written.
+    """Print the report, write it with the settings and the measures to `config.out`, and list the written files.
 
     Args:
         config: dataclass of the settings.
-        report: Markdown.
-        figures: name of a JSON file, and its text.
-        model: file that was written before, to be named too.
+        report: the report in Markdown.
+        figures: name and content of a JSON file with the measures.
+        model: file of the model, already written, to include in the list.
     """
     files = {
         "report.md": report,

@@ -1,4 +1,4 @@
-"""Where the objects of photographs are, as context is counted from."""
+"""The cells that the objects of photographs occupy, from which context is counted."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,31 +30,34 @@ class FitContextConfig(Settings):
     """Fit the context of searches.
 
     Args:
-        data: photographs to learn from (all of them: no selection by number of objects).
+        data: photographs to learn from (by default all of them, however many objects they have).
         name: name of the model.
-        resolution: cells in a row and in a column of the map of places.
-        edges: borders of the bands of distance, in longer sides of the image; the last band is open.
-        max_target_area: classes that cover a larger share of an image are not learned from as targets there.
-        place_smoothing: weight of the map of all classes, in pictures.
-        class_smoothing: weight of what holds for all classes in what holds for one, in cells.
-        pair_smoothing: weight of what holds for either class in what holds for a pair, in cells.
-        holdout: every n-th photograph is kept out and used to judge.
-        weigh: photographs to fit the weights on, spread over all that are not held out (0: the weights are 1).
-        detector: which detector looks.
-        sensor: the foveal sensor.
-        fixations: random fixations in each photograph.
-        iou: as in `train.fit_fom`, for looks to be shared with it.
-        seed: of the fixations, and of which looks are used.
-        shard: photographs in a unit of work.
-        folds: the weights are fitted on photographs that the prior beside them has not counted.
-        min_objects: photographs with fewer objects are left out when weights are fitted, and judged.
+        resolution: rows and columns of the grid on which places are counted.
+        edges: borders between the bands of distance, in units of the image's longer side. The last band has no upper
+            limit.
+        max_target_area: a class that covers a larger share of an image is not learned as a target from that image.
+        place_smoothing: weight of the average map over all classes in the map of a class, as a number of pictures.
+        class_smoothing: weight of the average over all classes in the ratios of a class, as a number of cells.
+        pair_smoothing: weight of the averages of two classes in the ratio of the pair, as a number of cells.
+        holdout: one in every n photographs is held out for the evaluation.
+        weigh: number of photographs to fit the weights on, evenly spaced among those that are not held out (0: the
+            weights are 1).
+        detector: the detector for fitting the weights.
+        sensor: the foveal sensor for fitting the weights.
+        fixations: random fixations in each photograph for fitting the weights.
+        iou: must be the same as in `train.fit_fom` to share looks with it.
+        seed: seed of the fixations and of the selection of looks.
+        shard: number of photographs in a unit of work.
+        folds: number of folds for fitting the weights, so that they are fitted on photographs that were not counted.
+        min_objects: photographs with fewer objects are used neither to fit the weights nor for the evaluation.
         out: folder for the model and the report.
         cache: folder for the looks (None: `out`).
-        workers: processes that look (None: one for each CPU core).
-        table: CSV of classes by classes to take in place of counting (`ContextPrior.from_table`).
-        source: where the table comes from (None: its name).
-        heights: CSV of classes by heights in a picture, beside a table.
-        embeddings: file of word vectors (GloVe's or word2vec's text) whose cosines make such a table.
+        workers: number of processes that look (None: one for each CPU core).
+        table: CSV table of classes by classes to use instead of counting (`ContextPrior.from_table`).
+        source: where the table comes from (None: its file name).
+        heights: CSV table of classes by heights in a picture, to use with `table`.
+        embeddings: file of word vectors in the text format of GloVe or word2vec. Their cosine similarities serve as the
+            table.
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
@@ -86,12 +89,12 @@ class FitContextConfig(Settings):
 
 @dataclass(frozen=True)
 class Places:
-    """What annotations tell of one photograph.
+    """The annotated objects of one photograph on a grid.
 
     Attributes:
         occupied: `(X·Y, K+1)` boolean, cells that objects of each class overlap.
         targets: classes that may be searched for.
-        grid: the cells.
+        grid: the grid of cells.
         objects: number of objects.
     """
 
@@ -102,7 +105,7 @@ class Places:
 
 
 def read_places(scenes: Scenes, config: FitContextConfig) -> list[Places]:
-    """Which cells the objects of every photograph overlap."""
+    """Find the cells that the objects of every photograph overlap."""
     places = []
     for index in range(len(scenes)):
         annotation = scenes.annotation(index)

@@ -1,4 +1,4 @@
-"""Questions about classes for a language model, from a file of prompts, and what its answers say."""
+"""Questions about classes for a language model, made from a file of prompts, and the meaning of its answers."""
 
 import re
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from semfov.io.files import check_regular
 SHIPPED = Path(__file__).parent / "context_prompts.txt"
 HEIGHTS = ("top", "middle", "bottom")
 OPTIONS = {"beside": "other", "height": "height"}
-"""What the questions of each section may name beside the class."""
+"""The second placeholder that prompts of each section may contain, besides `{name}`."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Question:
 
     Attributes:
         section: `beside` or `height`.
-        name: of the class.
-        option: the other class or the height that it asks for; None where the answer is to name them.
+        name: name of the class.
+        option: the other class or the height that the question asks about; None if the answer should name them.
         text: the prompt.
     """
 
@@ -36,10 +36,19 @@ class Question:
 
 
 def read_prompts(path: str | PathLike[str]) -> dict[str, list[str]]:
-    """Prompts by section: paragraphs below a line such as `[beside]`; lines that begin with # are left out.
+    """Read prompts from a file.
+
+    Each paragraph below a heading such as `[beside]` is a prompt. Lines that begin with # are comments.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The prompts of each section.
 
     Raises:
-        DataError: the file cannot be read, has no prompt, or one with a placeholder that is not known.
+        DataError: the file cannot be read, has no prompt in the section `[beside]`, or has a prompt with an unknown
+            placeholder.
     """
     check_regular(path)
     try:
@@ -71,13 +80,28 @@ def _check_prompt(prompt: str, section: str, path: str) -> None:
     try:
         fields = {field for _, field, _, _ in Formatter().parse(prompt) if field is not None}
     except ValueError as error:
-        raise DataError(f"{path}: {prompt[:40]!r}: {error}; braces of the text itself are doubled") from None
+        raise DataError(
+            f"{path}: {prompt[:40]!r}: {error}; write {{{{ and }}}} for braces that belong to the text"
+        ) from None
     if "name" not in fields or fields - known:
-        raise DataError(f"{path}: expected {{name}} and maybe {{{OPTIONS[section]}}} in {prompt[:60]!r}")
+        raise DataError(
+            f"{path}: expected the placeholder {{name}}, optionally {{{OPTIONS[section]}}}, and no others in "
+            f"{prompt[:60]!r}"
+        )
 
 
 def questions_of(prompts: dict[str, list[str]], classes: Sequence[str]) -> list[Question]:
-    """Every question that the prompts ask of the classes; of two classes in one order, for nearness is mutual."""
+    """Make the questions for all classes.
+
+    A pair of classes is asked about in one order only, because nearness is symmetric.
+
+    Args:
+        prompts: the prompts of each section (`read_prompts`).
+        classes: names of the classes.
+
+    Returns:
+        The questions.
+    """
     names = [canonical_name(name) for name in classes]
     asked = []
     for section, texts in prompts.items():
@@ -93,7 +117,15 @@ def questions_of(prompts: dict[str, list[str]], classes: Sequence[str]) -> list[
 
 
 def answer_values(question: Question, answer: str, classes: Sequence[str]) -> dict[str, float] | None:
-    """What an answer says of the options of a question, in [0, 1]; None where it says nothing that can be read.
+    """Read the values of a question's options from the answer.
+
+    Args:
+        question: the question.
+        answer: the answer.
+        classes: names of the classes.
+
+    Returns:
+        A value in [0, 1] for each option, or None if the answer cannot be read.
 
     >>> answer_values(Question("beside", "fork", "knife", "…"), "Very often: 8.", ["knife"])
     {'knife': 0.8}
@@ -111,7 +143,7 @@ def answer_values(question: Question, answer: str, classes: Sequence[str]) -> di
 
 
 def _graded(answer: str) -> float | None:
-    """A number from 0 to 10, yes or no, whichever comes first."""
+    """Read the first grade in an answer: a number from 0 to 10, yes or no."""
     for word in re.findall(r"\d+(?:\.\d+)?|[a-z]+", answer.lower()):
         if word in ("yes", "no"):
             return float(word == "yes")

@@ -1,4 +1,4 @@
-"""The end of a network, trained by itself on what the rest of it gives."""
+"""The last layers of a network, trained by themselves on the features of the other layers."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from semfov.errors import check
 class Tail:
     """The last convolutions before every head of a network, and the layers that depend on them.
 
-    What these layers read of the others, the features, does not change while the tail is trained, and need be computed
-    only once for an image. The convolutions are the network's own: training the tail trains the network.
+    The features that these layers read from the other layers do not change during the training of the tail. They have
+    to be computed only once for an image. The tail shares its convolutions with the network, so training the tail
+    changes the network.
 
     Args:
-        network: whose tail it is.
-        depth: convolutions before each head, one after the other, that belong to it.
+        network: the network.
+        depth: number of consecutive convolutions before each head to train.
 
     Attributes:
         trained: numbers of these convolutions, ascending.
-        layers: numbers of the layers that depend on them, ascending.
+        layers: numbers of these convolutions and of the layers that depend on them, ascending.
         inputs: numbers of the layers that give the features, ascending.
 
     Raises:
-        InputError: there are not so many convolutions one after the other before a head.
+        InputError: a head has fewer consecutive convolutions before it.
 
     >>> from semfov.detection.architectures import yolov3_tiny
     >>> tail = Tail(Darknet(yolov3_tiny()))
@@ -49,16 +50,16 @@ class Tail:
         self.inputs = sorted({source for number in self.layers for source in network.sources[number]} - reached)
 
     def _before(self, head: int, depth: int) -> Iterator[int]:
-        """The convolutions before a head, the last one first."""
+        """Find the convolutions before a head, beginning with the last one."""
         number = head
         for _ in range(depth):
             number = self.network.sources[number][0]
             fits = number >= 0 and isinstance(self.network.layers[number], Convolution)
-            check(fits, "depth", "only convolutions one after the other before each head", depth)
+            check(fits, "depth", "no more than the number of consecutive convolutions before each head", depth)
             yield number
 
     def named_parameters(self) -> dict[str, nn.Parameter]:
-        """Weights and biases that are trained, by the names that the network has for them."""
+        """Return the weights and biases to train, under their names in the network."""
         return {
             f"layers.{number}.{name}": parameter
             for number in self.trained
@@ -67,7 +68,14 @@ class Tail:
 
     @torch.no_grad()
     def features(self, canvas: Tensor) -> dict[int, Tensor]:
-        """What the tail reads of an image `(B, 3, H, W)`, by the number of the layer that gives it."""
+        """Compute the features that the tail reads.
+
+        Args:
+            canvas: images `(B, 3, H, W)`.
+
+        Returns:
+            The features by the number of the layer that gives them.
+        """
         self.network.check_image(canvas)
         outputs = {-1: canvas.contiguous(memory_format=torch.channels_last)}
         found = {}
@@ -78,7 +86,7 @@ class Tail:
         return found
 
     def __call__(self, features: Mapping[int, Tensor]) -> list[Tensor]:
-        """Raw maps of the heads from the features of images."""
+        """Compute the raw maps of the heads from the features of images."""
         outputs = dict(features)
         for number in self.layers:
             outputs[number] = self.network.layers[number](*(outputs[at] for at in self.network.sources[number]))

@@ -1,4 +1,4 @@
-"""Finding the exponent with which likelihoods count best."""
+"""Find the exponent of the likelihoods with which the fused belief guides the gaze best."""
 
 import json
 from dataclasses import dataclass, field
@@ -29,25 +29,26 @@ class FitTemperingConfig(Settings):
     """Find the exponent of the likelihoods.
 
     Args:
-        data: photographs to learn from (all of them: no selection by number of objects).
-        detector: which detector looks through the fovea.
+        data: photographs to learn from (by default all of them, however many objects they have).
+        detector: the detector that processes the foveated views.
         sensor: the foveal sensor.
-        calibrated: pass scores through the observation model shipped for the detector, or take them as likelihoods.
+        calibrated: compute likelihoods from the scores with the observation model shipped for the detector. If false,
+            the raw scores are the likelihoods.
         footprint: which cells a detection updates.
-        exponents: values of τ to compare.
-        photographs: use only so many (None: all).
+        exponents: values of the exponent τ to compare.
+        photographs: use only the first so many photographs (None: all).
         fixations: random fixations in each photograph.
-        iou: as in `train.fit_fom`, for looks to be shared with it.
-        seed: of the fixations.
-        shard: photographs in a unit of work.
-        columns: cells in a row.
-        rows: cells in a column.
+        iou: must be the same as in `train.fit_fom` to share looks with it.
+        seed: seed of the fixations.
+        shard: number of photographs in a unit of work.
+        columns: columns of the grid.
+        rows: rows of the grid.
         min_objects: photographs with fewer objects are left out.
         max_target_area: classes that cover a larger share of the image are not searched for.
-        holdout: every n-th photograph is kept out and used to judge.
+        holdout: one in every n photographs is held out for the evaluation.
         out: folder for the report.
         cache: folder for the labelled detections (None: `out`).
-        workers: processes that look (None: one for each CPU core).
+        workers: number of processes that look (None: one for each CPU core).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
@@ -92,32 +93,60 @@ def measure(
     model: FovealObservationModel | None,
     tempering: float,
 ) -> dict[str, float]:
-    """Mean over photographs of the share of next fixations that hit, `fitted` and `held_out`."""
+    """Measure one exponent: the share of next fixations that hit the target, as means over photographs.
+
+    Args:
+        config: the settings.
+        sampler: the sampler that looked.
+        samples: the labelled detections of the looks.
+        model: observation model, or None for raw scores.
+        tempering: the exponent.
+
+    Returns:
+        The means over the photographs to choose by (`fitted`) and over the `held_out` ones.
+    """
     observer = Semantic(len(sampler.eye.detector.classes) + 1, model, footprint=config.footprint, tempering=tempering)
     return means_of(config, hit_rates(config, sampler.scenes, samples, observer, f"tempering {tempering:g}"))
 
 
 def means_of(config: FitTemperingConfig, rates: dict[int, float]) -> dict[str, float]:
-    """Means of what `hit_rates` gives, over the photographs to choose by, `fitted`, and over those `held_out`."""
+    """Average hit rates over the photographs to choose by (`fitted`) and over the `held_out` ones.
+
+    Args:
+        config: the settings.
+        rates: hit rates by the index of the photograph (`hit_rates`).
+
+    Returns:
+        The two means.
+
+    Raises:
+        DataError: one of the two groups has no photograph.
+    """
     means: dict[str, list[float]] = {"fitted": [], "held_out": []}
     for index, share in rates.items():
         means["held_out" if index % config.holdout == 0 else "fitted"].append(share)
     if not all(means.values()):
-        raise DataError("data: too few photographs to fit and to judge by; give more")
+        raise DataError(
+            f"data: expected searches in photographs of both groups, got {len(means['fitted'])} photographs to choose "
+            f"by and {len(means['held_out'])} held-out ones; give more photographs"
+        )
     return {name: sum(values) / len(values) for name, values in means.items()}
 
 
 def hit_rates(
     config: FitTemperingConfig, scenes: Scenes, samples: Samples, observer: Semantic, title: str
 ) -> dict[int, float]:
-    """Share of next fixations that hit, by the index of the photograph.
+    """Compute the share of next fixations that hit the target in each photograph.
 
     Args:
-        config: which photographs and targets count.
+        config: the settings, which select photographs and targets.
         scenes: the photographs.
-        samples: looks at them, `config.fixations` at each, in order.
-        observer: fuses the looks.
-        title: of the progress.
+        samples: labelled detections of the looks, `config.fixations` for each photograph, in order.
+        observer: the observer that fuses the looks.
+        title: label of the progress bar.
+
+    Returns:
+        The hit rates by the index of the photograph.
     """
     rates = {}
     number = min(config.photographs or len(scenes), len(scenes))
@@ -139,21 +168,22 @@ def hit_rates(
 def hit_rate(
     observer: Semantic, seen: Detections, fixations: Tensor, grid: Grid, targets: Tensor, goal: Tensor
 ) -> float | None:
-    """Share of the next fixations that hit, over targets and over beliefs after the first look, the second and so on.
+    """Compute the share of next fixations that hit the target in one photograph.
 
-    A look that fixates the target would have ended the search and is left out. Where cells are equally probable, the
-    share of them that hold the target counts.
+    The mean is over targets and over the beliefs after the first look, the second look and so on. Looks that fixate the
+    target are left out, as they would have ended the search. If several cells are equally probable, the share of them
+    that contain the target counts.
 
     Args:
-        observer: fuses the looks.
-        seen: R looks at one photograph.
-        fixations: `(R, 2)`.
-        grid: the cells.
+        observer: the observer that fuses the looks.
+        seen: detections of R looks at the photograph.
+        fixations: `(R, 2)`, fixations of the looks, `(x, y)` in pixels.
+        grid: the grid of cells.
         targets: `(T,)`, classes to search for.
-        goal: `(T, X·Y)` boolean, cells that hold them.
+        goal: `(T, X·Y)` boolean, cells that contain them.
 
     Returns:
-        None where every look ends every search.
+        The share, or None if every look fixates every target.
     """
     evidence = observer.weigh(seen, fixations, grid)
     belief = observer.start(len(targets), grid, seen.scores)
@@ -172,13 +202,13 @@ def hit_rate(
 
 
 def report(hits: dict[float, dict[str, float]]) -> str:
-    """A row for every exponent, and the best of them, as Markdown."""
+    """Report the hit rates of every exponent and the best exponent as Markdown."""
     best = max(hits, key=lambda tempering: hits[tempering]["fitted"])
     rows = [[f"{t:g}", f"{100 * h['fitted']:.2f}", f"{100 * h['held_out']:.2f}"] for t, h in hits.items()]
     return "\n".join(
         [
-            f"Best exponent on the photographs to choose by: {best:g}. Percent of the next fixations that hit the "
-            "target, after one to all of the looks at a photograph, mean over photographs.",
+            f"Best exponent on the photographs to choose by: {best:g}. The table shows the percentage of next "
+            "fixations that hit the target, as a mean over all numbers of looks and over photographs.",
             "",
             *table([["tempering", "photographs to choose by", "held-out photographs"], *rows]),
             "",

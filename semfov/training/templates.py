@@ -1,4 +1,4 @@
-"""Fitting class templates: the mean features of the objects of every class."""
+"""Fit class templates: the mean features of the objects of every class."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from semfov.training.outputs import model_path, training_of, write_outputs
 
 @dataclass(frozen=True)
 class FitTemplatesConfig(Settings):
-    """Average what objects of each class look like to a detector.
+    """Average a detector's features over the objects of each class.
 
     Args:
-        data: photographs to learn from (all of them: no selection by number of objects).
-        detector: whose features they are (YOLOv3).
-        holdout: every n-th photograph is kept out and used to judge.
-        name: name of the model (None: the detector's).
+        data: photographs to learn from (by default all of them, however many objects they have).
+        detector: the detector that computes the features (one of the YOLOv3 family).
+        holdout: one in every n photographs is held out for the evaluation.
+        name: name of the model (None: the detector's name).
         out: folder for the model and the report.
     """
 
@@ -43,11 +43,11 @@ class FitTemplatesConfig(Settings):
 
 
 class TemplateSums:
-    """Features of objects and of all places, as sums.
+    """Sums of the features of objects and of all positions.
 
     Args:
-        classes: K.
-        channels: C.
+        classes: number of classes K.
+        channels: number of feature channels C.
     """
 
     def __init__(self, classes: int, channels: int) -> None:
@@ -57,36 +57,48 @@ class TemplateSums:
         self.places = 0
 
     def update(self, features: Tensor, objects: Tensor, labels: Tensor) -> None:
-        """Count a photograph: features `(C, h, w)` of all places, those of its objects `(M, C)`, and their labels."""
+        """Add a photograph.
+
+        Args:
+            features: `(C, h, w)`, features at all positions.
+            objects: `(M, C)`, features at the centres of the objects.
+            labels: `(M,)`, classes of the objects, 1..K.
+        """
         self.everywhere += features.double().sum((1, 2))
         self.places += features[0].numel()
         self.objects.index_add_(0, labels - 1, objects.double())
         self.counts += torch.bincount(labels - 1, minlength=len(self.counts))
 
     def templates(self) -> tuple[Tensor, Tensor]:
-        """Templates `(K, C)`, 0 for classes without objects, and the mean of all places `(C)`."""
+        """Compute the templates.
+
+        Returns:
+            The templates `(K, C)`, 0 for classes without objects, and the mean over all positions `(C,)`.
+        """
         mean = self.everywhere / max(1, self.places)
         centred = self.objects / self.counts.clamp(min=1)[:, None] - mean
         return torch.where(self.counts[:, None] > 0, centred, 0.0).float(), mean.float()
 
 
 def fit_templates(config: FitTemplatesConfig) -> None:
-    """Average the objects of all photographs but the held-out ones, and judge by those."""
+    """Average the objects of all photographs that are not held out, evaluate, and write all results."""
     prepare_worker()
     detector = make_detector(config.detector).eval().requires_grad_(False)
     scenes = make_scenes(config.data, detector.classes)
     held_out = list(range(0, len(scenes), config.holdout))
     fitted = [index for index in range(len(scenes)) if index % config.holdout]
     if not fitted:
-        raise DataError("data: too few photographs to fit and to judge by; give more")
+        raise DataError(
+            f"data: expected at least 2 photographs, one to train on and one to hold out, got {len(scenes)}"
+        )
     sums: TemplateSums | None = None
     for index in tqdm(fitted, desc="averaging objects", unit="photograph", dynamic_ncols=True):
         features, objects, labels = objects_of(detector, scenes, index)
         sums = sums or TemplateSums(len(detector.classes), len(features))
         sums.update(features, objects, labels)
     assert sums is not None
-    told = {"detector": detector.settings(), "counts": sums.counts.tolist(), **training_of(config, scenes)}
-    model = ClassTemplates(*sums.templates(), detector.classes, metadata=told).eval()
+    metadata = {"detector": detector.settings(), "counts": sums.counts.tolist(), **training_of(config, scenes)}
+    model = ClassTemplates(*sums.templates(), detector.classes, metadata=metadata).eval()
     areas = [
         area
         for index in tqdm(held_out, desc="judging", unit="photograph", dynamic_ncols=True)
@@ -99,8 +111,9 @@ def fit_templates(config: FitTemplatesConfig) -> None:
     text = "\n".join(
         [
             f"Templates of {int((sums.counts > 0).sum())} classes from {int(sums.counts.sum())} objects in "
-            f"{len(fitted)} photographs. How well attention to a class, in the sharp photograph, tells the cells of "
-            f"its objects from the others, over {len(areas)} classes in {len(held_out)} held-out photographs:",
+            f"{len(fitted)} photographs. The area under the ROC curve measures how well attention to a class in the "
+            "sharp photograph separates the cells of its objects from other cells. The mean is over "
+            f"{len(areas)} pairs of photograph and class in {len(held_out)} held-out photographs:",
             "",
             *table([["mean area under the ROC"], [f"{mean:.3f}"]]),
             "",
@@ -110,7 +123,17 @@ def fit_templates(config: FitTemplatesConfig) -> None:
 
 
 def objects_of(detector: Detector, scenes: Scenes, index: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Features of unit length of a photograph `(C, h, w)`, those at the centres of its objects, and their labels."""
+    """Compute the features of a photograph and of its objects, normalised to unit length.
+
+    Args:
+        detector: the detector.
+        scenes: the photographs.
+        index: index of the photograph.
+
+    Returns:
+        The features at all positions `(C, h, w)`, those at the centres of the objects `(M, C)`, and the labels of the
+        objects `(M,)`.
+    """
     with torch.inference_mode():
         canvas, placement = detector.fit(scenes[index].image[None])
         features = unit(detector.features(canvas))
@@ -121,7 +144,19 @@ def objects_of(detector: Detector, scenes: Scenes, index: int) -> tuple[Tensor, 
 
 
 def areas_under_roc(model: ClassTemplates, detector: Detector, scenes: Scenes, index: int) -> list[float]:
-    """How often a cell with a class gets more attention than one without, for each class of a photograph."""
+    """Compute the area under the ROC curve for each class in a photograph.
+
+    The area is the probability that a cell with the class gets more attention than a cell without it. Ties count half.
+
+    Args:
+        model: the templates.
+        detector: the detector.
+        scenes: the photographs.
+        index: index of the photograph.
+
+    Returns:
+        The areas.
+    """
     annotation: Annotation = scenes.annotation(index)
     grid = Grid(10, 10, annotation.size)
     covered = grid.footprint(annotation.boxes)

@@ -1,4 +1,4 @@
-"""People's next fixations as choices among cells, with what a policy makes of every cell at that moment."""
+"""People's next fixations as choices among cells, with the value that a policy gives to every cell at that moment."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from semfov.gaze.choice import Given
 
 @dataclass(frozen=True)
 class Choices:
-    """Next fixations, n of them.
+    """n choices of the next fixation.
 
     Attributes:
         picture: `(n,)`, number of the picture.
         subject: `(n,)`, number of the person.
-        cell: `(n,)`, that was fixated.
-        taken: `(n,)`, cell that was fixated next; it may be the same.
-        age: `(n, X·Y)`, how many fixations ago each cell was fixated last; infinite for never.
-        values: of each policy, `(n, X·Y)`.
+        cell: `(n,)`, the fixated cell.
+        taken: `(n,)`, the cell that was fixated next, possibly the same one.
+        age: `(n, X·Y)`, number of fixations since each cell was last fixated; infinite if it never was.
+        values: `(n, X·Y)` for each policy, its values of all cells.
     """
 
     picture: Tensor
@@ -40,13 +40,13 @@ class Choices:
         return len(self.taken)
 
     def __getitem__(self, index: Tensor) -> Choices:
-        """Some of the choices."""
+        """Select choices by index or mask."""
         tensors = {name: getattr(self, name)[index] for name in ("picture", "subject", "cell", "taken", "age")}
         return Choices(**tensors, values={name: values[index] for name, values in self.values.items()})
 
     @classmethod
     def join(cls, parts: Sequence[Choices]) -> Choices:
-        """All choices of several pictures."""
+        """Join the choices of several pictures."""
         names = ("picture", "subject", "cell", "taken", "age")
         tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
         values = {name: torch.cat([part.values[name] for part in parts]) for name in parts[0].values}
@@ -54,9 +54,15 @@ class Choices:
 
 
 def cells_of(fixations: Sequence[Fixations], grid: Grid) -> tuple[Tensor, Tensor]:
-    """Cells that people fixated, `(P, n)` with the last one repeated, and how many, `(P,)`.
+    """Convert people's fixations to cells. Fixations outside the picture are left out.
 
-    Fixations outside the picture are left out; who has none inside is left out by a count of 0.
+    Args:
+        fixations: fixations of P people.
+        grid: the grid of cells.
+
+    Returns:
+        The cells `(P, n)`, with the last one repeated as padding, and the number of fixations of each person `(P,)`,
+        which is 0 if all of them are outside the picture.
     """
     rows = [grid.cell_of(torch.as_tensor(each.points[each.inside], dtype=torch.float32)) for each in fixations]
     count = torch.tensor([len(row) for row in rows])
@@ -69,14 +75,17 @@ def cells_of(fixations: Sequence[Fixations], grid: Grid) -> tuple[Tensor, Tensor
 
 
 def choices_in(cells: Tensor, count: Tensor, grid: Grid, picture: int, subject: Tensor) -> Choices:
-    """The choices in one picture, person by person, without values.
+    """List the choices in one picture, person by person, without the values of policies.
 
     Args:
-        cells: `(P, n)`, that each person fixated.
-        count: `(P,)`, how many of them.
-        grid: the cells.
-        picture: its number.
+        cells: `(P, n)`, cells that each person fixated.
+        count: `(P,)`, number of fixations of each person.
+        grid: the grid of cells.
+        picture: number of the picture.
         subject: `(P,)`, numbers of the people.
+
+    Returns:
+        The choices.
     """
     found = []
     age = torch.full((len(cells), len(grid)), torch.inf)
@@ -96,16 +105,19 @@ def values_in(
     cells: Tensor,
     count: Tensor,
 ) -> Tensor:
-    """Values of all cells whenever somebody chose, `(n, X·Y)` in the order of `choices_in`.
+    """Compute the values that a policy gives to all cells at every choice.
 
-    Beliefs are made of the looks from the cells that the people fixated.
+    The belief at each choice results from looks at the cells that the person has fixated so far.
 
     Args:
-        looks: at the picture.
-        observer: turns looks into belief.
-        acquire: the acquisition function of episodes that fixate cells `(A,)`.
-        cells: `(P, n)`.
-        count: `(P,)`.
+        looks: looks at the picture from every cell.
+        observer: the observer, which turns looks into a belief.
+        acquire: makes the acquisition function for episodes that fixate the cells `(A,)`.
+        cells: `(P, n)`, cells that each person fixated.
+        count: `(P,)`, number of fixations of each person.
+
+    Returns:
+        Values `(n, X·Y)`, in the order of `choices_in`.
     """
     seeing = (count > 1).nonzero()[:, 0]
     table = torch.zeros(len(cells), cells.shape[1] - 1, len(looks.grid))

@@ -172,7 +172,7 @@ def test_a_busy_server_is_asked_again(server):
     assert chat.ask("near a fork in").text == SAYS["fork"]
     assert pauses == [1.0, 7.0, 4.0, 60.0]
     server.first = [(503, busy, {})] * 5
-    with pytest.raises(DataError, match=r"no answer after 5 tries, the last: HTTP 503 \(busy\)"):
+    with pytest.raises(DataError, match=r"no answer after 5 attempts \(the last failed with: HTTP 503 \(busy\)\)"):
         chat.ask("near a fork in")
 
 
@@ -180,7 +180,7 @@ def test_a_server_that_is_not_there_is_told(tmp_path):
     closed = Server()
     closed.close()
     pauses = []
-    with pytest.raises(DataError, match="refused; is the server running"):
+    with pytest.raises(DataError, match=r"refused\); check that the server is running"):
         ChatServer(closed.url, "m", retries=2, sleep=pauses.append).ask("?")
     assert pauses == [1.0, 2.0]
 
@@ -188,7 +188,7 @@ def test_a_server_that_is_not_there_is_told(tmp_path):
 def test_refusals_say_what_to_do(server, call, capsys):
     cases = {
         401: ({"error": {"message": "bad key"}}, "environment variable"),
-        404: ({"error": "no such model"}, "no model 'm'"),
+        404: ({"error": "no such model"}, "has the model 'm'"),
         400: ({"error": {"message": "too long"}}, "too long"),
         200: (b"<html>hello</html>", "chat completion"),
     }
@@ -207,7 +207,7 @@ def test_a_key_does_not_follow_where_an_answer_points(server):
     try:
         for code in (302, 307):
             server.first = [(code, {}, {"Location": f"{other.url}/chat/completions"})]
-            with pytest.raises(InputError, match="points elsewhere"):
+            with pytest.raises(InputError, match="redirects to another address"):
                 ChatServer(server.url, "m", "secret").ask("?")
         assert other.requests == []
     finally:
@@ -217,7 +217,7 @@ def test_a_key_does_not_follow_where_an_answer_points(server):
 def test_no_more_is_asked_than_the_budget_pays(server, call, capsys):
     price = ["--output_price", "1000000"]
     assert main([*call, *price, "--budget", "20"]) == 1
-    assert "budget: 20 is spent (21)" in capsys.readouterr().err
+    assert "budget: the answers have cost 21, which reaches the limit of 20" in capsys.readouterr().err
     assert len(server.requests) == 3
     assert main([*call, *price, "--budget", "1000"]) == 0
     assert len(server.requests) == 9

@@ -169,7 +169,7 @@ def test_sharp_views_where_none_is_foveated(viewer):
         (["--detector.name", "yolox-nano"], "unknown detector 'yolox-nano'"),
         (["--depth", "3"], "depth: expected only convolutions one after the other"),
         (["--holdout", "1"], "holdout: expected a whole number from 2"),
-        (["--data.limit", "1"], "too few photographs to train and to judge by (1)"),
+        (["--data.limit", "1"], "data: expected at least 2 photographs, one to train on and one to hold out, got 1"),
     ],
 )
 def test_mistakes_are_told_in_one_line(arguments, message, tmp_path, capsys):

@@ -386,7 +386,7 @@ def test_annotations_without_any_of_the_classes(home, tmp_path, capsys):
 def test_a_model_is_asked_for(capsys, tmp_path):
     assert main(["--out", str(tmp_path)]) == 1
     assert "model: expected the detector's name or file, got none" in capsys.readouterr().err
-    with pytest.raises(InputError, match=r"detector\.name: expected none beside the model"):
+    with pytest.raises(InputError, match=r"detector\.name: expected nothing, as model already names the detector"):
         FitDetectorConfig(model=Path("a.onnx"), detector=DetectorConfig(name="yolov3")).named()
 
 
