@@ -1,4 +1,4 @@
-"""Write `constraints.txt`: the versions, in this environment, of all that the tests need. `make constraints`."""
+"""Write `constraints.txt`: the installed version of every package that the tests need. Run by `make constraints`."""
 
 import tomllib
 from collections.abc import Iterable, Iterator
@@ -12,13 +12,22 @@ FILE = Path(__file__).parents[1] / "constraints.txt"
 PROJECT = tomllib.loads((FILE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 HEAD = """\
-# The versions that the tests run with: `make constraints` writes them, `make setup` takes them.
+# The versions that the tests run with: `make constraints` writes them, `make setup` installs them.
 # Users are not bound by them; pyproject.toml has the lower bounds.
 """
 
 
 def needed(texts: Iterable[str], extras: frozenset[str], seen: set[tuple[str, frozenset[str]]]) -> Iterator[str]:
-    """Names of what is required, with some extras, and of what that requires."""
+    """Yield the names of all required packages, including the requirements of requirements.
+
+    Args:
+        texts: requirements.
+        extras: extras of the package whose requirements these are.
+        seen: packages with their extras that were visited already. New ones are added.
+
+    Yields:
+        The name of an installed package.
+    """
     for text in texts:
         requirement = Requirement(text)
         if requirement.marker and not any(requirement.marker.evaluate({"extra": extra}) for extra in ("", *extras)):
@@ -33,13 +42,13 @@ def needed(texts: Iterable[str], extras: frozenset[str], seen: set[tuple[str, fr
         try:
             requires = distribution(name).requires or []
         except PackageNotFoundError:
-            continue  # of a platform that this is not
+            continue  # the package is for another platform
         yield name
         yield from needed(requires, wanted, seen)
 
 
 def pins() -> list[str]:
-    """`name==version` of everything, sorted."""
+    """Return `name==version` of all required packages, sorted."""
     names = {*needed([*PROJECT["dependencies"], "semfov[dev]"], frozenset(), set())}
     return [f"{name}=={distribution(name).version.partition('+')[0]}" for name in sorted(names)]
 

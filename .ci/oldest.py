@@ -8,7 +8,13 @@ PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text
 
 
 def oldest(requirements: list[str]) -> list[str]:
-    """`name==bound` of every requirement with a lower bound.
+    """Return `name==bound` for every requirement that has a lower bound.
+
+    Args:
+        requirements: requirements, such as `torch>=2.6`.
+
+    Returns:
+        The pinned requirements.
 
     >>> oldest(["torch>=2.6", "kornia", "jsonargparse[signatures]>=4.49"])
     ['torch==2.6', 'jsonargparse==4.49']

@@ -1,1 +1,1 @@
-"""Documents, and what makes the site of them."""
+"""The documentation, and the code that builds the site from it."""

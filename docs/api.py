@@ -1,4 +1,4 @@
-"""What is public, by its home: the reference of the site is made from it, and tests ask it."""
+"""The public names and the modules that document them. The site's reference and the tests use this list."""
 
 import importlib
 import inspect
@@ -35,10 +35,10 @@ MODULES = (
 
 @cache
 def entries() -> dict[str, list[tuple[str, Any]]]:
-    """Names that each module is the home of, with what they stand for; nothing stands twice."""
+    """List the public classes and functions of each module. Each of them is listed in one module only."""
     seen: set[int] = set()
     found: dict[str, list[tuple[str, Any]]] = {}
-    # Rooms first: the package only hands on what is theirs.
+    # The top-level package comes last, because it re-exports names of the others.
     for name in (*MODULES[1:], MODULES[0]):
         module = importlib.import_module(name)
         public = getattr(module, "__all__", None) or [n for n, t in vars(module).items() if _own(t, name)]
@@ -55,7 +55,17 @@ def _own(thing: Any, module: str) -> bool:
 
 
 def place(module: str, name: str, thing: Any) -> str:
-    """Where the reference explains a thing: its home, or where it is defined if a module has that name, too.
+    """Return the name under which the reference documents a class or function.
+
+    This is the name in its public module, or the name where it is defined if a module has the public name, too.
+
+    Args:
+        module: the public module.
+        name: the public name in it.
+        thing: the class or function.
+
+    Returns:
+        The full name.
 
     >>> from semfov.sensor import foveate, glimpse
     >>> place("semfov.sensor", "foveate", foveate), place("semfov.sensor", "glimpse", glimpse)
@@ -73,7 +83,7 @@ def _is_module(name: str) -> bool:
 
 
 def pages() -> dict[str, str]:
-    """Markdown of the reference, a page for each module; mkdocstrings fills in the docstrings."""
+    """Write the pages of the reference in Markdown, one for each module. mkdocstrings fills in the docstrings."""
     found = {}
     for module, things in entries().items():
         about = (inspect.getdoc(importlib.import_module(module)) or "").split("\n\n")[0]

@@ -1,8 +1,9 @@
 """Fine-tune an observation model by backpropagation through the belief, so that search finds targets sooner.
 
-One look at a scene gives detections; the observation model turns their scores into likelihoods, Kaplan's rule fuses
-them into the belief, and the next fixation goes where the target is most probable. All of it is differentiable, so the
-probability that a soft choice of the next fixation lands on a target can be raised by changing alpha.
+A look at a scene gives detections. The observation model turns their scores into likelihoods, Kaplan's rule fuses them
+into the belief, and the next fixation goes to the cell where the target is most probable. All of this is
+differentiable. Gradient ascent on the model's parameters alpha raises the probability that the next fixation, drawn
+from a softmax, lands on a target.
 
 Run it from a checkout: python -m examples.finetune_observation
 """
@@ -19,7 +20,7 @@ import semfov
 
 @dataclass(frozen=True)
 class Looks:
-    """What is seen from some cells of a scene, and the cells that hold each target."""
+    """The detections from some cells of a scene, and the cells that contain each target."""
 
     grid: semfov.Grid
     cells: Tensor
@@ -28,7 +29,7 @@ class Looks:
 
 
 def looks_at(scenes: semfov.EmbeddedScenes, eye: semfov.Eye, starts: int) -> list[Looks]:
-    """What is seen from a few cells of every scene: these never change, so they are computed once."""
+    """Look at every scene from a few cells. The detections never change, so they are computed once."""
     looks = []
     for index in range(len(scenes)):
         scene = scenes[index]
@@ -43,7 +44,7 @@ def looks_at(scenes: semfov.EmbeddedScenes, eye: semfov.Eye, starts: int) -> lis
 
 
 def chance_of_hit(model: semfov.FovealObservationModel, looks: Looks, sharpness: float) -> Tensor:
-    """Probability that the next fixation, drawn from a softmax over the target's posterior, lands on the target."""
+    """Compute the probability that the next fixation, drawn from a softmax over the posterior, lands on the target."""
     grid, cells, seen = looks.grid, looks.cells, looks.detections
     observer = semfov.observers.Semantic(len(model.classes) + 1, model)
     belief = observer(observer.start(len(cells), grid, seen.scores), seen, grid.centres[cells], grid)
@@ -57,9 +58,9 @@ def chance_of_hit(model: semfov.FovealObservationModel, looks: Looks, sharpness:
 
 
 def main() -> None:
-    """Train on some embedded scenes and judge on others."""
+    """Train on some embedded scenes and evaluate on others."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scenes", type=int, default=6, help="scenes to train on; as many others judge (default: 6)")
+    parser.add_argument("--scenes", type=int, default=6, help="training scenes, and as many test scenes (default: 6)")
     parser.add_argument("--starts", type=int, default=12, help="first fixations in each scene (default: 12)")
     parser.add_argument("--steps", type=int, default=30, help="steps of Adam (default: 30)")
     arguments = parser.parse_args()
@@ -80,11 +81,12 @@ def main() -> None:
         loss.backward()
         optimiser.step()
         if step % 10 == 0:
-            print(f"step {step:3d}: chance of a hit at the next fixation {100 * float(hits.mean().detach()):.1f} %")
+            percent = 100 * float(hits.mean().detach())
+            print(f"step {step:3d}: probability of a hit at the next fixation {percent:.1f} %")
     model.eval()
     with torch.no_grad():
-        for name, judged in (("before", published), ("after", model)):
-            hits = torch.cat([chance_of_hit(judged, look, 30.0) for look in test])
+        for name, tested in (("before", published), ("after", model)):
+            hits = torch.cat([chance_of_hit(tested, look, 30.0) for look in test])
             print(f"{name} training, on other scenes: {100 * float(hits.mean()):.1f} %")
 
 

@@ -1,4 +1,4 @@
-"""See a photograph as an eye does: sharp where it looks, blurred around.
+"""See a photograph as an eye does: sharp at the fixation, and increasingly blurred around it.
 
 Run it from a checkout: python -m examples.foveate_image PHOTO.jpg --gaze 200 300 --out foveated.png
 """
@@ -11,19 +11,21 @@ import semfov
 
 
 def main() -> None:
-    """Foveate a photograph, or an embedded scene where none is given."""
+    """Foveate a photograph, or an embedded scene if none is given."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("photo", nargs="?", help="image file (default: an embedded scene)")
-    parser.add_argument("--gaze", nargs=2, type=float, metavar=("X", "Y"), help="in pixels (default: the centre)")
+    parser.add_argument(
+        "--gaze", nargs=2, type=float, metavar=("X", "Y"), help="fixation in pixels (default: the centre)"
+    )
     parser.add_argument("--sigma", type=float, default=100.0, help="width of the fovea in pixels (default: 100)")
-    parser.add_argument("--out", default="foveated.png", help="where to write (default: foveated.png)")
+    parser.add_argument("--out", default="foveated.png", help="file to write (default: foveated.png)")
     arguments = parser.parse_args()
 
     image = semfov.read_image(arguments.photo) if arguments.photo else semfov.EmbeddedScenes(["cup"])[0].image
     height, width = image.shape[-2:]
     gaze = image.new_tensor(arguments.gaze or ((width - 1) / 2, (height - 1) / 2))
 
-    # A batch of one image and one gaze; `semfov.Foveation` is the same as a module, for many gazes at one image.
+    # A batch of one image and one gaze. The module `semfov.Foveation` does the same for many gazes at one image.
     foveated = semfov.foveate(image[None], gaze[None], sigma=arguments.sigma)[0]
 
     pixels = (foveated.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()

@@ -1,4 +1,4 @@
-"""Explore a panorama by moving an eye and turning a head, or search it for a class, and draw where both went.
+"""Explore a panorama by moving an eye and turning a head, or search it for a class, and draw the path of both.
 
 Run it from a checkout: python -m examples.look_around PANORAMA.jpg cup --out head.png --film head.gif
 """
@@ -11,14 +11,14 @@ from semfov.viz.head import animate_head, plot_head_path
 
 
 def main() -> None:
-    """Look around in an equirectangular panorama, or in one made of embedded scenes where none is given."""
+    """Look around in an equirectangular panorama, or in one made of embedded scenes if none is given."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("panorama", nargs="?", help="image file (default: embedded scenes on a sphere)")
     parser.add_argument("target", nargs="?", help="class to search for (default: explore)")
-    parser.add_argument("--seconds", type=float, default=10.0, help="at most (default: 10)")
-    parser.add_argument("--out", default="head.png", help="where to write (default: head.png)")
-    parser.add_argument("--film", help="where to write an animation, a GIF (default: none)")
-    parser.add_argument("--seed", type=int, default=0, help="of the panorama that is made (default: 0)")
+    parser.add_argument("--seconds", type=float, default=10.0, help="maximum duration (default: 10)")
+    parser.add_argument("--out", default="head.png", help="figure to write (default: head.png)")
+    parser.add_argument("--film", help="animation (GIF) to write (default: none)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the panorama of embedded scenes (default: 0)")
     arguments = parser.parse_args()
 
     agent = HeadAgent.recommended("yolov3-tiny")

@@ -1,6 +1,6 @@
-"""An observer of your own: remember the largest score of every class in every cell.
+"""Write your own observer: remember the highest score of every class in every cell.
 
-It needs no prior and no rule of fusion, and one confident look outweighs any number of doubtful ones.
+This observer needs no prior and no fusion rule. One confident look outweighs any number of uncertain ones.
 
 Run it from a checkout: python -m examples.own_observer
 """
@@ -19,53 +19,53 @@ from semfov.sensor import named_sensor
 
 @dataclass(frozen=True)
 class ScoreLook(semfov.observers.Look):
-    """What looks say: the largest score of each class in each cell."""
+    """The evidence of B looks: the highest score of each class in each cell."""
 
     scores: Tensor  # (B, X·Y, K+1)
     distance: Tensor  # (B, X·Y), from the fixation
 
     def __getitem__(self, index: Tensor | slice) -> "ScoreLook":
-        """Some of the looks."""
+        """Select looks by index or slice."""
         return ScoreLook(self.scores[index], self.distance[index])
 
     @classmethod
     def join(cls, looks: Sequence["ScoreLook"]) -> "ScoreLook":
-        """All looks of several batches."""
+        """Join the looks of several batches."""
         return cls(torch.cat([look.scores for look in looks]), torch.cat([look.distance for look in looks]))
 
 
 @dataclass(frozen=True)
 class ScoreBelief(semfov.Belief):
-    """What is believed: the largest score so far."""
+    """The belief: the highest score so far of each class in each cell."""
 
     scores: Tensor  # (B, X·Y, K+1)
-    closest: Tensor  # (B, X·Y), distance to the closest fixation; every belief has it
+    closest: Tensor  # (B, X·Y), distance to the closest fixation, which every belief has
 
     def probability(self, target: int | Tensor) -> Tensor:
-        """Largest score of the target in each cell, `(B, X·Y)`."""
+        """Return the highest score of the target in each cell, `(B, X·Y)`."""
         return self.scores[torch.arange(len(self.scores)), :, target]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "ScoreBelief":
-        """The belief with both tensors replaced."""
+        """Apply a function to both tensors."""
         return ScoreBelief(function(self.scores), function(self.closest))
 
 
 class BestScore(semfov.observers.Observer):
-    """Keeps the largest score of each class in each cell."""
+    """Keep the highest score of each class in each cell."""
 
     def __init__(self, components: int) -> None:
         super().__init__()
         self.components = components
 
     def start(self, batch: int, grid: semfov.Grid, like: Tensor) -> ScoreBelief:
-        """Nothing was seen."""
+        """Start with a score of 0 everywhere, as nothing has been seen."""
         scores = like.new_zeros(batch, len(grid), self.components)
         return ScoreBelief(scores, torch.full_like(scores[..., 0], torch.inf))
 
     def weigh(
         self, detections: semfov.Detections, fixation: Tensor, grid: semfov.Grid, target: int | None = None
     ) -> ScoreLook:
-        """The largest score among the boxes that overlap a cell."""
+        """Take the highest score of each class among the boxes that overlap a cell."""
         covered = grid.footprint(detections.boxes) & detections.mask[..., None]  # (B, L, X·Y)
         scores = detections.scores.new_zeros(len(fixation), len(grid), self.components)
         for box in range(covered.shape[1]):
@@ -73,7 +73,7 @@ class BestScore(semfov.observers.Observer):
         return ScoreLook(scores, grid.distance(fixation))
 
     def update(self, belief: semfov.Belief, look: semfov.observers.Look) -> ScoreBelief:
-        """The belief after one more look."""
+        """Update the belief with one more look."""
         assert isinstance(belief, ScoreBelief)
         assert isinstance(look, ScoreLook)
         return ScoreBelief(torch.maximum(belief.scores, look.scores), torch.minimum(belief.closest, look.distance))
@@ -91,7 +91,7 @@ def main() -> None:
         LiveLooks(eye, eye.open(image), grid),
         BestScore(len(detector.classes) + 1),
         semfov.acquisition.TargetPosterior(cup),
-        torch.tensor([0]),  # the cell that each episode starts in; here is one episode
+        torch.tensor([0]),  # the start cell of each episode; here, there is one episode
         Greedy(drawn_by(torch.Generator().manual_seed(0), len(grid), image)),
         most=20,
         ends=lambda step: goal[step.cell],

@@ -1,7 +1,8 @@
-"""Plug in a detector of your own as an ONNX file, and fit an observation model to what it sees off-centre.
+"""Plug in your own detector as an ONNX file, and fit an observation model to its scores away from the fovea.
 
 Run it from a checkout: python -m examples.own_onnx_detector MODEL.onnx --out model.safetensors
-Without a file it exports YOLOv3-tiny and takes that. For real use, fit on thousands of photographs: `train.fit_fom`.
+Without a file, it exports YOLOv3-tiny and uses that. For real use, fit on thousands of photographs with
+`train.fit_fom`.
 """
 
 import argparse
@@ -14,11 +15,11 @@ import semfov
 from semfov.detection.export import export_onnx
 from semfov.observation.matching import match
 
-EDGES = [n * 50 / 640 for n in range(1, 8)]  # borders of the levels of distance, in longer sides of the image
+EDGES = [n * 50 / 640 for n in range(1, 8)]  # borders between levels of distance, in units of the image's longer side
 
 
 def look_around(eye: semfov.Eye, scenes: semfov.EmbeddedScenes, looks: int) -> list[torch.Tensor]:
-    """Score vectors, distances to the fovea and true classes of what is detected from random fixations."""
+    """Return score vectors, distances to the fovea and true classes of the detections from random fixations."""
     generator = torch.Generator().manual_seed(0)
     scores, distances, labels = [], [], []
     for index in range(len(scenes)):
@@ -33,12 +34,12 @@ def look_around(eye: semfov.Eye, scenes: semfov.EmbeddedScenes, looks: int) -> l
 
 
 def main() -> None:
-    """Fit on some embedded scenes, judge on others, search with the result."""
+    """Fit on some embedded scenes, evaluate on others, and search with the result."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("model", nargs="?", help="ONNX detector (default: YOLOv3-tiny, exported)")
+    parser.add_argument("model", nargs="?", help="ONNX detector (default: an export of YOLOv3-tiny)")
     parser.add_argument("--scenes", type=int, default=8, help="scenes to fit on (default: 8)")
     parser.add_argument("--looks", type=int, default=6, help="fixations in each scene (default: 6)")
-    parser.add_argument("--out", default="model.safetensors", help="where to write (default: model.safetensors)")
+    parser.add_argument("--out", default="model.safetensors", help="file to write (default: model.safetensors)")
     arguments = parser.parse_args()
 
     with tempfile.TemporaryDirectory() as folder:
@@ -65,7 +66,7 @@ def main() -> None:
         scores, distances, labels = look_around(eye, others, arguments.looks)
     for name, probabilities in (("raw scores", scores), ("fitted model", model.calibrate(scores, distances))):
         loss = -probabilities.gather(-1, labels[:, None]).clamp(min=1e-6).log().mean()
-        print(f"{name}: {loss:.2f} nats lost per detection on other scenes")
+        print(f"{name}: negative log likelihood of {loss:.2f} nats per detection on other scenes")
 
     observer = semfov.observers.Semantic(len(detector.classes) + 1, model)
     search, explore = semfov.policies.Predictive(model), semfov.policies.KL(model)

@@ -1,7 +1,7 @@
-"""A policy of your own: look where the target is most probable, but not beside what was fixated already.
+"""Write your own policy: look where the target is most probable, but not close to earlier fixations.
 
-The fovea has seen the surroundings of a fixation, too. Inhibition of return that is as wide as the fovea therefore goes
-to places that are still blurred, as the gaze of people does (Klein, 2000).
+The fovea also shows the surroundings of a fixation sharply. Inhibition of return that is as wide as the fovea directs
+the gaze to places that are still blurred. People's gaze shows inhibition of return as well (Klein, 2000).
 
 Run it from a checkout: python -m examples.own_policy
 """
@@ -18,6 +18,10 @@ class InhibitedPosterior(semfov.acquisition.AcquisitionFunction):
     r"""Posterior of the target times one minus a Gaussian of the distance to the closest fixation so far.
 
     .. math:: a(x) = P(C^x = t) \left(1 - \exp\left(-\frac{d(x)^2}{2 w^2}\right)\right)
+
+    Args:
+        target: class t to search for.
+        width: w in units of the image's longer side.
     """
 
     def __init__(self, target: int | Tensor, width: float) -> None:
@@ -26,16 +30,16 @@ class InhibitedPosterior(semfov.acquisition.AcquisitionFunction):
         self.width = width
 
     def forward(self, belief: semfov.Belief, visited: Tensor) -> Tensor:
-        """Values `(B, X·Y)`."""
+        """Compute the values of all cells, `(B, X·Y)`."""
         inhibition = torch.exp(-belief.closest.square() / (2 * self.width**2))
         return belief.probability(self.target) * (1 - inhibition)
 
 
 class WideInhibition(policies.Policy):
-    """Search by `InhibitedPosterior`; the definition of the class registers it under its name.
+    """Search with `InhibitedPosterior`. Defining the class registers the policy under its name.
 
     Args:
-        width: w in longer sides of the image.
+        width: width w of the inhibition, in units of the image's longer side.
     """
 
     name = "wide-inhibition"
@@ -46,12 +50,12 @@ class WideInhibition(policies.Policy):
         self.width = width
 
     def forward(self, target: int | Tensor | None, grid: semfov.Grid) -> semfov.acquisition.AcquisitionFunction:
-        """The acquisition function for a target on a grid."""
+        """Make the acquisition function for a target on a grid."""
         return InhibitedPosterior(policies.wanted(target, self.name), self.width)
 
 
 def main() -> None:
-    """Search embedded scenes for everything in them, without the inhibition and with it."""
+    """Search embedded scenes for all their classes, without the wide inhibition and with it."""
     detector = semfov.load_detector("yolov3-tiny")
     eye = semfov.Eye(named_sensor("published"), detector).eval().requires_grad_(False)
     observer = semfov.observers.Semantic(len(detector.classes) + 1)

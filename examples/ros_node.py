@@ -1,6 +1,6 @@
-"""A ROS 2 node that searches what a camera sees: it publishes what it saw, and where the camera should look next.
+"""A ROS 2 node that searches a camera's images: it publishes detections, and the point where to look next.
 
-Run it where ROS 2 is sourced: python -m examples.ros_node --ros-args -p target:=cup -r image:=/camera/image_raw
+Source ROS 2 first, then run it: python -m examples.ros_node --ros-args -p target:=cup -r image:=/camera/image_raw
 """
 
 import rclpy
@@ -14,7 +14,7 @@ from semfov.io import ros
 
 
 class GazeNode(Node):
-    """Looks once at every image, and moves its gaze."""
+    """Look once at every image, and move the gaze."""
 
     def __init__(self) -> None:
         super().__init__("semfov_gaze")
@@ -27,7 +27,7 @@ class GazeNode(Node):
         self.create_subscription(Image, "image", self.look, 1)
 
     def look(self, message: Image) -> None:
-        """See, believe, and say where to look next."""
+        """Look at an image, update the belief, and publish the detections and the next gaze point."""
         moment = self.live.step(ros.picture(message))
         of = {"stamp": message.header.stamp, "frame": message.header.frame_id}
         found = ros.detection_array(moment.detections, self.agent.classes[1:], **of)
@@ -39,7 +39,7 @@ class GazeNode(Node):
 
 
 def main() -> None:
-    """Look until the node is stopped."""
+    """Run the node until it is stopped."""
     rclpy.init()
     rclpy.spin(GazeNode())
 

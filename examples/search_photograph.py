@@ -1,4 +1,4 @@
-"""Search a photograph for a class by moving a fovea, and draw where the gaze went.
+"""Search a photograph for a class by moving a fovea, and draw the scanpath.
 
 Run it from a checkout: python -m examples.search_photograph PHOTO.jpg cup --out scanpath.png
 """
@@ -10,15 +10,16 @@ from semfov import viz
 
 
 def main() -> None:
-    """Search a photograph, or an embedded scene where none is given."""
+    """Search a photograph, or an embedded scene if none is given."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("photo", nargs="?", help="image file (default: an embedded scene)")
     parser.add_argument("target", nargs="?", default="cup", help="class to search for (default: cup)")
-    parser.add_argument("--out", default="scanpath.png", help="where to write (default: scanpath.png)")
+    parser.add_argument("--out", default="scanpath.png", help="figure to write (default: scanpath.png)")
     arguments = parser.parse_args()
 
-    # An eye (a sensor before a detector), an observer that turns looks into belief, and a policy that chooses where to
-    # look next. `.published` is the paper's agent; `semfov.ActivePerception(...)` puts parts of your own together.
+    # The agent consists of an eye (a sensor followed by a detector), an observer that turns looks into a belief, and a
+    # policy that chooses where to look next. `.published` gives the agent of the paper; `semfov.ActivePerception(...)`
+    # combines your own parts.
     agent = semfov.ActivePerception.recommended("yolov3-tiny")
 
     image = semfov.read_image(arguments.photo) if arguments.photo else semfov.EmbeddedScenes(agent.classes[1:])[1].image

@@ -66,7 +66,7 @@ def test_own_policy_needs_fewer_gaze_shifts():
 
 def test_own_sensor_shows_what_is_too_small_for_the_fovea():
     output = run("own_sensor")
-    found = re.findall(r"^([\w ]+): (\d+) of (\d+) objects are named when they are fixated$", output, re.MULTILINE)
+    found = re.findall(r"^([\w ]+): (\d+) of (\d+) objects are recognised when they are fixated$", output, re.MULTILINE)
     assert [name for name, _, _ in found] == ["published fovea", "magnifying glass"]
     assert 2 * int(found[0][1]) < int(found[1][1])
     assert found[0][2] == found[1][2] != "0"
@@ -74,7 +74,7 @@ def test_own_sensor_shows_what_is_too_small_for_the_fovea():
 
 def test_own_detector_gets_an_observation_model(tmp_path):
     output = run("own_onnx_detector", "--scenes", 3, "--looks", 4, "--out", tmp_path / "model.safetensors")
-    raw, fitted = (float(value) for value in re.findall(r": ([\d.]+) nats", output))
+    raw, fitted = (float(value) for value in re.findall(r"likelihood of ([\d.]+) nats", output))
     assert fitted < raw
     model = semfov.FovealObservationModel.from_pretrained(tmp_path / "model.safetensors")
     assert len(model.classes) == 80

@@ -1,4 +1,4 @@
-"""Applications that fit semfov's models to data."""
+"""Commands that fit semfov's models to data."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ def _leave(*_: object) -> None:
     os._exit(128 + signal.SIGINT)
 
 
-# While `python -m train.…` looks for its module: Ctrl-C before everything is imported ends it in one line, too.
-# (Nothing can be shared with other packages here: importing semfov is what takes so long.)
+# This runs while `python -m train.…` looks for its module, so that Ctrl-C during the slow imports prints one line
+# and no traceback. The code is repeated in `eval`, because sharing it would require the slow import of semfov.
 if sys.argv[:1] == ["-m"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, _leave)

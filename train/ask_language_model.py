@@ -1,13 +1,15 @@
-"""Context from language: `python -m train.ask_language_model` fills a table of what is beside what by asking a model.
+r"""Ask a language model for context: `python -m train.ask_language_model` makes a table of objects that occur together.
 
     python -m train.ask_language_model --url http://127.0.0.1:8080/v1 --model NAME --out runs/asked
-    LANGUAGE_MODEL_KEY=… python -m train.ask_language_model --url https://HOST/v1 --model NAME --input_price 0.15 \\
+    LANGUAGE_MODEL_KEY=… python -m train.ask_language_model --url https://HOST/v1 --model NAME --input_price 0.15 \
         --output_price 0.6 --budget 1
 
-The server is any with the chat-completions interface; every question is asked at temperature 0. Answers are kept in
-`answers.jsonl` as they come: a command that was stopped goes on where it was when it is given again, and a question is
-never paid for twice. Tokens are counted as the server counts them. `beside.csv` and `heights.csv` go to
-`python -m train.fit_context --table … --heights …`, which judges them on photographs and fits how much they count.
+Any server with the chat-completions interface works. All questions are asked at temperature 0. Each answer is written
+to `answers.jsonl` as soon as it arrives. If the command is interrupted, repeat it: it continues where it stopped and
+pays for no question twice. The cost is computed from the numbers of tokens that the server reports.
+
+The tables `beside.csv` and `heights.csv` serve as input for `python -m train.fit_context --table … --heights …`, which
+evaluates them on photographs and fits their weights.
 """
 
 import sys

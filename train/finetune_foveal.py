@@ -1,14 +1,15 @@
-"""Train a detector's heads on foveal views: `python -m train.finetune_foveal` teaches them to see what is blurred.
+"""Fine-tune a detector's heads on foveal views: `python -m train.finetune_foveal` trains it to see blurred objects.
 
     python -m train.finetune_foveal --data.root DIR --data.annotations instances.json --out runs/finetune_foveal
 
-Without photographs it uses the embedded scenes, which is only good for trying it out.
+Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
-Every photograph is seen through `RandomFoveation` from a few random places. The last convolutions before the heads of
-YOLOv3-tiny, or of another of Darknet's detectors, are trained by YOLOv3's loss on what the rest of the network gives
-for these views, which is computed once. Photographs that were held out choose learning rate and epoch. The folder `out`
-gets the new detector (`<name>.onnx`), which `semfov.load_detector` takes, and a report. A run that was stopped goes on
-where it was when the same command is given again. Compare it with calibrating: `python -m eval.foveal_training`.
+`RandomFoveation` foveates every photograph at a few random points. The command trains the last convolutions before the
+heads of YOLOv3-tiny, or of another Darknet detector, with YOLOv3's loss. The features of the other layers are computed
+once for each view. The learning rate and the epoch are chosen on held-out photographs.
+
+The folder `out` gets a report and the new detector (`<name>.onnx`), which `semfov.load_detector` loads. If a run is
+interrupted, repeat the command to continue. `python -m eval.foveal_training` compares the result with calibration.
 """
 
 import sys

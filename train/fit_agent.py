@@ -1,15 +1,15 @@
-"""Train an agent that searches: `python -m train.fit_agent` learns where to look by trial, with others' PPO.
+"""Train a search agent with reinforcement learning: `python -m train.fit_agent` learns where to look from rewards.
 
     python -m train.fit_agent --out runs/fit_agent
 
-It needs `pip install "semfov[agents]"`. The agent acts in `semfov/GazeSearch-v0` and sees the belief alone: the
-probability of the target in every cell, which cells it has fixated, and where its gaze is. A small convolutional
-network gives every cell a number, and `sb3_contrib.MaskablePPO` learns it from rewards: 1 for the find, minus the price
-of every look. Nothing tells it that a probable cell is a good one.
+The command needs `pip install "semfov[agents]"`. The agent acts in the environment `semfov/GazeSearch-v0` and observes
+the belief alone: the probability of the target in every cell, the cells that it has fixated, and the position of its
+gaze. A small convolutional network computes a logit for every cell. `sb3_contrib.MaskablePPO` trains it with a reward
+of 1 for finding the target and a cost for every look. The agent has to learn by itself that probable cells are good.
 
-Without photographs it learns in embedded scenes and is judged in embedded scenes by another seed, beside random gaze
-and the hand-made policy whose belief it sees, from the same starts. The folder `out` gets the parameters
-(`agent.safetensors`) and a report.
+Without photographs, the agent learns in embedded scenes and is evaluated in other embedded scenes. It is compared with
+random gaze and with the hand-made policy whose belief it observes, from the same starting points. The folder `out` gets
+the parameters (`agent.safetensors`) and a report.
 """
 
 import sys

@@ -1,12 +1,15 @@
-"""Fit the context of searches: `python -m train.fit_context` counts where the classes are, and beside what.
+"""Fit the context of searches: `python -m train.fit_context` counts where classes occur, and which occur together.
 
     python -m train.fit_context --data.root DIR --data.annotations instances.json --out runs/fit_context
 
-It reads annotations alone and takes seconds. The folder `out` gets the prior (`<name>.safetensors`) and a report that
-judges it on photographs that were held out. How much it should count beside a belief that has looked is another
-matter: with `--weigh 400` its weights are fitted on looks at so many of the photographs (shared with `train.fit_fom`
-and `train.fit_search` under the same `--cache`); without, they are 1.
-Use it with `--policies [target-evidence] --belief.context both`, and
+The command reads annotations alone and takes seconds. The folder `out` gets the prior (`<name>.safetensors`) and a
+report that evaluates it on held-out photographs.
+
+In a search, the context is added to a belief with two weights. By default they are 1. With `--weigh 400` they are
+fitted on looks at 400 of the photographs. `train.fit_fom` and `train.fit_tempering` share these looks under the same
+`--cache`.
+
+Use the prior with `--policies [target-evidence] --belief.context both` and
 `--belief.context_model runs/fit_context/<name>.safetensors`.
 """
 

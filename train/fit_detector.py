@@ -1,18 +1,19 @@
-"""Fit everything to a detector of your own: `python -m train.fit_detector MODEL` makes a folder for the agent.
+"""Fit all models to your own detector: `python -m train.fit_detector MODEL` makes a folder that the agent loads.
 
     python -m train.fit_detector mine.onnx --data.root PHOTOS --data.annotations instances.json --out mymodels
     python -m eval.demo PHOTO.jpg --target cup --models mymodels
     python -m eval.search --models mymodels --data.root PHOTOS --data.annotations instances.json
 
-Without photographs it uses the embedded scenes, which is only good for trying it out.
+Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
-MODEL is a name or a file, as for `semfov.load_detector` (docs/detectors.md); a few dozen photographs with boxes are
-enough to begin with. Every photograph is looked at from every cell. To these looks are fitted an observation model with
-its misses, the exponent of its likelihoods, target evidence with the thresholds of decisions, and a map of all classes.
-Each is compared with raw scores on photographs that were held out, and what is no better is not used.
+MODEL is a name or a file, as for `semfov.load_detector` (docs/detectors.md). A few dozen photographs with boxes are
+enough to begin with. The detector looks at every photograph from every cell. Four parts are fitted to these looks: an
+observation model with its miss rates, the exponent of its likelihoods, target evidence with the thresholds of
+decisions, and a map of all classes. Each part is compared with raw scores on held-out photographs. The agent uses only
+the parts that are better.
 
-The folder `out` gets the models, a manifest, a report and figures. A run that was stopped goes on where it was when the
-same command is given again. `semfov.fit_detector` does the same in Python.
+The folder `out` gets the models, a manifest, a report and figures. If a run is interrupted, repeat the command to
+continue. `semfov.fit_detector` does the same in Python.
 """
 
 import sys

@@ -2,12 +2,14 @@
 
     python -m train.fit_fom --data.root DIR --data.annotations instances.json --out runs/fit_fom
 
-Without photographs it uses the embedded scenes, which is only good for trying it out.
+Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
-Every photograph is fixated at random points; detections are matched to the annotated boxes, and p(scores | class,
-distance to the fovea) is fitted to them. The folder `out` gets the model (`<name>.safetensors`), a report that judges
-it on photographs that it was not fitted on, and a reliability diagram. A run that was stopped goes on where it was;
-more machines share the work under `torchrun`. Use the model with `--belief.model runs/fit_fom/<name>.safetensors`.
+Every photograph is fixated at random points. The detections are matched to the annotated boxes, and p(scores | class,
+distance to the fovea) is fitted to them. The folder `out` gets the model (`<name>.safetensors`), a report that
+evaluates it on held-out photographs, and a reliability diagram. If a run is interrupted, repeat the command to
+continue. Several machines can share the work under `torchrun`.
+
+Use the model with `--belief.model runs/fit_fom/<name>.safetensors`.
 """
 
 import sys

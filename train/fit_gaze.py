@@ -1,20 +1,21 @@
-"""Learn where to look: `python -m train.fit_gaze` trains a gaze policy through whole searches.
+"""Learn where to look: `python -m train.fit_gaze` trains a gaze policy end to end, through whole searches.
 
     python -m train.fit_gaze --data.root DIR --data.annotations instances.json --out runs/fit_gaze
 
-Without photographs it uses the embedded scenes, which is only good for trying it out.
+Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
-Nothing is computed beforehand. In every step a few photographs are searched: the fovea is moved, the detector looks,
-the belief is updated, and a small network over the belief says where to look next. The fixation is drawn by
-Gumbel-softmax and passed straight through, so the loss, which asks that the next fixation lands on the target, is
-differentiated through belief, detector and foveation, back to the choices that brought the fovea there. Only the
-network learns (and the width of the fovea, with `--learn_sigma true`); detector and belief stay as they are. It starts
-as non-predictive search with tempering 0.25 and footprint `box_centre`, and is compared with that.
+Each training step searches a few photographs: the fovea moves, the detector looks, the belief is updated, and a small
+network computes from the belief where to look next. Fixations are drawn with a straight-through Gumbel-softmax. The
+loss rewards a next fixation on the target. Its gradient flows through belief, detector and foveation back to the
+choices of the earlier fixations. Only the network is trained, and with `--learn_sigma true` also the width of the
+fovea. Before training, the network is equivalent to non-predictive search with tempering 0.25 and footprint
+`box_centre`, and the report compares it with this search.
 
-A run that was stopped goes on where it was when the same command is given again, and on the same machine ends as if it
-had not been. The folder `out` gets the model (`<name>.safetensors`), a checkpoint, and a report that judges the model
-and its start on photographs that it was not trained on. Expect a few seconds a step on one CPU core.
-Use it with `--policies [learned] --gaze_model runs/fit_gaze/<name>.safetensors`.
+If a run is interrupted, repeat the command to continue. On the same machine, the result is the same as without the
+interruption. The folder `out` gets the model (`<name>.safetensors`), a checkpoint, and a report that evaluates the
+policy before and after training on held-out photographs. A step takes a few seconds on one CPU core.
+
+Use the model with `--policies [learned] --gaze_model runs/fit_gaze/<name>.safetensors`.
 """
 
 import sys

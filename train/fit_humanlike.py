@@ -1,13 +1,14 @@
-"""Fit how people look: `python -m train.fit_humanlike` brings a policy as near to people as habits can.
+"""Fit how people look: `python -m train.fit_humanlike` models people's next fixations with a policy and gaze habits.
 
     python -m train.fit_humanlike --root DIR --fixations fixations.json --out runs/fit_humanlike
 
-The pictures are looked at from every cell, and each person's scanpath is followed: whenever somebody chose where to
-look next, the policies are asked what they make of every cell. How people chose among the cells is then fitted by
-maximum likelihood, one term after another: a noisy choice by the policy's value, a bias for the centre, saccade
-lengths, and inhibition of return that fades. It is fitted on half of the people in half of the pictures, and judged by
-the other people in the other pictures. The folder `out` gets the model (`<name>.safetensors`,
-`semfov.gaze.GazeHabits`) and a report. Draw fixations by the model with `semfov.gaze.Habitual`.
+The command follows each person's scanpath. At every fixation, it computes the value that each policy gives to every
+cell. The person's choice of the next cell is then fitted by maximum likelihood, one term after another: a noisy choice
+by the policy's value, a centre bias, the distribution of saccade lengths, and inhibition of return that fades. The
+model is fitted on half of the people in half of the pictures, and evaluated on the other people in the other pictures.
+
+The folder `out` gets the model (`<name>.safetensors`, a `semfov.gaze.GazeHabits`) and a report. `semfov.gaze.Habitual`
+draws fixations from the model.
 """
 
 import sys

@@ -1,13 +1,14 @@
-"""Learn the map of all classes: `python -m train.fit_map` trains what the recommended agent explores by.
+"""Learn the map of all classes: `python -m train.fit_map` trains the model with which the recommended agent explores.
 
     python -m train.fit_map --data.root DIR --data.annotations instances.json --out runs/fit_map
 
-Without photographs it uses the embedded scenes, which is only good for trying it out.
+Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
-Every photograph is looked at from every cell (shared with `eval.explore` under the same `--cache`). Then the model
-explores them and learns from its own looks what is where, and how much more the next look will tell. The folder `out`
-gets the model (`<name>.safetensors`) and a report that judges it on photographs that were held out. Looking goes on
-where it was when the same command is given again.
+The detector looks at every photograph from every cell; `eval.explore` shares these looks under the same `--cache`. Then
+the model explores the photographs. From its own looks it learns which classes are in each cell, and how many more cells
+the next look will classify correctly. The folder `out` gets the model (`<name>.safetensors`) and a report that
+evaluates it on held-out photographs. If the looking is interrupted, repeat the command to continue.
+
 Use it with `python -m eval.explore --policies [learned-map] --belief.map_model runs/fit_map/<name>.safetensors`.
 """
 

@@ -1,15 +1,16 @@
-"""Learn evidence for targets: `python -m train.fit_search` trains what the recommended agent believes and decides by.
+"""Learn evidence for targets: `python -m train.fit_search` trains the model with which the recommended agent searches.
 
     python -m train.fit_search --data.root DIR --data.annotations instances.json --out runs/fit_search
 
-Without photographs it uses the embedded scenes, which is only good for trying it out.
+Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
-Every photograph is looked at from every cell (shared with `eval.search` under the same `--cache`). Then the model
-searches them for classes that they hold and for classes that they do not, and learns from its own looks where the
-target is, whether it is there at all, and where to look next. The folder `out` gets the model (`<name>.safetensors`)
-with the thresholds of its decisions, and a report that judges it on photographs that were held out. Looking goes on
-where it was when the same command is given again.
-Use it with `--policies [target-evidence] --belief.target_model runs/fit_search/<name>.safetensors`.
+The detector looks at every photograph from every cell; `eval.search` shares these looks under the same `--cache`. Then
+the model searches the photographs for present and for absent classes. From its own looks it learns where the target is,
+whether it is present, and where to look next. The folder `out` gets the model (`<name>.safetensors`) with the
+thresholds of its decisions, and a report that evaluates it on held-out photographs. If the looking is interrupted,
+repeat the command to continue.
+
+Use the model with `--policies [target-evidence] --belief.target_model runs/fit_search/<name>.safetensors`.
 """
 
 import sys

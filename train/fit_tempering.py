@@ -1,14 +1,15 @@
-"""Fit the tempering of likelihoods: `python -m train.fit_tempering` finds the exponent with which looks count best.
+"""Fit the tempering of likelihoods: `python -m train.fit_tempering` finds the exponent τ that guides the gaze best.
 
     python -m train.fit_tempering --data.root DIR --data.annotations instances.json --out runs/fit_tempering
 
-Without photographs it uses the embedded scenes, which is only good for trying it out.
+Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
-Every photograph is fixated at random points (the looks are shared with `train.fit_fom` under the same `--cache`). For
-each class that may be searched for, the looks are fused one after another with likelihoods to the power of τ, and after
-each of them the target's posterior tells where to look next. The folder `out` gets a report with a row for every τ: how
-often that fixation hits the target, on photographs to choose τ by and on photographs that were held out.
-Use it with `--belief.tempering τ`, or as the `tempering` of one policy.
+Every photograph is fixated at random points; `train.fit_fom` shares these looks under the same `--cache`. For each
+class that may be searched for, the looks are fused one after another with likelihoods to the power of τ. After each
+look, the most probable cell is the next fixation. The folder `out` gets a report that lists for every τ how often this
+fixation hits the target, on photographs to choose τ by and on held-out photographs.
+
+Use the best exponent with `--belief.tempering τ`, or as the `tempering` of one policy.
 """
 
 import sys

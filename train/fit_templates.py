@@ -1,13 +1,14 @@
-"""Fit class templates: `python -m train.fit_templates` averages what objects look like to a detector.
+"""Fit class templates: `python -m train.fit_templates` averages a detector's features over the objects of each class.
 
     python -m train.fit_templates --data.root DIR --data.annotations instances.json --out runs/fit_templates
 
-Without photographs it uses the embedded scenes, which is only good for trying it out.
+Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
-Every photograph is passed through the detector once, sharp. The features at the centres of the annotated objects are
-averaged for each class, which gives the templates that the search `ivsn` goes by. The folder `out` gets the model
-(`<name>.safetensors`) and a report that judges it on photographs that were held out.
-Use it with `--policies [ivsn] --templates runs/fit_templates/<name>.safetensors`.
+Every photograph is passed through the detector once, without foveation. The features at the centres of the annotated
+objects are averaged for each class. These averages are the templates of the search policy `ivsn`. The folder `out` gets
+the model (`<name>.safetensors`) and a report that evaluates it on held-out photographs.
+
+Use the model with `--policies [ivsn] --templates runs/fit_templates/<name>.safetensors`.
 """
 
 import sys

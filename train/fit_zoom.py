@@ -1,13 +1,13 @@
-"""Fit evidence by magnification: `python -m train.fit_zoom` looks at mosaics and learns where closer looks pay.
+"""Fit evidence by magnification: `python -m train.fit_zoom` learns from mosaics where closer looks find objects.
 
     python -m train.fit_zoom --data.root DIR --data.annotations instances.json --out runs/fit_zoom
 
-Without photographs it uses the embedded scenes, which is only good for trying it out.
+Without photographs, the command uses the embedded scenes, which is enough only to try it out.
 
-Mosaics of 4 × 4 and of 8 × 6 photographs are looked at in windows half a window apart, at all magnifications. What
-coarse looks show and what closer looks find in the same place is learned from. The folder `out` gets the model
-(`<name>.safetensors`), and a report that judges it on mosaics of photographs that were held out. Looking goes on where
-it was when the same command is given again.
+The detector looks at mosaics of 4 × 4 and of 8 × 6 photographs, in windows at steps of half a window and at all
+magnifications. The model learns to predict the results of closer looks from coarser looks at the same place. The folder
+`out` gets the model (`<name>.safetensors`), and a report that evaluates it on mosaics of held-out photographs. If the
+looking is interrupted, repeat the command to continue.
 """
 
 import sys

@@ -1,1 +1,1 @@
-"""The site: how it is put together and built."""
+"""Assemble and build the documentation site."""

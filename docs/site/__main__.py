@@ -1,7 +1,7 @@
 """Build the site from the repository, without a network and with warnings as errors: `python -m docs.site`.
 
-Pages are put together in `build/pages` and become HTML in `build/site`, by Zensical. `mkdocs.yml` is its configuration;
-Material for MkDocs, which it succeeds, reads the same file.
+The pages are assembled in `build/pages`. Zensical renders them to HTML in `build/site`. Its configuration is
+`mkdocs.yml`, which its predecessor, Material for MkDocs, can read as well.
 """
 
 import argparse
@@ -16,18 +16,18 @@ from docs.site.tutorials import tutorials
 PAGES = ROOT / "build" / "pages"
 SITE = ROOT / "build" / "site"
 _COMPLAINT = re.compile(r"(?im)^.*(?:warning|griffe:|error).*$")
-"""What is said of docstrings, too, which the strict mode lets pass."""
+"""Matches all messages, among them complaints about docstrings, which the strict mode ignores."""
 
 
 def build(*, run: bool) -> None:
-    """Put the pages together and render them.
+    """Assemble the pages and render them.
 
     Args:
         run: execute the tutorials.
 
     Raises:
-        LookupError: a page leads to what is not there.
-        ValueError: a tutorial warned, or rendering did.
+        LookupError: a page has a broken link, or names something that does not exist.
+        ValueError: a tutorial or the rendering gave a warning.
     """
     began = time.monotonic()
     stage = Stage(PAGES)
@@ -38,16 +38,18 @@ def build(*, run: bool) -> None:
     print(f"pages: {time.monotonic() - began:.0f} s")
     call = [sys.executable, "-m", "zensical", "build", "--clean", "--strict"]
     done = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=False)
-    said = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr)
-    if done.returncode or _COMPLAINT.search(said):
-        raise ValueError(f"the site has warnings\n{said}")
+    output = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr)
+    if done.returncode or _COMPLAINT.search(output):
+        raise ValueError(f"expected the site to build without warnings, got\n{output}")
     print(f"written: {SITE / 'index.html'}, {time.monotonic() - began:.0f} s in all")
 
 
 def main() -> int:
-    """The command."""
+    """Run the command and return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m docs.site", description=__doc__.splitlines()[0])
-    parser.add_argument("--skip-tutorials", action="store_true", help="show them without what they print and draw")
+    parser.add_argument(
+        "--skip-tutorials", action="store_true", help="do not execute the tutorials; show them without output"
+    )
     try:
         build(run=not parser.parse_args().skip_tutorials)
     except (LookupError, ValueError) as error:

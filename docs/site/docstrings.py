@@ -1,4 +1,4 @@
-"""What mkdocstrings is given of a docstring: formulas, examples and names in Markdown. An extension of Griffe's."""
+"""A Griffe extension that converts formulas, examples and names in docstrings to Markdown for mkdocstrings."""
 
 import re
 from collections.abc import Container
@@ -15,16 +15,19 @@ _EXAMPLE = re.compile(r"(?m)^( *)Example::\n\n((?:\1    .*\n|\n)*\1    .*)")
 
 
 def markdown(text: str, names: Names, module: str = "", arguments: Container[str] = ()) -> str:
-    """A docstring as Markdown; its sections stay Google's.
+    """Convert a docstring to Markdown. Sections such as `Args:` stay as they are.
 
     Args:
         text: the docstring.
-        names: where names lead to.
-        module: that it is in.
-        arguments: names of the function's own.
+        names: finds the links of names.
+        module: the module that contains the docstring.
+        arguments: names of the function's arguments, which are not linked.
+
+    Returns:
+        The Markdown.
 
     Raises:
-        LookupError: it names something of the package's that does not exist.
+        LookupError: the docstring names something in the package that does not exist.
     """
     text = _MATH.sub(lambda m: f"{m[1]}$$ {' '.join(m[2].split())} $$", text)
     text = _ROLE.sub(lambda m: f"${' '.join(m[1].split())}$", text)
@@ -41,20 +44,20 @@ def _fenced_example(match: re.Match[str]) -> str:
 
 
 def _arguments(thing: griffe.Object) -> set[str]:
-    """Names of a function's arguments, and of a class's attributes, which its text may mean."""
+    """Return the names of a function's arguments and of a class's attributes, which must not become links."""
     arguments = thing.parameters if isinstance(thing, griffe.Function | griffe.Class) else ()
     return {thing.name, *(argument.name for argument in arguments), *thing.members}
 
 
 class Docstrings(griffe.Extension):
-    """Rewrites every docstring once, when it is read."""
+    """Convert every docstring once, when it is read."""
 
     def __init__(self) -> None:
         super().__init__()
         self.names = Names()
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
-        """A module, class, function or attribute was loaded."""
+        """Convert the docstring of a module, class, function or attribute that was loaded."""
         if obj.docstring and not obj.is_alias:
             try:
                 text, module = obj.docstring.value, obj.module.path

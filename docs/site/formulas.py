@@ -1,6 +1,6 @@
-"""Formulas as MathML, which browsers draw by themselves: a Markdown extension for `$…$` and `$$…$$`.
+"""A Markdown extension that converts formulas in `$…$` and `$$…$$` to MathML.
 
-A page needs no script for it, and nothing from a network.
+Browsers render MathML by themselves, so the pages need no script and no network.
 """
 
 import re
@@ -14,16 +14,23 @@ from markdown.inlinepatterns import InlineProcessor
 PATTERN = r"(?<![\\$\w])(\$\$?)(?!\s*\$)(.+?)\1(?![\w$])"
 _BEFORE = re.compile(r"(?<=[\w)}\]])\s+(\\(?:ln|log|exp)(?![A-Za-z]))")
 _AFTER = re.compile(r"(\\(?:ln|log(?:_\w|_\{\w+\})?|exp))(?![A-Za-z])(?!\s*(?:[({_^]|\\left|\\[bB]igl))\s*")
-"""Where TeX sets a thin space, before a function and after it, and the converter sets none."""
+"""Positions before and after a function where TeX inserts a thin space, but the converter does not."""
 
-_BEFORE_ESCAPES = 185  # after code (190), so that `$` in code stays what it is
+_BEFORE_ESCAPES = 185  # after code (190), so that `$` in code is left alone
 
 
 def mathml(formula: str, *, block: bool) -> str:
-    """LaTeX to MathML.
+    """Convert LaTeX to MathML.
+
+    Args:
+        formula: the formula in LaTeX.
+        block: whether it is displayed in a block of its own.
+
+    Returns:
+        The MathML element.
 
     Raises:
-        ValueError: the converter does not know a command, which it would otherwise print as it stands.
+        ValueError: the converter does not know a command of the formula.
 
     >>> mathml("x_1", block=False)[:5]
     '<math'
@@ -34,26 +41,26 @@ def mathml(formula: str, *, block: bool) -> str:
     formula = _AFTER.sub(r"\1 \\, ", _BEFORE.sub(r" \\, \1", formula))
     result = convert(formula, display="block" if block else "inline")
     if unknown := re.findall(r"\\[A-Za-z]+", result):
-        raise ValueError(f"no MathML for {', '.join(unknown)} in {formula}")
+        raise ValueError(f"expected commands that can be converted to MathML, got {', '.join(unknown)} in {formula}")
     return result
 
 
 class Formula(InlineProcessor):
-    """Turns one formula into what Markdown puts into the page untouched."""
+    """Replace one formula by a placeholder, which Markdown exchanges for the MathML at the end."""
 
     def handleMatch(self, m: re.Match[str], data: str) -> tuple[str | etree.Element, int, int]:
-        """The placeholder of the formula, and where it stood."""
+        """Return the placeholder of a formula, and the position of the formula."""
         return self.md.htmlStash.store(mathml(m[2], block=m[1] == "$$")), m.start(0), m.end(0)
 
 
 class Formulas(Extension):
-    """The extension, named in `mkdocs.yml`."""
+    """The Markdown extension, which `mkdocs.yml` names."""
 
     def extendMarkdown(self, md: Markdown) -> None:
-        """Register the pattern."""
+        """Register the pattern of formulas."""
         md.inlinePatterns.register(Formula(PATTERN, md), "formula", _BEFORE_ESCAPES)
 
 
 def makeExtension(**settings: Any) -> Formulas:
-    """What Markdown calls."""
+    """Make the extension; Markdown calls this function."""
     return Formulas(**settings)

@@ -1,4 +1,4 @@
-"""Where a name in the text leads to: the place of every public thing in the reference."""
+"""Links from names in the text to the entries of classes and functions in the reference."""
 
 import importlib
 import inspect
@@ -11,22 +11,22 @@ from typing import Any
 from docs.api import MODULES, entries, place
 
 NAME = re.compile(r"(?<![`\[\w])`((?:semfov|[A-Z]\w*)(?:\.\w+)*)((?:\([^`]*\))?)`(?![`\]])")
-"""A name in code: a full one, or a class by itself, with or without a call."""
+"""A name in backticks: a full name, or the bare name of a class, with or without a call."""
 
 _BARE = re.compile(r"(?<![`\[\w])`([a-z]\w*)(?:\(\))?`(?![`\]])")
 
 
 class Names:
-    """Finds what is meant by a name."""
+    """Find the entry of the reference that a name refers to."""
 
     @cached_property
     def places(self) -> dict[int, str]:
-        """The place of a public class or function, by its identity."""
+        """The entry of each public class and function, by the object's `id`."""
         return {id(thing): place(module, name, thing) for module, things in entries().items() for name, thing in things}
 
     @cached_property
     def classes(self) -> dict[str, str]:
-        """The place of a public class, by its bare name, where only one has it."""
+        """The entry of each public class, by its bare name. Names that several classes share are left out."""
         found: dict[str, list[str]] = {}
         for things in entries().values():
             for name, thing in things:
@@ -35,10 +35,16 @@ class Names:
         return {name: places[0] for name, places in found.items() if len(places) == 1}
 
     def place(self, name: str) -> str | None:
-        """Where the reference explains a name; nothing where it does not.
+        """Find the entry of a name in the reference.
+
+        Args:
+            name: a full name, or the bare name of a class.
+
+        Returns:
+            The entry, or None if the reference has none.
 
         Raises:
-            LookupError: it is a name of the package's that does not exist.
+            LookupError: the name belongs to the package but does not exist.
         """
         if not name.startswith("semfov"):
             first, _, rest = name.partition(".")
@@ -56,7 +62,16 @@ class Names:
         return self.places[id(owner)] + (f".{member}" if _shown(owner, member) else "")
 
     def link_neighbours(self, text: str, module: str, but: Container[str] = ()) -> str:
-        """Text in which bare names of a module's public functions are links, but for some (a function's arguments)."""
+        """Turn bare names of a module's public functions into links.
+
+        Args:
+            text: the text.
+            module: the module.
+            but: names that are not linked, such as a function's arguments.
+
+        Returns:
+            The text with links.
+        """
         neighbours = {
             thing.__name__: self.places[id(thing)]
             for things in entries().values()
@@ -66,10 +81,18 @@ class Names:
         return _BARE.sub(lambda m: f"[{m[0]}][{neighbours[m[1]]}]" if m[1] in neighbours else m[0], text)
 
     def link(self, text: str, internals: set[str] | None = None) -> str:
-        """Text whose names are links; names that are not public are added to `internals`, and lead there.
+        """Turn full names and names of classes into links.
+
+        Args:
+            text: the text.
+            internals: names that are not public are added to it and linked to the page of internals (None: they are not
+                linked).
+
+        Returns:
+            The text with links.
 
         Raises:
-            LookupError: as for `place`.
+            LookupError: a name belongs to the package but does not exist.
         """
 
         def linked(match: re.Match[str]) -> str:
@@ -84,10 +107,16 @@ class Names:
 
 
 def resolve(name: str) -> tuple[Any, Any]:
-    """What a full name stands for, and the class that it is a member of.
+    """Find the object with a full name.
+
+    Args:
+        name: the full name.
+
+    Returns:
+        The object, and the class that it is a member of, or None.
 
     Raises:
-        LookupError: there is no such thing.
+        LookupError: the name does not exist.
     """
     parts = name.split(".")
     for length in range(1, len(parts) + 1):  # a function may hide the module that it is in
@@ -110,14 +139,14 @@ def _member(thing: Any, names: list[str]) -> tuple[Any, Any]:
 
 
 def _shown(owner: type, member: str) -> bool:
-    """Whether the reference shows a member: a documented method or property of the class itself."""
+    """Return whether the reference shows a member: a documented method or property of the class itself."""
     thing = inspect.getattr_static(owner, member, None)
     thing = getattr(thing, "__func__", None) or getattr(thing, "fget", None) or thing
     return member in vars(owner) and inspect.isfunction(thing) and bool(thing.__doc__) and not member.startswith("_")
 
 
 def _internal(name: str) -> str | None:
-    """The place of a class or function that is not public: where it is defined."""
+    """Return the name under which a class or function that is not public is defined."""
     thing, owner = resolve(name)
     thing = owner or thing
     if not (inspect.isclass(thing) or inspect.isfunction(thing)):

@@ -1,8 +1,8 @@
-"""Put the pages of the site together.
+"""Assemble the pages of the site.
 
-Pages come from where they are read without a site, too: the README is the home page, and what pages link to elsewhere
-in the repository becomes a page under `repository/`. The reference is made from the public surface, tutorials are
-executed, and names of the package in the text become links to where they are explained.
+The sources are the same files that people read in the repository. The README is the home page. Files of the repository
+that a page links to become pages under `repository/`. The reference is generated from the list of public names, the
+tutorials are executed, and names of the package in the text become links to the reference.
 """
 
 import posixpath
@@ -19,17 +19,17 @@ HOME = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.m
 LANGUAGES = {".py": "python", ".sh": "sh", ".yaml": "yaml", ".yml": "yaml", ".txt": "text", ".toml": "toml", "": "text"}
 _LINK = re.compile(r"(\]\()([^()\s]+)(\))")
 _FENCE = re.compile(r"(?ms)^( *```.*?^ *```$)")
-_INTERNALS = """# Inside
+_INTERNALS = """# Internals
 
-What pages of this site name and what is not public: it may change with any version.
+Classes and functions that pages of this site mention, but that are not public. They may change with any version.
 """
 
 
 class Stage:
-    """The pages in the folder that is rendered.
+    """The folder of pages that is rendered.
 
     Args:
-        folder: where to; what is there is replaced.
+        folder: the folder. Its content is replaced.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -47,10 +47,10 @@ class Stage:
         path.write_text(text, encoding="utf-8")
 
     def repository(self) -> None:
-        """The pages of `docs` and the home page, and what they lead to.
+        """Write the pages of `docs`, the home page, and all files that they link to.
 
         Raises:
-            LookupError: a page links to a file that is not there, or names something that does not exist.
+            LookupError: a page links to a file that does not exist, or names something that does not exist.
         """
         shutil.rmtree(self.folder, ignore_errors=True)
         files = [path for kind in ("*.md", "*.png", "*.css") for path in DOCS.rglob(kind)]
@@ -59,10 +59,10 @@ class Stage:
         self._follow()
 
     def finish(self) -> None:
-        """What other pages lead to, the reference, and what pages name beyond it.
+        """Write the files that other pages link to, the reference, and the page of internals.
 
         Raises:
-            LookupError: as for `repository`.
+            LookupError: a page links to a file that does not exist, or names something that does not exist.
         """
         self._follow()
         for module, text in pages().items():
@@ -71,7 +71,15 @@ class Stage:
         self.write("api/internals.md", f"{_INTERNALS}\n{inside}\n")
 
     def page(self, text: str, file: str) -> str:
-        """A page with its links and names leading to places on the site; `file` is where it lies in the repository."""
+        """Convert the links and names of a page to links on the site.
+
+        Args:
+            text: the page in Markdown.
+            file: its path in the repository.
+
+        Returns:
+            The page with links on the site.
+        """
         parts = _FENCE.split(text)
         return "".join(part if number % 2 else self._prose(part, file) for number, part in enumerate(parts))
 
@@ -105,14 +113,14 @@ class Stage:
             if (ROOT / wanted).is_dir():
                 wanted = f"{wanted}/index.md"
             if not (ROOT / wanted).is_file():
-                self.missing.append(f"{file} links to {match[2]}, which is not there")
+                self.missing.append(f"{file} links to {match[2]}, which does not exist")
                 return match[0]
             if not re.match("docs/tutorials/.*py$", wanted):
                 self._asked.append(wanted)
             here = posixpath.dirname(place_of(file)) or "."
             return f"{match[1]}{posixpath.relpath(place_of(wanted), here)}{hash_}{anchor}{match[3]}"
 
-        if file == "CHANGELOG.md":  # it names what is no more, too
+        if file == "CHANGELOG.md":  # it may mention names that were removed
             return _LINK.sub(moved, text)
         try:
             return self.names.link(_LINK.sub(moved, text), self.internals)
@@ -122,7 +130,13 @@ class Stage:
 
 
 def place_of(file: str) -> str:
-    """Where a file of the repository is on the site.
+    """Return the path on the site of a file in the repository.
+
+    Args:
+        file: path in the repository.
+
+    Returns:
+        The path of its page, relative to the root of the site.
 
     >>> place_of("docs/guides/gaze.md"), place_of("examples/own_policy.py")
     ('guides/gaze.md', 'repository/examples/own_policy.py.md')

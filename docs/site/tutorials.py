@@ -1,4 +1,4 @@
-"""Execute the tutorials, and turn them with all that they print and draw into pages of the site."""
+"""Execute the tutorials, and turn them and their output into pages of the site."""
 
 import base64
 import os
@@ -16,7 +16,7 @@ from nbclient import NotebookClient
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 LIMIT = 300
-"""Seconds that a cell may take, on a busy machine too."""
+"""Seconds after which a cell fails. The limit is high enough for a busy machine."""
 
 _PREPARE = """
 %config InlineBackend.figure_formats = ["png"]
@@ -27,12 +27,15 @@ warnings.filterwarnings("ignore", "IProgress not found")  # of tqdm, which Pooch
 
 
 def tutorials(folder: Path, prose: Callable[[str, str], str], *, run: bool = True) -> dict[str, str]:
-    """Markdown of every tutorial by its name; pictures and executed notebooks are written to `folder`.
+    """Convert the tutorials to Markdown, and write their figures and the executed notebooks.
 
     Args:
-        folder: of the pages.
-        prose: makes text of a file in the repository fit for the site.
-        run: execute them, two at a time; otherwise their pages have code and text alone.
+        folder: folder of the pages, for the figures and notebooks.
+        prose: converts text of a file in the repository for the site.
+        run: execute the tutorials, two at a time; otherwise the pages have no output.
+
+    Returns:
+        The Markdown of every tutorial by its name.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(2) as pool:
@@ -49,15 +52,21 @@ def tutorials(folder: Path, prose: Callable[[str, str], str], *, run: bool = Tru
 
 
 def read(source: Path) -> Any:
-    """The notebook that a text stands for; `# %%` begins a cell."""
+    """Read a Python file as a notebook. Cells begin with `# %%`."""
     return jupytext.read(source, fmt="py:percent")
 
 
 def execute(source: Path) -> Any:
-    """The notebook with its outputs, executed in a process and a folder of its own.
+    """Execute a tutorial as a notebook, in a separate process and a temporary folder.
+
+    Args:
+        source: the Python file.
+
+    Returns:
+        The notebook with its outputs.
 
     Raises:
-        ValueError: it wrote to stderr, where warnings go.
+        ValueError: a cell wrote to stderr, for example a warning.
         nbclient.exceptions.CellExecutionError: a cell failed.
     """
     notebook = read(source)
@@ -67,7 +76,7 @@ def execute(source: Path) -> Any:
             notebook,
             timeout=LIMIT,
             kernel_name="python3",
-            extra_arguments=["--log-level=ERROR"],  # it warns that its messages to this process are not encrypted
+            extra_arguments=["--log-level=ERROR"],  # hides a warning about unencrypted messages between the processes
             resources={"metadata": {"path": folder}},
         )
         path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -75,21 +84,31 @@ def execute(source: Path) -> Any:
     del notebook.cells[0]
     for cell, output in outputs(notebook):
         if output.get("name") == "stderr":
-            raise ValueError(f"{source.name} says on stderr {output['text']!r}, in the cell\n{cell.source}")
+            raise ValueError(
+                f"{source.name}: expected nothing on stderr, got {output['text']!r} from the cell\n{cell.source}"
+            )
     return notebook
 
 
 def outputs(notebook: Any) -> Iterator[tuple[Any, Any]]:
-    """What every cell printed or drew, beside the cell."""
+    """Yield every cell with each of its outputs."""
     for cell in notebook.cells:
         yield from ((cell, output) for output in cell.get("outputs", []))
 
 
 def page(notebook: Any, name: str, folder: Path) -> str:
-    """Markdown of a notebook; its pictures become files.
+    """Convert a notebook to Markdown, and write its figures to files.
+
+    Args:
+        notebook: the executed notebook.
+        name: name of the tutorial.
+        folder: folder for the figures.
+
+    Returns:
+        The Markdown.
 
     Raises:
-        ValueError: a picture has no `alt`, in words for who cannot see it.
+        ValueError: a cell with a figure has no alternative text (`alt`).
     """
     parts = [f"[Notebook]({name}.ipynb){{: .md-button download={name}.ipynb }}"]
     for number, cell in enumerate(notebook.cells):
@@ -101,7 +120,9 @@ def page(notebook: Any, name: str, folder: Path) -> str:
             data = output.get("data", {})
             if "image/png" in data:
                 if "alt" not in cell.metadata:
-                    raise ValueError(f"{name}: the picture of this cell has no alt text\n{cell.source}")
+                    raise ValueError(
+                        f'{name}: expected alt="…" on the line of the cell that draws a figure, got none\n{cell.source}'
+                    )
                 picture = folder / f"{name}-{number}.png"
                 picture.write_bytes(base64.b64decode(data["image/png"]))
                 parts.append(f"![{cell.metadata['alt']}]({picture.name})")

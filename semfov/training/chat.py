@@ -108,14 +108,15 @@ class ChatServer:
                 with self._opener.open(message, timeout=self.timeout) as response:
                     return _reply(response.read(_MOST), self.url, self.model)
             except urllib.error.HTTPError as error:
-                told = _told(error)
+                message_of_server = _told(error)
                 if error.code not in _AGAIN:
-                    raise _refusal(error.code, told, self.url, self.model) from None
-                failure, asked = f"HTTP {error.code}{told}", error.headers.get("Retry-After", "")
+                    refusal = _refusal(error.code, message_of_server, self.url, self.model)
+                    raise refusal from None
+                failure, retry_after = f"HTTP {error.code}{message_of_server}", error.headers.get("Retry-After", "")
             except (OSError, http.client.HTTPException) as error:
-                failure, asked = str(getattr(error, "reason", None) or error or type(error).__name__), ""
+                failure, retry_after = str(getattr(error, "reason", None) or error or type(error).__name__), ""
             if attempt < self.retries:
-                pause = float(asked) if asked.isdecimal() else self.wait * 2**attempt
+                pause = float(retry_after) if retry_after.isdecimal() else self.wait * 2**attempt
                 self._sleep(min(pause, _LONGEST_WAIT))
         raise DataError(
             f"{self.url}: no answer after {self.retries + 1} attempts (the last failed with: {failure}); check that "
@@ -153,6 +154,7 @@ def _told(error: urllib.error.HTTPError) -> str:
 
 
 def _refusal(code: int, told: str, url: str, model: str) -> InputError | DataError:
+    """Make the error for a request that the server refuses."""
     if code in (401, 403):
         return InputError(
             f"key: {url} refuses the API key with HTTP {code}{told}; set the environment variable that `key` names"

@@ -76,7 +76,9 @@ def fit_detector(
     of_fit = {each.name for each in fields(FitDetectorConfig)} - {"model", "data", "detector", "out", "workers"}
     unknown = sorted(settings.keys() - of_detector - of_fit)
     if unknown:
-        raise InputError(f"settings: expected names among {', '.join(sorted(of_detector | of_fit))}, got {unknown[0]!r}")
+        raise InputError(
+            f"settings: expected names among {', '.join(sorted(of_detector | of_fit))}, got {unknown[0]!r}"
+        )
     given = {name: value for name, value in settings.items() if name in of_detector}
     if given.get("classes") is not None:
         given["classes"] = tuple(given["classes"])

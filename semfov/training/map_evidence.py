@@ -146,6 +146,13 @@ def objective(step: Step, examples: MapExamples) -> Tensor:
     """Compute the cross-entropy of every class and of background, as a mean over cells and a sum over classes.
 
     A class that was drawn at random counts as often as the number of classes that it represents.
+
+    Args:
+        step: the step after a look.
+        examples: the examples, with the true classes of the cells.
+
+    Returns:
+        The loss, a scalar.
     """
     belief = step.belief
     assert isinstance(belief, MapBelief)

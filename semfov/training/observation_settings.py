@@ -19,8 +19,8 @@ class FitConfig(Settings):
         name: name of the model (None: the detector's name).
         method: how the model is fitted. `newton`, `fixed_point` (both by Minka; the paper does not say which it uses)
             and `gradient` maximise the likelihood of the scores, for classes and levels with `enough` detections.
-            `discriminative` maximises the posterior probability of the true class instead, which gives better
-            calibrated posteriors.
+            `discriminative` maximises the posterior probability of the true class instead, which is the quantity that
+            calibration is about.
         mosaics: number of mosaics of 8 × 6 photographs to look at in windows, for pictures larger than the detector's
             input (0: photographs, through the fovea). The levels are then octaves by which the picture is reduced, and
             `width` and `sensor` are ignored.

@@ -1,4 +1,4 @@
-"""What YOLOv3 is trained by (Redmon and Farhadi 2018), as a function of the raw maps of its heads."""
+"""The training loss of YOLOv3 (Redmon and Farhadi 2018), as a function of the raw maps of its heads."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Losses:
     """The parts of the loss, each a sum over the images of a batch.
 
     Attributes:
-        objectness: cross-entropies of whether a box is an object's.
-        classes: cross-entropies of the classes, of boxes that are.
-        boxes: errors of the places and sizes of these boxes.
+        objectness: cross-entropies of whether an object is assigned to a box.
+        classes: cross-entropies of the classes, for boxes with an object.
+        boxes: errors of the positions and sizes of these boxes.
     """
 
     objectness: Tensor
@@ -32,17 +32,17 @@ class Losses:
 
     @property
     def total(self) -> Tensor:
-        """Their sum, which is what is trained by."""
+        """The sum of the parts, which is minimised in training."""
         return self.objectness + self.classes + self.boxes
 
     def __add__(self, other: Self) -> Self:
-        """The losses of two batches."""
+        """Add the losses of two batches."""
         return type(self)(self.objectness + other.objectness, self.classes + other.classes, self.boxes + other.boxes)
 
 
 @dataclass(frozen=True)
 class _Assigned:
-    """Boxes of a head that objects are assigned to: where in the map they are, and which objects."""
+    """Boxes of a head that objects are assigned to: their position in the map, and the number of the object."""
 
     image: Tensor
     row: Tensor
@@ -60,42 +60,42 @@ def yolo_loss(
     *,
     ignore: float = 0.5,
 ) -> Losses:
-    r"""The loss of YOLOv3 on a batch (Redmon and Farhadi 2018, sections 2.1 and 2.2).
+    r"""Compute the loss of YOLOv3 on a batch (Redmon and Farhadi 2018, sections 2.1 and 2.2).
 
-    An object belongs to the anchor whose shape overlaps its own most, of all anchors that the heads have, in the cell
-    of its centre. (Where two heads have the same anchor, it belongs to both; of two objects that ask for one box the
-    later one gets it.) With the object's centre :math:`(c_x, c_y)` as fractions of that cell, its size
-    :math:`(w, h)`, the anchor's :math:`(p_w, p_h)` and the canvas' :math:`(W, H)`, the box :math:`t` that it is
-    assigned to costs
+    Each object is assigned to one predicted box: in the cell of its centre, with the anchor of the most similar shape
+    among all heads. (If two heads have the same anchor, the object is assigned to both. If two objects are assigned to
+    the same box, the later one gets it.) With the object's centre :math:`(c_x, c_y)` as fractions of that cell, its
+    size :math:`(w, h)`, the anchor's size :math:`(p_w, p_h)` and the canvas' size :math:`(W, H)`, the loss of the
+    assigned box :math:`t` is
 
     .. math:: \Big(2 - \frac{w h}{W H}\Big) \Big( \sum_{a \in x, y} H(c_a, \sigma(t_a))
               + \frac12 \Big(t_w - \ln \frac{w}{p_w}\Big)^2 + \frac12 \Big(t_h - \ln \frac{h}{p_h}\Big)^2 \Big)
               + H(1, \sigma(t_o)) + \sum_k H([k = label], \sigma(t_k))
 
-    where :math:`H` is the cross-entropy of a yes or no. All other boxes cost :math:`H(0, \sigma(t_o))`, but nothing
-    where they overlap an object by more than `ignore` as they are predicted. The gradient is what Darknet descends.
+    where :math:`H` is the binary cross-entropy. The loss of all other boxes is :math:`H(0, \sigma(t_o))`, except that
+    it is 0 for predicted boxes that overlap an object by more than `ignore`. The gradient is the same as Darknet's.
 
     Args:
-        maps: of the heads, each `(B, A (5 + K), h, w)`, as `Darknet` gives them.
-        heads: their anchors and classes.
+        maps: raw maps of the heads, each `(B, A (5 + K), h, w)`, as `Darknet` returns them.
+        heads: the heads, with their anchors and classes.
         canvas: `(width, height)` of the images in pixels.
-        boxes: of each image, `(M, 4)`, `(x1, y1, x2, y2)` in canvas pixels, with area.
-        labels: of each image, `(M,)`, classes 1..K.
-        ignore: overlap from which a box is no background (the paper: 0.5).
+        boxes: boxes of the objects in each image, `(M, 4)`, `(x1, y1, x2, y2)` in canvas pixels, with an area above 0.
+        labels: classes of the objects in each image, `(M,)`, 1..K.
+        ignore: overlap (IoU) above which a box is not trained as background (the paper: 0.5).
 
     Returns:
-        The parts, summed over images.
+        The parts of the loss, summed over images.
 
     Raises:
-        InputError: maps, heads, boxes and labels do not fit each other.
+        InputError: the shapes of maps, heads, boxes and labels are inconsistent.
 
     >>> head = Head(((8.0, 8.0),), classes=2)
     >>> losses = yolo_loss([torch.zeros(1, 7, 2, 2)], [head], (16, 16), [torch.zeros(0, 4)], [torch.zeros(0).long()])
-    >>> round(float(losses.total), 4)  # four boxes, none an object's: 4 ln 2
+    >>> round(float(losses.total), 4)  # four boxes without an object: 4 ln 2
     2.7726
     """
     check(len(maps) == len(heads), "maps", f"one for each of {len(heads)} heads", len(maps))
-    check(len(boxes) == len(labels), "labels", f"those of {len(boxes)} images", len(labels))
+    check(len(boxes) == len(labels), "labels", f"one tensor for each of {len(boxes)} images", len(labels))
     for raw, head in zip(maps, heads, strict=True):
         check_shape(raw, "maps", len(boxes), head.channels, None, None)
     for own, names in zip(boxes, labels, strict=True):
@@ -111,7 +111,7 @@ def yolo_loss(
 
 
 def _best_anchors(truth: Tensor, heads: Sequence[Head]) -> list[Tensor]:
-    """For each head which of its anchors objects `(M, 4)` belong to, `(M, A)` boolean."""
+    """Find the anchors that objects `(M, 4)` are assigned to, `(M, A)` boolean for each head."""
     sizes = truth[:, 2:] - truth[:, :2]
     corner = torch.zeros_like(sizes)
     anchors = truth.new_tensor([anchor for head in heads for anchor in head.anchors])
@@ -121,7 +121,7 @@ def _best_anchors(truth: Tensor, heads: Sequence[Head]) -> list[Tensor]:
 
 
 def _assign(raw: Tensor, canvas: tuple[int, int], truth: Tensor, image: Tensor, wanted: Tensor) -> _Assigned:
-    """The boxes of a head that objects belong to; the last of several objects gets a box."""
+    """Assign objects to boxes of a head. If several objects are assigned to a box, the last one gets it."""
     rows, columns = raw.shape[-2:]
     number, anchor = wanted.nonzero(as_tuple=True)
     column, row = _cells(truth, canvas, (columns, rows)).long().unbind(-1)
@@ -133,7 +133,7 @@ def _assign(raw: Tensor, canvas: tuple[int, int], truth: Tensor, image: Tensor, 
 
 
 def _cells(truth: Tensor, canvas: tuple[int, int], size: tuple[int, int]) -> Tensor:
-    """Centres of objects in cells of a map of `(columns, rows)`, `(M, 2)`."""
+    """Convert the centres of objects to units of the cells of a map with `(columns, rows)`, `(M, 2)`."""
     return (truth[:, :2] + truth[:, 2:]) / 2 * (truth.new_tensor(size) / truth.new_tensor(canvas))
 
 
@@ -147,7 +147,7 @@ def _head_loss(
     assigned: _Assigned,
     ignore: float,
 ) -> Losses:
-    """The loss of one head."""
+    """Compute the loss of one head."""
     batch, _, rows, columns = raw.shape
     cells = raw.view(batch, len(head.anchors), 5 + head.classes, rows, columns)
     of_object = torch.zeros_like(cells[:, :, 4])
@@ -163,7 +163,7 @@ def _head_loss(
     size = object_[:, 2:] - object_[:, :2]
     weight = 2 - size.prod(-1, keepdim=True) / (canvas[0] * canvas[1])
     place = _cells(object_, canvas, (columns, rows)) - torch.stack([assigned.column, assigned.row], -1)
-    # The sigmoid at which `decode_yolo` puts the centre there.
+    # The value of the sigmoid for which `decode_yolo` gives this centre.
     reach = ((place + (head.scale - 1) / 2) / head.scale).clamp(0, 1)
     centre = F.binary_cross_entropy_with_logits(chosen[:, :2], reach, weight.expand_as(reach), reduction="sum")
     ratio = size / raw.new_tensor(head.anchors)[assigned.anchor]
@@ -174,7 +174,7 @@ def _head_loss(
 def _overlapping(
     raw: Tensor, head: Head, canvas: tuple[int, int], truth: Tensor, image: Tensor, ignore: float
 ) -> Tensor:
-    """Which predicted boxes overlap an object of their image by more than `ignore`, `(B, A, h, w)`."""
+    """Find the predicted boxes that overlap an object of their image by more than `ignore`, `(B, A, h, w)` boolean."""
     batch, _, rows, columns = raw.shape
     predicted = decode_yolo(raw, head.anchors, canvas, head.scale).boxes
     found = predicted.new_zeros(batch, rows * columns * len(head.anchors), dtype=torch.bool)

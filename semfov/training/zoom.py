@@ -1,68 +1,52 @@
-"""Fitting evidence by magnification on mosaics of photographs."""
+"""Fit evidence by magnification on mosaics of photographs."""
 
+import json
 import logging
 import random
 from collections import defaultdict
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor, nn
-from torch.nn import functional as F
 
 from semfov.data.mosaics import Mosaics
 from semfov.experiments.parallel import available_cores, run_tasks
 from semfov.experiments.run import cache_folder
 from semfov.experiments.setup import make_detector, prepare_worker, split_photographs
-from semfov.experiments.summary import table as table_of
-from semfov.experiments.zoom import SHOWN
+from semfov.experiments.summary import table
 from semfov.experiments.zoom_store import GlanceStore, open_scene
 from semfov.io.files import inside
 from semfov.training.outputs import training_of, write_outputs
 from semfov.training.zoom_choice import choose, open_all
 from semfov.training.zoom_decision import fit_judge, judge_searches, search_mosaics
-from semfov.training.zoom_examples import LookedAt, ZoomExample, example_of, windows_of
+from semfov.training.zoom_examples import ZoomExample, example_of, windows_of
+from semfov.training.zoom_presence import fit_presence, pair_windows, presence_loss, presence_of
+from semfov.training.zoom_rates import fit_rates, rate_loss
 from semfov.training.zoom_settings import FitZoomConfig
-from semfov.zoom.belief import before_of
-from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
+from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import ZoomEye
 
 DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", "tile", "seed")
-"""Settings that thresholds and the probability of presence depend on."""
+"""Settings that the thresholds and the probability of presence depend on."""
 
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Windows:
-    """Looks and the closer windows that they tell of, as one table.
-
-    Attributes:
-        scores: `(N, K)`, strongest hints in the window.
-        summary: `(N, 3)`.
-        steps: `(N,)`, octaves to the closer look.
-        shown: `(N, K)`, whether it showed the class.
-        before: `(N,)`, row of the overview for the same window; -1 for the overview's own.
-        slot: `(N,)`, whether the window is a photograph of the mosaic.
-        mosaic: `(N,)`.
-    """
-
-    scores: Tensor
-    summary: Tensor
-    steps: Tensor
-    shown: Tensor
-    before: Tensor
-    slot: Tensor
-    mosaic: Tensor
-
-
 def make_eye(config: FitZoomConfig) -> ZoomEye:
-    """The eye that looks at the mosaics."""
+    """Make the eye that looks at the mosaics."""
     return ZoomEye(make_detector(config.detector)).eval().requires_grad_(False)
 
 
 def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, Mosaics]:
-    """Mosaics to fit on, near and far, and those of photographs that were held out."""
+    """Compose the mosaics to fit on, and those of held-out photographs.
+
+    Args:
+        config: the settings.
+        classes: names of the detector's classes.
+
+    Returns:
+        The mosaics: `near` and `far` to fit on, `judged` and `judged far` of held-out photographs, and `searched` to
+        fit decisions on.
+    """
     kept, held = split_photographs(config.data, classes, 5)
     tile = config.tile, config.tile * 3 // 4
     return {
@@ -75,7 +59,7 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
 
 
 def make_store(config: FitZoomConfig, eye: ZoomEye) -> GlanceStore:
-    """Where looks at mosaics are kept."""
+    """Open the store of looks at mosaics."""
     return GlanceStore(cache_folder(config.cache) / "glances", eye.settings(), len(eye.detector.classes))
 
 
@@ -83,14 +67,14 @@ _process: dict[str, Any] = {}
 
 
 def prepare_process(config: FitZoomConfig) -> None:
-    """Build eye, mosaics and store once in this process."""
+    """Build the eye, the mosaics and the store once in this process."""
     prepare_worker()
     eye = make_eye(config)
     _process.update(eye=eye, mosaics=make_mosaics(config, eye.detector.classes), store=make_store(config, eye))
 
 
 def look(task: tuple[str, int]) -> tuple[str, int]:
-    """Look at a mosaic, where that was not done before."""
+    """Look at all windows of a mosaic that are not in the store yet."""
     kind, index = task
     mosaics = _process["mosaics"][kind]
     glances = open_scene(_process["eye"], mosaics, index, _process["store"])
@@ -100,158 +84,12 @@ def look(task: tuple[str, int]) -> tuple[str, int]:
 
 
 def read_examples(mosaics: Mosaics, store: GlanceStore, eye: ZoomEye) -> list[ZoomExample]:
-    """What was seen of all mosaics."""
+    """Read the results of the looks at all mosaics."""
     return [example_of(mosaics, n, open_scene(eye, mosaics, n, store)) for n in range(len(mosaics))]
 
 
-def table(examples: list[ZoomExample]) -> Windows:
-    """Every look beside every closer window in it."""
-    rows: list[tuple[Tensor, Tensor, int, Tensor, int, bool, int]] = []
-    for number, example in enumerate(examples):
-        first: dict[int, int] = {}
-        for told in example.looks:
-            look = told.gist
-            if look is None:
-                continue
-            high, wide = (n * look.scale for n in look.scores.shape[:2])
-            for place, closer in enumerate(example.looks):
-                steps = closer.window.level - look.level
-                x1, y1, x2, y2 = closer.window.cells
-                x1, y1, x2, y2 = x1 - look.first[0], y1 - look.first[1], x2 - look.first[0], y2 - look.first[1]
-                inside = x1 >= 0 and y1 >= 0 and x2 <= wide and y2 <= high
-                if not 1 <= steps <= STEPS or not (inside or look.level == 0):
-                    continue
-                box = x1 // look.scale, y1 // look.scale, -(-x2 // look.scale), -(-y2 // look.scale)
-                pooled, summary = pool(look.scores, box)
-                before = -1 if look.level == 0 else first.get(place, -1)
-                if look.level == 0:
-                    first[place] = len(rows)
-                if look.level > 0 and before < 0:
-                    continue
-                slot = closer.window.within is not None
-                rows.append((pooled, summary, steps, closer.show >= SHOWN, before, slot, number))
-    columns: list[Any] = [*zip(*rows, strict=True)]
-    whole = [torch.tensor(columns[place]) for place in (2, 4, 5, 6)]
-    return Windows(torch.stack(columns[0]), torch.stack(columns[1]), whole[0], torch.stack(columns[3]), *whole[1:])
-
-
-def fit_presence(model: GlimpseEvidence, windows: Windows, steps: int, batch: int = 1024) -> None:
-    """Fit what looks say of whether closer ones show a class: mean cross-entropy over windows and classes."""
-    own = [model.slope, model.offset, *model.company.parameters(), *model.shape.parameters()]
-    optimizer = torch.optim.AdamW(own, lr=8e-3, weight_decay=1.0)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 8e-3, total_steps=steps)
-    first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
-    for _ in range(steps):
-        model.train()
-        loss = _presence_loss(model, windows, first[torch.randint(len(first), (batch,))])
-        if len(later):
-            loss = loss + _presence_loss(model, windows, later[torch.randint(len(later), (batch // 2,))])
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-    model.eval()
-
-
-def _presence_loss(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
-    odds = presence_of(model, windows, rows)
-    return F.binary_cross_entropy_with_logits(odds, windows.shown[rows].to(odds))
-
-
-def presence_of(model: GlimpseEvidence, windows: Windows, rows: Tensor) -> Tensor:
-    """Log odds of all classes in rows of one kind: of overviews, or of later looks."""
-    before = None
-    if bool((windows.before[rows] >= 0).all()):
-        training = model.training
-        model.eval()
-        with torch.no_grad():
-            before = presence_of(model, windows, windows.before[rows])
-        model.train(training)
-    return model.presence(windows.scores[rows], windows.summary[rows], windows.steps[rows], None, before)
-
-
-def fit_rates(model: GlimpseEvidence, examples: list[ZoomExample], steps: int, batch: int = 4) -> None:
-    """Fit how many objects closer looks find: the Poisson likelihood of their number in every window."""
-    own = [*model.rate.parameters(), model.prior, model.border]
-    optimizer = torch.optim.AdamW(own, lr=6e-3, weight_decay=0.1)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 6e-3, total_steps=steps)
-    for step in range(steps):
-        losses = [rate_loss(model, example) for example in random.sample(examples, min(batch, len(examples)))]
-        loss = torch.stack(losses).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(own, 1.0)
-        optimizer.step()
-        schedule.step()
-        if step % 100 == 99:
-            _log.info("rates: step %d, loss %.4f", step + 1, float(loss.detach()))
-
-
-def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
-    """Negative log likelihood of what was found in the windows of a mosaic, for some of its classes."""
-    shown = torch.stack([look.show for look in example.looks]).amax(0)
-    sure, faint = (shown >= SHOWN).nonzero()[:, 0] + 1, ((shown >= 0.02) & (shown < SHOWN)).nonzero()[:, 0] + 1
-    targets = torch.cat([torch.zeros(1).long(), _some(sure, 8), _some(faint, 4)])
-    looks = [look for look in example.looks if look.gist is not None]
-    overview, *others = looks
-    logs = _logs(model, overview, targets, None)
-    losses = [_told(model, example, overview, logs, targets, overview.found)]
-    for told in random.sample(others, min(2, len(others))):
-        before = _before(overview, logs.detach(), told)
-        seen = overview.found | told.found
-        losses.append(_told(model, example, told, _logs(model, told, targets, before), targets, seen))
-    return torch.stack(losses).mean()
-
-
-def _some(values: Tensor, most: int) -> Tensor:
-    return values[torch.randperm(len(values))[:most]]
-
-
-def _logs(model: GlimpseEvidence, told: LookedAt, targets: Tensor, before: Tensor | None) -> Tensor:
-    assert told.gist is not None
-    return model.rates(told.gist, targets, before)
-
-
-def _before(overview: LookedAt, logs: Tensor, told: LookedAt) -> Tensor:
-    """What the overview says of the cells of a closer look, for looks one octave closer still, `(T, rows, columns)`."""
-    first, look = overview.gist, told.gist
-    assert first is not None
-    assert look is not None
-    cells = (logs.exp() / first.scale**2).repeat_interleave(first.scale, -1).repeat_interleave(first.scale, -2)
-    rows, columns = (n * look.scale for n in look.scores.shape[:2])
-    part = cells[..., look.first[1] : look.first[1] + rows, look.first[0] : look.first[0] + columns]
-    source = torch.zeros(part.shape[-2:], dtype=torch.long)
-    return torch.stack([before_of(one, source, look) for one in part])
-
-
-def _told(
-    model: GlimpseEvidence, example: ZoomExample, told: LookedAt, logs: Tensor, targets: Tensor, seen: Tensor
-) -> Tensor:
-    """Mean negative log likelihood over the closer windows in a look."""
-    look = told.gist
-    assert look is not None
-    rates = logs.exp()
-    high, wide = look.scores.shape[:2]
-    terms = []
-    for closer in example.looks:
-        steps = closer.window.level - look.level
-        x1, y1, x2, y2 = closer.window.cells
-        box = [x1 - look.first[0], y1 - look.first[1], x2 - look.first[0], y2 - look.first[1]]
-        x1, y1, x2, y2 = (n // look.scale for n in box)
-        inside = x1 >= 0 and y1 >= 0 and x2 <= wide and y2 <= high
-        if closer.window.within is not None or not 1 <= steps <= STEPS or not (inside or look.level == 0):
-            continue
-        weight = model.taper(x2 - x1)
-        part = rates[:, steps - 1, max(y1, 0) : y2, max(x1, 0) : x2]
-        expected = torch.einsum("tyx,y,x->t", part, weight[: part.shape[1]], weight[: part.shape[2]])
-        new = example.labels[closer.found & ~seen]
-        count = torch.stack([(new == t).sum() if t else torch.tensor(len(new)) for t in targets.tolist()])
-        terms.append((expected - count * expected.clamp(min=1e-6).log()).mean())
-    return torch.stack(terms).mean() if terms else logs.sum() * 0
-
-
 def fit_zoom(config: FitZoomConfig) -> None:
-    """Look, fit, judge on what was held out, and write the model and a report."""
+    """Look at mosaics, fit, evaluate on held-out photographs, and write the model and a report."""
     eye = make_eye(config)
     mosaics = make_mosaics(config, eye.detector.classes)
     store = make_store(config, eye)
@@ -261,8 +99,8 @@ def fit_zoom(config: FitZoomConfig) -> None:
         model, examples = fit_looks(config, eye, mosaics, store)
         tried = choose(model, eye, mosaics["judged"], mosaics["judged far"], store)
         text, figures = judge(model, examples)
-        chosen = f"Chosen: foresight {model.foresight:g}, patience {model.patience:g}."
-        parts += [text, chosen, "", *table_of(tried), ""]
+        chosen = f"Settings chosen for the search: foresight {model.foresight:g}, patience {model.patience:g}."
+        parts += [text, chosen, "", *table(tried), ""]
     else:
         model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
         model.check_compatible(eye.settings())
@@ -275,7 +113,17 @@ def fit_zoom(config: FitZoomConfig) -> None:
 def fit_looks(
     config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
 ) -> tuple[GlimpseEvidence, list[ZoomExample]]:
-    """The model of what looks say of closer ones, and examples that were held out."""
+    """Fit the prediction of closer looks.
+
+    Args:
+        config: the settings.
+        eye: the eye that looks.
+        mosaics: the mosaics (`make_mosaics`).
+        store: store of the looks.
+
+    Returns:
+        The model, without the decisions of searches, and the held-out examples.
+    """
     looked = {kind: mosaics[kind] for kind in ("near", "far", "judged")}
     todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
     workers = config.workers or available_cores()
@@ -289,7 +137,7 @@ def fit_looks(
     metadata = {**eye.settings(), **training_of(config, mosaics["near"], "judged")}
     model = GlimpseEvidence(len(eye.detector.classes), metadata=metadata)
     known = examples["near"] + examples["far"]
-    fit_presence(model, table(known), config.steps)
+    fit_presence(model, pair_windows(known), config.steps)
     fit_rates(model, known, config.steps)
     return model.eval().requires_grad_(False), examples["judged"]
 
@@ -297,7 +145,18 @@ def fit_looks(
 def fit_decision(
     config: FitZoomConfig, model: GlimpseEvidence, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
 ) -> list[str]:
-    """Fit and choose when a search decides; returns what to report, lines of Markdown."""
+    """Fit the decisions of searches: the probability of presence, and the thresholds.
+
+    Args:
+        config: the settings.
+        model: the model to complete.
+        eye: the eye that looks.
+        mosaics: the mosaics (`make_mosaics`).
+        store: store of the looks.
+
+    Returns:
+        Lines of the report in Markdown.
+    """
     prepare_worker()
     torch.manual_seed(config.seed)
     searches = {
@@ -310,36 +169,42 @@ def fit_decision(
             seed=config.seed,
             title=title,
         )
-        for kind, title in (("searched", "searching"), ("judged", "searching what was held out"))
+        for kind, title in (("searched", "searching"), ("judged", "searching held-out mosaics"))
     }
     fit_judge(model, searches["searched"], config.judging)
     rows = judge_searches(model, searches["judged"], config)
     assert model.thresholds is not None
     model.metadata["decision"] = {name: getattr(config, name) for name in DECIDING}
-    count, told = (len(searches[kind].there) for kind in ("searched", "judged"))
+    fitted, held_out = (len(searches[kind].there) for kind in ("searched", "judged"))
     return [
-        f"Whether a picture holds a class, fitted on {count} searches, half of them for what is not there; judged on "
-        f"{told} in mosaics of photographs that were held out.",
+        f"The probability that a picture contains the target was fitted on {fitted} searches, about half of them for "
+        f"absent classes, and evaluated on {held_out} searches in mosaics of held-out photographs.",
         "",
         *rows,
         "",
-        f"Thresholds: found from {model.thresholds.confirm:.2f}, a look is worth its price from "
-        f"{model.thresholds.give_up:g}.",
+        f"Thresholds: a target counts as found from a probability of {model.thresholds.confirm:.2f} on. The search "
+        f"gives up when the best remaining look has a value below {model.thresholds.give_up:g}.",
         "",
     ]
 
 
 @torch.no_grad()
 def judge(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str]:
-    """Report on mosaics that were held out, as Markdown and as JSON."""
-    import json
+    """Evaluate the model on held-out mosaics.
 
-    windows = table(examples)
+    Args:
+        model: the model.
+        examples: the held-out examples.
+
+    Returns:
+        The measures as Markdown and as JSON.
+    """
+    windows = pair_windows(examples)
     first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
-    figures: dict[str, float] = {"cross-entropy, overview": float(_presence_loss(model, windows, first))}
+    figures: dict[str, float] = {"cross-entropy, overview": float(presence_loss(model, windows, first))}
     if len(later):
-        figures["cross-entropy, closer looks"] = float(_presence_loss(model, windows, later))
-        figures["the same windows by the overview"] = float(_presence_loss(model, windows, windows.before[later]))
+        figures["cross-entropy, closer looks"] = float(presence_loss(model, windows, later))
+        figures["the same windows by the overview"] = float(presence_loss(model, windows, windows.before[later]))
     slots = first[windows.slot[first]]
     odds, shown = presence_of(model, windows, slots), windows.shown[slots]
     passes: dict[str, list[int]] = defaultdict(list)
@@ -354,6 +219,7 @@ def judge(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str
         figures[f"passes to the first hit, {name}"] = sum(counts) / len(counts)
     losses = torch.stack([rate_loss(model, example) for example in examples])
     figures["rates, mean negative log likelihood"] = float(losses.mean())
-    lines = [f"{len(examples)} mosaics of photographs that were held out", ""]
-    lines += ["| what | value |", "|---|---|", *(f"| {name} | {value:.4f} |" for name, value in figures.items()), ""]
+    lines = [f"Evaluation on {len(examples)} mosaics of held-out photographs:", ""]
+    rows = [f"| {name} | {value:.4f} |" for name, value in figures.items()]
+    lines += ["| measure | value |", "|---|---|", *rows, ""]
     return "\n".join(lines), json.dumps(figures, indent=1)

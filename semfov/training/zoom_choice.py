@@ -1,4 +1,4 @@
-"""Choosing how evidence by magnification is gone by, on mosaics that were held out: `foresight` and `patience`."""
+"""Choose `foresight` and `patience`, the settings of a search by magnification, on mosaics of held-out photographs."""
 
 from collections.abc import Sequence
 from itertools import islice
@@ -21,21 +21,21 @@ PATIENCES = (1.5, 1.9, 2.3, 2.8, 3.5)
 
 @torch.inference_mode()
 def choose(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, far: Mosaics, store: GlanceStore) -> list[list[str]]:
-    """Set `foresight` to the one by which most is found, and `patience` to the one by which a class is found soonest.
+    """Set `foresight` to the value with the highest recall, and `patience` to the value that finds a class soonest.
 
-    Found is the mean recall over as many passes as a mosaic has photographs, and one; in kinds of mosaics that differ
-    in how much there is to find, as a share of the most that any foresight finds. Soonest is the mean number of passes
-    until a photograph is looked at that shows the class.
+    The recall is a mean over passes, from the first to one more than a mosaic has photographs. As the two kinds of
+    mosaics differ in difficulty, the recall of each kind is divided by the highest one that any `foresight` reaches.
+    Soonest means the lowest mean number of passes until a look at a photograph that shows the class.
 
     Args:
-        model: to set both of.
-        eye: that looks.
+        model: the model whose settings are chosen.
+        eye: the eye that looks.
         near: mosaics of few photographs.
-        far: mosaics of many.
-        store: where looks are kept.
+        far: mosaics of many photographs.
+        store: store of the looks.
 
     Returns:
-        A table of what was tried.
+        A table of the values that were tried.
     """
     kinds = near, far
     opened = [open_all(eye, mosaics, store) for mosaics in kinds]
@@ -52,7 +52,7 @@ def choose(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, far: Mosaics, st
         for glances in (*opened[0], *opened[1]):
             glances.save()
     most = [max(*values, 1e-9) for values in zip(*recalls.values(), strict=True)]
-    share = {value: sum(r / m for r, m in zip(told, most, strict=True)) for value, told in recalls.items()}
+    share = {value: sum(r / m for r, m in zip(each, most, strict=True)) for value, each in recalls.items()}
     model.foresight = max(share, key=share.__getitem__)
     slots = [[around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened[0])]
     passes: dict[float, float] = {}
@@ -67,14 +67,24 @@ def choose(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, far: Mosaics, st
 
 
 def open_all(eye: ZoomEye, mosaics: Mosaics, store: GlanceStore) -> list[StoredGlances]:
-    """Looks at each mosaic."""
+    """Open the stored looks of each mosaic."""
     return [open_scene(eye, mosaics, index, store) for index in range(len(mosaics))]
 
 
 def mean_recall(
     model: GlimpseEvidence, glances: Sequence[Glances], objects: Sequence[Annotation], passes: int
 ) -> float:
-    """Mean share of the objects of all mosaics that were found, over the passes."""
+    """Compute the mean recall over passes of an exploration that looks for all objects.
+
+    Args:
+        model: the evidence that guides the exploration.
+        glances: looks at each mosaic.
+        objects: the objects of each mosaic.
+        passes: number of passes.
+
+    Returns:
+        The share of the objects of all mosaics that were found, as a mean over the passes.
+    """
     found = 0
     for looks, annotation in zip(glances, objects, strict=True):
         seen: list[Glance] = []
@@ -85,13 +95,22 @@ def mean_recall(
             if glance is not None:
                 seen.append(glance[0])
                 count = int(found_in(seen, annotation).sum())
-            # Where nothing is left to look at, what was found stays.
+            # When no window is left, the number of found objects stays the same for the remaining passes.
             found += count
     return found / max(passes * sum(len(annotation.boxes) for annotation in objects), 1)
 
 
 def mean_passes(model: GlimpseEvidence, glances: Sequence[Glances], slots: Sequence[Sequence[Window]]) -> float:
-    """Mean passes until a photograph is looked at that shows a class, over the classes that one shows."""
+    """Compute the mean number of passes until a look at a photograph that shows the target.
+
+    Args:
+        model: the evidence that guides the search.
+        glances: looks at each mosaic.
+        slots: windows of the photographs of each mosaic.
+
+    Returns:
+        The mean over mosaics and over the classes that any of their photographs shows.
+    """
     counts = []
     for looks, photographs in zip(glances, slots, strict=True):
         shown = torch.stack([glance.show for glance in looks.see(photographs)]) >= SHOWN

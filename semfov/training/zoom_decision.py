@@ -1,4 +1,4 @@
-"""Fitting when a search of a large picture has found its target, or gives up: on searches of mosaics."""
+"""Fit the decisions of searches in large pictures, whether the target is found or absent, on searches of mosaics."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from semfov.zoom.search import look_for
 from semfov.zoom.tally import Tally
 
 JUDGED = (1, 4, 8, 16)
-"""Looks after which the probability of presence is judged."""
+"""Numbers of looks after which the probability of presence is evaluated."""
 
 
 @dataclass(frozen=True)
 class Searches:
-    """Searches that end when nothing is left to look at, or with their passes; those that ended stay as they were.
+    """E searches of n looks. A search that ends early, because no window is left, is padded with its last values.
 
     Attributes:
-        best: `(E, n)`, highest score of the target after each look.
-        case: `(E, n, 11)`, what else is known (`Tally.case`).
-        looked: `(E, n)`, whether a detection shows it.
-        left: `(E, n)`, what the best look that is left is worth.
+        best: `(E, n)`, highest score of the target so far, after each look.
+        case: `(E, n, 11)`, features of the search so far (`Tally.case`).
+        looked: `(E, n)`, whether a detection has shown the target (`Tally.looked`).
+        left: `(E, n)`, value of the best remaining look.
         there: `(E,)`, whether the target is in the picture.
     """
 
@@ -47,7 +47,7 @@ class Searches:
 
     @classmethod
     def join(cls, parts: Sequence[Searches]) -> Searches:
-        """All searches of several sets."""
+        """Join several sets of searches."""
         return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
 
@@ -62,16 +62,19 @@ def search_mosaics(
     seed: int,
     title: str,
 ) -> Searches:
-    """Search every mosaic for some classes that it holds, and for as many that it does not.
+    """Search every mosaic for some present classes and for as many absent ones.
 
     Args:
-        model: of the evidence that is gone by.
-        mosaics: to search.
-        opened: looks at them.
-        classes: that a mosaic holds, at most.
-        passes: of the detector, at most.
-        seed: of the choice of classes.
+        model: the evidence that guides the search.
+        mosaics: the mosaics.
+        opened: the stored looks at each mosaic.
+        classes: maximum number of present classes to search for in a mosaic.
+        passes: maximum number of passes of the detector in a search.
+        seed: seed of the choice of classes.
         title: label of the progress bar.
+
+    Returns:
+        The searches.
     """
     rows: list[list[Tensor]] = []
     for index, looks in enumerate(tqdm(opened, desc=title, unit="mosaic", dynamic_ncols=True)):
@@ -95,7 +98,7 @@ def search_mosaics(
 
 
 def fit_judge(model: GlimpseEvidence, searches: Searches, steps: int, batch: int = 4096) -> None:
-    """Fit whether a picture holds a class: mean cross-entropy after all looks of all searches."""
+    """Fit the probability that a picture contains the target, by the cross-entropy after all looks of all searches."""
     best, case = searches.best.flatten(), searches.case.flatten(0, 1)
     there = searches.there[:, None].expand_as(searches.best).flatten().float()
 
@@ -110,17 +113,26 @@ def fit_judge(model: GlimpseEvidence, searches: Searches, steps: int, batch: int
 
 @torch.no_grad()
 def judge_searches(model: GlimpseEvidence, searches: Searches, bounds: Bounds) -> list[str]:
-    """Set the thresholds by searches that were held out; returns lines of a table of how well presence is told."""
+    """Evaluate the probability of presence on held-out searches, and set the model's thresholds by them.
+
+    Args:
+        model: the model, whose thresholds are set.
+        searches: the held-out searches.
+        bounds: limits on wrong decisions.
+
+    Returns:
+        Lines of a table in Markdown.
+    """
     anywhere = model.anywhere(searches.best, searches.case).sigmoid()
     there = searches.there
     chosen = choose_thresholds(bounds, anywhere.mT, searches.looked.mT.to(anywhere), searches.left.mT, there)
-    # A window was looked at closely enough or was not: there is no probability of its place to choose from.
+    # The place is known as soon as a detection shows the target; there is no probability to put a threshold on.
     model.thresholds = chosen.changed(place=0.0)
     rows = [["looks", "area under ROC", "NLL", "Brier", "ECE", "ECE of the highest score"]]
     for number in (each for each in (*JUDGED, anywhere.shape[1]) if each <= anywhere.shape[1]):
-        told = BinarySums.of(anywhere[:, number - 1], there)
+        presence = BinarySums.of(anywhere[:, number - 1], there)
         raw = BinarySums.of(searches.best[:, number - 1], there)
         area = area_under_roc(anywhere[:, number - 1], there) if bool(there.any() and not there.all()) else float("nan")
-        rows.append([str(number), f"{area:.3f}", f"{told.nll:.3f}", f"{told.brier:.3f}", f"{told.ece:.3f}",
-                     f"{raw.ece:.3f}"])  # fmt: skip
+        measures = (presence.nll, presence.brier, presence.ece, raw.ece)
+        rows.append([str(number), f"{area:.3f}", *(f"{measure:.3f}" for measure in measures)])
     return table(rows)

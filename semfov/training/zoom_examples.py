@@ -1,4 +1,4 @@
-"""What closer looks at mosaics find, to learn from: every window of a coarse lattice."""
+"""Training examples for evidence by magnification: looks at every window of a coarse lattice over mosaics."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,13 +16,13 @@ from semfov.zoom.lattice import Lattice
 
 @dataclass(frozen=True)
 class LookedAt:
-    """A look at a window, with what it found.
+    """A look at a window and its results.
 
     Attributes:
-        window: that was looked at.
-        gist: of windows that can be looked at closer.
+        window: the window.
+        gist: summary of the look, for windows that can be looked at closer; None for others.
         show: `(K,)`, highest score of each class.
-        found: `(M,)`, which objects of the scene it found.
+        found: `(M,)` boolean, the objects of the scene that it found.
     """
 
     window: Window
@@ -33,12 +33,12 @@ class LookedAt:
 
 @dataclass(frozen=True)
 class ZoomExample:
-    """A mosaic, looked at in many windows.
+    """A mosaic with looks at many windows.
 
     Attributes:
-        lattice: of the mosaic.
+        lattice: the lattice of windows over the mosaic.
         labels: `(M,)`, classes of its objects.
-        looks: the overview first.
+        looks: the looks, the overview first.
     """
 
     lattice: Lattice
@@ -47,7 +47,17 @@ class ZoomExample:
 
 
 def found_by(glance: Glance, annotation: Annotation, score: float = FOUND, iou: float = 0.5) -> Tensor:
-    """Which objects a look finds, `(M,)`: a detection of their class, with this score and overlap."""
+    """Find the objects that a look shows with a detection of their class.
+
+    Args:
+        glance: the look.
+        annotation: the M objects of the scene.
+        score: least score of the detection.
+        iou: least overlap of the detection with the object.
+
+    Returns:
+        Whether each object is found, `(M,)` boolean.
+    """
     detections = glance.detections
     sure = detections.confidence[0] >= score
     boxes, labels = detections.boxes[0, sure], detections.labels[0, sure]
@@ -56,13 +66,13 @@ def found_by(glance: Glance, annotation: Annotation, score: float = FOUND, iou: 
 
 
 def windows_of(mosaics: Mosaics, index: int, lattice: Lattice) -> list[Window]:
-    """Windows of a mosaic half a window apart, and each of its photographs alone."""
+    """List the windows of a mosaic at steps of half a window, and one window for each photograph."""
     slots: Any = [tuple(map(float, tile.slot)) for tile in mosaics.tiles(index)]
     return [*half_steps(lattice), *(around(lattice, slot) for slot in slots)]
 
 
 def example_of(mosaics: Mosaics, index: int, glances: Glances) -> ZoomExample:
-    """What looks at a mosaic show and find."""
+    """Look at all windows of a mosaic and collect the results."""
     annotation = mosaics.annotation(index)
     looks = [
         LookedAt(glance.window, glance.gist, glance.show, found_by(glance, annotation))

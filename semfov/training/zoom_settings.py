@@ -1,4 +1,4 @@
-"""Settings of the fit of evidence by magnification."""
+"""Settings for fitting evidence by magnification."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,26 +13,27 @@ class FitZoomConfig(Settings):
     """Fit evidence by magnification on mosaics.
 
     Args:
-        data: photographs to compose mosaics of; every fifth is held out.
-        detector: which detector looks.
-        mosaics: mosaics of 4 × 4 photographs.
-        far: mosaics of 8 × 6 photographs, in which objects are half as large.
-        judged: mosaics of 4 × 4 photographs that were held out, to judge the fit and to choose by.
-        judged_far: mosaics of 8 × 6 photographs that were held out, to choose by.
-        tile: width of a photograph's slot in pixels; three quarters of it is the height.
-        searched: mosaics of 4 × 4 photographs to fit on when a search decides.
-        sought: classes that are there, and as many that are not, to search for in each of them.
-        passes: of such a search, at most.
-        false_alarms: share of absent targets that may be called found, by which the threshold is chosen.
-        surest: probability from which on a target counts as found at the latest, however many false alarms that makes.
-        lost: share of the targets that may be missed because no look is worth its price any more.
-        evidence: model that was fitted before, to fit anew only when a search decides (None: fit all).
-        steps: of the fits of what looks say of closer ones.
-        judging: steps of the fit of when a search decides.
-        seed: of mosaics and fit.
-        out: folder for the model and a report.
+        data: photographs to compose the mosaics from; one in five is held out.
+        detector: the detector.
+        mosaics: number of training mosaics of 4 × 4 photographs.
+        far: number of training mosaics of 8 × 6 photographs, in which objects are half as large.
+        judged: number of mosaics of 4 × 4 held-out photographs, to evaluate the fit and to choose settings of the
+            search and thresholds.
+        judged_far: number of mosaics of 8 × 6 held-out photographs, to choose settings of the search.
+        tile: width in pixels of the slot of a photograph; its height is three quarters of that.
+        searched: number of training mosaics of 4 × 4 photographs for fitting the decisions of searches.
+        sought: number of present classes, and of absent classes, to search for in each of these mosaics.
+        passes: maximum number of passes of the detector in such a search.
+        false_alarms: maximum share of absent targets that may be reported as found; it determines the threshold.
+        surest: upper limit of that threshold, even if more false alarms result.
+        lost: maximum share of the targets that may be missed because the search gives up.
+        evidence: model that was fitted before. If given, only the decisions of searches are fitted (None: fit all).
+        steps: number of training steps for predicting the results of closer looks.
+        judging: number of training steps for the decisions of searches.
+        seed: seed of the mosaics and the fit.
+        out: folder for the model and the report.
         cache: folder for the looks (None: the user's cache).
-        workers: processes (None: one for each CPU core).
+        workers: number of processes (None: one for each CPU core).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))

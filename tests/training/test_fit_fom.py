@@ -47,7 +47,7 @@ def test_fit_leaves_a_model_and_a_report(fitted):
     assert counts[person].sum() > 0
     assert counts[cup].sum() > 0
     report = (fitted / "report.md").read_text()
-    for word in ("raw scores", "Dirichlet, fixed_point", "takes those of level"):
+    for word in ("raw scores", "Dirichlet, fixed_point", "uses level"):
         assert word in report
     assert json.loads((fitted / "manifest.json").read_text())["model"]["method"] == "newton"
     assert (fitted / "reliability.png").stat().st_size > 3000

@@ -88,7 +88,7 @@ def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, 
         out=tmp_path / "out", workers=1,
     )  # fmt: skip
     fit_fom(config)
-    assert "octaves that the picture is reduced by" in capsys.readouterr().out
+    assert "the number of octaves by which the picture is reduced" in capsys.readouterr().out
     model = FovealObservationModel.from_pretrained(tmp_path / "out" / "bright-zoom.safetensors")
     assert model.edges.tolist() == [0.5, 1.5, 2.5]
     assert model.metadata["sensor"]["glimpse"] == "antialiased bilinear"
