@@ -55,7 +55,7 @@ class FitAgentConfig(Settings):
         epochs: passes over the collected gaze shifts in each update.
         minibatch: gaze shifts in one gradient step.
         rate: learning rate.
-        discount: factor by which a reward counts less for every gaze shift that it comes later.
+        discount: discount factor of rewards per gaze shift.
         width: channels of the network's hidden layers.
         starts: starting points for each evaluated scene and target.
         seed: seed of the initial parameters, the episodes and all random draws.

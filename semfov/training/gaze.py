@@ -51,7 +51,7 @@ class FitGazeConfig(Settings):
         shifts: number of gaze shifts in a search.
         window: number of gaze shifts that a gradient flows through (truncated backpropagation through time).
         temperature: temperature of the Gumbel-softmax.
-        discount: factor by which the loss of each gaze shift counts less than that of the one before.
+        discount: discount factor of the loss per gaze shift.
         posterior: weight of the loss term for the posterior probability of the target's cells.
         others: weight of the loss term for the other classes in the photograph. The same looks also show where these
             classes are.

@@ -50,7 +50,7 @@ class Relaxation:
         window: number of gaze shifts that a gradient flows through. Between two windows the belief is treated as a
             constant (truncated backpropagation through time).
         temperature: temperature of the Gumbel-softmax.
-        discount: γ, the factor by which each gaze shift counts less than the one before.
+        discount: γ, discount factor of the loss per gaze shift.
         posterior: w, weight of the loss term for the belief.
         others: weight of the loss term for classes that are not searched for.
         hard: use straight-through fixations (True), or soft points between the cells (False).

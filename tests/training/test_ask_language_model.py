@@ -263,8 +263,8 @@ def test_prompts_of_the_package_can_be_asked():
     [
         ("What?", r"\[beside\] or \[height\] before"),
         ("[near]\nWhat is near {name}?", r"got \[near\]"),
-        ("[beside]\nWhat?", r"expected \{name\}"),
-        ("[beside]\nIs {name} at {height}?", r"expected \{name\}"),
+        ("[beside]\nWhat?", r"expected the placeholder \{name\}"),
+        ("[beside]\nIs {name} at {height}?", r"expected the placeholder \{name\}"),
         ("[beside]\nIs {name} {", "braces"),
         ("[height]\nIs {name} at {height}?", "got none"),
     ],

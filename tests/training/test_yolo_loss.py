@@ -203,8 +203,8 @@ def test_descending_finds_an_object():
     ("change", "message"),
     [
         ({"maps": 1}, "maps: expected one for each of 2 heads, got 1"),
-        ({"labels": 1}, "labels: expected those of 3 images, got 1"),
-        ({"boxes": 2}, "labels: expected those of 2 images, got 3"),
+        ({"labels": 1}, "labels: expected one tensor for each of 3 images, got 1"),
+        ({"boxes": 2}, "labels: expected one tensor for each of 2 images, got 3"),
     ],
 )
 def test_refuses_what_does_not_fit(change, message):
