@@ -42,19 +42,19 @@ def entries() -> dict[str, list[tuple[str, Any]]]:
     for name in (*MODULES[1:], MODULES[0]):
         module = importlib.import_module(name)
         public = getattr(module, "__all__", None) or [n for n, t in vars(module).items() if _own(t, name)]
-        things = [(n, getattr(module, n)) for n in sorted(public)]
-        things = [(n, t) for n, t in things if (inspect.isclass(t) or inspect.isfunction(t)) and id(t) not in seen]
-        seen |= {id(t) for _, t in things}
-        found[name] = things
+        objects = [(n, getattr(module, n)) for n in sorted(public)]
+        objects = [(n, t) for n, t in objects if (inspect.isclass(t) or inspect.isfunction(t)) and id(t) not in seen]
+        seen |= {id(t) for _, t in objects}
+        found[name] = objects
     return {name: found[name] for name in MODULES if found[name]}
 
 
-def _own(thing: Any, module: str) -> bool:
-    public = inspect.isclass(thing) or inspect.isfunction(thing)
-    return public and thing.__module__ == module and not thing.__name__.startswith("_")
+def _own(obj: Any, module: str) -> bool:
+    public = inspect.isclass(obj) or inspect.isfunction(obj)
+    return public and obj.__module__ == module and not obj.__name__.startswith("_")
 
 
-def place(module: str, name: str, thing: Any) -> str:
+def place(module: str, name: str, obj: Any) -> str:
     """Return the name under which the reference documents a class or function.
 
     This is the name in its public module, or the name where it is defined if a module has the public name, too.
@@ -62,7 +62,7 @@ def place(module: str, name: str, thing: Any) -> str:
     Args:
         module: the public module.
         name: the public name in it.
-        thing: the class or function.
+        obj: the class or function.
 
     Returns:
         The full name.
@@ -72,7 +72,7 @@ def place(module: str, name: str, thing: Any) -> str:
     ('semfov.sensor.foveate', 'semfov.sensor.glimpse.glimpse')
     """
     public = f"{module}.{name}"
-    return f"{thing.__module__}.{thing.__qualname__}" if _is_module(public) else public
+    return f"{obj.__module__}.{obj.__qualname__}" if _is_module(public) else public
 
 
 def _is_module(name: str) -> bool:
@@ -85,8 +85,8 @@ def _is_module(name: str) -> bool:
 def pages() -> dict[str, str]:
     """Write the pages of the reference in Markdown, one for each module. mkdocstrings fills in the docstrings."""
     found = {}
-    for module, things in entries().items():
+    for module, objects in entries().items():
         about = (inspect.getdoc(importlib.import_module(module)) or "").split("\n\n")[0]
-        names = [f"::: {place(module, name, thing)}" for name, thing in things]
+        names = [f"::: {place(module, name, obj)}" for name, obj in objects]
         found[module] = "\n\n".join([f"# {module} {{#{module}}}", about, *names, ""])
     return found

@@ -43,10 +43,10 @@ def _fenced_example(match: re.Match[str]) -> str:
     return f"{indent}**Example**\n\n{indent}```python\n{code}\n{indent}```"
 
 
-def _arguments(thing: griffe.Object) -> set[str]:
+def _arguments(obj: griffe.Object) -> set[str]:
     """Return the names of a function's arguments and of a class's attributes, which must not become links."""
-    arguments = thing.parameters if isinstance(thing, griffe.Function | griffe.Class) else ()
-    return {thing.name, *(argument.name for argument in arguments), *thing.members}
+    arguments = obj.parameters if isinstance(obj, griffe.Function | griffe.Class) else ()
+    return {obj.name, *(argument.name for argument in arguments), *obj.members}
 
 
 class Docstrings(griffe.Extension):

@@ -22,16 +22,16 @@ class Names:
     @cached_property
     def places(self) -> dict[int, str]:
         """The entry of each public class and function, by the object's `id`."""
-        return {id(thing): place(module, name, thing) for module, things in entries().items() for name, thing in things}
+        return {id(obj): place(module, name, obj) for module, objects in entries().items() for name, obj in objects}
 
     @cached_property
     def classes(self) -> dict[str, str]:
         """The entry of each public class, by its bare name. Names that several classes share are left out."""
         found: dict[str, list[str]] = {}
-        for things in entries().values():
-            for name, thing in things:
-                if inspect.isclass(thing):
-                    found.setdefault(name, []).append(self.places[id(thing)])
+        for objects in entries().values():
+            for name, obj in objects:
+                if inspect.isclass(obj):
+                    found.setdefault(name, []).append(self.places[id(obj)])
         return {name: places[0] for name, places in found.items() if len(places) == 1}
 
     def place(self, name: str) -> str | None:
@@ -53,9 +53,9 @@ class Names:
             name = self.classes[first] + (f".{rest}" if rest else "")
         if name in MODULES:
             return name
-        thing, owner = resolve(name)
-        if id(thing) in self.places:
-            return self.places[id(thing)]
+        obj, owner = resolve(name)
+        if id(obj) in self.places:
+            return self.places[id(obj)]
         if owner is None or id(owner) not in self.places:
             return None
         member = name.rpartition(".")[2]
@@ -73,10 +73,10 @@ class Names:
             The text with links.
         """
         neighbours = {
-            thing.__name__: self.places[id(thing)]
-            for things in entries().values()
-            for _, thing in things
-            if inspect.isfunction(thing) and thing.__module__ == module and thing.__name__ not in but
+            obj.__name__: self.places[id(obj)]
+            for objects in entries().values()
+            for _, obj in objects
+            if inspect.isfunction(obj) and obj.__module__ == module and obj.__name__ not in but
         }
         return _BARE.sub(lambda m: f"[{m[0]}][{neighbours[m[1]]}]" if m[1] in neighbours else m[0], text)
 
@@ -121,34 +121,34 @@ def resolve(name: str) -> tuple[Any, Any]:
     parts = name.split(".")
     for length in range(1, len(parts) + 1):  # a function may hide the module that it is in
         try:
-            thing = importlib.import_module(".".join(parts[:length]))
+            obj = importlib.import_module(".".join(parts[:length]))
         except ModuleNotFoundError:
             break
         with suppress(AttributeError):
-            return _member(thing, parts[length:])
+            return _member(obj, parts[length:])
     raise LookupError(f"{name} does not exist")
 
 
-def _member(thing: Any, names: list[str]) -> tuple[Any, Any]:
+def _member(obj: Any, names: list[str]) -> tuple[Any, Any]:
     owner = None
     for name in names:
-        owner = thing if inspect.isclass(thing) else None
-        annotated = name in getattr(thing, "__annotations__", ())
-        thing = getattr(thing, name, None) if annotated else getattr(thing, name)
-    return thing, owner
+        owner = obj if inspect.isclass(obj) else None
+        annotated = name in getattr(obj, "__annotations__", ())
+        obj = getattr(obj, name, None) if annotated else getattr(obj, name)
+    return obj, owner
 
 
 def _shown(owner: type, member: str) -> bool:
     """Return whether the reference shows a member: a documented method or property of the class itself."""
-    thing = inspect.getattr_static(owner, member, None)
-    thing = getattr(thing, "__func__", None) or getattr(thing, "fget", None) or thing
-    return member in vars(owner) and inspect.isfunction(thing) and bool(thing.__doc__) and not member.startswith("_")
+    obj = inspect.getattr_static(owner, member, None)
+    obj = getattr(obj, "__func__", None) or getattr(obj, "fget", None) or obj
+    return member in vars(owner) and inspect.isfunction(obj) and bool(obj.__doc__) and not member.startswith("_")
 
 
 def _internal(name: str) -> str | None:
     """Return the name under which a class or function that is not public is defined."""
-    thing, owner = resolve(name)
-    thing = owner or thing
-    if not (inspect.isclass(thing) or inspect.isfunction(thing)):
+    obj, owner = resolve(name)
+    obj = owner or obj
+    if not (inspect.isclass(obj) or inspect.isfunction(obj)):
         return None
-    return f"{thing.__module__}.{thing.__qualname__}"
+    return f"{obj.__module__}.{obj.__qualname__}"

@@ -170,9 +170,9 @@ def train(config: FitAgentConfig, scenery: Scenery) -> tuple[Any, list[float]]:
         policy_kwargs={"width": config.width},
         device="cpu",
     )
-    told = Returns()
-    model.learn(config.steps, callback=told)
-    return model, told.means
+    recorder = Returns()
+    model.learn(config.steps, callback=recorder)
+    return model, recorder.means
 
 
 class TrainedAgent:

@@ -191,7 +191,7 @@ def ask_all(server: ChatServer, questions: dict[str, Question], answers: Answers
                     if config.budget is not None and spent >= config.budget:
                         raise InputError(
                             f"budget: the answers have cost {spent:.4g}, which reaches the limit of {config.budget:g}; "
-                            "all answers so far are kept, and a higher budget continues from them"
+                            "all answers so far are kept; repeat the command with a higher budget to continue"
                         )
                     under_way[pool.submit(server.ask, question.text)] = key, question
                 if not under_way:
@@ -214,8 +214,10 @@ def _next(todo: Iterator[tuple[str, Question]], most: int) -> Iterator[tuple[str
 
 def cost(entries: Sequence[dict[str, Any]], config: AskConfig) -> float:
     """Return the cost of the answers, computed from their tokens and the prices in the settings."""
-    asked, told = (sum(entry[name] for entry in entries) for name in ("prompt_tokens", "completion_tokens"))
-    return (asked * config.input_price + told * config.output_price) / 1e6
+    input_tokens, output_tokens = (
+        sum(entry[name] for entry in entries) for name in ("prompt_tokens", "completion_tokens")
+    )
+    return (input_tokens * config.input_price + output_tokens * config.output_price) / 1e6
 
 
 def tables_of(answers: Sequence[tuple[Question, str]], classes: Sequence[str]) -> tuple[Tensor, Tensor, int]:
@@ -233,19 +235,19 @@ def tables_of(answers: Sequence[tuple[Question, str]], classes: Sequence[str]) -
     Returns:
         The table of co-occurrence `(K, K)`, the table of heights `(K, 3)`, and the number of unreadable answers.
     """
-    said: dict[tuple[str, str, str], list[float]] = defaultdict(list)
+    readings: dict[tuple[str, str, str], list[float]] = defaultdict(list)
     unread = 0
     for question, answer in answers:
         values = answer_values(question, answer, classes)
         unread += values is None
         for option, value in (values or {}).items():
-            said[question.section, question.name, option].append(value)
+            readings[question.section, question.name, option].append(value)
             if question.section == "beside" and question.option is not None:
-                said[question.section, option, question.name].append(value)
+                readings[question.section, option, question.name].append(value)
     names = [canonical_name(name) for name in classes]
 
     def mean(section: str, options: Sequence[str]) -> Tensor:
-        found = [[said.get((section, name, option), []) for option in options] for name in names]
+        found = [[readings.get((section, name, option), []) for option in options] for name in names]
         return torch.tensor([[sum(each) / len(each) if each else torch.nan for each in row] for row in found])
 
     beside, heights = mean("beside", names), mean("height", HEIGHTS)
@@ -278,7 +280,9 @@ def read_classes(path: Path) -> tuple[str, ...]:
 
 def report(entries: Sequence[dict[str, Any]], unread: int, beside: Tensor, config: AskConfig, prompts: str) -> str:
     """Report the number of answers, their cost and the coverage of the table as Markdown."""
-    asked, told = (sum(entry[name] for entry in entries) for name in ("prompt_tokens", "completion_tokens"))
+    input_tokens, output_tokens = (
+        sum(entry[name] for entry in entries) for name in ("prompt_tokens", "completion_tokens")
+    )
     models = ", ".join(sorted({str(entry["model"]) for entry in entries}))
     named = int((beside > 0).sum()) // 2
     rows = [
@@ -287,8 +291,8 @@ def report(entries: Sequence[dict[str, Any]], unread: int, beside: Tensor, confi
         ["sha256 of the prompts", prompts],
         ["answers", str(len(entries))],
         ["unreadable answers", str(unread)],
-        ["input tokens (questions)", str(asked)],
-        ["output tokens (answers)", str(told)],
+        ["input tokens (questions)", str(input_tokens)],
+        ["output tokens (answers)", str(output_tokens)],
         ["cost", f"{cost(entries, config):.4g}" if config.input_price or config.output_price else "no prices given"],
         ["pairs of classes with a value above 0", f"{named} of {len(beside) * (len(beside) - 1) // 2}"],
     ]

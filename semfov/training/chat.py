@@ -108,11 +108,11 @@ class ChatServer:
                 with self._opener.open(message, timeout=self.timeout) as response:
                     return _reply(response.read(_MOST), self.url, self.model)
             except urllib.error.HTTPError as error:
-                message_of_server = _told(error)
+                reason = _error_message(error)
                 if error.code not in _AGAIN:
-                    refusal = _refusal(error.code, message_of_server, self.url, self.model)
+                    refusal = _refusal(error.code, reason, self.url, self.model)
                     raise refusal from None
-                failure, retry_after = f"HTTP {error.code}{message_of_server}", error.headers.get("Retry-After", "")
+                failure, retry_after = f"HTTP {error.code}{reason}", error.headers.get("Retry-After", "")
             except (OSError, http.client.HTTPException) as error:
                 failure, retry_after = str(getattr(error, "reason", None) or error or type(error).__name__), ""
             if attempt < self.retries:
@@ -138,34 +138,35 @@ def _reply(body: bytes, url: str, model: str) -> Reply:
         raise DataError(f"{url}: expected a chat completion with choices[0].message.content, got {start!r}") from None
 
 
-def _told(error: urllib.error.HTTPError) -> str:
+def _error_message(error: urllib.error.HTTPError) -> str:
     """Return the server's own error message, in parentheses."""
     try:
         body = error.read(_MOST)
     except (OSError, http.client.HTTPException):
         return ""
     try:
-        told = json.loads(body)["error"]
-        message = told["message"] if isinstance(told, dict) else told
+        answer = json.loads(body)["error"]
+        message = answer["message"] if isinstance(answer, dict) else answer
     except (ValueError, LookupError, TypeError, RecursionError):
         message = body.decode(errors="replace")
     plain = " ".join(str(message).split())
     return f" ({plain[:200]})" if plain else ""
 
 
-def _refusal(code: int, told: str, url: str, model: str) -> InputError | DataError:
+def _refusal(code: int, reason: str, url: str, model: str) -> InputError | DataError:
     """Make the error for a request that the server refuses."""
     if code in (401, 403):
         return InputError(
-            f"key: {url} refuses the API key with HTTP {code}{told}; set the environment variable that `key` names"
+            f"key: {url} refuses the API key with HTTP {code}{reason}; set the environment variable that `key` names"
         )
     if code == 404:
         return InputError(
-            f"url, model: {url} answers HTTP 404{told}; check the address, and that the server has the model {model!r}"
+            f"url, model: {url} answers HTTP 404{reason}; check the address, and whether the server has the model "
+            f"{model!r}"
         )
     if 300 <= code < 400:
         return InputError(
             f"url: {url} redirects to another address with HTTP {code}; redirects are not followed, so give the final "
             "address"
         )
-    return DataError(f"{url}: the server refuses the question with HTTP {code}{told}")
+    return DataError(f"{url}: the server refuses the question with HTTP {code}{reason}")

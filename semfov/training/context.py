@@ -64,7 +64,7 @@ def fit_context(config: FitContextConfig) -> None:
 
 
 def fit(places: Sequence[Places], classes: Sequence[str], config: FitContextConfig) -> ContextPrior:
-    """Count the context prior of photographs.
+    """Count the context in photographs.
 
     Args:
         places: the objects of each photograph, on the grid.

@@ -64,7 +64,7 @@ def make_cases(
         observer = Target(TargetEvidence.from_pretrained(sampler.eye.detector.name).requires_grad_(False))
     work = [(prior, index) for prior, part in folds for index in part]
     parts = []
-    for prior, index in tqdm(work, desc=f"context beside {kind}", unit="scene", dynamic_ncols=True):
+    for prior, index in tqdm(work, desc=f"context with {kind}", unit="scene", dynamic_ncols=True):
         place = places[index]
         looks = slice(index * config.fixations, (index + 1) * config.fixations)
         seen, fixations = samples.seen(looks), samples.fixations[looks]

@@ -264,7 +264,7 @@ class Workshop:
         config, run = self.config.evidence(self.components - 1), self.run
         fit = fit_evidence(config, run)
         grid = Grid(config.columns, config.rows, (config.columns, config.rows))
-        # More searches for absent classes give a more precise share of false alarms, and absent classes are plenty.
+        # More searches for absent classes give a more precise share of false alarms, and there are many such classes.
         each = max(config.classes, min(20, ABSENT // len(self.held_out)))
         area, scenes = config.max_target_area, self.held_out
         wide = make_examples(run, config.classes, area, config.seed, absent=each, scenes=scenes)

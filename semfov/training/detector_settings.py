@@ -83,7 +83,7 @@ class FitDetectorConfig(Settings):
         return replace(self, data=data, detector=replace(self.detector, name=str(self.model)))
 
     def sized(self, photographs: int) -> "FitDetectorConfig":
-        """Return these settings with defaults that suit the number of photographs where a setting is None."""
+        """Return these settings, with each None replaced by a default that suits the number of photographs."""
         few = photographs < MANY
         share = min(photographs / MANY, 1)
         return replace(

@@ -149,9 +149,9 @@ def objective(config: FitSearchConfig, step: Step, goal: Tensor) -> Tensor:
               + w_p \, \mathrm{BCE}(P(t)) - w_l \ln \frac{\sum_{x \in \text{goal}} o(x)}{\sum_x o(x)},
               \qquad o = p / (1 - p)
 
-    The terms are the cross-entropy of all cells (four times their mean for 100 cells), the cross-entropy of two
-    selected cells, the cross-entropy of presence in the photograph, and minus the log probability that a fixation drawn
-    in proportion to the odds o of the unvisited cells lands on the target.
+    The terms are the cross-entropy of all cells (four times their mean, which the formula writes for 100 cells), the
+    cross-entropy of two selected cells, the cross-entropy of presence in the photograph, and minus the log probability
+    that a fixation drawn in proportion to the odds o of the unvisited cells lands on the target.
 
     The cell a is the next one to fixate, and b is the most probable fixated cell. Both are selected because of their
     high probability, which biases them: a model that is calibrated over all cells overestimates these two. Therefore
@@ -325,9 +325,9 @@ def report(judged: list[dict[str, float]], thresholds: Thresholds, trained: int,
             "",
             *table([head, *rows]),
             "",
-            f"Thresholds: the target counts as found when it is present with a probability of {thresholds.confirm:.3f} "
-            f"and in one cell with {thresholds.place:.2f}. The search gives up when no other cell has a probability of "
-            f"{thresholds.give_up:.2f} or more.",
+            f"Thresholds: the target counts as found if the probability of its presence is at least "
+            f"{thresholds.confirm:.3f} and that of a fixated cell at least {thresholds.place:.2f}. The search gives up "
+            f"if no other cell has a probability of at least {thresholds.give_up:.2f}.",
             "",
         ]
     )

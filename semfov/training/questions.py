@@ -136,8 +136,8 @@ def answer_values(question: Question, answer: str, classes: Sequence[str]) -> di
         value = _graded(answer)
         return None if value is None else {question.option: value}
     if question.section == "height":
-        said = {height: float(bool(re.search(rf"\b{height}\b", answer.lower()))) for height in HEIGHTS}
-        return said if any(said.values()) else None
+        mentioned = {height: float(bool(re.search(rf"\b{height}\b", answer.lower()))) for height in HEIGHTS}
+        return mentioned if any(mentioned.values()) else None
     named = named_in(answer, classes)
     return {canonical_name(name): float(name in named) for name in classes} if answer.strip() else None
 

@@ -188,7 +188,7 @@ def test_a_server_that_is_not_there_is_told(tmp_path):
 def test_refusals_say_what_to_do(server, call, capsys):
     cases = {
         401: ({"error": {"message": "bad key"}}, "environment variable"),
-        404: ({"error": "no such model"}, "has the model 'm'"),
+        404: ({"error": "no such model"}, "whether the server has the model 'm'"),
         400: ({"error": {"message": "too long"}}, "too long"),
         200: (b"<html>hello</html>", "chat completion"),
     }
