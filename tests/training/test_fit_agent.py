@@ -61,7 +61,7 @@ def test_an_agent_learns_to_search_scenes_that_it_was_not_trained_on(cache, tmp_
 def test_the_same_scenes_are_not_judged(cache, capsys):
     alike = ["--data.limit", "1", "--judged.limit", "1", "--judged.scene_seed", "0", "--cache", str(cache)]
     assert main(alike) == 1
-    assert "judged: expected other scenes" in capsys.readouterr().err
+    assert "judged: expected scenes other than those of `data`" in capsys.readouterr().err
 
 
 def test_the_adapter_does_what_stable_baselines_own_does(scenery):

@@ -146,7 +146,8 @@ def test_the_folder_says_what_it_holds(home):
     thresholds = semfov.TargetEvidence.from_pretrained(home / "models/evidence.safetensors").thresholds
     assert 0.49 < thresholds.confirm <= 0.9  # few searches judge
     text = (home / "models/report.md").read_text()
-    assert f"found from {thresholds.confirm:.2f}, a look is worth it from {thresholds.give_up:.2f}" in text
+    assert f"counts as found from a probability of {thresholds.confirm:.2f} on" in text
+    assert f"gives up when no cell has a probability of {thresholds.give_up:.2f} or more" in text
     assert "20 photographs, 5 of them held out (one in 4); 3 classes; 4 × 4 cells" in text
     for name in ("reliability.png", "search.png", "explore.png"):
         assert f"({name})" in text
@@ -385,7 +386,7 @@ def test_annotations_without_any_of_the_classes(home, tmp_path, capsys):
 
 def test_a_model_is_asked_for(capsys, tmp_path):
     assert main(["--out", str(tmp_path)]) == 1
-    assert "model: expected the detector's name or file, got none" in capsys.readouterr().err
+    assert "model: expected the name or the file of a detector, got none" in capsys.readouterr().err
     with pytest.raises(InputError, match=r"detector\.name: expected nothing, as model already names the detector"):
         FitDetectorConfig(model=Path("a.onnx"), detector=DetectorConfig(name="yolov3")).named()
 

@@ -164,7 +164,7 @@ def test_a_run_leaves_a_model_and_a_report(tmp_path, capsys):
         ("kl-raw", ORDER[:number]) for number in range(1, 5)
     ]
     text = (tmp_path / "out/report.md").read_text()
-    assert "judged by 16 of 2 other people in 2 other pictures" in text
+    assert "evaluated on 16 fixations of 2 other people in 2 other pictures" in text
     # With few fixations the penalty on the weights counts, but nothing is worse than it was on what was fitted.
     for rows in (figures[:3], figures[3:7], figures[7:]):
         assert all(more["fitted"] >= less["fitted"] - 0.1 for less, more in pairwise(rows))
@@ -177,4 +177,4 @@ def test_pictures_of_another_size_are_told(tmp_path, capsys):
     given = write_viewing(tmp_path, pictures=2)
     Image.new("RGB", (640, 480)).save(tmp_path / "1.png")
     assert main([*given, "--policies", "[vocus2-raw]", "--out", str(tmp_path / "out")]) == 1
-    assert "expected pictures of (800, 600) pixels, 1.png is not" in capsys.readouterr().err
+    assert "expected all pictures to have 800 × 600 pixels, got another size for 1.png" in capsys.readouterr().err
