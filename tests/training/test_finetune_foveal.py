@@ -167,7 +167,7 @@ def test_sharp_views_where_none_is_foveated(viewer):
     ("arguments", "message"),
     [
         (["--detector.name", "yolox-nano"], "unknown detector 'yolox-nano'"),
-        (["--depth", "3"], "depth: expected only convolutions one after the other"),
+        (["--depth", "3"], "depth: expected no more than the number of consecutive convolutions before each head"),
         (["--holdout", "1"], "holdout: expected a whole number from 2"),
         (["--data.limit", "1"], "data: expected at least 2 photographs, one to train on and one to hold out, got 1"),
     ],
