@@ -22,7 +22,7 @@ _PREPARE = """
 %config InlineBackend.figure_formats = ["png"]
 %config InlineBackend.print_figure_kwargs = {"dpi": 110}
 import warnings
-warnings.filterwarnings("ignore", "IProgress not found")  # of tqdm, which Pooch asks for a bar that fits notebooks
+warnings.filterwarnings("ignore", "IProgress not found")  # from tqdm, as Pooch requests a progress bar for notebooks
 """
 
 

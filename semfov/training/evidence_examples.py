@@ -123,7 +123,7 @@ class ExampleLooks(Looks):
 
 def no_detections() -> Detections:
     """Raise an error: examples store features of detections, but not the detections."""
-    raise NotImplementedError("examples keep no detections")
+    raise NotImplementedError("examples store features of detections, not the detections")
 
 
 def make_examples(

@@ -114,12 +114,12 @@ def fit_gaze(config: FitGazeConfig) -> None:
     metadata = {**eye.settings(), **training_of(config, scenes, "save_every", "judged")}
     fovea = fovea_of(eye)
     start, width = first_model(config, metadata), float(fovea.sigma)
-    judged = {"start": judge(config, start, eye, scenes, held_out, "judging the start")}
+    judged = {"start": judge(config, start, eye, scenes, held_out, "evaluating the start")}
     fovea.log_sigma.requires_grad_(config.learn_sigma)
     gaze, losses = train(config, eye, scenes, trained_on, metadata)
     eye.requires_grad_(False)
     gaze.metadata.update(eye.settings())
-    judged["learned"] = judge(config, gaze, eye, scenes, held_out, "judging")
+    judged["learned"] = judge(config, gaze, eye, scenes, held_out, "evaluating")
     path = model_path(config, eye.detector.name)
     gaze.save(path)
     text = report(config, judged, losses, len(trained_on), len(held_out), (width, float(fovea.sigma)))

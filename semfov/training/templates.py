@@ -101,7 +101,7 @@ def fit_templates(config: FitTemplatesConfig) -> None:
     model = ClassTemplates(*sums.templates(), detector.classes, metadata=metadata).eval()
     areas = [
         area
-        for index in tqdm(held_out, desc="judging", unit="photograph", dynamic_ncols=True)
+        for index in tqdm(held_out, desc="evaluating", unit="photograph", dynamic_ncols=True)
         for area in areas_under_roc(model, detector, scenes, index)
     ]
     path = model_path(config, detector.name)

@@ -29,7 +29,7 @@ JUDGED = (1, 4, 8, 16)
 
 @dataclass(frozen=True)
 class Searches:
-    """E searches of n looks. A search that ends early, because no window is left, is padded with its last values.
+    """E searches of n looks. A search that ends early is padded with its last values, and with 0 for `left`.
 
     Attributes:
         best: `(E, n)`, highest score of the target so far, after each look.
@@ -107,7 +107,7 @@ def fit_judge(model: GlimpseEvidence, searches: Searches, steps: int, batch: int
         return F.binary_cross_entropy_with_logits(model.anywhere(best[rows], case[rows]), there[rows])
 
     model.judge.requires_grad_(True)
-    descend(model.judge.parameters(), loss_of, steps, 1e-2, decay=1.0, title="judging")
+    descend(model.judge.parameters(), loss_of, steps, 1e-2, decay=1.0, title="fitting decisions")
     model.judge.requires_grad_(False)
 
 
