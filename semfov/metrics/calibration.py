@@ -117,8 +117,8 @@ def reliability(confidence: Tensor, correct: Tensor, bins: int | Tensor = 15) ->
     Args:
         confidence: `(M,)`, predicted probabilities.
         correct: `(M,)` boolean, whether the prediction came true.
-        bins: number of equally wide bins, or the ascending edges between bins. A bin contains its upper edge and not its
-            lower one.
+        bins: number of equally wide bins, or the ascending edges between bins. A bin contains its upper edge and not
+            its lower one.
 
     Returns:
         `(3, bins)`, float64 on the CPU: number of predictions, sum of their confidence, and number that came true.
@@ -152,8 +152,8 @@ class BinarySums:
     therefore divided into 7 bins for reliability diagrams.
 
     Attributes:
-        bins: `(3, 21)`, float64: number of predictions, sum of their probabilities, and number that came true, by bin of
-            probability.
+        bins: `(3, 21)`, float64: number of predictions, sum of their probabilities, and number that came true, by bin
+            of probability.
         surprisal: sum of negative log likelihoods, in nats.
         square: sum of squared errors.
 

@@ -26,7 +26,7 @@ def area_under_roc(score: Tensor, present: Tensor) -> float:
     >>> area_under_roc(torch.tensor([0.9, 0.4, 0.4, 0.1]), torch.tensor([True, True, False, False]))
     0.875
     """
-    check(bool(present.any() and not present.all()), "present", "cases with the target and cases without it", "only one of the two")
+    check(bool(present.any() and not present.all()), "present", "both true and false values", "only one of the two")
     hit, miss = score[present].double(), score[~present].double().sort().values
     below = torch.searchsorted(miss, hit) + torch.searchsorted(miss, hit, right=True)
     return float(below.double().mean() / (2 * len(miss)))
@@ -87,7 +87,7 @@ def roc(score: Tensor, present: Tensor) -> tuple[list[float], list[float]]:
     >>> roc(torch.tensor([0.9, 0.4, 0.5, 0.1]), torch.tensor([True, True, False, False]))
     ([0.0, 0.0, 0.5, 0.5, 1.0], [0.0, 0.5, 0.5, 1.0, 1.0])
     """
-    check(bool(present.any() and not present.all()), "present", "cases with the target and cases without it", "only one of the two")
+    check(bool(present.any() and not present.all()), "present", "both true and false values", "only one of the two")
     levels = score.unique(sorted=True).flip(0)[:, None]
     told = score >= levels
     shares = [(told[:, kind].double().mean(1)).tolist() for kind in (~present, present)]

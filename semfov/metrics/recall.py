@@ -15,8 +15,8 @@ def found_objects(
     """Scores of the objects that a detector finds in one view, and scores of its false boxes.
 
     The class of a box is the one of its highest score, background excepted, and this score is its confidence. The boxes
-    of each class are matched with the objects of that class in descending order of confidence (`semfov.observation.match`).
-    Each object is matched once.
+    of each class are matched with the objects of that class in descending order of confidence
+    (`semfov.observation.match`). Each object is matched once.
 
     Args:
         boxes: `(L, 4)`, detections as (x1, y1, x2, y2) in pixels.

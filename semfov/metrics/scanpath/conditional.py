@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 def nss(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
-    r"""Normalised scanpath saliency (Peters et al., 2005): the map's value at each fixation as a z-score over its pixels.
+    r"""Normalised scanpath saliency (Peters et al., 2005): z-score of the map at each fixation, over its pixels.
 
     .. math:: \frac{s(x, y) - \bar s}{\sigma_s}
 
@@ -73,6 +73,13 @@ def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
 
 def share_below(ordered: Array, values: Array) -> Array:
     """Fraction of ascending numbers that are lower than each of `values`; ties count half.
+
+    Args:
+        ordered: numbers in ascending order.
+        values: `(n,)`, numbers to compare with them.
+
+    Returns:
+        `(n,)`, from 0 to 1.
 
     >>> share_below(np.array([1.0, 2.0, 2.0, 3.0]), np.array([2.0]))
     array([0.5])

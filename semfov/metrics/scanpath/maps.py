@@ -31,7 +31,7 @@ def auc_judd(saliency: ArrayLike, x: ArrayLike, y: ArrayLike) -> float:
     1.0
     """
     values, at = looked_up(saliency, x, y)
-    check(values.ndim == 2 and at.size > 0, "saliency", "one map (H, W) and at least one fixation", (values.shape, at.shape))
+    check(values.ndim == 2 and at.size > 0, "saliency", "one map and at least one fixation", (values.shape, at.shape))
     free = np.ones(values.shape, dtype=bool)
     free[np.floor(np.asarray(y) + 0.5).astype(int), np.floor(np.asarray(x) + 0.5).astype(int)] = False
     others = np.sort(values[free])

@@ -24,8 +24,8 @@ class MultiMatch(NamedTuple):
         position: of the fixated points.
         duration: of the fixations' durations; NaN where no durations are given.
 
-    >>> MultiMatch(0.9, 0.8, 1.0, 0.7, float("nan")).mean
-    0.85
+    >>> MultiMatch(0.5, 1.0, 1.0, 0.5, float("nan")).mean
+    0.75
     """
 
     shape: float

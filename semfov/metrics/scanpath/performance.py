@@ -136,7 +136,7 @@ def probability_mismatch(curve: ArrayLike, reference: ArrayLike) -> float:
 
 
 def scanpath_ratio(points: ArrayLike, box: ArrayLike) -> float:
-    r"""Scanpath ratio of Yang et al. (2020): the direct distance to the target over the length of the scanpath, at most 1.
+    r"""Scanpath ratio (Yang et al., 2020): direct distance to the target over the length of the scanpath, at most 1.
 
     .. math:: \min\left(1, \frac{\|c - p_0\|}{\sum_{i=1}^{m} \|p_i - p_{i-1}\|}\right)
 

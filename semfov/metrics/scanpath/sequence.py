@@ -97,9 +97,9 @@ def sequence_score(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> floa
 
     .. math:: S(a, b) = \frac{\mathrm{LCS}(a, b)}{\max(|a|, |b|)}
 
-    With one point for a match and no penalty for a gap, the best alignment is the longest common subsequence (LCS). This
-    is the sequence score of Borji and Itti (2013) in the form of Yang et al. (2020), where labels are clusters or cells.
-    It is the semantic sequence score (Yang et al., 2022) where labels are the classes of what was fixated.
+    With one point for a match and no penalty for a gap, the best alignment is the longest common subsequence (LCS).
+    This is the sequence score of Borji and Itti (2013) in the form of Yang et al. (2020), where labels are clusters or
+    cells. It is the semantic sequence score (Yang et al., 2022) where labels are the classes of what was fixated.
 
     Args:
         ours: labels of one scanpath, in order.
@@ -122,8 +122,8 @@ def edit_distance(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> int:
     """Edit distance of two sequences of labels (Levenshtein).
 
     It is the least number of labels to insert, delete or replace that turns one sequence into the other. This is the
-    fixation edit distance (Mondal et al., 2023) where labels are clusters or cells, and its semantic form where they are
-    classes.
+    fixation edit distance (Mondal et al., 2023) where labels are clusters or cells, and its semantic form where they
+    are classes.
 
     Args:
         ours: labels of one scanpath, in order.

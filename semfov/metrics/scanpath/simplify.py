@@ -11,9 +11,9 @@ Array = NDArray[np.float64]
 def merge_close(points: ArrayLike, size: tuple[float, float]) -> Array:
     """Merge successive fixations that are closer than half a window.
 
-    Ruarte et al. (2025) and the benchmark before it (Travi et al., 2022) do so to compare people's scanpaths with those of
-    models that fixate a cell only once. Beginning at the start, a fixation and the next are replaced by their mean as long
-    as both differences, in x and in y, are smaller than half the window.
+    Ruarte et al. (2025) and the benchmark before it (Travi et al., 2022) do so to compare people's scanpaths with those
+    of models that fixate a cell only once. Beginning at the start, a fixation and the next are replaced by their mean
+    as long as both differences, in x and in y, are smaller than half the window.
 
     Args:
         points: `(n, 2)`, fixations in order.
