@@ -98,8 +98,8 @@ class SceneObserver(Observer):
     """Keeps the belief about a scene that is seen through one window at a time.
 
     The belief about each view is that of an agent that moves its eye alone. A cell of the scene takes the belief of the
-    view in which the gaze came closest to it. A cell that was never seen has the belief of a cell of the first view at
-    a distance of one longer side, where nothing was detected.
+    view in which the gaze came closest to it. A cell that was never seen has the belief of a cell in which a look from
+    a distance of one longer side detected nothing.
 
     Args:
         inner: observer of a view: `semfov.observers.Target` or `LearnedMap`.
