@@ -194,6 +194,6 @@ def test_strategies_of_learned_maps(model):
         assert made.observer.model is model
         assert not made.observer.together
         assert isinstance(made.policy, kind)
-        with pytest.raises(InputError, match="expected a learned map in `Means.map`, got none"):
+        with pytest.raises(InputError, match="expected a learned map.*, got none"):
             strategy(name, observation=FovealObservationModel.identity(["a", "b", "c"], [0.2]))
     assert strategy("closer-look-learned", map=model).policy.fovea == 0.15
