@@ -88,7 +88,7 @@ class GazePath:
         return written
 
     def show(self, last: int) -> list[Any]:
-        """Show the fixations up to `last`; a frame marks its number, in its own colour if the target was found there."""
+        """Show the fixations up to `last`; a frame marks its number, in green if the target was found there."""
         for lines in self.lines:
             lines.set_segments(list(self.segments[:last]))
         self.dots.set_offsets(self.path[: last + 1])
