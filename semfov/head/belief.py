@@ -125,7 +125,7 @@ class SceneObserver(Observer):
         self.inner, self.views, self.prior = inner, views, prior
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> SceneBelief:
-        """The belief before the first look; `grid` is the strip of all views (`Views.grid`)."""
+        """The belief before the first look; `grid` is the strip of all views."""
         check(batch == 1, "batch", "1, as a head has one episode at a time", batch)
         cells = len(self.views.world.scene)
         nothing = like.new_zeros(1, cells)
