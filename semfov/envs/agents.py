@@ -94,8 +94,8 @@ class MaskedRandom:
         seed: of the generator.
 
     >>> agent = MaskedRandom(seed=0)
-    >>> agent(None, {"action_mask": np.array([0, 1, 0], dtype=np.int8)})
-    np.int64(1)
+    >>> int(agent(None, {"action_mask": np.array([0, 1, 0], dtype=np.int8)}))
+    1
     """
 
     def __init__(self, seed: int = 0) -> None:

@@ -21,6 +21,9 @@ class Calibration:
         ece: expected calibration error of the most probable class.
         classwise_ece: calibration error of the probability of each class, averaged over the classes.
         accuracy: fraction of predictions whose most probable class is the true one.
+
+    >>> calibration(torch.tensor([[0.9, 0.1], [0.4, 0.6]]), torch.tensor([0, 0])).count
+    2
     """
 
     count: int
@@ -106,7 +109,17 @@ def calibration_error(confidence: Tensor, correct: Tensor, bins: int = 15) -> Te
 
 
 def error_of(bins: Tensor) -> Tensor:
-    """Expected calibration error from the sums of `reliability`, `(3, bins)`."""
+    """Expected calibration error from the sums of `reliability`.
+
+    Args:
+        bins: `(3, bins)`, sums of `reliability`.
+
+    Returns:
+        The error, a scalar from 0 to 1.
+
+    >>> error_of(torch.tensor([[1.0, 1.0], [0.1, 0.8], [0.0, 1.0]])).round(decimals=4)
+    tensor(0.1500)
+    """
     count, confident, right = bins
     return (confident - right).abs().sum() / count.sum().clamp(min=1)
 
@@ -189,7 +202,11 @@ class BinarySums:
 
     @classmethod
     def nothing(cls) -> Self:
-        """The sums over no predictions, to which others are added."""
+        """The sums over no predictions, to which others are added.
+
+        Returns:
+            Sums of 0.
+        """
         return cls(torch.zeros(3, len(cls.EDGES) + 1, dtype=torch.float64), 0.0, 0.0)
 
     def __add__(self, other: Self) -> Self:
@@ -232,14 +249,25 @@ class BinarySums:
         return total / self.count if self.count else float("nan")
 
     def record(self) -> dict[str, Any]:
-        """The sums as JSON values, without empty bins; `from_record` reads them."""
+        """The sums as JSON values, without empty bins; `from_record` reads them.
+
+        Returns:
+            `bins` (each bin's number and its three sums), `surprisal` and `square`.
+        """
         filled = self.bins[0].nonzero()[:, 0].tolist()
         bins = {str(number): self.bins[:, number].tolist() for number in filled}
         return {"bins": bins, "surprisal": self.surprisal, "square": self.square}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Self:
-        """The sums from the JSON values of `record`."""
+        """Read the sums from JSON values.
+
+        Args:
+            record: the values that `record` returned.
+
+        Returns:
+            The same sums.
+        """
         sums = cls.nothing()
         for number, column in record["bins"].items():
             sums.bins[:, int(number)] = torch.tensor(column, dtype=torch.float64)

@@ -23,6 +23,12 @@ def answers_of(annotation: Annotation, grid: Grid, components: int) -> Tensor:
 
     Returns:
         `(X·Y, K+1)`, boolean.
+
+    >>> import torch
+    >>> objects = Annotation(torch.tensor([[0.0, 0, 8, 8]]), torch.tensor([1]), torch.tensor([False]), (20, 10))
+    >>> answers_of(objects, Grid(2, 1, (20, 10)), components=3).int()
+    tensor([[0, 1, 0],
+            [0, 0, 0]], dtype=torch.int32)
     """
     overlap = grid.footprint(annotation.boxes)
     classes = F.one_hot(annotation.labels, components)
@@ -50,7 +56,19 @@ def count_right(beta: Tensor, answers: Tensor) -> Tensor:
 
 
 def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
-    """The cells that `count_right` counts, `(B, X·Y)` boolean, for the same arguments."""
+    """The cells whose most probable class is that of an overlapping object; `count_right` counts them.
+
+    Args:
+        beta: `(B, X·Y, C)`, Dirichlet parameters of all classes or of a subset.
+        answers: `(X·Y, C)` boolean, correct classes of each cell (`answers_of`).
+
+    Returns:
+        `(B, X·Y)`, boolean.
+
+    >>> import torch
+    >>> right_cells(torch.tensor([[[0.5, 0.7], [0.5, 0.5]]]), torch.tensor([[False, True]] * 2))
+    tensor([[ True, False]])
+    """
     best = beta == beta.amax(-1, keepdim=True)
     return (best & answers).any(-1) & (best.sum(-1) == 1)
 

@@ -1,8 +1,8 @@
 """Acquisition functions of scene exploration that simulate one look at every cell.
 
-All sum, over the cells x of the map, a change that the look is expected to cause
-(`semfov.gaze.acquisition.lookahead`). p is the mean and T the sum of a cell's Dirichlet parameters. A prime or a bar
-marks their values after the simulated update.
+The value of a look is the change that it is expected to cause in the map, summed over the cells x
+(`semfov.gaze.acquisition.lookahead`); `TwoPeaks` takes the largest change instead. p is the mean and T the sum of a
+cell's Dirichlet parameters. A prime or a bar marks their values after the simulated update.
 """
 
 import torch

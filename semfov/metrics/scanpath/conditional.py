@@ -163,7 +163,22 @@ def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: A
 
 
 def looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[Array, Array]:
-    """The maps as float64, and their values `(..., n)` at the pixels of the fixations."""
+    """Read maps at the pixels of fixations.
+
+    Args:
+        maps: `(..., H, W)`.
+        x: `(..., n)`, of fixations, in pixels of the map.
+        y: `(..., n)`, of the same fixations.
+
+    Returns:
+        The maps as float64, and their values `(..., n)`.
+
+    Raises:
+        InputError: the shapes do not fit together, or a fixation lies outside its map.
+
+    >>> looked_up([[0.0, 1.0]], [0.6], [0.0])[1]
+    array([1.])
+    """
     values = np.asarray(maps, dtype=np.float64)
     check(values.ndim >= 2 and values.size > 0, "maps", "an array of shape (..., H, W), not empty", values.shape)
     column, row = (np.floor(np.asarray(each, dtype=np.float64) + 0.5) for each in (x, y))

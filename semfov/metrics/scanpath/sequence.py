@@ -75,6 +75,9 @@ def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
 
     Raises:
         InputError: scikit-learn is not installed.
+
+    >>> len(fitted_clusters([[0, 0], [1, 1], [98, 99]], bandwidth=5).cluster_centers_)
+    2
     """
     try:
         from sklearn.cluster import MeanShift
@@ -88,7 +91,19 @@ def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
 
 
 def labels_by(clusters: Any, points: ArrayLike) -> Labels:
-    """The number of the fitted cluster `(n,)` that each fixation `(n, 2)` belongs to."""
+    """Label fixations by fitted clusters.
+
+    Args:
+        clusters: as `fitted_clusters` returns them.
+        points: `(n, 2)`, fixations in the same unit.
+
+    Returns:
+        `(n,)`, numbers of clusters from 0.
+
+    >>> labels = labels_by(fitted_clusters([[0, 0], [1, 1], [98, 99]], bandwidth=5), [[0, 1], [1, 0], [99, 99]])
+    >>> bool(labels[0] == labels[1] != labels[2])
+    True
+    """
     return np.asarray(clusters.predict(np.asarray(points, dtype=np.float64)), dtype=np.int64)
 
 
