@@ -85,8 +85,8 @@ class Exploratory(Greedy):
         self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the best cell, or with the probability `astray` any cell not visited."""
-        lost = self.noise(shift, episodes)[:, :1] < self.astray
-        return super().__call__(shift, episodes, torch.where(lost, 0.0, values.detach()), visited, centres)
+        drawn = self.noise(shift, episodes)[:, :1] < self.astray
+        return super().__call__(shift, episodes, torch.where(drawn, 0.0, values.detach()), visited, centres)
 
 
 class Softmax(Choice):

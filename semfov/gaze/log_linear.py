@@ -77,10 +77,10 @@ def log_probability(features: Tensor, chosen: Tensor, weights: Tensor, *, chunk:
     """
     if features.shape[-1] != len(weights):
         raise InputError(f"weights: expected {features.shape[-1]} numbers, one a feature, got {len(weights)}")
-    told = []
+    parts = []
     for some, taken in zip(features.split(chunk), chosen.split(chunk), strict=True):
-        told.append((some.double() @ weights).log_softmax(-1).gather(-1, taken[:, None])[:, 0])
-    return torch.cat(told)
+        parts.append((some.double() @ weights).log_softmax(-1).gather(-1, taken[:, None])[:, 0])
+    return torch.cat(parts)
 
 
 def _derivatives(

@@ -225,7 +225,7 @@ class HeadAgent(nn.Module):
             passes: largest number of looks.
             seconds: time limit in seconds; a look that would end later is not taken.
             confirm: probability at which the search ends as found.
-            foresight: weight of what a look shows outside the fixated cell (`SearchGain`).
+            foresight: weight of the gain in sharpness over the cells of a view (`SearchGain`).
             prior: probability that a cell that was never seen holds the target.
             seed: of the generator that breaks ties.
 

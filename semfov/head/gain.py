@@ -16,7 +16,7 @@ from semfov.head.speeds import Speeds
 from semfov.head.views import SIDE, Views
 
 FORESIGHT = 0.5
-"""Weight of what a look shows outside the fixated cell (`SearchGain`)."""
+"""Weight of the gain in sharpness over the cells of a view (`SearchGain`)."""
 
 
 PRIOR = 0.03
@@ -52,7 +52,7 @@ class Gain(nn.Module, ABC):
 
 
 class SearchGain(Gain):
-    r"""Probability that a look finds the target, plus a weight for what it shows outside the fixated cell.
+    r"""Probability that a look finds the target, plus a weighted gain in sharpness over the cells of the view.
 
     .. math:: G(h, f) = P(t \in f) + c \sum_x |x| \, P(t \in x) \, [a(d_{h,f}(x)) - a(d^*(x))]_+
 
@@ -63,7 +63,7 @@ class SearchGain(Gain):
 
     Args:
         views: the possible views and fixations.
-        foresight: c.
+        foresight: c, weight of the gain in sharpness.
 
     >>> from semfov.belief.observers import Target
     >>> from semfov.belief.target_evidence import TargetEvidence

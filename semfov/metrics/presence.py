@@ -40,7 +40,7 @@ def threshold_for(absent: Tensor, share: float) -> float:
         share: largest false alarm rate: the fraction of these cases that may reach the threshold, from 0 to 1.
 
     Returns:
-        The threshold. A case is taken for a hit where its score is at or above it.
+        The threshold. A score at or above it reports the target as present.
 
     Raises:
         InputError: there is no case without the target.

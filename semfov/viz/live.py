@@ -26,8 +26,8 @@ _CODECS = ((".mp4", "mp4v"), (".avi", "MJPG"))
 def draw_moment(image: Tensor, moment: Moment, text: str) -> Frame:
     """Draw belief, gaze and decision into a frame.
 
-    The opacity of the colour over a cell is the probability that the cell holds the target, or in an exploration any
-    object. A circle marks the present gaze, and a line leads to the point of the next one.
+    The opacity of the colour over a cell is proportional to the probability that the cell holds the target, or in an
+    exploration any object. A circle marks the present gaze, and a line leads to the point of the next one.
 
     Args:
         image: `(3, H, W)`, RGB in [0, 1].

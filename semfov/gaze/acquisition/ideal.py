@@ -60,7 +60,7 @@ class SignalSearch(AcquisitionFunction):
 
 
 class EntropyLimit(SignalSearch):
-    r"""Entropy limit minimisation: the largest expected decrease of the entropy of the target's place by a look.
+    r"""Entropy limit minimisation: the limit of the expected decrease of the entropy of the target's place by a look.
 
     .. math:: a(f) = \frac{1}{2} \sum_x q(x) \, d'^2(x, f), \qquad q \propto P(t \in x)
 
