@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from semfov.envs.observation import (
     GAZES,
     Arrays,
+    belief_planes,
     belief_space,
-    believed,
     first,
     glimpses,
+    infos_of,
     observation_space,
-    observe,
-    tell,
+    observations_of,
 )
 from semfov.envs.rendering import Film
 from semfov.envs.scenery import Scenery, open_scenery
@@ -103,7 +103,7 @@ class GazeEnv(gymnasium.Env[Arrays, np.int64]):
         self.gazes.begin(_ROW, [episode])
         self._film = None if self.render_mode is None else Film(self.gazes)
         self._over = False
-        return self._told()
+        return self._observed()
 
     def step(self, action: np.int64) -> tuple[Arrays, float, bool, bool, Arrays]:
         """Move the gaze to a cell, and look.
@@ -126,7 +126,7 @@ class GazeEnv(gymnasium.Env[Arrays, np.int64]):
             self._film.add()
         terminated, truncated = bool(moved.terminated), bool(moved.truncated)
         self._over = terminated or truncated
-        observation, info = self._told()
+        observation, info = self._observed()
         return observation, float(moved.reward), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -160,7 +160,7 @@ class GazeEnv(gymnasium.Env[Arrays, np.int64]):
             `(C + 2, Y, X)`, float32 in [0, 1]: the probability of the target (in an exploration of each class,
             background first), the cells that were fixated, and the cell of the gaze.
         """
-        found: NDArray[np.float32] = believed(self.gazes, _ROW)[0]
+        found: NDArray[np.float32] = belief_planes(self.gazes, _ROW)[0]
         return found
 
     def glimpse(self, side: int) -> NDArray[np.uint8]:
@@ -175,8 +175,10 @@ class GazeEnv(gymnasium.Env[Arrays, np.int64]):
         found: NDArray[np.uint8] = glimpses(self.gazes, _ROW, side)[0]
         return found
 
-    def _told(self) -> tuple[Arrays, Arrays]:
-        return first(observe(self.gazes, _ROW, **self.shown)), first(tell(self.gazes, _ROW, detections=True))
+    def _observed(self) -> tuple[Arrays, Arrays]:
+        return first(observations_of(self.gazes, _ROW, **self.shown)), first(
+            infos_of(self.gazes, _ROW, detections=True)
+        )
 
 
 class GazeSearch(GazeEnv):

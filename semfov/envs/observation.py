@@ -48,7 +48,7 @@ def glimpse_space(side: int) -> spaces.Box:
     return spaces.Box(0, 255, (side, side, 3), np.uint8)
 
 
-def observe(gazes: Gazes, rows: Tensor, *, belief: bool, glimpse: int | None) -> Arrays:
+def observations_of(gazes: Gazes, rows: Tensor, *, belief: bool, glimpse: int | None) -> Arrays:
     """Observations of the episodes in rows `(n,)`, each array `(n, ...)`."""
     shown: Arrays = {
         "gaze": gazes.places(rows).float().numpy(),
@@ -56,14 +56,14 @@ def observe(gazes: Gazes, rows: Tensor, *, belief: bool, glimpse: int | None) ->
         "step": gazes.shift[rows].numpy(),
     }
     if belief:
-        shown["belief"] = believed(gazes, rows)
+        shown["belief"] = belief_planes(gazes, rows)
     if glimpse is not None:
         shown["glimpse"] = glimpses(gazes, rows, glimpse)
     return shown
 
 
 @torch.inference_mode()
-def believed(gazes: Gazes, rows: Tensor) -> NDArray[np.float32]:
+def belief_planes(gazes: Gazes, rows: Tensor) -> NDArray[np.float32]:
     """Planes of probabilities, of the fixated cells and of the cell of the gaze, `(n, C+2, Y, X)`."""
     visited = gazes.memory.visited[rows]
     here = torch.zeros_like(visited).scatter(1, gazes.cell[rows, None], True)
@@ -86,10 +86,10 @@ def glimpses(gazes: Gazes, rows: Tensor, side: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(pixels)
 
 
-def tell(gazes: Gazes, rows: Tensor, *, detections: bool) -> Arrays:
+def infos_of(gazes: Gazes, rows: Tensor, *, detections: bool) -> Arrays:
     """Infos of the episodes in rows `(n,)`, each array `(n, ...)`."""
     passes = gazes.shift[rows] + 1
-    told: Arrays = {
+    infos: Arrays = {
         "passes": passes.numpy(),
         "pixels": (passes * gazes.scenery.pixels).numpy(),
         "action_mask": (~gazes.memory.visited[rows]).to(torch.int8).numpy(),
@@ -97,11 +97,11 @@ def tell(gazes: Gazes, rows: Tensor, *, detections: bool) -> Arrays:
         "scene": np.array([gazes.episodes[row].scene for row in rows.tolist()]),
     }
     if detections:
-        told["detections"] = detected(gazes.seen(rows), gazes.scenery.run.eye.detector)
-    return told
+        infos["detections"] = detection_arrays(gazes.seen(rows), gazes.scenery.run.eye.detector)
+    return infos
 
 
-def detected(seen: Detections, detector: Detector) -> Arrays:
+def detection_arrays(seen: Detections, detector: Detector) -> Arrays:
     """Detections as arrays of one shape, padded to the largest number L that the detector gives.
 
     Gymnasium's own vectorised environments require infos of constant shape.

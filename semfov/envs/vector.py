@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.envs.environment import GazeExplore, GazeSearch, choose
-from semfov.envs.observation import GAZES, Arrays, observation_space, observe, tell
+from semfov.envs.observation import GAZES, Arrays, infos_of, observation_space, observations_of
 from semfov.envs.scenery import Scenery, open_scenery
 from semfov.errors import check, check_whole, lookup
 
@@ -127,7 +127,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         check(len(episodes) == len(rows), "episodes", wanted, len(episodes))
         self.gazes.begin(rows, episodes)
         self._ended[:, rows] = False
-        return self._told()
+        return self._observed()
 
     def step(self, actions: NDArray[np.int64]) -> tuple[Arrays, NDArray[Any], NDArray[Any], NDArray[Any], Arrays]:
         """Move the gaze of every episode, and look.
@@ -162,7 +162,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
                 last = self._last(ended)
                 self._restart(ended)
                 self._ended[:] = False
-        observation, info = self._told()
+        observation, info = self._observed()
         return observation, reward.numpy(), terminated, truncated, info | last
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -182,21 +182,21 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         """Last observations and infos of finished episodes, which Gymnasium keeps where a reset follows at once."""
         ended = np.zeros(self.num_envs, dtype=bool)
         ended[rows.numpy()] = True
-        seen = observe(self.gazes, rows, **self.shown)
+        seen = observations_of(self.gazes, rows, **self.shown)
         shown = np.full(self.num_envs, None, dtype=object)
         for number, row in enumerate(rows.tolist()):
             shown[row] = {name: value[number] for name, value in seen.items()}
-        told = tell(self.gazes, self._rows, detections=self._detections)
+        infos = infos_of(self.gazes, self._rows, detections=self._detections)
         return {
             "final_obs": shown,
             "_final_obs": ended,
-            "final_info": _marked(told, ended),
+            "final_info": _marked(infos, ended),
             "_final_info": ended.copy(),
         }
 
-    def _told(self) -> tuple[Arrays, Arrays]:
-        told = tell(self.gazes, self._rows, detections=self._detections)
-        return observe(self.gazes, self._rows, **self.shown), _marked(told, np.ones(self.num_envs, dtype=bool))
+    def _observed(self) -> tuple[Arrays, Arrays]:
+        infos = infos_of(self.gazes, self._rows, detections=self._detections)
+        return observations_of(self.gazes, self._rows, **self.shown), _marked(infos, np.ones(self.num_envs, dtype=bool))
 
 
 def _marked(infos: Arrays, which: NDArray[np.bool_]) -> Arrays:

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from semfov.envs.environment import GazeEnv
-from semfov.envs.observation import Arrays, belief_space, believed, glimpse_space
+from semfov.envs.observation import Arrays, belief_planes, belief_space, glimpse_space
 from semfov.envs.vector import GazeVectorEnv
 from semfov.envs.zoom import ZoomEnv
 from semfov.errors import InputError
@@ -118,7 +118,7 @@ class VectorBeliefObservation(VectorObservationWrapper):
         Returns:
             `(num_envs, C + 2, Y, X)`, float32 in [0, 1].
         """
-        return believed(self._inner.gazes, torch.arange(self.num_envs))
+        return belief_planes(self._inner.gazes, torch.arange(self.num_envs))
 
 
 def _own(env: Any, *kinds: type[Any]) -> Any:

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch.nn.functional import adaptive_avg_pool2d, adaptive_max_pool2d, interpolate
 
-from semfov.envs.observation import Arrays, detected, first, glimpse_space
+from semfov.envs.observation import Arrays, detection_arrays, first, glimpse_space
 from semfov.envs.zoom_scenery import ZoomScenery, open_zoom_scenery
 from semfov.errors import InputError, check, check_number, check_whole
 from semfov.experiments.zoom_orders import overview
@@ -128,7 +128,7 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
         self.seen, self.done, self.passes = [], set[Window](), 0
         self._look(overview(self.glances))
         self.result, self._over = self._rate(), False
-        return self._observe(), self._tell()
+        return self._observe(), self._info()
 
     def step(self, action: Action) -> tuple[Arrays, float, bool, bool, Arrays]:
         """Look at a window.
@@ -156,7 +156,7 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
         if self._over:
             self.glances.save()
         reward = self.find * (self.result - before) - self.price
-        return self._observe(), reward, terminated, truncated, self._tell()
+        return self._observe(), reward, terminated, truncated, self._info()
 
     def close(self) -> None:
         """Save the looks of an episode that is not over."""
@@ -187,7 +187,7 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
             shown["glimpse"] = self.glimpse(self._glimpse)
         return shown
 
-    def _tell(self) -> Arrays:
+    def _info(self) -> Arrays:
         lattice = self.glances.lattice
         free = np.zeros(self.scenery.windows, dtype=np.int8)
         free[: len(lattice)] = 1
@@ -200,7 +200,7 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
             "action_mask": free,
             "result": self.result,
             "scene": self.scene,
-            "detections": first(detected(seen, self.scenery.run.eye.detector)),
+            "detections": first(detection_arrays(seen, self.scenery.run.eye.detector)),
         }
 
     @property
