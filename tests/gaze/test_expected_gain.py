@@ -113,7 +113,7 @@ def test_policy_is_registered(model):
     belief, visited = belief_of(model)
     assert torch.equal(acquisition(belief, visited), ExpectedGain(model, GRID)(belief, visited))
     for means in (None, Means()):
-        with pytest.raises(InputError, match=r"policy 'expected-gain': expected a learned map in `Means.map`, got none"):
+        with pytest.raises(InputError, match=r"'expected-gain': expected a learned map in `Means.map`, got none"):
             named_policy("expected-gain", "exploration", means)
     with pytest.raises(InputError, match="expected-gain"):
         named_policy("expected-gain", "search", Means(map=model))
