@@ -23,7 +23,7 @@ PRIOR = 0.03
 """Prior probability that a cell that was never seen holds the target of a search."""
 
 UNSEEN = 1.0
-"""Expected fraction of never seen cells that an exploration classifies correctly when they are fixated."""
+"""Expected fraction of cells that an exploration classifies correctly when it first fixates them."""
 
 OUT = -1e6
 """Value of actions that must not be chosen."""
