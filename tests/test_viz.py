@@ -248,7 +248,7 @@ def test_fixation_is_scanpath_view_and_belief(scanpath, image):
     shown = np.asarray(believed.images[-1].get_array()).ravel()
     np.testing.assert_allclose(shown, belief[:, 2], rtol=1e-6)
     explored = draw(plot_fixation(replace(scanpath, target=None), 1, image, image))
-    assert explored.axes[2].get_title() == "what is where after fixation 1"
+    assert explored.axes[2].get_title() == "semantic map after fixation 1"
 
 
 def test_semantic_map_names_what_is_more_probable_than_background():

@@ -1,7 +1,7 @@
-"""Gymnasium environments of search and exploration: `pip install "semfov[envs]"`.
+"""Gymnasium environments of visual search and scene exploration; they need `pip install "semfov[envs]"`.
 
-`gymnasium.make("semfov.envs:semfov/GazeSearch-v0")` and `gymnasium.make("semfov.envs:semfov/GazeExplore-v0")` make one,
-and so do the names alone once this package was imported.
+`gymnasium.make("semfov.envs:semfov/GazeSearch-v0")` and `gymnasium.make("semfov.envs:semfov/GazeExplore-v0")` make one.
+After `import semfov.envs` the names work without `semfov.envs:`.
 """
 
 from semfov.errors import DataError
@@ -9,7 +9,7 @@ from semfov.errors import DataError
 try:
     import gymnasium as _gymnasium  # noqa: F401
 except ImportError:
-    raise DataError('semfov.envs: needs Gymnasium; pip install "semfov[envs]"') from None
+    raise DataError('semfov.envs needs Gymnasium: pip install "semfov[envs]"') from None
 
 from semfov.envs.agents import MaskedRandom, PolicyAgent, Ran, run_agent
 from semfov.envs.environment import GazeEnv, GazeExplore, GazeSearch

@@ -1,4 +1,4 @@
-"""Hand-made agents for the environments, and what comes of an agent's episodes."""
+"""Agents without training for the environments, and how to run an agent on given episodes."""
 
 from __future__ import annotations
 
@@ -23,20 +23,23 @@ Cells = NDArray[np.int64]
 
 
 class Agent(Protocol):
-    """What acts in an environment: cells `(B,)` from its observations and infos."""
+    """Anything that chooses cells `(B,)` from the observations and infos of B episodes."""
 
     def __call__(self, observations: Any, infos: dict[str, Any]) -> Cells:
-        """The next cell of every episode."""
+        """Choose the next cell of every episode."""
 
 
 class PolicyAgent:
-    """A policy of semfov's as an agent: the one whose belief the environment keeps (`open_scenery`, `policy`).
+    """A policy of semfov as an agent: the one whose belief the environment keeps (`policy` of `open_scenery`).
 
-    It breaks ties by the numbers that `eval.search` and `eval.explore` give the same episode, so that it makes the same
-    fixations. It reads the belief from the environment, and of observations and infos nothing.
+    It breaks ties by the random numbers that `eval.search` and `eval.explore` use for the same episode, so it makes the
+    same fixations. It reads the belief from the environment, and ignores observations and infos.
 
     Args:
         env: a `GazeEnv` or a `GazeVectorEnv`, wrapped or not.
+
+    Raises:
+        InputError: the environment is of another kind.
 
     Example::
 
@@ -56,7 +59,7 @@ class PolicyAgent:
 
     @torch.inference_mode()
     def __call__(self, observations: Any = None, infos: Any = None) -> Any:
-        """The next cell, or that of every episode `(num_envs,)`."""
+        """Choose the next cell, or those of all episodes `(num_envs,)` in a `GazeVectorEnv`."""
         gazes = self._gazes
         groups: dict[int, list[int]] = {}
         for row, episode in enumerate(gazes.episodes):
@@ -73,7 +76,7 @@ class PolicyAgent:
         acquisition = candidate.acquisition(targets if bool(targets.any()) else None, grid, gazes.cell[rows])
         visited = gazes.memory.visited[rows]
         values = acquisition(gazes.belief[rows], visited)
-        # Ties of the n-th shift are broken by the n-th numbers; an episode that is over may have none left.
+        # The n-th gaze shift uses the n-th random numbers. An episode that is over may have used all of them.
         noise = torch.stack([self._noise_of(row)[min(int(gazes.shift[row]), scenery.shifts)] for row in rows.tolist()])
         return Greedy(drawn_from(noise[:, None]))(0, torch.arange(len(rows)), values, visited, grid.centres)[1]
 
@@ -85,33 +88,41 @@ class PolicyAgent:
 
 
 class MaskedRandom:
-    """Any cell that was not fixated, as the action mask has it.
+    """Choose any cell that was not fixated, by the action mask of the infos.
 
     Args:
-        seed: of the draws.
+        seed: of the generator.
+
+    >>> agent = MaskedRandom(seed=0)
+    >>> int(agent(None, {"action_mask": np.array([0, 1, 0], dtype=np.int8)}))
+    1
     """
 
     def __init__(self, seed: int = 0) -> None:
         self._random = np.random.default_rng(seed)
 
     def __call__(self, observations: Any, infos: dict[str, Any]) -> Any:
-        """The next cell, or that of every episode."""
+        """Choose the next cell, or those of all episodes."""
         free = np.asarray(infos["action_mask"], dtype=bool)
         return np.int64(self._draw(free)) if free.ndim == 1 else np.array([self._draw(one) for one in free])
 
     def _draw(self, free: NDArray[np.bool_]) -> int:
-        # Where all cells were fixated, any will do.
+        # Where all cells were fixated, choose any of them.
         return int(self._random.choice(np.flatnonzero(free) if free.any() else len(free)))
 
 
 @dataclass(frozen=True)
 class Ran:
-    """What came of an episode.
+    """The result of an episode.
 
     Attributes:
-        cells: fixated, in order.
+        cells: fixated cells in order.
         found_at: the gaze shift that found the target, or -1.
-        results: how far the task was done after each look: 1 where a search is on its target, or the map's success.
+        results: result of the task after each look: in a search, 1 once the gaze is on the target; in an exploration,
+            the success rate of the map.
+
+    >>> Ran(cells=(0, 12), found_at=1, results=(0.0, 1.0)).found_at
+    1
     """
 
     cells: tuple[int, ...]
@@ -120,12 +131,25 @@ class Ran:
 
 
 def run_agent(envs: Any, agent: Agent, episodes: Sequence[Any]) -> list[Ran]:
-    """Let an agent do episodes of the protocol, as many at a time as there are environments.
+    """Run an agent on given episodes of the protocol, as many at a time as there are environments.
 
     Args:
-        envs: a `GazeVectorEnv` whose episodes rest when they are over (`autoreset_mode="Disabled"`), wrapped or not.
-        agent: what acts.
-        episodes: of `Scenery.episodes`.
+        envs: a `GazeVectorEnv` whose finished episodes wait for a reset (`autoreset_mode="Disabled"`), wrapped or not.
+        agent: chooses the cells.
+        episodes: episodes of `Scenery.episodes`.
+
+    Returns:
+        The result of each episode, in their order.
+
+    Raises:
+        InputError: `envs` is of another kind, or restarts episodes by itself.
+
+    Example::
+
+        scenery = open_scenery("search", count=2)
+        envs = GazeVectorEnv("search", 8, scenery, autoreset_mode="Disabled")
+        results = run_agent(envs, PolicyAgent(envs), scenery.episodes(0)[:16])
+        print(sum(result.found_at for result in results) / len(results), "gaze shifts")
     """
     inner = envs.unwrapped
     check(isinstance(inner, GazeVectorEnv), "envs", "a GazeVectorEnv", type(inner).__name__)
@@ -134,7 +158,7 @@ def run_agent(envs: Any, agent: Agent, episodes: Sequence[Any]) -> list[Ran]:
     ran: list[Ran] = []
     for first in range(0, len(episodes), envs.num_envs):
         part = list(episodes[first : first + envs.num_envs])
-        # The last part is filled up with one of its episodes.
+        # The last part is filled up with copies of its last episode.
         ran += _run(envs, agent, part + part[-1:] * (envs.num_envs - len(part)))[: len(part)]
     return ran
 

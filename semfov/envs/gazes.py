@@ -1,4 +1,4 @@
-"""Episodes of the protocols, a look at a time: what single and vectorised environments are made of."""
+"""Episodes of the protocols, one look at a time: the common core of single and vectorised environments."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from semfov.metrics.exploration import count_right
 
 @dataclass(frozen=True)
 class Moved:
-    """What came of a gaze shift of n episodes, each `(n,)`.
+    """The result of a gaze shift in n episodes.
 
     Attributes:
-        reward: what it found, minus its price.
-        terminated: whether the episode is over.
-        truncated: whether its gaze shifts are spent.
+        reward: `(n,)`, reward for what the look found, minus its price.
+        terminated: `(n,)`, whether the episode is over because the task is done.
+        truncated: `(n,)`, whether the gaze shifts are used up.
     """
 
     reward: Tensor
@@ -39,21 +39,20 @@ class Moved:
 class Gazes(ABC):
     """A batch of episodes, each in a scene of its own.
 
-    A look at a cell that was fixated before shows nothing new, for scenes stand still: it costs its price and changes
-    nothing.
+    Scenes are static, so a second look at a cell shows nothing new: it costs its price and changes nothing.
 
     Args:
         scenery: scenes, looks and belief.
-        count: how many episodes there are at a time, B.
-        price: of a look.
-        find: what is to be found is worth.
-        together: compute all episodes at once.
+        count: B, number of episodes at a time.
+        price: cost of a look.
+        find: reward for finding the target, or for a complete map.
+        together: whether learned beliefs of all episodes are computed at once.
 
     Attributes:
-        episodes: of the protocol, one for each row; None before the first.
+        episodes: episode of the protocol in each row; None before the first.
         memory: beliefs and visited cells.
         cell: `(B,)`, fixated cells.
-        shift: `(B,)`, gaze shifts that were made.
+        shift: `(B,)`, number of gaze shifts so far.
     """
 
     memory: Memory
@@ -72,18 +71,19 @@ class Gazes(ABC):
 
     @property
     def belief(self) -> Belief:
-        """After the last look of each episode."""
+        """Belief after the last look of each episode."""
         return self.memory.belief
 
     @property
     def targets(self) -> Tensor:
-        """Class that each episode searches for, `(B,)`; 0 where nothing is searched for."""
+        """Class that each episode searches for, `(B,)`; 0 in explorations."""
         return self._targets
 
     @torch.inference_mode()
     def begin(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        """Start episodes of the protocol in some rows `(n,)`, with a look from the start."""
-        check(self._begun or len(rows) == len(self.episodes), "rows", "all, to begin with", rows.tolist())
+        """Start episodes of the protocol in the rows `(n,)`, with a look from their start."""
+        every = self._begun or len(rows) == len(self.episodes)
+        check(every, "rows", f"all {len(self.episodes)} rows at the first start", rows.tolist())
         for row, episode in zip(rows.tolist(), episodes, strict=True):
             self.episodes[row] = episode
         scenes = [episode.scene for episode in episodes]
@@ -101,7 +101,7 @@ class Gazes(ABC):
 
     @torch.inference_mode()
     def move(self, rows: Tensor, cells: Tensor) -> Moved:
-        """Shift the gaze of some rows `(n,)` to cells `(n,)`, and look."""
+        """Move the gaze of the rows `(n,)` to cells `(n,)`, and look."""
         fresh = ~self.memory.visited[rows, cells]
         self.cell[rows] = cells
         self.shift[rows] += 1
@@ -122,34 +122,34 @@ class Gazes(ABC):
         return self.places(rows) * self.size[rows] - 0.5
 
     def places(self, rows: Tensor) -> Tensor:
-        """Fixated points `(n, 2)` as shares of width and height."""
+        """Fixated points `(n, 2)` as fractions of width and height."""
         lines, columns = self.scenery.shape
         cell = self.cell[rows]
         return torch.stack([(cell % columns + 0.5) / columns, (cell // columns + 0.5) / lines], -1)
 
     def seen(self, rows: Tensor) -> Detections:
-        """What is seen from where the gazes are, a batch of n."""
+        """Detections of the present looks, a batch of n."""
         return self.looks.see(self.observer, rows, self.cell[rows], self.points(rows)).detections()
 
     @abstractmethod
     def map(self, rows: Tensor) -> Tensor:
-        """What is believed, `(n, C, Y, X)`, in [0, 1]."""
+        """The belief as planes `(n, C, Y, X)`, in [0, 1]."""
 
     @abstractmethod
     def result(self, rows: Tensor) -> Tensor:
-        """How far the task is done, `(n,)`, from 0 to 1."""
+        """Result of the task so far, `(n,)`, from 0 to 1."""
 
     @abstractmethod
     def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:
-        """Take account of new episodes, which had their first look."""
+        """Prepare the rows for new episodes, whose first look was made."""
 
     @abstractmethod
     def _judge(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """What the last look found, and whether the episode is over, each `(n,)`."""
+        """Gain of the last look, and whether the episode is over, each `(n,)`."""
 
 
 class Searches(Gazes):
-    """Searches: over when the gaze lands on a cell that an object of the target class overlaps."""
+    """Searches: an episode is over when the gaze lands on a cell that an object of the target class overlaps."""
 
     def __init__(self, scenery: Scenery, count: int, **options: Any) -> None:
         super().__init__(scenery, count, **options)
@@ -179,7 +179,7 @@ class Searches(Gazes):
 
 
 class Explorations(Gazes):
-    """Explorations: over when every cell was fixated."""
+    """Explorations: an episode is over when every cell was fixated."""
 
     def __init__(self, scenery: Scenery, count: int, **options: Any) -> None:
         super().__init__(scenery, count, **options)
@@ -193,7 +193,7 @@ class Explorations(Gazes):
         return known.mT.reshape(len(rows), -1, *self.scenery.shape)
 
     def result(self, rows: Tensor) -> Tensor:
-        """Share of the cells with objects whose most probable class is that of one of them."""
+        """Fraction of the cells with objects whose most probable class is that of one of these objects."""
         return self._success[rows]
 
     def _enter(self, rows: Tensor, episodes: Sequence[Any]) -> None:

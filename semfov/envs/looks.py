@@ -1,4 +1,4 @@
-"""What is seen from every cell of several scenes, in one table that a batch of episodes reads."""
+"""Looks from every cell of several scenes, in one table that a batch of episodes reads."""
 
 from collections.abc import Callable, Sequence
 
@@ -11,14 +11,14 @@ from semfov.episode import Looks, Sight, Stopwatch, StoredLooks
 
 
 class SceneLooks(Looks):
-    """Stored looks (`semfov.episode.StoredLooks`) at several scenes, each opened when an episode first enters it.
+    """Stored looks (`semfov.episode.StoredLooks`) in several scenes; each is opened when an episode first enters it.
 
-    What they say is one table for all scenes, so that a step of episodes in many scenes is one gather.
+    Their evidence is one table for all scenes, so that a step of episodes in many scenes is a single gather.
 
     Args:
-        open_scene: gives the stored looks at a scene, with all targets that are searched for in it.
-        observer: that weighs them.
-        episodes: how many there are at a time.
+        open_scene: returns the stored looks in a scene, with all targets that are searched for in it.
+        observer: weighs the looks.
+        episodes: number of episodes at a time.
     """
 
     def __init__(self, open_scene: Callable[[int], StoredLooks], observer: Observer, episodes: int) -> None:
@@ -27,16 +27,16 @@ class SceneLooks(Looks):
         self._starts: dict[int, tuple[int, int]] = {}
         self._table: Look | None = None
         self._seen: Detections | None = None
-        # Of each episode: the rows of the table and of the detections that have the look from cell 0.
+        # For each episode, the rows of the look from cell 0: in the table, and in the detections.
         self._row, self._place = torch.zeros(2, episodes, dtype=torch.int64)
 
     def enter(self, episodes: Tensor, scenes: Sequence[int], targets: Tensor | None) -> None:
-        """Let episodes go on in other scenes.
+        """Move episodes to other scenes.
 
         Args:
             episodes: `(n,)`, their numbers.
-            scenes: of each.
-            targets: `(n,)`, class that each searches for; None where nothing is searched for.
+            scenes: scene of each.
+            targets: `(n,)`, class that each searches for; None in explorations.
         """
         for scene in scenes:
             if scene not in self._scenes:
@@ -58,7 +58,7 @@ class SceneLooks(Looks):
         self._table = self._seen = None
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
-        """What the table has of the cells; the fixations are their centres."""
+        """Read the looks at the cells from the table; the fixations are the centres of the cells."""
         watch = Stopwatch()
         if self._table is None:
             parts = [stored.weighed(self._observer) for stored in self._scenes.values()]

@@ -1,4 +1,4 @@
-"""What environments show: spaces, observations and infos as arrays."""
+"""Spaces, observations and infos of the environments as arrays."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GAZES: dict[str, type[Gazes]] = {"search": Searches, "exploration": Explorations
 
 
 def observation_space(scenery: Scenery, task: str, *, belief: bool, glimpse: int | None) -> spaces.Dict:
-    """The space of the observations of one episode."""
+    """The space of the observations of one episode, for the arguments of `GazeEnv`."""
     shown: dict[str, spaces.Space[Any]] = {
         "gaze": spaces.Box(0, 1, (2,), np.float32),
         "target": spaces.Discrete(len(scenery.classes)),
@@ -37,34 +37,34 @@ def observation_space(scenery: Scenery, task: str, *, belief: bool, glimpse: int
 
 
 def belief_space(scenery: Scenery, task: str) -> spaces.Box:
-    """Planes of all cells: the probability of the target, or of all classes in an exploration, and two more."""
+    """Space of the belief's planes: probability of the target, or of all classes in an exploration, and two more."""
     probabilities = 1 if task == "search" else len(scenery.classes)
     return spaces.Box(0, 1, (probabilities + 2, *scenery.shape), np.float32)
 
 
 def glimpse_space(side: int) -> spaces.Box:
-    """What the eye is shown, `side` pixels wide and high."""
+    """Space of the foveated image, `side` pixels wide and high."""
     check_whole(side, "glimpse", 1, 4096)
     return spaces.Box(0, 255, (side, side, 3), np.uint8)
 
 
-def observe(gazes: Gazes, rows: Tensor, *, belief: bool, glimpse: int | None) -> Arrays:
-    """Observations of some episodes `(n,)`, each array `(n, ...)`."""
+def observations_of(gazes: Gazes, rows: Tensor, *, belief: bool, glimpse: int | None) -> Arrays:
+    """Observations of the episodes in rows `(n,)`, each array `(n, ...)`."""
     shown: Arrays = {
         "gaze": gazes.places(rows).float().numpy(),
         "target": gazes.targets[rows].numpy(),
         "step": gazes.shift[rows].numpy(),
     }
     if belief:
-        shown["belief"] = believed(gazes, rows)
+        shown["belief"] = belief_planes(gazes, rows)
     if glimpse is not None:
         shown["glimpse"] = glimpses(gazes, rows, glimpse)
     return shown
 
 
 @torch.inference_mode()
-def believed(gazes: Gazes, rows: Tensor) -> NDArray[np.float32]:
-    """Probabilities, which cells were fixated, and where the gaze is, `(n, C+2, Y, X)`."""
+def belief_planes(gazes: Gazes, rows: Tensor) -> NDArray[np.float32]:
+    """Planes of probabilities, of the fixated cells and of the cell of the gaze, `(n, C+2, Y, X)`."""
     visited = gazes.memory.visited[rows]
     here = torch.zeros_like(visited).scatter(1, gazes.cell[rows, None], True)
     more = torch.stack([visited, here], 1).reshape(len(rows), 2, *gazes.scenery.shape)
@@ -74,7 +74,7 @@ def believed(gazes: Gazes, rows: Tensor) -> NDArray[np.float32]:
 
 @torch.inference_mode()
 def glimpses(gazes: Gazes, rows: Tensor, side: int) -> NDArray[np.uint8]:
-    """What the eye is shown of the scenes, `(n, side, side, 3)`."""
+    """Foveated images that the eye sees, `(n, side, side, 3)`."""
     eye, found = gazes.scenery.run.eye, []
     for row, point in zip(rows.tolist(), gazes.points(rows), strict=True):
         view = gazes.scenery.view(gazes.episodes[row].scene)
@@ -86,10 +86,10 @@ def glimpses(gazes: Gazes, rows: Tensor, side: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(pixels)
 
 
-def tell(gazes: Gazes, rows: Tensor, *, detections: bool) -> Arrays:
-    """Infos of some episodes, each array `(n, ...)`."""
+def infos_of(gazes: Gazes, rows: Tensor, *, detections: bool) -> Arrays:
+    """Infos of the episodes in rows `(n,)`, each array `(n, ...)`."""
     passes = gazes.shift[rows] + 1
-    told: Arrays = {
+    infos: Arrays = {
         "passes": passes.numpy(),
         "pixels": (passes * gazes.scenery.pixels).numpy(),
         "action_mask": (~gazes.memory.visited[rows]).to(torch.int8).numpy(),
@@ -97,14 +97,21 @@ def tell(gazes: Gazes, rows: Tensor, *, detections: bool) -> Arrays:
         "scene": np.array([gazes.episodes[row].scene for row in rows.tolist()]),
     }
     if detections:
-        told["detections"] = detected(gazes.seen(rows), gazes.scenery.run.eye.detector)
-    return told
+        infos["detections"] = detection_arrays(gazes.seen(rows), gazes.scenery.run.eye.detector)
+    return infos
 
 
-def detected(seen: Detections, detector: Detector) -> Arrays:
-    """Detections as arrays of one shape, `(n, L, ...)`, L the most that the detector gives: what is beyond is masked.
+def detection_arrays(seen: Detections, detector: Detector) -> Arrays:
+    """Detections as arrays of one shape, padded to the largest number L that the detector gives.
 
-    Gymnasium's own vectorised environments take no infos of changing shapes.
+    Gymnasium's own vectorised environments require infos of constant shape.
+
+    Args:
+        seen: detections of n looks.
+        detector: the detector, which limits their number.
+
+    Returns:
+        `boxes` `(n, L, 4)`, `scores` `(n, L, K+1)` and `mask` `(n, L)`, which is true for entries that are detections.
     """
     number, count = seen.mask.shape
     limit, components = max(detector.selection.limit, count), seen.scores.shape[-1]
@@ -116,6 +123,6 @@ def detected(seen: Detections, detector: Detector) -> Arrays:
 
 
 def first(arrays: Arrays) -> Arrays:
-    """The first episode's part of arrays."""
+    """The first entry of each array."""
     one = {name: first(value) if isinstance(value, dict) else value[0] for name, value in arrays.items()}
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in one.items()}

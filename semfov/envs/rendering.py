@@ -1,4 +1,4 @@
-"""Pictures of an episode while it goes on."""
+"""Pictures of an episode in progress."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from semfov.viz.fixation import plot_fixation
 
 
 class Film:
-    """The looks of the first episode of a batch so far.
+    """The looks so far of the first episode of a batch.
 
     Args:
-        gazes: the batch; its episode has had its first look.
+        gazes: the batch; its first episode has had its first look.
     """
 
     def __init__(self, gazes: Gazes) -> None:
@@ -45,17 +45,17 @@ class Film:
         self.steps.append(step)
 
     def scanpath(self) -> Scanpath:
-        """The record of the looks."""
+        """The looks so far as a scanpath."""
         gazes, episode = self.gazes, self.gazes.episodes[0]
         grid, classes = gazes.scenery.grid(episode.scene), gazes.scenery.classes
         searching = isinstance(episode, Episode)
-        # A belief about the target tells nothing of other classes, which a search's picture does not show either.
+        # A belief about the target has no other classes. A scanpath needs them, but the picture of a search does not.
         beside: Observer | None = Semantic(len(classes)) if searching else None
         with torch.inference_mode():
             return trace(self.steps, grid, classes, episode.cue if searching else None, beside)
 
     def draw(self) -> NDArray[np.uint8]:
-        """The last look as a picture `(H, W, 3)`."""
+        """Draw the last look, as RGB pixels `(H, W, 3)`."""
         gazes = self.gazes
         if self._stimulus is None:
             self._stimulus = Stimulus.of(gazes.scenery.run.eye, gazes.scenery.image(gazes.episodes[0].scene))

@@ -1,4 +1,4 @@
-"""The world of an environment: scenes, the eye that looks at them, and the belief that it keeps."""
+"""What environments share: scenes, the eye that looks at them, and the belief that it keeps."""
 
 from __future__ import annotations
 
@@ -36,37 +36,48 @@ from semfov.metrics.exploration import answers_of
 from semfov.sensor.named import SensorName
 
 Source = Scenes | str | Path | None
-"""Scenes of any kind, or the folder of photographs; None for the embedded scenes."""
+"""Scenes of any kind, or a folder of photographs; None for the embedded scenes."""
 
-_VIEWS = 16  # pictures that are kept open for glimpses
+_VIEWS = 16  # number of pictures that are kept open for glimpses
 
 
 class Scenery:
-    """Scenes, an eye and a belief, which any number of environments share: `open_scenery` makes one.
+    """Scenes, an eye and a belief, which any number of environments can share; `open_scenery` makes one.
 
-    Episodes are those of the protocols (`semfov.experiments`), and so are looks: what is seen from every cell of a
-    scene is computed when an episode first enters it, and kept on disk.
+    Episodes and looks are those of the protocols (`semfov.experiments`). The looks from all cells of a scene are
+    computed when an episode first enters it, and are kept on disk.
 
     Args:
-        run: the experiment that the episodes are of, with one policy, whose belief the environments keep.
-        targets: classes that are searched for; None for all that a scene allows.
+        run: experiment that defines the episodes, with one policy, whose belief the environments keep.
+        targets: classes to search for; None takes all that a scene allows.
 
     Attributes:
         run: as given.
-        policy: what tables call the policy.
-        scenes: indices of the scenes that may have something to look for.
+        policy: name of the policy in tables.
+        scenes: indices of the scenes that may have episodes.
+
+    Raises:
+        InputError: the run has several policies, or its belief uses context between scenes.
+        DataError: no scene has anything to look for.
+
+    Example::
+
+        scenery = open_scenery("search", count=2)
+        env = GazeSearch(scenery)
+        print(len(scenery.episodes(0)), scenery.shape, scenery.shifts)
     """
 
     def __init__(self, run: SearchRun | ExploreRun, targets: Sequence[str | int] | None = None) -> None:
-        check(len(run.policies) == 1, "policy", "one", f"{len(run.policies)}")
+        check(len(run.policies) == 1, "policy", "a single policy", f"{len(run.policies)}")
         self.run = run
         self.policy = next(iter(run.policies))
         context = run.config.belief.context, run.policies[self.policy].context
-        check(not {"place", "cooccurrence", "both"} & set(context), "context", "none: it is of one scene", context)
+        learned = {"place", "cooccurrence", "both"} & set(context)
+        check(not learned, "context", "none, as an environment keeps the belief about one scene", context)
         names = self.classes[1:]
         self._wanted = None if targets is None else {class_index(target, names, "targets") for target in targets}
         self.scenes = [scene for scene in range(len(run.scenes)) if self._asked(scene)]
-        # Kept for as long as there are environments: what they go by, whoever asks.
+        # Results are kept for as long as an environment uses this scenery.
         self._listed = cache(self._list)
         self.grid = cache(run.grid)
         self.answers = cache(self._answers)
@@ -74,10 +85,12 @@ class Scenery:
         self.together = cache(self._together)
         self.view = lru_cache(_VIEWS)(lambda scene: run.eye.open(self.image(scene)[None]))
         if not any(self.episodes(scene) for scene in self.scenes):
-            raise DataError("scenes: expected some with anything to look for, got none; give others, or other targets")
+            raise DataError(
+                "scenes: expected at least one with objects to look for, got none; change scenes or targets"
+            )
 
     def _asked(self, scene: int) -> list[int]:
-        """Classes that a scene is searched for, or that are on it."""
+        """Classes to search for in a scene, or those of its objects in an exploration."""
         if isinstance(self.run, SearchRun):
             allowed = self.run.scenes.targets(scene)
             return [target for target in allowed if self._wanted is None or target in self._wanted]
@@ -85,7 +98,14 @@ class Scenery:
         return found
 
     def episodes(self, scene: int) -> list[Any]:
-        """All episodes of a scene: its searches or explorations, as the protocol draws their starts."""
+        """All episodes of a scene: its searches or explorations, with the starts that the protocol draws.
+
+        Args:
+            scene: index of the scene.
+
+        Returns:
+            Episodes, which `GazeEnv.reset` takes as an option.
+        """
         return self._listed(scene)
 
     def _list(self, scene: int) -> list[Any]:
@@ -97,7 +117,14 @@ class Scenery:
         return list(explorations_of(run.scenes, scene, belief.columns * belief.rows, protocol))
 
     def draw(self, random: np.random.Generator) -> Any:
-        """An episode at random: all scenes are equally likely, and in each all its targets."""
+        """Draw an episode: all scenes are equally likely, and so are all episodes of a scene.
+
+        Args:
+            random: generator to draw with.
+
+        Returns:
+            The episode.
+        """
         while True:
             episodes = self.episodes(self.scenes[random.integers(len(self.scenes))])
             if episodes:
@@ -110,74 +137,88 @@ class Scenery:
 
     @property
     def observer(self) -> Observer:
-        """Turns looks into belief."""
+        """The observer that turns looks into belief."""
         return self.run.strategies[self.policy].observer
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of the cells."""
+        """Number of rows and columns of the cells."""
         return self.run.config.belief.rows, self.run.config.belief.columns
 
     @property
     def shifts(self) -> int:
-        """Most gaze shifts of an episode."""
+        """Largest number of gaze shifts of an episode."""
         return self.run.config.protocol.shifts
 
     @property
     def pixels(self) -> int:
-        """That a look shows the detector."""
+        """Number of pixels that the detector takes in for a look."""
         wide, high = self.run.eye.detector.input_size
         return wide * high
 
     def _together(self) -> Observer:
-        """The observer that computes all episodes of a batch at once: faster, and rounded by the batch."""
+        """The observer that computes all episodes of a batch at once: faster, but its rounding depends on the batch."""
         if not isinstance(self.observer, Target | LearnedMap):
             return self.observer
         return type(self.observer)(self.observer.model, together=True)  # type: ignore[arg-type]
 
     def _open(self, scene: int) -> StoredLooks:
-        """What is seen from every cell of a scene."""
+        """Stored looks from every cell of a scene."""
         asked = sorted({episode.cue for episode in self.episodes(scene) if isinstance(episode, Episode)})
         targets = torch.tensor(asked) if asked else None
         return StoredLooks(self.run.detections(scene), self.grid(scene), targets)
 
     def _answers(self, scene: int) -> Tensor:
-        """Which classes are right for each cell of a scene, `(X·Y, K+1)`."""
+        """Correct classes of each cell of a scene, `(X·Y, K+1)`."""
         return answers_of(self.run.scenes.annotation(scene), self.grid(scene), len(self.classes))
 
     def noise(self, episode: Episode | Exploration) -> Tensor:
-        """Random numbers that break an episode's ties, `(shifts+1, X·Y)`: those of `eval.search` and `eval.explore`."""
+        """Random numbers that break the ties of an episode, the same as in `eval.search` and `eval.explore`.
+
+        Args:
+            episode: the episode.
+
+        Returns:
+            `(shifts+1, X·Y)`, in [0, 1).
+        """
         cells, protocol = self.shape[0] * self.shape[1], self.run.config.protocol
         if isinstance(episode, Episode):
             return tie_noise(self.run.scenes, episode, cells, protocol)
         return explore_noise(self.run.scenes, episode, cells, protocol)
 
     def image(self, scene: int) -> Tensor:
-        """Pixels of a scene, `(3, H, W)`."""
+        """Pixels of a scene.
+
+        Args:
+            scene: index of the scene.
+
+        Returns:
+            `(3, H, W)`, RGB in [0, 1].
+        """
         return self.run.scenes[scene].image
 
 
 class _Search(SearchRun):
-    """Visual search in scenes that are given."""
+    """Visual search in given scenes."""
 
     def __init__(self, config: SearchConfig, scenes: Callable[[Any], Scenes]) -> None:
         self._choose = scenes
         super().__init__(config)
 
     def open_scenes(self) -> Scenes:
-        """The given ones."""
+        """The given scenes."""
         return self._choose(super().open_scenes)
 
 
 class _Explore(ExploreRun):
-    """Exploration of scenes that are given."""
+    """Exploration of given scenes."""
 
     def __init__(self, config: ExploreConfig, scenes: Callable[[Any], Scenes]) -> None:
         self._choose = scenes
         super().__init__(config)
 
     def open_scenes(self) -> Scenes:
-        """The given ones."""
+        """The given scenes."""
         return self._choose(super().open_scenes)
 
 
@@ -202,33 +243,41 @@ def open_scenery(
     store: bool = True,
     config: RunConfig | None = None,
 ) -> Scenery:
-    """Open scenes for environments.
+    """Open scenes for environments of search or exploration.
 
     Args:
         task: `search` or `exploration`.
-        scenes: embedded scenes (None), the folder of a set in COCO's format, or any `Scenes` with the detector's
+        scenes: embedded scenes (None), the folder of a data set in COCO's format, or any `Scenes` with the detector's
             classes.
         annotations: COCO-format instances file of the folder.
-        count: use only the first so many scenes (None: all of a folder, 8 embedded ones).
+        count: use only the first scenes, this many (None: all of a folder, 8 embedded ones).
         mosaics: number of mosaics to compose of the scenes; 0 takes the scenes as they are.
-        tiles: photographs in a row and in a column of a mosaic.
-        targets: classes to search for, by name or index; None: all that a scene allows.
-        detector: by name, or an ONNX model.
-        weights: file with its weights.
-        sensor: the fovea, by name (`semfov.sensor.SENSORS`).
-        policy: preset or settings of `eval.search` or `eval.explore`; it says which belief is kept, and it is the
-            hand-made agent of the environment (`PolicyAgent`).
-        grid: columns and rows of the cells.
-        shifts: most gaze shifts of an episode (None: 30 of a search, 20 of an exploration).
-        starts: of each scene and target that episodes are drawn from.
+        tiles: number of photographs in a row and in a column of a mosaic.
+        targets: classes to search for, by name or index; None takes all that a scene allows.
+        detector: name of a detector, or path of an ONNX model.
+        weights: file with the detector's weights.
+        sensor: name of the foveal sensor (`semfov.sensor.SENSORS`).
+        policy: preset or settings of `eval.search` or `eval.explore`. It determines the belief that the environment
+            keeps, and it is the policy of `PolicyAgent`.
+        grid: number of columns and rows of the cells.
+        shifts: largest number of gaze shifts of an episode (None: 30 in a search, 20 in an exploration).
+        starts: number of starts for each scene and target, from which episodes are drawn.
         seed: of embedded scenes, mosaics and starts.
-        cache: folder for what is seen (None: the user's cache).
-        store: keep what is seen on disk.
-        config: all settings of the experiment in place of these; its scenes may be given as `scenes` too.
+        cache: folder for stored looks (None: the user's cache).
+        store: whether looks are kept on disk.
+        config: all settings of the experiment, instead of these arguments; its scenes may be given as `scenes` too.
+
+    Returns:
+        The scenery, to be shared by environments.
 
     Raises:
-        InputError: an argument does not fit.
+        InputError: an argument is out of range, or the scenes have other classes than the detector.
         DataError: photographs, annotations or weights are missing or damaged.
+
+    Example::
+
+        scenery = open_scenery("search", "photographs/", "instances.json", targets=["cat", "cup"])
+        envs = [GazeSearch(scenery, belief=True) for _ in range(4)]
     """
     search = task == "search"
     check(task in ("search", "exploration"), "task", "'search' or 'exploration'", repr(task))
@@ -261,5 +310,5 @@ def open_scenery(
 
     run = _Search(config, choose) if isinstance(config, SearchConfig) else _Explore(config, choose)
     names = run.eye.detector.classes
-    check(run.scenes.classes == names, "scenes", "classes of the detector", f"{len(run.scenes.classes)} others")
+    check(run.scenes.classes == names, "scenes", "the classes of the detector", f"{len(run.scenes.classes)} others")
     return Scenery(run, targets)

@@ -1,4 +1,4 @@
-"""Environments side by side for Stable-Baselines3: `pip install "semfov[agents]"`."""
+"""Vectorised environments for Stable-Baselines3; they need `pip install "semfov[agents]"`."""
 
 from __future__ import annotations
 
@@ -16,15 +16,20 @@ try:
     import sb3_contrib as _contrib  # noqa: F401
     from stable_baselines3.common.vec_env import VecEnv
 except ImportError:
-    raise DataError('semfov.envs.stable_baselines3: needs it and sb3-contrib; pip install "semfov[agents]"') from None
+    raise DataError(
+        'semfov.envs.stable_baselines3 needs Stable-Baselines3 and sb3-contrib: pip install "semfov[agents]"'
+    ) from None
 
 
 class StableVecEnv(VecEnv):
-    """A `GazeVectorEnv` as Stable-Baselines3 takes it, with the action masks that `sb3_contrib.MaskablePPO` asks for.
+    """A `GazeVectorEnv` for Stable-Baselines3, with the action masks that `sb3_contrib.MaskablePPO` needs.
 
     Args:
         envs: environments whose episodes restart in the same step (`autoreset_mode="SameStep"`).
-        key: of the observations, if they are to have one entry alone, such as `belief`.
+        key: use this entry of the observations alone, such as `belief`; None uses all.
+
+    Raises:
+        InputError: `envs` is of another kind, or restarts its episodes otherwise.
 
     Example::
 
@@ -43,7 +48,7 @@ class StableVecEnv(VecEnv):
         self._returns, self._lengths = np.zeros(envs.num_envs), np.zeros(envs.num_envs, dtype=int)
 
     def reset(self) -> Any:
-        """Start all episodes, with the seeds that `seed` gave."""
+        """Start all episodes, with the seeds that were given to `seed`."""
         asked = None if all(seed is None for seed in self._seeds) else self._seeds
         observations, _ = self.envs.reset(seed=asked)
         self._reset_seeds()
@@ -56,7 +61,7 @@ class StableVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> Any:
-        """A step of all: observations, rewards, which episodes are over, and infos with their ends."""
+        """Make a step in all environments; returns observations, rewards, which episodes are over, and infos."""
         observations, rewards, terminated, truncated, told = self.envs.step(self._actions)
         over = terminated | truncated
         self._returns += rewards
@@ -76,31 +81,31 @@ class StableVecEnv(VecEnv):
         return observations if self.key is None else observations[self.key]
 
     def close(self) -> None:
-        """Release what the environments hold."""
+        """Release the resources of the environments."""
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute, once for each environment."""
+        """The value of an attribute, once for each environment."""
         return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refused: the environments are one."""
-        raise AttributeError(f"{attr_name}: the environments are one, and have no attributes of their own")
+        """Raise an error, because the environments share their attributes."""
+        raise AttributeError(f"{attr_name}: cannot be set, because the environments share their attributes")
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """A method's results, one for each environment: `action_masks`."""
+        """Results of a method, one for each environment; `action_masks` is the only one."""
         check(method_name == "action_masks", "method_name", "'action_masks'", repr(method_name))
         masks = self.envs.action_masks()
         return [masks[row] for row in self._get_indices(indices)]
 
     def has_attr(self, attr_name: str) -> bool:
-        """Whether all environments have an attribute."""
+        """Whether the environments have an attribute."""
         return hasattr(self.envs, attr_name)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """None of them is wrapped."""
+        """False for all, as the environments are not wrapped."""
         return [False] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[Any]:
-        """None: a picture takes a `GazeEnv`."""
+        """None for all, as only a `GazeEnv` can draw pictures."""
         return [None] * self.num_envs

@@ -1,4 +1,4 @@
-"""Many episodes at a time: vectorised environments on the batched loop."""
+"""Vectorised environments: many episodes on the batched loop."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.envs.environment import GazeExplore, GazeSearch, choose
-from semfov.envs.observation import GAZES, Arrays, observation_space, observe, tell
+from semfov.envs.observation import GAZES, Arrays, infos_of, observation_space, observations_of
 from semfov.envs.scenery import Scenery, open_scenery
 from semfov.errors import check, check_whole, lookup
 
@@ -23,24 +23,34 @@ PRICES = {"search": GazeSearch.default_price, "exploration": GazeExplore.default
 
 
 class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
-    """Episodes that go on side by side, each in a scene of its own; one step of all is one step of the batched loop.
+    """Many episodes side by side, each in a scene of its own; a step of all is one step of the batched loop.
 
-    Environment i, seeded with s, does what a `GazeEnv` does that is seeded with s + i. With `together`, the default,
-    learned beliefs of all episodes are computed at once, which is faster, but rounded by the batch.
+    With seed s, environment i does the same as a `GazeEnv` with seed s + i. With `together`, the default, learned
+    beliefs of all episodes are computed at once. This is faster, but the rounding then depends on the batch.
 
     Args:
         task: `search` or `exploration`.
-        num_envs: how many episodes.
-        scenery: scenes, looks and belief, to be shared; None opens one.
-        price: of a look.
-        find: what is to be found is worth.
-        belief: observations have the belief.
-        glimpse: observations have what the eye is shown, so many pixels wide and high; None leaves it out.
-        detections: infos have what was detected.
-        together: compute learned beliefs of all episodes at once.
-        autoreset_mode: when episodes that are over restart: in the `NextStep`, Gymnasium's default, in the `SameStep`,
-            or when a reset names them (`Disabled`); they rest until then.
-        options: of `open_scenery`, where no scenery is given.
+        num_envs: number of episodes.
+        scenery: scenes, looks and belief, which several environments may share; None opens one.
+        price: cost of a look, subtracted from the reward; None takes the default of the task.
+        find: reward for finding the target, or for a complete map.
+        belief: whether observations contain the belief.
+        glimpse: side in pixels of the foveated image that observations contain; None leaves it out.
+        detections: whether infos contain the detections.
+        together: whether learned beliefs of all episodes are computed at once.
+        autoreset_mode: when finished episodes restart: in the next step (`NextStep`, Gymnasium's default), in the same
+            step (`SameStep`), or when a reset names them (`Disabled`).
+        options: options of `open_scenery`, where no scenery is given.
+
+    Raises:
+        InputError: an argument is out of range, or both a scenery and options are given.
+        DataError: the scenes or the weights of the detector cannot be read.
+
+    Example::
+
+        envs = GazeVectorEnv("search", 64, count=8, belief=True)
+        observations, infos = envs.reset(seed=0)
+        print(observations["belief"].shape)  # (64, 3, 10, 10)
     """
 
     def __init__(
@@ -59,7 +69,7 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         **options: Any,
     ) -> None:
         check_whole(num_envs, "num_envs", 1, 1_000_000)
-        check(scenery is None or not options, "scenery", "no other options beside it", ", ".join(options))
+        check(scenery is None or not options, "scenery", "no options of `open_scenery` beside it", ", ".join(options))
         lookup(
             str(getattr(autoreset_mode, "value", autoreset_mode)),
             [mode.value for mode in AutoresetMode],
@@ -69,8 +79,8 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         self.metadata = {"render_modes": [], "autoreset_mode": mode}
         self.num_envs, self.task = num_envs, task
         self.scenery = open_scenery(task, **options) if scenery is None else scenery
-        worth = {"price": PRICES[task] if price is None else price, "find": find}
-        self.gazes = GAZES[task](self.scenery, num_envs, **worth, together=together)
+        reward = {"price": PRICES[task] if price is None else price, "find": find}
+        self.gazes = GAZES[task](self.scenery, num_envs, **reward, together=together)
         self.shown: dict[str, Any] = {"belief": belief, "glimpse": glimpse}
         self.single_observation_space = observation_space(self.scenery, task, belief=belief, glimpse=glimpse)
         self.single_action_space = spaces.Discrete(self.scenery.shape[0] * self.scenery.shape[1])
@@ -78,25 +88,32 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._detections = detections
         self._rows = torch.arange(num_envs)
-        # Whether each was terminated, and truncated, in a step before.
+        # Whether each episode was terminated, and whether it was truncated, in an earlier step.
         self._ended = torch.zeros(2, num_envs, dtype=torch.bool)
         self._randoms: list[np.random.Generator] = [seeding.np_random()[0] for _ in range(num_envs)]
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Arrays, Arrays]:
-        """Start an episode in every environment.
+        """Start an episode in every environment, or in some of them.
 
         Args:
-            seed: s, for s, s + 1, …; or one for each.
-            options: `reset_mask`, a boolean for each, to reset some alone; `episodes`, one of the protocol for each of
-                these (`Scenery.episodes`); else as for `GazeEnv.reset`.
+            seed: s, for the seeds s, s + 1, … of the environments; or one seed for each environment.
+            options: `reset_mask`, a boolean for each environment, to reset only some; `episodes`, an episode of the
+                protocol (`Scenery.episodes`) for each environment that is reset; or the options of `GazeEnv.reset`.
+
+        Returns:
+            The observations and infos of all environments. Each info has a mask of the environments that it applies to,
+            as in Gymnasium.
+
+        Raises:
+            InputError: there are too few or too many seeds or episodes, or an option is unknown.
         """
         if seed is not None:
             given = (
                 [int(seed) + row for row in range(self.num_envs)] if isinstance(seed, int | np.integer) else list(seed)
             )
-            check(len(given) == self.num_envs, "seed", f"{self.num_envs} of them", len(given))
+            check(len(given) == self.num_envs, "seed", f"{self.num_envs} seeds, one for each environment", len(given))
             for row, one in enumerate(given):
                 if one is not None:
                     self._randoms[row] = seeding.np_random(one)[0]
@@ -106,13 +123,25 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
         episodes = asked.pop("episodes", None)
         if episodes is None:
             episodes = [choose(self.scenery, self._randoms[row], asked) for row in rows.tolist()]
-        check(len(episodes) == len(rows), "episodes", f"{len(rows)} of them", len(episodes))
+        wanted = f"{len(rows)} episodes, one for each environment that is reset"
+        check(len(episodes) == len(rows), "episodes", wanted, len(episodes))
         self.gazes.begin(rows, episodes)
         self._ended[:, rows] = False
-        return self._told()
+        return self._observed()
 
     def step(self, actions: NDArray[np.int64]) -> tuple[Arrays, NDArray[Any], NDArray[Any], NDArray[Any], Arrays]:
-        """Shift all gazes, and look."""
+        """Move the gaze of every episode, and look.
+
+        Args:
+            actions: `(num_envs,)`, cells.
+
+        Returns:
+            Observations, rewards, terminated, truncated and infos, each for all environments. What a finished episode
+            does depends on `autoreset_mode`.
+
+        Raises:
+            InputError: the actions are not `num_envs` cells.
+        """
         chosen = torch.as_tensor(np.asarray(actions), dtype=torch.int64)
         cells = self.scenery.shape[0] * self.scenery.shape[1]
         inside = chosen.shape == (self.num_envs,) and bool(((chosen >= 0) & (chosen < cells)).all())
@@ -133,11 +162,15 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
                 last = self._last(ended)
                 self._restart(ended)
                 self._ended[:] = False
-        observation, info = self._told()
+        observation, info = self._observed()
         return observation, reward.numpy(), terminated, truncated, info | last
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Which cells were not fixated, `(num_envs, X·Y)`."""
+        """Mask of the cells that were not fixated.
+
+        Returns:
+            `(num_envs, X·Y)`, boolean.
+        """
         free: NDArray[np.bool_] = (~self.gazes.memory.visited).numpy()
         return free
 
@@ -146,28 +179,28 @@ class GazeVectorEnv(VectorEnv[Arrays, NDArray[np.int64], NDArray[Any]]):
             self.gazes.begin(rows, [self.scenery.draw(self._randoms[row]) for row in rows.tolist()])
 
     def _last(self, rows: Tensor) -> Arrays:
-        """Observations and infos at the end of episodes, as Gymnasium has them where a reset follows at once."""
+        """Last observations and infos of finished episodes, which Gymnasium keeps where a reset follows at once."""
         ended = np.zeros(self.num_envs, dtype=bool)
         ended[rows.numpy()] = True
-        seen = observe(self.gazes, rows, **self.shown)
+        seen = observations_of(self.gazes, rows, **self.shown)
         shown = np.full(self.num_envs, None, dtype=object)
         for number, row in enumerate(rows.tolist()):
             shown[row] = {name: value[number] for name, value in seen.items()}
-        told = tell(self.gazes, self._rows, detections=self._detections)
+        infos = infos_of(self.gazes, self._rows, detections=self._detections)
         return {
             "final_obs": shown,
             "_final_obs": ended,
-            "final_info": _marked(told, ended),
+            "final_info": _marked(infos, ended),
             "_final_info": ended.copy(),
         }
 
-    def _told(self) -> tuple[Arrays, Arrays]:
-        told = tell(self.gazes, self._rows, detections=self._detections)
-        return observe(self.gazes, self._rows, **self.shown), _marked(told, np.ones(self.num_envs, dtype=bool))
+    def _observed(self) -> tuple[Arrays, Arrays]:
+        infos = infos_of(self.gazes, self._rows, detections=self._detections)
+        return observations_of(self.gazes, self._rows, **self.shown), _marked(infos, np.ones(self.num_envs, dtype=bool))
 
 
 def _marked(infos: Arrays, which: NDArray[np.bool_]) -> Arrays:
-    """Infos, each with a mask of the environments that it is of."""
+    """Infos, each with a mask of the environments that it applies to."""
     marked: Arrays = {}
     for name, value in infos.items():
         marked[name] = _marked(value, which) if isinstance(value, dict) else value

@@ -1,4 +1,4 @@
-"""Observations of one kind: what is believed, or what is seen."""
+"""Wrappers that replace the observation by the belief or by the foveated image."""
 
 from __future__ import annotations
 
@@ -12,21 +12,24 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from semfov.envs.environment import GazeEnv
-from semfov.envs.observation import Arrays, belief_space, believed, glimpse_space
+from semfov.envs.observation import Arrays, belief_planes, belief_space, glimpse_space
 from semfov.envs.vector import GazeVectorEnv
 from semfov.envs.zoom import ZoomEnv
 from semfov.errors import InputError
 
 
 class BeliefObservation(gymnasium.ObservationWrapper[Any, Any, Arrays]):
-    """The belief as the observation: planes for convolutions over the cells.
+    """The belief as the observation: planes over the cells, as input of a convolutional network.
 
-    With cells as actions they are `(C + 2, Y, X)`: the probability of the target (of every class, in an exploration),
-    which cells were fixated, and where the gaze is. With windows they are `(2, Y, X)`: the probability that closer
-    looks find an object, and how close each place was looked at.
+    Where actions are cells, the planes are `(C + 2, Y, X)`: the probability of the target (in an exploration of every
+    class), the cells that were fixated, and the cell of the gaze. Where actions are windows, they are `(2, Y, X)`: the
+    probability that closer looks find an object, and how closely each place was looked at.
 
     Args:
         env: a `GazeEnv` or a `ZoomEnv`, wrapped or not.
+
+    Raises:
+        InputError: the environment is of another kind.
 
     Example::
 
@@ -39,17 +42,31 @@ class BeliefObservation(gymnasium.ObservationWrapper[Any, Any, Arrays]):
         self.observation_space = self._inner.belief_space
 
     def observation(self, observation: Arrays) -> NDArray[np.float32]:
-        """The planes."""
+        """Replace an observation by the planes.
+
+        Args:
+            observation: observation of the environment; ignored.
+
+        Returns:
+            `(C + 2, Y, X)` or `(2, Y, X)`, float32 in [0, 1].
+        """
         found: NDArray[np.float32] = self._inner.planes()
         return found
 
 
 class GlimpseObservation(gymnasium.ObservationWrapper[Any, Any, Arrays]):
-    """What the eye is shown as the observation: a picture `(side, side, 3)`.
+    """The foveated image as the observation, `(side, side, 3)`.
 
     Args:
         env: a `GazeEnv` or a `ZoomEnv`, wrapped or not.
-        side: pixels.
+        side: width and height in pixels.
+
+    Raises:
+        InputError: the environment is of another kind, or there is no such side.
+
+    Example::
+
+        env = GlimpseObservation(gymnasium.make("semfov.envs:semfov/GazeSearch-v0"), side=84)
     """
 
     def __init__(self, env: gymnasium.Env[Arrays, Any], side: int = 84) -> None:
@@ -58,15 +75,32 @@ class GlimpseObservation(gymnasium.ObservationWrapper[Any, Any, Arrays]):
         self.observation_space = glimpse_space(side)
 
     def observation(self, observation: Arrays) -> NDArray[np.uint8]:
-        """The picture."""
+        """Replace an observation by the image.
+
+        Args:
+            observation: observation of the environment; ignored.
+
+        Returns:
+            `(side, side, 3)`, RGB, uint8.
+        """
         found: NDArray[np.uint8] = self._inner.glimpse(self._side)
         return found
 
 
 class VectorBeliefObservation(VectorObservationWrapper):
-    """`BeliefObservation` of a `GazeVectorEnv`: `(num_envs, C + 2, Y, X)`.
+    """`BeliefObservation` for a `GazeVectorEnv`: `(num_envs, C + 2, Y, X)`.
 
-    The last observations of episodes that restart in the same step are not made again: infos keep them as they were.
+    The last observations of episodes that restart in the same step are not replaced; infos keep them unchanged.
+
+    Args:
+        env: a `GazeVectorEnv`, wrapped or not.
+
+    Raises:
+        InputError: the environment is of another kind.
+
+    Example::
+
+        envs = VectorBeliefObservation(GazeVectorEnv("search", 64))
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
@@ -76,8 +110,15 @@ class VectorBeliefObservation(VectorObservationWrapper):
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
     def observations(self, observations: Arrays) -> NDArray[np.float32]:
-        """The planes of every episode."""
-        return believed(self._inner.gazes, torch.arange(self.num_envs))
+        """Replace observations by the planes of every episode.
+
+        Args:
+            observations: observations of the environments; ignored.
+
+        Returns:
+            `(num_envs, C + 2, Y, X)`, float32 in [0, 1].
+        """
+        return belief_planes(self._inner.gazes, torch.arange(self.num_envs))
 
 
 def _own(env: Any, *kinds: type[Any]) -> Any:

@@ -1,4 +1,4 @@
-"""One episode at a time with large pictures: a look is a choice of where and how close."""
+"""Large pictures, one episode at a time: a look is a choice of where to look and how closely."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch.nn.functional import adaptive_avg_pool2d, adaptive_max_pool2d, interpolate
 
-from semfov.envs.observation import Arrays, detected, first, glimpse_space
+from semfov.envs.observation import Arrays, detection_arrays, first, glimpse_space
 from semfov.envs.zoom_scenery import ZoomScenery, open_zoom_scenery
 from semfov.errors import InputError, check, check_number, check_whole
 from semfov.experiments.zoom_orders import overview
@@ -26,25 +26,35 @@ from semfov.zoom.search import ZoomPath
 
 Action = NDArray[np.float32]
 
-_SHOWN_SIDE = 1280  # longer side in pixels of a picture that is drawn
+_SHOWN_SIDE = 1280  # longer side in pixels of rendered pictures
 
 
 class ZoomEnv(gymnasium.Env[Arrays, Action]):
     """Base of `ZoomSearch` and `ZoomExplore`.
 
-    An action is `(x, y, magnification)`, each from 0 to 1: the middle of the window as shares of width and height, and
-    how close, from the whole picture to the closest look, a step of the scale an octave. The eye looks at the window
-    of `semfov.zoom.Lattice` that is nearest. The first look is the whole picture.
+    An action is `(x, y, magnification)`, each from 0 to 1: the middle of the window as fractions of width and height,
+    and the magnification from the whole picture (0) to the closest look (1), in equal steps of an octave. The eye looks
+    at the nearest window of `semfov.zoom.Lattice`. The first look of an episode is the whole picture.
 
     Args:
-        scenery: pictures and looks (`open_zoom_scenery`), to be shared by several environments; None opens one.
-        price: of a look.
-        find: what is to be found is worth.
-        belief: observations have what is expected of closer looks, and how close each place was looked at.
-        grid: columns and rows of that.
-        glimpse: observations have what the eye is shown, so many pixels wide and high; None leaves it out.
+        scenery: pictures and looks (`open_zoom_scenery`), which several environments may share; None opens one.
+        price: cost of a look, subtracted from the reward; None takes the default of the task.
+        find: reward for finding the target, or all objects.
+        belief: whether observations contain the belief (`planes`).
+        grid: number of columns and rows of the belief's planes.
+        glimpse: side in pixels of the window's image that observations contain (`glimpse`); None leaves it out.
         render_mode: `rgb_array` or None.
-        options: of `open_zoom_scenery`, where none is given.
+        options: options of `open_zoom_scenery`, where no scenery is given.
+
+    Raises:
+        InputError: an argument is out of range, or both a scenery and options are given.
+        DataError: the pictures or the weights of the detector cannot be read.
+
+    Example::
+
+        env = ZoomSearch(scenes="aerial/", targets=["person"], detector="yolox-nano")
+        observation, info = env.reset(seed=0)
+        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 (Gymnasium has it so)
@@ -65,7 +75,8 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
         **options: Any,
     ) -> None:
         check(render_mode in (None, "rgb_array"), "render_mode", "'rgb_array' or None", repr(render_mode))
-        check(scenery is None or not options, "scenery", "no other options beside it", ", ".join(options))
+        alone = scenery is None or not options
+        check(alone, "scenery", "no options of `open_zoom_scenery` beside it", ", ".join(options))
         self.scenery = open_zoom_scenery(**options) if scenery is None else scenery
         self.price, self.find = self.default_price if price is None else price, find
         check_number(self.price, "price", 0, 1e9)
@@ -86,11 +97,20 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
         self.seen: list[Glance] = []
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Arrays, Arrays]:
-        """Start an episode, with a look at the whole picture.
+        """Start an episode with a look at the whole picture.
 
         Args:
-            seed: of all draws from now on.
-            options: `scene`, an index, to draw an episode in it; and `target`, a class index, to search for in it.
+            seed: of all random draws from now on; None continues the present generator.
+            options: `scene`, the index of a picture to draw an episode in, and `target`, the index of a class to search
+                for in it.
+
+        Returns:
+            The observation, and an info with `detections`, `passes` of the detector, `pixels` shown to it,
+            `action_mask` over the windows, `result` and `scene`.
+
+        Raises:
+            InputError: an option is unknown, or the picture cannot be searched for the class.
+            DataError: no picture has anything to look for.
         """
         super().reset(seed=seed)
         asked = dict(options or {})
@@ -108,15 +128,26 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
         self.seen, self.done, self.passes = [], set[Window](), 0
         self._look(overview(self.glances))
         self.result, self._over = self._rate(), False
-        return self._observe(), self._tell()
+        return self._observe(), self._info()
 
     def step(self, action: Action) -> tuple[Arrays, float, bool, bool, Arrays]:
-        """Look at a window."""
+        """Look at a window.
+
+        Args:
+            action: `(x, y, magnification)`, each from 0 to 1.
+
+        Returns:
+            The observation, the reward, whether the episode is over because the target was found (`terminated`) or
+            because the looks are used up (`truncated`), and the info as from `reset`.
+
+        Raises:
+            InputError: the action is out of range, or no episode is in progress.
+        """
         given = np.asarray(action, dtype=np.float64)
         fits = given.shape == (3,) and bool(((given >= 0) & (given <= 1)).all())
         check(fits, "action", "(x, y, magnification), each from 0 to 1", action)
         if not self.seen or self._over:
-            raise InputError("step: expected a call of reset before it, for no episode is going on")
+            raise InputError("step: expected an episode in progress, got none; call reset first")
         self._look(window_of(self.glances.lattice, given))
         before, self.result = self.result, self._rate()
         terminated = self.task == "search" and self.result == 1
@@ -125,15 +156,15 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
         if self._over:
             self.glances.save()
         reward = self.find * (self.result - before) - self.price
-        return self._observe(), reward, terminated, truncated, self._tell()
+        return self._observe(), reward, terminated, truncated, self._info()
 
     def close(self) -> None:
-        """Keep on disk what was seen in an episode that is not over."""
+        """Save the looks of an episode that is not over."""
         if self.seen:
             self.glances.save()
 
     def _look(self, window: Window) -> None:
-        """A look; one at a window that was looked at before shows nothing new."""
+        """Look at a window; a second look at the same window shows nothing new."""
         self.passes += 1
         self.window = window
         if window in self.done:
@@ -156,7 +187,7 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
             shown["glimpse"] = self.glimpse(self._glimpse)
         return shown
 
-    def _tell(self) -> Arrays:
+    def _info(self) -> Arrays:
         lattice = self.glances.lattice
         free = np.zeros(self.scenery.windows, dtype=np.int8)
         free[: len(lattice)] = 1
@@ -169,16 +200,21 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
             "action_mask": free,
             "result": self.result,
             "scene": self.scene,
-            "detections": first(detected(seen, self.scenery.run.eye.detector)),
+            "detections": first(detection_arrays(seen, self.scenery.run.eye.detector)),
         }
 
     @property
     def belief_space(self) -> spaces.Box:
-        """Of `planes`."""
+        """Space of `planes`."""
         return spaces.Box(0, 1, (2, *self.shape), np.float32)
 
     def planes(self) -> NDArray[np.float32]:
-        """`(2, Y, X)`: the probability that closer looks find an object in a place, and how close it was looked at."""
+        """The belief as planes over the picture.
+
+        Returns:
+            `(2, Y, X)`, float32 in [0, 1]: the probability that closer looks find an object, and how closely each place
+            was looked at.
+        """
         lattice = self.glances.lattice
         expected = [self.belief.expected(level) for level in range(1, lattice.levels)]
         most = torch.stack(expected).amax(0) if expected else torch.zeros(lattice.rows, lattice.columns)
@@ -193,7 +229,14 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
         return found
 
     def glimpse(self, side: int) -> NDArray[np.uint8]:
-        """What the eye is shown, `(side, side, 3)`."""
+        """The image of the present window that the eye sees.
+
+        Args:
+            side: width and height in pixels.
+
+        Returns:
+            `(side, side, 3)`, RGB, uint8.
+        """
         eye = self.scenery.run.eye
         view = eye.open(self.scenery.image(self.scene))
         canvas = eye.glimpse(view, torch.tensor([self.window.fixation], dtype=torch.float64))[0]
@@ -201,13 +244,24 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
         return np.ascontiguousarray(shown.mul(255).round().byte().permute(1, 2, 0).numpy())
 
     def action_of(self, window: Window) -> Action:
-        """The action that looks at a window."""
+        """The action that looks at a window.
+
+        Args:
+            window: window of the lattice.
+
+        Returns:
+            `(x, y, magnification)`, each from 0 to 1.
+        """
         lattice, (x, y, _) = self.glances.lattice, window.fixation
         level = window.level / max(lattice.levels - 1, 1)
         return np.clip([(x + 0.5) / lattice.size[0], (y + 0.5) / lattice.size[1], level], 0, 1).astype(np.float32)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The windows that were looked at, and the objects that were found, as a picture `(H, W, 3)`."""
+        """Draw the windows that were looked at, and the objects that were found.
+
+        Returns:
+            RGB pixels `(H, W, 3)`; None where `render_mode` is None.
+        """
         if self.render_mode is None:
             return None
         target = self.target or None
@@ -223,11 +277,17 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
 class ZoomSearch(ZoomEnv):
     """Search a large picture for an object of a class: look closer until a look shows one.
 
-    The reward of a step is `find` where an object of the class is found (a box with a score of 0.1 and an overlap of
-    0.5), minus `price`. The episode then is over, or after the most looks.
+    The reward of a step is `find` if an object of the class is found (a box with a score of 0.1 and an overlap of 0.5),
+    minus `price`. The episode ends with the find, or after the largest number of looks.
 
     Args:
-        scenery: see `ZoomEnv`, as all arguments.
+        scenery: this and all other arguments are those of `ZoomEnv`.
+
+    Example::
+
+        env = ZoomSearch(mosaics=2, targets=["cat"])
+        observation, info = env.reset(seed=0)
+        print(env.scenery.classes[observation["target"]], info["passes"])
     """
 
     task = "search"
@@ -237,10 +297,16 @@ class ZoomSearch(ZoomEnv):
 class ZoomExplore(ZoomEnv):
     """Find all objects of a large picture.
 
-    The reward of a step is `find` times the rise in the share of the objects that are found, minus `price`.
+    The reward of a step is `find` times the increase of the fraction of objects that are found, minus `price`.
 
     Args:
-        scenery: see `ZoomEnv`, as all arguments.
+        scenery: this and all other arguments are those of `ZoomEnv`.
+
+    Example::
+
+        env = ZoomExplore(mosaics=2)
+        observation, info = env.reset(seed=0)
+        print(info["result"])  # fraction of the objects that the whole picture shows
     """
 
     task = "exploration"
@@ -248,10 +314,20 @@ class ZoomExplore(ZoomEnv):
 
 
 class ZoomPolicyAgent:
-    """semfov's own choice of the next window (`semfov.zoom`) as an agent.
+    """The choice of windows of `semfov.zoom` as an agent.
 
     Args:
         env: a `ZoomEnv`, wrapped or not.
+
+    Raises:
+        InputError: the environment is of another kind.
+
+    Example::
+
+        env = gymnasium.make("semfov.envs:semfov/GazeSearch-v0", action="window")
+        agent = ZoomPolicyAgent(env)
+        observation, info = env.reset(seed=0)
+        observation, reward, terminated, truncated, info = env.step(agent(observation, info))
     """
 
     def __init__(self, env: Any) -> None:
@@ -261,7 +337,7 @@ class ZoomPolicyAgent:
         self._env = inner
 
     def __call__(self, observation: Any = None, info: Any = None) -> Action:
-        """The next action; the whole picture once more where no window is worth a look."""
+        """Choose the next action; the whole picture again where no other window is expected to show anything."""
         env, belief = self._env, self._env.belief
         if env.task == "search":
             choice = best_hit(belief, env.done)
@@ -271,7 +347,14 @@ class ZoomPolicyAgent:
 
 
 def window_of(lattice: Lattice, action: NDArray[np.float64]) -> Window:
-    """The window of the lattice that is nearest to `(x, y, magnification)`, each from 0 to 1.
+    """The window of the lattice that is nearest to an action.
+
+    Args:
+        lattice: windows of the picture.
+        action: `(x, y, magnification)`, each from 0 to 1.
+
+    Returns:
+        The window.
 
     >>> window_of(Lattice.over((2560, 1920), (416, 416)), np.array([0.5, 0.5, 1.0])).cells
     (12, 8, 20, 16)

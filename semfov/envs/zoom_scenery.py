@@ -1,4 +1,4 @@
-"""The world of environments with large pictures: what windows of them show, computed once and kept."""
+"""What environments with large pictures share: the pictures, and looks at their windows, computed once and kept."""
 
 from __future__ import annotations
 
@@ -28,11 +28,16 @@ _TRIES = 1000
 
 
 class ZoomScenery:
-    """Large pictures and an eye that zooms, which any number of environments share: `open_zoom_scenery` makes one.
+    """Large pictures and an eye that zooms, which any number of environments can share; `open_zoom_scenery` makes one.
 
     Args:
-        run: the experiment whose pictures, looks and evidence these are.
-        targets: classes that are searched for; None for all that a picture allows.
+        run: experiment that defines the pictures, looks and evidence.
+        targets: classes to search for; None takes all that a picture allows.
+
+    Example::
+
+        scenery = open_zoom_scenery("aerial/", targets=["person"], detector="yolox-nano")
+        envs = [ZoomSearch(scenery) for _ in range(4)]
     """
 
     def __init__(self, run: ZoomRun, targets: Sequence[str | int] | None = None) -> None:
@@ -50,18 +55,18 @@ class ZoomScenery:
 
     @property
     def passes(self) -> int:
-        """Most looks of an episode, the overview among them."""
+        """Largest number of looks of an episode, the first one at the whole picture included."""
         return self.run.config.passes
 
     @property
     def pixels(self) -> int:
-        """That a look shows the detector."""
+        """Number of pixels that the detector takes in for a look."""
         wide, high = self.run.eye.detector.input_size
         return wide * high
 
     @cached_property
     def windows(self) -> int:
-        """Most windows that any of the pictures has."""
+        """Largest number of windows of any of the pictures."""
         scenes, eye = self.run.scenes, self.run.eye
         if isinstance(scenes, Pictures):
             sizes = [open_large(scenes.root / str(name)).size for name in scenes.ids]
@@ -73,7 +78,17 @@ class ZoomScenery:
         return self.run.glances(scene)
 
     def targets(self, scene: int) -> list[int]:
-        """Classes that a picture may be searched for."""
+        """Classes that a picture may be searched for.
+
+        Args:
+            scene: index of the picture.
+
+        Returns:
+            Class indices, 1..K.
+
+        Raises:
+            InputError: the pictures have no annotations, and no targets were given.
+        """
         if not self.known:
             if self._wanted is None:
                 raise InputError("targets: expected classes to search for in pictures without annotations, got none")
@@ -81,7 +96,14 @@ class ZoomScenery:
         return [each for each in self.run.scenes.targets(scene) if self._wanted is None or each in self._wanted]
 
     def episodes(self, scene: int) -> list[int]:
-        """Targets of all searches of a picture: those that the overview does not show already."""
+        """Targets of all searches of a picture: those that the look at the whole picture does not show already.
+
+        Args:
+            scene: index of the picture.
+
+        Returns:
+            Class indices, 1..K.
+        """
         return self._listed(scene)
 
     def _list(self, scene: int) -> list[int]:
@@ -90,7 +112,19 @@ class ZoomScenery:
         return [target for target in self.targets(scene) if not self.found([first], scene, target)]
 
     def draw(self, random: np.random.Generator, task: str, scene: int | None = None) -> tuple[int, int]:
-        """A picture at random, or the given one, and a target in it; 0 for an exploration."""
+        """Draw a picture and a target.
+
+        Args:
+            random: generator to draw with.
+            task: `search` or `exploration`.
+            scene: index of a picture to take; None draws one.
+
+        Returns:
+            Index of the picture, and class index of the target, 0 for an exploration.
+
+        Raises:
+            DataError: no picture was found that has anything to look for.
+        """
         for _ in range(_TRIES):
             picture = int(random.integers(len(self.run.scenes))) if scene is None else scene
             if task != "search":
@@ -98,22 +132,49 @@ class ZoomScenery:
                     return picture, 0
             elif targets := self.episodes(picture):
                 return picture, targets[random.integers(len(targets))]
-        raise DataError("scenes: expected pictures with anything to look for, found none; give others")
+        raise DataError(
+            "scenes: expected pictures with objects to look for, found none; give other pictures or targets"
+        )
 
     def found(self, looks: Sequence[Glance], scene: int, target: int) -> bool:
-        """Whether an object of the target is found: by its box, or by its score where boxes are not known."""
+        """Whether looks have found an object of the target class: by its box, or without annotations by the score.
+
+        Args:
+            looks: looks so far.
+            scene: index of the picture.
+            target: class index.
+
+        Returns:
+            Whether it was found.
+        """
         if not self.known:
             return any(float(glance.show[target - 1]) >= SHOWN for glance in looks)
         return bool(found_in(looks, self._of(scene, target), target).any())
 
     def share(self, looks: Sequence[Glance], scene: int) -> float:
-        """Share of the objects that are found, or how many are where boxes are not known."""
+        """Fraction of the objects that looks have found.
+
+        Args:
+            looks: looks so far.
+            scene: index of the picture.
+
+        Returns:
+            From 0 to 1; the number of objects found where there are no annotations.
+        """
         if not self.known:
             return float(len(merge(looks, None, score=SHOWN)))
         return float(found_in(looks, self.run.scenes.annotation(scene)).float().mean())
 
     def boxes(self, scene: int, target: int) -> Tensor:
-        """Where objects of the target, or all, really are, as far as that is known."""
+        """True boxes of the objects of a class, or of all objects, as far as they are annotated.
+
+        Args:
+            scene: index of the picture.
+            target: class index; 0 takes all classes.
+
+        Returns:
+            `(M, 4)`, in pixels of the picture.
+        """
         return (self._of(scene, target) if target else self.run.scenes.annotation(scene)).boxes
 
     def _of(self, scene: int, target: int) -> Annotation:
@@ -122,19 +183,26 @@ class ZoomScenery:
         return Annotation(every.boxes[kept], every.labels[kept], every.crowd[kept], every.size)
 
     def image(self, scene: int) -> Tensor:
-        """Pixels of a picture, `(3, H, W)`."""
+        """Pixels of a picture.
+
+        Args:
+            scene: index of the picture.
+
+        Returns:
+            `(3, H, W)`, RGB in [0, 1].
+        """
         return self.run.scenes[scene].image
 
 
 class _Given(ZoomRun):
-    """Large pictures that are given, or of a folder without annotations."""
+    """Given large pictures, or those of a folder without annotations."""
 
     def __init__(self, config: ZoomConfig, scenes: Source) -> None:
         self._chosen = scenes
         super().__init__(config)
 
     def open_scenes(self, classes: tuple[str, ...]) -> Scenes:
-        """The given ones, or all pictures of the folder."""
+        """The given pictures, or all pictures of the folder."""
         if self._chosen is not None and not isinstance(self._chosen, str | Path):
             return self._chosen
         if self._chosen is None or self.config.data.annotations is not None:
@@ -167,23 +235,31 @@ def open_zoom_scenery(
 
     Args:
         scenes: embedded scenes (None), a folder of large pictures, or any `Scenes` with the detector's classes.
-        annotations: COCO-format instances file of the folder; without one nothing is known to be in the pictures, and
-            what the detector shows with a score of 0.3 counts.
-        count: use only the first so many scenes (None: all of a folder, 8 embedded ones).
-        mosaics: number of mosaics to compose of the scenes; 0 takes them as they are (None: 8 of embedded scenes, else
-            0).
-        tiles: photographs in a row and in a column of a mosaic.
-        targets: classes to search for, by name or index; None: all that a picture allows.
-        detector: by name; one that evidence by magnification is shipped for.
-        weights: file with its weights.
-        passes: most looks of an episode, the overview among them.
+        annotations: COCO-format instances file of the folder. Without one the objects in the pictures are unknown, and
+            those that the detector shows with a score of 0.3 count.
+        count: use only the first scenes, this many (None: all of a folder, 8 embedded ones).
+        mosaics: number of mosaics to compose of the scenes; 0 takes the scenes as they are (None: 8 of embedded scenes,
+            otherwise 0).
+        tiles: number of photographs in a row and in a column of a mosaic.
+        targets: classes to search for, by name or index; None takes all that a picture allows.
+        detector: name of a detector for which evidence by magnification is shipped.
+        weights: file with the detector's weights.
+        passes: largest number of looks of an episode, the first one at the whole picture included.
         seed: of embedded scenes and mosaics.
-        cache: folder for what is seen (None: the user's cache).
-        store: keep what is seen on disk.
+        cache: folder for stored looks (None: the user's cache).
+        store: whether looks are kept on disk.
+
+    Returns:
+        The scenery, to be shared by environments.
 
     Raises:
-        InputError: an argument does not fit.
+        InputError: an argument is out of range, or the scenes have other classes than the detector.
         DataError: pictures, annotations or weights are missing or damaged.
+
+    Example::
+
+        scenery = open_zoom_scenery("aerial/", targets=["person"], detector="yolox-nano")
+        env = ZoomSearch(scenery, belief=True)
     """
     check_whole(passes, "passes", 2, 100_000)
     folder = Path(scenes) if isinstance(scenes, str | Path) else None
@@ -208,5 +284,5 @@ def open_zoom_scenery(
     )
     run = _Given(config, scenes)
     names = run.eye.detector.classes
-    check(run.scenes.classes == names, "scenes", "classes of the detector", f"{len(run.scenes.classes)} others")
+    check(run.scenes.classes == names, "scenes", "the classes of the detector", f"{len(run.scenes.classes)} others")
     return ZoomScenery(run, targets)

@@ -1,4 +1,4 @@
-"""How the next fixation is chosen from the values of the cells."""
+"""How the next fixation is chosen from the acquisition values of the cells."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -11,32 +11,51 @@ from semfov.gaze.relaxation import soft_fixation
 from semfov.gaze.selection import select_fixation
 
 Noise = Callable[[int, Tensor], Tensor]
-"""Random numbers `(A, X·Y)` in [0, 1) for the n-th choice of some episodes `(A,)`."""
+"""Maps the number of a gaze shift and the numbers of A episodes `(A,)` to random numbers `(A, X·Y)` in [0, 1)."""
 
 
 class Choice(ABC):
-    """Base of all ways to choose the next fixation."""
+    """Base of all ways to choose the next fixation.
+
+    A subclass implements `__call__`, which `semfov.rollout` calls once for every gaze shift.
+
+    >>> class First(Choice):
+    ...     def __call__(self, shift, episodes, values, visited, centres):
+    ...         cell = (~visited).long().argmax(-1)
+    ...         return centres[cell], cell
+    >>> First()(0, torch.tensor([0]), torch.zeros(1, 2), torch.tensor([[True, False]]), torch.zeros(2, 2))[1]
+    tensor([1])
+    """
 
     @abstractmethod
     def __call__(
         self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The next fixation `(A, 2)` and its cell `(A,)`; any cell where all were visited.
+        """Choose the next fixation of each episode.
 
         Args:
-            shift: gaze shifts that were made before.
-            episodes: `(A,)`, numbers of the episodes that go on.
+            shift: number of gaze shifts made so far.
+            episodes: `(A,)`, numbers of the episodes that are not over.
             values: `(A, X·Y)`, acquisition values.
-            visited: `(A, X·Y)` boolean, cells that are out.
-            centres: `(X·Y, 2)`, of the cells.
+            visited: `(A, X·Y)` boolean, cells that were fixated and may not be chosen.
+            centres: `(X·Y, 2)`, centres of the cells in pixels.
+
+        Returns:
+            The fixations `(A, 2)` in pixels, and their cells `(A,)`. Where all cells were visited, the cell is
+            arbitrary.
         """
 
 
 class Greedy(Choice):
-    """The best cell not visited (`select_fixation`).
+    """Choose the cell of the highest value among those not visited (`select_fixation`).
 
     Args:
-        noise: breaks ties.
+        noise: random numbers that break ties.
+
+    >>> choice = Greedy(drawn_from(torch.rand(1, 1, 3)))
+    >>> values, centres = torch.tensor([[0.1, 0.7, 0.2]]), torch.zeros(3, 2)
+    >>> choice(0, torch.tensor([0]), values, torch.tensor([[False, True, False]]), centres)[1]
+    tensor([2])
     """
 
     def __init__(self, noise: Noise) -> None:
@@ -45,16 +64,16 @@ class Greedy(Choice):
     def __call__(
         self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The centre of the best cell; the first cell where all were visited."""
+        """Return the centre of the best cell and the cell; cell 0 where all were visited."""
         cell = select_fixation(values, visited, self.noise(shift, episodes)).clamp(min=0)
         return centres[cell], cell
 
 
 class Exploratory(Greedy):
-    """`Greedy` with some fixations astray, which training needs to see all cells.
+    """`Greedy`, with some fixations drawn at random so that training sees all cells.
 
     Args:
-        noise: breaks ties, and draws: other numbers whenever it is asked.
+        noise: random numbers that break ties and draw; it must give new numbers at every call.
         astray: probability of a fixation at random.
     """
 
@@ -65,20 +84,23 @@ class Exploratory(Greedy):
     def __call__(
         self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The best cell, or any."""
-        lost = self.noise(shift, episodes)[:, :1] < self.astray
-        return super().__call__(shift, episodes, torch.where(lost, 0.0, values.detach()), visited, centres)
+        """Return the best cell, or with the probability `astray` any cell not visited."""
+        drawn = self.noise(shift, episodes)[:, :1] < self.astray
+        return super().__call__(shift, episodes, torch.where(drawn, 0.0, values.detach()), visited, centres)
 
 
 class Softmax(Choice):
-    r"""A noisy choice: a cell not visited is drawn with :math:`P(x) \propto e^{b \, a(x)}`.
+    r"""A noisy choice: draw a cell not visited with probability :math:`P(x) \propto e^{b \, a(x)}`.
 
-    With b = 0 all cells are equally likely; the larger b, the nearer it comes to `Greedy`. The draw is that of
-    `soft_fixation` and so of the random numbers alone. No gradient flows through it.
+    With b = 0 all cells are equally likely. The larger b, the closer the choice is to `Greedy`. Cells are drawn as by
+    `soft_fixation`, and the draw depends on the values and the random numbers alone. No gradient flows through it.
 
     Args:
-        noise: draws.
-        inverse_temperature: b, 0 or more, in units of one over those of the values.
+        noise: random numbers to draw with.
+        inverse_temperature: b, 0 or more, in the inverse unit of the values.
+
+    Raises:
+        InputError: b is negative.
 
     >>> noise = drawn_from(torch.rand(1, 1, 3, generator=torch.Generator().manual_seed(0)))
     >>> values, centres = torch.tensor([[0.0, 1.0, 2.0]]), torch.zeros(3, 2)
@@ -94,19 +116,27 @@ class Softmax(Choice):
     def __call__(
         self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The drawn cell's centre; any cell where all were visited."""
+        """Return the centre of the drawn cell and the cell; any cell where all were visited."""
         logits = self.inverse_temperature * values.detach()
         return soft_fixation(logits, visited, centres, self.noise(shift, episodes))
 
 
 class Relaxed(Choice):
-    """A draw by Gumbel-softmax, through which gradients flow (`soft_fixation`).
+    """Draw a cell by Gumbel-softmax, so that gradients flow through the choice (`soft_fixation`).
 
     Args:
-        noise: draws.
-        cell_of: cell of a soft point.
-        temperature: of the softmax.
-        hard: straight-through, or the soft point.
+        noise: random numbers to draw with.
+        cell_of: maps points `(A, 2)` to their cells `(A,)`; needed where `hard` is false.
+        temperature: temperature of the softmax.
+        hard: fixate the centre of the drawn cell with a straight-through gradient; otherwise fixate the mean of all
+            centres, weighted by the softmax.
+
+    >>> from semfov import Grid
+    >>> choice = Relaxed(drawn_from(torch.full((1, 1, 2), 0.5)), Grid(2, 1, (20, 10)).cell_of)
+    >>> values = torch.tensor([[0.0, 9.0]], requires_grad=True)
+    >>> point, cell = choice(0, torch.tensor([0]), values, torch.zeros(1, 2).bool(), Grid(2, 1, (20, 10)).centres)
+    >>> cell.tolist(), point.requires_grad
+    ([1], True)
     """
 
     def __init__(
@@ -120,17 +150,21 @@ class Relaxed(Choice):
     def __call__(
         self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The drawn fixation."""
+        """Return the drawn fixation and its cell."""
         drawn = self.noise(shift, episodes)
         fixation, cell = soft_fixation(values, visited, centres, drawn, temperature=self.temperature, hard=self.hard)
         return fixation, cell if self.hard else self.cell_of(fixation.detach())
 
 
 class Given(Choice):
-    """A scanpath that is known already.
+    """Follow a scanpath that is given.
 
     Args:
         cells: `(B, n)`, the cells that each episode fixates, the start first.
+
+    >>> centres = torch.tensor([[0.0, 0.0], [1.0, 0.0]])
+    >>> Given(torch.tensor([[0, 1]]))(0, torch.tensor([0]), torch.zeros(1, 2), torch.zeros(1, 2).bool(), centres)[1]
+    tensor([1])
     """
 
     def __init__(self, cells: Tensor) -> None:
@@ -139,18 +173,24 @@ class Given(Choice):
     def __call__(
         self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The next cell of the scanpath; its last one at the end."""
+        """Return the centre of the next cell of the scanpath and the cell; the last cell again at the end."""
         cell = self.cells[episodes, min(shift + 1, self.cells.shape[1] - 1)]
         return centres[cell], cell
 
 
 def first_cell(start: int | None, seed: int, cells: int) -> tuple[int, torch.Generator]:
-    """The cell that an episode fixates first, and the generator that breaks its ties.
+    """The first cell of an episode, and the generator that breaks its ties.
 
     Args:
         start: the cell; None draws one.
         seed: of the generator.
-        cells: how many there are.
+        cells: number of cells.
+
+    Returns:
+        The cell and the generator, which has drawn the cell where `start` is None.
+
+    Raises:
+        InputError: `start` is not a cell, or `seed` is not a whole number of 0 or more.
 
     >>> first_cell(3, 0, 100)[0]
     3
@@ -164,10 +204,10 @@ def first_cell(start: int | None, seed: int, cells: int) -> tuple[int, torch.Gen
 
 
 def drawn_from(noise: Tensor) -> Noise:
-    """Random numbers from a table `(B, shifts, X·Y)`."""
+    """Random numbers from a table `(B, shifts, X·Y)`, so that an episode repeats."""
     return lambda shift, episodes: noise[episodes, shift]
 
 
 def drawn_by(generator: torch.Generator, cells: int, like: Tensor) -> Noise:
-    """Random numbers as they are needed; dtype and device as `like`."""
+    """Random numbers from a generator as they are needed, with the dtype and device of `like`."""
     return lambda shift, episodes: torch.rand(len(episodes), cells, generator=generator).to(like)

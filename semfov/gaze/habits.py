@@ -1,4 +1,4 @@
-"""How people move their eyes, whatever there is to see: a log-linear choice among all cells."""
+"""How people move their eyes regardless of the picture: a log-linear choice among all cells."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,25 +16,29 @@ from semfov.io.schema import Field, Number, Schema
 
 
 class GazeHabits(Pretrained):
-    r"""Where people look next, given a value of every cell: the cell is drawn with a probability that is log-linear.
+    r"""Where people look next: a log-linear model of the next cell, given the acquisition values of all cells.
 
     .. math:: P(x \mid f_1 \ldots f_n) \propto \exp\bigl(b \, z(x) + c(x) + s(\|x - f_n\|) + r(n - l(x))\bigr)
 
-    with z the values of an acquisition function, scaled to mean 0 and variance 1 over the cells (`standardised`), c a
-    bias for the centre, s a table of saccade lengths, and r a table of how a cell is kept from the gaze, or draws it,
-    the more fixations ago :math:`l(x)` it was last fixated: inhibition of return that fades. There is no other
-    inhibition: the gaze may stay, and may return. `train.fit_humanlike` fits all of it to people's next fixations.
+    z are the values of an acquisition function, scaled to mean 0 and variance 1 over the cells (`standardised`). c is a
+    centre bias, and s a table over the length of the saccade. r is a table over the age of a cell, the number of
+    fixations since it was last fixated at fixation l(x): a negative entry keeps the gaze from returning, and a positive
+    one attracts it. This is inhibition of return that fades. There is no other inhibition: the gaze may stay, and may
+    return. `train.fit_humanlike` fits all parameters to people's next fixations.
 
     Args:
         pull: b, inverse temperature of the choice.
         place: `(X·Y)`, c.
-        step: `(D)`, s in every bin of distance, the cell itself in the first.
-        edges: D - 1 ascending borders of the bins, in longer sides of the image.
+        step: `(D)`, s in every bin of distance; the first bin holds the fixated cell itself.
+        edges: D - 1 ascending edges of the distance bins, in units of the image's longer side.
         back: `(R)`, r in every bin of age.
-        ages: R - 1 ascending last ages of the bins but the last, in fixations: an age of 1 is that of the fixation
-            before the present one.
-        columns: cells in a row.
-        metadata: JSON values that are kept with the model.
+        ages: R - 1 ascending numbers, the last age in each bin but the last one, in fixations. The cell of the
+            fixation before the present one has age 1.
+        columns: number of cells in a row.
+        metadata: JSON values to keep with the model.
+
+    Raises:
+        InputError: the sizes do not fit together, or a number is not finite.
 
     >>> habits = GazeHabits(0.0, torch.zeros(3), torch.tensor([-9.0, 1.0, 0.0]), [0.1, 0.4], torch.zeros(1), [], 3)
     >>> never = torch.full((1, 3), torch.inf)
@@ -91,50 +95,64 @@ class GazeHabits(Pretrained):
             self.register_buffer(name, given.detach().to(place.dtype).clone())
 
     def forward(self, values: Tensor, cell: Tensor, age: Tensor, grid: Grid) -> Tensor:
-        """Log probabilities up to a constant, `(B, X·Y)`.
+        """Log probability of every cell as the next one, up to a constant.
 
         Args:
             values: `(B, X·Y)`, of an acquisition function.
-            cell: `(B,)`, that is fixated.
-            age: `(B, X·Y)`, how many fixations ago each cell was fixated last, 0 for the present one and infinite for
-                those that never were.
+            cell: `(B,)`, the cell that is fixated.
+            age: `(B, X·Y)`, number of fixations since each cell was last fixated: 0 for the present cell, and infinite
+                for cells that were never fixated.
             grid: the cells of one image.
 
+        Returns:
+            `(B, X·Y)`, in nats.
+
         Raises:
-            InputError: the grid is another than the model was fitted on.
+            InputError: the grid has another shape than the one the model was fitted on.
         """
         check((grid.columns, len(grid)) == (self.columns, len(self.place)), "grid", str(self), grid)
         steps = step_bins(grid, cell, self.edges)
         ages = age_bins(age, self.ages)
-        # Of a cell that was never fixated, or is now, the age says nothing.
+        # The table of ages has no entry for cells that were never fixated, and for the cell that is fixated now.
         back = torch.where(ages >= 0, self.back[ages.clamp(min=0)], 0.0)
         return self.pull * standardised(values) + (self.place + self.step[steps] + back).to(values)
 
     def extra_repr(self) -> str:
-        """Grid, for `repr`."""
+        """Describe the grid for `repr`.
+
+        Returns:
+            Its columns and rows.
+        """
         return f"columns={self.columns}, rows={len(self.place) // self.columns}"
 
     def _record(self) -> dict[str, Any]:
-        """Columns of the grid."""
+        """Number of columns of the grid."""
         return {"columns": self.columns}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The tables from what was kept."""
+        """The tables from a file's record and tensors."""
         tables = {name: tensors[name] for name in ("place", "step", "edges", "back", "ages")}
         return cls(float(tensors["pull"]), **tables, columns=record["columns"], metadata=record["metadata"])
 
 
 class Habitual(Choice):
-    """The next fixation as people choose it: drawn by `GazeHabits` from the values of an acquisition function.
+    """Choose the next fixation as people do: draw it by `GazeHabits` from the values of an acquisition function.
 
-    It goes by its own memory of what was fixated when, and not by the cells that are out. One is made for each
+    It keeps its own memory of when each cell was fixated, and may return to visited cells. Make a new one for each
     `semfov.rollout`.
 
     Args:
-        noise: draws.
+        noise: random numbers to draw with.
         habits: the fitted model.
         grid: the cells.
+
+    >>> from semfov.gaze.choice import drawn_from
+    >>> grid = Grid(2, 1, (20, 10))
+    >>> habits = GazeHabits(50.0, torch.zeros(2), torch.zeros(1), [], torch.zeros(1), [], 2)
+    >>> choice = Habitual(drawn_from(torch.full((1, 1, 2), 0.5)), habits, grid)
+    >>> choice(0, torch.tensor([0]), torch.tensor([[1.0, 0.0]]), torch.tensor([[True, False]]), grid.centres)[1]
+    tensor([0])
     """
 
     def __init__(self, noise: Noise, habits: GazeHabits, grid: Grid) -> None:
@@ -147,9 +165,9 @@ class Habitual(Choice):
     def __call__(
         self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The drawn cell and its centre."""
+        """Return the centre of the drawn cell and the cell."""
         if shift == 0:
-            # All episodes are there, and the start is all that was fixated.
+            # At the first choice all episodes take part, and only their start cells were fixated.
             self._cell = visited.long().argmax(-1)
             self._age = torch.full_like(values.detach(), torch.inf)
         cell = self._cell[episodes]
@@ -162,7 +180,13 @@ class Habitual(Choice):
 
 
 def standardised(values: Tensor) -> Tensor:
-    """Values `(..., X·Y)` scaled to mean 0 and variance 1 over the cells; 0 where all are equal.
+    """Scale values to mean 0 and variance 1 over the cells; 0 everywhere where all are equal.
+
+    Args:
+        values: `(..., X·Y)`.
+
+    Returns:
+        The same shape.
 
     >>> standardised(torch.tensor([[1.0, 3.0], [2.0, 2.0]]))
     tensor([[-1.,  1.],
@@ -170,16 +194,16 @@ def standardised(values: Tensor) -> Tensor:
     """
     apart = values - values.mean(-1, keepdim=True)
     spread = apart.square().mean(-1, keepdim=True).sqrt()
-    # Rounding alone tells equal values apart.
+    # A spread as small as this is a rounding error of equal values.
     least = 1e-6 * values.abs().amax(-1, keepdim=True) + torch.finfo(values.dtype).tiny
     return torch.where(spread > least, apart / spread.clamp(min=torch.finfo(values.dtype).tiny), 0.0)
 
 
 def step_bins(grid: Grid, cell: Tensor, edges: Tensor) -> Tensor:
-    """Bin of the distance from `cell` `(...)` to every cell, `(..., X·Y)`; one that equals a border is inside."""
+    """Bin of the distance from each cell `(...)` to all, `(..., X·Y)`; a distance on an edge is in the lower bin."""
     return torch.bucketize(grid.cell_distance.to(edges)[cell], edges)
 
 
 def age_bins(age: Tensor, ages: Tensor) -> Tensor:
-    """Bin of every age, `(...)`; -1 where it is 0 or infinite."""
+    """Bin of every age `(...)`; -1 where the age is 0 or infinite."""
     return torch.where((age > 0) & age.isfinite(), torch.bucketize(age.to(ages).contiguous(), ages), -1)

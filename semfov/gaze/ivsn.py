@@ -1,4 +1,4 @@
-"""Invariant visual search as published: a picture is searched for what is like a picture of the target."""
+"""Invariant visual search (IVSN) as published: attention to what resembles a picture of the target."""
 
 from os import PathLike
 from typing import Self
@@ -17,17 +17,17 @@ class IVSN(nn.Module):
 
     .. math:: M(y) = \sum_c \phi_c(I)(y) \, \psi_c(T)
 
-    φ are the features of the search image I after the last convolutions of VGG16, and ψ those of the target's picture T
-    after the pooling that follows, where a picture of 28 × 28 pixels is one place: the target's features are the
-    kernel that the search image is correlated with. The gaze goes from one maximum to the next, with inhibition of
-    return. The network knows nothing of the task; it is VGG16 trained on ImageNet. It sees the whole picture sharply:
+    φ are the features of the search image I after the last convolutions of VGG16. ψ are the features of the target's
+    picture T after the pooling that follows; for a picture of 28 × 28 pixels they are one vector. The search image is
+    correlated with this vector. The gaze goes from one maximum to the next, with inhibition of return. The network is
+    VGG16 trained on ImageNet, and is not trained for the task. It sees the whole picture sharply;
     `semfov.acquisition.TemplateAttention` is its counterpart for foveal looks.
 
     Args:
-        features: φ, as `torchvision.models.vgg16().features` without its last pooling.
-        pool: what is done to φ of a target to get ψ.
-        picture: the search image is resized to a square of so many pixels.
-        target: the target's picture is resized to a square of so many pixels.
+        features: network that computes φ, such as `torchvision.models.vgg16().features` without its last pooling.
+        pool: pooling that turns φ of a target into ψ.
+        picture: side in pixels of the square to which the search image is resized.
+        target: side in pixels of the square to which the target's picture is resized.
 
     Shape:
         - image: `(B, 3, H, W)`, RGB in [0, 1]; target: `(B, 3, h, w)`
@@ -42,7 +42,7 @@ class IVSN(nn.Module):
 
     def __init__(self, features: nn.Module, pool: nn.Module, *, picture: int = 224, target: int = 28) -> None:
         super().__init__()
-        check(min(picture, target) > 0, "picture, target", "sizes above 0", (picture, target))
+        check(min(picture, target) > 0, "picture, target", "positive numbers of pixels", (picture, target))
         self.features = features
         self.pool = pool
         self.picture, self.target = picture, target
@@ -51,11 +51,14 @@ class IVSN(nn.Module):
 
     @classmethod
     def vgg16(cls, weights: str | PathLike[str] | None = "torchvision") -> Self:
-        """Over torchvision's VGG16.
+        """Make the model from torchvision's VGG16.
 
         Args:
             weights: a safetensors file with VGG16's `features.*` as torchvision names them; `torchvision` for those of
                 ImageNet, which torchvision downloads (528 MB); None for random ones.
+
+        Returns:
+            The model in evaluation mode, without gradients for its weights.
 
         Raises:
             DataError: the file does not hold the weights of VGG16's features.
@@ -69,7 +72,7 @@ class IVSN(nn.Module):
         layers = list(network)
         for layer in layers:
             if isinstance(layer, nn.MaxPool2d):
-                # Caffe's VGG16 rounds up: 28 pixels are one place after five times, where rounding down leaves none.
+                # Caffe's VGG16 rounds sizes up: five poolings leave 1 of 28 pixels; rounding down would leave 0.
                 layer.ceil_mode = True
         made = cls(nn.Sequential(*layers[:-1]), layers[-1]).eval().requires_grad_(False)
         if weights not in (None, "torchvision"):
@@ -77,11 +80,22 @@ class IVSN(nn.Module):
         return made
 
     def forward(self, image: Tensor, target: Tensor) -> Tensor:
-        """Attention to the target at every place of the image."""
+        """Attention to the target at every position of the image.
+
+        Args:
+            image: `(B, 3, H, W)`, RGB in [0, 1], the search images.
+            target: `(B, 3, h, w)`, RGB in [0, 1], a picture of the target for each of them.
+
+        Returns:
+            `(B, 14, 14)` for a `picture` of 224 pixels.
+
+        Raises:
+            InputError: shapes or pixel values do not fit, or the target's features are more than one vector.
+        """
         for name, pixels in (("image", image), ("target", target)):
             check_shape(pixels, name, None, 3, None, None)
             check_pixels(pixels, name)
-        check(len(image) == len(target), "target", f"{len(image)} pictures", len(target))
+        check(len(image) == len(target), "target", f"{len(image)} pictures, one for each image", len(target))
         kernel = self.pool(self.features(self._prepared(target, self.target)))
         check_shape(kernel, "target's features", None, None, 1, 1)
         return torch.einsum("bchw,bc->bhw", self.features(self._prepared(image, self.picture)), kernel[..., 0, 0])

@@ -23,15 +23,15 @@ class LearnedGaze(PretrainedForEye):
 
     .. math:: \ell(x) = s \ln p_t(x) + h(\psi)(x), \qquad f = \arg\max_{x \notin \mathcal V} \ell(x)
 
-    with ψ the `gaze_features` of all cells and h a convolutional network that sees five cells around. It starts with
-    h = 0, as non-predictive search (`TargetPosterior`), and training moves it from there.
+    ψ are the `gaze_features` of all cells, and h is a convolutional network whose receptive field is the 7 × 7 cells
+    around each cell. Before training, h = 0, and the policy equals non-predictive search (`TargetPosterior`).
 
-    The policy is trained behind one belief, and comes with it: `observer` makes it.
+    The policy is trained on one belief, and its settings are kept with the model: `observer` makes that belief.
 
     Args:
-        width: channels of h.
-        belief: settings of the belief that it reads (of `Semantic`); raw scores are likelihoods.
-        metadata: JSON values kept with the model: `detector` and `sensor` (settings it was trained for).
+        width: number of channels of h.
+        belief: settings of the belief that the policy reads (of `Semantic`, with raw scores as likelihoods).
+        metadata: JSON values to keep with the model: `detector` and `sensor`, the settings it was trained for.
 
     >>> gaze = LearnedGaze()
     >>> sum(p.numel() for p in gaze.parameters())
@@ -82,30 +82,47 @@ class LearnedGaze(PretrainedForEye):
         )
 
     def forward(self, belief: DirichletBelief, visited: Tensor, target: int | Tensor, columns: int) -> Tensor:
-        """Values ℓ of all cells, `(B, X·Y)`; arguments as for `gaze_features`."""
+        """Values ℓ of all cells.
+
+        Args:
+            belief: Dirichlet belief `(B, X·Y, C)` after at least one look.
+            visited: `(B, X·Y)` boolean, cells that were fixated.
+            target: class 1..K, or a tensor `(B,)` with one for each episode.
+            columns: number of cells in a row.
+
+        Returns:
+            `(B, X·Y)`, differentiable in the belief and the parameters.
+        """
         present = belief.probability(target).log()
         features = gaze_features(belief, visited, target, columns)
         correction: Tensor = self.network(features.mT.unflatten(-1, (-1, columns)))
         return self.log_scale.exp() * present + correction[:, 0].flatten(1)
 
     def observer(self, components: int) -> Semantic:
-        """The belief that it was trained behind, for so many classes, background included."""
+        """Make the belief that the policy was trained on.
+
+        Args:
+            components: number of classes, background included (K + 1).
+
+        Returns:
+            The observer that keeps this belief.
+        """
         return Semantic(components, **self.belief)
 
     def _record(self) -> dict[str, Any]:
-        """Width of the network, and the belief that it reads."""
+        """Width of the network, and settings of the belief that it reads."""
         return {"width": self.width, "belief": self.belief}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The network from what was kept."""
+        """The network from a file's record and tensors."""
         model = cls(record["width"], belief=record["belief"], metadata=record["metadata"])
         model.load_state_dict(tensors)
         return model
 
 
 class LearnedAcquisition(AcquisitionFunction):
-    """`LearnedGaze` for one search.
+    """`LearnedGaze` as the acquisition function of one search.
 
     Args:
         gaze: the policy.
@@ -133,21 +150,35 @@ class LearnedAcquisition(AcquisitionFunction):
 
 
 def gaze_features(belief: DirichletBelief, visited: Tensor, target: int | Tensor, columns: int) -> Tensor:
-    r"""What a searcher remembers of every cell, `(B, X·Y, 12)`, the same for every class.
+    r"""Features of every cell that the learned policy reads; their meaning is the same for every target class.
 
-    With :math:`p = \beta / T`, :math:`T = \sum_k \beta_k` and C classes they are, each scaled to about unit size:
-    :math:`\ln C p` for the target, the background and the most probable other class; the target's against that of the
-    best cell not visited; how far the entropy is below that of C equal classes; T against the least of all cells; the
-    distance to the closest fixation; whether the cell was visited; how many cells were; the squared distance from the
-    middle of the image; the row; and 1, by which a convolution knows the border. Kaplan's rule moves a belief about
-    many classes little at a time, so the first six are passed through :math:`\sinh^{-1}(100 x) / 2`, which tells
-    hundredths apart and keeps what is large in bounds.
+    With :math:`p = \beta / T`, :math:`T = \sum_k \beta_k` and C classes the features of a cell are, in this order and
+    each scaled to about unit size:
+
+    1. :math:`\ln C p` of the target,
+    2. :math:`\ln C p` of background,
+    3. :math:`\ln C p` of the most probable other class,
+    4. the first feature minus its highest value in the cells not visited,
+    5. one minus the entropy of the cell as a fraction of that of C equally probable classes,
+    6. T minus the smallest T of all cells,
+    7. the distance to the closest fixation,
+    8. whether the cell was visited,
+    9. the number of visited cells,
+    10. the squared distance from the middle of the image,
+    11. the row,
+    12. 1, which lets a convolution recognise the border.
+
+    A look changes a belief about many classes only a little by Kaplan's rule. The first six therefore pass through
+    :math:`\sinh^{-1}(100 x) / 2`, which resolves differences of a hundredth and bounds large values.
 
     Args:
         belief: the belief, `(B, X·Y, C)`, after at least one look.
-        visited: `(B, X·Y)` boolean.
+        visited: `(B, X·Y)` boolean, cells that were fixated.
         target: class 1..K, or a tensor `(B,)` with one for each episode.
-        columns: cells in a row.
+        columns: number of cells in a row.
+
+    Returns:
+        `(B, X·Y, 12)`.
     """
     beta, target = belief.beta, torch.as_tensor(target, device=belief.beta.device)
     classes = beta.shape[-1]

@@ -1,4 +1,4 @@
-"""Log-linear choices: maximum likelihood of which of several alternatives was taken."""
+"""Log-linear choice models, fitted by maximum likelihood to which of several alternatives was chosen."""
 
 import torch
 from torch import Tensor
@@ -9,22 +9,26 @@ _STEPS, _TOLERANCE = 100, 1e-9
 
 
 def fit_log_linear(features: Tensor, chosen: Tensor, *, ridge: float = 1.0, chunk: int = 2048) -> Tensor:
-    r"""Weights under which what was chosen is likeliest, `(F,)`, by Newton's method in double precision.
+    r"""Fit the weights of a log-linear choice model by maximum likelihood (conditional logit; McFadden, 1974).
 
     .. math:: \max_w \sum_n \ln \frac{e^{w \cdot \phi_n(x_n)}}{\sum_x e^{w \cdot \phi_n(x)}} - \frac{\rho}{2} \|w\|^2
 
-    (Conditional logit, McFadden, 1974.) The sum is concave, so there is one maximum. The ridge settles weights that
-    the choices do not tell, such as a constant added to all bins of a table, and keeps weights of what never happened
-    finite.
+    Newton's method in double precision. The sum is concave, so there is one maximum. The ridge ρ determines weights
+    that the data leave open, such as a constant added to all bins of a table. It also keeps weights finite for
+    alternatives that were never chosen.
 
     Args:
-        features: `(n, A, F)`, φ of every alternative of every choice.
-        chosen: `(n,)`, index of the alternative taken.
+        features: `(n, A, F)`, φ, the F features of each of A alternatives in n choices.
+        chosen: `(n,)`, index of the alternative chosen.
         ridge: ρ, positive.
-        chunk: choices that are taken at a time.
+        chunk: number of choices to compute at a time.
+
+    Returns:
+        `(F,)`, the weights w, float64.
 
     Raises:
-        DataError: it does not converge.
+        InputError: there is no choice, the shapes do not fit together, or the ridge is not positive.
+        DataError: the fit does not converge.
 
     >>> features = torch.eye(2).expand(10, 2, 2)
     >>> weights = fit_log_linear(features, torch.tensor([0] * 8 + [1] * 2), ridge=1e-6)
@@ -42,7 +46,7 @@ def fit_log_linear(features: Tensor, chosen: Tensor, *, ridge: float = 1.0, chun
         if float(step @ slope) <= _TOLERANCE * (1 + abs(value)):
             return weights + step
         size = 1.0
-        # Newton's step may be too long far from the maximum; a part of it always gains.
+        # Far from the maximum Newton's step may be too long; a short enough part of it always raises the value.
         while True:
             moved = weights + size * step
             there = _derivatives(features, chosen, moved, ridge, chunk)
@@ -50,30 +54,39 @@ def fit_log_linear(features: Tensor, chosen: Tensor, *, ridge: float = 1.0, chun
                 break
             size /= 2
         weights, (value, slope, curvature) = moved, there
-    raise DataError(f"the fit of choices did not converge in {_STEPS} steps; give more choices, or a larger ridge")
+    raise DataError(f"the fit did not converge in {_STEPS} steps; give more choices, or a larger `ridge`")
 
 
 def log_probability(features: Tensor, chosen: Tensor, weights: Tensor, *, chunk: int = 2048) -> Tensor:
-    """Log probability of each choice under a log-linear model, `(n,)` in nats and double precision.
+    """Log probability of each choice under a log-linear model.
 
     Args:
-        features: `(n, A, F)`.
-        chosen: `(n,)`.
-        weights: `(F,)`.
-        chunk: choices that are taken at a time.
+        features: `(n, A, F)`, features of the alternatives.
+        chosen: `(n,)`, index of the alternative chosen.
+        weights: `(F,)`, as `fit_log_linear` returns them.
+        chunk: number of choices to compute at a time.
+
+    Returns:
+        `(n,)`, in nats, float64.
+
+    Raises:
+        InputError: the number of weights differs from the number of features.
+
+    >>> log_probability(torch.eye(2)[None], torch.tensor([0]), torch.zeros(2).double()).exp()
+    tensor([0.5000], dtype=torch.float64)
     """
     if features.shape[-1] != len(weights):
-        raise InputError(f"weights: expected {features.shape[-1]} numbers, got {len(weights)}")
-    told = []
+        raise InputError(f"weights: expected {features.shape[-1]} numbers, one a feature, got {len(weights)}")
+    parts = []
     for some, taken in zip(features.split(chunk), chosen.split(chunk), strict=True):
-        told.append((some.double() @ weights).log_softmax(-1).gather(-1, taken[:, None])[:, 0])
-    return torch.cat(told)
+        parts.append((some.double() @ weights).log_softmax(-1).gather(-1, taken[:, None])[:, 0])
+    return torch.cat(parts)
 
 
 def _derivatives(
     features: Tensor, chosen: Tensor, weights: Tensor, ridge: float, chunk: int
 ) -> tuple[float, Tensor, Tensor]:
-    """The penalised log likelihood, its gradient, and its Hessian with the sign turned."""
+    """The penalised log likelihood, its gradient, and its negative Hessian."""
     value = -0.5 * ridge * float(weights @ weights)
     slope = -ridge * weights
     curvature = ridge * torch.eye(len(weights), dtype=weights.dtype, device=weights.device)

@@ -1,4 +1,4 @@
-"""A soft choice of the next fixation, so that a gradient flows from what is seen there to the values of the cells."""
+"""A soft choice of the next fixation, through which gradients reach the values of the cells."""
 
 import torch
 from torch import Tensor
@@ -9,24 +9,27 @@ from semfov.errors import check, check_shape
 def soft_fixation(
     logits: Tensor, visited: Tensor, centres: Tensor, noise: Tensor, *, temperature: float = 1.0, hard: bool = True
 ) -> tuple[Tensor, Tensor]:
-    r"""Fixation drawn by Gumbel-softmax over the cells not visited (Jang, Gu and Poole, 2017).
+    r"""Draw a fixation by Gumbel-softmax over the cells not visited (Jang, Gu and Poole, 2017).
 
     .. math:: y = \mathrm{softmax}\left(\frac{\ell - \ln(-\ln u)}{\tau}\right), \quad
               x^* = \arg\max_x y(x), \quad \tilde f = \sum_x y(x) \, c(x)
 
-    With `hard` the fixation is the centre of x*, a draw from `softmax(ℓ)`, and its gradient that of the soft point f̃
+    With `hard` the fixation is the centre of x*, a draw from `softmax(ℓ)`, and has the gradient of the soft point f̃
     (straight-through; Bengio, Léonard and Courville, 2013); otherwise it is f̃ itself.
 
     Args:
         logits: `(B, X·Y)`, ℓ.
-        visited: `(B, X·Y)` boolean, cells that are out; at least one is left in every row.
-        centres: `(X·Y, 2)`, c.
+        visited: `(B, X·Y)` boolean, cells that may not be drawn; each row must leave at least one.
+        centres: `(X·Y, 2)`, c, centres of the cells in pixels.
         noise: `(B, X·Y)`, u, uniform in [0, 1).
-        temperature: τ.
-        hard: straight-through, or the soft point.
+        temperature: τ, positive.
+        hard: fixate the centre of x* with a straight-through gradient; otherwise the soft point f̃.
 
     Returns:
-        The fixation `(B, 2)` and the chosen cell `(B,)`.
+        The fixations `(B, 2)` in pixels, and the drawn cells `(B,)`.
+
+    Raises:
+        InputError: the temperature is not positive, or the shapes do not fit together.
 
     >>> logits = torch.tensor([[0.0, 9.0, 0.0]], requires_grad=True)
     >>> centres = torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])

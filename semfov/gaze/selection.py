@@ -11,17 +11,20 @@ def select_fixation(values: Tensor, visited: Tensor, noise: Tensor, *, tolerance
 
     .. math:: f = \arg\max_{x \notin \mathcal V} a(x)
 
-    Cells whose values agree with the best to within `tolerance` (relative) are tied, and the one with the highest
-    `noise` wins. A tolerance of a few rounding errors keeps equal beliefs equal, whatever the order of summation.
+    Cells whose values equal the best to within `tolerance` (relative) are tied, and the one with the highest
+    `noise` wins. A tolerance of a few rounding errors keeps equal beliefs tied, whatever the order of summation.
 
     Args:
         values: `(B, X·Y)`, acquisition values.
-        visited: `(B, X·Y)` boolean, cells that are out.
+        visited: `(B, X·Y)` boolean, cells that were fixated and may not be chosen.
         noise: `(B, X·Y)`, random numbers in [0, 1) from each episode's own generator.
         tolerance: relative difference up to which values count as equal.
 
     Returns:
         `(B,)`, the chosen cell, or -1 where every cell has been visited.
+
+    Raises:
+        InputError: the shapes differ, or a cell that is not visited has the value NaN.
 
     >>> select_fixation(torch.tensor([[0.2, 0.9, 0.9]]), torch.tensor([[False, True, False]]), torch.rand(1, 3))
     tensor([2])
@@ -31,7 +34,7 @@ def select_fixation(values: Tensor, visited: Tensor, noise: Tensor, *, tolerance
     check_shape(noise, "noise", *values.shape)
     if values_known(values, visited):
         unusable = torch.isnan(values) & ~visited
-        check(not bool(unusable.any()), "values", "numbers", "NaN for a cell that is not visited")
+        check(not bool(unusable.any()), "values", "numbers for all cells not visited", f"{int(unusable.sum())} NaN")
     choice = torch.where(best_cells(values, visited, tolerance), noise, -1.0).argmax(-1)
     return torch.where(visited.all(-1), -1, choice)
 

@@ -1,4 +1,4 @@
-"""What objects of each class look like to a detector: templates among its own features."""
+"""What objects of each class look like to a detector: class templates among its own features."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,21 +16,26 @@ from semfov.io.schema import CLASSES, Field, Schema
 
 
 class ClassTemplates(PretrainedForEye):
-    r"""Attention for every class: how like its template the features of every place are.
+    r"""Attention for every class: the similarity of the features at every position to the template of the class.
 
     .. math:: M_k(y) = \cos\bigl(\hat\phi(y) - \mu, T_k\bigr), \qquad T_k = \bar\phi_k - \mu, \qquad
               \hat\phi = \phi / \|\phi\|
 
-    with φ a detector's features before its first head, :math:`\bar\phi_k` the mean of :math:`\hat\phi` at the centres
-    of objects of class k, and μ that over all places. IVSN (Zhang, Feng, Ma, Lim, Zhao and Kreiman, 2018) correlates
-    the features of a search image with those of a picture of the target; here the picture is the average object of the
-    class, and the network the detector that searches. `train.fit_templates` fits them.
+    φ are a detector's features before its first head, :math:`\bar\phi_k` is the mean of :math:`\hat\phi` at the centres
+    of objects of class k, and μ its mean over all positions. IVSN (Zhang, Feng, Ma, Lim, Zhao and Kreiman, 2018)
+    correlates the features of a search image with those of a picture of the target. Here the average object of the
+    class takes the place of that picture, and the network is the detector that searches. `train.fit_templates` fits the
+    templates.
 
     Args:
         templates: `(K, C)`, T.
         mean: `(C)`, μ.
         classes: names of the K classes.
-        metadata: JSON values kept with the model: `detector` (settings that they were fitted for) and `counts`.
+        metadata: JSON values to keep with the model: `detector` (the settings of the detector that the templates were
+            fitted for) and `counts`.
+
+    Raises:
+        InputError: the shapes do not fit together, or a template is not finite.
 
     >>> templates = ClassTemplates(torch.eye(2), torch.zeros(2), ["cup", "cat"])
     >>> templates(torch.tensor([3.0, 4.0]).view(1, 2, 1, 1)).flatten()
@@ -60,41 +65,65 @@ class ClassTemplates(PretrainedForEye):
         self.register_buffer("mean", mean.detach().clone())
 
     def forward(self, features: Tensor) -> Tensor:
-        """Cosine of the features `(B, C, h, w)` at every place with the template of every class, `(B, K, h, w)`."""
+        """Compare the features at every position with the template of every class.
+
+        Args:
+            features: `(B, C, h, w)`, of the detector.
+
+        Returns:
+            `(B, K, h, w)`, M, cosines from -1 to 1.
+
+        Raises:
+            InputError: the features have another number of channels than the templates.
+        """
         check_shape(features, "features", None, len(self.mean), None, None)
         centred = unit(features) - self.mean.to(features)[:, None, None]
         return torch.einsum("kc,bchw->bkhw", F.normalize(self.templates.to(features), dim=-1), unit(centred))
 
     def check_eye(self, settings: Mapping[str, Any], classes: Sequence[str]) -> None:
-        """Raise `InputError` beside another detector or other classes; arguments as `Eye.settings` and its classes."""
+        """Raise an error unless the templates were fitted for this eye's detector and classes.
+
+        Args:
+            settings: settings of the eye (`Eye.settings`).
+            classes: names of its classes.
+
+        Raises:
+            InputError: the detector or the classes differ.
+        """
         check_classes(self.classes, classes, self.title)
         self.check_compatible(settings)
 
     def _record(self) -> dict[str, Any]:
-        """Classes."""
+        """The names of the classes."""
         return {"classes": self.classes}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The templates from what was kept."""
+        """The templates from a file's record and tensors."""
         return cls(tensors["templates"], tensors["mean"], record["classes"], metadata=record["metadata"])
 
 
 def unit(features: Tensor) -> Tensor:
-    """Features `(B, C, h, w)` of length 1 at every place."""
+    """Scale features `(B, C, h, w)` to length 1 at every position."""
     return F.normalize(features, dim=1)
 
 
 def at_points(maps: Tensor, points: Tensor, placement: Placement, canvas: tuple[int, int]) -> Tensor:
-    """Values of maps `(B, K, h, w)` over a canvas at points `(P, 2)` of the image, `(B, K, P)`, bilinear.
+    """Read maps that cover a canvas at points of the image, by bilinear interpolation.
 
     Args:
-        maps: over the whole canvas, padding included.
-        points: in pixels of the image.
+        maps: `(B, K, h, w)`, over the whole canvas, padding included.
+        points: `(P, 2)`, in pixels of the image.
         placement: where the image lies on the canvas.
-        canvas: `(width, height)` of the canvas.
+        canvas: `(width, height)` of the canvas in pixels.
+
+    Returns:
+        `(B, K, P)`, values of the maps.
+
+    Raises:
+        InputError: the canvas is empty.
     """
-    check(min(canvas) > 0, "canvas", "a width and a height", canvas)
+    check(min(canvas) > 0, "canvas", "a positive width and height", canvas)
     share = (placement.points_to_canvas(points.to(maps)) + 0.5) / maps.new_tensor(canvas)
     where = (2 * share - 1).expand(len(maps), 1, -1, -1)
     return F.grid_sample(maps, where, padding_mode="border", align_corners=False)[:, :, 0]

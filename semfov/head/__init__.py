@@ -1,4 +1,4 @@
-"""A head that turns: scenes larger than the field of the eye, seen one window at a time."""
+"""A head that turns: scenes larger than the eye's field of view, seen through one window at a time."""
 
 from semfov.head.agent import HeadAgent, HeadPath
 from semfov.head.belief import SceneBelief, SceneObserver

@@ -28,25 +28,32 @@ from semfov.io.shipped import shipped_model
 from semfov.sensor.foveation import Foveation
 
 SIGMA = 100.0
-"""Width of the fovea, in pixels of a view of 640, that the shipped evidence was learned with."""
+"""Width of the fovea that the shipped evidence was learned with, in pixels of a view of 640 pixels."""
 
 CONFIRM = 0.7
+"""Probability of the target in the fixated cell at which a search ends as found."""
 
 
 @dataclass(frozen=True)
 class HeadPath:
-    """What eye and head did in an episode.
+    """The record of an episode: where eye and head looked, what was seen and what was believed.
 
     Attributes:
-        views: all that could be looked at.
+        views: the views and fixations that were possible.
         target: class that was searched for; None for an exploration.
         classes: names of the classes, background first.
-        actions: pose and cell of each look (`Views`).
-        seconds: at the end of each look.
-        detections: of each look, a batch of one, boxes in pixels of its view.
-        maps: `(N, S)`, after each look, the probability that a cell of the scene holds the target, or in an exploration
-            any object.
-        found: whether the target was found, with the last look.
+        actions: number of the pose and cell of each look (`Views`).
+        seconds: time at the end of each look.
+        detections: detections of each look, a batch of one, with boxes in pixels of its view.
+        maps: `(N, S)`, after each look, the probability that a cell of the scene holds the target, or any object in an
+            exploration.
+        found: whether the last look found the target.
+
+    Example::
+
+        path = agent.search(Panorama("street.jpg"), "bicycle")
+        print(path.turns, path.seconds[-1])  # turns of the head, and the time taken
+        regions, labels, scores = path.places(-1)  # objects of the last look
     """
 
     views: Views
@@ -64,24 +71,41 @@ class HeadPath:
 
     @property
     def turns(self) -> int:
-        """How often the head moved."""
+        """Number of times that the head moved."""
         poses = [action // self.views.cells for action in self.actions]
         return sum(one != other for one, other in pairwise(poses))
 
     def pose(self, look: int) -> Tensor:
-        """Pose of the head in a look, `(3,)`."""
+        """Pose of the head in a look.
+
+        Args:
+            look: number of the look; negative numbers count from the end.
+
+        Returns:
+            `(3,)`, as `World` defines it: the position of the window, and its field of view in degrees.
+        """
         return self.views.poses[self.actions[look] // self.views.cells]
 
     def gaze(self, look: int) -> Tensor:
-        """Point of the scene that the eye looked at: a direction, or pixels of a flat scene, `(D,)`."""
+        """Point of the scene that the eye fixated in a look.
+
+        Args:
+            look: number of the look; negative numbers count from the end.
+
+        Returns:
+            `(D,)`, a unit direction in a panorama, or pixels of a flat scene.
+        """
         return self.views.gaze[self.actions[look]]
 
     def places(self, look: int, score: float = 0.1) -> tuple[Places, Tensor, Tensor]:
-        """Objects of a look in scene coordinates, their classes and their scores.
+        """Objects detected in a look, in coordinates of the scene.
 
         Args:
-            look: which.
-            score: objects with a lower one are left out; of a search, all others than the target are.
+            look: number of the look; negative numbers count from the end.
+            score: least score of an object. For a search, only objects of the target class are returned.
+
+        Returns:
+            The regions that the objects cover, their classes `(M,)` and their scores `(M,)`.
         """
         seen = self.detections[look]
         best, label = seen.scores[0, :, 1:].max(-1)
@@ -92,21 +116,21 @@ class HeadPath:
         return self.views.world.places(seen.boxes[0, kept], self.pose(look)), label[kept], best[kept]
 
     def __repr__(self) -> str:
-        """What came of it."""
+        """One line on the outcome of the episode."""
         what = "exploration" if self.target is None else self.classes[self.target]
         found = "" if self.target is None else (", found" if self.found else ", not found")
         return f"HeadPath: {what}{found}, {len(self)} looks, {self.turns} turns of the head, {self.seconds[-1]:.1f} s"
 
 
 class HeadAgent(nn.Module):
-    """Looks around in a scene that is larger than the field of its eye, and turns its head where that pays.
+    """An agent that looks around in a scene larger than its eye's field of view, and turns its head where that pays.
 
     Args:
         eye: sensor and detector.
-        search: evidence for a target.
-        explore: evidence for a map.
+        search: evidence model for a target.
+        explore: evidence model for a map.
         speeds: of eye and head.
-        fields: of view in degrees, narrowest first.
+        fields: fields of view in degrees, narrowest first.
 
     Example::
 
@@ -139,17 +163,20 @@ class HeadAgent(nn.Module):
         fields: Sequence[float] = (60.0,),
         **options: Any,
     ) -> Self:
-        """The agent with the evidence that is shipped for a detector, that of `ActivePerception.recommended`.
+        """Make the agent with the models that are shipped for a detector, as `ActivePerception.recommended` does.
 
         Args:
             name: `yolov3-tiny` or `yolox-nano`.
             speeds: of eye and head.
-            fields: of view in degrees, narrowest first.
-            options: of `semfov.load_detector`.
+            fields: fields of view in degrees, narrowest first.
+            options: options of `semfov.load_detector`.
+
+        Returns:
+            The agent in evaluation mode, without gradients for its weights.
 
         Raises:
             InputError: no models are shipped for a detector of this name.
-            DataError: the weights cannot be had, or are damaged.
+            DataError: the weights cannot be obtained, or are damaged.
         """
         eye = Eye(Foveation(SIGMA, growth=2.0), load_detector(name, **options))
         shipped = shipped_model(TargetEvidence, learned_for(eye.detector.name, 2.0), name)
@@ -164,7 +191,14 @@ class HeadAgent(nn.Module):
         return ("background", *self.eye.detector.classes)
 
     def views(self, world: World) -> Views:
-        """All that can be looked at in a scene."""
+        """The views and fixations that are possible in a scene.
+
+        Args:
+            world: the scene.
+
+        Returns:
+            Views with the agent's fields of view and fovea.
+        """
         return Views(world, self.fields, fovea=SIGMA / self.eye.reference)
 
     def search(
@@ -180,23 +214,26 @@ class HeadAgent(nn.Module):
         prior: float = PRIOR,
         seed: int = 0,
     ) -> HeadPath:
-        """Search a scene for a class, by the gain that is expected per second (`SearchGain`, `PerPrice`).
+        """Search a scene for a class, by the expected gain per second (`SearchGain`, `PerPrice`).
 
-        It is found when the gaze rests on a cell that holds it with a probability of `confirm`.
+        The target is found when the gaze is on a cell that holds it with a probability of at least `confirm`.
 
         Args:
-            world: `semfov.head.Panorama` or `Flat`.
+            world: the scene, a `semfov.head.Panorama` or `Flat`.
             target: name or index (1..K) of the class.
-            start: first action (`Views`); None looks ahead, at the middle of the first view.
-            passes: looks at most.
-            seconds: at most.
-            confirm: probability.
-            foresight: share of what a look shows from aside that counts towards a find.
+            start: first action (`Views`); None looks straight ahead, at the middle of the middle view.
+            passes: largest number of looks.
+            seconds: time limit in seconds; a look that would end later is not taken.
+            confirm: probability at which the search ends as found.
+            foresight: weight of the gain in sharpness over the cells of a view (`SearchGain`).
             prior: probability that a cell that was never seen holds the target.
             seed: of the generator that breaks ties.
 
+        Returns:
+            The record of the search.
+
         Raises:
-            InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
+            InputError: the class is unknown (the nearest names are suggested), or an argument is out of range.
         """
         index = class_index(target, self.classes[1:], "target")
         check_number(confirm, "confirm", 0, 1)
@@ -210,7 +247,21 @@ class HeadAgent(nn.Module):
     def explore(
         self, world: World, *, start: int | None = None, passes: int = 40, seconds: float = 30.0, seed: int = 0
     ) -> HeadPath:
-        """Explore a scene, by the cells that are expected to be named right per second; arguments as for `search`."""
+        """Explore a scene, by the expected number of additional correct cells per second (`ExploreGain`, `PerPrice`).
+
+        Args:
+            world: the scene, a `semfov.head.Panorama` or `Flat`.
+            start: first action (`Views`); None looks straight ahead, at the middle of the middle view.
+            passes: largest number of looks.
+            seconds: time limit in seconds; a look that would end later is not taken.
+            seed: of the generator that breaks ties.
+
+        Returns:
+            The record of the exploration.
+
+        Raises:
+            InputError: an argument is out of range.
+        """
         views = self.views(world)
         gain, observer = ExploreGain(views, self.map_evidence), SceneObserver(LearnedMap(self.map_evidence), views)
         acquire: Callable[[int], AcquisitionFunction] = lambda action: PerPrice(gain, self.speeds, action)  # noqa: E731

@@ -1,4 +1,4 @@
-"""What is believed of a scene that is seen one window at a time."""
+"""The belief about a scene that is seen through one window at a time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,12 +18,12 @@ from semfov.head.views import Views
 
 @dataclass(frozen=True)
 class SceneLook(Look):
-    """What a look says about the cells of a view.
+    """The evidence of a look about the cells of a view.
 
     Attributes:
-        pose: of the head.
-        said: about the view.
-        gaze: `(1,)`, the scene's cell that is looked at.
+        pose: number of the head's pose.
+        said: evidence about the cells of the view.
+        gaze: `(1,)`, the fixated cell of the scene.
     """
 
     pose: int
@@ -31,13 +31,13 @@ class SceneLook(Look):
     gaze: Tensor
 
     def __getitem__(self, index: Tensor | slice) -> "SceneLook":
-        """The look itself: there is one."""
+        """The look itself, as there is only one."""
         return self
 
     @classmethod
     def join(cls, looks: object) -> "SceneLook":
-        """Looks from several poses are none from one."""
-        raise InputError("looks: expected one look, for each is from a pose of its own")
+        """Raise an error, because looks from several poses cannot be joined."""
+        raise InputError("looks: expected a single look; looks of a head cannot be joined, as their poses may differ")
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,22 @@ class SceneBelief(Belief):
     """Belief about the cells of a scene, in one episode.
 
     Attributes:
-        values: `(1, S, C)`: of a target, the probability that a cell holds it, and the same if no fixated cell does; of
-            all classes, the probability of each, background first.
-        closest: `(1, S)`, how near the gaze has come to each cell, in longer sides of the narrowest view
-            (`Views.distances`); infinite where it was never seen.
-        owner: `(1, S)`, the pose from which it was; -1 for none.
+        values: `(1, S, C)`. For a belief about a target, C is 2: the probability that a cell holds the target, and the
+            same under the condition that no fixated cell does. For a belief about all classes, the probability of each,
+            background first.
+        closest: `(1, S)`, distance of the closest fixation to each cell, in units of the narrowest view's longer side
+            (`Views.distances`); infinite where a cell was never seen.
+        owner: `(1, S)`, number of the pose from which the closest fixation was; -1 where a cell was never seen.
         examined: `(1, S)` boolean, cells that were fixated.
         looks: `(1,)`, number of looks.
-        views: what is believed of the view from each pose; None where there was no look.
+        views: belief about the view from each pose; None where there was no look.
+
+    >>> from semfov.belief.target_evidence import TargetEvidence
+    >>> from semfov.head import Flat
+    >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
+    >>> belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
+    >>> belief.probability(1).shape, bool((belief.owner < 0).all())
+    (torch.Size([1, 130]), True)
     """
 
     values: Tensor
@@ -64,7 +72,7 @@ class SceneBelief(Belief):
 
     @property
     def about_all(self) -> bool:
-        """Whether it is about all classes."""
+        """Whether it is a belief about all classes, and not about one target."""
         return self.values.shape[-1] > 2
 
     def probability(self, target: int | Tensor) -> Tensor:
@@ -72,7 +80,7 @@ class SceneBelief(Belief):
         return pick(self.values, torch.as_tensor(target)) if self.about_all else self.values[..., 0]
 
     def chance(self, target: int | Tensor) -> Tensor:
-        """The same if no fixated cell holds it, `(1, S)`."""
+        """The same under the condition that no fixated cell holds the target, `(1, S)`."""
         return self.probability(target) if self.about_all else self.values[..., 1]
 
     def class_probabilities(self) -> Tensor:
@@ -87,28 +95,38 @@ class SceneBelief(Belief):
 
 
 class SceneObserver(Observer):
-    """Keeps a belief about a scene that is seen one window at a time.
+    """Keeps the belief about a scene that is seen through one window at a time.
 
-    Each view is believed of as an agent does that moves its eye alone. Cells of the scene take that over from the view
-    in which the gaze has come nearest to them. A cell that was never seen has the value of one that was seen from a
-    whole longer side away, and showed nothing.
+    The belief about each view is that of an agent that moves its eye alone. A cell of the scene takes the belief of the
+    view in which the gaze came closest to it. A cell that was never seen has the belief of a cell in which a look from
+    a distance of one longer side detected nothing.
 
     Args:
         inner: observer of a view: `semfov.observers.Target` or `LearnedMap`.
-        views: all that can be looked at.
-        prior: probability that a cell that was never seen holds the target; None goes by the observer.
+        views: the possible views and fixations.
+        prior: probability that a cell that was never seen holds the target; None takes that of the observer.
+
+    Raises:
+        InputError: `prior` is not between 0 and 1.
+
+    >>> from semfov.belief.target_evidence import TargetEvidence
+    >>> from semfov.head import Flat
+    >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
+    >>> observer = SceneObserver(Target(TargetEvidence()), views, prior=0.03)
+    >>> observer.start(1, views.grid, torch.zeros(1)).looks
+    tensor([0.])
     """
 
     by_target = True
 
     def __init__(self, inner: Target | LearnedMap, views: Views, *, prior: float | None = None) -> None:
         super().__init__()
-        check(prior is None or 0 < prior < 1, "prior", "a probability", prior)
+        check(prior is None or 0 < prior < 1, "prior", "a probability between 0 and 1", prior)
         self.inner, self.views, self.prior = inner, views, prior
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> SceneBelief:
-        """Nothing seen yet; `grid` is the strip of all views."""
-        check(batch == 1, "batch", "one episode at a time", batch)
+        """The belief before the first look; `grid` is the strip of all views."""
+        check(batch == 1, "batch", "1, as a head has one episode at a time", batch)
         cells = len(self.views.world.scene)
         nothing = like.new_zeros(1, cells)
         values = like.new_zeros(1, cells, 2 if isinstance(self.inner, Target) else len(self.inner.model.prior))
@@ -116,14 +134,14 @@ class SceneObserver(Observer):
         return SceneBelief(values, nothing + torch.inf, nothing.long() - 1, nothing.bool(), like.new_zeros(1), never)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> SceneLook:
-        """What a look from a point `(1, 2)` of the strip says; boxes are in pixels of the view."""
+        """Evidence of a look from a point `(1, 2)` of the strip; boxes are in pixels of the view."""
         pose, point = self.views.action_of(fixation[0])
         said = self.inner.weigh(detections, point[None], self.views.view_grid, target)
         action = self.views.grid.cell_of(fixation)
         return SceneLook(pose, said, self.views.gaze_cell[action])
 
     def update(self, belief: Belief, look: Look) -> SceneBelief:
-        """Belief after one more look."""
+        """The belief after one more look."""
         known, seen = own(belief, SceneBelief, "belief"), own(look, SceneLook, "look")
         views, grid, pose = self.views, self.views.view_grid, seen.pose
         values = known.values
@@ -146,24 +164,24 @@ class SceneObserver(Observer):
         return SceneBelief(values, closest, owner, examined, known.looks + 1, after)
 
     def _distance(self, pose: int, look: SceneLook) -> Tensor:
-        """From the gaze to the cells that its view shows, `(V,)`."""
+        """Distances from the gaze to the cells that its view shows, `(V,)`."""
         said = look.said
         assert isinstance(said, TargetLook | MapLook)
         return self.views.distances[pose][int(said.fixated)]
 
     def _told(self, view: Belief) -> Tensor:
-        """What is believed of a view, `(C, cells)`."""
+        """Belief about the cells of a view, `(C, cells)`."""
         if isinstance(self.inner, Target):
             return torch.cat([view.probability(0), view.chance(0)])
         return view.class_probabilities()[0].mT
 
     def _unseen(self, look: Look, like: Tensor) -> Tensor:
-        """Values `(1, S, C)` of what was never seen."""
+        """Values `(1, S, C)` of cells that were never seen."""
         if isinstance(look, TargetLook) and self.prior is not None:
             return torch.full_like(like, self.prior)
         assert isinstance(look, TargetLook | MapLook)
         evidence = torch.zeros_like(look.evidence) + self.inner.model.unseen(look.evidence)
         blank = replace(look, evidence=evidence, distance=torch.ones_like(look.distance), score=0 * look.score)
         told = self._told(self.inner.update(self.inner.start(1, self.views.view_grid, like), blank))
-        # Not the cell that counts as fixated.
+        # The median leaves out the one cell that counts as fixated.
         return told.median(-1).values.expand_as(like).clone()

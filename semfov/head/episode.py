@@ -1,4 +1,4 @@
-"""Episodes of an eye in a head: the loop of active perception over all that both can look at."""
+"""Episodes of an eye in a head: the loop of active perception over all poses and fixations."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -19,15 +19,15 @@ from semfov.head.views import Views
 from semfov.head.world import Places
 
 Detect = Callable[[int], Detections]
-"""What is seen by an action, a batch of one: boxes in pixels of the view."""
+"""Maps an action to its detections, a batch of one with boxes in pixels of the view."""
 
 
 class HeadLooks(Looks):
     """Looks of an eye in a head.
 
     Args:
-        views: all that can be looked at.
-        detect: what is seen by an action.
+        views: the possible views and fixations.
+        detect: maps an action to its detections.
         target: class that is searched for.
     """
 
@@ -36,7 +36,7 @@ class HeadLooks(Looks):
         self.grid, self.like = views.grid, views.poses
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
-        """Detect and weigh."""
+        """Detect objects, and weigh them as evidence."""
         watch = Stopwatch()
         detections = self.detect(int(cell))
         watch.lap("detect")
@@ -46,7 +46,15 @@ class HeadLooks(Looks):
 
 
 def live(eye: Eye, views: Views) -> Detect:
-    """Looks by an eye; the view from the pose of the last look stays open."""
+    """Detections of an eye, computed when they are asked for; the view of the last pose is kept for the next look.
+
+    Args:
+        eye: sensor and detector.
+        views: the possible views and fixations.
+
+    Returns:
+        A function that maps an action to its detections.
+    """
     opened: tuple[int, View] | None = None
 
     def detect(action: int) -> Detections:
@@ -64,10 +72,10 @@ class HeadStep:
     """One look.
 
     Attributes:
-        action: pose and cell (`Views`).
-        seconds: since the start, this look included.
-        belief: after it.
-        detections: boxes in pixels of the view, a batch of one.
+        action: number of the pose and cell (`Views`).
+        seconds: time since the start, this look included.
+        belief: after the look.
+        detections: a batch of one, with boxes in pixels of the view.
     """
 
     action: int
@@ -89,19 +97,22 @@ def look_around(
     seconds: float = math.inf,
     seed: int | Sequence[int] = 0,
 ) -> Iterator[HeadStep]:
-    """An episode, look by look; whoever takes the steps ends it.
+    """Run an episode and yield its looks one by one; the caller may stop at any time.
 
     Args:
-        views: all that can be looked at.
-        detect: what is seen by an action.
+        views: the possible views and fixations.
+        detect: maps an action to its detections.
         observer: keeps the belief about the scene.
-        acquire: makes the acquisition function of who has done an action.
+        acquire: makes the acquisition function that chooses the action after a given one.
         start: first action.
         target: class that is searched for.
         speeds: of eye and head.
-        passes: looks at most.
-        seconds: a look that would end later is not taken.
+        passes: largest number of looks.
+        seconds: time limit; a look that would end later is not taken.
         seed: of the generator that breaks ties.
+
+    Yields:
+        Each look, with the belief after it.
     """
     speeds = Speeds() if speeds is None else speeds
     numbers = [seed] if isinstance(seed, int) else [*seed]
@@ -131,21 +142,24 @@ def look_around(
 
 
 def hash_of(numbers: Sequence[int]) -> int:
-    """A seed of 63 bits for several numbers."""
+    """Combine several numbers into one seed of 63 bits."""
     import hashlib
 
     return int.from_bytes(hashlib.sha256(repr([*numbers]).encode()).digest()[:8], "big") >> 1
 
 
 def rests_on(views: Views, action: int, places: Places) -> Tensor:
-    """Which objects the cell that an action fixates overlaps, `(M,)` boolean.
+    """Which objects overlap the cell that an action fixates.
 
-    A cell and an object overlap where one holds a point of the other, of a grid of 9 × 9 points all over each.
+    A cell and an object overlap if one contains a point of the other. 9 × 9 points spread over each are tested.
 
     Args:
-        views: all that can be looked at.
-        action: pose and cell.
-        places: what the objects cover.
+        views: the possible views and fixations.
+        action: number of the pose and cell.
+        places: regions that the objects cover.
+
+    Returns:
+        `(M,)`, boolean.
     """
     pose, cell = divmod(action, views.cells)
     edges = views.view_grid.edges[cell]

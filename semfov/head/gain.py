@@ -1,4 +1,4 @@
-"""What a look is expected to bring, from each pose of the head and each fixation of the eye; and who goes by it."""
+"""The expected gain of a look from each pose and fixation, and acquisition functions of a head that use it."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -16,24 +16,24 @@ from semfov.head.speeds import Speeds
 from semfov.head.views import SIDE, Views
 
 FORESIGHT = 0.5
-"""Share of what a look shows from aside that counts towards a find."""
+"""Weight of the gain in sharpness over the cells of a view (`SearchGain`)."""
 
 
 PRIOR = 0.03
-"""Probability that a cell that was never seen holds the target of a search."""
+"""Prior probability that a cell that was never seen holds the target of a search."""
 
 UNSEEN = 1.0
-"""Cells of an exploration that are expected to be named right where they are first fixated."""
+"""Expected fraction of cells that an exploration classifies correctly when it first fixates them."""
 
 OUT = -1e6
-"""Value of actions that are not to be chosen."""
+"""Value of actions that must not be chosen."""
 
 
 class Gain(nn.Module, ABC):
-    """Base of what a look is expected to bring.
+    """Base of the expected gains of a look.
 
     Args:
-        views: all that can be looked at.
+        views: the possible views and fixations.
     """
 
     def __init__(self, views: Views) -> None:
@@ -42,28 +42,36 @@ class Gain(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
-        """Gains `(A,)` of all actions from some poses; those of others have no meaning.
+        """Gains `(A,)` of all actions from the given poses; the values of other actions have no meaning.
 
         Args:
             belief: after the last look.
-            here: the pose of the head.
-            poses: which are asked for.
+            here: number of the present pose.
+            poses: numbers of the poses for which gains are needed.
         """
 
 
 class SearchGain(Gain):
-    r"""Probability that a look finds the target, and what it shows from aside.
+    r"""Probability that a look finds the target, plus a weighted gain in sharpness over the cells of the view.
 
     .. math:: G(h, f) = P(t \in f) + c \sum_x |x| \, P(t \in x) \, [a(d_{h,f}(x)) - a(d^*(x))]_+
 
-    The first is the probability that the cell f, which the gaze would rest on, holds the target, where the gaze has not
-    been. The second is the expected area of the target that is seen better than ever before: with |x| the area of a
-    cell, :math:`d^*` the distance of the closest gaze so far, and a the acuity of the fovea (`Views.acuity`), which is
-    0 for what was never seen. So one formula tells what it is worth to move the eye, and to turn the head.
+    The first term is the probability that the fixated cell f holds the target; it is 0 where the cell was fixated
+    before. The second term is the expected area of the target that is seen more sharply than before. |x| is the area of
+    a cell, :math:`d^*` the distance of its closest fixation so far, and a the acuity of the fovea (`Views.acuity`),
+    which is 0 where a cell was never seen. One formula thus gives the value of a saccade and of a turn of the head.
 
     Args:
-        views: all that can be looked at.
-        foresight: c.
+        views: the possible views and fixations.
+        foresight: c, weight of the gain in sharpness.
+
+    >>> from semfov.belief.observers import Target
+    >>> from semfov.belief.target_evidence import TargetEvidence
+    >>> from semfov.head import Flat, SceneObserver
+    >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
+    >>> belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
+    >>> SearchGain(views)(belief, 0, [0]).shape  # 9 poses, 100 cells in each view
+    torch.Size([900])
     """
 
     def __init__(self, views: Views, foresight: float = FORESIGHT) -> None:
@@ -72,7 +80,7 @@ class SearchGain(Gain):
         self._acuity = [views.acuity(distance) for distance in views.distances]
 
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
-        """Gains `(A,)`, in finds."""
+        """Gains `(A,)`, in probabilities of a find."""
         views = self.views
         chance = belief.probability(0)[0]
         known = views.acuity(belief.closest[0])
@@ -88,18 +96,26 @@ class SearchGain(Gain):
 
 
 class ExploreGain(Gain):
-    r"""How many more cells of the scene a look is expected to name right, by their area.
+    r"""Expected number of additional cells of the scene that are classified correctly after a look, weighted by area.
 
     .. math:: G(h, f) = \sum_{x \text{ seen}} |x| \, E[\Delta \mid f](x) + u \sum_{x \text{ not}} |x| \, a(d_{h,f}(x))
 
-    `MapEvidence.gain` has learned what a look brings to cells that were seen before. Of those that were not nothing is
-    known but how often a look names a cell right: u times the acuity of the fovea there. After a turn of the head the
-    eye lands on one of nine cells; every cell is valued where the head stays.
+    For cells that were seen before, `MapEvidence.gain` has learned the gain of a look. For the others it is u times the
+    acuity of the fovea there. After a turn of the head the eye lands on one of nine cells. All cells of a view are
+    valued where the head stays.
 
     Args:
-        views: all that can be looked at.
-        model: that the map is learned with.
-        unseen: u.
+        views: the possible views and fixations.
+        model: the model that the map is learned with.
+        unseen: u, expected fraction of cells that are classified correctly when they are first fixated.
+
+    >>> from semfov.belief.observers import LearnedMap
+    >>> from semfov.head import Flat, SceneObserver
+    >>> views, model = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8)), MapEvidence(components=3)
+    >>> belief = SceneObserver(LearnedMap(model), views).start(1, views.grid, torch.zeros(1))
+    >>> gains = ExploreGain(views, model)(belief, here=0, poses=[0, 1])
+    >>> int((gains > OUT).sum())  # 100 cells of the present view, and 9 of the other one
+    109
     """
 
     def __init__(self, views: Views, model: MapEvidence, unseen: float = UNSEEN) -> None:
@@ -110,7 +126,7 @@ class ExploreGain(Gain):
         self._landings = (third[:, None] * SIDE + third).flatten()
 
     def forward(self, belief: SceneBelief, here: int, poses: Sequence[int]) -> Tensor:
-        """Gains `(A,)`, in cells of average area; below all others where the eye does not land."""
+        """Gains `(A,)`, in cells of average area; the lowest value where the eye does not land."""
         views = self.views
         probabilities = belief.class_probabilities()
         known = belief.owner[0] >= 0
@@ -131,13 +147,23 @@ class ExploreGain(Gain):
 
 
 class PerPrice(AcquisitionFunction):
-    """Expected gain per second: the eye moves, or the head, whichever pays more.
+    """Expected gain per second, for movements of the eye and turns of the head alike.
 
     Args:
-        gain: of a look.
-        speeds: of eye and head; None values gains alone, whatever they cost.
-        action: where eye and head are.
-        poses: to which the head may turn; None takes those whose views tile the scene.
+        gain: expected gain of a look.
+        speeds: of eye and head; None takes the gain alone, whatever the movement costs.
+        action: the present action (`Views`).
+        poses: numbers of the poses that the head may turn to; None takes those whose views tile the scene.
+
+    >>> from semfov.belief.observers import Target
+    >>> from semfov.belief.target_evidence import TargetEvidence
+    >>> from semfov.head import Flat, SceneObserver
+    >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
+    >>> belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
+    >>> acquisition = PerPrice(SearchGain(views), Speeds(), action=0)
+    >>> values = acquisition(belief, torch.zeros(1, 900, dtype=torch.bool))
+    >>> int((values > OUT).sum())  # 4 of the 9 poses tile the scene
+    400
     """
 
     def __init__(self, gain: Gain, speeds: Speeds | None, action: int, poses: Sequence[int] | None = None) -> None:
@@ -158,13 +184,22 @@ class PerPrice(AcquisitionFunction):
 
 
 class Scan(AcquisitionFunction):
-    """A head that goes through poses in a given order, again and again, whatever is seen; the eye goes by the gain.
+    """A head that goes through its poses in a given order, again and again; the eye follows the gain in each view.
 
     Args:
-        gain: of a look.
-        order: numbers of poses; with one of them the eye moves alone.
-        dwell: looks from each pose.
-        action: where eye and head are.
+        gain: expected gain of a look.
+        order: numbers of poses; with a single one the eye moves alone.
+        dwell: number of looks from each pose.
+        action: the present action (`Views`).
+
+    >>> from semfov.belief.observers import Target
+    >>> from semfov.belief.target_evidence import TargetEvidence
+    >>> from semfov.head import Flat, SceneObserver
+    >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
+    >>> belief = SceneObserver(Target(TargetEvidence()), views).start(1, views.grid, torch.zeros(1))
+    >>> scan = Scan(SearchGain(views), order=[2, 0], dwell=1, action=0)
+    >>> int(scan(belief, torch.zeros(1, 900, dtype=torch.bool)).argmax()) // views.cells
+    2
     """
 
     def __init__(self, gain: Gain, order: Sequence[int], dwell: int, action: int) -> None:
@@ -172,7 +207,7 @@ class Scan(AcquisitionFunction):
         self.gain, self.order, self.dwell, self.action = gain, order, dwell, action
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(1, A)`; `OUT` from all poses but the next one."""
+        """Values `(1, A)`; `OUT` for all poses but the next one."""
         known, cells = own(belief, SceneBelief, "belief"), self.gain.views.cells
         turn = int(known.looks) // self.dwell
         for _ in self.order:
@@ -191,7 +226,7 @@ class Anywhere(AcquisitionFunction):
     """Any pose and any fixation, at random.
 
     Args:
-        views: all that can be looked at.
+        views: the possible views and fixations.
     """
 
     def __init__(self, views: Views) -> None:
@@ -199,5 +234,5 @@ class Anywhere(AcquisitionFunction):
         self.views = views
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """The same value for all `(1, A)`."""
+        """The same value for all actions, `(1, A)`."""
         return torch.zeros(1, len(self.views.grid))

@@ -1,4 +1,4 @@
-"""Panoramas made of photographs on a sphere, by seed: every object's place is known in directions."""
+"""Panoramas composed of photographs on a sphere, by seed; the direction of every object is known."""
 
 import hashlib
 import json
@@ -14,23 +14,23 @@ from semfov.data.scene import Annotation, Scene, Scenes, legal_targets
 from semfov.errors import check
 from semfov.sensor.sphere import Camera, Regions, panorama_directions
 
-_VERSION = 1  # raise it whenever the same seed would give another picture
+_VERSION = 1  # increase it whenever the same seed would give another picture
 
 _SLOT = (640, 480)
-"""Pixels of the plane that a photograph is put on, which touches the sphere in its middle."""
+"""Size in pixels of the plane that holds a photograph; its middle touches the sphere."""
 
 RINGS = ((0.0, 6), (46.0, 3), (-46.0, 3))
-"""Latitude in degrees, and number of photographs side by side there."""
+"""For each ring, its latitude in degrees and its number of photographs."""
 
 
 @dataclass(frozen=True)
 class Patch:
-    """A photograph's place on the sphere.
+    """The position of a photograph on the sphere.
 
     Attributes:
-        index: of the photograph among its scenes.
+        index: number of the photograph among its scenes.
         pose: yaw and pitch of its middle, and the width of its slot, in degrees.
-        box: `(x1, y1, x2, y2)` that it fills of its slot of 640 × 480 px, in the middle of it.
+        box: `(x1, y1, x2, y2)`, the part of its slot of 640 × 480 px that it fills, in the middle of the slot.
     """
 
     index: int
@@ -39,21 +39,24 @@ class Patch:
 
 
 class Panoramas:
-    """Equirectangular panoramas of photographs that hang around the viewer.
+    """Equirectangular panoramas of photographs around the viewer.
 
-    Each photograph lies on a plane that touches the sphere, as large as fits its slot of 4:3 with its proportions kept.
-    A camera that looks straight at it sees it undistorted. Rings are turned at random. Panorama `i` of a seed depends
-    on the seed, on `i` and on the photographs only. No photograph is in a panorama twice, unless there are fewer than
-    slots. What they leave free is grey.
+    Each photograph lies on a plane that touches the sphere. It is as large as its slot of 4:3 allows, with its
+    proportions kept. A camera that looks straight at it sees it undistorted. Each ring of photographs is rotated at
+    random. Panorama `i` depends on the seed, on `i` and on the photographs only. No photograph appears twice in a
+    panorama, unless there are fewer photographs than slots. The space between photographs is grey.
 
     Args:
         scenes: the photographs with their boxes, a COCO-format set or embedded scenes.
-        rings: latitude in degrees and number of slots of each ring; with the default none overlap.
+        rings: latitude in degrees and number of slots of each ring; with the default no slots overlap.
         slot: width of a slot in degrees.
-        width: of the panorama in pixels, even; half of it is the height.
+        width: width of the panorama in pixels, even; its height is half of it.
         count: number of panoramas.
         seed: of the compositions.
-        fill: value of what lies between the photographs.
+        fill: grey value between the photographs, from 0 to 1.
+
+    Raises:
+        InputError: an argument is out of range.
 
     >>> from semfov.data import EmbeddedScenes
     >>> panoramas = Panoramas(EmbeddedScenes(("person", "cat"), count=3), width=256, count=1)
@@ -72,10 +75,11 @@ class Panoramas:
         seed: int = 0,
         fill: float = 114 / 255,
     ) -> None:
-        check(len(rings) > 0, "rings", "at least one", rings)
+        check(len(rings) > 0, "rings", "at least one ring", rings)
         for latitude, number in rings:
-            check(-90 <= latitude <= 90 and number >= 1, "rings", "latitudes and numbers of slots", rings)
-        check(0 < slot < 180, "slot", "degrees between 0 and 180", slot)
+            fits = -90 <= latitude <= 90 and number >= 1
+            check(fits, "rings", "pairs of a latitude from -90 to 90 degrees and a number of slots", rings)
+        check(0 < slot < 180, "slot", "an angle between 0 and 180 degrees", slot)
         check(width >= 2 and width % 2 == 0, "width", "an even number of pixels", width)
         check(count >= 1, "count", "at least 1", count)
         check(seed >= 0, "seed", "at least 0", seed)
@@ -88,10 +92,18 @@ class Panoramas:
         self.fingerprint = hashlib.sha256(json.dumps(what).encode()).hexdigest()
 
     def __len__(self) -> int:
+        """Number of panoramas."""
         return len(self.ids)
 
     def patches(self, index: int) -> list[Patch]:
-        """The photographs of a panorama, ring by ring."""
+        """The photographs of a panorama, ring by ring.
+
+        Args:
+            index: number of the panorama.
+
+        Returns:
+            One patch for each slot.
+        """
         generator = np.random.Generator(np.random.PCG64([self._seed, self.ids[index]]))
         slots, known = sum(number for _, number in self.rings), len(self.scenes)
         rounds = -(-slots // known)
@@ -118,10 +130,10 @@ class Panoramas:
         return Scene(self.ids[index], name, canvas, annotation.boxes, annotation.labels)
 
     def _put(self, canvas: Tensor, patch: Patch) -> None:
-        """Project a photograph on the panorama: each of its pixels takes what lies in its direction."""
+        """Project a photograph onto the panorama."""
         camera = Camera(torch.tensor(patch.pose), _SLOT)
         x1, y1, x2, y2 = patch.box
-        # As many pixels as the panorama has for it at the horizon: shrunk without aliasing, then sampled.
+        # The photograph is first resized, with antialiasing, to the resolution of the panorama at the horizon.
         scale = self.size[0] / (2 * math.pi) / float(camera.focal)
         image = self.scenes[patch.index].image[None]
         shape = (max(1, round((y2 - y1) * scale)), max(1, round((x2 - x1) * scale)))
@@ -142,7 +154,14 @@ class Panoramas:
         canvas[:, rows[row], columns[column]] = seen[:, row, column]
 
     def regions(self, index: int) -> Regions:
-        """Where the objects of a panorama are, exactly: boxes in the planes of their photographs."""
+        """The exact regions of the objects of a panorama: boxes in the planes of their photographs.
+
+        Args:
+            index: number of the panorama.
+
+        Returns:
+            One region for each object.
+        """
         patches = self.patches(index)
         parts = [self.scenes.annotation(patch.index).boxes for patch in patches]
         poses = [torch.tensor([patch.pose]).expand(len(part), 3) for patch, part in zip(patches, parts, strict=True)]
@@ -157,16 +176,38 @@ class Panoramas:
         return boxes * scale + boxes.new_tensor([x1, y1] * 2)
 
     def annotation(self, index: int) -> Annotation:
-        """The objects of a panorama, without composing it; boxes that cross the seam end beyond its right border."""
+        """The objects of a panorama, without composing its pixels.
+
+        Args:
+            index: number of the panorama.
+
+        Returns:
+            Classes of the objects, and the smallest boxes around them in pixels of the panorama. A box that crosses the
+            seam extends beyond the right border.
+        """
         parts = [self.scenes.annotation(patch.index) for patch in self.patches(index)]
         labels, crowd = torch.cat([part.labels for part in parts]), torch.cat([part.crowd for part in parts])
         return Annotation(self.regions(index).panorama_boxes(self.size), labels, crowd, self.size)
 
     def targets(self, index: int) -> list[int]:
-        """Classes of a panorama that may be searched for, ascending: none that covers more than a fifth of it."""
+        """Classes of a panorama that may be searched for: those that cover no more than a fifth of it.
+
+        Args:
+            index: number of the panorama.
+
+        Returns:
+            Class indices, ascending.
+        """
         return legal_targets(self.annotation(index))
 
     def digest(self, index: int) -> str:
-        """sha256 of what the pixels of a panorama depend on."""
+        """SHA-256 hash of everything that the pixels of a panorama depend on.
+
+        Args:
+            index: number of the panorama.
+
+        Returns:
+            64 hexadecimal digits.
+        """
         parts = [(self.scenes.digest(patch.index), patch.pose, patch.box) for patch in self.patches(index)]
         return hashlib.sha256(json.dumps([_VERSION, self.size, self.fill, parts]).encode()).hexdigest()

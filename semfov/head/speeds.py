@@ -1,4 +1,4 @@
-"""What movements of eye and head cost: seconds."""
+"""The time that movements of eye and head take."""
 
 from dataclasses import dataclass
 
@@ -7,28 +7,28 @@ from torch import Tensor
 
 from semfov.errors import check_number
 
-_STILL = 1e-3  # degrees, which an angle of 0 can be by rounding
+_STILL = 1e-3  # degrees; smaller angles are rounding errors of 0
 
 
 @dataclass(frozen=True)
 class Speeds:
-    r"""How long eye, head and detector take.
+    r"""Durations of looks and of movements of eye, head and zoom.
 
-    Saccades last longer the larger they are (the main sequence: Bahill, Clark and Stark, 1975): for an amplitude A in
-    degrees :math:`21 + 2.2 A` ms, the line of Carpenter (Movements of the Eyes, 1988). The head, as a motor with a
-    bounded speed v and acceleration a, turns by an angle A in the least time,
+    Larger saccades last longer (the main sequence: Bahill, Clark and Stark, 1975). A saccade of amplitude A in degrees
+    takes :math:`21 + 2.2 A` ms, the line of Carpenter (Movements of the Eyes, 1988). The head is a motor with bounded
+    speed v and acceleration a. It turns by an angle A in the shortest possible time,
 
     .. math:: t = 2 \sqrt{A / a} \ \text{ for } A \le v^2 / a, \quad \text{else } \frac{A}{v} + \frac{v}{a}
 
-    Eye, head and zoom move at the same time, and a look follows when all have arrived.
+    Eye, head and zoom move at the same time, and the look follows when all have arrived.
 
     Attributes:
-        look: seconds of a fixation with its pass of the detector.
-        eye_start: seconds of the smallest saccade.
-        eye: seconds for each degree of a saccade.
+        look: duration of a fixation with its pass of the detector, in seconds.
+        eye_start: duration of the smallest saccade, in seconds.
+        eye: additional seconds for each degree of a saccade.
         head: v, degrees per second.
         acceleration: a, degrees per second squared.
-        zoom: seconds for each doubling of the field of view.
+        zoom: seconds for each doubling or halving of the field of view.
 
     >>> speeds = Speeds()
     >>> round(float(speeds.saccade(torch.tensor(10.0))), 3), round(float(speeds.turn(torch.tensor(90.0))), 3)
@@ -50,17 +50,40 @@ class Speeds:
         check_number(self.look, "look", 1e-6, 1e6)
 
     def saccade(self, angle: Tensor) -> Tensor:
-        """Seconds of saccades by angles `(...)` in degrees; none where the eye stays."""
+        """Duration of saccades.
+
+        Args:
+            angle: `(...)`, amplitudes in degrees.
+
+        Returns:
+            `(...)`, seconds; 0 where the eye stays.
+        """
         return torch.where(angle > _STILL, self.eye_start + self.eye * angle, 0.0)
 
     def turn(self, angle: Tensor) -> Tensor:
-        """Seconds in which the head turns by angles `(...)` in degrees."""
+        """Duration of turns of the head.
+
+        Args:
+            angle: `(...)`, in degrees.
+
+        Returns:
+            `(...)`, seconds; 0 where the head stays.
+        """
         angle = torch.where(angle > _STILL, angle, 0.0)
         fast = self.head**2 / self.acceleration
         short = 2 * (angle / self.acceleration).sqrt()
         return torch.where(angle <= fast, short, angle / self.head + self.head / self.acceleration)
 
     def price(self, eye: Tensor, head: Tensor, octaves: Tensor) -> Tensor:
-        """Seconds of a gaze shift and the look after it: the slowest of its movements, and the look."""
+        """Duration of a gaze shift and the look after it: that of the slowest movement, plus the look.
+
+        Args:
+            eye: `(...)`, amplitude of the saccade in degrees.
+            head: `(...)`, angle of the head's turn in degrees.
+            octaves: `(...)`, change of the field of view, in doublings; the sign does not matter.
+
+        Returns:
+            `(...)`, seconds.
+        """
         slowest = torch.maximum(self.saccade(eye), self.turn(head))
         return self.look + torch.maximum(slowest, self.zoom * octaves.abs())

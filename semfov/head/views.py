@@ -1,4 +1,4 @@
-"""All that eye and head can look at: the views from the poses of the head, as one grid of cells."""
+"""All possible views of a head and fixations of its eye, as one grid of cells."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from semfov.head.speeds import Speeds
 from semfov.head.world import World
 
 SIDE = 10
-"""Cells in a row and in a column of a view: those that the shipped evidence was learned on."""
+"""Number of cells in a row and in a column of a view, as the shipped evidence was learned on."""
 
 
 @dataclass(frozen=True)
@@ -31,29 +31,39 @@ class Seen:
 
 
 class Views:
-    """The poses of a head, and the fixations of the eye in the view from each.
+    """The possible poses of a head, and the possible fixations of the eye in the view from each.
 
-    The views are thought of as a strip, one below the other. So an action, a pose and a cell of its view, is one cell
-    of a grid, `action = pose * 100 + cell`, and the loop that moves an eye over a picture moves eye and head.
+    The views are arranged as a strip, one below the other. An action, which is a pose and a cell of its view, is then
+    one cell of a grid, `action = pose * 100 + cell`. So the loop that moves an eye over a picture also moves eye and
+    head.
 
     Args:
         world: the scene.
-        fields: of view in degrees, narrowest first; several of them let the head zoom.
-        fovea: width σ of the fovea in longer sides of a view.
+        fields: fields of view in degrees, narrowest first; with several of them the head can zoom.
+        fovea: width σ of the fovea in units of a view's longer side.
 
     Attributes:
-        poses: `(P, 3)`.
+        poses: `(P, 3)`, poses of the head.
         tiling: for each field of view, rows of the numbers of poses whose views tile the scene.
         grid: the strip.
         view_grid: the cells of one view.
-        gaze: `(A, D)`, point of the scene that each action looks at.
-        gaze_cell: `(A,)`, the scene's cell that holds it.
-        seen: for each pose, what it shows of the scene.
+        gaze: `(A, D)`, point of the scene that each action fixates.
+        gaze_cell: `(A,)`, cell of the scene that contains this point.
+        seen: for each pose, the cells of the scene that its view shows.
+
+    Raises:
+        InputError: `fields` is empty or not ascending, or `fovea` is not positive.
+
+    >>> from semfov.head import Flat
+    >>> views = Views(Flat(torch.rand(3, 480, 640), (40, 30), degree=8))
+    >>> len(views), len(views.grid), views.tiling
+    (9, 900, [[[0, 2], [6, 8]]])
     """
 
     def __init__(self, world: World, fields: Sequence[float] = (60.0,), *, fovea: float = 100 / 640) -> None:
-        check(len(fields) > 0 and list(fields) == sorted(fields), "fields", "fields of view, narrowest first", fields)
-        check(fovea > 0, "fovea", "a positive share of the longer side", fovea)
+        ascending = len(fields) > 0 and list(fields) == sorted(fields)
+        check(ascending, "fields", "one or more fields of view in degrees, narrowest first", fields)
+        check(fovea > 0, "fovea", "a positive fraction of the longer side", fovea)
         self.world, self.fields, self.fovea = world, tuple(fields), fovea
         poses: list[Tensor] = []
         self.tiling: list[list[list[int]]] = []
@@ -81,22 +91,37 @@ class Views:
 
     @property
     def cells(self) -> int:
-        """Cells of a view."""
+        """Number of cells of a view."""
         return len(self.view_grid)
 
     @cached_property
     def reachable(self) -> Tensor:
-        """Cells of the scene that some view shows, `(S,)` boolean."""
+        """Cells of the scene that at least one view shows, `(S,)` boolean."""
         reachable = torch.zeros(len(self.world.scene), dtype=torch.bool)
         reachable[torch.cat([seen.cells for seen in self.seen])] = True
         return reachable
 
     def places(self, pose: int) -> Tensor:
-        """Where the cells that a pose shows lie in its view, for `grid_sample`, `(V, 2)`."""
+        """Positions in a view of the scene's cells that it shows, as coordinates for `grid_sample`.
+
+        Args:
+            pose: number of the pose.
+
+        Returns:
+            `(V, 2)`, from -1 to 1 over the view.
+        """
         return 2 * (self.seen[pose].points + 0.5) / self.view_grid.extent - 1
 
     def spread(self, values: Tensor, pose: int) -> Tensor:
-        """Values `(C, cells)` of a view's cells at the scene's cells that it shows, `(C, V)`; bilinear."""
+        """Interpolate values of a view's cells at the scene's cells that the view shows.
+
+        Args:
+            values: `(C, cells)`, values of the view's cells.
+            pose: number of the pose.
+
+        Returns:
+            `(C, V)`, by bilinear interpolation.
+        """
         image = values.unflatten(-1, (SIDE, SIDE))[None]
         place = self.places(pose)[None, None].to(values)
         return F.grid_sample(image, place, padding_mode="border", align_corners=False)[0, :, 0]
@@ -105,9 +130,9 @@ class Views:
     def distances(self) -> list[Tensor]:
         r"""For each pose, distance `(cells, V)` from each cell of its view to the scene's cells that it shows.
 
-        In longer sides of the narrowest view. With σ the width of the fovea, a fovea's acuity at a distance d falls as
-        :math:`1 / (1 + d / σ)`, and that of a wider view is less everywhere by the ratio r of the fields. So what is
-        seen at d in a wider view is seen as well as at :math:`r (σ + d) - σ` in the narrowest.
+        The unit is the longer side of the narrowest view. With σ the width of the fovea, the acuity at a distance d
+        falls as :math:`1 / (1 + d / σ)`. The acuity of a wider view is lower everywhere by the ratio r of the fields. A
+        point at distance d in a wider view is therefore seen as well as one at :math:`r (σ + d) - σ` in the narrowest.
         """
         centres, side = self.view_grid.centres, self.view_grid.extent.amax()
         result = []
@@ -117,11 +142,25 @@ class Views:
         return result
 
     def acuity(self, distance: Tensor) -> Tensor:
-        """1 / (1 + d / σ) of distances d; 0 of what was never seen, at infinity."""
+        """Relative acuity of the fovea, 1 / (1 + d / σ).
+
+        Args:
+            distance: `(...)`, d in units of the narrowest view's longer side (`distances`).
+
+        Returns:
+            `(...)`, from 0 to 1; 0 where the distance is infinite, for cells that were never seen.
+        """
         return 1 / (1 + distance / self.fovea)
 
     def action_of(self, point: Tensor) -> tuple[int, Tensor]:
-        """Pose and pixel `(2,)` of its view, of a point `(2,)` of the strip."""
+        """Pose and pixel of a point of the strip.
+
+        Args:
+            point: `(2,)`, in pixels of the strip.
+
+        Returns:
+            The number of the pose, and the pixel `(2,)` of its view.
+        """
         high = self.world.size[1]
         pose = int((float(point[1]) + 0.5) // high)
         return pose, point - point.new_tensor([0, pose * high])
@@ -133,12 +172,20 @@ class Views:
         return [self.world.shift(centres[:, None], centres[None], field) for field in self.fields]
 
     def prices(self, action: int, speeds: Speeds) -> Tensor:
-        """Seconds from one action to each, `(A,)`, the look there included."""
+        """Time from one action to each other one, the look there included.
+
+        Args:
+            action: the present action.
+            speeds: of eye and head.
+
+        Returns:
+            `(A,)`, seconds.
+        """
         pose, cell = divmod(action, self.cells)
         here = self.poses[pose]
         head = self.world.turn(here.expand_as(self.poses), self.poses)
         octaves = (self.poses[:, 2] / here[2]).log2()
-        # The eye turns in the head, by what its field of view is where it goes.
+        # The angle of the saccade is measured in the field of view of the new pose.
         which = torch.tensor([self.fields.index(float(field)) for field in self.poses[:, 2]])
         eye = torch.stack([shifts[cell] for shifts in self._shifts])[which]
         return speeds.price(eye, head[:, None], octaves[:, None]).flatten()

@@ -1,4 +1,4 @@
-"""Scenes larger than the field of an eye, seen through a window that a head moves."""
+"""Scenes larger than the eye's field of view, seen through a window that a head moves."""
 
 import math
 from abc import ABC, abstractmethod
@@ -17,35 +17,39 @@ from semfov.sensor.perspective import even_rows, go_around, sample
 from semfov.sensor.sphere import Camera, Regions, angle_between, panorama_directions, panorama_points
 
 VIEW = (416, 312)
-"""`(width, height)` in pixels of what the eye sees at once."""
+"""Default `(width, height)` of a view in pixels."""
 
 
 class Places(Protocol):
-    """What objects cover of a scene."""
+    """Regions that objects cover in a scene."""
 
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: Tensor) -> "Places":
-        """Some of them."""
+        """The selected regions."""
 
     def samples(self, count: int = 9) -> Tensor:
-        """Points all over each, its borders included, `(M, count², D)`."""
+        """Points spread over each region, its borders included, `(M, count², D)`."""
 
     def contain(self, points: Tensor, /) -> Tensor:
-        """Which points `(N, D)` lie in each, `(M, N)` boolean."""
+        """Whether each region contains each of the points `(N, D)`, `(M, N)` boolean."""
 
 
 class World(ABC):
-    """Base of scenes that a head looks around in.
+    """Base of the scenes that a head looks around in.
 
-    A pose of the head is three numbers, where the window is and how wide: its field of view in degrees is the last. A
-    point of the scene has D coordinates.
+    A pose of the head has three numbers: two for the position of the window, and the field of view in degrees. A point
+    of the scene has D coordinates.
 
     Attributes:
-        scene: cells over the whole scene, in its own pixels.
-        size: `(w, h)` of a view.
-        centres: `(S, D)`, points in the middle of the cells.
-        area: `(S,)`, of the cells, 1 on average.
+        scene: cells of the whole scene, in pixels of its picture.
+        size: `(w, h)` of a view in pixels.
+        centres: `(S, D)`, centres of the cells.
+        area: `(S,)`, relative areas of the cells, 1 on average.
+
+    >>> world = Flat(torch.rand(3, 480, 640), (40, 30), degree=8)
+    >>> isinstance(world, World), [len(row) for row in world.poses(40.0)]
+    (True, [3, 3, 3])
     """
 
     scene: Grid
@@ -55,49 +59,123 @@ class World(ABC):
 
     @abstractmethod
     def view(self, pose: Tensor) -> Tensor:
-        """What is seen from a pose `(3,)`, `(3, h, w)`."""
+        """Render the view from a pose.
+
+        Args:
+            pose: `(3,)`, of the head.
+
+        Returns:
+            `(3, h, w)`, RGB in [0, 1].
+        """
 
     @abstractmethod
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Where points `(N, D)` are in the view from a pose `(3,)`, `(N, 2)`, and whether they are inside, `(N,)`."""
+        """Project points of the scene into the view from a pose.
+
+        Args:
+            points: `(N, D)`, points of the scene.
+            pose: `(3,)`, of the head.
+
+        Returns:
+            Pixels of the view `(N, 2)`, and whether they are inside it `(N,)`.
+        """
 
     @abstractmethod
     def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
-        """Points of the scene `(N, D)` that pixels `(N, 2)` of the view from a pose show."""
+        """Points of the scene that pixels of the view from a pose show.
+
+        Args:
+            points: `(N, 2)`, pixels of the view.
+            pose: `(3,)`, of the head.
+
+        Returns:
+            `(N, D)`, points of the scene.
+        """
 
     @abstractmethod
     def cell_of(self, points: Tensor) -> Tensor:
-        """Cells `(N,)` of the scene in which points `(N, D)` lie."""
+        """Cells of the scene that contain points.
+
+        Args:
+            points: `(N, D)`, points of the scene.
+
+        Returns:
+            `(N,)`, numbers of the cells.
+        """
 
     @abstractmethod
     def pixels_of(self, points: Tensor) -> Tensor:
-        """Pixels `(N, 2)` of the scene's picture where points `(N, D)` are."""
+        """Positions of points in the scene's picture.
+
+        Args:
+            points: `(N, D)`, points of the scene.
+
+        Returns:
+            `(N, 2)`, in pixels of the picture.
+        """
 
     @abstractmethod
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
-        """Angles in degrees by which the head turns between poses `(..., 3)`, `(...)`."""
+        """Angles by which the head turns between poses.
+
+        Args:
+            one: `(..., 3)`, first poses.
+            other: `(..., 3)`, second poses.
+
+        Returns:
+            `(...)`, in degrees.
+        """
 
     @abstractmethod
     def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
-        """Angles in degrees between pixels `(..., 2)` of views with a field of view, seen by the eye, `(...)`."""
+        """Angles by which the eye turns between pixels of a view.
+
+        Args:
+            one: `(..., 2)`, first pixels.
+            other: `(..., 2)`, second pixels.
+            field: field of view in degrees.
+
+        Returns:
+            `(...)`, in degrees.
+        """
 
     @abstractmethod
     def poses(self, field: float) -> list[list[Tensor]]:
-        """Poses half a window apart, row by row; every second of every second row tile the scene."""
+        """Poses at a distance of half a window, row by row. Every second pose of every second row tiles the scene.
+
+        Args:
+            field: field of view in degrees.
+
+        Returns:
+            Rows of poses `(3,)`.
+        """
 
     @abstractmethod
     def places(self, boxes: Tensor, pose: Tensor) -> Places:
-        """What boxes `(M, 4)` in the view from a pose cover of the scene."""
+        """Regions of the scene that boxes in the view from a pose cover.
+
+        Args:
+            boxes: `(M, 4)`, in pixels of the view.
+            pose: `(3,)`, of the head.
+
+        Returns:
+            One region for each box.
+        """
 
 
 class Panorama(World):
     """A panorama around the viewer, seen by a perspective camera (`semfov.sensor.sphere.Camera`).
 
+    A pose is the camera's yaw, pitch and horizontal field of view in degrees. Points are unit directions, so D is 3.
+
     Args:
-        image: equirectangular, of any common kind (`semfov.as_image`), an even number of columns.
+        image: equirectangular picture of any common kind (`semfov.as_image`), with an even number of columns.
         size: `(w, h)` of a view in pixels.
         cell: height of the scene's cells in degrees.
         reach: how far up and down the head turns, in degrees.
+
+    Raises:
+        InputError: an argument is out of range.
 
     >>> world = Panorama(torch.rand(3, 64, 128), (40, 30))
     >>> world.view(torch.tensor([0.0, 0.0, 60.0])).shape, len(world.scene)
@@ -109,8 +187,8 @@ class Panorama(World):
     ) -> None:
         pixels = as_image(image)
         check(pixels.shape[-1] % 2 == 0, "image", "an even number of columns", pixels.shape[-1])
-        check(0 < cell <= 90, "cell", "degrees from 0 to 90", cell)
-        check(0 <= reach <= 90, "reach", "degrees from 0 to 90", reach)
+        check(0 < cell <= 90, "cell", "a positive angle of at most 90 degrees", cell)
+        check(0 <= reach <= 90, "reach", "an angle from 0 to 90 degrees", reach)
         self.picture, self.size, self.reach = (pixels.shape[-1], pixels.shape[-2]), size, reach
         self.scene = Grid(round(360 / cell), round(180 / cell), self.picture)
         self.centres = panorama_directions(self.scene.centres, self.picture)
@@ -119,44 +197,44 @@ class Panorama(World):
         self._source = go_around(even_rows(pixels)[None])[0]
 
     def view(self, pose: Tensor) -> Tensor:
-        """What the camera sees."""
+        """Render the view of the camera."""
         return sample(self._source, pose, self.size).clamp(0, 1)
 
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels in which directions are seen."""
+        """Pixels at which directions are seen."""
         return Camera(pose, self.size).points(points)
 
     def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
-        """Directions in which pixels look."""
+        """Directions of pixels."""
         return Camera(pose, self.size).directions(points)
 
     def cell_of(self, points: Tensor) -> Tensor:
-        """Cells in which directions lie."""
+        """Cells that contain directions."""
         return self.scene.cell_of(self.pixels_of(points))
 
     def pixels_of(self, points: Tensor) -> Tensor:
-        """Pixels of the panorama in these directions."""
+        """Pixels of the panorama at directions."""
         return panorama_points(points, self.picture)
 
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
-        """Angle between the axes of cameras."""
+        """Angle between the optical axes of two cameras."""
         middle = torch.tensor([[0.0, 0.0]])
         return angle_between(*(Camera(pose, (1, 1)).directions(middle)[..., 0, :] for pose in (one, other)))
 
     def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
-        """Angle between what pixels show."""
+        """Angle between the directions of two pixels."""
         camera = Camera(torch.tensor([0.0, 0.0, field]), self.size)
         rays = (camera.directions(points.reshape(-1, 2)).view(*points.shape[:-1], 3) for points in (one, other))
         return angle_between(*rays)
 
     def poses(self, field: float) -> list[list[Tensor]]:
-        """Rings around the viewer."""
+        """Rings of poses around the viewer."""
         high = 2 * math.degrees(math.atan(math.tan(math.radians(field / 2)) * self.size[1] / self.size[0]))
         number = math.floor(self.reach / (high / 2))
         rings = []
         for row in range(-number, number + 1):
             pitch = row * high / 2
-            # Of a ring that tiles, the sides of the windows meet down to their corners nearest to the horizon.
+            # In a ring that tiles, the sides of neighbouring windows meet even at the corners nearest to the horizon.
             tiles = (row + number) % 2 == 0
             low = max(abs(pitch) - high / 2, 0) if tiles else abs(pitch)
             count = 2 * math.ceil(360 * math.cos(math.radians(low)) / field - 1e-9)
@@ -170,10 +248,14 @@ class Panorama(World):
 
 @dataclass(frozen=True)
 class Boxes:
-    """What boxes cover of a flat scene.
+    """Regions of a flat scene: boxes.
 
     Attributes:
         boxes: `(M, 4)` in pixels of the scene.
+
+    >>> Boxes(torch.tensor([[0.0, 0, 4, 4], [6, 6, 8, 8]])).contain(torch.tensor([[2.0, 2.0]]))
+    tensor([[ True],
+            [False]])
     """
 
     boxes: Tensor
@@ -183,18 +265,32 @@ class Boxes:
         return len(self.boxes)
 
     def __getitem__(self, index: Tensor) -> "Boxes":
-        """Some of the boxes."""
+        """The selected boxes."""
         return Boxes(self.boxes[index])
 
     def samples(self, count: int = 9) -> Tensor:
-        """Points all over each box, `(M, count², 2)`."""
+        """Points on a regular grid over each box, its borders included.
+
+        Args:
+            count: number of points along each side.
+
+        Returns:
+            `(M, count², 2)`, in pixels of the scene.
+        """
         share = torch.linspace(0, 1, count).to(self.boxes)
         y, x = torch.meshgrid(share, share, indexing="ij")
         low, high = self.boxes[:, None, :2], self.boxes[:, None, 2:]
         return low + torch.stack([x, y], -1).flatten(0, 1) * (high - low) - 0.5
 
     def contain(self, points: Tensor) -> Tensor:
-        """Which points `(N, 2)` lie in each box, `(M, N)`."""
+        """Whether each box contains each of the points.
+
+        Args:
+            points: `(N, 2)`, in pixels of the scene.
+
+        Returns:
+            `(M, N)`, boolean.
+        """
         low, high = self.boxes[:, None, :2] - 0.5, self.boxes[:, None, 2:] - 0.5
         return ((points >= low) & (points <= high)).all(-1)
 
@@ -202,14 +298,17 @@ class Boxes:
 class Flat(World):
     """A large picture in front of the viewer, seen through a window that moves over it.
 
-    Pictures are taken to be far: so many pixels are a degree, all over. A pose is the point in the middle of the window
-    in pixels, and its width in degrees.
+    The picture is taken to be far away, so that the number of pixels per degree is the same everywhere. A pose is the
+    middle of the window in pixels, and the window's width in degrees. Points are pixels, so D is 2.
 
     Args:
-        picture: of any common kind (`semfov.data.large.open_large`).
+        picture: picture of any common kind (`semfov.data.large.open_large`).
         size: `(w, h)` of a view in pixels.
-        degree: pixels of the picture for each degree.
+        degree: number of pixels of the picture per degree.
         cell: height of the scene's cells in degrees.
+
+    Raises:
+        InputError: `degree` or `cell` is not positive.
 
     >>> world = Flat(torch.rand(3, 480, 640), (40, 30), degree=8)
     >>> world.view(torch.tensor([319.5, 239.5, 40.0])).shape, len(world.scene)
@@ -245,25 +344,25 @@ class Flat(World):
         return box
 
     def view(self, pose: Tensor) -> Tensor:
-        """The window, resampled."""
+        """The content of the window, resampled to the size of a view."""
         pixels = self.opened.read(self._box(pose)).float()[None] / 255
         return F.interpolate(pixels, self.size[::-1], mode="bilinear", antialias=True)[0].clamp(0, 1)
 
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels of the window where points of the picture are."""
+        """Pixels of the view that show points of the picture."""
         x1, y1, x2, y2 = self._box(pose)
         size = points.new_tensor(self.size)
         seen = (points + 0.5 - points.new_tensor([x1, y1])) * size / points.new_tensor([x2 - x1, y2 - y1]) - 0.5
         return seen, ((seen >= -0.5) & (seen <= size - 0.5)).all(-1)
 
     def to_scene(self, points: Tensor, pose: Tensor) -> Tensor:
-        """Points of the picture that pixels of the window show."""
+        """Points of the picture that pixels of the view show."""
         x1, y1, x2, y2 = self._box(pose)
         extent = points.new_tensor([x2 - x1, y2 - y1])
         return (points + 0.5) * extent / points.new_tensor(self.size) + points.new_tensor([x1, y1]) - 0.5
 
     def cell_of(self, points: Tensor) -> Tensor:
-        """Cells in which points lie."""
+        """Cells that contain points."""
         return self.scene.cell_of(points)
 
     def pixels_of(self, points: Tensor) -> Tensor:
@@ -271,19 +370,21 @@ class Flat(World):
         return points
 
     def turn(self, one: Tensor, other: Tensor) -> Tensor:
-        """Distance between the middles of windows."""
+        """Distance between the middles of two windows, in degrees."""
         return torch.linalg.vector_norm(one[..., :2] - other[..., :2], dim=-1) / self.degree
 
     def shift(self, one: Tensor, other: Tensor, field: float) -> Tensor:
-        """Distance between what pixels show."""
+        """Distance between the points that two pixels show, in degrees."""
         return torch.linalg.vector_norm(one - other, dim=-1) * (field / self.size[0])
 
     def poses(self, field: float) -> list[list[Tensor]]:
-        """Windows that lie in the picture."""
+        """Windows that lie inside the picture."""
         width = field * self.degree
         height = width * self.size[1] / self.size[0]
         fits = round(width) <= self.picture[0] and round(height) <= self.picture[1]
-        check(fits, "field", "a window that the picture holds", f"{field} degrees, {width:.0f} × {height:.0f} pixels")
+        got = f"{field} degrees, {width:.0f} × {height:.0f} pixels; give narrower `fields`, or a smaller `degree`"
+        largest = f"a window inside the picture of {self.picture[0]} × {self.picture[1]} pixels"
+        check(fits, "field", largest, got)
 
         def middles(length: int, side: float) -> list[float]:
             steps = 2 * math.ceil(length / side - 1 - 1e-9)

@@ -1,1 +1,1 @@
-"""Figures of merit: of searches, of explorations, of probabilities."""
+"""Measures of searches, explorations, probabilities, detections and scanpaths."""

@@ -1,4 +1,4 @@
-"""Means and their errors."""
+"""Standard errors of means."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +7,20 @@ Array = NDArray[np.float64]
 
 
 def standard_error(values: Array, axis: int = 0) -> Array:
-    """Standard error of the mean along `axis`; NaN for fewer than two values."""
+    r"""Standard error of the mean along one axis.
+
+    .. math:: \mathrm{SE} = \sqrt{\frac{1}{n (n - 1)} \sum_i (x_i - \bar x)^2}
+
+    Args:
+        values: n numbers along `axis`, any shape.
+        axis: the axis to average over.
+
+    Returns:
+        The shape of `values` without `axis`; NaN where n is less than 2.
+
+    >>> standard_error(np.array([1.0, 3.0]))
+    array(1.)
+    """
     count = values.shape[axis]
     if count < 2:
         return np.full(np.delete(values.shape, axis), np.nan)

@@ -1,4 +1,4 @@
-"""How well probabilities agree with what happens: scoring rules and calibration errors."""
+"""How well predicted probabilities agree with outcomes: scoring rules and calibration errors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,15 +12,18 @@ from semfov.errors import check, check_shape
 
 @dataclass(frozen=True)
 class Calibration:
-    """Figures of a set of predictions.
+    """Scoring rules and calibration errors of a set of predictions.
 
     Attributes:
         count: number of predictions.
         nll: mean negative log likelihood of the true class, in nats.
         brier: mean squared distance between prediction and truth, summed over classes, from 0 to 2.
         ece: expected calibration error of the most probable class.
-        classwise_ece: calibration error of every class's probability, mean over classes.
-        accuracy: share of predictions whose most probable class is true.
+        classwise_ece: calibration error of the probability of each class, averaged over the classes.
+        accuracy: fraction of predictions whose most probable class is the true one.
+
+    >>> calibration(torch.tensor([[0.9, 0.1], [0.4, 0.6]]), torch.tensor([0, 0])).count
+    2
     """
 
     count: int
@@ -32,7 +35,23 @@ class Calibration:
 
 
 def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Calibration:
-    """All figures for predictions `(M, K+1)` and true classes `(M,)`; NaN where there are no predictions."""
+    """Compute all measures of `Calibration` for predictions over K + 1 classes.
+
+    Args:
+        probabilities: `(M, K+1)`, one predicted distribution in each row.
+        labels: `(M,)`, int64, true classes from 0 to K.
+        bins: number of equally wide bins for the calibration errors.
+
+    Returns:
+        The measures; all but the count are NaN where there are no predictions.
+
+    Raises:
+        InputError: the shapes do not fit together, or `bins` is less than 1.
+
+    >>> figures = calibration(torch.tensor([[0.9, 0.1], [0.4, 0.6]]), torch.tensor([0, 0]))
+    >>> figures.accuracy, round(figures.brier, 3)
+    (0.5, 0.37)
+    """
     check_shape(probabilities, "probabilities", None, None)
     check_shape(labels, "labels", probabilities.shape[0])
     check(bins >= 1, "bins", "at least 1", bins)
@@ -54,7 +73,19 @@ def calibration(probabilities: Tensor, labels: Tensor, *, bins: int = 15) -> Cal
 
 
 def surprisal(probability: Tensor) -> Tensor:
-    """Negative log, in nats; of a probability that has underflowed to 0, that of the smallest number, not infinity."""
+    """Negative logarithm of probabilities, in nats.
+
+    A probability that has underflowed to 0 counts as the smallest positive float32, so that the result stays finite.
+
+    Args:
+        probability: any shape.
+
+    Returns:
+        The same shape.
+
+    >>> surprisal(torch.tensor([1.0, 0.5]))
+    tensor([-0.0000, 0.6931])
+    """
     return -probability.clamp(min=torch.finfo(torch.float32).tiny).log()
 
 
@@ -67,24 +98,48 @@ def calibration_error(confidence: Tensor, correct: Tensor, bins: int = 15) -> Te
         confidence: `(M,)`, predicted probabilities.
         correct: `(M,)` boolean, whether the prediction came true.
         bins: number of bins.
+
+    Returns:
+        The error, a float64 scalar from 0 to 1.
+
+    >>> calibration_error(torch.tensor([0.9, 0.9]), torch.tensor([True, False])).round(decimals=4)
+    tensor(0.4000, dtype=torch.float64)
     """
     return error_of(reliability(confidence, correct, bins))
 
 
 def error_of(bins: Tensor) -> Tensor:
-    """The expected calibration error from what `reliability` counts, `(3, bins)`."""
+    """Expected calibration error from the sums of `reliability`.
+
+    Args:
+        bins: `(3, bins)`, sums of `reliability`.
+
+    Returns:
+        The error, a scalar from 0 to 1.
+
+    >>> error_of(torch.tensor([[1.0, 1.0], [0.1, 0.8], [0.0, 1.0]])).round(decimals=4)
+    tensor(0.1500)
+    """
     count, confident, right = bins
     return (confident - right).abs().sum() / count.sum().clamp(min=1)
 
 
 def reliability(confidence: Tensor, correct: Tensor, bins: int | Tensor = 15) -> Tensor:
-    """Count, sum of confidence and number of correct predictions of every bin of confidence, `(3, bins)`, float64.
+    """Sums for a reliability diagram: what was predicted and what came true, by bin of confidence.
 
     Args:
         confidence: `(M,)`, predicted probabilities.
         correct: `(M,)` boolean, whether the prediction came true.
-        bins: number of equally wide bins, or the edges between bins, ascending; a bin has its upper edge, but not its
-            lower one.
+        bins: number of equally wide bins, or the ascending edges between bins. A bin contains its upper edge and not
+            its lower one.
+
+    Returns:
+        `(3, bins)`, float64 on the CPU: number of predictions, sum of their confidence, and number that came true.
+
+    >>> reliability(torch.tensor([0.2, 0.9, 0.8]), torch.tensor([False, True, True]), 2)
+    tensor([[1.0000, 2.0000],
+            [0.2000, 1.7000],
+            [0.0000, 2.0000]], dtype=torch.float64)
     """
     edges = torch.arange(1, bins, dtype=torch.float64) / bins if isinstance(bins, int) else bins
     p = confidence.detach().to("cpu", torch.float64).contiguous()
@@ -98,19 +153,20 @@ _RARE = torch.tensor([1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2], dtype=torch.float64)
 
 @dataclass(frozen=True)
 class BinarySums:
-    r"""Sums over predictions of what is so or not, from which their figures follow; the sums of parts add up.
+    r"""Sums over binary predictions, from which their measures follow; the sums of parts of the data add up.
 
     For probabilities :math:`p_i` and outcomes :math:`y_i \in \{0, 1\}` the mean negative log likelihood and the mean
-    Brier score (Brier, 1950; here without the other class's half, from 0 to 1) are
+    Brier score (Brier, 1950; here of one of the two classes, from 0 to 1) are
 
     .. math:: -\frac1n \sum_i \ln \left( y_i p_i + (1 - y_i)(1 - p_i) \right), \qquad
               \frac1n \sum_i (p_i - y_i)^2
 
-    Where nearly all probabilities are small, the first of 15 equally wide bins holds nearly all predictions: it is kept
-    in 7 parts, for reliability diagrams.
+    Where nearly all probabilities are small, the first of 15 equally wide bins holds nearly all predictions. It is
+    therefore divided into 7 bins for reliability diagrams.
 
     Attributes:
-        bins: `(3, 21)`, float64: count, sum of probabilities, and number that came true, by bin of probability.
+        bins: `(3, 21)`, float64: number of predictions, sum of their probabilities, and number that came true, by bin
+            of probability.
         surprisal: sum of negative log likelihoods, in nats.
         square: sum of squared errors.
 
@@ -128,11 +184,14 @@ class BinarySums:
 
     @classmethod
     def of(cls, probability: Tensor, outcome: Tensor) -> Self:
-        """Sums over predictions.
+        """Sum over predictions.
 
         Args:
-            probability: `(M,)`.
-            outcome: `(M,)` boolean, whether it was so.
+            probability: `(M,)`, predicted probabilities.
+            outcome: `(M,)` boolean, whether the prediction came true.
+
+        Returns:
+            The sums.
         """
         check_shape(probability, "probability", None)
         check_shape(outcome, "outcome", len(probability))
@@ -143,7 +202,11 @@ class BinarySums:
 
     @classmethod
     def nothing(cls) -> Self:
-        """Sums over no prediction."""
+        """The sums over no predictions, to which others are added.
+
+        Returns:
+            Sums of 0.
+        """
         return cls(torch.zeros(3, len(cls.EDGES) + 1, dtype=torch.float64), 0.0, 0.0)
 
     def __add__(self, other: Self) -> Self:
@@ -152,17 +215,17 @@ class BinarySums:
 
     @property
     def count(self) -> int:
-        """How many predictions."""
+        """Number of predictions."""
         return int(self.bins[0].sum())
 
     @property
     def probability(self) -> float:
-        """Mean probability; this and all means are NaN where there is no prediction."""
+        """Mean predicted probability; this and all other means are NaN where there are no predictions."""
         return self._mean(float(self.bins[1].sum()))
 
     @property
     def rate(self) -> float:
-        """Share that came true."""
+        """Fraction of the predictions that came true."""
         return self._mean(float(self.bins[2].sum()))
 
     @property
@@ -186,14 +249,25 @@ class BinarySums:
         return total / self.count if self.count else float("nan")
 
     def record(self) -> dict[str, Any]:
-        """As JSON values: bins without predictions are left out."""
+        """The sums as JSON values, without empty bins; `from_record` reads them.
+
+        Returns:
+            `bins` (each bin's number and its three sums), `surprisal` and `square`.
+        """
         filled = self.bins[0].nonzero()[:, 0].tolist()
         bins = {str(number): self.bins[:, number].tolist() for number in filled}
         return {"bins": bins, "surprisal": self.surprisal, "square": self.square}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Self:
-        """From what `record` gave."""
+        """Read the sums from JSON values.
+
+        Args:
+            record: the values that `record` returned.
+
+        Returns:
+            The same sums.
+        """
         sums = cls.nothing()
         for number, column in record["bins"].items():
             sums.bins[:, int(number)] = torch.tensor(column, dtype=torch.float64)

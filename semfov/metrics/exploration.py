@@ -1,4 +1,4 @@
-"""Figures of merit of scene exploration."""
+"""Measures of scene exploration."""
 
 from collections.abc import Sequence
 
@@ -14,20 +14,38 @@ Array = NDArray[np.float64]
 
 
 def answers_of(annotation: Annotation, grid: Grid, components: int) -> Tensor:
-    """Which classes are right for each cell, `(X·Y, K+1)` boolean: those of the objects that overlap it."""
+    """The classes that are correct for each cell: those of the objects whose boxes overlap it.
+
+    Args:
+        annotation: boxes and classes of the objects, in pixels of the image.
+        grid: cells of the image.
+        components: number of classes, background included (K + 1).
+
+    Returns:
+        `(X·Y, K+1)`, boolean.
+
+    >>> import torch
+    >>> objects = Annotation(torch.tensor([[0.0, 0, 8, 8]]), torch.tensor([1]), torch.tensor([False]), (20, 10))
+    >>> answers_of(objects, Grid(2, 1, (20, 10)), components=3).int()
+    tensor([[0, 1, 0],
+            [0, 0, 0]], dtype=torch.int32)
+    """
     overlap = grid.footprint(annotation.boxes)
     classes = F.one_hot(annotation.labels, components)
     return overlap.T.float() @ classes.float() > 0
 
 
 def count_right(beta: Tensor, answers: Tensor) -> Tensor:
-    """Number of cells whose most probable class is an object's there, `(B,)`.
+    """Number of cells whose most probable class is that of an overlapping object.
 
-    A cell of which nothing is known has no most probable class: where classes are tied, the answer is wrong.
+    A cell where several classes are tied for the most probable one counts as wrong, so a cell without information does.
 
     Args:
-        beta: `(B, X·Y, C)`, Dirichlet parameters, of all classes or of some.
-        answers: `(X·Y, C)`, right classes of each cell.
+        beta: `(B, X·Y, C)`, Dirichlet parameters of all classes or of a subset.
+        answers: `(X·Y, C)` boolean, correct classes of each cell (`answers_of`).
+
+    Returns:
+        `(B,)`, int64.
 
     >>> import torch
     >>> beta = torch.tensor([[[0.5, 0.7], [0.9, 0.1], [0.5, 0.5]]])
@@ -38,13 +56,32 @@ def count_right(beta: Tensor, answers: Tensor) -> Tensor:
 
 
 def right_cells(beta: Tensor, answers: Tensor) -> Tensor:
-    """Which cells `count_right` counts, `(B, X·Y)` boolean; arguments as there."""
+    """The cells whose most probable class is that of an overlapping object; `count_right` counts them.
+
+    Args:
+        beta: `(B, X·Y, C)`, Dirichlet parameters of all classes or of a subset.
+        answers: `(X·Y, C)` boolean, correct classes of each cell (`answers_of`).
+
+    Returns:
+        `(B, X·Y)`, boolean.
+
+    >>> import torch
+    >>> right_cells(torch.tensor([[[0.5, 0.7], [0.5, 0.5]]]), torch.tensor([[False, True]] * 2))
+    tensor([[ True, False]])
+    """
     best = beta == beta.amax(-1, keepdim=True)
     return (best & answers).any(-1) & (best.sum(-1) == 1)
 
 
 def success_rate(right: Sequence[int], cells: int) -> Array:
-    """Share of the cells with objects whose class is right, after each gaze shift.
+    """Fraction of the cells with objects whose most probable class is correct, after each gaze shift.
+
+    Args:
+        right: number of correct cells after each gaze shift (`count_right`).
+        cells: number of cells with objects.
+
+    Returns:
+        One value from 0 to 1 for each entry of `right`.
 
     >>> success_rate([1, 3, 4], 4)
     array([0.25, 0.75, 1.  ])

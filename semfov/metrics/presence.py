@@ -1,4 +1,4 @@
-"""Figures of merit of telling whether a target is there."""
+"""Measures of deciding whether a target is present."""
 
 import torch
 from torch import Tensor
@@ -7,41 +7,63 @@ from semfov.errors import check
 
 
 def area_under_roc(score: Tensor, present: Tensor) -> float:
-    r"""Probability that a case with the target scores higher than one without (Hanley and McNeil, 1982).
+    """Area under the receiver operating characteristic (Hanley and McNeil, 1982).
+
+    It is the probability that a case with the target scores higher than one without:
 
     .. math:: P(s_+ > s_-) + P(s_+ = s_-) / 2
 
     Args:
-        score: `(M,)`.
-        present: `(M,)` boolean; cases of both kinds are needed.
+        score: `(M,)`, higher where the target is more likely present.
+        present: `(M,)` boolean, whether it is; some must be true and some false.
+
+    Returns:
+        The area, from 0 to 1; 0.5 for scores without information.
+
+    Raises:
+        InputError: the target is present in all cases or in none.
 
     >>> area_under_roc(torch.tensor([0.9, 0.4, 0.4, 0.1]), torch.tensor([True, True, False, False]))
     0.875
     """
-    check(bool(present.any() and not present.all()), "present", "cases with and without the target", "one kind alone")
+    check(bool(present.any() and not present.all()), "present", "both true and false values", "only one of the two")
     hit, miss = score[present].double(), score[~present].double().sort().values
     below = torch.searchsorted(miss, hit) + torch.searchsorted(miss, hit, right=True)
     return float(below.double().mean() / (2 * len(miss)))
 
 
 def threshold_for(absent: Tensor, share: float) -> float:
-    """Least threshold that no more than this share of the cases without the target reach.
+    """The lowest threshold that keeps the false alarm rate at or below a limit.
 
     Args:
-        absent: `(M,)`, scores of cases without the target.
-        share: of false alarms.
+        absent: `(M,)`, scores of the cases without the target.
+        share: largest false alarm rate: the fraction of these cases that may reach the threshold, from 0 to 1.
+
+    Returns:
+        The threshold. A score at or above it reports the target as present.
+
+    Raises:
+        InputError: there is no case without the target.
 
     >>> threshold_for(torch.tensor([0.1, 0.2, 0.3, 0.9]), 0.25) <= 0.31
     True
     """
-    check(len(absent) > 0, "absent", "at least one case", "none")
+    check(len(absent) > 0, "absent", "at least one case without the target", "none")
     allowed = int(share * len(absent))
     order = absent.double().sort(descending=True).values
     return float(torch.nextafter(order[min(allowed, len(order) - 1)], torch.tensor(torch.inf, dtype=torch.float64)))
 
 
 def hits_at(score: Tensor, present: Tensor, share: float) -> float:
-    """Share of the cases with the target that are told at this share of false alarms.
+    """Hit rate at a given false alarm rate: the fraction of the cases with the target that reach the threshold.
+
+    Args:
+        score: `(M,)`, higher where the target is more likely present.
+        present: `(M,)` boolean, whether it is.
+        share: largest false alarm rate, from 0 to 1.
+
+    Returns:
+        The hit rate, from 0 to 1.
 
     >>> hits_at(torch.tensor([0.9, 0.4, 0.5, 0.1]), torch.tensor([True, True, False, False]), 0.0)
     0.5
@@ -50,12 +72,22 @@ def hits_at(score: Tensor, present: Tensor, share: float) -> float:
 
 
 def roc(score: Tensor, present: Tensor) -> tuple[list[float], list[float]]:
-    """Shares of false alarms and of hits at every threshold, from none to all.
+    """The receiver operating characteristic: false alarm rate and hit rate at every threshold.
+
+    Args:
+        score: `(M,)`, higher where the target is more likely present.
+        present: `(M,)` boolean, whether it is; some must be true and some false.
+
+    Returns:
+        False alarm rates and hit rates, both ascending from 0 to 1.
+
+    Raises:
+        InputError: the target is present in all cases or in none.
 
     >>> roc(torch.tensor([0.9, 0.4, 0.5, 0.1]), torch.tensor([True, True, False, False]))
     ([0.0, 0.0, 0.5, 0.5, 1.0], [0.0, 0.5, 0.5, 1.0, 1.0])
     """
-    check(bool(present.any() and not present.all()), "present", "cases with and without the target", "one kind alone")
+    check(bool(present.any() and not present.all()), "present", "both true and false values", "only one of the two")
     levels = score.unique(sorted=True).flip(0)[:, None]
     told = score >= levels
     shares = [(told[:, kind].double().mean(1)).tolist() for kind in (~present, present)]

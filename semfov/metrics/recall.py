@@ -1,4 +1,4 @@
-"""How many of the objects in view a detector finds, at a price in false boxes."""
+"""How many of the objects in view a detector finds at a given rate of false boxes."""
 
 from __future__ import annotations
 
@@ -12,20 +12,25 @@ from semfov.observation.matching import match
 def found_objects(
     boxes: Tensor, scores: Tensor, truth: Tensor, labels: Tensor, *, iou: float = 0.5
 ) -> tuple[Tensor, Tensor]:
-    """With what score each object of a view is found and named right, and the scores of the boxes that find none.
+    """Scores of the objects that a detector finds in one view, and scores of its false boxes.
 
-    A box has the class of its largest score, background aside, and that score. The boxes of a class choose in
-    descending order of score among the objects of this class (`semfov.observation.match`), each object once.
+    The class of a box is the one of its highest score, background excepted, and this score is its confidence. The boxes
+    of each class are matched with the objects of that class in descending order of confidence
+    (`semfov.observation.match`). Each object is matched once.
 
     Args:
-        boxes: `(L, 4)`, detections.
+        boxes: `(L, 4)`, detections as (x1, y1, x2, y2) in pixels.
         scores: `(L, K+1)`, their score vectors or posteriors, background first.
-        truth: `(M, 4)`, boxes of the objects.
-        labels: `(M,)`, their classes, 1..K.
-        iou: least overlap.
+        truth: `(M, 4)`, boxes of the objects, in the same frame.
+        labels: `(M,)`, classes of the objects, 1..K.
+        iou: least intersection over union of a match.
 
     Returns:
-        `(M,)`, scores, 0 for objects that are not found, and `(F,)`, of the other boxes.
+        `(M,)`, the confidence at which each object is found, 0 where it is not, and `(F,)`, the confidence of the boxes
+        that match no object.
+
+    Raises:
+        InputError: the shapes do not fit together.
 
     >>> boxes, scores = torch.tensor([[0.0, 0, 9, 9], [0, 0, 8, 8]]), torch.tensor([[0.1, 0.7, 0.2], [0.2, 0.6, 0.2]])
     >>> found_objects(boxes, scores, torch.tensor([[0.0, 0, 9, 9]]), torch.tensor([1]))
@@ -38,7 +43,7 @@ def found_objects(
     found, false = scores.new_zeros(len(labels)), torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
     for label in (named + 1).unique().tolist():
         mine, objects = order[named[order] + 1 == label], (labels == label).nonzero()[:, 0]
-        # An object's own number takes the place of its class.
+        # Objects are numbered from 1 in place of a class, so that a match says which object it is.
         number = match(boxes[mine], truth[objects], torch.arange(1, len(objects) + 1, device=boxes.device), iou=iou)
         found[objects[number[number > 0] - 1]] = confidence[mine[number > 0]]
         false[mine[number > 0]] = False
@@ -46,15 +51,21 @@ def found_objects(
 
 
 def score_for(false: Tensor, views: int, rate: float = 1.0) -> float:
-    """The least score above which `views` views have at most `rate` false boxes each, on average.
+    """The score threshold at which a detector gives a certain number of false boxes in each view, on average.
 
-    What is found above it is a point of the free-response curve (Bunch, Hamilton, Sanderson and Simmons 1978), on which
-    detectors whose scores mean different things can be compared.
+    The recall at this threshold is a point of the free-response curve (Bunch, Hamilton, Sanderson and Simmons 1978). It
+    compares detectors whose scores have different meanings.
 
     Args:
         false: `(F,)`, scores of the false boxes of all views.
-        views: how many there are.
-        rate: false boxes in a view.
+        views: number of views.
+        rate: allowed false boxes in each view, on average.
+
+    Returns:
+        The threshold: at most `rate · views` false boxes score higher. 0 where there are no more false boxes than that.
+
+    Raises:
+        InputError: `views` is less than 1, or `rate` is negative.
 
     >>> score_for(torch.tensor([0.9, 0.5, 0.4, 0.1]), views=2)
     0.4...

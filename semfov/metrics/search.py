@@ -1,4 +1,4 @@
-"""Figures of merit of visual search."""
+"""Measures of visual search."""
 
 from math import comb
 
@@ -9,11 +9,14 @@ Array = NDArray[np.float64]
 
 
 def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> Array:
-    """Share of searches that have found their target after 0..`shifts` gaze shifts, `(..., shifts+1)`.
+    """Fraction of searches that have found their target after 0..`shifts` gaze shifts.
 
     Args:
         found_at: `(..., episodes)`, gaze shift at which each search found its target, -1 where it did not.
         shifts: last gaze shift.
+
+    Returns:
+        `(..., shifts+1)`, ascending.
 
     >>> cumulative_performance(np.array([1, 3, -1, 1]), 3)
     array([0.  , 0.5 , 0.5 , 0.75])
@@ -24,9 +27,19 @@ def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> Array:
 
 
 def random_search(targets: int, shifts: int, cells: int = 100) -> Array:
-    """Chance that random search without return has hit one of `targets` cells after 0..`shifts` gaze shifts.
+    r"""Probability that random search without return has hit one of `targets` cells after 0..`shifts` gaze shifts.
 
-    The start is none of them, so n shifts draw n of the other `cells - 1` cells: `1 - C(N-m, n) / C(N, n)`.
+    The start is not a target cell, so n gaze shifts draw n of the other N = `cells - 1` cells, of which m are targets:
+
+    .. math:: P(n) = 1 - \binom{N - m}{n} \Big/ \binom{N}{n}
+
+    Args:
+        targets: number of target cells, m.
+        shifts: last gaze shift.
+        cells: number of cells of the grid.
+
+    Returns:
+        `(shifts+1,)`.
 
     >>> random_search(1, 2, cells=5)
     array([0.  , 0.25, 0.5 ])

@@ -1,1 +1,1 @@
-"""Pages to step through in a browser."""
+"""HTML pages on which a reader steps through episodes in a browser."""

@@ -1,4 +1,4 @@
-"""Curves and tables as HTML that follows the page's colours."""
+"""Curves and tables as HTML, in the colours of the page."""
 
 from __future__ import annotations
 
@@ -19,14 +19,17 @@ _DASHES = ("", "9 5", "3 4", "12 4 3 4")
 
 
 def curves_html(curves: Mapping[str, Array], errors: Mapping[str, Array], label: str) -> str:
-    """Shares after 0, 1, … gaze shifts as lines in percent, with bands of one standard error, and a legend.
+    """Curves over gaze shifts as an SVG, in percent, with bands of one standard error and a legend.
 
-    Of many curves the legend names some, as in `semfov.viz`; the others are grey.
+    Of more than seven curves the legend names some, as in `semfov.viz`; the others are grey.
 
     Args:
-        curves: by name, in [0, 1].
-        errors: standard errors of some of them.
-        label: what the curves show.
+        curves: by name, values after 0, 1, … gaze shifts, in [0, 1].
+        errors: by name, standard errors of some of the curves.
+        label: description of the values.
+
+    Returns:
+        HTML.
     """
     last = max(len(curve) for curve in curves.values()) - 1
     highest = max(float(np.nanmax(curve)) for curve in curves.values())
@@ -59,7 +62,7 @@ def curves_html(curves: Mapping[str, Array], errors: Mapping[str, Array], label:
         f'<li><svg viewBox="0 0 38 12" aria-hidden="true">{sample}</svg> {escape(name)}</li>'
         for name, sample in zip(named, samples, strict=True)
     )
-    title = escape(f"{label} after 0 to {last} gaze shifts; the table below has the figures")
+    title = escape(f"{label} after 0 to {last} gaze shifts; the table below has the numbers")
     return (
         f'<div class="curves"><p>{escape(label)}</p>'
         f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{title}">{"".join(parts)}</svg>'
@@ -68,7 +71,15 @@ def curves_html(curves: Mapping[str, Array], errors: Mapping[str, Array], label:
 
 
 def table_html(rows: Sequence[Sequence[str]], caption: str) -> str:
-    """A table whose first row is its head and whose first column names the rows."""
+    """A table whose first row is its head and whose first column names the rows.
+
+    Args:
+        rows: texts of the cells.
+        caption: text above the table.
+
+    Returns:
+        HTML.
+    """
     head = "".join(f'<th scope="col"{_number(n)}>{escape(cell)}</th>' for n, cell in enumerate(rows[0]))
     body = "".join(
         f'<tr><th scope="row">{escape(row[0])}</th>'
@@ -88,7 +99,7 @@ def _number(column: int) -> str:
 
 
 def _line(order: int, count: int) -> str:
-    """Class and dashes of a line; no two are alike, as in `semfov.viz`."""
+    """Class and dashes of a line; all lines differ, as in `semfov.viz`."""
     group = _COLOURS if count > _COLOURS else 2
     dashes = _DASHES[order // group % len(_DASHES)]
     return f'class="c{order % _COLOURS}"' + (f' stroke-dasharray="{dashes}"' if dashes else "")
@@ -104,7 +115,7 @@ def _axes(last: int, top: float) -> str:
     every = next(step for step in (1, 2, 5, 10, 20, 50, 100, 10**6) if last / step <= 10)
     for shift in range(0, last + 1, every):
         x = left + shift / max(last, 1) * (right - left)
-        # On a phone, where letters are larger, every other number has to do.
+        # On a phone, where letters are larger, only every second number is shown.
         minor = ' class="minor"' if (shift // every) % 2 else ""
         parts.append(f'<text{minor} x="{x:.1f}" y="{bottom + 27}" text-anchor="middle">{shift}</text>')
     parts.append(f'<line class="axis" x1="{left}" x2="{right}" y1="{bottom}" y2="{bottom}"/>')

@@ -1,4 +1,4 @@
-"""An episode as data for a page: pictures as JPEG, probabilities in steps of 1/255 of their greatest."""
+"""An episode as data for a page: pictures as JPEG, and probabilities quantised to 255 steps of their maximum."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from semfov.viz.semantic import entropy
 Data = dict[str, Any]
 
 LEAST = 0.05
-"""Detections that are less confident are left out."""
+"""Detections of lower confidence are left out."""
 
 
 class Pool:
-    """Pictures of a page, each kept once.
+    """The pictures of a page, each kept once.
 
     Attributes:
-        pictures: data URIs.
+        pictures: data URIs of the pictures.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class Pool:
         self._index: dict[str, int] = {}
 
     def add(self, image: Tensor, width: int, quality: int) -> int:
-        """Number of a picture `(3, H, W)`, at most `width` pixels wide."""
+        """Add a picture `(3, H, W)`, reduced to at most `width` pixels, and return its number."""
         uri = jpeg_uri(image, width, quality)
         if uri not in self._index:
             self._index[uri] = len(self.pictures)
@@ -44,12 +44,12 @@ class Pool:
         return self._index[uri]
 
     def __len__(self) -> int:
-        """Bytes that the pictures take."""
+        """Total size of the pictures in bytes."""
         return sum(map(len, self.pictures))
 
 
 def jpeg_uri(image: Tensor, width: int, quality: int) -> str:
-    """A picture `(3, H, W)` as a data URI, at most `width` pixels wide."""
+    """A picture `(3, H, W)` as a data URI, reduced to at most `width` pixels."""
     from PIL import Image
 
     if image.shape[-1] > width:
@@ -73,19 +73,23 @@ def episode_data(
     width: int = 416,
     quality: int = 75,
 ) -> Data:
-    """What a page shows of an episode, as JSON values.
+    """Collect the data of an episode for a page, as JSON values.
 
     Args:
         scanpath: the episode.
-        image: `(3, H, W)`, RGB in [0, 1]; None shows none.
-        views: for each fixation the foveated photograph `(3, h, w)`, of any size; None shows none.
-        pool: takes the pictures.
-        name: what to call the episode.
-        settings: of detector and sensor, `Eye.settings()`; None are those that the scanpath kept.
-        boxes: `(M, 4)`, where the target really is.
-        classes: keep the belief about so many classes beside background, the most probable anywhere (None: all).
-        width: of the views in pixels; the photograph is half as wide again.
+        image: `(3, H, W)`, RGB in [0, 1]; None shows no photograph.
+        views: for each fixation the foveated photograph `(3, h, w)`, of any size; None shows no views.
+        pool: collects the pictures.
+        name: name of the episode.
+        settings: settings of detector and sensor (`Eye.settings()`); None takes those that the scanpath kept.
+        boxes: `(M, 4)`, true boxes of the target.
+        classes: number of probability maps to keep beside background, of the classes most probable anywhere; None keeps
+            all.
+        width: width of the views in pixels; the photograph is half as wide again.
         quality: of the JPEG files.
+
+    Returns:
+        The data, for `semfov.report.page.page_html`.
     """
     grid = scanpath.grid
     size = grid.extent.tolist()
@@ -122,7 +126,7 @@ def episode_data(
 
 
 def about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
-    """Detector, sensor and decision in words; None for what was not kept."""
+    """Detector, sensor and decision in words; None for parts that were not kept."""
     if settings is None and scanpath.stimulus is not None:
         settings = scanpath.stimulus.settings
     decision = f"{describe(scanpath)}. {why_it_ended(scanpath)}".rstrip()
@@ -138,7 +142,7 @@ def about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
 
 
 def outcome_data(scanpath: Scanpath) -> Data:
-    """What came of the episode, why it ended, and the cell and box of a target that was found."""
+    """Why the episode ended, and the cell and box of a target that was found."""
     decision = scanpath.decision
     found = decision is not None and decision.outcome == "found"
     box = decision.box if decision is not None and found else None
@@ -150,7 +154,17 @@ def outcome_data(scanpath: Scanpath) -> Data:
 
 
 def detection_data(scanpath: Scanpath, fixation: int, most: int = 10, scores: int = 5) -> list[Data]:
-    """The most confident detections of a look, each with its greatest class scores and a place for its label."""
+    """The most confident detections of a look, each with its highest class scores and the position of its label.
+
+    Args:
+        scanpath: the episode.
+        fixation: number of the look.
+        most: largest number of detections.
+        scores: largest number of class scores for each detection.
+
+    Returns:
+        For each detection its box, its label, pairs of class name and score, and the rectangle of its label.
+    """
     detections = scanpath.detections[fixation][0]
     width, height = scanpath.grid.extent.tolist()
     unit = width / 640
@@ -173,9 +187,16 @@ def detection_data(scanpath: Scanpath, fixation: int, most: int = 10, scores: in
 
 
 def map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
-    """Probability maps `(n, X·Y)`: the target's first, those that are most probable anywhere, background at the end.
+    """Probability maps `(n, X·Y)`: of the target, then of the classes most probable anywhere, then of background.
 
-    The target's is that of the search, where it has one.
+    The map of the target is the belief of the search, where the scanpath has one.
+
+    Args:
+        scanpath: the episode.
+        classes: number of maps to keep beside background; None keeps all.
+
+    Returns:
+        For each map its label, its maximum, and its values in base 64.
     """
     probabilities = scanpath.probabilities.detach().cpu()
     order = (1 + probabilities[..., 1:].amax((0, 1)).argsort(descending=True, stable=True)).tolist()
@@ -185,7 +206,7 @@ def map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
         maps.append({"label": scanpath.classes[target], **quantised(class_posterior(scanpath))})
     kept = [*order[: None if classes is None else max(0, classes - len(maps))], 0]
     maps += [{"label": scanpath.classes[index], **quantised(probabilities[..., index])} for index in kept]
-    # One entry for each class: detectors have been seen that give several of them one name.
+    # Some detectors give several classes the same name. A number tells their entries apart.
     times: Counter[str] = Counter()
     for each in maps:
         times[each["label"]] += 1
@@ -195,12 +216,12 @@ def map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:
 
 
 def quantised(values: Tensor) -> Data:
-    """Numbers from 0 up in 255 steps of the greatest, row by row, in base 64."""
+    """Numbers of 0 or more in 255 steps of their maximum, in row-major order, in base 64."""
     greatest = max(float(values.max()), 1e-12)
     steps = (values.detach().cpu().double() / greatest * 255).round().to(torch.uint8)
     return {"max": rounded(greatest), "data": base64.b64encode(np.ascontiguousarray(steps.numpy()).tobytes()).decode()}
 
 
 def rounded(value: float) -> float | None:
-    """Four digits of a number; None for what is not finite."""
+    """A number rounded to four digits; None if it is not finite."""
     return float(f"{value:.4g}") if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""A scanpath as a notebook shows it: the stepping page in a frame of its own, and never larger than it should be."""
+"""The display of a scanpath in a notebook: the page to step through, in a frame, with a limited size."""
 
 from __future__ import annotations
 
@@ -12,22 +12,29 @@ from semfov.viz.animation import animate
 from semfov.viz.scanpath import plot_scanpath
 
 MOST = 3_000_000
-"""No more bytes than this go into a notebook's file for one scanpath."""
+"""Largest number of bytes that a scanpath adds to a notebook's file."""
 
 HEIGHT = 760
-"""Of the frame, in pixels; the page scrolls in it."""
+"""Height of the frame in pixels; the page scrolls in it."""
 
 FINENESS = ((416, 75), (320, 65), (240, 55), (160, 45))
-"""Widths in pixels and JPEG qualities of the pictures: the first that fits is taken."""
+"""Widths in pixels and JPEG qualities of the pictures; the first pair that fits is taken."""
 
 _MAPS = MOST // 4
-"""What the probability maps may take."""
+"""Largest number of bytes of the probability maps."""
 
 
 def notebook_html(scanpath: Scanpath) -> str:
-    """A frame with the page to step through; where even the coarsest is too large, what the scanpath says in words.
+    """The page to step through in a frame; a short text where the page would be too large.
 
-    A frame shares neither style nor program with the notebook around it, and what is in it can reach nothing outside.
+    The frame shares neither styles nor scripts with the notebook around it, and its content cannot access anything
+    outside.
+
+    Args:
+        scanpath: the episode.
+
+    Returns:
+        HTML.
     """
     classes = _classes_that_fit(scanpath)
     if classes >= 1:
@@ -43,11 +50,11 @@ def notebook_html(scanpath: Scanpath) -> str:
             if len(frame.encode()) <= MOST:
                 return frame
     words = escape(repr(scanpath))
-    return f"<pre>{words}\n  too long to step through here: see scanpath.plot() and scanpath.to_frame()</pre>"
+    return f"<pre>{words}\n  too long to step through here; use scanpath.plot() or scanpath.to_frame()</pre>"
 
 
 def framed(page: str, title: str) -> str:
-    """A page in a frame that runs its program and may do nothing else."""
+    """A page in a sandboxed frame that may run scripts and nothing else."""
     return (
         f'<iframe title="{escape(title)}" sandbox="allow-scripts" loading="lazy" srcdoc="{escape(page)}" '
         f'style="width:100%;height:{HEIGHT}px;border:1px solid #888;border-radius:6px"></iframe>'
@@ -55,7 +62,7 @@ def framed(page: str, title: str) -> str:
 
 
 def _classes_that_fit(scanpath: Scanpath) -> int:
-    """How many classes' maps there is room for, beside those of background and entropy, and the values."""
+    """Number of classes whose maps fit, beside the maps of background and entropy and the acquisition values."""
     look = len(scanpath) * len(scanpath.grid)
     bytes_of_map, bytes_of_values = 4 * look / 3, 8 * look
     room = _MAPS - bytes_of_values - 2 * bytes_of_map

@@ -74,7 +74,7 @@
     if (episode.outcome.box !== null && fixation === episode.fixations.length - 1) {
       target.append(box(episode.outcome.box, { stroke: "white", "stroke-width": 5 * unit() }), box(episode.outcome.box, { stroke: FOUND, "stroke-width": 3 * unit() }));
     }
-    // From dark to bright as time goes on, with the same colours however far it is shown.
+    // Colours go from dark to bright over the whole episode, however much of it is shown.
     const last = Math.max(episode.fixations.length - 1, 1);
     const when = (number) => colour("time", number / last).fill;
     const points = visited.map(middle);
@@ -131,7 +131,7 @@
 
   function drawBelief() {
     const map = episode.maps[chosenClass], values = mapValues(map), best = bestOf(values);
-    // One scale for all classes and fixations: nothing at 0, and the most at 1.
+    // One scale from 0 to 1 for all classes and fixations.
     drawMap("belief", values, 0, 1, "overlay", `Probability of ${map.label}: highest ${short(values[best])} at ${place(best)}`)
       .append(...cross(episode.fixations[fixation].cell));
     return `Probability of ${map.label} is highest at ${place(best)}: ${short(values[best])}.`;
@@ -161,7 +161,7 @@
   const row = (tag, values) => html("tr", {}, values.map((value) => html(tag, {}, String(value))));
   function listDetections() {
     const now = episode.fixations[fixation].detections, table = find("detections");
-    if (!now.length) return table.replaceChildren(row("td", ["nothing was detected"]));
+    if (!now.length) return table.replaceChildren(row("td", ["no detections"]));
     const most = Math.max(...now.map((detection) => detection.scores.length));
     const heads = Array.from({ length: most }, (_, number) => `class ${number + 1}`);
     const rows = now.map((detection, number) => row("td", [number + 1, ...detection.scores.map(([name, score]) => `${name} ${(score ?? 0).toFixed(3)}`)]));
@@ -184,7 +184,7 @@
     find("seconds").replaceChildren(html("thead", {}, head), html("tbody", {}, rows));
   }
 
-  // What the reader does.
+  // Controls.
   function show() {
     const now = episode.fixations[fixation], last = episode.fixations.length - 1;
     find("fixation").value = fixation;
@@ -249,7 +249,7 @@
   find("forward").addEventListener("click", () => { stop(); go(fixation + 1); });
   find("play").addEventListener("click", play);
   document.addEventListener("keydown", (event) => {
-    // Lists and the slider have their own use for these keys.
+    // Lists and the slider use these keys themselves.
     if (event.target.closest("select, input, .wide") || event.altKey || event.ctrlKey || event.metaKey) return;
     const moves = { ArrowLeft: fixation - 1, ArrowRight: fixation + 1, Home: 0, End: episode.fixations.length - 1 };
     if (!(event.key in moves)) return;

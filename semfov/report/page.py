@@ -1,4 +1,4 @@
-"""A page as one file: markup, style, program and data, and nothing fetched from anywhere."""
+"""A page as a single file with markup, style, script and data, which loads nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -19,26 +19,29 @@ if TYPE_CHECKING:
 FOLDER = Path(__file__).parent
 
 OPACITY = 0.82
-"""Of colours that are no probabilities, over the photograph."""
+"""Opacity over the photograph of colours that do not stand for probabilities."""
 
 ABOUT = {"name": "Photograph", "detector": "Detector", "sensor": "Sensor", "decision": "Decision"}
-"""What stands at the head of a page, by its key in an episode's data."""
+"""Entries at the head of a page, by their keys in the data of an episode."""
 
 
 def write_page(path: Path, title: str, episodes: Sequence[Data], pool: Pool, *, sections: str = "") -> Path:
-    """Write a page with episodes to step through, and return its path; arguments as for `page_html`."""
+    """Write a page on which a reader steps through episodes, and return its path; arguments as for `page_html`."""
     write_text(path, page_html(title, episodes, pool, sections=sections))
     return path
 
 
 def page_html(title: str, episodes: Sequence[Data], pool: Pool, *, sections: str = "") -> str:
-    """A page with episodes to step through.
+    """Make a page on which a reader steps through episodes.
 
     Args:
         title: plain text.
-        episodes: from `episode_data`.
-        pool: the pictures of the episodes.
-        sections: HTML that stands above the episodes, escaped already.
+        episodes: data of the episodes (`semfov.report.episode.episode_data`).
+        pool: pictures of the episodes.
+        sections: HTML to insert above the episodes, with special characters already escaped.
+
+    Returns:
+        The HTML of the page.
     """
     data = {
         "episodes": list(episodes),
@@ -59,12 +62,12 @@ def page_html(title: str, episodes: Sequence[Data], pool: Pool, *, sections: str
         "about": about_html(episodes[0] if episodes else None),
     }
     template = (FOLDER / "page.html").read_text(encoding="utf-8")
-    # In one pass, so that nothing in a part is taken for a place to fill in.
+    # All parts are inserted in one pass, so that braces inside a part are not taken for a placeholder.
     return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], template)
 
 
 def about_html(episode: Data | None) -> str:
-    """What was looked at, by what, and what came of it; the program changes it when it opens another episode."""
+    """The head of the page: photograph, detector, sensor and decision; the script updates it for other episodes."""
     if episode is None:
         return ""
     told = "".join(
@@ -75,17 +78,32 @@ def about_html(episode: Data | None) -> str:
 
 
 def json_script(data: Any) -> str:
-    """JSON that can stand in a script element, whatever its texts contain.
+    r"""JSON text that is safe inside a script element.
+
+    Args:
+        data: JSON values.
+
+    Returns:
+        The text, in which `&`, `<` and `>` are escaped.
 
     >>> json_script({"class": "</script>"})
-    '{"class":"\\\\u003c/script\\\\u003e"}'
+    '{"class":"\\u003c/script\\u003e"}'
     """
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
 def colour_steps(colours: str | Colormap, opacity: float = 1.0, steps: int = 33) -> list[list[float]]:
-    """Red, green and blue of a colour map at equal steps, 0 to 255, and the opacity, 0 to 1."""
+    """Colours of a colour map at equal steps.
+
+    Args:
+        colours: matplotlib colour map, or its name.
+        opacity: factor on the opacity.
+        steps: number of colours.
+
+    Returns:
+        For each step red, green and blue from 0 to 255, and opacity from 0 to 1.
+    """
     from matplotlib import colormaps
 
     colours = colormaps[colours] if isinstance(colours, str) else colours

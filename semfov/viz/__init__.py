@@ -1,7 +1,7 @@
-"""Figures of search and belief, drawn to be read in print; each function returns a matplotlib figure.
+"""Figures of searches, explorations and beliefs, made for print; each function returns a matplotlib figure.
 
-Save one with `save_figure(figure, "name.pdf")` (PNG and SVG too); in a notebook, let it be the last value of a cell. To
-draw in a figure of your own, give its axes as `ax=` or `axes=`.
+Save a figure with `save_figure(figure, "name.pdf")` (PNG and SVG too). In a notebook, a figure is shown if it is the
+last value of a cell. To draw in an existing figure, give its axes as `ax=` or `axes=`.
 """
 
 from semfov.scanpath import describe, why_it_ended

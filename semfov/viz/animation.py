@@ -1,4 +1,4 @@
-"""Animations of figures: GIF by Pillow, MP4 where ffmpeg is installed."""
+"""Animations of episodes: GIF by Pillow, and MP4 where ffmpeg is installed."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class Film:
 
     Attributes:
         frames: pixels `(H, W, 3)`, all of one size.
-        seconds: that each frame stays.
-        hold: that the last frame stays longer.
-        title: what is to be seen.
+        seconds: duration of each frame.
+        hold: additional seconds of the last frame.
+        title: description of the film.
     """
 
     frames: list[Frame]
@@ -48,16 +48,16 @@ class Film:
         return len(self.frames)
 
     def __repr__(self) -> str:
-        """What it is, in a line."""
+        """One line on the content."""
         height, width = self.frames[0].shape[:2]
         return f"Film: {self.title}, {len(self)} frames of {width} × {height} px"
 
     def save(self, path: str | PathLike[str]) -> list[Path]:
-        """Write a GIF and, where ffmpeg is installed, an MP4 beside it; returns what was written."""
+        """Write a GIF and, where ffmpeg is installed, an MP4 beside it; returns the paths written."""
         return save_animation(self.frames, Path(path), seconds=self.seconds, hold=self.hold)
 
     def _repr_html_(self) -> str:
-        """The GIF itself, in the notebook's file."""
+        """The film as a GIF inside the notebook's file."""
         from html import escape
 
         file = io.BytesIO()
@@ -76,20 +76,29 @@ def animate(
     seconds: float = 1.0,
     hold: float = 2.0,
 ) -> Path | Film:
-    """Draw an episode as a film: for each fixation the scanpath so far, what was seen, and what was believed.
+    """Make a film of an episode: for each fixation the scanpath so far, the foveated view, and the belief.
 
     Args:
         scanpath: the episode.
-        path: of a GIF to write, with an MP4 beside it where ffmpeg is installed; None gives the film itself.
-        image: `(3, H, W)`, RGB in [0, 1]; None is the scanpath's own.
-        views: for each fixation the foveated photograph `(3, h, w)`; None are the scanpath's own.
-        boxes: `(M, 4)`, where the target really is.
-        seconds: that each frame stays.
-        hold: that the last frame stays longer.
+        path: GIF file to write, with an MP4 beside it where ffmpeg is installed; None returns the film instead.
+        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own.
+        views: for each fixation the foveated photograph `(3, h, w)`; None takes the scanpath's own.
+        boxes: `(M, 4)`, true boxes of the target.
+        seconds: duration of each frame.
+        hold: additional seconds of the last frame.
+
+    Returns:
+        The path of the GIF, or a film, which a notebook shows.
 
     Raises:
-        InputError: there are no photograph and views, neither given nor kept.
+        InputError: the photograph or the views are neither given nor kept by the scanpath, or a duration is out of
+            range.
         DataError: the file cannot be written.
+
+    Example::
+
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        animate(scanpath, "search.gif", seconds=0.5)
     """
     film = film_of(scanpath, image=image, views=views, boxes=boxes, seconds=seconds, hold=hold)
     return film if path is None else film.save(path)[0]
@@ -104,7 +113,7 @@ def film_of(
     seconds: float = 1.0,
     hold: float = 2.0,
 ) -> Film:
-    """The film of an episode; arguments as for `animate`."""
+    """Make the film of an episode; arguments and errors as for `animate`."""
     check(seconds > 0, "seconds", "a positive time", seconds)
     check(hold >= 0, "hold", "0 seconds or more", hold)
     frames = episode_frames(scanpath, photograph_of(scanpath, image), views_of(scanpath, views), boxes)
@@ -114,7 +123,7 @@ def film_of(
 def episode_frames(
     scanpath: Scanpath, image: Tensor, views: Sequence[Tensor], boxes: Tensor | None = None, dpi: int = 90
 ) -> list[Frame]:
-    """Frames of an episode, all drawn in one figure; each is what `plot_fixation` draws."""
+    """Frames of an episode, all drawn in one figure; each is the figure of `plot_fixation`."""
     from matplotlib import rc_context
 
     def figures() -> Iterator[Any]:
@@ -127,7 +136,7 @@ def episode_frames(
 
 
 def render(figures: Iterable[Any], dpi: int = 90) -> list[Frame]:
-    """Pixels `(H, W, 3)` of matplotlib figures, each drawn before the next one is asked for."""
+    """Draw matplotlib figures and return their pixels `(H, W, 3)`; each is drawn before the next is requested."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     frames = []
@@ -140,7 +149,7 @@ def render(figures: Iterable[Any], dpi: int = 90) -> list[Frame]:
 
 
 def in_palette(frame: Frame, refine: int = 0) -> Any:
-    """A frame as a Pillow image of 256 colours of its own, dithered; refining the colours takes seconds a round."""
+    """A frame as a Pillow image of 256 colours of its own, with dithering; each round of refinement takes seconds."""
     from PIL import Image
 
     image = Image.fromarray(frame)
@@ -148,13 +157,16 @@ def in_palette(frame: Frame, refine: int = 0) -> Any:
 
 
 def save_animation(frames: Sequence[Frame], path: Path, *, seconds: float = 1.0, hold: float = 2.0) -> list[Path]:
-    """Write `path` (a GIF) and, where ffmpeg is installed, an MP4 beside it; returns what was written.
+    """Write frames as a GIF and, where ffmpeg is installed, as an MP4 beside it.
 
     Args:
         frames: pixels `(H, W, 3)`, all of one size.
         path: of the GIF.
-        seconds: that each frame stays.
-        hold: that the last frame stays longer.
+        seconds: duration of each frame.
+        hold: additional seconds of the last frame.
+
+    Returns:
+        The paths written.
     """
     with replacing(path) as temporary, temporary.open("wb") as file:
         write_gif(frames, file, seconds, hold)
@@ -163,7 +175,7 @@ def save_animation(frames: Sequence[Frame], path: Path, *, seconds: float = 1.0,
 
 
 def write_gif(frames: Sequence[Frame], file: Any, seconds: float, hold: float) -> None:
-    """Write frames as a GIF, in 256 colours that they share."""
+    """Write frames as a GIF with a common palette of 256 colours."""
     first, *others = in_one_palette(frames)
     times = [int(1000 * seconds)] * len(frames)
     times[-1] += int(1000 * hold)
@@ -171,16 +183,23 @@ def write_gif(frames: Sequence[Frame], file: Any, seconds: float, hold: float) -
 
 
 def in_one_palette(frames: Sequence[Frame], most: int = 6) -> list[Any]:
-    """Frames as Pillow images of 256 colours: those of `most` of them, dithered.
+    """Frames as Pillow images with a common palette of 256 colours, which is made from `most` of them.
 
-    A palette of each frame's own would make what stands still flicker.
+    With a palette for each frame, static parts of the film would flicker.
+
+    Args:
+        frames: pixels `(H, W, 3)`, all of one size.
+        most: largest number of frames that the palette is made from.
+
+    Returns:
+        The Pillow images.
     """
     from PIL import Image
 
     chosen = [frames[round(n)] for n in np.linspace(0, len(frames) - 1, min(most, len(frames)))]
     palette = Image.fromarray(np.concatenate([frame[::2, ::2] for frame in chosen])).quantize(256)
     colours = np.array(palette.getpalette()).reshape(-1, 3)
-    # A mean of almost white is not white, and that is what most of a figure is.
+    # Most of a figure is white, but the palette's mean of nearly white pixels is not: make it white.
     colours[(colours >= 244).all(-1)] = 255
     palette.putpalette(colours.flatten().tolist())
     return [Image.fromarray(frame).quantize(palette=palette) for frame in frames]
@@ -191,7 +210,7 @@ def _save_mp4(ffmpeg: str, frames: Sequence[Frame], path: Path, seconds: float, 
     stay = 1 + round(hold / seconds)
     pixels = b"".join(frame.tobytes() for frame in [*frames[:-1], *[frames[-1]] * stay])
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{1 / seconds:g}", "-i", "-"]
-    # Players want even sizes, 4:2:0 colour and more than one frame a second.
+    # Players need even sizes, 4:2:0 colour and more than one frame per second.
     options = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-r", "10", "-f", "mp4"]
     with replacing(path) as temporary:
         command = [ffmpeg, "-loglevel", "error", "-y", *source, *options, str(temporary)]

@@ -1,4 +1,4 @@
-"""What is believed of a class: overlays on the photograph, bars."""
+"""The probability of one class in every cell: over the photograph, and as bars."""
 
 from __future__ import annotations
 
@@ -20,18 +20,29 @@ if TYPE_CHECKING:
 
 
 def class_posterior(scanpath: Scanpath, target: int | None = None) -> Tensor:
-    """Probability of a class in every cell after each look, `(n, X·Y)`.
+    """Probability of a class in every cell after each look.
 
     Args:
         scanpath: the episode.
-        target: index of the class; None is the one that was searched for, as the search believed it.
+        target: index of the class; None takes the class that was searched for, with the belief of the search.
+
+    Returns:
+        `(n, X·Y)`, on the CPU.
 
     Raises:
         InputError: no class is given and nothing was searched for, or there is no such class.
+
+    >>> import torch
+    >>> from semfov import Grid
+    >>> grid, p = Grid(2, 1, (20, 10)), torch.tensor([[[0.5, 0.5], [0.9, 0.1]]])
+    >>> cells, values = torch.tensor([0]), torch.zeros(1, 2)
+    >>> path = Scanpath(grid, ("background", "cup"), 1, cells, grid.centres[cells], (), p, values, found=False)
+    >>> class_posterior(path)
+    tensor([[0.5000, 0.1000]])
     """
     index = scanpath.target if target is None else target
     if index is None:
-        raise InputError("target: expected a class index, since the scanpath has none, got None")
+        raise InputError("target: expected a class index, as nothing was searched for, got None")
     last = len(scanpath.classes) - 1
     check(0 <= index <= last, "target", f"a class index from 0 to {last}", index)
     if scanpath.posterior is not None and index == scanpath.target:
@@ -48,16 +59,27 @@ def plot_belief(
     image: Tensor | None = None,
     ax: Axes | None = None,
 ) -> Figure:
-    """Probability of a class in every cell after a fixation, laid over the photograph in grey.
+    """Plot the probability of a class in every cell after a fixation, over the photograph in grey.
 
-    The scale goes from 0, where the photograph is as it is, to 1, so that all such pictures compare.
+    The colour scale goes from 0, where the photograph is visible unchanged, to 1. All such figures can be compared.
 
     Args:
         scanpath: the episode.
-        fixation: its number; -1 is the last.
-        target: index of the class; None is the one that was searched for.
-        image: `(3, H, W)`, RGB in [0, 1]; None is the scanpath's own, where it has one.
+        fixation: number of the fixation; -1 is the last.
+        target: index of the class; None takes the class that was searched for.
+        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own, where it has one.
         ax: axes to draw in; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: there is no such fixation or class.
+
+    Example::
+
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        save_figure(plot_belief(scanpath), "belief.pdf")
     """
     figure, (axes,) = make_figure(1, 1, width=5.6, height=4.6, layout="compressed", given=only(ax))
     drawn = draw_belief(axes, scanpath, check_fixation(scanpath, fixation), target, _grey(scanpath, image))
@@ -75,15 +97,26 @@ def plot_belief_strip(
     columns: int = 5,
     axes: Sequence[Axes] | None = None,
 ) -> Figure:
-    """`plot_belief` for every fixation, with one scale; at most so many: the first ones and the last.
+    """Plot `plot_belief` for several fixations with a common colour scale.
 
     Args:
         scanpath: the episode.
-        target: index of the class; None is the one that was searched for.
+        target: index of the class; None takes the class that was searched for.
         image: as for `plot_belief`.
-        most: at most so many fixations are shown.
-        columns: pictures side by side.
-        axes: to draw in, as many as there are fixations to show; None makes a figure.
+        most: largest number of fixations to show: the first ones and the last.
+        columns: number of pictures in a row.
+        axes: axes to draw in, one for each fixation that is shown; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: there is no such class, or an argument is out of range.
+
+    Example::
+
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        save_figure(plot_belief_strip(scanpath, most=4, columns=2), "beliefs.pdf")
     """
     check(columns >= 1, "columns", "at least 1", columns)
     shown, grey = choose_fixations(scanpath, most), _grey(scanpath, image)
@@ -106,15 +139,26 @@ def plot_belief_strip(
 def plot_belief_bars(
     scanpath: Scanpath, *, target: int | None = None, most: int = 4, axes: Sequence[Axes] | None = None
 ) -> Figure:
-    """Probability of a class in every cell as bars over the grid, after at most so many fixations, on one scale.
+    """Plot the probability of a class as bars over the grid, after several fixations, with a common scale.
 
-    The grid is seen from below the picture: the near edge is its bottom row.
+    The grid is seen from below the picture: its near edge is the bottom row.
 
     Args:
         scanpath: the episode.
-        target: index of the class; None is the one that was searched for.
-        most: at most so many fixations are shown: the first ones and the last.
-        axes: with `projection="3d"`, as many as there are fixations to show; None makes a figure.
+        target: index of the class; None takes the class that was searched for.
+        most: largest number of fixations to show: the first ones and the last.
+        axes: axes with `projection="3d"`, one for each fixation that is shown; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: there is no such class, or the axes are too few, too many, or not in 3D.
+
+    Example::
+
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        save_figure(plot_belief_bars(scanpath), "bars.pdf")
     """
     from matplotlib import colormaps
     from matplotlib.figure import Figure
@@ -126,8 +170,9 @@ def plot_belief_bars(
         figure = Figure(figsize=(3.3 * len(shown) + 0.4, 3.0), layout="constrained")
         panels: list[Any] = [figure.add_subplot(1, len(shown), n + 1, projection="3d") for n in range(len(shown))]
     else:
-        check(len(axes) == len(shown), "axes", f"{len(shown)} of them", len(axes))
-        check(all(hasattr(each, "bar3d") for each in axes), "axes", 'those with projection="3d"', "others")
+        check(len(axes) == len(shown), "axes", f"{len(shown)} axes, one for each fixation", len(axes))
+        solid = all(hasattr(each, "bar3d") for each in axes)
+        check(solid, "axes", 'axes with projection="3d"', "axes without it")
         figure, panels = root(axes[0]), list(axes)
     column, row = (index.ravel() for index in np.meshgrid(np.arange(grid.columns), np.arange(grid.rows)))
     for panel, fixation in zip(panels, shown, strict=True):
@@ -150,7 +195,7 @@ def plot_belief_bars(
 
 
 def draw_belief(axes: Axes, scanpath: Scanpath, fixation: int, target: int | None, image: Tensor | None) -> AxesImage:
-    """Probability of a class in every cell over a photograph, from 0 to 1."""
+    """Draw the probability of a class in every cell, from 0 to 1, over a photograph."""
     posterior = class_posterior(scanpath, target)[fixation]
     if image is not None:
         draw_image(axes, image, scanpath.grid, grey=True)
@@ -161,13 +206,13 @@ def draw_belief(axes: Axes, scanpath: Scanpath, fixation: int, target: int | Non
 
 
 def belief_title(scanpath: Scanpath, fixation: int, target: int | None = None) -> str:
-    """The greatest probability of a class after a fixation, in words."""
+    """Text with the highest probability of a class in any cell after a fixation."""
     highest = float(class_posterior(scanpath, target)[fixation].max())
     return f"p({_name(scanpath, target)}) up to {highest:.2f}"
 
 
 def _grey(scanpath: Scanpath, image: Tensor | None) -> Tensor | None:
-    """The photograph to lay beliefs over, where there is one."""
+    """The photograph under the belief: the given one, or the scanpath's own."""
     return scanpath.image if image is None else image
 
 

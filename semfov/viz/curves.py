@@ -1,4 +1,4 @@
-"""Curves of merit over gaze shifts."""
+"""Curves over gaze shifts."""
 
 from __future__ import annotations
 
@@ -18,22 +18,28 @@ if TYPE_CHECKING:
 Curves = Mapping[str, NDArray[np.float64]]
 
 REST = "0.6"
-"""Colour of the curves that a legend does not name."""
+"""Colour of the curves that the legend does not name."""
 
 
 @styled
 def plot_cumulative_performance(
     curves: Curves, errors: Curves | None = None, *, title: str = "", ax: Axes | None = None
 ) -> Figure:
-    """Share of targets found after each gaze shift, one curve per policy, with bands of one standard error.
+    """Plot the fraction of targets found after each gaze shift, one curve a policy, with bands of one standard error.
 
-    Of more than seven curves the legend names the highest and those of random gaze; the others are grey.
+    Of more than seven curves the legend names the highest ones and those of random gaze; the others are grey.
 
     Args:
         curves: for each policy its cumulative performance after 0, 1, 2, … gaze shifts, in [0, 1].
         errors: standard errors of the same shape.
         title: title of the figure.
         ax: axes to draw in; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: there is no curve.
 
     >>> figure = plot_cumulative_performance({"random": np.linspace(0, 0.8, 31)})
     """
@@ -46,9 +52,23 @@ def plot_cumulative_performance(
 def plot_success_rate(
     curves: Curves, errors: Curves | None = None, *, title: str = "", ax: Axes | None = None
 ) -> Figure:
-    """Share of the cells with objects whose class is right after each gaze shift.
+    """Plot the fraction of cells with objects whose class is correct after each gaze shift, one curve for each policy.
 
-    Arguments as for `plot_cumulative_performance`.
+    Of more than seven curves the legend names the highest ones and those of random gaze; the others are grey.
+
+    Args:
+        curves: for each policy its success rate after 0, 1, 2, … gaze shifts, in [0, 1].
+        errors: standard errors of the same shape.
+        title: title of the figure.
+        ax: axes to draw in; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: there is no curve.
+
+    >>> figure = plot_success_rate({"random": np.linspace(0.1, 0.5, 21)}, title="exploration")
     """
     return _plot_curves(curves, errors, title, "cells with the right class (%)", ax)[0]
 
@@ -61,18 +81,24 @@ def plot_curve_panels(
     columns: int = 2,
     axes: Sequence[Axes] | None = None,
 ) -> Figure:
-    """Curves of several experiments with the same policies side by side, with one legend.
+    """Plot curves of several experiments with the same policies side by side, with one legend.
 
     Args:
-        panels: by title, curves in [0, 1] and their standard errors, as for `plot_cumulative_performance`.
+        panels: for each title, curves in [0, 1] and their standard errors, as for `plot_cumulative_performance`.
         label: of the vertical axis.
-        columns: panels in a row.
-        axes: to draw in, one for each panel; None makes a figure.
+        columns: number of panels in a row.
+        axes: axes to draw in, one for each panel; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: there is no panel, or the number of axes does not fit.
 
     >>> curves = {"random": np.linspace(0, 0.8, 31)}
     >>> figure = plot_curve_panels({"wide": (curves, {}), "narrow": (curves, {})}, label="targets found (%)")
     """
-    check(len(panels) > 0, "panels", "at least one", 0)
+    check(len(panels) > 0, "panels", "at least one panel", 0)
     columns = len(panels) if axes is not None else columns
     rows = -(-len(panels) // columns)
     figure, every = make_figure(rows, columns, width=4.4 * columns, height=2.9 * rows + 0.5, given=axes)
@@ -86,7 +112,14 @@ def plot_curve_panels(
 
 
 def highlighted(curves: Curves, most: int = len(COLOURS)) -> list[str]:
-    """Curves that a legend names, at most so many: the highest on average, and random gaze, which all are held against.
+    """The curves that a legend names: the highest on average, and random gaze as the reference.
+
+    Args:
+        curves: by name.
+        most: largest number of curves to name.
+
+    Returns:
+        Their names, in the order of `curves`.
 
     >>> highlighted({"random": np.zeros(2), "a": np.ones(2), "b": np.full(2, 0.5)}, most=2)
     ['random', 'a']
@@ -97,7 +130,13 @@ def highlighted(curves: Curves, most: int = len(COLOURS)) -> list[str]:
 
 
 def others_named(count: int) -> str:
-    """The one entry in a legend for all curves that it does not name.
+    """The legend's single entry for all curves that it does not name.
+
+    Args:
+        count: number of these curves.
+
+    Returns:
+        The text.
 
     >>> others_named(9)
     '9 others'
@@ -106,7 +145,7 @@ def others_named(count: int) -> str:
 
 
 def _draw(axes: Axes, curves: Curves, errors: Curves | None, band: float, named: Sequence[str] | None = None) -> None:
-    """Curves with bands of one standard error; those that are not `named` are grey."""
+    """Draw curves with bands of one standard error; those that are not in `named` are grey."""
     from matplotlib.ticker import MaxNLocator
 
     named = list(curves) if named is None else named
@@ -128,7 +167,7 @@ def _draw(axes: Axes, curves: Curves, errors: Curves | None, band: float, named:
 
 
 def legend_of(figure: Figure, axes: Axes, *, columns: int, given: bool) -> None:
-    """The legend of axes below their figure, or in the axes where the figure is the caller's own."""
+    """Draw the legend of axes below their figure, or inside the axes where the figure was given by the caller."""
     lines, names = axes.get_legend_handles_labels()
     if given:
         axes.legend(lines, names)
@@ -137,13 +176,13 @@ def legend_of(figure: Figure, axes: Axes, *, columns: int, given: bool) -> None:
 
 
 def _plot_curves(curves: Curves, errors: Curves | None, title: str, label: str, ax: Axes | None) -> tuple[Figure, Axes]:
-    check(len(curves) > 0, "curves", "at least one", 0)
+    check(len(curves) > 0, "curves", "at least one curve", 0)
     figure, (axes,) = make_figure(1, 1, width=6.2, height=4.0, given=only(ax))
     _draw(axes, curves, errors, band=0.15, named=highlighted(curves))
     axes.set(xlabel="gaze shifts", ylabel=label, title=title)
     lines, names = axes.get_legend_handles_labels()
     if len(curves) > len(COLOURS):
-        # The rest was drawn first, below the others, and comes last.
+        # The grey curves were drawn first, below the others, but come last in the legend.
         lines, names = [*lines[1:], lines[0]], [*names[1:], names[0]]
     axes.legend(lines, names, loc="lower right", framealpha=0.9)
     return figure, axes

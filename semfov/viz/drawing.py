@@ -1,4 +1,4 @@
-"""What figures are made of: photograph, grid, what is believed of cells, boxes with labels, the point of gaze."""
+"""Parts of figures: photograph, grid, values of cells, boxes with labels, and the point of gaze."""
 
 from __future__ import annotations
 
@@ -20,47 +20,57 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 CONFIDENT = 0.1
-"""Detections that are less confident are not drawn."""
+"""Detections of lower confidence are not drawn."""
 
 _LABEL_POINTS = 6.5
 
 
 def photograph_of(scanpath: Scanpath, image: Tensor | None) -> Tensor:
-    """The image that was given, or the one that the scanpath kept, `(3, h, w)`.
+    """The given image, or the one that the scanpath kept.
+
+    Args:
+        scanpath: the episode.
+        image: `(3, h, w)`, or None.
+
+    Returns:
+        `(3, h, w)`.
 
     Raises:
         InputError: there is neither.
     """
     shown = scanpath.image if image is None else image
     if shown is None:
-        raise InputError("image: expected the photograph, for the scanpath has kept none, got None")
+        raise InputError("image: expected the photograph, as the scanpath kept none, got None")
     return shown
 
 
 def check_fixation(scanpath: Scanpath, fixation: int) -> int:
-    """The number of a fixation, counted from the end where it is negative."""
+    """The number of a fixation; negative numbers count from the end."""
     count = len(scanpath)
-    check(-count <= fixation < count, "fixation", f"one of {count} (or -1 for the last)", fixation)
+    check(-count <= fixation < count, "fixation", f"a number from 0 to {count - 1}, or -1 for the last", fixation)
     return fixation % count
 
 
 def choose_fixations(scanpath: Scanpath, most: int) -> list[int]:
-    """At most so many fixations: the first ones and the last."""
+    """Numbers of at most `most` fixations: the first ones and the last."""
     check(most >= 1, "most", "at least 1", most)
     count = len(scanpath)
     return list(range(count)) if count <= most else [*range(most - 1), count - 1]
 
 
 def draw_image(axes: Axes, image: Tensor, grid: Grid, *, grey: bool = False) -> AxesImage:
-    """A photograph or a view of it `(3, h, w)`, of any size, in the frame of the grid.
+    """Draw a photograph or a view of it, of any size, in the coordinates of the grid.
 
-    Coordinates are pixel edges, not centres, at integers: the frame of boxes and of the grid.
+    Pixel edges, not centres, are at integers, as for boxes and for the grid.
 
     Args:
         axes: to draw in.
-        image: RGB in [0, 1].
+        image: `(3, h, w)`, RGB in [0, 1].
         grid: the cells.
-        grey: its lightness alone, for colours to be laid over it.
+        grey: draw the luma alone, so that colours can be laid over it.
+
+    Returns:
+        The matplotlib image.
     """
     width, height = grid.extent.tolist()
     drawn = axes.imshow(pixels_of(image, grey=grey), extent=(0, width, height, 0), interpolation="bilinear")
@@ -69,7 +79,7 @@ def draw_image(axes: Axes, image: Tensor, grid: Grid, *, grey: bool = False) -> 
 
 
 def pixels_of(image: Tensor, *, grey: bool = False) -> Any:
-    """A picture `(3, h, w)` as matplotlib takes it; grey is Rec. 601's luma."""
+    """A picture `(3, h, w)` as an array for matplotlib; grey is the luma of Rec. 601."""
     check_shape(image, "image", 3, None, None)
     shown = image.detach().cpu().clamp(0, 1)
     if grey:
@@ -78,7 +88,7 @@ def pixels_of(image: Tensor, *, grey: bool = False) -> Any:
 
 
 def draw_cells(axes: Axes, grid: Grid, values: Tensor, *, alpha: float | None = None, **style: Any) -> AxesImage:
-    """A value of every cell `(X·Y,)` as a colour."""
+    """Draw a value of every cell `(X·Y,)` as a colour."""
     width, height = grid.extent.tolist()
     drawn = axes.imshow(
         table_of(grid, values), extent=(0, width, height, 0), alpha=alpha, interpolation="nearest", **style
@@ -88,12 +98,12 @@ def draw_cells(axes: Axes, grid: Grid, values: Tensor, *, alpha: float | None = 
 
 
 def draw_overlay(axes: Axes, grid: Grid, probabilities: Tensor) -> AxesImage:
-    """A probability of every cell `(X·Y,)`, from 0, which is transparent, to 1: one scale for all pictures."""
+    """Draw a probability of every cell `(X·Y,)` over a picture, on a scale from 0, which is transparent, to 1."""
     return draw_cells(axes, grid, probabilities, cmap=overlay_colours(), vmin=0, vmax=1)
 
 
 def draw_scale(axes: Axes | list[Axes], drawn: AxesImage, label: str) -> None:
-    """The colour bar of what was drawn."""
+    """Draw the colour bar of an image."""
     first = axes[0] if isinstance(axes, list) else axes
     figure: Any = first.figure
     figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
@@ -105,7 +115,7 @@ def table_of(grid: Grid, values: Tensor) -> Any:
 
 
 def draw_grid(axes: Axes, grid: Grid) -> None:
-    """The borders of the cells."""
+    """Draw the borders of the cells."""
     from matplotlib.collections import LineCollection
 
     width, height = grid.extent.tolist()
@@ -115,7 +125,7 @@ def draw_grid(axes: Axes, grid: Grid) -> None:
 
 
 def draw_boxes(axes: Axes, boxes: Tensor, colour: str, line: str = "-", width: float = 1.2) -> list[Artist]:
-    """Outlines of boxes `(M, 4)`."""
+    """Draw the outlines of boxes `(M, 4)`."""
     from matplotlib.patches import Rectangle
 
     style: dict[str, Any] = {"edgecolor": colour, "linestyle": line, "linewidth": width}
@@ -125,7 +135,7 @@ def draw_boxes(axes: Axes, boxes: Tensor, colour: str, line: str = "-", width: f
 
 
 def draw_gaze(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
-    """A cross where the gaze is."""
+    """Draw a cross at the point of gaze."""
     x, y = (scanpath.fixations[fixation].cpu() + 0.5).tolist()
     return [
         *axes.plot(x, y, "+", color="white", markersize=11, markeredgewidth=2.8, zorder=5),
@@ -134,7 +144,7 @@ def draw_gaze(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
 
 
 def seen_well(scanpath: Scanpath, fixation: int, most: int) -> tuple[Tensor, list[int], list[float]]:
-    """The most confident detections of a look that are drawn: boxes `(M, 4)`, classes and scores."""
+    """The most confident detections of a look: boxes `(M, 4)`, classes and scores."""
     detections = scanpath.detections[fixation]
     sure = detections.confidence[0] >= CONFIDENT
     labels = detections.labels[0][sure][:most].tolist()
@@ -144,10 +154,20 @@ def seen_well(scanpath: Scanpath, fixation: int, most: int) -> tuple[Tensor, lis
 def draw_detections(
     axes: Axes, scanpath: Scanpath, fixation: int, most: int = 6, kept_free: list[Box] | None = None
 ) -> list[Artist]:
-    """The most confident detections of a look, each labelled by its best class that is not background.
+    """Draw the most confident detections of a look, each labelled with its best class other than background.
 
-    Labels leave the point of gaze free, and the rectangles of `kept_free`; where they fit is known once the figure is
-    laid out.
+    Labels cover neither the point of gaze nor the rectangles of `kept_free`. The figure must be laid out, because the
+    positions of labels depend on the layout.
+
+    Args:
+        axes: to draw in.
+        scanpath: the episode.
+        fixation: number of the look.
+        most: largest number of detections.
+        kept_free: rectangles that labels must not cover.
+
+    Returns:
+        The artists drawn.
     """
     boxes, labels, scores = seen_well(scanpath, fixation, most)
     texts = [f"{scanpath.classes[label]} {score:.2f}" for label, score in zip(labels, scores, strict=True)]
@@ -178,22 +198,22 @@ def draw_detections(
 
 
 def text_size(axes: Axes, text: str, points: float) -> tuple[float, float]:
-    """About the `(width, height)` of a label in the units of axes that are laid out."""
+    """Approximate `(width, height)` of a label in units of axes that are laid out."""
     scale = per_point(axes)
     return (_text_width(text) * points + 3) * scale, (points * 1.2 + 2.5) * scale
 
 
 @lru_cache(1024)
 def _text_width(text: str) -> float:
-    """How wide a text is beside the size of its letters."""
+    """Width of a text for a font size of 1."""
     from matplotlib.textpath import TextPath
 
-    # An empty path has no extents. What stands between dollars is text here, and no formula.
+    # An empty path has no extents. Dollar signs are replaced, because matplotlib would typeset a formula.
     return float(TextPath((0, 0), text.replace("$", "S"), size=1).get_extents().width) if text.strip() else 0.0
 
 
 def per_point(axes: Axes) -> float:
-    """How many units of the axes make a point, once the figure is laid out."""
+    """Number of units of the axes in a point, once the figure is laid out."""
     figure: Any = axes.figure
     box = axes.get_window_extent()
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
@@ -202,7 +222,7 @@ def per_point(axes: Axes) -> float:
 
 
 def lightness(colour: Any) -> float:
-    """Rec. 601's luma of a colour, from 0 to 1."""
+    """Luma of a colour by Rec. 601, from 0 to 1."""
     from matplotlib.colors import to_rgb
 
     return float(torch.tensor(to_rgb(colour)) @ torch.tensor([0.299, 0.587, 0.114]))

@@ -1,4 +1,4 @@
-"""One fixation after the other in one figure: what an animation is made of."""
+"""One fixation in a figure: a frame of an animation."""
 
 from __future__ import annotations
 
@@ -41,20 +41,28 @@ def plot_fixation(
     boxes: Tensor | None = None,
     axes: Sequence[Axes] | None = None,
 ) -> Figure:
-    """One fixation: the scanpath so far, what was seen, what was believed after it; a frame of an animation.
+    """Plot one fixation: the scanpath so far, the foveated view with its detections, and the belief after the look.
 
-    The belief is the target's posterior, or what is where if nothing is searched for.
+    The belief is the target's posterior, or the semantic map if nothing was searched for.
 
     Args:
         scanpath: the episode.
-        fixation: its number; -1 is the last.
-        image: `(3, H, W)`, RGB in [0, 1]; None is the scanpath's own.
-        view: the foveated photograph `(3, h, w)`, of any size; None is the scanpath's own.
-        boxes: `(M, 4)`, where the target really is (drawn dashed).
-        axes: three of them to draw in; None makes a figure.
+        fixation: number of the fixation; -1 is the last.
+        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own.
+        view: the foveated photograph `(3, h, w)`, of any size; None takes the scanpath's own.
+        boxes: `(M, 4)`, true boxes of the target, drawn dashed.
+        axes: three axes to draw in; None makes a figure.
+
+    Returns:
+        The figure.
 
     Raises:
-        InputError: there are no photograph and view, neither given nor kept.
+        InputError: the photograph or the view is neither given nor kept by the scanpath, or there is no such fixation.
+
+    Example::
+
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        save_figure(plot_fixation(scanpath, 0), "first.png")
     """
     fixation = check_fixation(scanpath, fixation)
     view = scanpath.views()[fixation] if view is None else view
@@ -62,18 +70,18 @@ def plot_fixation(
 
 
 class FixationFigure:
-    """A figure of one fixation that goes to others: laid out once, and only what differs is changed.
+    """A figure of one fixation that can show other fixations: it is laid out once, and only differences are redrawn.
 
     Args:
         scanpath: the episode.
         image: `(3, H, W)`, RGB in [0, 1].
         view: any foveated photograph `(3, h, w)`, for its size.
-        boxes: `(M, 4)`, where the target really is.
-        axes: three of them to draw in; None makes a figure.
+        boxes: `(M, 4)`, true boxes of the target.
+        axes: three axes to draw in; None makes a figure.
 
     Attributes:
         figure: the figure.
-        axes: of scanpath, view and belief.
+        axes: axes of scanpath, view and belief.
     """
 
     def __init__(
@@ -89,7 +97,7 @@ class FixationFigure:
         self.figure, self.axes = make_figure(1, 3, width=12.6, height=height, layout="compressed", given=axes)
         path, seen, believed = self.axes
         if axes is None:
-            # Pictures have no ticks, and to find that out takes a tenth of the time.
+            # Hidden axes save the layout of ticks, a tenth of the time.
             for panel in self.axes:
                 panel.xaxis.set_visible(False)
                 panel.yaxis.set_visible(False)
@@ -101,20 +109,20 @@ class FixationFigure:
             self.belief = draw_semantic_map(believed, scanpath, 0, image)
         else:
             self.belief = draw_belief(believed, scanpath, 0, None, image)
-        # Its cross goes with the fixation.
+        # `show` draws the cross of the gaze.
         for line in list(believed.lines):
             line.remove()
         draw_scale(believed, self.belief, "probability")
         path.set_title("fixation 0")
         lay_out(self.figure)
         if axes is None:
-            # Nothing moves from now on, and to lay it out again takes as long as to draw it.
+            # The layout does not change any more, and computing it again takes as long as drawing.
             self.figure.set_layout_engine("none")
         self.path = GazePath(path, scanpath)
         self.changing: list[Artist] = []
 
     def show(self, fixation: int, view: Tensor) -> Figure:
-        """Go to a fixation, seen as `view` `(3, h, w)`."""
+        """Show a fixation, seen as `view` `(3, h, w)`."""
         path, seen, believed = self.axes
         for artist in self.changing:
             artist.remove()
@@ -125,7 +133,7 @@ class FixationFigure:
         self.changing += draw_detections(seen, self.scanpath, fixation, MOST_BOXES)
         if self.scanpath.target is None:
             values: Any = most_probable(self.scanpath, fixation)
-            believed.set_title(f"what is where after fixation {fixation}")
+            believed.set_title(f"semantic map after fixation {fixation}")
             self.changing += write_names(believed, self.scanpath, fixation)
         else:
             values = posterior_of(self.scanpath)[fixation]

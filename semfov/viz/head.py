@@ -1,4 +1,4 @@
-"""Where eye and head looked in a scene, as a figure and as a film."""
+"""Figures and films of eye and head in a scene."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def describe_head(path: HeadPath) -> str:
-    """What came of it, in a sentence."""
+    """One sentence on the outcome of an episode."""
     what = "exploration" if path.target is None else path.classes[path.target]
     found = "" if path.target is None else (" found" if path.found else " not found")
     looks = f"{len(path)} look{'s' if len(path) != 1 else ''}"
@@ -34,16 +34,27 @@ def describe_head(path: HeadPath) -> str:
 
 @styled
 def plot_head_path(path: HeadPath, image: ImageLike, *, looks: int | None = None, ax: Axes | None = None) -> Figure:
-    """The windows that the head turned to, the fixations in their order, and the objects that were found.
+    """Plot the windows that the head turned to, the fixations in their order, and the objects that were found.
 
     Args:
-        path: of a search or an exploration.
-        image: the scene's picture at any size, of any common kind (`semfov.as_image`).
-        looks: draw the first so many; None draws all.
+        path: record of a search or an exploration.
+        image: the scene's picture in any size, of any common kind (`semfov.as_image`).
+        looks: number of looks to draw, from the first; None draws all.
         ax: axes to draw in; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: there are fewer looks.
+
+    Example::
+
+        path = agent.search(Panorama("street.jpg"), "bicycle")
+        save_figure(plot_head_path(path, "street.jpg"), "path.png")
     """
     count = len(path) if looks is None else looks
-    check(1 <= count <= len(path), "looks", f"1 to {len(path)}", count)
+    check(1 <= count <= len(path), "looks", f"a number from 1 to {len(path)}", count)
     width, height = path.views.world.scene.extent.tolist()
     figure, (axes,) = make_figure(
         1, 1, width=7.2, height=7.2 * height / width + 0.3, layout="compressed", given=only(ax)
@@ -54,7 +65,7 @@ def plot_head_path(path: HeadPath, image: ImageLike, *, looks: int | None = None
 
 
 def draw_path(axes: Axes, path: HeadPath, image: Tensor, count: int) -> None:
-    """The first so many looks, in pixels of the scene's picture."""
+    """Draw the first `count` looks, in pixels of the scene's picture."""
     world = path.views.world
     draw_image(axes, image, world.scene)
     poses = list(dict.fromkeys(action // path.views.cells for action in path.actions[:count]))
@@ -80,7 +91,7 @@ def draw_path(axes: Axes, path: HeadPath, image: Tensor, count: int) -> None:
 
 
 def _outline(axes: Axes, path: HeadPath, places: Any, **style: Any) -> None:
-    """The border of one region of the scene; what crosses the seam of a panorama is drawn at both ends."""
+    """Draw the border of a region of the scene; one that crosses the seam of a panorama is drawn at both ends."""
     world = path.views.world
     if hasattr(places, "outlines"):
         points = world.pixels_of(places.outlines()[0]) + 0.5
@@ -94,7 +105,7 @@ def _outline(axes: Axes, path: HeadPath, places: Any, **style: Any) -> None:
 
 
 def _unwrapped(points: Tensor, path: HeadPath) -> tuple[Any, Any]:
-    """x and y of a line, whose neighbours in a panorama are less than half a turn apart."""
+    """Coordinates x and y of a line, made continuous across the seam of a panorama."""
     x, y = points.unbind(-1)
     if path.views.gaze.shape[-1] == 3:
         wide = float(path.views.world.scene.extent[0])
@@ -111,17 +122,25 @@ def animate_head(
     seconds: float = 0.8,
     hold: float = 2.0,
 ) -> Path | Film:
-    """A film of eye and head: for each look the scene with the windows so far, the view, and what is believed.
+    """Make a film of eye and head: for each look the scene with the windows so far, the view, and the belief.
 
     Args:
-        path: of a search or an exploration.
+        path: record of a search or an exploration.
         image: the scene's picture, of any common kind (`semfov.as_image`).
-        file: a GIF to write, with an MP4 beside it where ffmpeg is installed; None gives the film itself.
-        seconds: that each frame stays.
-        hold: that the last frame stays longer.
+        file: GIF file to write, with an MP4 beside it where ffmpeg is installed; None returns the film instead.
+        seconds: duration of each frame.
+        hold: additional seconds of the last frame.
+
+    Returns:
+        The path of the GIF, or a film, which a notebook shows.
 
     Raises:
         DataError: the file cannot be written.
+
+    Example::
+
+        path = agent.search(Panorama("street.jpg"), "bicycle")
+        animate_head(path, "street.jpg", "path.gif")
     """
     from matplotlib import rc_context
 

@@ -1,4 +1,4 @@
-"""Curves of people and models side by side."""
+"""Curves and scanpaths of people and models side by side."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Curves = Mapping[str, NDArray[np.float64]]
 
 @styled
 def plot_by_shift(curves: Curves, errors: Curves | None = None, *, label: str, title: str = "") -> Figure:
-    """A figure of merit after 1, 2, … gaze shifts, one curve per model, with bands of one standard error.
+    """Plot a measure after 1, 2, … gaze shifts, one curve for each model, with bands of one standard error.
 
     Args:
         curves: for each model `(N,)`.
@@ -28,9 +28,15 @@ def plot_by_shift(curves: Curves, errors: Curves | None = None, *, label: str, t
         label: of the vertical axis.
         title: title of the figure.
 
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: there is no curve.
+
     >>> figure = plot_by_shift({"people": np.linspace(2, 1, 8)}, label="NSS")
     """
-    check(len(curves) > 0, "curves", "at least one", 0)
+    check(len(curves) > 0, "curves", "at least one curve", 0)
     figure, (axes,) = make_figure(1, 1, width=8.0, height=4.0)
     for order, (name, curve) in enumerate(curves.items()):
         style = line_style(order, len(curves))
@@ -48,11 +54,17 @@ def plot_by_shift(curves: Curves, errors: Curves | None = None, *, label: str, t
 
 @styled
 def plot_scanpaths_beside(image: Tensor, scanpaths: Mapping[str, Sequence[NDArray[np.float64]]]) -> Figure:
-    """Scanpaths of several searchers over the same picture, a panel for each.
+    """Plot scanpaths of several searchers on the same picture, in one panel for each searcher.
 
     Args:
-        image: `(3, H, W)` in [0, 1].
-        scanpaths: by searcher, each `(n, 2)`, `(x, y)` in pixels; a larger mark is the first fixation.
+        image: `(3, H, W)`, RGB in [0, 1].
+        scanpaths: for each searcher its scanpaths `(n, 2)`, `(x, y)` in pixels; a larger mark shows the first fixation.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: there is no searcher.
 
     >>> import torch
     >>> figure = plot_scanpaths_beside(torch.rand(3, 60, 80), {"people": [np.array([[40.0, 30.0], [10.0, 10.0]])]})

@@ -1,4 +1,4 @@
-"""Where to write labels, so that none covers another."""
+"""Positions for labels, so that none covers another."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -9,13 +9,16 @@ Point = tuple[float, float]
 
 
 def place_labels(boxes: Sequence[Box], sizes: Sequence[Size], frame: Size, taken: Sequence[Box] = ()) -> list[Box]:
-    """Rectangles for the labels of boxes, in order: at a corner of the box where one is free, else further down.
+    """Rectangles for the labels of boxes: at a free corner of the box, or else further down.
 
     Args:
         boxes: `(x1, y1, x2, y2)`, y growing downwards.
         sizes: `(width, height)` of each label.
-        frame: `(width, height)` that labels should not leave, as far as they fit.
-        taken: rectangles to keep free, too.
+        frame: `(width, height)` of the picture, which labels leave only if they do not fit.
+        taken: rectangles that labels must not cover.
+
+    Returns:
+        A rectangle `(x1, y1, x2, y2)` for each label, in their order.
 
     >>> place_labels([(0, 0, 9, 9), (0, 0, 9, 9)], [(4, 1), (4, 1)], (10, 10))
     [(0.0, 0.0, 4.0, 1.0), (0.0, 8, 4.0, 9)]
@@ -37,15 +40,18 @@ def place_labels(boxes: Sequence[Box], sizes: Sequence[Size], frame: Size, taken
 
 
 def place_numbers(points: Sequence[Point], sizes: Sequence[Size], frame: Size, reach: float) -> list[Box | None]:
-    """Rectangles for the numbers of points: on the point where there is room, else near it; None where there is none.
+    """Rectangles for the numbers of points: on the point where there is room, or else near it.
 
-    No number covers another number or another point. The first and the last point come first.
+    No number covers another number or another point. The first and the last point are placed first.
 
     Args:
-        points: `(x, y)`, those that are the same count as one.
+        points: `(x, y)`; equal points count as one.
         sizes: `(width, height)` of each number.
-        frame: `(width, height)` that numbers do not leave.
-        reach: how far from a point its number may be.
+        frame: `(width, height)` of the picture, which numbers do not leave.
+        reach: largest distance of a number from its point.
+
+    Returns:
+        A rectangle for each number; None where there is no room.
 
     >>> first, second = place_numbers([(5, 5), (6, 5)], [(4, 4), (4, 4)], (20, 20), 9)
     >>> first[2] <= second[0]
@@ -69,9 +75,18 @@ def place_numbers(points: Sequence[Point], sizes: Sequence[Size], frame: Size, r
 def place_within(
     candidates: Sequence[Iterable[Point]], sizes: Sequence[Size], frame: Size, taken: Sequence[Box] = ()
 ) -> list[Box]:
-    """Rectangles for labels whose middle may be at any of some points, in order: the first one that is free.
+    """Rectangles for labels whose middle may be at any of several points: at the first free one.
 
-    Where none is, the label is moved down from the first.
+    Where none is free, the label is moved down from the first point.
+
+    Args:
+        candidates: for each label the possible middles, best first.
+        sizes: `(width, height)` of each label.
+        frame: `(width, height)` of the picture.
+        taken: rectangles that labels must not cover.
+
+    Returns:
+        A rectangle for each label, in their order.
 
     >>> place_within([[(2, 1)], [(2, 1), (7, 1)]], [(4, 2), (4, 2)], (10, 10))
     [(0.0, 0.0, 4.0, 2.0), (5.0, 0.0, 9.0, 2.0)]
@@ -85,7 +100,7 @@ def place_within(
 
 
 def _around(point: Point, size: Size, reach: float) -> Iterator[Point]:
-    """The point itself, then rings of places around it."""
+    """The point itself, followed by rings of points around it."""
     yield point
     radius = step = 0.6 * max(size)
     while radius <= reach:
@@ -105,7 +120,7 @@ def _into(x: float, y: float, width: float, height: float, frame: Size) -> Box:
 
 
 def _further(label: Box, placed: list[Box]) -> Box:
-    """The label moved down until it is free, out of the frame if need be."""
+    """The label moved down until it is free, out of the frame if necessary."""
     x1, y1, x2, y2 = label
     while covered := [other for other in placed if _cover((x1, y1, x2, y2), other)]:
         y1, y2 = (lowest := max(other[3] for other in covered)), lowest + y2 - y1

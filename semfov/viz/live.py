@@ -1,4 +1,4 @@
-"""What is seen and believed at a frame of a camera or a video, drawn into it, and the video that comes of it."""
+"""The view and belief of an agent drawn into frames of a camera or a video, and video files of such frames."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from semfov.viz.style import FOUND, GAZE, TARGET
 Frame = NDArray[np.uint8]
 
 _LONGEST = 640
-# Containers and codecs of OpenCV's, in the order they are tried; the last one comes with every build of it.
+# Containers and codecs in the order in which they are tried; every build of OpenCV has the last one.
 _CODECS = ((".mp4", "mp4v"), (".avi", "MJPG"))
 
 
 def draw_moment(image: Tensor, moment: Moment, text: str) -> Frame:
     """Draw belief, gaze and decision into a frame.
 
-    The colour over a cell is as strong as the probability that it holds the target (of an exploration: any object). The
-    circle is where the gaze is, and the line leads to where it goes for the next frame.
+    The opacity of the colour over a cell is proportional to the probability that the cell holds the target, or in an
+    exploration any object. A circle marks the present gaze, and a line leads to the point of the next one.
 
     Args:
         image: `(3, H, W)`, RGB in [0, 1].
-        moment: what is seen and believed.
-        text: for the upper edge.
+        moment: look and belief at this frame.
+        text: text at the upper edge.
 
     Returns:
-        Pixels `(h, w, 3)`, the longer side at most 640 and both even, as video wants them.
+        Pixels `(h, w, 3)`. The longer side has at most 640 pixels, and both sides are even, as videos require.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -65,7 +65,7 @@ def draw_moment(image: Tensor, moment: Moment, text: str) -> Frame:
 
 
 def video_suffix() -> str:
-    """That of the videos that OpenCV writes here: `.mp4`, or `.avi` where it was built without FFmpeg."""
+    """Suffix of the videos that OpenCV can write here: `.mp4`, or `.avi` where it was built without FFmpeg."""
     return next(suffix for suffix, codec in _CODECS if suffix == _CODECS[-1][0] or _writes(suffix, codec))
 
 
@@ -74,11 +74,11 @@ def video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
     """Write frames to a video, whole or not at all.
 
     Args:
-        path: of the file; its suffix is that of `video_suffix`.
+        path: of the file, with the suffix of `video_suffix`.
         rate: frames per second.
 
     Yields:
-        What takes the frames `(h, w, 3)`, all of one size, one after the other.
+        A function that takes the frames `(h, w, 3)`, all of one size, one after the other.
 
     Raises:
         DataError: the file cannot be written, or OpenCV is not installed.
@@ -86,10 +86,10 @@ def video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
     try:
         import cv2
     except ImportError:
-        raise DataError(f"{path}: videos need OpenCV; pip install opencv-python-headless") from None
+        raise DataError(f"{path}: videos need OpenCV: pip install opencv-python-headless") from None
     codec = dict(_CODECS)[path.suffix]
     with replacing(path) as temporary:
-        # OpenCV goes by the suffix.
+        # OpenCV chooses the container by the suffix.
         named = temporary.with_name(temporary.name + path.suffix)
         writer: Any = None
         try:

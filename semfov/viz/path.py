@@ -1,4 +1,4 @@
-"""The path of the gaze: fixations in their order, coloured by time."""
+"""The path of the gaze: numbered fixations, coloured by time."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ _POINTS = 6.5
 
 
 class GazePath:
-    """Saccades as thin lines, fixations as dots with their numbers, from dark to bright as time goes on.
+    """Saccades as thin lines and fixations as numbered dots, from dark to bright in the order of time.
 
-    All is made once, from the whole episode, so that a fixation looks the same however much of the path is shown.
+    All is laid out once, for the whole episode, so a fixation looks the same however much of the path is shown.
 
     Args:
-        axes: that the photograph is in, laid out.
+        axes: axes that hold the photograph, laid out.
         scanpath: the episode.
 
     Attributes:
-        numbers: of the fixations; None for those that there is no room for.
-        taken: rectangles that the numbers take.
+        numbers: text of each fixation's number; None where it did not fit.
+        taken: rectangles that the numbers occupy.
     """
 
     def __init__(self, axes: Axes, scanpath: Scanpath) -> None:
@@ -53,7 +53,7 @@ class GazePath:
 
     def _numbers(self, axes: Axes) -> list[Annotation | None]:
         scale, count = per_point(axes), len(self.path)
-        # A digit is about 0.64 of the height of the letters, and the frame adds 4 points.
+        # The width of a digit is about 0.64 of the font size, and the frame adds 4 points.
         sizes = [((0.64 * len(str(n)) * _POINTS + 4.5) * scale, (_POINTS + 4) * scale) for n in range(count)]
         points = [(float(x), float(y)) for x, y in self.path]
         frame = self.scanpath.grid.extent.tolist()
@@ -68,7 +68,7 @@ class GazePath:
             box = {"boxstyle": "round,pad=0.22,rounding_size=0.5", "facecolor": colour, "edgecolor": "white",
                    "linewidth": 0.7}  # fmt: skip
             middle = (place[0] + place[2]) / 2, (place[1] + place[3]) / 2
-            # A line to a number that stands off its point.
+            # A line joins a number to its point if it is not written on it.
             off = max(abs(a - b) for a, b in zip(point, middle, strict=True)) > scale
             arrow = {"arrowstyle": "-", "color": "white", "linewidth": 0.7, "shrinkA": 0, "shrinkB": 0}
             text = axes.annotate(
@@ -88,7 +88,7 @@ class GazePath:
         return written
 
     def show(self, last: int) -> list[Any]:
-        """Show fixations up to the `last` one, of which the end of a search that found its target is framed."""
+        """Show the fixations up to `last`; a frame marks its number, in green if the target was found there."""
         for lines in self.lines:
             lines.set_segments(list(self.segments[:last]))
         self.dots.set_offsets(self.path[: last + 1])

@@ -1,4 +1,4 @@
-"""Hits against false alarms."""
+"""The receiver operating characteristic of deciding whether a target is present."""
 
 from __future__ import annotations
 
@@ -18,12 +18,20 @@ if TYPE_CHECKING:
 
 @styled
 def plot_roc(scores: Mapping[str, Tensor], present: Tensor, *, axes: Sequence[Axes] | None = None) -> Figure:
-    """Receiver operating characteristic: hits against false alarms, the whole of it beside its first tenth.
+    """Plot hit rates against false alarm rates: the whole range, and beside it false alarm rates up to 0.1.
 
     Args:
-        scores: by name, `(M,)`.
-        present: `(M,)` boolean; cases of both kinds are needed.
-        axes: two of them to draw in; None makes a figure.
+        scores: for each name `(M,)`, higher where the target is more likely present.
+        present: `(M,)` boolean, whether it is; some must be true and some false.
+        axes: two axes to draw in; None makes a figure.
+
+    Returns:
+        The figure; its legend has the areas under the curves.
+
+    Raises:
+        InputError: the target is present in all cases or in none.
+
+    >>> figure = plot_roc({"one look": torch.tensor([0.9, 0.4, 0.1])}, torch.tensor([True, True, False]))
     """
     figure, panels = make_figure(1, 2, width=10, height=4.6, layout="compressed", given=axes)
     for panel, widest in zip(panels, (1.0, 0.1), strict=True):

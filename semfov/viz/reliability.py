@@ -21,14 +21,21 @@ if TYPE_CHECKING:
 def plot_reliability(
     predictions: Mapping[str, tuple[Tensor, Tensor]], *, bins: int = 15, axes: Sequence[Axes] | None = None
 ) -> Figure:
-    """How often the most probable class is right, against its probability; a calibrated model lies on the diagonal.
+    """Plot the accuracy of the most probable class against its probability; a calibrated model lies on the diagonal.
 
-    Bins with fewer than 20 predictions are left out: their shares are mostly chance.
+    Bins with fewer than 20 predictions are left out, because their fractions are mostly chance.
 
     Args:
         predictions: for each model its probabilities `(M, K+1)` and the true classes `(M,)`.
-        bins: equally wide bins of probability.
-        axes: two of them to draw in, the second for how many predictions there are; None makes a figure.
+        bins: number of equally wide bins of probability.
+        axes: two axes to draw in, the second for the distribution of predictions; None makes a figure.
+
+    Returns:
+        The figure.
+
+    >>> import torch
+    >>> probabilities = torch.rand(200, 3).softmax(-1)
+    >>> figure = plot_reliability({"random": (probabilities, torch.randint(3, (200,)))}, bins=5)
     """
     figure, (above, below) = make_figure(2, 1, width=4.4, height=5.4, ratios=[3, 1], given=axes)
     above.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="perfectly calibrated")
@@ -40,10 +47,10 @@ def plot_reliability(
         at, share = confident[filled] / count[filled], right[filled] / count[filled]
         above.plot(at, share, marker="o", markersize=4, label=name, **style)
         below.stairs(count / count.sum(), np.linspace(0, 1, bins + 1), linewidth=1.4, **style)
-    above.set(xlim=(0, 1), ylim=(0, 1), ylabel="share that is right")
+    above.set(xlim=(0, 1), ylim=(0, 1), ylabel="fraction correct")
     above.legend(loc="upper left")
     above.grid(alpha=0.3, linewidth=0.5)
-    below.set(xlim=(0, 1), xlabel="probability of the most probable class", ylabel="share")
+    below.set(xlim=(0, 1), xlabel="probability of the most probable class", ylabel="fraction")
     return figure
 
 
@@ -55,18 +62,26 @@ def plot_cell_reliability(
     groups: str,
     axes: Sequence[Axes] | None = None,
 ) -> Figure:
-    """How often what is told of cells is so, against its probability; a calibrated belief lies on the diagonal.
+    """Plot how often cells hold the target against the predicted probability; a calibrated belief lies on the diagonal.
 
-    Axes are in log odds, for most cells hold nothing. Bins with fewer than 20 predictions are left out, and so are
-    those of which all or none came true: they have no place on such axes. The last panel has the expected calibration
-    error by groups of cells.
+    Axes are in log odds, because most cells hold nothing. Bins with fewer than 20 predictions are left out. So are bins
+    in which all or none of the predictions came true, because they have no position on such axes. The last panel shows
+    the expected calibration error by group of cells.
 
     Args:
-        panels: by title, for each belief `(3, bins)`: count, sum of probabilities, and number that came true
-            (`semfov.metrics.calibration.reliability`).
+        panels: for each title and each belief `(3, bins)`: number of predictions, sum of probabilities, and number that
+            came true (`semfov.metrics.calibration.reliability`).
         errors: for each belief, expected calibration errors by group of cells.
-        groups: what the groups are.
-        axes: to draw in, one for each panel and one for the errors; None makes a figure.
+        groups: label of the groups.
+        axes: axes to draw in, one for each panel and one for the errors; None makes a figure.
+
+    Returns:
+        The figure.
+
+    >>> import torch
+    >>> bins = torch.tensor([[100.0, 100.0], [20.0, 60.0], [18.0, 63.0]])
+    >>> panels, errors = {"all cells": {"learned": bins}}, {"learned": {"seen": 0.02, "unseen": 0.03}}
+    >>> figure = plot_cell_reliability(panels, errors, groups="cells")
     """
     shape = (2, -(-(len(panels) + 1) // 2)) if axes is None else (1, len(panels) + 1)
     figure, every = make_figure(*shape, width=8.4, height=7.2, given=axes)
@@ -83,7 +98,7 @@ def plot_cell_reliability(
             set_ticks(_TICKS, [f"{tick:g}" for tick in _TICKS])
             set_ticks([], minor=True)
         panel.set(xlim=(3e-4, 0.997), ylim=(3e-4, 0.997), title=title)
-        panel.set(xlabel="probability of the target in a cell", ylabel="share of the cells that hold it")
+        panel.set(xlabel="probability of the target in a cell", ylabel="fraction of cells that hold it")
         panel.grid(alpha=0.3, linewidth=0.5)
     last = every[len(panels)]
     for name, error in errors.items():

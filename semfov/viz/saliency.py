@@ -1,4 +1,4 @@
-"""Saliency maps."""
+"""Figures of saliency maps."""
 
 from __future__ import annotations
 
@@ -28,15 +28,26 @@ def plot_saliency(
     title: str = "saliency",
     axes: Sequence[Axes] | None = None,
 ) -> Figure:
-    """A saliency map beside its photograph and, with a grid, the saliency of the cells with the greatest one framed.
+    """Plot a photograph, its saliency map and, with a grid, the saliency of the cells.
+
+    The most salient cell is framed.
 
     Args:
-        saliency: `(H, W)` of any size.
+        saliency: `(H, W)`, of any size.
         image: `(3, H, W)`, RGB in [0, 1].
-        grid: the cells over the photograph.
-        reduction: how a cell's saliency comes from its pixels (`semfov.saliency.cell_saliency`).
-        title: what to call the map.
-        axes: to draw in, two of them, three with a grid; None makes a figure.
+        grid: cells of the photograph; None leaves out the third panel.
+        reduction: how the saliency of a cell follows from its pixels (`semfov.saliency.cell_saliency`).
+        title: title of the map.
+        axes: axes to draw in, two, or three with a grid; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: the saliency is not `(H, W)`, or the number of axes does not fit.
+
+    >>> import torch
+    >>> figure = plot_saliency(torch.rand(12, 16), torch.rand(3, 48, 64), grid=Grid(4, 3, (64, 48)))
     """
     check_shape(saliency, "saliency", None, None)
     height, width = image.shape[-2:]

@@ -1,4 +1,4 @@
-"""Where the gaze went, and what was seen from there."""
+"""Figures of scanpaths: where the gaze went, and what was seen from each fixation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, FigureBase
 
 MOST_BOXES = 6
-"""At most so many detections of a look are drawn."""
+"""Largest number of detections of a look that are drawn."""
 
 
 @styled
@@ -42,19 +42,27 @@ def plot_scanpath(
     detections: bool = True,
     ax: Axes | None = None,
 ) -> Figure:
-    """Numbered fixations on the photograph, coloured by time, the grid, and what was detected from the last fixation.
+    """Plot numbered fixations on the photograph, coloured by time, with the grid and the last look's detections.
 
-    A legend tells whose the boxes are.
+    A legend explains the colours of the boxes.
 
     Args:
         scanpath: the episode.
-        image: `(3, H, W)`, RGB in [0, 1]; None is the scanpath's own.
-        boxes: `(M, 4)`, where the target really is (drawn dashed).
-        detections: draw those of the last fixation.
+        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own.
+        boxes: `(M, 4)`, true boxes of the target, drawn dashed.
+        detections: whether to draw the detections of the last fixation.
         ax: axes to draw in; None makes a figure.
 
+    Returns:
+        The figure.
+
     Raises:
-        InputError: there is no photograph, neither given nor kept.
+        InputError: the photograph is neither given nor kept by the scanpath.
+
+    Example::
+
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        save_figure(plot_scanpath(scanpath), "scanpath.pdf")
     """
     image = photograph_of(scanpath, image)
     height = 6.4 * image.shape[-2] / image.shape[-1] + 0.6
@@ -81,17 +89,25 @@ def plot_foveated_strip(
     columns: int = 5,
     axes: Sequence[Axes] | None = None,
 ) -> Figure:
-    """What the eye was shown at each fixation, with what it detected there.
+    """Plot the foveated views of several fixations, with the detections in them.
 
     Args:
         scanpath: the episode.
-        views: for each fixation the foveated photograph `(3, h, w)`, of any size; None are the scanpath's own.
-        most: at most so many fixations are shown: the first ones and the last.
-        columns: pictures side by side.
-        axes: to draw in, as many as there are fixations to show; None makes a figure.
+        views: for each fixation the foveated photograph `(3, h, w)`, of any size; None takes the scanpath's own.
+        most: largest number of fixations to show: the first ones and the last.
+        columns: number of pictures in a row.
+        axes: axes to draw in, one for each fixation that is shown; None makes a figure.
+
+    Returns:
+        The figure.
 
     Raises:
-        InputError: there are no views, neither given nor kept.
+        InputError: the views are neither given nor kept by the scanpath, or an argument is out of range.
+
+    Example::
+
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        save_figure(plot_foveated_strip(scanpath, most=4), "views.png")
     """
     views = views_of(scanpath, views)
     check(columns >= 1, "columns", "at least 1", columns)
@@ -119,20 +135,28 @@ def plot_episode(
     most: int = 5,
     figure: FigureBase | None = None,
 ) -> Figure:
-    """A whole episode: the scanpath, and for its fixations the foveated view above the belief after it.
+    """Plot a whole episode: the scanpath, and for several fixations the foveated view above the belief after it.
 
-    The belief is the target's posterior, or what is where if nothing was searched for.
+    The belief is the target's posterior, or the semantic map if nothing was searched for.
 
     Args:
         scanpath: the episode.
-        image: `(3, H, W)`, RGB in [0, 1]; None is the scanpath's own.
-        views: for each fixation the foveated photograph `(3, h, w)`, of any size; None are the scanpath's own.
-        boxes: `(M, 4)`, where the target really is (drawn dashed).
-        most: at most so many fixations are shown: the first ones and the last.
+        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own.
+        views: for each fixation the foveated photograph `(3, h, w)`, of any size; None takes the scanpath's own.
+        boxes: `(M, 4)`, true boxes of the target, drawn dashed.
+        most: largest number of fixations to show: the first ones and the last.
         figure: empty figure or subfigure to draw in; None makes one.
 
+    Returns:
+        The figure.
+
     Raises:
-        InputError: there are no photograph and views, neither given nor kept.
+        InputError: the photograph or the views are neither given nor kept by the scanpath.
+
+    Example::
+
+        scanpath = agent.explore(read_image("kitchen.jpg"))
+        save_figure(plot_episode(scanpath, most=3), "episode.pdf")
     """
     from matplotlib.figure import Figure
 
@@ -165,7 +189,7 @@ def plot_episode(
 
 
 def draw_place(axes: Axes, scanpath: Scanpath, image: Tensor, boxes: Tensor | None) -> None:
-    """The photograph, the grid, and where the target really is."""
+    """Draw the photograph, the grid, and the true boxes of the target."""
     draw_image(axes, image, scanpath.grid)
     draw_grid(axes, scanpath.grid)
     if boxes is not None:
@@ -173,7 +197,7 @@ def draw_place(axes: Axes, scanpath: Scanpath, image: Tensor, boxes: Tensor | No
 
 
 def draw_legend(axes: Axes, scanpath: Scanpath, boxes: Tensor | None, fixation: int | None) -> None:
-    """Whose the boxes are, below the picture; those of `fixation` are told to be the last look's."""
+    """Draw a legend of the boxes below the picture; detections of `fixation` are named as those of the last look."""
     from matplotlib.lines import Line2D
 
     name = "target" if scanpath.target is None else scanpath.classes[scanpath.target]
@@ -204,26 +228,26 @@ def draw_legend(axes: Axes, scanpath: Scanpath, boxes: Tensor | None, fixation: 
 
 
 def found_box(scanpath: Scanpath) -> Tensor | None:
-    """The box of the decision, where the target was found in one."""
+    """The box of the decision, where the target was found with one."""
     return None if scanpath.decision is None else scanpath.decision.box
 
 
 def draw_view(axes: Axes, scanpath: Scanpath, fixation: int, view: Tensor) -> None:
-    """What the eye was shown at a fixation."""
+    """Draw the foveated view of a fixation."""
     draw_image(axes, view, scanpath.grid)
     draw_gaze(axes, scanpath, fixation)
     axes.set_title(f"fixation {fixation}")
 
 
 def views_of(scanpath: Scanpath, views: Sequence[Tensor] | None) -> Sequence[Tensor]:
-    """The views that were given, or those of what the scanpath kept."""
+    """The given views, or those of the scanpath."""
     views = scanpath.views() if views is None else views
-    check(len(views) == len(scanpath), "views", f"one for each of {len(scanpath)} fixations", len(views))
+    check(len(views) == len(scanpath), "views", f"{len(scanpath)} views, one for each fixation", len(views))
     return views
 
 
 def _label_views(figure: Figure, scanpath: Scanpath, views: Iterable[tuple[Axes, int]]) -> None:
-    """Detections of views; where their labels fit is known only once the figure is laid out."""
+    """Draw the detections of views, after the layout of the figure, on which the positions of labels depend."""
     lay_out(figure)
     for axes, fixation in views:
         draw_detections(axes, scanpath, fixation, MOST_BOXES)

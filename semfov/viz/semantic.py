@@ -1,4 +1,4 @@
-"""What is where: the most probable class of every cell, the names of regions, and how uncertain they are."""
+"""Semantic maps: the most probable class of every cell, the names of regions, and how uncertain they are."""
 
 from __future__ import annotations
 
@@ -34,9 +34,23 @@ _NAME_POINTS = 7
 
 
 def entropy(scanpath: Scanpath) -> Tensor:
-    """Uncertainty about the class of every cell after each look, `-Σ p_k log2 p_k` in bits, `(n, X·Y)`.
+    r"""Entropy of the class of every cell after each look.
 
-    Marginal probabilities, of a learned map, are scaled to sum to 1.
+    .. math:: H = -\sum_k p_k \log_2 p_k
+
+    The marginal probabilities of a learned map are first scaled to sum to 1.
+
+    Args:
+        scanpath: the episode.
+
+    Returns:
+        `(n, X·Y)`, in bits, on the CPU.
+
+    >>> grid, p = Grid(2, 1, (20, 10)), torch.tensor([[[0.5, 0.5], [0.0, 1.0]]])
+    >>> cells, values = torch.tensor([0]), torch.zeros(1, 2)
+    >>> path = Scanpath(grid, ("background", "cup"), None, cells, grid.centres[cells], (), p, values, found=False)
+    >>> entropy(path)
+    tensor([[1., 0.]])
     """
     shares = scanpath.probabilities / scanpath.probabilities.sum(-1, keepdim=True)
     return torch.special.entr(shares).sum(-1).detach().cpu() / math.log(2)
@@ -46,13 +60,24 @@ def entropy(scanpath: Scanpath) -> Tensor:
 def plot_semantic_map(
     scanpath: Scanpath, fixation: int = -1, *, image: Tensor | None = None, axes: Sequence[Axes] | None = None
 ) -> Figure:
-    """The most probable object of every cell after a fixation, with its name, beside how uncertain the cell is.
+    """Plot the most probable object of every cell after a fixation, with its name, beside the entropy of the cell.
 
     Args:
         scanpath: the episode.
-        fixation: its number; -1 is the last.
-        image: `(3, H, W)`, RGB in [0, 1]; None is the scanpath's own, where it has one.
-        axes: two of them to draw in; None makes a figure.
+        fixation: number of the fixation; -1 is the last.
+        image: `(3, H, W)`, RGB in [0, 1]; None takes the scanpath's own, where it has one.
+        axes: two axes to draw in; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: there is no such fixation.
+
+    Example::
+
+        scanpath = agent.explore(read_image("kitchen.jpg"))
+        save_figure(plot_semantic_map(scanpath), "map.pdf")
     """
     fixation, grid = check_fixation(scanpath, fixation), scanpath.grid
     image = scanpath.image if image is None else image
@@ -75,13 +100,13 @@ def plot_semantic_map(
 
 
 def draw_semantic_map(axes: Axes, scanpath: Scanpath, fixation: int, image: Tensor | None) -> AxesImage:
-    """Probability of the most probable object of every cell over a photograph, from 0 to 1."""
+    """Draw the probability of the most probable object of every cell, from 0 to 1, over a photograph."""
     if image is not None:
         draw_image(axes, image, scanpath.grid, grey=True)
     drawn = draw_overlay(axes, scanpath.grid, most_probable(scanpath, fixation))
     draw_grid(axes, scanpath.grid)
     draw_gaze(axes, scanpath, fixation)
-    axes.set_title(f"what is where after fixation {fixation}")
+    axes.set_title(f"semantic map after fixation {fixation}")
     return drawn
 
 
@@ -91,7 +116,7 @@ def most_probable(scanpath: Scanpath, fixation: int) -> Tensor:
 
 
 def write_names(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
-    """Borders of regions, and names, each on a cell where it covers no other; the figure is laid out."""
+    """Draw borders and names of regions, each name on a cell where it covers no other; the figure must be laid out."""
     from matplotlib.collections import LineCollection
     from matplotlib.patheffects import withStroke
 
@@ -116,7 +141,14 @@ def write_names(axes: Axes, scanpath: Scanpath, fixation: int) -> list[Artist]:
 
 
 def borders(grid: Grid, region: Sequence[int]) -> list[list[tuple[float, float]]]:
-    """The sides of cells of a region beyond which it ends.
+    """Sides of cells that bound a region.
+
+    Args:
+        grid: the cells.
+        region: cells of the region.
+
+    Returns:
+        Each side as its two end points.
 
     >>> len(borders(Grid(3, 2, (30, 20)), [0, 1]))
     6
@@ -136,14 +168,23 @@ def borders(grid: Grid, region: Sequence[int]) -> list[list[tuple[float, float]]
 
 
 def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, list[int], float]]:
-    """What the map names after a fixation: class, cells that touch, and the greatest probability among them.
+    """The objects of the map after a fixation: regions of adjacent cells with the same most probable class.
 
-    A cell is named where an object is more probable than background, and than thrice an even share or a half. The
-    regions that cover most are first.
+    A cell has an object if its most probable object class is more probable than background, and more probable than 3
+    over the number of classes, or than 0.5 where that is less.
 
     Args:
         scanpath: the episode.
-        fixation: its number; -1 is the last.
+        fixation: number of the fixation; -1 is the last.
+
+    Returns:
+        For each region its class, its cells, and its highest probability; the largest regions first.
+
+    >>> grid, p = Grid(2, 1, (20, 10)), torch.tensor([[[0.1, 0.9], [0.2, 0.8]]])
+    >>> cells, values = torch.tensor([0]), torch.zeros(1, 2)
+    >>> path = Scanpath(grid, ("background", "cup"), None, cells, grid.centres[cells], (), p, values, found=False)
+    >>> [(name, region, round(p, 2)) for name, region, p in named_regions(path)]
+    [('cup', [0, 1], 0.9)]
     """
     grid, probabilities = scanpath.grid, scanpath.probabilities[fixation].detach().cpu()
     objects, label = probabilities[:, 1:].max(-1)
@@ -155,7 +196,13 @@ def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, lis
 
 
 def regions(labels: Tensor) -> list[list[int]]:
-    """Cells that touch at a side and share a label other than 0, of a table `(Y, X)`.
+    """Regions of cells that touch at a side and share a label other than 0.
+
+    Args:
+        labels: `(Y, X)`, label of each cell.
+
+    Returns:
+        Cells of each region, ascending.
 
     >>> regions(torch.tensor([[1, 1, 0], [2, 1, 1]]))
     [[0, 1, 4, 5], [3]]

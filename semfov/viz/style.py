@@ -1,4 +1,4 @@
-"""One look for all figures: colours that everyone can tell apart, lines, fonts, sizes."""
+"""The common style of all figures: colours for colour-blind readers, lines, fonts and sizes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's palette: told apart with every common form of colour blindness."""
+"""Okabe and Ito's palette, whose colours differ under every common form of colour blindness."""
 
 GAZE, TARGET, FOUND, TRUTH, OTHER = COLOURS[0], COLOURS[1], COLOURS[2], COLOURS[4], COLOURS[5]
-"""Colours with a meaning: the gaze, the target's detections, its end, annotated boxes, other detections."""
+"""Colours with a meaning: gaze, detections of the target, the found target, annotated boxes, other detections."""
 
 LINES = ("-", "--", "-.", ":")
 
@@ -29,10 +29,10 @@ PROBABILITY = "viridis"
 UNCERTAINTY = "cividis"
 TIME = "viridis"
 OVERLAY = "plasma"
-"""Colour maps; all grow steadily in lightness, in grey print too."""
+"""Colour maps, whose lightness increases steadily, so that they work in grey print too."""
 
 OPACITY = 0.85
-"""How much of the photograph an overlay of 1 hides."""
+"""Opacity of an overlay where the probability is 1."""
 
 STYLE: Any = {
     "font.family": "sans-serif",
@@ -45,7 +45,7 @@ STYLE: Any = {
 }
 
 FILES: Any = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "path"}
-"""Text in vector files stays sharp and looks the same everywhere: PDFs embed the font, SVGs its outlines."""
+"""Text in vector files looks the same everywhere: PDFs embed the font, and SVGs its outlines."""
 
 Arguments = ParamSpec("Arguments")
 
@@ -54,7 +54,7 @@ _laid_out: WeakSet[Figure] = WeakSet()
 
 
 def styled(plot: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
-    """Draw a figure with `STYLE`, whatever the caller's settings of matplotlib are."""
+    """Decorate a plot function to draw with `STYLE`, whatever the caller's settings of matplotlib are."""
 
     @wraps(plot)
     def draw(*arguments: Arguments.args, **options: Arguments.kwargs) -> Figure:
@@ -62,8 +62,8 @@ def styled(plot: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
 
         with rc_context(STYLE):
             figure = plot(*arguments, **options)
-            # Matplotlib makes the labels of ticks when it draws: they would come in the caller's fonts. A figure of the
-            # caller's own is left for him to draw.
+            # Matplotlib makes the labels of ticks when it draws, and would then use the caller's fonts. A figure that
+            # the caller has given is left for the caller to draw.
             if all(options.get(name) is None for name in _PLACES) and figure not in _laid_out:
                 figure.draw_without_rendering()
             teach_notebook()
@@ -73,7 +73,7 @@ def styled(plot: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
 
 
 def teach_notebook() -> None:
-    """Let a notebook show a figure that is a cell's last value: it learns to only when pyplot makes one."""
+    """Let a notebook show a figure as a cell's last value, which otherwise only figures of pyplot do."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     if shell is None:
@@ -87,7 +87,7 @@ def teach_notebook() -> None:
 
 
 def lay_out(figure: Figure) -> None:
-    """Find where everything is, for what is placed by it."""
+    """Compute the layout of a figure, for parts whose position depends on it."""
     figure.draw_without_rendering()
     _laid_out.add(figure)
 
@@ -101,40 +101,61 @@ def make_figure(
     layout: Literal["constrained", "compressed"] = "constrained",
     given: Sequence[Axes] | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of `width` × `height` inches that needs no window, and its axes, row by row; or the axes that are given.
+    """Make a figure of `width` × `height` inches without a window, or use the given axes.
 
-    The layout is `compressed` for pictures, which keep their proportions: they move together.
+    The layout is `compressed` for pictures, whose proportions are fixed, so that they move together.
+
+    Args:
+        rows: number of rows of axes.
+        columns: number of columns of axes.
+        width: in inches.
+        height: in inches.
+        ratios: relative heights of the rows.
+        layout: layout engine of matplotlib.
+        given: axes to use instead of a new figure.
+
+    Returns:
+        The figure, and its axes row by row.
+
+    Raises:
+        InputError: the number of given axes does not fit.
     """
     from matplotlib.figure import Figure
 
     if given is not None:
         every = list(given)
-        check(len(every) == rows * columns, "axes", f"{rows * columns} of them", len(every))
+        check(len(every) == rows * columns, "axes", f"{rows * columns} axes", len(every))
         return root(every[0]), every
     figure = Figure(figsize=(width, height), layout=layout)
     return figure, list(figure.subplots(rows, columns, squeeze=False, height_ratios=ratios).flat)
 
 
 def only(ax: Axes | None) -> list[Axes] | None:
-    """One axes as the list that `make_figure` takes."""
+    """A single `ax` as the list that `make_figure` takes."""
     return None if ax is None else [ax]
 
 
 def root(axes: Axes) -> Figure:
-    """The figure that axes are in, whatever part of it they are in."""
+    """The figure that contains axes, also where they are in a subfigure."""
     part: Any = axes.figure
-    # Of a part of a figure this is the whole figure, and of a figure itself.
+    # For a subfigure this is the whole figure, and for a figure it is the figure itself.
     whole: Figure = part.figure
     return whole
 
 
 def save_figure(figure: Figure, path: str | Path, *, dpi: float = 150) -> Path:
-    """Save a figure by the ending of the path, `.png`, `.pdf` or `.svg` among others, whole or not at all.
+    """Save a figure in the format of the suffix, such as `.png`, `.pdf` or `.svg`; the file is written atomically.
 
     Args:
         figure: from any function of `semfov.viz`.
         path: of the file.
-        dpi: pixels per inch, for what is made of pixels.
+        dpi: pixels per inch, for pictures inside the figure.
+
+    Returns:
+        The path.
+
+    Raises:
+        DataError: the file cannot be written.
 
     >>> import tempfile
     >>> from matplotlib.figure import Figure
@@ -151,9 +172,12 @@ def save_figure(figure: Figure, path: str | Path, *, dpi: float = 150) -> Path:
 
 @cache
 def overlay_colours() -> Colormap:
-    r"""Colours of a probability over a photograph: nothing at 0, then ever more of it, :math:`\alpha = 0.85 \sqrt{p}`.
+    r"""Colour map of probabilities over a photograph: transparent at 0, with opacity :math:`\alpha = 0.85 \sqrt{p}`.
 
-    The root lets small probabilities be seen on a scale that ends at 1.
+    The square root makes small probabilities visible on a scale that ends at 1.
+
+    Returns:
+        A matplotlib colour map of 256 colours.
     """
     import numpy as np
     from matplotlib import colormaps
@@ -166,6 +190,6 @@ def overlay_colours() -> Colormap:
 
 
 def line_style(order: int, count: int) -> dict[str, Any]:
-    """Colour and dashes of one of `count` lines; no two are alike, and few lines also differ in dashes."""
+    """Colour and dashes of line `order` of `count` lines; no two are alike, and few lines differ in dashes too."""
     group = len(COLOURS) if count > len(COLOURS) else 2
     return {"color": COLOURS[order % len(COLOURS)], "linestyle": LINES[order // group % len(LINES)]}

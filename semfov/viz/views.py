@@ -1,4 +1,4 @@
-"""What the eye was shown during an episode."""
+"""The views of the eye during an episode."""
 
 from torch import Tensor
 
@@ -7,9 +7,17 @@ from semfov.scanpath import Stimulus
 
 
 def foveated_views(eye: Eye, image: Tensor, fixations: Tensor) -> list[Tensor]:
-    """What the detector is shown of an image `(3, H, W)` from each of the fixations `(n, 2)`: `(3, h, w)` each.
+    """The images that the detector is given from each fixation, without the padding around the picture.
 
-    At the detector's resolution, without the canvas around the picture. A scanpath of an agent's has them at hand
+    They have the detector's resolution. The scanpath of an agent keeps what is needed to compute them
     (`Scanpath.views`).
+
+    Args:
+        eye: sensor and detector.
+        image: `(3, H, W)`, RGB in [0, 1].
+        fixations: `(n, 2)`, in pixels of the image.
+
+    Returns:
+        n views `(3, h, w)`.
     """
     return Stimulus.of(eye, image).views(fixations)

@@ -1,4 +1,4 @@
-"""Where an eye zoomed in on a large picture, and what it found."""
+"""The windows at which an eye looked in a large picture, and the objects that it found."""
 
 from __future__ import annotations
 
@@ -16,16 +16,23 @@ if TYPE_CHECKING:
 
 @styled
 def plot_zoom_path(path: ZoomPath, image: Tensor, *, score: float = 0.1, ax: Axes | None = None) -> Figure:
-    """The windows that were looked at, numbered in their order, and the objects that were found.
+    """Plot the windows that were looked at, numbered in their order, and the objects that were found.
 
-    A number stands in a corner of its window where none stands yet. Objects are named where all classes were looked
-    for.
+    The first look, at the whole picture, is not drawn. Objects have names where all classes were looked for.
 
     Args:
-        path: of a search or an exploration.
-        image: `(3, h, w)`, RGB in [0, 1], the picture at any size.
-        score: objects with a lower one are not drawn.
+        path: record of a search or an exploration.
+        image: `(3, h, w)`, RGB in [0, 1], the picture in any size.
+        score: least score of the objects that are drawn.
         ax: axes to draw in; None makes a figure.
+
+    Returns:
+        The figure.
+
+    Example::
+
+        path = agent.search("harbour.tif", "person")
+        save_figure(plot_zoom_path(path, semfov.as_image("harbour_small.jpg")), "path.png")
     """
     from matplotlib.patches import Rectangle
 
@@ -59,19 +66,22 @@ def plot_zoom_path(path: ZoomPath, image: Tensor, *, score: float = 0.1, ax: Axe
 
 
 def _free(box: tuple[float, float, float, float], taken: list[tuple[float, float]], room: float) -> tuple[float, float]:
-    """Where the number of a window stands: in the corner of it that is farthest from other numbers, or in its middle.
+    """Position for the number of a window: the corner farthest from other numbers, or the middle.
 
     Args:
-        box: of the window.
-        taken: where numbers stand.
-        room: that a number needs across.
+        box: `(x1, y1, x2, y2)` of the window.
+        taken: positions of other numbers.
+        room: width that a number needs.
+
+    Returns:
+        `(x, y)`.
     """
     x1, y1, x2, y2 = box
     left, right, top, bottom = x1 + room / 2, x2 - room / 2, y1 + room / 2, y2 - room / 2
     places = [(left, top), (right, top), (left, bottom), (right, bottom), ((x1 + x2) / 2, (y1 + y2) / 2)]
 
     def far(place: tuple[float, float]) -> float:
-        # As far as a number needs is enough: then it is the first such corner.
+        # Distances beyond the width of a number count the same, so that the first free corner is taken.
         return min([room, *(max(abs(place[0] - x), abs(place[1] - y)) for x, y in taken)])
 
     return max(places, key=far)

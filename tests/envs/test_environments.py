@@ -246,7 +246,7 @@ def test_mosaics_photographs_and_targets_make_environments(world, tmp_path):
     assert {episode.target for episode in scenery.episodes(0)} == {scenery.classes.index("cup")}
     env = GazeSearch(scenery)
     assert env.reset(seed=0)[0] in env.observation_space
-    with pytest.raises(DataError, match="expected some with anything to look for"):
+    with pytest.raises(DataError, match="expected at least one with objects to look for"):
         open_scenery("search", **world, targets=["zebra"])
     with pytest.raises(InputError, match="did you mean 'cat'"):
         open_scenery("search", **world, targets=["catt"])
@@ -257,14 +257,14 @@ def test_mosaics_photographs_and_targets_make_environments(world, tmp_path):
 def test_mistakes_are_told(sceneries):
     scenery = sceneries["search"]
     env = GazeSearch(scenery)
-    with pytest.raises(InputError, match="step: expected a call of reset"):
+    with pytest.raises(InputError, match="step: expected an episode in progress, got none; call reset"):
         env.step(0)
     env.reset()
     with pytest.raises(InputError, match="action: expected a whole number from 0 to 19"):
         env.step(20)
     with pytest.raises(InputError, match="options: expected episode or scene, got start"):
         env.reset(options={"start": 3})
-    with pytest.raises(InputError, match="scenery: expected no other options beside it, got count"):
+    with pytest.raises(InputError, match="scenery: expected no options of `open_scenery` beside it, got count"):
         GazeSearch(scenery, count=3)
     with pytest.raises(InputError, match="render_mode: expected 'rgb_array' or None"):
         GazeSearch(scenery, render_mode="human")

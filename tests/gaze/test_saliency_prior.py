@@ -114,9 +114,9 @@ def test_choices_are_still_those_of_a_product():
 def test_bad_arguments():
     with pytest.raises(InputError, match="weight"):
         SaliencyPrior(TargetPosterior(2), SALIENCY, weight=-0.1)
-    with pytest.raises(InputError, match="saliency: expected no negative"):
+    with pytest.raises(InputError, match="saliency: expected numbers of 0 or more"):
         SaliencyPrior(TargetPosterior(2), -SALIENCY, weight=0.3)
-    with pytest.raises(InputError, match="saliency: expected no negative"):
+    with pytest.raises(InputError, match="saliency: expected numbers of 0 or more"):
         SaliencyPrior(TargetPosterior(2), SALIENCY * math.nan, weight=0.3)
     with pytest.raises(InputError, match="saliency"):
         values(SaliencyPrior(TargetPosterior(2), SALIENCY[:, :7], weight=0.3))

@@ -89,7 +89,7 @@ def test_pictures(agent, panorama, tmp_path):
         assert len(set(frames)) == 1
     written = animate_head(path, panorama, tmp_path / "head.gif")
     assert written.stat().st_size > 1000
-    with pytest.raises(InputError, match="looks: expected 1 to 2"):
+    with pytest.raises(InputError, match="looks: expected a number from 1 to 2"):
         plot_head_path(path, panorama, looks=3)
 
 

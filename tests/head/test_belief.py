@@ -224,7 +224,7 @@ def test_the_gaze_rests_on_what_its_cell_overlaps(views):
 
 def test_one_episode_at_a_time(views, models):
     observer = SceneObserver(Target(models[0]), views)
-    with pytest.raises(InputError, match="batch: expected one episode at a time"):
+    with pytest.raises(InputError, match="batch: expected 1, as a head has one episode at a time"):
         observer.start(2, views.grid, torch.zeros(1))
     with pytest.raises(InputError, match="prior: expected a probability"):
         SceneObserver(Target(models[0]), views, prior=1.5)

@@ -121,7 +121,7 @@ def test_windows_beyond_a_picture_are_refused():
     flat = Flat(torch.rand(3, 48, 64), (32, 24), degree=2)
     with pytest.raises(InputError, match="pose: expected a window inside 64 × 48 pixels"):
         flat.view(torch.tensor([0.0, 0.0, 20.0]))
-    with pytest.raises(InputError, match="field: expected a window that the picture holds"):
+    with pytest.raises(InputError, match="field: expected a window inside the picture"):
         flat.poses(60.0)
     with pytest.raises(InputError, match="fields: expected"):
         Views(flat, (30.0, 20.0))

@@ -60,7 +60,7 @@ def test_area_at_the_ends_and_in_single_precision():
 
 @pytest.mark.parametrize("present", [[True, True], [False, False], []], ids=["there", "not there", "none"])
 def test_cases_of_both_kinds_are_needed(present):
-    with pytest.raises(InputError, match="present: expected cases with and without the target"):
+    with pytest.raises(InputError, match="present: expected both true and false values"):
         area_under_roc(torch.zeros(len(present)), torch.tensor(present, dtype=torch.bool))
 
 

@@ -94,7 +94,7 @@ def test_drawn_in_the_callers_axes(name, scanpath):
         ]
         assert a.get_title() == b.get_title()
     if isinstance(place, int):
-        with pytest.raises(InputError, match=f"axes: expected {place} of them"):
+        with pytest.raises(InputError, match=f"axes: expected {place} axes"):
             function(*arguments, **options, axes=given[:-1])
 
 

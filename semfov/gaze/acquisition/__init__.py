@@ -1,4 +1,4 @@
-"""Acquisition functions: the value of fixating each cell, given the belief."""
+"""Acquisition functions: the value of fixating each cell next, given the belief."""
 
 from semfov.gaze.acquisition.accuracy import ExpectedAccuracy
 from semfov.gaze.acquisition.base import AcquisitionFunction

@@ -1,4 +1,4 @@
-"""Exploration that brings the fovea closer to what it has not named yet."""
+"""Exploration that brings the fovea closer to cells whose class is not known yet."""
 
 from torch import Tensor
 
@@ -9,20 +9,24 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 
 
 class CloserLook(AcquisitionFunction):
-    r"""How much better than ever before the cells would be seen whose class is not known yet.
+    r"""By how much a fixation improves the best view so far of the cells whose class is not known.
 
-    Successive looks from one distance see, and miss, the same objects; only a closer look shows more. So a cell counts
-    by the acuity that a fixation adds to that of its closest look :math:`d^*`:
+    Successive looks from one distance detect, and miss, the same objects; only a closer look shows more. A cell
+    therefore counts by the acuity v that the fixation adds to that of its closest look so far, at distance :math:`d^*`:
 
     .. math:: a(f) = \sum_x \bigl(1 - \max_k q_k(x)\bigr) \bigl[v(d(x, f)) - v(d^*(x))\bigr]_+, \qquad
               v(d) = e^{-\max(d / r - 1,\, 0)}
 
-    q are the probabilities of the classes other than background, r is the width of the fovea: within it all is seen
-    equally well. Once the fovea has been near every cell nothing is gained anywhere, and ties are broken at random.
+    q are the probabilities of the classes other than background, scaled to sum to 1. r is the width of the fovea,
+    within which acuity is constant. Once the fovea has been near every cell, all gains are 0, and ties are broken at
+    random.
 
     Args:
         grid: the cells of one image.
-        fovea: r in longer sides of the image (100 px of 640 by default).
+        fovea: r in units of the image's longer side (100 px of 640 by default).
+
+    Raises:
+        InputError: `fovea` is not positive.
 
     >>> import torch
     >>> grid = Grid(3, 1, (90, 30))
@@ -41,7 +45,7 @@ class CloserLook(AcquisitionFunction):
         self.register_buffer("seen", acuity(grid.cell_distance, fovea))
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(B, X·Y)` for a belief about all classes; where the fovea was is in `belief.closest`."""
+        """Values `(B, X·Y)` for a belief about all classes, which knows each cell's closest look."""
         return one_by_one(self._values, belief.class_probabilities(), belief.closest)
 
     def _values(self, probabilities: Tensor, closest: Tensor) -> Tensor:
@@ -51,10 +55,14 @@ class CloserLook(AcquisitionFunction):
         return (gain * unknown[..., None]).sum(-2)
 
     def extra_repr(self) -> str:
-        """Settings, for `repr`."""
+        """Describe the settings for `repr`.
+
+        Returns:
+            The width of the fovea.
+        """
         return f"fovea={self.fovea:g}"
 
 
 def acuity(distance: Tensor, fovea: float) -> Tensor:
-    """How well is seen at distances in longer sides, `exp(-max(d / r - 1, 0))` for a fovea of the width r."""
+    """Relative acuity `exp(-max(d / r - 1, 0))` at distances d for a fovea of width r, in one unit."""
     return (1 - distance / fovea).clamp(max=0).exp()

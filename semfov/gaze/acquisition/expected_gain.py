@@ -1,4 +1,4 @@
-"""Exploration that looks where it has learned that a look names most."""
+"""Exploration that looks where a learned model expects to classify most cells correctly."""
 
 from torch import Tensor
 
@@ -11,15 +11,24 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 
 
 class ExpectedGain(AcquisitionFunction):
-    r"""How many more cells a look from each cell is expected to name right, :math:`E[\Delta \mid f]`.
+    r"""Expected number of additional cells that the map classifies correctly after a look, :math:`E[\Delta \mid f]`.
 
-    The sum over all cells of what `MapEvidence.gain` has learned from the looks of explorations: a cell gains by a
-    closer look, and more so the less sure the map is of it. An exploration is worth its price as long as some cell is
-    expected to gain more (`semfov.ActivePerception.explore(until=...)`).
+    `MapEvidence.gain` predicts the gain of each cell, and this is the sum over the cells. The prediction was learned
+    from looks of explorations: a cell gains by a closer look, and gains more where the map is less certain. An
+    exploration can end when no cell is expected to gain more than a look costs
+    (`semfov.ActivePerception.explore(until=...)`).
 
     Args:
-        model: that the map is learned with.
+        model: the model that the map is learned with.
         grid: the cells of one image.
+
+    >>> from semfov.belief.observers import LearnedMap
+    >>> import torch
+    >>> model = MapEvidence(components=3).requires_grad_(False)
+    >>> grid = Grid(3, 1, (30, 10))
+    >>> belief = LearnedMap(model).start(1, grid, torch.zeros(1))
+    >>> ExpectedGain(model, grid)(belief, torch.zeros(1, 3, dtype=torch.bool)).shape
+    torch.Size([1, 3])
     """
 
     distance: Tensor
@@ -30,7 +39,7 @@ class ExpectedGain(AcquisitionFunction):
         self.register_buffer("distance", grid.cell_distance)
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(B, X·Y)` in cells, for a belief of `semfov.observers.LearnedMap`."""
+        """Values `(B, X·Y)`, in cells, for a belief of `semfov.observers.LearnedMap`."""
         known = own(belief, MapBelief, "belief")
         return one_by_one(self._values, known.probabilities, known.closest, known.looks)
 

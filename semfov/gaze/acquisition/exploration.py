@@ -1,7 +1,8 @@
-"""Acquisition functions of scene exploration: which fixation changes the map for the better?
+"""Acquisition functions of scene exploration that simulate one look at every cell.
 
-All simulate one look from every cell (`semfov.gaze.acquisition.lookahead`) and sum over the map what it does to each
-cell x; p and T are mean and sum of a cell's Dirichlet parameters, primed after the simulated update.
+The value of a look is the change that it is expected to cause in the map, summed over the cells x
+(`semfov.gaze.acquisition.lookahead`); `TwoPeaks` takes the largest change instead. p is the mean and T the sum of a
+cell's Dirichlet parameters. A prime or a bar marks their values after the simulated update.
 """
 
 import torch
@@ -14,21 +15,25 @@ from semfov.observation.dirichlet import kl_from_symmetric
 
 
 class KLDivergence(Lookahead):
-    r"""How far a look is expected to take the map from knowing nothing.
+    r"""How much a look is expected to raise the divergence of the map from its uniform prior.
 
     .. math:: a(f) = \sum_x F(\bar\beta(x \mid f)) - F(\beta(x)), \qquad
               F(\beta) = \mathrm{KL}\bigl(\mathrm{Dir}(\beta) \,\|\, \mathrm{Dir}(\beta^0)\bigr)
 
     with β⁰ the uniform prior, 0.5 for every class (Luzio, Bernardino and Moreno, 2024, Scene Exploration: F and the
-    sum over the map that the next fixation maximises). The published value is :math:`\sum_x F(\bar\beta)`. The present
-    map's is the same for every fixation; without it, small differences are lost in a large sum.
+    sum over the map that the next fixation maximises). The published value is :math:`\sum_x F(\bar\beta)`. The term of
+    the present map is the same for every fixation. It is subtracted because small differences would be lost by rounding
+    in a large sum.
 
     Args:
         model: the observation model.
         grid: the cells.
-        prior: β⁰.
+        prior: β⁰, positive.
 
-    An eye that sees well up to 0.4 image widths takes in all of three cells from the central one:
+    Raises:
+        InputError: `prior` is not positive.
+
+    A fovea that sees well up to 0.4 image widths sees all of three cells from the central one:
 
     >>> from semfov import DirichletBelief, FovealObservationModel
     >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])
@@ -43,78 +48,117 @@ class KLDivergence(Lookahead):
         check(prior > 0, "prior", "a positive number", prior)
         self.prior = prior
 
-    def worth(self, outlook: Outlook) -> Tensor:
-        """Divergence gained."""
-        # The present map goes through the special functions with the predicted ones, as one level more.
+    def cell_values(self, outlook: Outlook) -> Tensor:
+        """Increase of the divergence from the prior."""
+        # The present map is appended as one more level, so that the special functions are called once.
         every = torch.cat([outlook.next_beta, outlook.beta[..., None, :]], -2)
         divergence = kl_from_symmetric(every, self.prior)
         return divergence[..., :-1] - divergence[..., -1:]
 
 
 class BayesianSurprise(Lookahead):
-    r"""How much a look is expected to change the map: divergence of the predicted from the present posterior.
+    r"""How much a look is expected to change the map: divergence of the predicted posterior from the present one.
 
     .. math:: a(f) = \sum_x \mathrm{KL}\bigl(\bar p(x \mid f) \,\|\, p(x)\bigr)
 
-    (The surprise of Itti and Baldi, 2009, of the expected look. `KLDivergence` measures from the prior instead, and
-    between the Dirichlets.)
+    This is the surprise of Itti and Baldi (2009), of the expected look. `KLDivergence` in contrast is between Dirichlet
+    distributions, and from the prior.
 
     Args:
         model: the observation model.
         grid: the cells.
+
+    >>> from semfov import DirichletBelief, FovealObservationModel
+    >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])
+    >>> model = FovealObservationModel(alpha, [0.4], ["cup"]).requires_grad_(False)
+    >>> belief = DirichletBelief(torch.tensor([[1.0, 2.0]]).repeat(3, 1))
+    >>> BayesianSurprise(model, Grid(3, 1, (30, 10)))(belief, torch.zeros(3, dtype=torch.bool)).argmax()
+    tensor(1)
     """
 
-    def worth(self, outlook: Outlook) -> Tensor:
-        """Divergence of the predicted from the present posterior."""
+    def cell_values(self, outlook: Outlook) -> Tensor:
+        """Divergence of the predicted posterior from the present one."""
         return divergence(outlook)
 
 
 class NegativeEntropy(Lookahead):
-    r"""How certain a look is expected to leave the map.
+    r"""How much a look is expected to lower the entropy of the map.
 
     .. math:: a(f) = \sum_x H(p(x)) - H(\bar p(x \mid f)), \qquad H(p) = -\sum_k p_k \ln p_k
 
     (Luzio, Bernardino and Moreno, 2024, Scene Exploration, the classification negentropy.) The published value is
-    :math:`-\sum_x H(\bar p)`. The entropy of the present map is the same for every fixation; with it, small differences
-    are not lost in a large sum.
+    :math:`-\sum_x H(\bar p)`. The entropy of the present map is the same for every fixation. It is added because small
+    differences would be lost by rounding in a large sum.
+
+    Args:
+        model: the observation model.
+        grid: the cells.
+
+    >>> from semfov import DirichletBelief, FovealObservationModel
+    >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])
+    >>> model = FovealObservationModel(alpha, [0.4], ["cup"]).requires_grad_(False)
+    >>> belief = DirichletBelief(torch.tensor([[1.0, 2.0]]).repeat(3, 1))
+    >>> NegativeEntropy(model, Grid(3, 1, (30, 10)))(belief, torch.zeros(3, dtype=torch.bool)).argmax()
+    tensor(1)
     """
 
-    def worth(self, outlook: Outlook) -> Tensor:
-        """Entropy lost."""
+    def cell_values(self, outlook: Outlook) -> Tensor:
+        """Decrease of the entropy."""
         surprise = torch.xlogy(outlook.mean, outlook.mean)[..., None, :]
         # H(p) - H(p') = KL(p' || p) + Σ (p' - p) ln p
         return divergence(outlook) + (outlook.growth * surprise).sum(-1)
 
 
 class TwoPeaks(Lookahead):
-    r"""Largest change, anywhere on the map, of the lead of the most probable class over the second.
+    r"""Largest change, over the cells of the map, of the margin of the most probable class over the second.
 
     .. math:: a(f) = \max_x |\Delta(p'(x \mid f)) - \Delta(p(x))|, \qquad \Delta(p) = p_{(1)} - p_{(2)}
 
     (Luzio, Bernardino and Moreno, 2024, Scene Exploration, the expected improvement of the two-peak difference.)
-    """
-
-    def worth(self, outlook: Outlook) -> Tensor:
-        """Absolute change of the lead."""
-        return (lead(outlook.next_mean) - lead(outlook.mean)[..., None]).abs()
-
-    def pool(self, worth: Tensor) -> Tensor:
-        """The largest over the map."""
-        return worth.amax(-2)
-
-
-class UpperConfidenceBound(Lookahead):
-    r"""How far a look is expected to raise the upper confidence bound of every cell's most probable class.
-
-    .. math:: a(f) = \sum_x U'(x \mid f) - U(x), \qquad U = p_{(1)} + \kappa \sqrt{p_{(1)} (1 - p_{(1)}) / (T + 1)}
-
-    Mean and standard deviation are those of the class's probability under the Dirichlet belief. (The bound is that of
-    Srinivas et al., 2010, taken on the predicted map; the present map's does not change the choice.)
 
     Args:
         model: the observation model.
         grid: the cells.
-        kappa: κ, standard deviations above the mean.
+
+    >>> from semfov import DirichletBelief, FovealObservationModel
+    >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])
+    >>> model = FovealObservationModel(alpha, [0.1], ["cup"]).requires_grad_(False)
+    >>> belief = DirichletBelief(torch.tensor([[20.0, 40.0], [1.0, 2.0], [20.0, 40.0]]))
+    >>> TwoPeaks(model, Grid(3, 1, (30, 10)))(belief, torch.zeros(3, dtype=torch.bool)).argmax()
+    tensor(1)
+    """
+
+    def cell_values(self, outlook: Outlook) -> Tensor:
+        """Absolute change of the margin."""
+        return (lead(outlook.next_mean) - lead(outlook.mean)[..., None]).abs()
+
+    def pool(self, values: Tensor) -> Tensor:
+        """The largest change over the map."""
+        return values.amax(-2)
+
+
+class UpperConfidenceBound(Lookahead):
+    r"""How much a look is expected to raise the upper confidence bound of every cell's most probable class.
+
+    .. math:: a(f) = \sum_x U'(x \mid f) - U(x), \qquad U = p_{(1)} + \kappa \sqrt{p_{(1)} (1 - p_{(1)}) / (T + 1)}
+
+    U is the mean of the class's probability plus κ standard deviations, under the Dirichlet belief. The bound is that
+    of Srinivas et al. (2010), on the predicted map. The term of the present map does not change the choice.
+
+    Args:
+        model: the observation model.
+        grid: the cells.
+        kappa: κ, number of standard deviations above the mean, 0 or more.
+
+    Raises:
+        InputError: `kappa` is negative.
+
+    >>> from semfov import DirichletBelief, FovealObservationModel
+    >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])
+    >>> model = FovealObservationModel(alpha, [0.4], ["cup"]).requires_grad_(False)
+    >>> belief = DirichletBelief(torch.tensor([[1.0, 2.0]]).repeat(3, 1))
+    >>> UpperConfidenceBound(model, Grid(3, 1, (30, 10)), kappa=0.5)(belief, torch.zeros(3, dtype=torch.bool)).shape
+    torch.Size([3])
     """
 
     def __init__(self, model: LevelledModel, grid: Grid, *, kappa: float = 2.0) -> None:
@@ -122,8 +166,8 @@ class UpperConfidenceBound(Lookahead):
         check(kappa >= 0, "kappa", "0 or more", kappa)
         self.kappa = kappa
 
-    def worth(self, outlook: Outlook) -> Tensor:
-        """Rise of the bound."""
+    def cell_values(self, outlook: Outlook) -> Tensor:
+        """Increase of the bound."""
         after = self._bound(outlook.next_mean.amax(-1), outlook.next_total)
         return after - self._bound(outlook.mean.amax(-1), outlook.total)[..., None]
 
@@ -132,18 +176,29 @@ class UpperConfidenceBound(Lookahead):
 
 
 class ProbabilityOfImprovement(Lookahead):
-    r"""How likely a look leaves each cell with a more probable best class than it has.
+    r"""Probability that a look makes the most probable class of each cell more probable, summed over the cells.
 
     .. math:: a(f) = \sum_x \Phi\left(\frac{p'_{(1)}(x \mid f) - p_{(1)}(x) - \xi}{\sigma'(x \mid f)}\right), \qquad
               \sigma'^2 = p'_{(1)} (1 - p'_{(1)}) / (T' + 1)
 
-    with the predicted Dirichlet's marginal taken for normal. (Kushner, 1964, on the predicted map. What a
-    caption of Luzio, Bernardino and Moreno, 2024, calls the probability of improving is the sum of `KLDivergence`.)
+    The marginal of the predicted Dirichlet is approximated by a normal distribution. This is the probability of
+    improvement of Kushner (1964), on the predicted map. (A caption of Luzio, Bernardino and Moreno, 2024, gives this
+    name to the sum of `KLDivergence`.)
 
     Args:
         model: the observation model.
         grid: the cells.
-        margin: ξ, probability by which to improve.
+        margin: ξ, least increase of the probability that counts as an improvement.
+
+    Raises:
+        InputError: `margin` is not in [0, 1).
+
+    >>> from semfov import DirichletBelief, FovealObservationModel
+    >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])
+    >>> model = FovealObservationModel(alpha, [0.4], ["cup"]).requires_grad_(False)
+    >>> belief = DirichletBelief(torch.tensor([[1.0, 2.0]]).repeat(3, 1))
+    >>> ProbabilityOfImprovement(model, Grid(3, 1, (30, 10)))(belief, torch.zeros(3, dtype=torch.bool)).argmax()
+    tensor(1)
     """
 
     def __init__(self, model: LevelledModel, grid: Grid, *, margin: float = 0.0) -> None:
@@ -151,7 +206,7 @@ class ProbabilityOfImprovement(Lookahead):
         check(0 <= margin < 1, "margin", "at least 0 and less than 1", margin)
         self.margin = margin
 
-    def worth(self, outlook: Outlook) -> Tensor:
+    def cell_values(self, outlook: Outlook) -> Tensor:
         """Probability of improvement."""
         peak = outlook.next_mean.amax(-1)
         gain = peak - outlook.mean.amax(-1)[..., None] - self.margin
@@ -159,10 +214,16 @@ class ProbabilityOfImprovement(Lookahead):
 
 
 def divergence(outlook: Outlook) -> Tensor:
-    r"""Divergence of predicted from present means, `(..., X·Y, N)`.
+    r"""Divergence of the predicted means from the present ones.
 
-    With :math:`e_k = p'_k / p_k - 1`, as :math:`\sum_k p_k ((1 + e_k) \ln(1 + e_k) - e_k)`, of which no term is
-    negative: what is small does not come from large terms that cancel.
+    It is computed as :math:`\sum_k p_k ((1 + e_k) \ln(1 + e_k) - e_k)` with :math:`e_k = p'_k / p_k - 1`. No term of
+    this sum is negative, so small divergences are not differences of large numbers.
+
+    Args:
+        outlook: present and predicted belief.
+
+    Returns:
+        `(..., X·Y, N)`, in nats.
     """
     growth = outlook.growth
     change = growth.log1p()
@@ -171,7 +232,13 @@ def divergence(outlook: Outlook) -> Tensor:
 
 
 def lead(mean: Tensor) -> Tensor:
-    """Difference of the two largest of probabilities `(..., K+1)`, `(...)`.
+    """Difference of the largest and the second largest probability.
+
+    Args:
+        mean: `(..., K+1)`, probabilities.
+
+    Returns:
+        `(...)`.
 
     >>> lead(torch.tensor([0.2, 0.5, 0.3]))
     tensor(0.2000)
@@ -181,6 +248,6 @@ def lead(mean: Tensor) -> Tensor:
 
 
 def deviation(peak: Tensor, total: Tensor) -> Tensor:
-    """Standard deviation of a class's probability with this mean, under a Dirichlet with this sum of parameters."""
+    """Standard deviation of a class probability under a Dirichlet, from its mean and the sum of the parameters."""
     variance = peak * (1 - peak) / (total + 1)
     return variance.clamp(min=torch.finfo(variance.dtype).tiny).sqrt()

@@ -1,4 +1,4 @@
-"""Acquisition functions of ideal searchers, which know how well they see: what will a look tell of the place?"""
+"""Acquisition functions of ideal searchers, which know how visible the target is from every fixation."""
 
 from abc import abstractmethod
 from typing import Protocol
@@ -12,12 +12,12 @@ from semfov.errors import check
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.observation.separation import ScoringModel, visibility
 
-# Cells that cannot be seen at all are told apart by noise alone: each of n equal ones is right with 1/n.
+# Where nothing is visible the answer is a guess: with this signal each of n equal cells is right with 1/n.
 _LEAST_SIGNAL = 1e-4
 
 
 class SignalModel(ScoringModel, Protocol):
-    """What these functions need of an observation model (`semfov.FovealObservationModel`)."""
+    """The part of an observation model that these functions need (`semfov.FovealObservationModel`)."""
 
     def level(self, distance: Tensor) -> Tensor:
         """Level of each distance, `(...)` from 0 to N - 1."""
@@ -25,10 +25,10 @@ class SignalModel(ScoringModel, Protocol):
 
 
 class SignalSearch(AcquisitionFunction):
-    """Base of the ideal searchers of Najemnik and Geisler: one target, somewhere, seen through normal noise.
+    """Base of the ideal searchers of Najemnik and Geisler: there is one target, and it is seen through Gaussian noise.
 
-    The prior of the target's place is the belief's probability in every cell, scaled to sum to 1 over the cells that
-    were not fixated: a search that goes on has not found it there.
+    The prior of the target's place is its probability in every cell by the belief, scaled to sum to 1 over the cells
+    not yet fixated: in a search that continues, no fixated cell held the target.
 
     Args:
         target: class 1..K, or a tensor `(B,)` with one for each episode.
@@ -36,7 +36,7 @@ class SignalSearch(AcquisitionFunction):
         grid: the cells of one image.
 
     Attributes:
-        signal: `(..., f, x)`, d' of a target in cell x seen from f, for each target.
+        signal: `(..., f, x)`, d' of a target in cell x seen from cell f, for each target.
     """
 
     target: Tensor
@@ -56,45 +56,66 @@ class SignalSearch(AcquisitionFunction):
 
     @abstractmethod
     def values(self, place: Tensor, signal: Tensor) -> Tensor:
-        """Values `(B, X·Y)` for the probability of the place `(B, X·Y)` and d' `(B, f, x)`."""
+        """Values `(B, X·Y)` for the prior of the place `(B, X·Y)` and d' `(B, f, x)`."""
 
 
 class EntropyLimit(SignalSearch):
-    r"""Entropy limit minimisation: how much a look is expected to lower the entropy of the target's place, at most.
+    r"""Entropy limit minimisation: the limit of the expected decrease of the entropy of the target's place by a look.
 
     .. math:: a(f) = \frac{1}{2} \sum_x q(x) \, d'^2(x, f), \qquad q \propto P(t \in x)
 
-    (Najemnik and Geisler, 2009, the entropy limit minimisation rule, ELM; in nats.) It is the ideal searcher's choice
-    in nearly all cases at a small part of the cost: a sum over the cells for each fixation.
+    This is the ELM rule of Najemnik and Geisler (2009), in nats. It makes the ideal searcher's choice in nearly all
+    cases, at a small part of the cost: a sum over the cells for each fixation.
 
     Args:
         target: class 1..K, or a tensor `(B,)` with one for each episode.
         model: the observation model, with miss rates.
         grid: the cells of one image.
+
+    >>> from semfov import DirichletBelief, FovealObservationModel
+    >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])
+    >>> missed = torch.tensor([[0.5, 0.9], [0.1, 0.8]])
+    >>> model = FovealObservationModel(alpha, [0.4], ["cup"], miss_rate=missed).requires_grad_(False)
+    >>> belief = DirichletBelief(torch.ones(1, 3, 2))
+    >>> EntropyLimit(1, model, Grid(3, 1, (30, 10)))(belief, torch.zeros(1, 3, dtype=torch.bool)).argmax()
+    tensor(1)
     """
 
     def values(self, place: Tensor, signal: Tensor) -> Tensor:
-        """The sum."""
+        """The sum, in nats."""
         return (signal.square() @ place[..., None])[..., 0] / 2
 
 
 class CorrectLocalisation(SignalSearch):
-    r"""Probability that the most probable cell is the target's after a look: the Bayesian ideal searcher.
+    r"""Probability that the most probable cell after a look is that of the target: the Bayesian ideal searcher.
 
-    A target in x answers with :math:`W_x \sim N(1/2, 1/d'^2)` and every other cell with :math:`N(-1/2, 1/d'^2)`, which
-    multiplies its probability by :math:`e^{d'^2 W}`. With q as in `EntropyLimit`,
+    The cell x of the target gives a response :math:`W_x \sim N(1/2, 1/d'^2)`, and every other cell one of
+    :math:`N(-1/2, 1/d'^2)`. A response multiplies the cell's probability by :math:`e^{d'^2 W}`. With q as in
+    `EntropyLimit`,
 
     .. math:: a(f) = \sum_x q(x) \int \varphi(w) \prod_{y \ne x} \Phi\left(
               \frac{2 \ln (q(x) / q(y)) + d_y'^2 + d_x'^2 + 2 d_x' w}{2 d_y'}\right) dw
 
-    (Najemnik and Geisler, 2005, the next fixation of the ideal searcher.) The integral is a sum over equidistant w,
-    smooth where d' is. Its cost grows with the third power of the number of cells: it is a reference for small grids.
+    (Najemnik and Geisler, 2005, the next fixation of the ideal searcher.) The integral is computed as a sum over
+    equidistant w, which is differentiable where d' is. The cost grows with the third power of the number of cells, so
+    this is a reference for small grids.
 
     Args:
         target: class 1..K, or a tensor `(B,)` with one for each episode.
         model: the observation model, with miss rates.
         grid: the cells of one image.
-        nodes: number of w, from -5 to 5.
+        nodes: number of values of w, from -5 to 5; at least 8.
+
+    Raises:
+        InputError: `nodes` is less than 8.
+
+    >>> from semfov import DirichletBelief, FovealObservationModel
+    >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])
+    >>> missed = torch.tensor([[0.5, 0.9], [0.1, 0.8]])
+    >>> model = FovealObservationModel(alpha, [0.4], ["cup"], miss_rate=missed).requires_grad_(False)
+    >>> belief = DirichletBelief(torch.ones(1, 3, 2))
+    >>> CorrectLocalisation(1, model, Grid(3, 1, (30, 10)))(belief, torch.zeros(1, 3, dtype=torch.bool)).argmax()
+    tensor(1)
     """
 
     def __init__(self, target: int | Tensor, model: SignalModel, grid: Grid, *, nodes: int = 64) -> None:
@@ -103,24 +124,28 @@ class CorrectLocalisation(SignalSearch):
         self.nodes = nodes
 
     def values(self, place: Tensor, signal: Tensor) -> Tensor:
-        """The integral, a fixation at a time."""
+        """The integral, computed for one fixation at a time."""
         return torch.stack([correct_localisation(place, d, nodes=self.nodes) for d in signal.unbind(-2)], -1)
 
     def extra_repr(self) -> str:
-        """Settings, for `repr`."""
+        """Describe the settings for `repr`.
+
+        Returns:
+            The number of nodes.
+        """
         return f"nodes={self.nodes}"
 
 
 def correct_localisation(place: Tensor, signal: Tensor, *, nodes: int = 64) -> Tensor:
-    """Probability that the most probable place is right after a look; see `CorrectLocalisation`.
+    """Probability that the most probable cell after a look is that of the target; see `CorrectLocalisation`.
 
     Args:
         place: `(..., X·Y)`, prior q.
         signal: `(..., X·Y)`, d' of every cell from the fixation, not negative.
-        nodes: of the integral.
+        nodes: number of nodes of the integral.
 
     Returns:
-        `(...)`.
+        `(...)`, probabilities.
 
     >>> even = torch.full((4,), 0.25)
     >>> correct_localisation(even, torch.zeros(4)), correct_localisation(even, torch.full((4,), 9.0))
@@ -129,7 +154,7 @@ def correct_localisation(place: Tensor, signal: Tensor, *, nodes: int = 64) -> T
     noise = torch.linspace(-5, 5, nodes, dtype=place.dtype, device=place.device)
     weight = (-noise.square() / 2).softmax(0)
     d = signal.clamp(min=_LEAST_SIGNAL)
-    # Cells of the target x and of its rivals y, and the noise w in x.
+    # Dimensions: the cell x of the target, every other cell y, and the noise w in x.
     log, half = place.clamp(min=torch.finfo(place.dtype).tiny).log(), d.square() / 2
     ahead = log[..., :, None] - log[..., None, :] + half[..., :, None] + half[..., None, :]
     heard = (d[..., None] * noise)[..., None, :]

@@ -1,4 +1,4 @@
-"""One look ahead: what a fixation is expected to make of the belief about the whole map."""
+"""One-step lookahead: the belief about the whole map that a fixation is expected to lead to."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 
 
 class LevelledModel(Protocol):
-    """What looking ahead needs of an observation model (`semfov.FovealObservationModel`)."""
+    """The part of an observation model that the lookahead needs (`semfov.FovealObservationModel`)."""
 
     def level(self, distance: Tensor) -> Tensor:
         """Level of each distance, `(...)` from 0 to N - 1."""
@@ -27,13 +27,13 @@ class LevelledModel(Protocol):
 
 @dataclass(frozen=True)
 class Outlook:
-    """The belief now, and what one more look from each level of distance is expected to leave of it.
+    """The present belief, and the belief expected after one more look from each level of distance.
 
     Attributes:
-        beta: β, `(..., X·Y, K+1)`.
+        beta: β, `(..., X·Y, K+1)`, Dirichlet parameters.
         total: T = Σ β, `(..., X·Y)`.
         mean: p = β / T, `(..., X·Y, K+1)`.
-        evidence: r = λ / Σ p λ, the expected look's likelihoods as factors on the mean, `(..., X·Y, N, K+1)`.
+        evidence: r = λ / Σ p λ, `(..., X·Y, N, K+1)`, the likelihoods λ of the expected look, as factors on the mean.
     """
 
     beta: Tensor
@@ -70,19 +70,22 @@ def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
     .. math:: \bar S_n = \sum_k p_k \, E[S \mid k, n], \qquad p'_k = \frac{T p_k + p_k r_k}{T + 1}, \quad
               r_k = \frac{\bar S_{n,k}}{\sum_j p_j \bar S_{n,j}}
 
-    The expected scores stand in Kaplan's rule as they are (Luzio, Bernardino and Moreno, 2024, the equation of
+    The expected scores enter Kaplan's rule without calibration (Luzio, Bernardino and Moreno, 2024, the equation of
     :math:`\bar S^x`, "which can then be applied with Kaplan's rule").
 
     Args:
         beta: `(..., X·Y, K+1)`, Dirichlet parameters.
-        expected: `(K+1, N, K+1)`, scores to expect of each class at each level
+        expected: `(K+1, N, K+1)`, expected scores of each class at each level
             (`FovealObservationModel.expected_scores`).
 
+    Returns:
+        The present and the expected belief.
+
     Raises:
-        InputError: belief and expected scores are of different numbers of classes.
+        InputError: belief and expected scores have different numbers of classes.
     """
     components = beta.shape[-1]
-    check(expected.shape[0] == components, "model", f"{components} classes", expected.shape[0])
+    check(expected.shape[0] == components, "model", f"{components} classes, as the belief has", expected.shape[0])
     total = beta.sum(-1)
     mean = beta / total[..., None]
     table = expected.to(beta).flatten(1)
@@ -92,10 +95,10 @@ def look_ahead(beta: Tensor, expected: Tensor) -> Outlook:
 
 
 class Lookahead(AcquisitionFunction):
-    """Base of the acquisition functions of exploration.
+    """Base of the acquisition functions of exploration that look one step ahead.
 
-    A cell's update depends on the fixation only through the level of the distance between them. So every cell is
-    updated N times and not X·Y times; `forward` looks up which of the N counts for each fixation.
+    The update of a cell depends on the fixation only through the level of the distance between them. Every cell is
+    therefore updated N times instead of X·Y times, and `forward` looks up the level that applies to each fixation.
 
     Args:
         model: the observation model (`semfov.FovealObservationModel`).
@@ -116,27 +119,30 @@ class Lookahead(AcquisitionFunction):
         expected = self.model.expected_scores()
 
         def values(maps: Tensor) -> Tensor:
-            return self.pool(seen_from(self.worth(look_ahead(maps, expected)), self.levels))
+            return self.pool(seen_from(self.cell_values(look_ahead(maps, expected)), self.levels))
 
         if beta.ndim == 2 or self.levels.ndim > 2:
             return values(beta)
-        # A map alone stays in the processor's cache: a batch at once costs four times as much.
+        # One map at a time stays in the processor's cache; a batch at once takes four times as long.
         return one_by_one(values, beta.flatten(0, -3)).view(beta.shape[:-1])
 
     @abstractmethod
-    def worth(self, outlook: Outlook) -> Tensor:
-        """What seeing a cell from each level is worth, `(..., X·Y, N)`."""
+    def cell_values(self, outlook: Outlook) -> Tensor:
+        """Value of seeing each cell from each level, `(..., X·Y, N)`."""
 
-    def pool(self, worth: Tensor) -> Tensor:
-        """One value for each fixation `(..., X·Y)` from what it is worth at every cell `(..., X·Y, X·Y)`: the sum."""
-        return worth.sum(-2)
+    def pool(self, values: Tensor) -> Tensor:
+        """Value of each fixation `(..., X·Y)`: the sum over the map of the values `(..., seen cell, fixation)`."""
+        return values.sum(-2)
 
 
 def seen_from(values: Tensor, levels: Tensor) -> Tensor:
-    """What is so for each level `(..., X·Y, N)`, for each fixation: `(..., seen cell, fixation)`.
+    """Look up values of every cell and level for each fixation.
 
     Args:
-        values: for every cell and level.
+        values: `(..., X·Y, N)`, for every cell and level.
         levels: `(X·Y, X·Y)` or `(B, X·Y, X·Y)`, level of the distance between every two cells.
+
+    Returns:
+        `(..., seen cell, fixation)`.
     """
     return values.gather(-1, levels.expand(*values.shape[:-1], levels.shape[-1]))

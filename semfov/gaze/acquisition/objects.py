@@ -1,4 +1,4 @@
-"""Exploration that goes by where objects are."""
+"""Exploration that looks at objects."""
 
 from torch import Tensor
 
@@ -7,7 +7,7 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 
 
 class ObjectEvidence(AcquisitionFunction):
-    r"""How much speaks for any object in each cell: the sum over all classes but background.
+    r"""Probability of any object in each cell: the sum over all classes except background.
 
     .. math:: a(x) = \sum_{k \ge 1} P(C^x = k)
 

@@ -1,4 +1,4 @@
-"""Acquisition functions of visual search that look beyond the fixated cell: what a fovea takes in."""
+"""Acquisition functions of visual search that account for all cells within the fovea, and not the fixated one alone."""
 
 from abc import abstractmethod
 from typing import Protocol
@@ -13,7 +13,7 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 
 
 class MissModel(Protocol):
-    """What these functions need of an observation model (`semfov.FovealObservationModel`)."""
+    """The part of an observation model that these functions need (`semfov.FovealObservationModel`)."""
 
     miss_rate: Tensor | None
 
@@ -23,7 +23,7 @@ class MissModel(Protocol):
 
 
 class TargetVisibility(AcquisitionFunction):
-    """Base of the acquisition functions that know from where the target can be seen.
+    """Base of the acquisition functions that use the probability of detecting the target from each fixation.
 
     Args:
         target: class 1..K, or a tensor `(B,)` with one for each episode.
@@ -31,7 +31,10 @@ class TargetVisibility(AcquisitionFunction):
         grid: the cells of one image.
 
     Attributes:
-        visibility: `(..., f, x)`, probability that a target in cell x is detected from f, for each target.
+        visibility: `(..., f, x)`, probability that a target in cell x is detected from cell f, for each target.
+
+    Raises:
+        InputError: the model has no miss rates.
     """
 
     target: Tensor
@@ -40,7 +43,7 @@ class TargetVisibility(AcquisitionFunction):
     def __init__(self, target: int | Tensor, model: MissModel, grid: Grid) -> None:
         super().__init__()
         if model.miss_rate is None:
-            raise InputError("model: expected an observation model with miss rates, got one without")
+            raise InputError("model: expected an observation model with miss rates, got one without them")
         self.register_buffer("target", torch.as_tensor(target))
         level = model.level(grid.cell_distance)
         self.register_buffer("visibility", 1 - model.miss_rate[self.target][..., level])
@@ -57,46 +60,60 @@ class TargetVisibility(AcquisitionFunction):
 
 
 class FovealHit(TargetVisibility):
-    r"""Probability that the target is detected anywhere from the next fixation, if cells are independent.
+    r"""Probability that a look detects the target in any cell, if cells are independent.
 
     .. math:: a(f) = 1 - \prod_x \bigl(1 - p_t(x) \, v_t(d(x, f))\bigr), \qquad v_t = 1 - m_t
 
-    with m the miss rates of the observation model: the probability of finding the target within the fovea.
+    m are the miss rates of the observation model.
 
     Args:
         target: class 1..K, or a tensor `(B,)` with one for each episode.
         model: the observation model, with miss rates.
         grid: the cells of one image.
+
+    >>> from semfov import DirichletBelief, FovealObservationModel
+    >>> missed = torch.tensor([[0.5, 0.9], [0.1, 0.8]])
+    >>> model = FovealObservationModel(torch.ones(2, 2, 2), [0.4], ["cup"], miss_rate=missed)
+    >>> belief = DirichletBelief(torch.ones(1, 3, 2))
+    >>> FovealHit(1, model, Grid(3, 1, (30, 10)))(belief, torch.zeros(1, 3, dtype=torch.bool)).argmax()
+    tensor(1)
     """
 
     def values(self, present: Tensor, visibility: Tensor) -> Tensor:
-        """Probability of a hit."""
+        """Probability of a detection."""
         return -torch.expm1(torch.log1p(-present[..., None, :] * visibility).sum(-1))
 
 
 class PlaceInformation(TargetVisibility):
-    r"""How much the next look is expected to tell of the target's place.
+    r"""Expected information that the next look gives about the target's place, in nats.
 
-    With the place distributed as :math:`q(x) \propto p_t(x)`, a look from f detects the target with probability
-    :math:`v_t(d(x, f))` if it is at x, and its place is then known; if it does not, q becomes
+    The place is distributed as :math:`q(x) \propto p_t(x)`. If the target is at x, a look from f detects it with
+    probability :math:`v_t(d(x, f))`, and its place is then known. If nothing is detected, q becomes
     :math:`q'(x) \propto q(x) (1 - v_t)`:
 
     .. math:: a(f) = H(q) - \Bigl(\sum_x q(x) (1 - v_t(d(x, f)))\Bigr) H(q')
 
-    (The expected information gain of a searcher, as in Butko and Movellan, 2010, with a detector that either sees or
-    misses.)
+    This is the expected information gain of a searcher as in Butko and Movellan (2010), with a detector that either
+    detects the target or misses it.
 
     Args:
         target: class 1..K, or a tensor `(B,)` with one for each episode.
         model: the observation model, with miss rates.
         grid: the cells of one image.
+
+    >>> from semfov import DirichletBelief, FovealObservationModel
+    >>> missed = torch.tensor([[0.5, 0.9], [0.1, 0.8]])
+    >>> model = FovealObservationModel(torch.ones(2, 2, 2), [0.4], ["cup"], miss_rate=missed)
+    >>> belief = DirichletBelief(torch.ones(1, 3, 2))
+    >>> PlaceInformation(1, model, Grid(3, 1, (30, 10)))(belief, torch.zeros(1, 3, dtype=torch.bool)).argmax()
+    tensor(1)
     """
 
     def values(self, present: Tensor, visibility: Tensor) -> Tensor:
-        """Entropy of the place that is expected to be lost, in nats."""
+        """Expected decrease of the entropy of the place, in nats."""
         place = present / present.sum(-1, keepdim=True)
         missed = place[..., None, :] * (1 - visibility)
         nothing = missed.sum(-1)
-        # P(nothing) H(q') = -Σ m ln m + P ln P with m = q (1 - v)
+        # P(no detection) H(q') = -Σ m ln m + P ln P with m = q (1 - v)
         left = torch.xlogy(nothing, nothing) - torch.xlogy(missed, missed).sum(-1)
         return -torch.xlogy(place, place).sum(-1, keepdim=True) - left

@@ -1,4 +1,4 @@
-"""Bottom-up saliency beside top-down value."""
+"""Bottom-up saliency combined with a top-down acquisition function."""
 
 import torch
 from torch import Tensor
@@ -9,20 +9,23 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 
 
 class SaliencyPrior(AcquisitionFunction):
-    r"""Semantic value times a saliency map: saliency is a prior over the cells, counted with a weight.
+    r"""Another acquisition function multiplied by a saliency map, which acts as a prior over the cells.
 
     .. math:: a(x) = \ln v(x) + w \ln\frac{s(x) + \epsilon}{\sum_y (s(y) + \epsilon)}, \qquad
               \epsilon = 10^{-3} \max_y s(y)
 
-    v is the value that another acquisition function gives, as the target's posterior; a value that is not positive
-    counts as next to nothing. With w = 0 it is that function alone. Luzio, Bernardino and Moreno (2024) name the
-    integration of semantic information "with traditional bottom-up cues" as what to try next and give no formula; the
-    product of prior and likelihood is that of Torralba, Oliva, Castelhano and Henderson (2006).
+    v is the value by the other function, such as the target's posterior. Values of 0 and below are replaced by the
+    smallest positive number. With w = 0 only v counts. Luzio, Bernardino and Moreno (2024) name the integration of
+    semantic information "with traditional bottom-up cues" as future work and give no formula. The product of prior and
+    likelihood is that of Torralba, Oliva, Castelhano and Henderson (2006).
 
     Args:
-        acquisition: gives v.
+        acquisition: the other acquisition function, v.
         saliency: s, `(..., X·Y)`, not negative (`semfov.saliency.cell_saliency`).
         weight: w, 0 or more.
+
+    Raises:
+        InputError: the weight or a saliency is negative.
 
     >>> from semfov import DirichletBelief, acquisition
     >>> belief = DirichletBelief(torch.tensor([[[1.0, 1.0], [1.0, 1.1]]]))
@@ -36,11 +39,12 @@ class SaliencyPrior(AcquisitionFunction):
     def __init__(self, acquisition: AcquisitionFunction, saliency: Tensor, *, weight: float) -> None:
         super().__init__()
         check(weight >= 0, "weight", "0 or more", weight)
-        check(bool((saliency >= 0).all()), "saliency", "no negative numbers", float(saliency.min()))
+        least = float(saliency.min())
+        check(least >= 0, "saliency", "numbers of 0 or more", f"{least:g}")
         self.acquisition = acquisition
         self.weight = weight
         peak = saliency.amax(-1, keepdim=True)
-        # A picture without contrast has no saliency anywhere: all of its cells are equal.
+        # Where saliency is 0 everywhere, as in a picture without contrast, the prior is uniform.
         raised = saliency + torch.where(peak > 0, 1e-3 * peak, 1.0)
         self.register_buffer("log_prior", (raised / raised.sum(-1, keepdim=True)).log())
 
@@ -52,5 +56,9 @@ class SaliencyPrior(AcquisitionFunction):
         return one_by_one(lambda row: row.clamp(min=least).log(), value) + self.weight * self.log_prior.to(value)
 
     def extra_repr(self) -> str:
-        """Settings, for `repr`."""
+        """Describe the settings for `repr`.
+
+        Returns:
+            The weight of the saliency.
+        """
         return f"weight={self.weight:g}"

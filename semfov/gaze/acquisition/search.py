@@ -1,4 +1,4 @@
-"""Acquisition functions of visual search: where is the target?"""
+"""Acquisition functions of visual search that go by the probability of the target."""
 
 from typing import Protocol
 
@@ -13,7 +13,7 @@ from semfov.gaze.acquisition.lookahead import LevelledModel, look_ahead, seen_fr
 
 
 class ExpectingModel(Protocol):
-    """What prediction needs of an observation model (`semfov.FovealObservationModel`)."""
+    """The part of an observation model that the prediction needs (`semfov.FovealObservationModel`)."""
 
     def expected_scores(self) -> Tensor:
         """Expected scores `E[S | class k, level n]`, `(K+1, N, K+1)`, level 0 at the fovea."""
@@ -25,8 +25,8 @@ class TargetPosterior(AcquisitionFunction):
 
     .. math:: a(x) = P(C^x = t) = \beta_t(x) / \sum_j \beta_j(x)
 
-    for a Dirichlet belief (Luzio, Bernardino and Moreno, 2024, Non-Predictive Visual Search); any other belief says
-    itself what the probability is (`Belief.chance`).
+    for a Dirichlet belief (Luzio, Bernardino and Moreno, 2024, Non-Predictive Visual Search). Other beliefs define the
+    probability themselves (`Belief.chance`).
 
     Args:
         target: index of the target class, 1..K, or a tensor `(B,)` with one for each episode.
@@ -49,19 +49,25 @@ class TargetPosterior(AcquisitionFunction):
 
 
 class PredictedTargetPosterior(AcquisitionFunction):
-    r"""Probability of the target that one more, foveal look at a cell is expected to leave: predictive search.
+    r"""Expected probability of the target in a cell after one more look at the cell: predictive search.
 
-    With the scores expected of such a look and one simulated update by Kaplan's rule,
+    The scores expected of this foveal look enter one simulated update by Kaplan's rule:
 
     .. math:: \bar S_0 = \sum_k p_k \, \frac{\alpha_{k,0}}{\sum_j \alpha_{k,0,j}}, \qquad
               a(x) = \frac{\bar\beta_t}{\sum_k \bar\beta_k} = p_t \frac{T + r_t}{T + 1}, \quad
               r_t = \frac{\bar S_{0,t}}{\sum_j p_j \bar S_{0,j}}, \quad T = \sum_j \beta_j
 
-    (Luzio, Bernardino and Moreno, 2024, Predictive Visual Search). The expected scores are not calibrated again.
+    (Luzio, Bernardino and Moreno, 2024, Predictive Visual Search.) The expected scores are not calibrated again.
 
     Args:
         target: index of the target class, 1..K, or a tensor `(B,)` with one for each episode.
         model: the observation model, for the expected scores.
+
+    >>> from semfov import DirichletBelief, FovealObservationModel
+    >>> model = FovealObservationModel(torch.tensor([[[9.0, 1.0]], [[1.0, 9.0]]]), [], ["cup"]).requires_grad_(False)
+    >>> belief = DirichletBelief(torch.tensor([[[1.0, 3.0], [1.0, 1.0]]]))
+    >>> PredictedTargetPosterior(1, model)(belief, torch.zeros(1, 2, dtype=torch.bool)).argmax()
+    tensor(0)
     """
 
     target: Tensor
@@ -78,20 +84,30 @@ class PredictedTargetPosterior(AcquisitionFunction):
 
 
 class NeighbourhoodPosterior(AcquisitionFunction):
-    r"""Probability of the target around a cell in the map that a fixation of it is expected to leave.
+    r"""Expected probability of the target in and around a cell after a fixation of that cell.
 
     .. math:: a(f) = \sum_x \exp\left(-\frac{\|x - f\|^2}{2 \varsigma^2}\right) \bar p_t(x \mid f)
 
-    with :math:`\bar p` the predicted map, every cell seen from the level of its distance to f. The outlook of Luzio,
-    Bernardino and Moreno (2024) proposes it: "the semantic information available in the cells surrounding a potential
-    fixation point, which can be extracted from" the predicted map, weighted "according to their distance to the focal
-    point". The paper gives no weights; the Gaussian is our choice.
+    :math:`\bar p` is the predicted map, in which every cell is seen at the level of its distance to f. The outlook of
+    Luzio, Bernardino and Moreno (2024) proposes it: "the semantic information available in the cells surrounding a
+    potential fixation point, which can be extracted from" the predicted map, weighted "according to their distance to
+    the focal point". The paper gives no weights; the Gaussian is our choice.
 
     Args:
         target: index of the target class, 1..K, or a tensor `(B,)` with one for each episode.
         model: the observation model, for the expected scores.
         grid: the cells of one image.
-        sigma: ς in cells.
+        sigma: ς in cells, positive.
+
+    Raises:
+        InputError: `sigma` is not positive.
+
+    >>> from semfov import DirichletBelief, FovealObservationModel
+    >>> alpha = torch.tensor([[[9.0, 1.0], [2.0, 1.0]], [[1.0, 9.0], [1.0, 2.0]]])
+    >>> model = FovealObservationModel(alpha, [0.4], ["cup"]).requires_grad_(False)
+    >>> belief = DirichletBelief(torch.ones(1, 3, 2))
+    >>> NeighbourhoodPosterior(1, model, Grid(3, 1, (30, 10)))(belief, torch.zeros(1, 3, dtype=torch.bool)).argmax()
+    tensor(1)
     """
 
     target: Tensor

@@ -1,4 +1,4 @@
-"""Acquisition functions that do not look at the belief."""
+"""Acquisition functions that do not depend on the belief."""
 
 from torch import Tensor
 
@@ -8,7 +8,7 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 
 
 class Uniform(AcquisitionFunction):
-    """Every cell is worth the same: with ties broken at random this is uniform random gaze.
+    """The same value for every cell: with ties broken at random this is uniform random gaze.
 
     >>> import torch
     >>> from semfov import DirichletBelief
@@ -22,10 +22,16 @@ class Uniform(AcquisitionFunction):
 
 
 class Static(AcquisitionFunction):
-    """Given values, such as a saliency map's, whatever the belief.
+    """Given values of the cells, such as a saliency map, whatever the belief.
 
     Args:
         values: `(..., X·Y)`.
+
+    >>> import torch
+    >>> from semfov import DirichletBelief
+    >>> salient = Static(torch.tensor([0.1, 0.7, 0.2]))
+    >>> salient(DirichletBelief(torch.ones(1, 3, 2)), torch.zeros(1, 3, dtype=torch.bool))
+    tensor([[0.1000, 0.7000, 0.2000]])
     """
 
     values: Tensor
@@ -35,6 +41,6 @@ class Static(AcquisitionFunction):
         self.register_buffer("values", values)
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """The values `(..., X·Y)`, for a belief about as many cells."""
+        """The values `(..., X·Y)`, for a belief about the same number of cells."""
         check_shape(self.values, "values", belief.closest.shape[-1])
         return self.values.expand(belief.closest.shape)

@@ -1,4 +1,4 @@
-"""Attention to what is like the target, gathered over foveal looks."""
+"""Attention to what resembles the target, accumulated over foveal looks."""
 
 import torch
 from torch import Tensor
@@ -11,21 +11,30 @@ from semfov.gaze.acquisition.closer_look import acuity
 
 
 class TemplateAttention(AcquisitionFunction):
-    r"""How like the target's template each cell is, by all looks so far, those from near counting more.
+    r"""Similarity of each cell to the target's template, averaged over all looks so far; near looks have more weight.
 
     .. math:: a(x) = \frac{\sum_{f \in \mathcal V} v(d(x, f)) \, M_t^f(x)}{\sum_{f \in \mathcal V} v(d(x, f))},
               \qquad v(d) = e^{-\max(d / r - 1,\, 0)}
 
-    with :math:`M_t^f` the attention for the target of what the fovea shows from f (`semfov.gaze.ClassTemplates`), and
-    :math:`\mathcal V` the fixated cells. It is IVSN (Zhang et al., 2018) "with foveal vision, extracting top-down
-    characteristics along the way", as the outlook of Luzio, Bernardino and Moreno (2024) asks. How looks are weighed
-    is our choice; v is that of `CloserLook`.
+    :math:`M_t^f` is the attention map for the target of the foveated image seen from f
+    (`semfov.gaze.ClassTemplates`), and :math:`\mathcal V` are the fixated cells. This is IVSN (Zhang et al., 2018)
+    "with foveal vision, extracting top-down characteristics along the way", as the outlook of Luzio, Bernardino and
+    Moreno (2024) proposes. The weights v of the looks are our choice; they are those of `CloserLook`.
 
     Args:
         target: class 1..K, or a tensor `(B,)` with one for each episode.
-        attention: `(X·Y, K, X·Y)`, M of every class in every cell, seen from the centre of every cell.
+        attention: `(X·Y, K, X·Y)`, M for each fixated cell, class and seen cell.
         grid: the cells of one image.
-        fovea: r in longer sides of the image.
+        fovea: r in units of the image's longer side.
+
+    Raises:
+        InputError: the shape of `attention` does not fit the grid, `fovea` is not positive, or there is no such class.
+
+    >>> from semfov import DirichletBelief
+    >>> attention = torch.tensor([[0.1, 0.9], [0.2, 0.3]])[:, None]
+    >>> search = TemplateAttention(1, attention, Grid(2, 1, (20, 10)))
+    >>> search(DirichletBelief(torch.ones(1, 2, 2)), torch.tensor([[True, False]]))
+    tensor([[0.1000, 0.9000]])
     """
 
     target: Tensor
@@ -44,7 +53,7 @@ class TemplateAttention(AcquisitionFunction):
         self.register_buffer("weight", acuity(grid.cell_distance, fovea))
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Values `(B, X·Y)`; the belief has no part in them."""
+        """Values `(B, X·Y)`; they do not depend on the belief."""
         seen = self.attention.transpose(0, 1)[(self.target - 1).expand(len(visited))]
         return one_by_one(self._values, seen, visited.to(seen))
 

@@ -1,4 +1,4 @@
-"""Policies: registered by name, each makes the acquisition function for a target on a grid."""
+"""Policies, registered by name: each makes the acquisition function for a target on a grid."""
 
 from semfov.gaze.policies.base import POLICIES, Means, ModelPolicy, Policy, Task, named_policy, policy_names, wanted
 from semfov.gaze.policies.exploration import (

@@ -1,4 +1,4 @@
-"""What a policy is, and where policies are registered by name."""
+"""The base class of policies, and their registry by name."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -20,19 +20,24 @@ Task = Literal["search", "exploration"]
 
 
 class GazeModel(LevelledModel, MissModel, SightedModel, SignalModel, Protocol):
-    """What all policies together need of an observation model (`semfov.FovealObservationModel`)."""
+    """The part of an observation model that policies need, all taken together (`semfov.FovealObservationModel`)."""
 
 
 @dataclass(frozen=True)
 class Means:
-    """What a policy may be made from.
+    """The models and settings that policies are made from; `Policy.make` takes the ones it needs.
 
     Attributes:
-        model: observation model, for the scores to expect and for miss rates.
+        model: observation model, for the expected scores and the miss rates.
         gaze: learned gaze policy.
         map: learned map.
-        fovea: width σ of the fovea in longer sides of the image.
+        fovea: width σ of the fovea in units of the image's longer side.
         prior: Dirichlet parameter of every class before the first look.
+
+    >>> named_policy("kl", "exploration", Means(prior=1.0))
+    Traceback (most recent call last):
+    ...
+    semfov.errors.InputError: policy 'kl': expected an observation model in `Means.model`, got none
     """
 
     model: GazeModel | None = None
@@ -45,16 +50,25 @@ class Means:
 class Policy(nn.Module, ABC):
     """Base of all policies: how to choose where to look, for any target on any grid.
 
-    A subclass is registered under its `name` when it is defined, and can then be named in settings. `needs_model`,
-    `needs_gaze` and `needs_map` say what it is made from, and `make` takes that from `Means`.
+    A subclass is registered under its `name` when it is defined, and settings can then refer to it by that name.
+    `needs_model`, `needs_gaze` and `needs_map` declare what it is made from, and `make` takes that from `Means`.
 
     Attributes:
-        name: that settings know it by.
-        tasks: what it is for.
+        name: name in settings.
+        tasks: tasks that the policy is for.
         needs_model: whether it is made from an observation model.
         needs_gaze: whether it is made from a learned gaze policy.
-        needs_map: whether it is made from a learned map, and goes by that.
-        by_place: whether it searches by the target's probability in every cell alone, and so with any belief.
+        needs_map: whether it is made from a learned map, and works on the belief of that map alone.
+        by_place: whether it searches by the probability of the target in every cell alone, and so works on any belief.
+
+    >>> from semfov import acquisition
+    >>> class Leftmost(Policy):
+    ...     name, tasks = "leftmost", ("search", "exploration")
+    ...     def forward(self, target, grid):
+    ...         return acquisition.Static(-grid.centres[:, 0])
+    >>> named_policy("leftmost", "search")(3, Grid(10, 10, (640, 480)))
+    Static()
+    >>> del POLICIES["leftmost"]
     """
 
     name: ClassVar[str]
@@ -71,24 +85,37 @@ class Policy(nn.Module, ABC):
 
     @classmethod
     def make(cls, means: Means) -> Self:
-        """The policy from what it needs."""
+        """Make the policy from the models and settings that it needs.
+
+        Args:
+            means: models and settings; those that the policy declares to need are given.
+
+        Returns:
+            The policy.
+        """
         return cls()
 
     @abstractmethod
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The acquisition function for a target on a grid.
+        """Make the acquisition function for a target on a grid.
 
         Args:
-            target: class 1..K, a tensor `(B,)` with one for each episode, or None where nothing is searched for.
+            target: class 1..K, a tensor `(B,)` with one for each episode, or None in an exploration.
             grid: the cells.
+
+        Returns:
+            The acquisition function.
         """
 
 
 class ModelPolicy(Policy):
-    """Base of the policies that know how the detector sees.
+    """Base of the policies that use an observation model: how well the detector sees at each distance from the fovea.
 
     Args:
         model: observation model.
+
+    >>> issubclass(POLICIES["predictive"], ModelPolicy), issubclass(POLICIES["random"], ModelPolicy)
+    (True, False)
     """
 
     needs_model = True
@@ -99,17 +126,23 @@ class ModelPolicy(Policy):
 
     @classmethod
     def make(cls, means: Means) -> Self:
-        """With the observation model."""
+        """Make the policy with the observation model."""
         assert means.model is not None
         return cls(means.model)
 
 
 POLICIES: dict[str, type[Policy]] = {}
-"""Every policy by its name."""
+"""All registered policies by name."""
 
 
 def policy_names(task: Task) -> list[str]:
     """Names of the policies for a task.
+
+    Args:
+        task: `search` or `exploration`.
+
+    Returns:
+        The names in the order of registration.
 
     >>> policy_names("search")[:3]
     ['random', 'non-predictive', 'predictive']
@@ -118,15 +151,18 @@ def policy_names(task: Task) -> list[str]:
 
 
 def named_policy(name: str, task: Task, means: Means | None = None) -> Policy:
-    """The policy of a name.
+    """Make a policy by its name.
 
     Args:
-        name: of a registered policy.
-        task: what it must be for.
-        means: what it may be made from.
+        name: name of a registered policy.
+        task: task that it must be for, `search` or `exploration`.
+        means: models and settings to make it from.
+
+    Returns:
+        The policy.
 
     Raises:
-        InputError: no policy for this task has that name, or it needs what `means` has not.
+        InputError: no policy for this task has that name, or `means` lacks a model that it needs.
 
     >>> named_policy("non-predictive", "search")(3, Grid(10, 10, (640, 480)))
     TargetPosterior()
@@ -134,16 +170,32 @@ def named_policy(name: str, task: Task, means: Means | None = None) -> Policy:
     kind = POLICIES[lookup(name, policy_names(task), f"{task} policy")]
     means = means or Means()
     if kind.needs_model and means.model is None:
-        raise InputError(f"policy {name!r}: expected an observation model for the scores to expect, got none")
+        raise InputError(f"policy {name!r}: expected an observation model in `Means.model`, got none")
     if kind.needs_gaze and means.gaze is None:
-        raise InputError(f"policy {name!r}: expected a learned gaze policy, got none")
+        raise InputError(f"policy {name!r}: expected a learned gaze policy in `Means.gaze`, got none")
     if kind.needs_map and means.map is None:
-        raise InputError(f"policy {name!r}: expected a learned map, got none")
+        raise InputError(f"policy {name!r}: expected a learned map in `Means.map`, got none")
     return kind.make(means)
 
 
 def wanted(target: int | Tensor | None, name: str) -> int | Tensor:
-    """The target, which a policy of this name cannot do without."""
+    """Return the target, or raise an error where there is none.
+
+    A search policy calls it in `forward`.
+
+    Args:
+        target: class 1..K, a tensor `(B,)`, or None.
+        name: name of the policy, for the error.
+
+    Returns:
+        The target.
+
+    Raises:
+        InputError: `target` is None.
+
+    >>> wanted(3, "non-predictive")
+    3
+    """
     if target is None:
         raise InputError(f"policy {name!r}: expected a target to search for, got none")
     return target

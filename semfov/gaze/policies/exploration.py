@@ -1,4 +1,7 @@
-"""Policies of scene exploration. Of those that look ahead, `kl`, `negative-entropy` and `two-peaks` are published."""
+"""Policies of scene exploration.
+
+`kl`, `negative-entropy` and `two-peaks` are those of Luzio, Bernardino and Moreno (2024).
+"""
 
 from typing import Self
 
@@ -23,11 +26,17 @@ from semfov.gaze.policies.base import GazeModel, Means, ModelPolicy, Policy
 
 
 class KL(ModelPolicy):
-    """Where a look takes the map furthest from its prior (`semfov.acquisition.KLDivergence`).
+    """Look where the divergence of the map from its prior is expected to grow most (`semfov.acquisition.KLDivergence`).
 
     Args:
         model: observation model.
         prior: Dirichlet parameter of every class before the first look.
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> policy = KL(FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"]), prior=1.0)
+    >>> policy(None, Grid(4, 3, (40, 30))).prior
+    1.0
     """
 
     name = "kl"
@@ -39,7 +48,7 @@ class KL(ModelPolicy):
 
     @classmethod
     def make(cls, means: Means) -> Self:
-        """With the observation model and the prior."""
+        """Make the policy with the observation model and the prior."""
         assert means.model is not None
         return cls(means.model, means.prior)
 
@@ -49,7 +58,17 @@ class KL(ModelPolicy):
 
 
 class Surprise(ModelPolicy):
-    """Where a look changes the map most (`semfov.acquisition.BayesianSurprise`)."""
+    """Look where the map is expected to change most (`semfov.acquisition.BayesianSurprise`).
+
+    Args:
+        model: observation model.
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> policy = Surprise(FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"]))
+    >>> type(policy(None, Grid(4, 3, (40, 30)))).__name__
+    'BayesianSurprise'
+    """
 
     name = "surprise"
     tasks = ("exploration",)
@@ -60,40 +79,80 @@ class Surprise(ModelPolicy):
 
 
 class Negentropy(ModelPolicy):
-    """Where a look leaves the map most certain (`semfov.acquisition.NegativeEntropy`)."""
+    """Look where the entropy of the map is expected to fall most (`semfov.acquisition.NegativeEntropy`).
+
+    Args:
+        model: observation model.
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> policy = Negentropy(FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"]))
+    >>> type(policy(None, Grid(4, 3, (40, 30)))).__name__
+    'NegativeEntropy'
+    """
 
     name = "negative-entropy"
     tasks = ("exploration",)
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The entropy lost."""
+        """The decrease of the entropy."""
         return NegativeEntropy(self.model, grid)
 
 
 class Peaks(ModelPolicy):
-    """Where a look changes the lead of the most probable class most (`semfov.acquisition.TwoPeaks`)."""
+    """Look where the margin of a most probable class is expected to change most (`semfov.acquisition.TwoPeaks`).
+
+    Args:
+        model: observation model.
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> policy = Peaks(FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"]))
+    >>> type(policy(None, Grid(4, 3, (40, 30)))).__name__
+    'TwoPeaks'
+    """
 
     name = "two-peaks"
     tasks = ("exploration",)
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The change of the lead."""
+        """The change of the margin."""
         return TwoPeaks(self.model, grid)
 
 
 class ConfidenceBound(ModelPolicy):
-    """Where a look raises upper confidence bounds most (`semfov.acquisition.UpperConfidenceBound`)."""
+    """Look where the upper confidence bounds are expected to rise most (`semfov.acquisition.UpperConfidenceBound`).
+
+    Args:
+        model: observation model.
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> policy = ConfidenceBound(FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"]))
+    >>> type(policy(None, Grid(4, 3, (40, 30)))).__name__
+    'UpperConfidenceBound'
+    """
 
     name = "upper-confidence-bound"
     tasks = ("exploration",)
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The rise of the bounds."""
+        """The increase of the bounds."""
         return UpperConfidenceBound(self.model, grid)
 
 
 class Improvement(ModelPolicy):
-    """Where a look most likely makes the map surer (`semfov.acquisition.ProbabilityOfImprovement`)."""
+    """Look where the map most probably becomes more certain (`semfov.acquisition.ProbabilityOfImprovement`).
+
+    Args:
+        model: observation model.
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> policy = Improvement(FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"]))
+    >>> type(policy(None, Grid(4, 3, (40, 30)))).__name__
+    'ProbabilityOfImprovement'
+    """
 
     name = "probability-of-improvement"
     tasks = ("exploration",)
@@ -104,21 +163,34 @@ class Improvement(ModelPolicy):
 
 
 class Accuracy(ModelPolicy):
-    """Where a look names most cells right (`semfov.acquisition.ExpectedAccuracy`); needs miss rates."""
+    """Look where most cells are expected to become correct (`semfov.acquisition.ExpectedAccuracy`).
+
+    Args:
+        model: observation model, with miss rates.
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> model = FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"], miss_rate=torch.full((2, 1), 0.5))
+    >>> type(Accuracy(model)(None, Grid(4, 3, (40, 30)))).__name__
+    'ExpectedAccuracy'
+    """
 
     name = "expected-accuracy"
     tasks = ("exploration",)
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The cells that are named right."""
+        """The expected number of additional correct cells."""
         return ExpectedAccuracy(self.model, grid)
 
 
 class Closer(Policy):
-    """Where the fovea comes closest to what is not named yet (`semfov.acquisition.CloserLook`).
+    """Look where the fovea comes closer than before to cells whose class is unknown (`semfov.acquisition.CloserLook`).
 
     Args:
-        fovea: width σ of the fovea in longer sides of the image.
+        fovea: width σ of the fovea in units of the image's longer side.
+
+    >>> Closer(0.2)(None, Grid(4, 3, (40, 30)))
+    CloserLook(fovea=0.2)
     """
 
     name = "closer-look"
@@ -130,7 +202,7 @@ class Closer(Policy):
 
     @classmethod
     def make(cls, means: Means) -> Self:
-        """With the width of the fovea."""
+        """Make the policy with the width of the fovea."""
         return cls(means.fovea)
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
@@ -139,10 +211,13 @@ class Closer(Policy):
 
 
 class Gain(Policy):
-    """Where a look is expected to name most cells right that are not yet (`semfov.acquisition.ExpectedGain`).
+    """Look where a learned map expects most additional cells to become correct (`semfov.acquisition.ExpectedGain`).
 
     Args:
         model: learned map.
+
+    >>> type(Gain(MapEvidence(components=3))(None, Grid(4, 3, (40, 30)))).__name__
+    'ExpectedGain'
     """
 
     name = "expected-gain"
@@ -155,21 +230,27 @@ class Gain(Policy):
 
     @classmethod
     def make(cls, means: Means) -> Self:
-        """With the learned map."""
+        """Make the policy with the learned map."""
         assert means.map is not None
         return cls(means.map)
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The cells gained."""
+        """The expected number of additional correct cells."""
         return ExpectedGain(self.model, grid)
 
 
 class Objects(Policy):
-    """Where an object is (`semfov.acquisition.ObjectEvidence`): with a `Landing` observer, where people look."""
+    """Look at objects of any class (`semfov.acquisition.ObjectEvidence`).
+
+    With the observer `semfov.observers.Landing` this is where people look.
+
+    >>> Objects()(None, Grid(4, 3, (40, 30)))
+    ObjectEvidence()
+    """
 
     name = "objects"
     tasks = ("exploration",)
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The evidence for any object."""
+        """The probability of any object."""
         return ObjectEvidence()

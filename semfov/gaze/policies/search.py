@@ -1,8 +1,8 @@
 """Policies of visual search.
 
-`random`, `non-predictive` and `predictive` are those of Luzio, Bernardino and Moreno (2024), `entropy-limit` and
-`ideal-observer` those of Najemnik and Geisler (2009, 2005), whose searcher by maximum a posteriori is `non-predictive`.
-The others are ours.
+`random`, `non-predictive` and `predictive` are those of Luzio, Bernardino and Moreno (2024). `entropy-limit` and
+`ideal-observer` are those of Najemnik and Geisler (2009, 2005), whose maximum a posteriori searcher equals
+`non-predictive`. The others are ours.
 """
 
 from typing import ClassVar, Self
@@ -20,7 +20,11 @@ from semfov.gaze.policies.base import Means, ModelPolicy, Policy, Task, wanted
 
 
 class Random(Policy):
-    """Any cell, for searches and explorations (`semfov.acquisition.Uniform`)."""
+    """Look at random, in searches and explorations (`semfov.acquisition.Uniform`).
+
+    >>> Random()(None, Grid(4, 3, (40, 30)))
+    Uniform()
+    """
 
     name = "random"
     tasks: ClassVar[tuple[Task, ...]] = ("search", "exploration")
@@ -31,9 +35,12 @@ class Random(Policy):
 
 
 class NonPredictive(Policy):
-    """Where the target is most probable (`semfov.acquisition.TargetPosterior`).
+    """Look where the target is most probable (`semfov.acquisition.TargetPosterior`).
 
-    It is also the searcher by maximum a posteriori (MAP) that Najemnik and Geisler (2005) compare with their ideal one.
+    It equals the maximum a posteriori (MAP) searcher that Najemnik and Geisler (2005) compare with their ideal one.
+
+    >>> NonPredictive()(3, Grid(4, 3, (40, 30)))
+    TargetPosterior()
     """
 
     name = "non-predictive"
@@ -45,7 +52,17 @@ class NonPredictive(Policy):
 
 
 class Predictive(ModelPolicy):
-    """Where a look is expected to leave the target most probable (`semfov.acquisition.PredictedTargetPosterior`)."""
+    """Look where the target will be most probable after the look (`semfov.acquisition.PredictedTargetPosterior`).
+
+    Args:
+        model: observation model.
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> policy = Predictive(FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"]))
+    >>> type(policy(1, Grid(4, 3, (40, 30)))).__name__
+    'PredictedTargetPosterior'
+    """
 
     name = "predictive"
     tasks = ("search",)
@@ -56,7 +73,17 @@ class Predictive(ModelPolicy):
 
 
 class Neighbourhood(ModelPolicy):
-    """Where the target is expected in the cell or beside it (`semfov.acquisition.NeighbourhoodPosterior`)."""
+    """Look where the target is expected in the cell or its neighbours (`semfov.acquisition.NeighbourhoodPosterior`).
+
+    Args:
+        model: observation model.
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> policy = Neighbourhood(FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"]))
+    >>> type(policy(1, Grid(4, 3, (40, 30)))).__name__
+    'NeighbourhoodPosterior'
+    """
 
     name = "neighbourhood"
     tasks = ("search",)
@@ -67,7 +94,17 @@ class Neighbourhood(ModelPolicy):
 
 
 class FovealHits(ModelPolicy):
-    """From where the target is most likely detected (`semfov.acquisition.FovealHit`); needs miss rates."""
+    """Look from where a detection of the target is most probable (`semfov.acquisition.FovealHit`).
+
+    Args:
+        model: observation model, with miss rates.
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> model = FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"], miss_rate=torch.full((2, 1), 0.5))
+    >>> type(FovealHits(model)(1, Grid(4, 3, (40, 30)))).__name__
+    'FovealHit'
+    """
 
     name = "foveal-hit"
     tasks = ("search",)
@@ -79,7 +116,17 @@ class FovealHits(ModelPolicy):
 
 
 class InformationOnPlace(ModelPolicy):
-    """From where the target's place is told best (`semfov.acquisition.PlaceInformation`); needs miss rates."""
+    """Look from where most information about the target's place is expected (`semfov.acquisition.PlaceInformation`).
+
+    Args:
+        model: observation model, with miss rates.
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> model = FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"], miss_rate=torch.full((2, 1), 0.5))
+    >>> type(InformationOnPlace(model)(1, Grid(4, 3, (40, 30)))).__name__
+    'PlaceInformation'
+    """
 
     name = "place-information"
     tasks = ("search",)
@@ -91,9 +138,17 @@ class InformationOnPlace(ModelPolicy):
 
 
 class EntropyLimitMinimisation(ModelPolicy):
-    """From where the entropy of the target's place can fall most (`semfov.acquisition.EntropyLimit`).
+    """Look from where the entropy of the target's place can fall most (`semfov.acquisition.EntropyLimit`).
 
-    It needs miss rates, and a model whose Dirichlets are densities of the scores (`semfov.observation.visibility`).
+    Args:
+        model: observation model, with miss rates, whose Dirichlets are densities of the scores
+            (`semfov.observation.visibility`).
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> model = FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"], miss_rate=torch.full((2, 1), 0.5))
+    >>> type(EntropyLimitMinimisation(model)(1, Grid(4, 3, (40, 30)))).__name__
+    'EntropyLimit'
     """
 
     name = "entropy-limit"
@@ -101,14 +156,23 @@ class EntropyLimitMinimisation(ModelPolicy):
     by_place = True
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The limit of the entropy lost."""
+        """The limit of the decrease of the entropy."""
         return EntropyLimit(wanted(target, self.name), self.model, grid)
 
 
 class IdealObserver(ModelPolicy):
-    """From where the target is most likely told right (`semfov.acquisition.CorrectLocalisation`).
+    """Look from where the target is most probably located correctly (`semfov.acquisition.CorrectLocalisation`).
 
-    It needs what `EntropyLimitMinimisation` does, and time: a tenth of a second and more for 100 cells.
+    A decision takes a tenth of a second or more for 100 cells.
+
+    Args:
+        model: observation model, as for `EntropyLimitMinimisation`.
+
+    >>> import torch
+    >>> from semfov import FovealObservationModel
+    >>> model = FovealObservationModel(torch.ones(2, 1, 2), [], ["cup"], miss_rate=torch.full((2, 1), 0.5))
+    >>> type(IdealObserver(model)(1, Grid(4, 3, (40, 30)))).__name__
+    'CorrectLocalisation'
     """
 
     name = "ideal-observer"
@@ -116,15 +180,18 @@ class IdealObserver(ModelPolicy):
     by_place = True
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The probability of being right."""
+        """The probability of a correct localisation."""
         return CorrectLocalisation(wanted(target, self.name), self.model, grid)
 
 
 class Learned(Policy):
-    """A gaze policy learned end to end (`semfov.gaze.LearnedGaze`).
+    """Look where a network learned end to end gives the highest value (`semfov.gaze.LearnedGaze`).
 
     Args:
         gaze: the learned network.
+
+    >>> type(Learned(LearnedGaze())(1, Grid(4, 3, (40, 30)))).__name__
+    'LearnedAcquisition'
     """
 
     name = "learned"
@@ -137,10 +204,10 @@ class Learned(Policy):
 
     @classmethod
     def make(cls, means: Means) -> Self:
-        """With the learned network."""
+        """Make the policy with the learned network."""
         assert means.gaze is not None
         return cls(means.gaze)
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """What the network makes of the belief."""
+        """The values of the network."""
         return LearnedAcquisition(self.gaze, wanted(target, self.name), grid)

@@ -1,7 +1,7 @@
-"""Bottom-up saliency: where an image draws the gaze, whatever is looked for. Baselines to compare with.
+"""Bottom-up saliency: where an image attracts the gaze, whatever the task. Baselines for comparison.
 
 VOCUS2 is the baseline of Luzio, Bernardino and Moreno (2024, section IV-B), computed anew on the foveated view of every
-fixation. The model of Itti, Koch and Niebur is the one that VOCUS2 reforms; the paper has no figures for it.
+fixation. VOCUS2 builds on the model of Itti, Koch and Niebur; the paper has no figures for that model.
 """
 
 from semfov.gaze.saliency.cells import cell_saliency

@@ -1,4 +1,4 @@
-"""Blur and enlargement of images as OpenCV does them."""
+"""Blur and enlargement of images as in OpenCV."""
 
 import torch
 from torch import Tensor
@@ -6,17 +6,27 @@ from torch import Tensor
 from semfov.errors import check, check_shape
 from semfov.sensor.lines import Lines, Taps, banded, constant, separable
 
-# Pixels that one product makes at once: more of them multiply more zeros, fewer make the products slow.
+# Number of pixels that one matrix product computes: larger tiles multiply more zeros, smaller tiles are slower.
 _TILE = 24
 
 
 def gaussian_kernel(sigma: float) -> Tensor:
-    r"""Weights of a Gaussian, `(2r+1,)` in float64.
+    r"""Weights of a Gaussian kernel.
 
     .. math:: w_i \propto \exp(-i^2 / 2\sigma^2), \quad |i| \le r, \quad 2r + 1 = \mathrm{round}(8\sigma + 1)
 
-    the number of taps made odd by rounding up: OpenCV's kernel for floats where no size is given. The weights are
-    Kornia's. The blur is not: by `benchmarks.pyramid` Kornia's takes more than twice as long on a CPU.
+    The number of taps is made odd by rounding up. This is OpenCV's kernel for floats where no size is given. The
+    weights are computed by Kornia. The blur is not, because Kornia's takes more than twice as long on a CPU
+    (`benchmarks.pyramid`).
+
+    Args:
+        sigma: σ in pixels, positive.
+
+    Returns:
+        `(2r+1,)`, float64, with sum 1.
+
+    Raises:
+        InputError: σ is not positive.
 
     >>> gaussian_kernel(0.25)
     tensor([3.3524e-04, 9.9933e-01, 3.3524e-04], dtype=torch.float64)
@@ -29,12 +39,18 @@ def gaussian_kernel(sigma: float) -> Tensor:
 
 
 def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor:
-    """Blur with a Gaussian, borders continued: `cv2.GaussianBlur` of floats with `BORDER_REPLICATE`.
+    """Blur with a Gaussian, where the border pixels are repeated: `cv2.GaussianBlur` of floats with `BORDER_REPLICATE`.
 
     Args:
         image: `(B, C, H, W)`.
-        sigma: standard deviation in pixels, see `gaussian_kernel`.
+        sigma: standard deviation in pixels (`gaussian_kernel`).
         halve: keep only the first of every two pixels, `floor(n / 2)` of n (at least 1) along each axis.
+
+    Returns:
+        `(B, C, H, W)`, or about half of H and W with `halve`.
+
+    Raises:
+        InputError: the image is empty or of another shape, or σ is not positive.
 
     >>> gaussian_blur(torch.ones(1, 3, 5, 7), 2.0, halve=True).shape
     torch.Size([1, 3, 2, 3])
@@ -47,7 +63,14 @@ def gaussian_blur(image: Tensor, sigma: float, *, halve: bool = False) -> Tensor
 
 
 def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Enlarge an image `(..., h, w)` to `(height, width)` by cubic interpolation (a = -0.75): `cv2.INTER_CUBIC`.
+    """Enlarge an image by cubic interpolation (a = -0.75): `cv2.INTER_CUBIC`.
+
+    Args:
+        image: `(..., h, w)`.
+        size: `(height, width)` of the result in pixels.
+
+    Returns:
+        `(..., height, width)`.
 
     >>> enlarge(torch.rand(1, 2, 3), (4, 5)).shape
     torch.Size([1, 4, 5])
@@ -61,7 +84,7 @@ def enlarge(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 @constant
 def _blurring(count: int, sigma: float, step: int, dtype: torch.dtype, device: torch.device) -> Lines:
-    """Blur of lines of `count` pixels, of which one of `step` is kept; borders continued."""
+    """Linear map that blurs lines of `count` pixels and keeps one pixel of every `step`; border pixels are repeated."""
     kernel = gaussian_kernel(sigma)
     length, reach = max(count // step, 1), len(kernel) // 2
     index = torch.arange(length)[:, None] * step + torch.arange(len(kernel)) - reach
@@ -71,7 +94,7 @@ def _blurring(count: int, sigma: float, step: int, dtype: torch.dtype, device: t
 
 @constant
 def _enlarging(count: int, length: int, dtype: torch.dtype, device: torch.device) -> Lines:
-    """Keys' cubic interpolation (a = -0.75), pixels as areas, borders continued."""
+    """Linear map of Keys' cubic interpolation (a = -0.75) of pixels as areas; border pixels are repeated."""
     place = (torch.arange(length).double() + 0.5) * (count / length) - 0.5
     index = place.floor().long()[:, None] + torch.arange(-1, 3)
     distance = (place[:, None] - index).abs()
@@ -80,6 +103,6 @@ def _enlarging(count: int, length: int, dtype: torch.dtype, device: torch.device
     far = a * (((distance - 5) * distance + 8) * distance - 4)
     taps = Taps(index.clamp(0, count - 1), torch.where(distance <= 1, near, far))
     ratio, rest = divmod(length, count)
-    # Where the ratio is no whole number the tiles would not be evenly spaced.
+    # Tiles are evenly spaced only where the ratio is a whole number.
     shift = count if rest else max(_TILE // ratio, 1)
     return banded(taps, count, length if rest else shift * ratio, shift, 2, dtype, device)

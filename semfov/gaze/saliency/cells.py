@@ -1,4 +1,4 @@
-"""A saliency map over the pixels as values of the cells of a grid."""
+"""Reduce a saliency map over the pixels to values of the cells of a grid."""
 
 from typing import Literal, get_args
 
@@ -11,19 +11,23 @@ Reduction = Literal["mean", "max"]
 
 
 def cell_saliency(saliency: Tensor, columns: int, rows: int, reduction: Reduction = "mean") -> Tensor:
-    """Saliency of each of `columns` × `rows` equal cells over the image, numbered row by row.
+    """Saliency of each of `columns` × `rows` equal cells of the image, numbered row by row.
 
     Args:
         saliency: `(B, H, W)`, of any size.
         columns: number of cells in a row, X.
         rows: number of cells in a column, Y.
-        reduction: `mean` over the cell's area (a pixel on the border counts with the share inside), or `max` over
-            the pixels that share a positive area with it. With `max` the best cell not yet visited is that of the most
-            salient pixel once the pixels of visited cells are nullified, as Luzio, Bernardino and Moreno (2024, section
-            IV-B) describe inhibition of return.
+        reduction: `mean` over the area of the cell, where a pixel on the border counts by the fraction inside; or
+            `max` over the pixels that overlap the cell. With `max` the best cell not yet visited is the one of the
+            most salient pixel outside visited cells, as Luzio, Bernardino and Moreno (2024, section IV-B) describe
+            inhibition of return.
 
     Returns:
         `(B, Y·X)`.
+
+    Raises:
+        InputError: the map is empty or not `(B, H, W)` of floating-point numbers, there is no such `reduction`, or
+            `columns` or `rows` is less than 1.
 
     >>> cell_saliency(torch.tensor([[[0.0, 2.0, 4.0]]]), 2, 1)
     tensor([[0.6667, 3.3333]])
@@ -42,8 +46,8 @@ def cell_saliency(saliency: Tensor, columns: int, rows: int, reduction: Reductio
 
 
 def _shares(pixels: int, cells: int, like: Tensor) -> Tensor:
-    """Share of each cell's length that each pixel covers, `(cells, pixels)`; rows sum to 1."""
-    # On a scale where both pixels and cells have whole-number borders.
+    """Fraction of each cell's length that each pixel covers, `(cells, pixels)`; rows sum to 1."""
+    # Lengths are scaled so that the borders of both pixels and cells are whole numbers.
     pixel = torch.arange(pixels, device=like.device) * cells
     cell = torch.arange(cells, device=like.device)[:, None] * pixels
     overlap = torch.minimum(pixel + cells, cell + pixels) - torch.maximum(pixel, cell)
@@ -51,5 +55,5 @@ def _shares(pixels: int, cells: int, like: Tensor) -> Tensor:
 
 
 def _covered(pixels: int, cells: int) -> list[tuple[int, int]]:
-    """First and end pixel of those that overlap each cell."""
+    """For each cell, the first and the end index of the pixels that overlap it."""
     return [(cell * pixels // cells, -(-(cell + 1) * pixels // cells)) for cell in range(cells)]

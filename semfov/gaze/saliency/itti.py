@@ -23,12 +23,23 @@ _TAPS, _PERIOD, _SIGMA = 9, 7.0, 7 / 3
 # Lower maxima of a map do not count (Walther and Koch, 2006).
 _PEAK = 0.1
 
-# Maps with a smaller range, in units of the rounding error at 1, hold nothing else, and stretching would promote it.
+# Maps with a smaller range, in units of the rounding error at 1, hold rounding errors alone. Scaling would amplify
+# them.
 _FLAT = 32
 
 
 def gaussian_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
-    """Levels 0 to `levels` of a dyadic Gaussian pyramid (`cv2.pyrDown`), for channels `(B, C, H, W)`.
+    """Dyadic Gaussian pyramid (`cv2.pyrDown`).
+
+    Args:
+        channels: `(B, C, H, W)`.
+        levels: number of the last level, 0 or more.
+
+    Returns:
+        Levels 0 to `levels`; level 0 is `channels`.
+
+    Raises:
+        InputError: `levels` is negative.
 
     >>> [tuple(level.shape[-2:]) for level in gaussian_pyramid(torch.rand(1, 3, 9, 12), 3)]
     [(9, 12), (5, 6), (3, 3), (2, 2)]
@@ -41,15 +52,19 @@ def gaussian_pyramid(channels: Tensor, levels: int) -> list[Tensor]:
 
 
 def gabor_kernels(orientations: Sequence[float] = ORIENTATIONS) -> Tensor:
-    r"""Even and odd Gabor filters that do not answer to a uniform image, `(2n, 9, 9)` in float64.
+    r"""Even and odd Gabor filters without response to a uniform image.
 
     .. math:: g_\phi(x, y) = \cos(2\pi u / 7 + \phi) \exp(-(x^2 + y^2) / 2\sigma^2), \quad
         u = x \cos\theta + y \sin\theta, \quad \phi \in \{0, \pi/2\}, \quad \sigma = 7/3
 
-    less their mean, with absolute values that sum to 1. At 0° the wave runs along x: vertical bars answer.
+    The mean is subtracted, and the absolute values are scaled to sum to 1. At 0° the wave runs along x, and vertical
+    bars give the largest response.
 
     Args:
-        orientations: angles θ in degrees, y pointing down.
+        orientations: angles θ in degrees, with y pointing down.
+
+    Returns:
+        `(2n, 9, 9)` for n angles, float64, the even and the odd filter of each in turn.
 
     >>> gabor_kernels([0.0]).shape
     torch.Size([2, 9, 9])
@@ -65,7 +80,14 @@ def gabor_kernels(orientations: Sequence[float] = ORIENTATIONS) -> Tensor:
 
 
 def orientation_energy(intensity: Tensor, orientations: Sequence[float] = ORIENTATIONS) -> Tensor:
-    """Answer of Gabor filters `(B, n, h, w)` to an intensity `(B, 1, h, w)`: |even| + |odd|, borders continued.
+    """Response |even| + |odd| of Gabor filters to an intensity, where the border pixels are repeated.
+
+    Args:
+        intensity: `(B, 1, h, w)`.
+        orientations: n angles in degrees.
+
+    Returns:
+        `(B, n, h, w)`, not negative.
 
     >>> orientation_energy(torch.eye(9)[None, None])[0, :, 4, 4].argmax()
     tensor(3)
@@ -78,7 +100,7 @@ def orientation_energy(intensity: Tensor, orientations: Sequence[float] = ORIENT
 
 
 def across_scales(centre: Tensor, surround: Tensor) -> Tensor:
-    """Difference of two scales, `|centre - surround|`, the coarser enlarged bilinearly to the finer."""
+    """Difference of two scales, `|centre - surround|`, after bilinear enlargement of the coarser to the finer."""
     size = (centre.shape[-2], centre.shape[-1])
     return (centre - F.interpolate(surround, size, mode="bilinear", align_corners=False)).abs()
 
@@ -88,12 +110,15 @@ def promote(maps: Tensor) -> Tensor:
 
     .. math:: N(M) = M \, (1 - \bar m)^2
 
-    for a map stretched to [0, 1] and the mean of its local maxima other than the largest. A local maximum exceeds
-    0.1 and is no less than its eight neighbours; of equal neighbours the first counts. A map whose range is within
-    rounding errors of values up to 1 gives 0.
+    M is the map scaled to [0, 1], and :math:`\bar m` the mean of its local maxima other than the largest. A local
+    maximum exceeds 0.1 and is no less than its eight neighbours; of equal neighbours the first counts. A map whose
+    range is no more than the rounding errors of values up to 1 becomes 0.
 
     Args:
         maps: `(..., h, w)`, each normalised alone.
+
+    Returns:
+        The same shape, from 0 to 1.
 
     >>> promote(torch.tensor([[4.0, 0.0, 0.0, 2.0]]))
     tensor([[0.2500, 0.0000, 0.0000, 0.1250]])
@@ -101,13 +126,19 @@ def promote(maps: Tensor) -> Tensor:
     maps = rescale(maps, _FLAT * torch.finfo(maps.dtype).eps)
     peaks = local_maxima(maps) & (maps > _PEAK)
     count = peaks.sum((-2, -1), keepdim=True)
-    # The largest is exactly 1 and always among them.
+    # The largest maximum is exactly 1, and is always among the peaks.
     others = ((maps * peaks).sum((-2, -1), keepdim=True) - 1) / (count - 1).clamp(min=1)
     return maps * (1 - torch.where(count > 1, others, 0.0)) ** 2
 
 
 def local_maxima(maps: Tensor) -> Tensor:
-    """Pixels of maps `(..., h, w)` above their earlier and no less than their later neighbours, row by row.
+    """Local maxima: pixels above their earlier neighbours and no less than their later ones, in row-major order.
+
+    Args:
+        maps: `(..., h, w)`.
+
+    Returns:
+        The same shape, boolean.
 
     >>> local_maxima(torch.tensor([[1.0, 3.0, 3.0], [0.0, 2.0, 1.0]])).int()
     tensor([[0, 1, 0],
@@ -123,7 +154,7 @@ def local_maxima(maps: Tensor) -> Tensor:
 
 
 def conspicuity(image: Tensor) -> Tensor:
-    r"""Conspicuity of intensity, colour and orientation, `(B, 3, h, w)` at scale 4 (Itti, Koch and Niebur, 1998).
+    r"""Conspicuity maps of intensity, colour and orientation at scale 4 (Itti, Koch and Niebur, 1998).
 
     .. math:: \bar I = \bigoplus_{c,s} N(I_{c,s}), \quad
         \bar C = \bigoplus_{c,s} N(RG_{c,s}) + N(BY_{c,s}), \quad
@@ -131,12 +162,15 @@ def conspicuity(image: Tensor) -> Tensor:
 
     over centres c = 2, 3, 4 and surrounds s = c + 3, c + 4 of the Gaussian pyramid.
 
-    The opponency's contrast is that of R - G at the centre to R - G in the surround. Equation 2 of Itti, Koch and
-    Niebur has G - R in the surround, which taken literally answers most to a uniform colour; their text means the
-    contrast. So it is with B - Y and their equation 3.
+    The contrast of an opponency is the difference of R - G at the centre and R - G in the surround. Equation 2 of Itti,
+    Koch and Niebur has G - R in the surround. Taken literally, it responds most to a uniform colour, while their text
+    means the contrast. The same holds for B - Y and their equation 3.
 
     Args:
         image: `(B, 3, H, W)`, RGB in [0, 1].
+
+    Returns:
+        `(B, 3, h, w)`.
     """
     levels = max(CENTRES) + max(DELTAS)
     pyramid = gaussian_pyramid(anchor(double_opponency(image)), levels)
@@ -158,14 +192,17 @@ def itti_koch_saliency(image: Tensor, *, normalise: bool = True) -> Tensor:
 
     .. math:: S = \tfrac{1}{3} (N(\bar I) + N(\bar C) + N(\bar O))
 
-    at scale 4, enlarged bilinearly to the image; see `conspicuity` and `promote`.
+    It is computed at scale 4 and enlarged bilinearly to the size of the image; see `conspicuity` and `promote`.
 
     Args:
         image: `(B, 3, H, W)`, RGB in [0, 1].
-        normalise: stretch every map to [0, 1].
+        normalise: scale every map to [0, 1].
 
     Returns:
-        `(B, H, W)`.
+        `(B, H, W)`, saliency, 0 or more.
+
+    Raises:
+        InputError: the image is not `(B, 3, H, W)` of floating-point numbers, or is empty.
 
     >>> image = torch.zeros(1, 3, 192, 256)
     >>> image[:, 0, 80:96, 48:64] = 1.0
@@ -173,7 +210,7 @@ def itti_koch_saliency(image: Tensor, *, normalise: bool = True) -> Tensor:
     >>> 72 <= row < 104 and 40 <= column < 72
     True
     """
-    # Whether a pixel is a peak hangs on its last digits: half precision finds peaks everywhere, and saliency nowhere.
+    # Peaks depend on the last digits of a map: in half precision nearly every pixel is one, and no saliency remains.
     with torch.autocast(image.device.type, enabled=False):
         saliency = promote(conspicuity(image)).mean(1, keepdim=True)
     size = (image.shape[-2], image.shape[-1])
@@ -182,7 +219,10 @@ def itti_koch_saliency(image: Tensor, *, normalise: bool = True) -> Tensor:
 
 
 class IttiKoch(nn.Module):
-    """Saliency by Itti, Koch and Niebur, see `itti_koch_saliency`.
+    """Saliency by Itti, Koch and Niebur as a module; see `itti_koch_saliency`.
+
+    Args:
+        normalise: scale every map to [0, 1].
 
     >>> IttiKoch()(torch.rand(2, 3, 32, 48)).shape
     torch.Size([2, 32, 48])
@@ -193,9 +233,20 @@ class IttiKoch(nn.Module):
         self.normalise = normalise
 
     def forward(self, image: Tensor) -> Tensor:
-        """Saliency `(B, H, W)` of an image `(B, 3, H, W)`."""
+        """Compute the saliency of images.
+
+        Args:
+            image: `(B, 3, H, W)`, RGB in [0, 1].
+
+        Returns:
+            `(B, H, W)`.
+        """
         return itti_koch_saliency(image, normalise=self.normalise)
 
     def extra_repr(self) -> str:
-        """Settings, for `print`."""
+        """Describe the settings for `repr`.
+
+        Returns:
+            Whether maps are normalised.
+        """
         return f"normalise={self.normalise}"

@@ -1,4 +1,4 @@
-"""Opponent colours, as either model has them, and CIELAB."""
+"""Opponent colours of both saliency models, and CIELAB."""
 
 import torch
 from torch import Tensor
@@ -39,8 +39,8 @@ def lab_colours(image: Tensor) -> Tensor:
 
     .. math:: (L^* / 100, \; a^* / 255, \; b^* / 255)
 
-    The scale is that of OpenCV's bytes divided by 255, as in the program of VOCUS2's authors. Their rounding and their
-    offset to the opponencies, which no contrast depends on, are left out.
+    The scale is that of OpenCV's bytes divided by 255, as in the program of VOCUS2's authors. Two of its steps are left
+    out: the rounding to bytes, and the offset of the opponencies, on which contrasts do not depend.
 
     Args:
         image: `(B, 3, H, W)`, RGB in [0, 1].
@@ -59,9 +59,9 @@ def lab_colours(image: Tensor) -> Tensor:
 
 
 def double_opponency(image: Tensor) -> Tensor:
-    r"""Intensity and the two opponencies of Itti, Koch and Niebur (1998), whose hue does not depend on intensity.
+    r"""Intensity and the two colour opponencies of Itti, Koch and Niebur (1998), which do not depend on intensity.
 
-    With r, g, b divided by I where I exceeds a tenth of the image's largest, and zero elsewhere,
+    With r, g and b divided by I where I exceeds a tenth of its maximum over the image, and 0 elsewhere,
 
     .. math:: R = [r - (g + b)/2]_+, \; G = [g - (r + b)/2]_+, \; B = [b - (r + g)/2]_+,
         \; Y = [(r + g)/2 - |r - g|/2 - b]_+
@@ -87,8 +87,14 @@ def double_opponency(image: Tensor) -> Tensor:
 
 
 def anchor(channels: Tensor) -> Tensor:
-    """Take the first pixel off every channel `(B, C, H, W)`.
+    """Subtract the first pixel from every channel.
 
-    Contrasts do not depend on it, and without it those of a uniform image are exactly zero, not rounding errors.
+    Contrasts do not depend on it. The contrasts of a uniform image are then exactly 0, without rounding errors.
+
+    Args:
+        channels: `(B, C, H, W)`.
+
+    Returns:
+        The same shape.
     """
     return channels - channels[..., :1, :1]

@@ -1,4 +1,4 @@
-"""VOCUS2: saliency as the contrast of two Gaussian pyramids, centre and surround."""
+"""VOCUS2: saliency as the contrast of two Gaussian pyramids, of centres and of surrounds."""
 
 from typing import Literal, NamedTuple, get_args
 
@@ -13,7 +13,7 @@ from semfov.gaze.saliency.opponent import anchor, lab_colours, opponent_colours
 
 ColorSpace = Literal["opponent", "lab"]
 
-# Maps of `lab` with a smaller range, in units of the rounding error at 1, hold nothing else.
+# Maps of `lab` with a smaller range, in units of the rounding error at 1, hold rounding errors alone.
 _FLAT = 8
 
 
@@ -34,22 +34,26 @@ def twin_pyramids(
 ) -> list[list[Twin]]:
     r"""Centre and surround pyramids (Frintrop, Werner and Martin García, CVPR 2015, section 3.2).
 
-    A layer halves the one before; within a layer S scales, each blurred on from the one before (Lowe, 2004):
+    Each layer has half the size of the one before. A layer has S scales, each computed by further blur of the one
+    before (Lowe, 2004):
 
     .. math:: \sigma_c(s) = 2^{s/S} \sigma_c, \quad
         \mathrm{surround} = G(2^{s/S} \sqrt{\sigma_s^2 - \sigma_c^2}) * \mathrm{centre}
 
-    Scale S of a layer has twice the blur of scale 0: every second pixel of it starts the next layer.
+    Scale S of a layer has twice the blur of scale 0, and every second pixel of it is scale 0 of the next layer.
 
     Args:
         channels: `(B, C, H, W)`.
         centre_sigma: :math:`\sigma_c` in pixels of a layer.
         surround_sigma: :math:`\sigma_s`, larger than `centre_sigma`.
         layers: number of layers; fewer where the shorter side of the image cannot be halved so often.
-        scales: scales of a layer, S.
+        scales: number of scales of a layer, S.
 
     Returns:
         For each layer a list of its scales.
+
+    Raises:
+        InputError: the channels are empty or of another shape, or a setting is out of range.
 
     >>> [len(layer) for layer in twin_pyramids(torch.rand(1, 3, 9, 20))]
     [2, 2, 2, 2]
@@ -77,7 +81,14 @@ def twin_pyramids(
 
 
 def on_off_contrasts(centre: Tensor, surround: Tensor) -> tuple[Tensor, Tensor]:
-    """Bright on dark and dark on bright: `max(centre - surround, 0)` and `max(surround - centre, 0)`.
+    """Contrasts of bright on dark and of dark on bright.
+
+    Args:
+        centre: any shape.
+        surround: the same shape.
+
+    Returns:
+        `max(centre - surround, 0)` and `max(surround - centre, 0)`.
 
     >>> on_off_contrasts(torch.tensor([1.0, 2.0]), torch.tensor([3.0, 0.0]))
     (tensor([0., 2.]), tensor([2., 0.]))
@@ -98,26 +109,29 @@ def vocus2_saliency(
 ) -> Tensor:
     """Saliency by VOCUS2 (Frintrop, Werner and Martin García, "Traditional saliency reloaded", CVPR 2015).
 
-    On-off and off-on contrasts of intensity, red-green and blue-yellow over all layers and scales, fused.
+    It fuses the on-off and off-on contrasts of intensity, red-green and blue-yellow over all layers and scales.
 
-    The saliency baseline of Luzio, Bernardino and Moreno (2024, section IV-B), who print no settings. The authors of
-    VOCUS2 ship two sets with their program: the defaults here are those for cluttered scenes (`coffee_cfg.xml`), and
-    σ of 3 and 13 are the program's own defaults, for salient single objects.
+    This is the saliency baseline of Luzio, Bernardino and Moreno (2024, section IV-B), who print no settings. The
+    authors of VOCUS2 ship two sets with their program. The defaults here are those for cluttered scenes
+    (`coffee_cfg.xml`). σ of 3 and 13 are the program's own defaults, for salient single objects.
 
     Args:
         image: `(B, 3, H, W)`, RGB in [0, 1].
         centre_sigma: blur of the centre; 2 for cluttered scenes, 3 for salient single objects.
         surround_sigma: blur of the surround; 6 for cluttered scenes, 13 for salient single objects.
-        layers: layers of the pyramids, each half the one before.
-        scales: scales of a layer.
+        layers: number of layers of the pyramids, each half the size of the one before.
+        scales: number of scales of a layer.
         fusion: `mean` or `max`, within and across features.
         color_space: `opponent`, the intensity and two opponencies of Frintrop, Werner and Martin García
             (`semfov.gaze.saliency.opponent.opponent_colours`); or `lab`, CIELAB, which the authors' program offers too
-            (`lab_colours` there). The program rounds CIELAB to bytes. Values that are not rounded are ours.
-        normalise: stretch every map to [0, 1].
+            (`lab_colours` in the same module). The program rounds CIELAB to bytes; we do not.
+        normalise: scale every map to [0, 1].
 
     Returns:
-        `(B, H, W)`.
+        `(B, H, W)`, saliency, 0 or more.
+
+    Raises:
+        InputError: the image is not `(B, 3, H, W)` of floating-point numbers, or a setting is out of range.
 
     >>> image = torch.zeros(1, 3, 40, 60)
     >>> image[:, 0, 10:14, 30:34] = 1.0
@@ -127,19 +141,31 @@ def vocus2_saliency(
     """
     lookup(fusion, ("mean", "max"), "fusion")
     lookup(color_space, get_args(ColorSpace), "color space")
-    # Products of single precision: contrasts are small differences.
+    # Contrasts are small differences, so half precision is not enough.
     with torch.autocast(image.device.type, enabled=False):
         channels = opponent_colours(image) if color_space == "opponent" else lab_colours(image)
         pyramids = twin_pyramids(anchor(channels), centre_sigma, surround_sigma, layers=layers, scales=scales)
         maps = [torch.cat([_contrasts(twin, fusion) for twin in twins], 1) for twins in pyramids]
         saliency = fuse(maps, (image.shape[-2], image.shape[-1]), fusion)
-    # A power may round differently from pixel to pixel: in `lab` a uniform image has contrasts of a few digits' error.
+    # The powers in CIELAB round differently from pixel to pixel, so a uniform image has contrasts of rounding errors.
     flat = 0.0 if color_space == "opponent" else _FLAT * torch.finfo(saliency.dtype).eps
     return rescale(saliency, flat) if normalise else saliency
 
 
 class VOCUS2(nn.Module):
-    """Saliency by VOCUS2, see `vocus2_saliency`.
+    """Saliency by VOCUS2 as a module; see `vocus2_saliency`.
+
+    Args:
+        centre_sigma: blur of the centre in pixels; 2 for cluttered scenes, 3 for salient single objects.
+        surround_sigma: blur of the surround in pixels; 6 for cluttered scenes, 13 for salient single objects.
+        layers: number of layers of the pyramids, each half the size of the one before.
+        scales: number of scales of a layer.
+        fusion: `mean` or `max`, within and across features.
+        color_space: `opponent` or `lab`.
+        normalise: scale every map to [0, 1].
+
+    Raises:
+        InputError: a setting is out of range.
 
     >>> VOCUS2(centre_sigma=3.0, surround_sigma=13.0)(torch.rand(2, 3, 32, 48)).shape
     torch.Size([2, 32, 48])
@@ -169,7 +195,14 @@ class VOCUS2(nn.Module):
         self.normalise = normalise
 
     def forward(self, image: Tensor) -> Tensor:
-        """Saliency `(B, H, W)` of an image `(B, 3, H, W)`."""
+        """Compute the saliency of images.
+
+        Args:
+            image: `(B, 3, H, W)`, RGB in [0, 1].
+
+        Returns:
+            `(B, H, W)`.
+        """
         return vocus2_saliency(
             image,
             centre_sigma=self.centre_sigma,
@@ -182,7 +215,11 @@ class VOCUS2(nn.Module):
         )
 
     def extra_repr(self) -> str:
-        """Settings, for `print`."""
+        """Describe the settings for `repr`.
+
+        Returns:
+            All settings by name.
+        """
         sigmas = f"centre_sigma={self.centre_sigma:g}, surround_sigma={self.surround_sigma:g}"
         settings = f"layers={self.layers}, scales={self.scales}, fusion={self.fusion!r}"
         return f"{sigmas}, {settings}, color_space={self.color_space!r}"
@@ -191,7 +228,7 @@ class VOCUS2(nn.Module):
 def _contrasts(twin: Twin, fusion: Fusion) -> Tensor:
     """Contrasts to be fused `(B, N, h, w)`."""
     if fusion == "mean":
-        # One of both contrasts is zero, so their mean is half the difference; the channels' mean is taken on the way.
+        # One of the two contrasts is 0, so their mean is half the difference. The mean over channels is taken as well.
         return (twin.centre - twin.surround).abs_().mean(1, keepdim=True) / 2
     return torch.cat(on_off_contrasts(*twin), 1)
 

@@ -1,7 +1,8 @@
-"""Figures of merit of scanpaths: people's beside people's, and models' beside people's.
+"""Measures of scanpaths: people compared with people, and models compared with people.
 
-Fixations are arrays of points in any one unit, maps are arrays `(H, W)` whose pixel centres are at integers.
-Definitions differ between groups: each function says whose it computes. Sequences need `pip install semfov[human]`.
+Fixations are arrays of points in any one unit. Maps are arrays `(H, W)` whose pixel centres are at integers.
+Definitions differ between groups, and each function names the group whose definition it computes. Functions on
+sequences need `pip install semfov[human]`.
 """
 
 from semfov.metrics.scanpath.conditional import auc, information_gain, log_density, log_likelihood, nss

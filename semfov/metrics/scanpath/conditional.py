@@ -1,7 +1,7 @@
-"""How well maps foretell single fixations: each map is given what was fixated before (Kümmerer and Bethge, 2021).
+"""How well maps predict single fixations: each map is given the fixations before (Kümmerer and Bethge, 2021).
 
-Maps are `(..., H, W)` and fixations `(..., n)`: n fixations to each map. A figure of merit is `(..., n)`, one for each
-fixation; average fixations of a person, then people, then pictures, as the study asks.
+Maps are `(..., H, W)` and fixations `(..., n)`: n fixations for each map. A measure is `(..., n)`, one value for each
+fixation. Average over the fixations of a person, then over people, then over pictures, as the study requires.
 """
 
 from __future__ import annotations
@@ -15,39 +15,52 @@ Array = NDArray[np.float64]
 
 
 def nss(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
-    r"""Normalised scanpath saliency (Peters et al., 2005): standard deviations above its mean that the map has there.
+    r"""Normalised scanpath saliency (Peters et al., 2005): z-score of the map at each fixation, over its pixels.
 
     .. math:: \frac{s(x, y) - \bar s}{\sigma_s}
 
-    0 where the map is the same everywhere, as in pysaliency. (Ruarte et al., 2025, count values below the mean as 0.)
+    It is 0 where the map is constant, as in pysaliency. (Ruarte et al., 2025, count values below the mean as 0.)
 
     Args:
         maps: `(..., H, W)`, densities or saliency.
         x: `(..., n)`, of fixations, in pixels of the map.
-        y: `(..., n)`.
+        y: `(..., n)`, of the same fixations.
+
+    Returns:
+        `(..., n)`, in standard deviations of the map.
+
+    Raises:
+        InputError: the shapes do not fit together, or a fixation lies outside its map.
 
     >>> nss([[0.0, 0.0], [0.0, 1.0]], [1], [1])
     array([1.73205081])
     """
     values, at = looked_up(maps, x, y)
     flat = values.reshape(*values.shape[:-2], -1)
-    # Of equal values the mean may differ from them by rounding, and so may the deviation from 0.
+    # By rounding the mean of equal values may differ from them, and their deviation from 0.
     even = (np.ptp(flat, axis=-1) == 0)[..., None]
     deviation = np.where(even, 1, flat.std(-1)[..., None])
     return np.where(even, 0, (at - flat.mean(-1)[..., None]) / deviation)
 
 
 def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
-    r"""Area under the curve for single fixations: the share of pixels with a lower value, ties counted half.
+    r"""Area under the ROC for single fixations: the fraction of pixels with a lower value; ties count half.
 
     .. math:: P(s(u) < s(x, y)) + \tfrac12 P(s(u) = s(x, y)), \quad u \text{ uniform over the pixels}
 
-    Of Kümmerer and Bethge (2021), with all pixels as negatives, as in pysaliency (`nonfixations="uniform"`).
+    Definition of Kümmerer and Bethge (2021), with all pixels as negatives, as in pysaliency
+    (`nonfixations="uniform"`).
 
     Args:
-        maps: `(..., H, W)`.
+        maps: `(..., H, W)`, densities or saliency.
         x: `(..., n)`, of fixations, in pixels of the map.
-        y: `(..., n)`.
+        y: `(..., n)`, of the same fixations.
+
+    Returns:
+        `(..., n)`, from 0 to 1.
+
+    Raises:
+        InputError: the shapes do not fit together, or a fixation lies outside its map.
 
     >>> auc([[0.0, 1.0], [2.0, 3.0]], [1], [1])
     array([0.875])
@@ -59,7 +72,14 @@ def auc(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
 
 
 def share_below(ordered: Array, values: Array) -> Array:
-    """Share of ascending numbers that are lower than each of the values, ties counted half.
+    """Fraction of ascending numbers that are lower than each of `values`; ties count half.
+
+    Args:
+        ordered: numbers in ascending order.
+        values: `(n,)`, numbers to compare with them.
+
+    Returns:
+        `(n,)`, from 0 to 1.
 
     >>> share_below(np.array([1.0, 2.0, 2.0, 3.0]), np.array([2.0]))
     array([0.5])
@@ -69,18 +89,29 @@ def share_below(ordered: Array, values: Array) -> Array:
 
 
 def log_density(maps: ArrayLike, floor: float = 0.0) -> Array:
-    r"""Natural logarithms of maps made densities over their pixels: each is divided by its sum.
+    r"""Natural logarithm of maps that are normalised to densities over their pixels.
 
     .. math:: \ln\left( (1 - \epsilon) \frac{s}{\sum s} + \frac{\epsilon}{HW} \right)
 
     Args:
-        maps: `(..., H, W)`, from 0, not all 0.
-        floor: ε, share of a uniform density in the mixture; without it, pixels of 0 have no chance (-inf).
+        maps: `(..., H, W)`, not negative; no map is 0 everywhere.
+        floor: ε, weight of a uniform density in the mixture. With 0, a pixel of value 0 has probability 0, and its
+            logarithm is -inf.
+
+    Returns:
+        `(..., H, W)`, log densities in nats.
+
+    Raises:
+        InputError: a map has negative or infinite values, or is 0 everywhere.
+
+    >>> log_density([[1.0, 3.0]]).round(3)
+    array([[-1.386, -0.288]])
     """
     values = np.asarray(maps, dtype=np.float64)
     total = values.sum((-1, -2), keepdims=True)
     usable = bool((values >= 0).all() and np.isfinite(total).all() and (total > 0).all())
-    check(usable, "maps", "numbers from 0, not all of them 0", "others")
+    got = f"values from {values.min():g} to {values.max():g}, with sums from {total.min():g} to {total.max():g}"
+    check(usable, "maps", "finite numbers of 0 or more, not all 0 in a map", got)
     with np.errstate(divide="ignore"):
         return np.asarray(np.log((1 - floor) * values / total + floor / (values.shape[-1] * values.shape[-2])))
 
@@ -93,7 +124,13 @@ def log_likelihood(density: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
     Args:
         density: `(..., H, W)`, natural logarithms of densities over the pixels (`log_density`).
         x: `(..., n)`, of fixations, in pixels of the map.
-        y: `(..., n)`.
+        y: `(..., n)`, of the same fixations.
+
+    Returns:
+        `(..., n)`, in bits; 0 for a uniform density.
+
+    Raises:
+        InputError: the shapes do not fit together, or a fixation lies outside its map.
 
     >>> log_likelihood(log_density([[1.0, 1.0], [1.0, 5.0]]), [1], [1]).round(3)
     array([1.322])
@@ -103,29 +140,54 @@ def log_likelihood(density: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
 
 
 def information_gain(density: ArrayLike, baseline: ArrayLike, x: ArrayLike, y: ArrayLike) -> Array:
-    r"""Bits by which a density foretells fixations better than a baseline (Kümmerer, Wallis and Bethge, 2015).
+    r"""Information gain over a baseline density, in bits for each fixation (Kümmerer, Wallis and Bethge, 2015).
 
     .. math:: \log_2 p(x, y) - \log_2 p_b(x, y)
 
     Args:
         density: `(..., H, W)`, natural logarithms of densities over the pixels (`log_density`).
-        baseline: those of the baseline, usually a centre bias.
+        baseline: `(..., H, W)`, natural logarithms of the baseline's densities, usually a centre bias.
         x: `(..., n)`, of fixations, in pixels of the map.
-        y: `(..., n)`.
+        y: `(..., n)`, of the same fixations.
+
+    Returns:
+        `(..., n)`, in bits; positive where the density predicts the fixation better than the baseline.
+
+    Raises:
+        InputError: the shapes do not fit together, or a fixation lies outside its map.
+
+    >>> information_gain(log_density([[1.0, 3.0]]), log_density([[1.0, 1.0]]), [1], [0]).round(3)
+    array([0.585])
     """
     return log_likelihood(density, x, y) - log_likelihood(baseline, x, y)
 
 
 def looked_up(maps: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[Array, Array]:
-    """The maps, and their values `(..., n)` at the pixels that fixations are in."""
+    """Read maps at the pixels of fixations.
+
+    Args:
+        maps: `(..., H, W)`.
+        x: `(..., n)`, of fixations, in pixels of the map.
+        y: `(..., n)`, of the same fixations.
+
+    Returns:
+        The maps as float64, and their values `(..., n)`.
+
+    Raises:
+        InputError: the shapes do not fit together, or a fixation lies outside its map.
+
+    >>> looked_up([[0.0, 1.0]], [0.6], [0.0])[1]
+    array([1.])
+    """
     values = np.asarray(maps, dtype=np.float64)
-    check(values.ndim >= 2 and values.size > 0, "maps", "(..., H, W)", values.shape)
+    check(values.ndim >= 2 and values.size > 0, "maps", "an array of shape (..., H, W), not empty", values.shape)
     column, row = (np.floor(np.asarray(each, dtype=np.float64) + 0.5) for each in (x, y))
     leading = values.shape[:-2]
     fits = column.shape == row.shape and column.shape[:-1] == leading and column.ndim == len(leading) + 1
-    check(fits, "x, y", f"fixations {(*leading, 'n')}", (column.shape, row.shape))
+    check(fits, "x, y", f"arrays of shape {(*leading, 'n')}, one row for each map", (column.shape, row.shape))
     height, width = values.shape[-2:]
-    inside = bool(((column >= 0) & (column < width) & (row >= 0) & (row < height)).all())
-    check(inside, "x, y", f"points inside a map of {width} × {height} pixels", "others")
+    outside = ~((column >= 0) & (column < width) & (row >= 0) & (row < height))
+    got = f"{int(outside.sum())} of {outside.size} outside it; remove them, or scale them to pixels of the map"
+    check(not bool(outside.any()), "x, y", f"points inside a map of {width} × {height} pixels", got)
     flat = values.reshape(*leading, -1)
     return values, np.take_along_axis(flat, (row * width + column).astype(np.int64), axis=-1)

@@ -1,4 +1,4 @@
-"""How well a saliency map tells the pixels that people fixated from others, over a whole picture."""
+"""How well a saliency map separates the pixels that people fixated from others, over a whole picture."""
 
 from __future__ import annotations
 
@@ -10,26 +10,32 @@ from semfov.metrics.scanpath.conditional import looked_up, share_below
 
 
 def auc_judd(saliency: ArrayLike, x: ArrayLike, y: ArrayLike) -> float:
-    r"""Area under the ROC of Judd et al. (2009) as the MIT benchmark computes it (Bylinskii et al., 2019).
+    """Area under the ROC of Judd et al. (2009) as the MIT benchmark computes it (Bylinskii et al., 2019).
 
-    Thresholds are the values at the fixations; hits are counted over fixations and false alarms over the pixels that
-    nobody fixated; the corners (0, 0) and (1, 1) are added and the curve is joined by straight lines. Without the
-    benchmark's random jitter, as `pysaliency` with `jitter=False`.
+    Thresholds are the values at the fixations. Hits are counted over fixations, and false alarms over the pixels that
+    nobody fixated. The corners (0, 0) and (1, 1) are added, and the curve is joined by straight lines. The benchmark's
+    random jitter is left out, as in `pysaliency` with `jitter=False`.
 
     Args:
-        saliency: `(H, W)`.
+        saliency: `(H, W)`, the map.
         x: `(n,)`, of all fixations, in pixels of the map.
-        y: `(n,)`.
+        y: `(n,)`, of the same fixations.
+
+    Returns:
+        The area, from 0 to 1.
+
+    Raises:
+        InputError: there is no fixation, none of the pixels is free of fixations, or a fixation lies outside the map.
 
     >>> auc_judd([[0.0, 0.1], [0.2, 0.9]], [1], [1])
     1.0
     """
     values, at = looked_up(saliency, x, y)
-    check(values.ndim == 2 and at.size > 0, "saliency", "one map, and fixations", (values.shape, at.shape))
+    check(values.ndim == 2 and at.size > 0, "saliency", "one map and at least one fixation", (values.shape, at.shape))
     free = np.ones(values.shape, dtype=bool)
     free[np.floor(np.asarray(y) + 0.5).astype(int), np.floor(np.asarray(x) + 0.5).astype(int)] = False
     others = np.sort(values[free])
-    check(len(others) > 0, "saliency", "pixels that nobody fixated", "none")
+    check(len(others) > 0, "saliency", "at least one pixel that nobody fixated", "none")
     thresholds = np.sort(at)[::-1]
     hits = 1 - np.searchsorted(np.sort(at), thresholds) / len(at)
     alarms = 1 - np.searchsorted(others, thresholds) / len(others)
@@ -37,17 +43,24 @@ def auc_judd(saliency: ArrayLike, x: ArrayLike, y: ArrayLike) -> float:
 
 
 def auc_shuffled(saliency: ArrayLike, x: ArrayLike, y: ArrayLike, other_x: ArrayLike, other_y: ArrayLike) -> float:
-    r"""Shuffled area under the ROC (Tatler, Baddeley and Gilchrist, 2005; Zhang et al., 2008).
+    """Shuffled area under the ROC (Tatler, Baddeley and Gilchrist, 2005; Zhang et al., 2008).
 
-    Negatives are where people looked in other pictures, so that a centre bias gains nothing:
-    :math:`P(s_+ > s_-) + P(s_+ = s_-)/2`, over all pairs, as in pysaliency.
+    The negatives are fixations of other pictures, so a centre bias gains nothing. Over all pairs, as in pysaliency:
+
+    .. math:: P(s_+ > s_-) + P(s_+ = s_-)/2
 
     Args:
-        saliency: `(H, W)`.
+        saliency: `(H, W)`, the map.
         x: `(n,)`, of all fixations of this picture, in pixels of the map.
-        y: `(n,)`.
-        other_x: `(m,)`, of fixations of other pictures.
-        other_y: `(m,)`.
+        y: `(n,)`, of the same fixations.
+        other_x: `(m,)`, of fixations of other pictures, in the same pixels.
+        other_y: `(m,)`, of the same fixations.
+
+    Returns:
+        The area, from 0 to 1.
+
+    Raises:
+        InputError: fixations of this picture or of others are missing, or one lies outside the map.
 
     >>> auc_shuffled([[0.0, 0.1], [0.2, 0.9]], [1], [1], [0, 1], [1, 1])
     0.75

@@ -1,4 +1,4 @@
-"""MultiMatch: how alike two scanpaths are, in five ways."""
+"""MultiMatch: similarity of two scanpaths in five dimensions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,20 @@ Array = NDArray[np.float64]
 
 
 class MultiMatch(NamedTuple):
-    """Similarities from 0 to 1; NaN where a scanpath has fewer than three fixations, or durations are not given."""
+    """Similarities of two scanpaths, each from 0 to 1; `multimatch` gives the formulas.
+
+    All are NaN where a scanpath has fewer than three fixations.
+
+    Attributes:
+        shape: of the saccade vectors.
+        direction: of the angles of the saccades.
+        length: of the lengths of the saccades.
+        position: of the fixated points.
+        duration: of the fixations' durations; NaN where no durations are given.
+
+    >>> MultiMatch(0.5, 1.0, 1.0, 0.5, float("nan")).mean
+    0.75
+    """
 
     shape: float
     direction: float
@@ -23,7 +36,7 @@ class MultiMatch(NamedTuple):
 
     @property
     def mean(self) -> float:
-        """Of the four that do not need durations, as Ruarte et al. (2025) report it."""
+        """Mean of the four dimensions that need no durations, as Ruarte et al. (2025) report it."""
         return float(np.mean(self[:4]))
 
 
@@ -42,16 +55,22 @@ def multimatch(
     - shape :math:`1 - \mathrm{med} \|u - v\| / 2D`
     - direction :math:`1 - \mathrm{med} |\angle(u, v)| / \pi`
     - length :math:`1 - \mathrm{med} |\|u\| - \|v\|| / D`
-    - position :math:`1 - \mathrm{med} \|p - q\| / D`, of the points where the saccades start
-    - duration :math:`1 - \mathrm{med} |s - t| / \max(s, t)`, of the fixations there
+    - position :math:`1 - \mathrm{med} \|p - q\| / D`, with the points p and q where the saccades start
+    - duration :math:`1 - \mathrm{med} |s - t| / \max(s, t)`, with the durations s and t of the fixations there
 
-    The same as `multimatch_gaze.docomparison` without grouping.
+    The result equals that of `multimatch_gaze.docomparison` without grouping.
 
     Args:
         ours: `(n, 2)`, fixations of one scanpath.
-        theirs: `(m, 2)`, of the other.
+        theirs: `(m, 2)`, fixations of the other, in the same unit.
         size: `(width, height)` of the screen, in the same unit.
-        durations: of both scanpaths' fixations, in any one unit.
+        durations: durations `(n,)` and `(m,)` of the fixations, in any one unit.
+
+    Returns:
+        The five similarities.
+
+    Raises:
+        InputError: fixations are not points, or durations are not as many as fixations.
 
     >>> path = [[0, 0], [30, 0], [30, 40]]
     >>> multimatch(path, path, (300, 400)).mean
@@ -59,7 +78,7 @@ def multimatch(
     """
     a, b = (np.asarray(path, dtype=np.float64) for path in (ours, theirs))
     for name, path in (("ours", a), ("theirs", b)):
-        check(path.ndim == 2 and path.shape[1] == 2, name, "fixations (n, 2)", path.shape)
+        check(path.ndim == 2 and path.shape[1] == 2, name, "fixations of shape (n, 2)", path.shape)
     if len(a) < 3 or len(b) < 3:
         return MultiMatch(*[float("nan")] * 5)
     u, v = np.diff(a, axis=0), np.diff(b, axis=0)
@@ -71,7 +90,8 @@ def multimatch(
     duration = float("nan")
     if durations is not None:
         s, t = (np.asarray(each, dtype=np.float64) for each in durations)
-        check(len(s) == len(a) and len(t) == len(b), "durations", f"{len(a)} and {len(b)}", (len(s), len(t)))
+        expected = f"{len(a)} and {len(b)} numbers, one for each fixation"
+        check(len(s) == len(a) and len(t) == len(b), "durations", expected, (len(s), len(t)))
         longer = np.maximum(s[i], t[j])
         duration = 1 - float(np.median(np.abs(s[i] - t[j]) / np.where(longer > 0, longer, 1)))
     return MultiMatch(
@@ -94,7 +114,7 @@ def _aligned(cost: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     path = [(rows - 1, columns - 1)]
     while path[-1] != (0, 0):
         i, j = path[-1]
-        # `total` is one larger on top and on the left: its entry (i, j) belongs to the pair (i - 1, j - 1).
+        # `total` has one more row and column in front: its entry (i, j) belongs to the pair (i - 1, j - 1).
         steps = {(i - 1, j - 1): total[i, j], (i - 1, j): total[i, j + 1], (i, j - 1): total[i + 1, j]}
         path.append(min(steps, key=lambda step: steps[step]))
     first, second = np.array(path[::-1]).T

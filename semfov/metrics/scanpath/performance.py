@@ -1,4 +1,4 @@
-"""How soon searches find their target, and how straight they go there."""
+"""How soon searches find their target, and how direct their scanpaths are."""
 
 from __future__ import annotations
 
@@ -14,11 +14,17 @@ Array = NDArray[np.float64]
 
 
 def found_at(points: ArrayLike, box: ArrayLike) -> int:
-    """Gaze shift after which the gaze is first on the target, 0 for the first fixation; -1 where it never is.
+    """Gaze shift after which the gaze is on the target for the first time.
 
     Args:
         points: `(n, 2)`, fixations in order.
-        box: `(x1, y1, x2, y2)`, of the target, in the same frame; its edges belong to it.
+        box: `(x1, y1, x2, y2)` of the target, in the same frame; its edges belong to it.
+
+    Returns:
+        0 for the first fixation, and so on; -1 where the target is never fixated.
+
+    Raises:
+        InputError: `points` is not of shape `(n, 2)`, or is empty.
 
     >>> found_at([[0, 0], [5, 5], [6, 6]], [4, 4, 8, 8])
     1
@@ -30,19 +36,22 @@ def found_at(points: ArrayLike, box: ArrayLike) -> int:
 
 
 def mean_performance(found: Sequence[int], groups: Sequence[Hashable], shifts: int) -> Array:
-    r"""Share of searches that have found their target after 0, 1, … gaze shifts, averaged over groups of searches.
+    r"""Fraction of searches that have found their target after each gaze shift, averaged over groups of searches.
 
     .. math:: P(n) = \frac1{|G|} \sum_{g \in G} \frac{|\{i \in g : 0 \le f_i \le n\}|}{|g|}
 
-    Ruarte et al. (2025) average over people, each person's searches first; Yang et al. (2020) over target categories.
+    In Ruarte et al. (2025) a group is a person, in Yang et al. (2020) a target category.
 
     Args:
         found: gaze shift at which each search found its target, -1 where it did not.
-        groups: of each search: its person, or its target's category.
+        groups: group of each search, such as its person or its target's category.
         shifts: last gaze shift.
 
     Returns:
-        `(shifts+1,)`.
+        `(shifts+1,)`, for 0, 1, … gaze shifts.
+
+    Raises:
+        InputError: there is no search, or `groups` has another length than `found`.
 
     >>> mean_performance([1, -1, 0], ["ann", "ann", "bob"], 1)
     array([0.5 , 0.75])
@@ -56,20 +65,26 @@ def mean_performance(found: Sequence[int], groups: Sequence[Hashable], shifts: i
 
 
 def performance_area(curve: ArrayLike) -> float:
-    r"""Area under a curve of cumulative performance by the trapezoidal rule, its fixations spread over [0, 1].
+    r"""Area under a curve of cumulative performance by the trapezoidal rule, with its fixations spread over [0, 1].
 
     .. math:: A = \frac1{N-1} \left( \tfrac12 P_1 + P_2 + \dots + P_{N-1} + \tfrac12 P_N \right)
 
-    "AUCperf" of Ruarte et al. (2025), who take N = 10 fixations on COCO-Search18, the first among them.
+    This is "AUCperf" of Ruarte et al. (2025), who take N = 10 fixations on COCO-Search18, the first one included.
 
     Args:
-        curve: `(N,)`, share found by the 1st, 2nd, … fixation.
+        curve: `(N,)`, fraction found by the 1st, 2nd, … fixation.
+
+    Returns:
+        The area, from 0 to 1.
+
+    Raises:
+        InputError: the curve has fewer than two values.
 
     >>> performance_area([0.0, 0.5, 1.0])
     0.5
     """
     values = np.asarray(curve, dtype=np.float64)
-    check(values.ndim == 1 and len(values) >= 2, "curve", "at least two values in a row", values.shape)
+    check(values.ndim == 1 and len(values) >= 2, "curve", "an array of shape (N,) with N of 2 or more", values.shape)
     return float(np.trapezoid(values, np.linspace(0, 1, len(values))))
 
 
@@ -78,12 +93,18 @@ def tfp_auc(found: Sequence[int], categories: Sequence[Hashable], shifts: int = 
 
     .. math:: \sum_{n=0}^{N} P(n), \quad P \text{ averaged over categories}
 
-    TFP-AUC of Yang et al. (2020): six gaze shifts, so that seven fixations are summed and 7 is the largest value.
+    TFP-AUC of Yang et al. (2020), with six gaze shifts: seven fixations are summed, and 7 is the largest value.
 
     Args:
         found: gaze shift at which each search found its target, -1 where it did not.
-        categories: of the targets.
-        shifts: last gaze shift.
+        categories: category of each search's target.
+        shifts: last gaze shift, N.
+
+    Returns:
+        The area, from 0 to N + 1.
+
+    Raises:
+        InputError: there is no search, or `categories` has another length than `found`.
 
     >>> tfp_auc([1, -1], ["cup", "fork"], shifts=2)
     1.0
@@ -92,32 +113,44 @@ def tfp_auc(found: Sequence[int], categories: Sequence[Hashable], shifts: int = 
 
 
 def probability_mismatch(curve: ArrayLike, reference: ArrayLike) -> float:
-    r"""How far a curve of target fixation probability is from people's (Yang et al., 2020).
+    r"""Distance between a curve of target fixation probability and that of people (Yang et al., 2020).
 
     .. math:: \sum_n | P(n) - P_{\text{people}}(n) |
 
     Args:
-        curve: `(N,)`, share found by the 1st, 2nd, … fixation.
-        reference: `(N,)`, that of people.
+        curve: `(N,)`, fraction found by the 1st, 2nd, … fixation.
+        reference: `(N,)`, the same curve of people.
+
+    Returns:
+        The distance, from 0 to N.
+
+    Raises:
+        InputError: the curves differ in length.
 
     >>> probability_mismatch([0.0, 0.5, 0.5], [0.0, 0.25, 1.0])
     0.75
     """
     ours, theirs = np.asarray(curve, dtype=np.float64), np.asarray(reference, dtype=np.float64)
-    check(ours.shape == theirs.shape, "reference", f"a curve of {ours.shape}", theirs.shape)
+    check(ours.shape == theirs.shape, "reference", f"a curve of shape {ours.shape}, as `curve`", theirs.shape)
     return float(np.abs(ours - theirs).sum())
 
 
 def scanpath_ratio(points: ArrayLike, box: ArrayLike) -> float:
-    r"""Straight way to the target over the way that the gaze went (Yang et al., 2020), at most 1.
+    r"""Scanpath ratio (Yang et al., 2020): direct distance to the target over the length of the scanpath, at most 1.
 
     .. math:: \min\left(1, \frac{\|c - p_0\|}{\sum_{i=1}^{m} \|p_i - p_{i-1}\|}\right)
 
-    c is the centre of the target and m the first fixation on it. NaN where the target was never fixated, or at once.
+    c is the centre of the target, and m the first fixation on it.
 
     Args:
         points: `(n, 2)`, fixations in order.
-        box: `(x1, y1, x2, y2)`, of the target.
+        box: `(x1, y1, x2, y2)` of the target, in the same frame.
+
+    Returns:
+        The ratio, from 0 to 1; NaN where the target was never fixated, or by the first fixation already.
+
+    Raises:
+        InputError: `points` is not of shape `(n, 2)`, or is empty.
 
     >>> scanpath_ratio([[0, 0], [0, 6], [8, 6]], [7, 5, 9, 7])
     0.7142857142857143
@@ -133,5 +166,6 @@ def scanpath_ratio(points: ArrayLike, box: ArrayLike) -> float:
 
 def _points(points: ArrayLike) -> Array:
     array = np.asarray(points, dtype=np.float64)
-    check(array.ndim == 2 and array.shape[1] == 2 and len(array) > 0, "points", "(n, 2), at least one", array.shape)
+    usable = array.ndim == 2 and array.shape[1] == 2 and len(array) > 0
+    check(usable, "points", "an array of shape (n, 2), not empty", array.shape)
     return array

@@ -1,4 +1,4 @@
-"""Scanpaths as words: what the same places and things, visited in the same order, say about two of them."""
+"""Scanpaths as sequences of labels, and how similar two sequences are."""
 
 from __future__ import annotations
 
@@ -15,70 +15,116 @@ Labels = NDArray[np.int64]
 
 
 def cell_labels(points: ArrayLike, columns: int, rows: int, size: tuple[float, float]) -> Labels:
-    """Which cell of a grid each fixation is in, `(n,)`: the letters of ScanMatch (Cristino et al., 2010).
+    """The grid cell of each fixation: the letters of ScanMatch (Cristino et al., 2010).
 
     Args:
         points: `(n, 2)`, in pixels of a picture, pixel centres at integers.
-        columns: cells in a row.
-        rows: cells in a column.
+        columns: number of cells in a row.
+        rows: number of cells in a column.
         size: `(width, height)` of the picture.
+
+    Returns:
+        `(n,)`, cells numbered row by row from 0.
+
+    Raises:
+        InputError: a point lies outside the picture.
 
     >>> cell_labels([[0, 0], [99, 0], [99, 99]], 2, 2, (100, 100))
     array([0, 1, 3])
     """
     inside = (np.asarray(points, dtype=np.float64) + 0.5) / np.asarray(size, dtype=np.float64)
-    check(bool(((inside >= 0) & (inside <= 1)).all()), "points", f"points of a picture of {size}", "others")
+    outside = int(((inside < 0) | (inside > 1)).any(-1).sum())
+    check(outside == 0, "points", f"points inside a picture of {size} pixels", f"{outside} outside it; remove them")
     column, row = np.minimum(inside * (columns, rows), (columns - 1e-9, rows - 1e-9)).astype(np.int64).T
     return np.asarray(row * columns + column)
 
 
 def cluster_labels(points: ArrayLike, others: ArrayLike, bandwidth: float | None = None) -> Labels:
-    """Which cluster of all fixations of a picture each fixation is in, `(n,)`; clusters are by mean shift.
+    """The cluster of each fixation, where mean shift has clustered all fixations of a picture.
 
-    The letters of Borji and Itti's sequence score (2013) as Yang et al. (2020) compute it: scikit-learn's `MeanShift`
-    on the fixations of all people.
+    These are the letters of Borji and Itti's sequence score (2013) as Yang et al. (2020) compute it: scikit-learn's
+    `MeanShift` on the fixations of all people.
 
     Args:
         points: `(n, 2)`, fixations to label.
-        others: `(m, 2)`, fixations that the clusters are made of.
-        bandwidth: of the mean shift, in units of the points; None: scikit-learn's estimate.
+        others: `(m, 2)`, fixations to cluster, in the same unit.
+        bandwidth: bandwidth of the mean shift, in the unit of the points; None takes scikit-learn's estimate.
+
+    Returns:
+        `(n,)`, numbers of clusters from 0.
 
     Raises:
         InputError: scikit-learn is not installed.
+
+    >>> labels = cluster_labels([[0, 0], [99, 99]], [[0, 0], [1, 1], [98, 99]], bandwidth=5)
+    >>> bool(labels[0] == labels[1])
+    False
     """
     return labels_by(fitted_clusters(others, bandwidth), points)
 
 
 def fitted_clusters(others: ArrayLike, bandwidth: float | None = None) -> Any:
-    """The clusters of `cluster_labels`, a fitted `sklearn.cluster.MeanShift`, for those who label more than once."""
+    """The clusters of `cluster_labels` as a fitted `sklearn.cluster.MeanShift`, to label fixations more than once.
+
+    Args:
+        others: `(m, 2)`, fixations to cluster.
+        bandwidth: bandwidth of the mean shift, in the unit of the points; None takes scikit-learn's estimate.
+
+    Returns:
+        The fitted `sklearn.cluster.MeanShift`; `labels_by` takes it.
+
+    Raises:
+        InputError: scikit-learn is not installed.
+
+    >>> len(fitted_clusters([[0, 0], [1, 1], [98, 99]], bandwidth=5).cluster_centers_)
+    2
+    """
     try:
         from sklearn.cluster import MeanShift
     except ImportError:
-        raise InputError("cluster_labels: expected scikit-learn; pip install semfov[human]") from None
+        raise InputError("cluster_labels needs scikit-learn: pip install semfov[human]") from None
     shift = MeanShift(bandwidth=bandwidth, bin_seeding=True)
     with warnings.catch_warnings():
-        # Where each fixation has a bin of its own all of them are seeds, which is as good.
+        # The warning says that no two fixations share a bin. All of them are seeds then, which does no harm.
         warnings.filterwarnings("ignore", message="Binning data failed")
         return shift.fit(np.asarray(others, dtype=np.float64))
 
 
 def labels_by(clusters: Any, points: ArrayLike) -> Labels:
-    """Which of the fitted clusters each fixation `(n, 2)` is in, `(n,)`."""
+    """Label fixations by fitted clusters.
+
+    Args:
+        clusters: as `fitted_clusters` returns them.
+        points: `(n, 2)`, fixations in the same unit.
+
+    Returns:
+        `(n,)`, numbers of clusters from 0.
+
+    >>> labels = labels_by(fitted_clusters([[0, 0], [1, 1], [98, 99]], bandwidth=5), [[0, 1], [1, 0], [99, 99]])
+    >>> bool(labels[0] == labels[1] != labels[2])
+    True
+    """
     return np.asarray(clusters.predict(np.asarray(points, dtype=np.float64)), dtype=np.int64)
 
 
 def sequence_score(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> float:
-    r"""How alike two words are, from 0 to 1: Needleman and Wunsch's alignment without a price of gaps.
+    r"""Similarity of two sequences of labels, from 0 to 1: Needleman and Wunsch's alignment without a gap penalty.
 
     .. math:: S(a, b) = \frac{\mathrm{LCS}(a, b)}{\max(|a|, |b|)}
 
-    With one point for a match and none for gaps the best alignment is the longest common subsequence. Sequence score of
-    Borji and Itti (2013) in the form of Yang et al. (2020), where letters are clusters or cells that were fixated; the
-    semantic sequence score (Yang et al., 2022) where they are the classes of what was fixated.
+    With one point for a match and no penalty for a gap, the best alignment is the longest common subsequence (LCS).
+    This is the sequence score of Borji and Itti (2013) in the form of Yang et al. (2020), where labels are clusters or
+    cells. It is the semantic sequence score (Yang et al., 2022) where labels are the classes of what was fixated.
 
     Args:
-        ours: letters of one scanpath, in order.
-        theirs: letters of the other.
+        ours: labels of one scanpath, in order.
+        theirs: labels of the other.
+
+    Returns:
+        The similarity, from 0 to 1.
+
+    Raises:
+        InputError: a sequence is empty, or rapidfuzz is not installed.
 
     >>> sequence_score(["cup", "cup", "fork"], ["cup", "fork", "oven", "fork"])
     0.5
@@ -88,10 +134,21 @@ def sequence_score(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> floa
 
 
 def edit_distance(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> int:
-    """Least number of fixations to insert, delete or replace (Levenshtein) that turn one word into the other.
+    """Edit distance of two sequences of labels (Levenshtein).
 
-    Fixation edit distance (Mondal et al., 2023) where letters are clusters or cells; its semantic form where they are
-    classes.
+    It is the least number of labels to insert, delete or replace that turns one sequence into the other. This is the
+    fixation edit distance (Mondal et al., 2023) where labels are clusters or cells, and its semantic form where they
+    are classes.
+
+    Args:
+        ours: labels of one scanpath, in order.
+        theirs: labels of the other.
+
+    Returns:
+        The number of edits, 0 or more.
+
+    Raises:
+        InputError: a sequence is empty, or rapidfuzz is not installed.
 
     >>> edit_distance([3, 7, 7, 1], [3, 7, 1])
     1
@@ -100,7 +157,7 @@ def edit_distance(ours: Sequence[Hashable], theirs: Sequence[Hashable]) -> int:
 
 
 def _word(labels: Sequence[Hashable], argument: str) -> list[Hashable]:
-    check(len(labels) > 0, argument, "at least one letter", "none")
+    check(len(labels) > 0, argument, "at least one label", "none")
     return labels.tolist() if isinstance(labels, np.ndarray) else list(labels)
 
 
@@ -108,5 +165,5 @@ def _rapidfuzz() -> Any:
     try:
         from rapidfuzz import distance
     except ImportError:
-        raise InputError("sequences: expected rapidfuzz; pip install semfov[human]") from None
+        raise InputError("comparing sequences needs rapidfuzz: pip install semfov[human]") from None
     return distance

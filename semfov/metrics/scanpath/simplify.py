@@ -1,4 +1,4 @@
-"""Scanpaths with small steps taken out."""
+"""Scanpaths simplified by merging fixations that are close together."""
 
 from __future__ import annotations
 
@@ -9,15 +9,18 @@ Array = NDArray[np.float64]
 
 
 def merge_close(points: ArrayLike, size: tuple[float, float]) -> Array:
-    """Fixations `(m, 2)` in which neighbours that are closer than half a window are one, at their mean point.
+    """Merge successive fixations that are closer than half a window.
 
-    As Ruarte et al. (2025) and the benchmark before it (Travi et al., 2022) do, so that people's scanpaths can be laid
-    beside those of models that make one fixation a cell: from the start, a fixation and the next are replaced by their
-    mean as long as both differences are smaller than half the window.
+    Ruarte et al. (2025) and the benchmark before it (Travi et al., 2022) do so to compare people's scanpaths with those
+    of models that fixate a cell only once. Beginning at the start, a fixation and the next are replaced by their mean
+    as long as both differences, in x and in y, are smaller than half the window.
 
     Args:
         points: `(n, 2)`, fixations in order.
-        size: `(width, height)` of the window.
+        size: `(width, height)` of the window, in the unit of the points.
+
+    Returns:
+        `(m, 2)`, the merged fixations, m ≤ n.
 
     >>> merge_close([[0, 0], [2, 0], [9, 9]], (10, 10))
     array([[1., 0.],
