@@ -163,5 +163,5 @@ def test_missing_packages_and_files(monkeypatch):
     with pytest.raises(DataError, match=r"expected the photograph .* pip install"):
         EmbeddedScenes(CLASSES)
     monkeypatch.setattr(module, "find_spec", lambda _: None)
-    with pytest.raises(DataError, match=r"expected the package .*; pip install"):
+    with pytest.raises(DataError, match=r"expected the package .*, which is not installed; pip install"):
         EmbeddedScenes(CLASSES)

@@ -160,7 +160,7 @@ def test_a_missing_file_is_named(tmp_path):
 
 
 def test_one_person_looks_at_a_picture_once_in_ruartes_file(tmp_path):
-    with pytest.raises(InputError, match=r"two for a\.jpg"):
+    with pytest.raises(InputError, match=r"several for a\.jpg"):
         write_ruarte(tmp_path / "s.json", [record(), record()])
 
 
