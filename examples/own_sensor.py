@@ -1,7 +1,7 @@
-"""A sensor of your own: a magnifying glass, which shows a part of the picture around the fixation enlarged.
+"""Write your own sensor: a magnifying glass, which enlarges the part of the picture around the fixation.
 
-Detectors miss what is small on their input. Enlarged it is found more often, though enlarging adds no detail. What a
-magnifying glass shows lies elsewhere than in the picture, so the sensor also leads the detector's boxes back.
+Detectors miss objects that are small on their input. They find them more often when they are enlarged, although enlarging
+adds no detail. A magnifying glass moves pixels, so this sensor also maps the detector's boxes back to the picture.
 
 Run it from a checkout: python -m examples.own_sensor
 """
@@ -21,7 +21,7 @@ class MagnifyingGlass(Sensor):
     """Shows a window around the fixation, enlarged to the size of the canvas.
 
     Args:
-        power: how many times things look larger.
+        power: factor by which objects are enlarged.
     """
 
     def __init__(self, power: float = 2.0) -> None:
@@ -29,32 +29,32 @@ class MagnifyingGlass(Sensor):
         self.power = power
 
     def open(self, canvas: Tensor, scale: Tensor) -> Tensor:
-        """Nothing to prepare; a sensor with widths in pixels would multiply them by `scale`."""
+        """Return the canvas as it is; a sensor with widths in pixels would multiply them by `scale`."""
         return canvas
 
     def look(self, state: Tensor, gaze: Tensor) -> Tensor:
-        """The windows `(F, 3, h, w)` around fixations `(F, 2)`."""
+        """Enlarge the windows around fixations `(F, 2)` to views `(F, 3, h, w)`."""
         size = state.shape[-1], state.shape[-2]
         return glimpse(state, self.windows(state, gaze)[None], size, padding_mode="border")[0]
 
     def boxes_to_canvas(self, state: Tensor, gaze: Tensor, boxes: Tensor) -> Tensor:
-        """Boxes `(F, N, 4)` seen through the glass, as boxes on the canvas."""
+        """Map boxes `(F, N, 4)` in the views to the canvas."""
         corner = self.windows(state, gaze)[:, None, :2]
         return boxes / self.power + torch.cat([corner, corner], -1)
 
     def windows(self, canvas: Tensor, gaze: Tensor) -> Tensor:
-        """What is shown of the canvas, `(F, 4)`: not beyond its borders, as far as the fixation allows."""
+        """Compute the windows `(F, 4)` around fixations, moved to lie inside the canvas."""
         size = gaze.new_tensor([canvas.shape[-1], canvas.shape[-2]])
         corner = torch.minimum((gaze + 0.5 - size / (2 * self.power)).clamp(min=0), size * (1 - 1 / self.power))
         return torch.cat([corner, corner + size / self.power], -1)
 
     def settings(self) -> dict[str, Any]:
-        """What the views depend on: stored looks and fitted models are kept apart by it."""
+        """List the settings that the views depend on, by which stored looks and fitted models are told apart."""
         return {"kind": "magnifying glass", "power": self.power}
 
 
 def main() -> None:
-    """Fixate every object of two mosaics of embedded scenes, in which all are small, and count those that are named."""
+    """Fixate every object of two mosaics of embedded scenes, in which objects are small, and count the recognised ones."""
     detector = semfov.load_detector("yolov3-tiny")
     mosaics = Mosaics(semfov.EmbeddedScenes(detector.classes, count=8), 2, 2, tile=(320, 240), count=2)
     sensors = {"published fovea": named_sensor("published"), "magnifying glass": MagnifyingGlass(power=3.0)}
