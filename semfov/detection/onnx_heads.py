@@ -122,7 +122,7 @@ def decode_distances(
     check_shape(distances, "distances", None, classes.shape[1], None)
     bins = distances.shape[-1] // 4
     whole = bins > 0 and distances.shape[-1] == 4 * bins
-    check(whole, "distances", "a multiple of 4 as number of channels", tuple(distances.shape))
+    check(whole, "distances", "4 · bins channels, the same number of bins for each side", tuple(distances.shape))
     grid = _grid(distances, canvas, strides, offset)
     expected = distances.unflatten(-1, (4, bins)).softmax(-1) @ torch.arange(bins).to(distances)
     point, reach = grid[:, :2] * grid[:, 2:], expected * grid[:, 2:]

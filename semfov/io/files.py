@@ -77,7 +77,7 @@ def inside(folder: str | Path, name: str) -> Path:
     except (OSError, ValueError, RuntimeError):
         lies = False
     if not lies:
-        raise DataError(f"{folder}: expected the name of a file in this folder, got {name!a}, which is outside it")
+        raise DataError(f"{folder}: expected the name of a file in this folder, got {name!a}, which leads out of it")
     return path
 
 

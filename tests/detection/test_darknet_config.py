@@ -37,7 +37,7 @@ def test_values():
     for key in ("mask", "word"):
         with pytest.raises(DataError, match=rf"a.cfg:7: \[yolo\] {key}: expected"):
             section.integer(key)
-    with pytest.raises(DataError, match="from 4 up, got '3'"):
+    with pytest.raises(DataError, match="of at least 4, got '3'"):
         section.integer("size", minimum=4)
     with pytest.raises(DataError, match="expected numbers, got 'x'"):
         section.numbers("word")
