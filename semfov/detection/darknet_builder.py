@@ -9,6 +9,7 @@ from torch import nn
 from semfov.detection.darknet_config import Section
 from semfov.detection.darknet_layers import ACTIVATIONS, Convolution, Head, MaxPool, Route, Shortcut, Upsample
 from semfov.errors import DataError
+from semfov.io.schema import shown
 
 # YOLOv3 has 62 million parameters and a map of 12 million numbers; the limits keep a typing error from filling memory.
 _MOST_PARAMETERS = 3 * 10**8
@@ -98,8 +99,8 @@ class Builder:
         self._parameters += here.channels // groups * filters * size**2 + 4 * filters
         if self._parameters > _MOST_PARAMETERS:
             raise DataError(
-                f"{section.where}: expected at most {_MOST_PARAMETERS:,} parameters up to this layer, got "
-                f"{self._parameters:,}; check the cfg"
+                f"{section.where}: expected at most {_MOST_PARAMETERS:,} parameters up to this layer, got more; "
+                f"check the cfg"
             )
         _check_kernel(section, size, stride, section.integer("padding", 0, minimum=0))
         same = section.integer("pad", 0, minimum=0)
@@ -135,10 +136,10 @@ class Builder:
         if len({shape.step for shape in shapes}) != 1:
             raise DataError(f"{section.where}: [route] expected layers of one size, got {section.text('layers')}")
         if group >= groups or any(shape.channels % groups for shape in shapes):
-            counts = ", ".join(str(shape.channels) for shape in shapes)
+            counts = shown([shape.channels for shape in shapes])
             raise DataError(
                 f"{section.where}: [route] expected a group_id below groups, and groups that divide the channels "
-                f"({counts}), got group_id={group} and groups={groups}"
+                f"{counts}, got group_id={shown(group)} and groups={shown(groups)}"
             )
         self._append(Shape(sum(shape.channels for shape in shapes) // groups, shapes[0].step), sources)
         return Route(groups, group)
