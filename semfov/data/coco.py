@@ -90,7 +90,7 @@ class CocoScenes:
         packed = _Packed(coco, _match(coco, self.classes, annotations), drop_crowds=crowd == "drop")
         self.repairs = packed.repairs
         if self.repairs:
-            _log.warning("%s: %s", annotations, _told(self.repairs))
+            _log.warning("%s: %s", annotations, _summary(self.repairs))
 
         self._packed = packed
         self._rows: list[int] = []
@@ -168,7 +168,7 @@ class CocoScenes:
         return _sha256(content, self._packed.sizes[self._rows[index]])
 
 
-def _told(repairs: Counter[str], most: int = 8) -> str:
+def _summary(repairs: Counter[str], most: int = 8) -> str:
     """Repairs in words; the `most` most frequent ones are listed one by one."""
     first = ", ".join(f"{what}: {n}" for what, n in repairs.most_common(most))
     rest = [n for _, n in repairs.most_common()[most:]]

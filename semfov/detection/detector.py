@@ -22,6 +22,8 @@ class Detector(nn.Module, ABC):
     all boxes of its head. `forward` does everything: it fits the images, detects, and maps the boxes back. An agent
     that foveates at the detector's resolution calls `fit`, foveates the canvas and calls `detect`.
 
+    The arguments are also attributes.
+
     Args:
         name: name of the model in tables and in fitted observation models.
         classes: names of the K classes, without background, in the order of the scores from index 1.

@@ -214,9 +214,9 @@ def load_onnx(
     try:
         scores = known.decode(outputs, size).classes.shape[-1]
     except (KeyError, IndexError, RuntimeError, TypeError, StopIteration) as error:
-        told = ", ".join(f"{output} {tuple(tensor.shape)}" for output, tensor in outputs.items())
+        listed = ", ".join(f"{output} {tuple(tensor.shape)}" for output, tensor in outputs.items())
         raise InputError(
-            f"head: expected the model's head, got {chosen['head']!r}, which does not fit the outputs {told[:300]}"
+            f"head: expected the model's head, got {chosen['head']!r}, which does not fit the outputs {listed[:300]}"
         ) from error
     check(scores > 0, "outputs", "at least one score", f"{scores} with head {chosen['head']!r}")
     names = coco_names(scores) if names is None else names

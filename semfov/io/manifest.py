@@ -132,8 +132,8 @@ class Manifest:
         """
         path = Path(folder) / FILE
         record = _read(path)
-        told = record.pop("sha256", None)
-        if told != checksum({}, record):
+        recorded = record.pop("sha256", None)
+        if recorded != checksum({}, record):
             raise DataError(f"{path}: damaged or changed, its sha256 is not the one it was written with; {_AGAIN}")
         try:
             _SCHEMA.check({}, record)

@@ -54,9 +54,9 @@ class Field:
     def check(self, name: str, tensor: Tensor, sizes: Sizes) -> None:
         """Raise `InputError` unless a tensor meets the requirements; add the sizes that it determines to `sizes`."""
         fits = tensor.ndim == len(self.shape) and all(map(_fits, self.shape, tensor.shape, [sizes] * tensor.ndim))
-        told = ", ".join(str(size) for size in self.shape)
+        shape = ", ".join(str(size) for size in self.shape)
         known = ", ".join(f"{key} = {value}" for key, value in sizes.items())
-        check(fits, name, f"shape ({told})" + (f" with {known}" if known else ""), tuple(tensor.shape))
+        check(fits, name, f"shape ({shape})" + (f" with {known}" if known else ""), tuple(tensor.shape))
         types = FLOATS if self.dtype is None else (self.dtype,)
         check(tensor.dtype in types, name, " or ".join(map(str, types)), tensor.dtype)
         if not tensor.numel() or not self.finite:
@@ -100,7 +100,7 @@ class Number(Json):
     whole: bool = False
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         whole = self.whole or self.size is not None
         check(is_number(value, whole=whole), name, "a whole number" if whole else "a finite number", shown(value))
         if self.size is not None:
@@ -113,7 +113,7 @@ class Flag(Json):
     """True or false."""
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         check(isinstance(value, bool), name, "true or false", shown(value))
 
 
@@ -136,7 +136,7 @@ class Array(Json):
     distinct: bool = False
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         check(isinstance(value, list | tuple), name, "a list", shown(value))
         fits = self.size is None or _fits(self.size, len(value), sizes)
         check(fits, name, f"{self.size} items", f"{len(value)} with {sizes}")
@@ -159,7 +159,7 @@ class Pair(Json):
     items: tuple[Json, ...]
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         fits = isinstance(value, list | tuple) and len(value) == len(self.items)
         check(fits, name, f"a list of {len(self.items)} items", shown(value))
         for place, (item, kind) in enumerate(zip(value, self.items, strict=True)):
@@ -177,7 +177,7 @@ class Text(Json):
     options: tuple[str, ...] = ()
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         fits = isinstance(value, str) and (value in self.options or not self.options)
         check(fits, name, f"one of {', '.join(self.options)}" if self.options else "text", shown(value))
         check(is_plain(value), name, "text without control characters", shown(value))
@@ -198,7 +198,7 @@ class Object(Json):
     required: tuple[str, ...] = ()
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         check(isinstance(value, Mapping), name, "an object", shown(value))
         for key in self.required:
             check(key in value, f"{name}.{key}", "a value", "nothing")
@@ -220,7 +220,7 @@ class Maybe(Json):
     of: Json
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         if value is not None:
             self.of.check(name, value, sizes)
 
@@ -229,7 +229,7 @@ class Anything(Json):
     """Any JSON value."""
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
 
 
 CLASSES = Array(Text(), "K", least=1, distinct=True)
@@ -257,10 +257,10 @@ class Schema:
     def check(self, tensors: Mapping[str, Tensor], record: Mapping[str, Any] | None = None) -> None:
         """Raise `InputError` unless tensors and record meet the requirements."""
         sizes: Sizes = {}
-        told = record or {}
+        values = record or {}
         for name, kind in self.record.items():
-            check(name in told or isinstance(kind, Maybe), name, "a value", "nothing")
-            kind.check(name, told.get(name), sizes)
+            check(name in values or isinstance(kind, Maybe), name, "a value", "nothing")
+            kind.check(name, values.get(name), sizes)
         for name in tensors:
             check(name in self.tensors, "tensors", f"no others than {', '.join(self.tensors)}", shown(name))
         for name, each in self.tensors.items():

@@ -70,10 +70,10 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
     if not isinstance(record, dict) or record.get("kind") != kind:
         found = record.get("kind") if isinstance(record, dict) else type(record).__name__
         raise DataError(f"{path}: expected a file of kind {kind}, got {found}")
-    told = record.pop(_CHECKSUM, None)
-    if told is None:
+    recorded = record.pop(_CHECKSUM, None)
+    if recorded is None:
         raise DataError(f"{path}: expected a file with the sha256 of its content, got one without; write it again")
-    if told != checksum(tensors, record):
+    if recorded != checksum(tensors, record):
         raise DataError(f"{path}: damaged, its sha256 is not the one it was written with; fetch it again")
     return tensors, record
 
