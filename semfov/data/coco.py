@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 class CocoScenes:
-    """Photographs with COCO annotations, selected by the conditions of the published experiments.
+    """Photographs with COCO annotations, selected by the criteria of the published experiments.
 
     An image is kept if it has at least `min_instances` boxes (of any category) and at least one legal target. A legal
     target is a class whose boxes cover at most `max_target_area` of the image. Categories are matched to `classes` by
@@ -182,8 +182,8 @@ def _known_ids(ids: Collection[int | str], known: Sequence[Any], annotations: st
     if missing:
         some = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
         raise DataError(
-            f"annotations {annotations}: expected images with all {len(wanted)} ids, got none with {len(missing)} of "
-            f"them: {some}; correct ids or the annotations"
+            f"annotations {annotations}: expected an image for each of {len(wanted)} ids, got none for "
+            f"{len(missing)} of them: {some}; correct ids or the annotations"
         )
     return wanted
 

@@ -44,7 +44,7 @@ class Mosaics:
         tile: `(width, height)` of a slot in pixels.
         count: number of mosaics.
         seed: seed of the compositions.
-        fill: value of the pixels beside the photographs.
+        fill: value of the pixels outside the photographs.
 
     >>> from semfov.data import EmbeddedScenes
     >>> mosaics = Mosaics(EmbeddedScenes(("person", "cat"), count=3), 2, 2, tile=(320, 240), count=1)

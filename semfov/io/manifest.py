@@ -78,7 +78,7 @@ class Part:
         sha256: sha256 of the file.
         used: whether the agent uses the part. Where it does not, it acts as an agent without this model.
         why: the reason for that choice, in a sentence.
-        settings: JSON values that belong to the part beside its file.
+        settings: JSON values that belong to the part in addition to its file.
     """
 
     file: str | None

@@ -61,7 +61,7 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
             record = json.loads((file.metadata() or {})[_KEY], parse_constant=_refuse_constant)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
+        raise DataError(f"{path}: no such file; check the path") from None
     except (OSError, SafetensorError, ValueError, RecursionError, TypeError, AttributeError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise DataError(f"{path}: not a readable safetensors file ({reason}); write or fetch it again") from None
@@ -69,7 +69,7 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
         raise DataError(f"{path}: expected a file that semfov wrote, got one without its record") from None
     if not isinstance(record, dict) or record.get("kind") != kind:
         found = record.get("kind") if isinstance(record, dict) else type(record).__name__
-        raise DataError(f"{path}: expected a file of kind {kind}, got {found}")
+        raise DataError(f"{path}: expected a file of kind {kind}, got {found}; check the path")
     recorded = record.pop(_CHECKSUM, None)
     if recorded is None:
         raise DataError(f"{path}: expected a file with the sha256 of its content, got one without; write it again")

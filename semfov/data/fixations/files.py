@@ -42,7 +42,7 @@ def read_json(path: str | PathLike[str], kind: Json) -> Any:
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: cannot be read as JSON ({error})") from None
+        raise DataError(f"{path}: cannot be read as JSON ({error}); correct or replace the file") from None
     check_record(kind, path, "", value)
     return value
 

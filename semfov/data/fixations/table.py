@@ -50,7 +50,7 @@ def read_table(path: str | PathLike[str]) -> list[Fixations]:
     try:
         lines = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"), newline=""), strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path}: cannot be read as a table ({error})") from None
+        raise DataError(f"{path}: cannot be read as a table ({error}); correct or replace the file") from None
     missing = [name for name in COLUMNS if lines and name not in lines[0]]
     if missing:
         raise DataError(f"{path}: expected the columns {', '.join(COLUMNS)}, got none named {', '.join(missing)}")
