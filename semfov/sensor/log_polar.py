@@ -47,7 +47,7 @@ class Retina:
         wedges = 4 * max(1, round(pi * self.fovea / (2 * self.spacing)))
         rings = 2 + ceil(self.fovea * log1p(self._reach(size) / self.fovea) / self.spacing)
         expected = f"a distance large enough for at most {_MOST:,} receptors"
-        check(rings * wedges <= _MOST, "spacing", expected, f"{self.spacing}, which gives {rings * wedges:,}")
+        check(rings * wedges <= _MOST, "spacing", expected, self.spacing)
         return rings, wedges
 
     def levels(self, size: tuple[int, int]) -> int:
