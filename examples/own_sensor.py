@@ -1,7 +1,7 @@
 """Write your own sensor: a magnifying glass, which enlarges the part of the picture around the fixation.
 
-Detectors miss objects that are small on their input. They find them more often when they are enlarged, although enlarging
-adds no detail. A magnifying glass moves pixels, so this sensor also maps the detector's boxes back to the picture.
+Detectors miss objects that are small on their input. They find them more often enlarged, although enlarging adds no
+detail. A magnifying glass moves pixels, so this sensor also maps the detector's boxes back to the picture.
 
 Run it from a checkout: python -m examples.own_sensor
 """
@@ -54,7 +54,7 @@ class MagnifyingGlass(Sensor):
 
 
 def main() -> None:
-    """Fixate every object of two mosaics of embedded scenes, in which objects are small, and count the recognised ones."""
+    """Fixate every object of two mosaics, in which objects are small, and count those that are recognised."""
     detector = semfov.load_detector("yolov3-tiny")
     mosaics = Mosaics(semfov.EmbeddedScenes(detector.classes, count=8), 2, 2, tile=(320, 240), count=2)
     sensors = {"published fovea": named_sensor("published"), "magnifying glass": MagnifyingGlass(power=3.0)}

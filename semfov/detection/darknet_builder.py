@@ -91,8 +91,8 @@ class Builder:
         here, filters, groups = self._here, section.integer("filters", 1), section.integer("groups", 1)
         if here.channels % groups or filters % groups:
             raise DataError(
-                f"{section.where}: expected groups that divide {here.channels} input channels and {filters} filters, "
-                f"got {groups}"
+                f"{section.where}: expected groups that divide {shown(here.channels)} input channels and "
+                f"{shown(filters)} filters, got {shown(groups)}"
             )
         size, stride = section.integer("size", 1), section.integer("stride", 1)
         # Parameters are counted before the layer is made, because making it allocates them.

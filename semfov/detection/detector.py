@@ -43,9 +43,9 @@ class Detector(nn.Module, ABC):
     ...         height, width = canvas.shape[-2:]
     ...         boxes = canvas.new_tensor([0, 0, width, height]).expand(len(canvas), 1, 4)
     ...         return Candidates(boxes, torch.full((len(canvas), 1, 1), 0.9))
-    >>> detections = Whole("whole", ("thing",), (64, 64))(torch.rand(2, 3, 30, 40))
-    >>> detections.boxes[0].tolist(), detections.scores[0].tolist()
-    ([[0.0, 0.0, 40.0, 30.0]], [[0.10000002384185791, 0.8999999761581421]])
+    >>> detections = Whole("whole", ("photograph",), (64, 64))(torch.rand(2, 3, 30, 40))
+    >>> detections.boxes[0], detections.scores[0]
+    (tensor([[ 0.,  0., 40., 30.]]), tensor([[0.1000, 0.9000]]))
     """
 
     def __init__(
