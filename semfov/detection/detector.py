@@ -145,7 +145,7 @@ class Detector(nn.Module, ABC):
             Features `(B, C, h, w)`.
 
         Raises:
-            InputError: the detector does not give access to its features, as an ONNX model.
+            InputError: the detector does not give access to its features, for instance because it is an ONNX model.
         """
         raise InputError(
             f"detector: expected one that gives access to its features, such as yolov3-tiny, got {self.name}"

@@ -123,7 +123,7 @@ def load_yolo(
         stride: pad the canvas only to a multiple of this number of pixels; None pads it to `input_size`.
         background: background policy of the scores (`semfov.detection.score_vectors`).
         threshold: smallest confidence of a box (`Selection`).
-        iou: overlap above which the less confident of two boxes is suppressed (`Selection`).
+        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
         limit: largest number of boxes of an image (`Selection`).
         per_class: suppress only boxes of the same class (`Selection`).
         runtime: the runtime of the network: `"torch"`; `"onnxruntime"`, on a CPU and without gradients; or `"auto"`,

@@ -173,7 +173,7 @@ def load_onnx(
         logits: whether the model returns scores before the sigmoid.
         background: background policy of the scores (`semfov.detection.score_vectors`).
         threshold: smallest confidence of a box (`Selection`).
-        iou: overlap above which the less confident of two boxes is suppressed (`Selection`).
+        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
         limit: largest number of boxes of an image (`Selection`).
         per_class: suppress only boxes of the same class (`Selection`).
         threads: number of threads of onnxruntime; None for `torch.get_num_threads()`.

@@ -178,7 +178,7 @@ def load_torchvision(
         first: number of outputs before the first class, 1 or 0 (`TorchvisionDetector`).
         background: background policy of the scores (`semfov.detection.score_vectors`).
         threshold: smallest confidence of a box (`Selection`).
-        iou: overlap above which the less confident of two boxes is suppressed (`Selection`).
+        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
         limit: largest number of boxes of an image (`Selection`).
         per_class: suppress only boxes of the same class (`Selection`).
         device: device of the model.
