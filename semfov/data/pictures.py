@@ -71,8 +71,8 @@ class Pictures:
         if index not in self._sizes:
             height, width = read_image(self._path(index)).shape[-2:]
             self._sizes[index] = width, height
-        none = torch.zeros(0, dtype=torch.int64)
-        return Annotation(torch.zeros(0, 4), none, none.bool(), self._sizes[index])
+        labels = torch.zeros(0, dtype=torch.int64)
+        return Annotation(torch.zeros(0, 4), labels, labels.bool(), self._sizes[index])
 
     def targets(self, index: int) -> list[int]:
         """Return an empty list: no objects are known."""

@@ -156,7 +156,7 @@ class Foveation(Sensor):
         return Opened(self.pyramid(canvas), self.sigma * shrink)
 
     def look(self, state: Opened, gaze: Tensor) -> Tensor:
-        """Canvases `(F, 3, H, W)` foveated around fixations `(F, 2)`."""
+        """Foveate a canvas around fixations `(F, 2)`: views `(F, 3, H, W)`."""
         return foveate(state.bands, gaze[None], sigma=state.sigma, growth=self.growth)[0]
 
     def settings(self) -> dict[str, Any]:

@@ -55,9 +55,9 @@ def panorama_points(directions: Tensor, size: tuple[int, int]) -> Tensor:
     x, y, z = directions.unbind(-1)
     squared = x.square() + z.square()
     pole = squared <= 1e-12 * (squared + y.square())
-    one, none = torch.ones_like(x), torch.zeros_like(x)
-    longitude = torch.atan2(torch.where(pole, none, x), torch.where(pole, one, z))
-    latitude = torch.atan2(-y, torch.where(pole, none, torch.where(pole, one, squared).sqrt()))
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    longitude = torch.atan2(torch.where(pole, zero, x), torch.where(pole, one, z))
+    latitude = torch.atan2(-y, torch.where(pole, zero, torch.where(pole, one, squared).sqrt()))
     column = (longitude + torch.pi) * (size[0] / (2 * torch.pi)) - 0.5
     # A longitude that is rounded up to half a turn belongs to the other end of the row.
     column = torch.where(column >= size[0] - 0.5, column - size[0], column)
@@ -188,7 +188,7 @@ class Regions:
         return len(self.boxes)
 
     def __getitem__(self, index: Tensor | slice) -> "Regions":
-        """Some of the regions."""
+        """Return some of the regions."""
         return Regions(Camera(self.camera.pose[index], self.camera.size), self.boxes[index])
 
     def contain(self, directions: Tensor) -> Tensor:
