@@ -1,8 +1,7 @@
-"""Write your own sensor: a magnifying glass, which enlarges a part of the picture around the fixation.
+"""Write your own sensor: a magnifying glass, which enlarges the part of the picture around the fixation.
 
-Detectors miss objects that are small on their input. They find enlarged objects more often, although enlarging adds no
-detail. Boxes that are detected through the glass have other coordinates than in the picture, so the sensor also
-converts them back.
+Detectors miss objects that are small on their input. They find them more often enlarged, although enlarging adds no
+detail. A magnifying glass moves pixels, so this sensor also maps the detector's boxes back to the picture.
 
 Run it from a checkout: python -m examples.own_sensor
 """
@@ -19,10 +18,10 @@ from semfov.sensor import Sensor, glimpse, named_sensor
 
 
 class MagnifyingGlass(Sensor):
-    """Show a window around the fixation, enlarged to the size of the canvas.
+    """Shows a window around the fixation, enlarged to the size of the canvas.
 
     Args:
-        power: magnification factor.
+        power: factor by which objects are enlarged.
     """
 
     def __init__(self, power: float = 2.0) -> None:
@@ -30,46 +29,46 @@ class MagnifyingGlass(Sensor):
         self.power = power
 
     def open(self, canvas: Tensor, scale: Tensor) -> Tensor:
-        """Return the canvas, as there is nothing to prepare. A sensor with widths in pixels would scale them here."""
+        """Return the canvas as it is; a sensor with widths in pixels would multiply them by `scale`."""
         return canvas
 
     def look(self, state: Tensor, gaze: Tensor) -> Tensor:
-        """Render the windows `(F, 3, h, w)` around fixations `(F, 2)`."""
+        """Enlarge the windows around fixations `(F, 2)` to views `(F, 3, h, w)`."""
         size = state.shape[-1], state.shape[-2]
         return glimpse(state, self.windows(state, gaze)[None], size, padding_mode="border")[0]
 
     def boxes_to_canvas(self, state: Tensor, gaze: Tensor, boxes: Tensor) -> Tensor:
-        """Convert boxes `(F, N, 4)` in the views to coordinates of the canvas."""
+        """Map boxes `(F, N, 4)` in the views to the canvas."""
         corner = self.windows(state, gaze)[:, None, :2]
         return boxes / self.power + torch.cat([corner, corner], -1)
 
     def windows(self, canvas: Tensor, gaze: Tensor) -> Tensor:
-        """Compute the visible part of the canvas for each fixation, `(F, 4)`, shifted to stay inside the canvas."""
+        """Compute the windows `(F, 4)` around fixations, moved to lie inside the canvas."""
         size = gaze.new_tensor([canvas.shape[-1], canvas.shape[-2]])
         corner = torch.minimum((gaze + 0.5 - size / (2 * self.power)).clamp(min=0), size * (1 - 1 / self.power))
         return torch.cat([corner, corner + size / self.power], -1)
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings that the views depend on. Stored looks and fitted models are identified by them."""
+        """List the settings that the views depend on, by which stored looks and fitted models are told apart."""
         return {"kind": "magnifying glass", "power": self.power}
 
 
 def main() -> None:
-    """Fixate every object in two mosaics of embedded scenes, where all are small, and count the recognised ones."""
+    """Fixate every object of two mosaics, in which objects are small, and count those that are recognised."""
     detector = semfov.load_detector("yolov3-tiny")
     mosaics = Mosaics(semfov.EmbeddedScenes(detector.classes, count=8), 2, 2, tile=(320, 240), count=2)
     sensors = {"published fovea": named_sensor("published"), "magnifying glass": MagnifyingGlass(power=3.0)}
     for name, sensor in sensors.items():
         eye = semfov.Eye(sensor, detector).eval().requires_grad_(False)
-        recognised = objects = 0
+        named = objects = 0
         for scene in (mosaics[index] for index in range(len(mosaics))):
             fixations = (scene.boxes[:, :2] + scene.boxes[:, 2:]) / 2 - 0.5
             seen = eye.look(eye.open(scene.image[None]), fixations)
             for look, label in enumerate(scene.labels.tolist()):
                 here = box_iou(seen.boxes[look], scene.boxes[look, None])[:, 0] >= 0.5
-                recognised += bool((here & seen.mask[look] & (seen.scores[look, :, label] >= 0.5)).any())
+                named += bool((here & seen.mask[look] & (seen.scores[look, :, label] >= 0.5)).any())
             objects += len(scene.labels)
-        print(f"{name}: {recognised} of {objects} objects are recognised when they are fixated")
+        print(f"{name}: {named} of {objects} objects are named when they are fixated")
 
 
 if __name__ == "__main__":

@@ -15,11 +15,11 @@ Name = TypeVar("Name", bound=str)
 
 
 class SemfovError(Exception):
-    """Base of every error that semfov raises on purpose; its message names the thing and the remedy."""
+    """Base of every error that semfov raises on purpose; the message names what is wrong and how to correct it."""
 
 
 class InputError(SemfovError, ValueError):
-    """An argument, a setting or a tensor is not what the call needs."""
+    """An argument, a setting or a tensor does not have the value, type or shape that the call needs."""
 
 
 class DataError(SemfovError):
@@ -27,16 +27,36 @@ class DataError(SemfovError):
 
 
 def check(condition: bool, argument: str, expected: str, got: object) -> None:
-    """Raise `InputError` unless `condition` holds: the argument, what was expected and what came.
+    """Raise `InputError` with a message in the house's form, unless a condition holds.
+
+    Args:
+        condition: whether the argument is as expected.
+        argument: name of the argument.
+        expected: what the argument must be, in words.
+        got: the value that was passed.
+
+    Raises:
+        InputError: the condition does not hold.
 
     >>> check(True, "sigma", "a positive number", 3.0)
+    >>> check(False, "sigma", "a positive number", -1.0)
+    Traceback (most recent call last):
+    semfov.errors.InputError: sigma: expected a positive number, got -1.0
     """
     if not condition:
         raise InputError(f"{argument}: expected {expected}, got {got}")
 
 
 def values_known(*tensors: Tensor) -> bool:
-    """Whether the values of tensors can be read: not while a graph is traced, nor under transforms of `torch.func`.
+    """Tell whether the values of tensors can be read.
+
+    They cannot while a graph is traced or under a transform of `torch.func`. Checks of values are left out there.
+
+    Args:
+        tensors: tensors of any shape.
+
+    Returns:
+        Whether the values of all of them can be read.
 
     >>> values_known(torch.ones(2))
     True
@@ -47,7 +67,7 @@ def values_known(*tensors: Tensor) -> bool:
         return False
     try:
         for tensor in tensors:
-            # A transform wraps its tensors, and what it wraps has no memory of its own.
+            # A transform wraps its tensors, and a wrapped tensor has no memory of its own.
             tensor.data_ptr()
     except RuntimeError:
         return False
@@ -55,20 +75,31 @@ def values_known(*tensors: Tensor) -> bool:
 
 
 def check_shape(tensor: Tensor, argument: str, *shape: int | None) -> None:
-    """Raise `InputError` unless the last dimensions of `tensor` are `shape` (`None` stands for any size).
+    """Raise `InputError` unless the last dimensions of a tensor have the given sizes.
+
+    Args:
+        tensor: the tensor.
+        argument: name of the argument, for the message.
+        shape: size of each of the last dimensions; `None` stands for any size.
 
     >>> check_shape(torch.zeros(2, 3, 4), "boxes", None, 4)
     """
     sizes = tuple(tensor.shape[-len(shape) :])
     if tensor.ndim >= len(shape) and all(s is None or s == n for s, n in zip(shape, sizes, strict=True)):
         return
-    # Only now: graphs with dynamic sizes cannot write them out.
+    # The message is built only now, because a graph with dynamic sizes cannot write the sizes out.
     wanted = ", ".join("any" if s is None else str(s) for s in shape)
     check(False, argument, f"a tensor of shape (..., {wanted})", tuple(tensor.shape))
 
 
 def check_whole(value: object, argument: str, low: int, high: int) -> None:
-    """Raise `InputError` unless `value` is a whole number from `low` to `high`.
+    """Raise `InputError` unless a value is a whole number in a range.
+
+    Args:
+        value: the value.
+        argument: name of the argument, for the message.
+        low: the smallest value allowed.
+        high: the largest value allowed.
 
     >>> check_whole(3, "shifts", 0, 10)
     """
@@ -77,7 +108,13 @@ def check_whole(value: object, argument: str, low: int, high: int) -> None:
 
 
 def check_number(value: object, argument: str, low: float, high: float) -> None:
-    """Raise `InputError` unless `value` is a number from `low` to `high`.
+    """Raise `InputError` unless a value is a number in a range.
+
+    Args:
+        value: the value.
+        argument: name of the argument, for the message.
+        low: the smallest value allowed.
+        high: the largest value allowed.
 
     >>> check_number(0.5, "threshold", 0, 1)
     """
@@ -86,9 +123,18 @@ def check_number(value: object, argument: str, low: float, high: float) -> None:
 
 
 def check_pixels(image: Tensor, argument: str) -> None:
-    """Raise `InputError` where an image is not RGB in [0, 1] up to rounding: bytes, say, or NaN.
+    """Raise `InputError` unless the values of an image lie in [0, 1], up to rounding.
+
+    The message tells how to bring the image into that range.
+
+    Args:
+        image: pixels of any shape.
+        argument: name of the argument, for the message.
 
     >>> check_pixels(torch.rand(1, 3, 4, 4), "image")
+    >>> check_pixels(torch.full((1, 3, 4, 4), 255.0), "image")
+    Traceback (most recent call last):
+    semfov.errors.InputError: image: expected RGB in [0, 1], got numbers from 255 to 255; divide by 255
     """
     if not values_known(image) or not image.numel():
         return
@@ -99,30 +145,53 @@ def check_pixels(image: Tensor, argument: str) -> None:
 
 
 def _to_unit(least: float, most: float) -> str:
-    """What to do with pixels of such a range."""
+    """How to bring pixels from `least` to `most` into [0, 1], in words."""
     if not math.isfinite(least + most):
-        return "replace what is no number (torch.nan_to_num)"
+        return "replace NaN and infinite values (torch.nan_to_num)"
     if least >= -0.25 and most <= 1.25:
-        return "clamp to [0, 1] what resampling has carried beyond"
+        return "clamp to [0, 1] the values that resampling has moved outside"
     if least < 0:
         return (
-            "undo the normalisation: image * std + mean, for ImageNet's with mean (0.485, 0.456, 0.406) and std "
-            "(0.229, 0.224, 0.225), or (image + 1) / 2 where it was to [-1, 1]"
+            "undo the normalisation: image * std + mean, for ImageNet with mean (0.485, 0.456, 0.406) and std "
+            "(0.229, 0.224, 0.225), or (image + 1) / 2 for an image normalised to [-1, 1]"
         )
     return "divide by 255" if most <= 255.5 else "divide by the value of white"
 
 
 def check_finite(tensor: Tensor, argument: str) -> None:
-    """Raise `InputError` where `tensor` holds a NaN or an infinity."""
+    """Raise `InputError` where a tensor holds a NaN or an infinite value.
+
+    Args:
+        tensor: the tensor, of any shape.
+        argument: name of the argument, for the message.
+
+    >>> check_finite(torch.tensor([1.0, float("nan")]), "gaze")
+    Traceback (most recent call last):
+    semfov.errors.InputError: gaze: expected finite numbers, got 1 of 2 that are not finite
+    """
     bad = int((~torch.isfinite(tensor)).sum())
-    check(bad == 0, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not")
+    check(bad == 0, argument, "finite numbers", f"{bad} of {tensor.numel()} that are not finite")
 
 
 def lookup(name: str, known: Iterable[Name], what: str) -> Name:
-    """Return `name` if it is `known`, else raise `InputError` with the nearest known names.
+    """Return a name if it is known; otherwise suggest the nearest known names.
+
+    Args:
+        name: the name that was asked for.
+        known: the names that exist.
+        what: kind of name, for the message.
+
+    Returns:
+        The known name.
+
+    Raises:
+        InputError: the name is unknown.
 
     >>> lookup("cup", ["cup", "cat"], "class")
     'cup'
+    >>> lookup("cups", ["cup", "cat"], "class")
+    Traceback (most recent call last):
+    semfov.errors.InputError: unknown class 'cups'; did you mean 'cup'?
     """
     names = list(known)
     if name in names:

@@ -1,4 +1,4 @@
-"""Images, annotated scenes and where they come from."""
+"""Images, annotated scenes and their sources."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -13,22 +13,25 @@ from semfov.errors import DataError
 from semfov.io.files import check_regular
 from semfov.io.schema import is_number, is_plain, shown
 
-_LARGEST = 2**24  # pixels of a side, up to which float32 boxes have whole pixels
+_LARGEST = 2**24  # largest side in pixels for which float32 represents every whole pixel
 
 
 def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
     """Read and check a COCO instances file.
 
-    Ids are integers or strings, one kind for all images. Every image needs `id`, `file_name`, `width` and `height`;
-    every category `id` and `name`; every annotation `id`, `image_id`, `category_id` and `bbox` = `[x, y, width,
-    height]`, and may have `iscrowd`. Other keys are not looked at.
+    Ids are integers or strings, the same kind for all images. Every image needs `id`, `file_name`, `width` and
+    `height`. Every category needs `id` and `name`. Every annotation needs `id`, `image_id`, `category_id` and `bbox` =
+    `[x, y, width, height]`, and may have `iscrowd`. Other keys are ignored.
+
+    Args:
+        path: the file.
 
     Returns:
         A `pycocotools.coco.COCO` index, and the sha256 of the file.
 
     Raises:
-        DataError: the file is missing, not JSON, or an entry lacks a key, is of the wrong type, repeats an id or
-            refers to one that is not there.
+        DataError: the file is missing or not JSON, or an entry lacks a key, has a value of the wrong type, repeats an
+            id or refers to an id that does not exist.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -54,7 +57,7 @@ def read_annotations(path: str | PathLike[str]) -> tuple[Any, str]:
 
 
 class _Fault(Exception):
-    """What is wrong with an entry."""
+    """An error in an entry; the message describes it."""
 
 
 def _read(path: str | PathLike[str], name: str) -> bytes:
@@ -113,7 +116,7 @@ def _entries(data: dict[str, Any], key: str) -> Iterator[tuple[str, dict[str, An
 
 
 def _ids(data: dict[str, Any], key: str, fields: dict[str, type]) -> set[int | str]:
-    """Ids of the entries, each there once, while further fields are of their type and not empty."""
+    """Ids of the entries, checked to be unique; further fields are checked to have their type and not to be empty."""
     seen: set[int | str] = set()
     for where, entry in _entries(data, key):
         identity = entry.get("id")
@@ -122,7 +125,7 @@ def _ids(data: dict[str, Any], key: str, fields: dict[str, type]) -> set[int | s
         if isinstance(identity, str) and not is_plain(identity):
             raise _Fault(f"{where}: expected id to have no control characters, got {_show(entry, 'id')}")
         if identity in seen:
-            raise _Fault(f"{where}: id {_show(entry, 'id')} is there more than once")
+            raise _Fault(f"{where}: expected unique ids, got id {_show(entry, 'id')} more than once")
         seen.add(identity)
         for field, kind in fields.items():
             if not isinstance(entry.get(field), kind) or not entry[field]:
@@ -144,5 +147,5 @@ def _kind(value: object) -> str:
 
 
 def _show(entry: dict[str, Any], key: str) -> str:
-    """A value as an error prints it: on one line and short."""
+    """A value as error messages print it: on one line and short."""
     return shown(entry[key]) if key in entry else "nothing"

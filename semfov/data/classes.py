@@ -10,7 +10,7 @@ from torch import Tensor
 from semfov.data.synonyms import SYNONYMS
 from semfov.errors import InputError, check
 
-# Darknet's lists keep the names of PASCAL VOC for six classes that COCO renamed.
+# Darknet's list of COCO classes keeps the PASCAL VOC names of six classes that COCO renamed.
 ALIASES = {
     "aeroplane": "airplane",
     "motorbike": "motorcycle",
@@ -24,7 +24,13 @@ _IRREGULAR = {"person": "people", "mouse": "mice", "skis": "ski", "scissors": "s
 
 
 def canonical_name(name: str) -> str:
-    """The COCO spelling of a class name, in lower case with single spaces.
+    """Write a class name in COCO's spelling, in lower case with single spaces.
+
+    Args:
+        name: name of a class, in COCO's or Darknet's spelling.
+
+    Returns:
+        The name in COCO's spelling.
 
     >>> canonical_name("TVmonitor"), canonical_name("traffic_light")
     ('tv', 'traffic light')
@@ -34,7 +40,16 @@ def canonical_name(name: str) -> str:
 
 
 def class_indices(classes: Sequence[str]) -> dict[str, int]:
-    """Index of each class by its canonical name, from 1 (0 is background).
+    """Index the classes by their canonical names.
+
+    Args:
+        classes: names of the K classes.
+
+    Returns:
+        The index of each class, from 1 (0 is background), by its canonical name.
+
+    Raises:
+        InputError: two names are the same.
 
     >>> class_indices(("person", "sofa"))
     {'person': 1, 'couch': 2}
@@ -46,18 +61,21 @@ def class_indices(classes: Sequence[str]) -> dict[str, int]:
 
 
 def class_index(name: str | int, classes: Sequence[str], argument: str = "class") -> int:
-    """Index of a class, from 1, by its name or by that index.
+    """Look up the index of a class by its name.
 
-    A name may be in any case, with or without spaces, underscores and hyphens, in either of its spellings (`ALIASES`),
-    and in the plural.
+    A name may be in upper or lower case, with or without spaces, underscores and hyphens, in COCO's or Darknet's
+    spelling, and in the singular or the plural. An index is also accepted, and checked.
 
     Args:
-        name: name or index 1..K.
+        name: name or index 1..K of the class.
         classes: names of the K classes.
-        argument: what messages call it.
+        argument: name of the argument, for the message.
+
+    Returns:
+        The index, from 1.
 
     Raises:
-        InputError: there is no such class; what people else call classes, and the nearest names, are suggested.
+        InputError: there is no such class; the message suggests classes with this synonym or a similar name.
 
     >>> class_index("couch", ("person", "sofa")), class_index("Wine_Glasses", ("cup", "wine glass"))
     (2, 2)
@@ -75,35 +93,36 @@ def class_index(name: str | int, classes: Sequence[str], argument: str = "class"
         if len(fits) == 1:
             return fits[0]
         if fits:
-            raise _unknown(argument, name, [classes[index - 1] for index in fits], classes)
+            raise InputError(_unknown(argument, name, [classes[index - 1] for index in fits], classes))
     singular = [word for word in SYNONYMS if wanted in other_numbers(word)]
     meant = [key for word in (wanted, *singular) for key in map(plain_key, SYNONYMS.get(word, ())) if key in keys]
     near = get_close_matches(wanted, keys, n=3, cutoff=0.8 if meant else 0.6)
-    raise _unknown(argument, name, [classes[keys.index(key)] for key in (*meant, *near)], classes)
+    raise InputError(_unknown(argument, name, [classes[keys.index(key)] for key in (*meant, *near)], classes))
 
 
 def _index(value: object, classes: int, argument: str) -> int:
-    """An index 1..K from whatever counts as a whole number."""
+    """An index 1..K from a whole number of any type."""
     value = value.item() if isinstance(value, Tensor) and value.ndim == 0 else value
     inside = isinstance(value, Integral) and not isinstance(value, bool) and 1 <= int(value) <= classes
     check(inside, argument, f"a name, or a whole number from 1 to {classes}", repr(value))
     return int(value)  # type: ignore[call-overload]
 
 
-def _unknown(argument: str, name: str, meant: Sequence[str], classes: Sequence[str]) -> InputError:
+def _unknown(argument: str, name: str, meant: Sequence[str], classes: Sequence[str]) -> str:
+    """The message for an unknown class, with the classes that may be meant."""
     names = list(dict.fromkeys(meant))
     hint = f"did you mean {' or '.join(map(repr, names))}?" if names else f"known: {', '.join(classes)}"
-    return InputError(f"{argument}: unknown class {name!r}; {hint}")
+    return f"{argument}: unknown class {name!r}; {hint}"
 
 
 def plain_key(name: str) -> str:
-    """A name without what people write it with or without."""
+    """A name in lower case, without spaces, underscores and hyphens, in COCO's spelling."""
     plain = re.sub(r"[\s_-]+", "", name.lower())
     return re.sub(r"\s", "", ALIASES.get(plain, plain))
 
 
 def other_numbers(key: str) -> set[str]:
-    """The plural of a class as English makes it, or the singular of one that has only a plural."""
+    """Plural forms of a class name; for a name that is a plural, also its singular."""
     forms = {f"{key}s", f"{key}es", _IRREGULAR.get(key, f"{key}s")}
     for end, plural in (("y", "ies"), ("f", "ves"), ("fe", "ves")):
         if key.endswith(end):

@@ -26,38 +26,45 @@ _log = logging.getLogger(__name__)
 
 
 class CocoScenes:
-    """Photographs with COCO annotations, those that meet the conditions of the published selection.
+    """Photographs with COCO annotations, selected by the criteria of the published experiments.
 
-    An image is kept that has at least `min_instances` boxes (of any category) and at least one class whose boxes
-    cover at most `max_target_area` of it: such classes are its legal targets. Categories are matched to `classes`
-    by name, in COCO's or in Darknet's spelling.
+    An image is kept if it has at least `min_instances` boxes (of any category) and at least one legal target. A legal
+    target is a class whose boxes cover at most `max_target_area` of the image. Categories are matched to `classes` by
+    name, in COCO's or in Darknet's spelling.
 
-    Boxes are cut to their image. Dropped are boxes without area inside the image, boxes of crowds with
-    `crowd="drop"`, and boxes of categories that `classes` does not have. `repairs` counts each over the whole file,
-    and one warning of the logger `semfov.data.coco` tells them; anything else that is wrong with the file raises.
+    Boxes are cut to their image. Boxes without area inside the image are dropped, and so are boxes of categories that
+    are not in `classes` and, with `crowd="drop"`, boxes of crowds. `repairs` counts the boxes of the whole file that
+    were cut or dropped, and a warning of the logger `semfov.data.coco` lists them. Any other error in the file raises.
 
     Args:
         root: folder of the images.
         annotations: COCO instances file.
         classes: names of the detector's classes 1..K.
-        min_instances: boxes that an image needs, at least.
-        max_target_area: share of the image that a target may cover; None allows any, and images without targets.
-        limit: keep only so many images, those with the lowest ids.
-        ids: ids of the images to choose among, before any other selection; None takes all.
-        coverage: how the share is measured (`semfov.data.scene.box_coverage`): the sum of the boxes' areas, or the
-            area of their union, which is smaller where they overlap. On the 300 photographs of the results tables
-            the sum admits 1,079 image-target pairs, the union 1,090.
-        crowd: whether boxes that frame a crowd count as ordinary boxes (a gaze on a crowd of people is on people)
-            or are dropped.
+        min_instances: smallest number of boxes of an image.
+        max_target_area: largest fraction of the image that a target may cover; None allows any fraction, and keeps
+            images without targets.
+        limit: largest number of images; those with the lowest ids are kept.
+        ids: ids of the images to select from; None for all.
+        coverage: how the fraction is measured (`semfov.data.scene.box_coverage`): `sum` of the boxes' areas, or area of
+            their `union`, which is smaller where they overlap. On the 300 photographs of the results tables the sum
+            admits 1,079 image-target pairs, the union 1,090.
+        crowd: `keep` treats a box around a crowd as an ordinary box (a gaze on a crowd of people is on people), and
+            `drop` leaves it out.
 
     Attributes:
-        classes: as given.
+        classes: names of the detector's classes.
         ids: ids of the kept images, ascending.
-        repairs: what was cut or dropped, and how often.
+        repairs: how many boxes were cut or dropped, by reason.
         fingerprint: sha256 of the annotation file, the settings, and the names and sizes of the image files.
 
     Raises:
-        DataError: a file is missing, damaged, no regular file or not below `root`, or no image is left.
+        DataError: a file is missing or damaged, is not a regular file or is outside `root`, or no image is left.
+
+    Example::
+
+        scenes = CocoScenes("val2017", "annotations/instances_val2017.json", detector.classes, limit=300)
+        scene = scenes[0]
+        scene.image, scene.boxes, [scenes.classes[target - 1] for target in scenes.targets(0)]
     """
 
     def __init__(
@@ -83,7 +90,7 @@ class CocoScenes:
         packed = _Packed(coco, _match(coco, self.classes, annotations), drop_crowds=crowd == "drop")
         self.repairs = packed.repairs
         if self.repairs:
-            _log.warning("%s: %s", annotations, _told(self.repairs))
+            _log.warning("%s: %s", annotations, _summary(self.repairs))
 
         self._packed = packed
         self._rows: list[int] = []
@@ -112,22 +119,46 @@ class CocoScenes:
         return len(self._rows)
 
     def __getitem__(self, index: int) -> Scene:
-        """Decode an image: upright, or as stored where only that has the recorded size."""
+        """Decode an image: upright, or as stored where only the stored pixels have the recorded size."""
         annotation = self.annotation(index)
         image = read_sized(self._files[index], annotation.size)
         name = self._packed.names[self._rows[index]]
         return Scene(self.ids[index], name, image, annotation.boxes, annotation.labels)
 
     def annotation(self, index: int) -> Annotation:
-        """The objects of a scene, without decoding its image."""
+        """Return the objects of a scene, without decoding its image.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            The objects of the detector's classes.
+        """
         return self._packed.annotation(self._rows[index])
 
     def targets(self, index: int) -> list[int]:
-        """Classes of a scene that may be searched for, ascending."""
+        """List the classes of a scene that may be searched for.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            Class indices 1..K, ascending.
+        """
         return list(self._targets[index])
 
     def digest(self, index: int) -> str:
-        """sha256 of an image file and of the size that its annotations tell."""
+        """Compute the sha256 of an image file and of the size in its annotations.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            64 hexadecimal digits.
+
+        Raises:
+            DataError: the file cannot be read.
+        """
         path = self._files[index]
         check_regular(path, f"image {path}")
         try:
@@ -137,25 +168,28 @@ class CocoScenes:
         return _sha256(content, self._packed.sizes[self._rows[index]])
 
 
-def _told(repairs: Counter[str], most: int = 8) -> str:
-    """Repairs in words, the most frequent ones one by one."""
+def _summary(repairs: Counter[str], most: int = 8) -> str:
+    """Repairs in words; the `most` most frequent ones are listed one by one."""
     first = ", ".join(f"{what}: {n}" for what, n in repairs.most_common(most))
     rest = [n for _, n in repairs.most_common()[most:]]
-    return first + (f", and {len(rest)} more kinds of boxes cut or dropped: {sum(rest)}" if rest else "")
+    return first + (f", and {sum(rest)} boxes cut or dropped for {len(rest)} more reasons" if rest else "")
 
 
 def _known_ids(ids: Collection[int | str], known: Sequence[Any], annotations: str | PathLike[str]) -> set[str]:
-    """Ids as text, all of which the annotations have."""
+    """Ids as text, checked to be in the annotations."""
     wanted = {str(i) for i in ids}
     missing = sorted(wanted - {str(i) for i in known})
     if missing:
         some = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
-        raise DataError(f"annotations {annotations}: {len(missing)} of {len(wanted)} ids are not in it: {some}")
+        raise DataError(
+            f"annotations {annotations}: expected an image for each of {len(wanted)} ids, got none for "
+            f"{len(missing)} of them: {some}; correct ids or the annotations"
+        )
     return wanted
 
 
 class _Packed:
-    """The objects of all images of a file, end to end in a few tensors, so that they travel to workers cheaply."""
+    """The objects of all images of a file, concatenated in a few tensors, which are cheap to send to workers."""
 
     def __init__(self, coco: Any, labels: dict[int | str, int], *, drop_crowds: bool) -> None:
         self.ids: list[Any] = sorted(coco.imgs)
@@ -178,7 +212,7 @@ class _Packed:
         dropped = solid & crowd & drop_crowds
         kept = solid & ~dropped
         known = kept & (label > 0)
-        # official files have two decimals: less than one of them is rounding
+        # official files have two decimals, so a difference of up to 0.01 is rounding
         outside = kept & ((edges - cut).abs() > 0.01).any(-1)
         for what, which in (("without area in the image, dropped", ~solid), ("of crowds, dropped", dropped)):
             self._count(f"boxes {what}", which)
@@ -202,7 +236,7 @@ class _Packed:
 
 
 def _match(coco: Any, classes: tuple[str, ...], path: str | PathLike[str]) -> dict[int | str, int]:
-    """Category id -> index of the class, 0 for categories that the detector does not have."""
+    """Index of the class by category id, 0 for categories that the detector does not have."""
     indices = class_indices(classes)
     labels = {i: indices.get(canonical_name(category["name"]), 0) for i, category in coco.cats.items()}
     if not any(labels.values()):
@@ -215,7 +249,7 @@ def _match(coco: Any, classes: tuple[str, ...], path: str | PathLike[str]) -> di
 
 
 def _file_sizes(root: str | PathLike[str], files: list[Path]) -> list[int]:
-    """Sizes of files, all of which are regular ones below `root`, also where a link is followed."""
+    """Sizes of files, checked to be regular files inside `root`, also after links are followed."""
     sizes, missing = [], []
     base = os.path.realpath(root)
     for path in files:
@@ -225,7 +259,7 @@ def _file_sizes(root: str | PathLike[str], files: list[Path]) -> list[int]:
             below = False
         if not below:
             raise DataError(
-                f"image {path}: expected a file below data.root ({root}), got a file_name that leads out of it"
+                f"image {path}: expected a file inside data.root ({root}), got a file_name that leads out of it"
             )
         check_regular(path, f"image {path}")
         try:

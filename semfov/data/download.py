@@ -31,9 +31,9 @@ class Archive:
     """A zip file on the server.
 
     Attributes:
-        path: where it lies below the server's address.
-        size: in bytes.
-        sha256: of the whole file.
+        path: its path on the server.
+        size: its size in bytes.
+        sha256: sha256 of the whole file.
     """
 
     path: str
@@ -46,7 +46,7 @@ class Archive:
         return PurePosixPath(self.path).name
 
 
-# COCO publishes no digests of its own; these are what many independent users of the files recorded.
+# COCO publishes no digests; these were recorded by many independent users of the files.
 _ANNOTATIONS = Archive(
     "annotations/annotations_trainval2017.zip",
     252_907_541,
@@ -65,18 +65,18 @@ SPLITS = {
 def download_coco(split: str, root: str | os.PathLike[str], *, address: str = ADDRESS, keep: bool = False) -> None:
     """Fetch a split's images into `root/<split>` and its boxes into `root/annotations/instances_<split>.json`.
 
-    What is there already is not fetched again; an interrupted transfer goes on where it stopped. Archives that lie
-    in `root` already are verified, used and left there.
+    Files that are already complete are not fetched again, and an interrupted transfer continues where it stopped.
+    Archives that are already in `root` are verified, used and left there.
 
     Args:
         split: `"val2017"` or `"train2017"`.
         root: folder of the data set.
-        address: of the server, or of a mirror that has the same files under the same paths.
+        address: address of the server, or of a mirror that has the same files under the same paths.
         keep: keep the archives that were fetched.
 
     Raises:
         InputError: the split is unknown.
-        DataError: no network, no space, or a file that is not the official one.
+        DataError: the network fails, the disk is full, or a file is not the official one.
     """
     images = SPLITS[lookup(split, SPLITS, "split")]
     check(address.startswith(("http://", "https://")), "address", "http://... or https://...", repr(address))
@@ -86,7 +86,20 @@ def download_coco(split: str, root: str | os.PathLike[str], *, address: str = AD
 def fetch_split(
     split: str, root: Path, images: Archive, annotations: Archive, *, address: str, keep: bool, pause: float = 1.0
 ) -> None:
-    """`download_coco` for any pair of archives."""
+    """`download_coco` for any pair of archives.
+
+    Args:
+        split: name of the split.
+        root: folder of the data set.
+        images: archive of the images.
+        annotations: archive of the annotations.
+        address: address of the server.
+        keep: keep the archives that were fetched.
+        pause: seconds to wait before a failed transfer is tried again.
+
+    Raises:
+        DataError: the network fails, the disk is full, or a file is not the official one.
+    """
     instances = f"annotations/instances_{split}.json"
     try:
         if _is_complete(root, split, instances):
@@ -103,7 +116,7 @@ def fetch_split(
                 file.replace(brought)
             else:
                 file.unlink()
-        with contextlib.suppress(OSError):  # another split's transfer may wait in it
+        with contextlib.suppress(OSError):  # it may hold an unfinished transfer of another split
             (root / ".download").rmdir()
     except OSError as error:
         raise DataError(
@@ -112,9 +125,23 @@ def fetch_split(
 
 
 def fetch(archive: Archive, folder: Path, *, address: str = ADDRESS, pause: float = 1.0) -> Path:
-    """Fetch an archive into `folder` and verify it; a transfer that breaks off goes on, `pause` seconds later.
+    """Fetch an archive and verify it; a transfer that breaks off is continued.
 
-    Unfinished bytes wait in `<name>.part`, also from an earlier run; the file itself is there only when verified.
+    Unfinished bytes are kept in `<name>.part`, also from one run to the next. The file itself appears only when it is
+    complete and verified.
+
+    Args:
+        archive: the archive.
+        folder: folder to fetch it into.
+        address: address of the server.
+        pause: seconds to wait before a failed transfer is tried again.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        DataError: the transfer fails several times without progress, the disk is too small, or the file is not the
+            official one.
     """
     file, part = folder / archive.name, folder / f"{archive.name}.part"
     if file.exists():
@@ -144,9 +171,17 @@ def fetch(archive: Archive, folder: Path, *, address: str = ADDRESS, pause: floa
 
 
 def unpack(file: Path, root: Path, members: str) -> None:
-    """Unpack what lies under `members` in a zip file; every file appears whole or not at all.
+    """Unpack the members of a zip file whose names begin with `members`, each one atomically.
 
-    Files that are there with the right content are left alone, so an interrupted run goes on.
+    Files that already have the right content are skipped, so an interrupted run can be continued.
+
+    Args:
+        file: the zip file.
+        root: folder to unpack into.
+        members: beginning of the members' names.
+
+    Raises:
+        DataError: the zip file is damaged, has no such members, or has a member with an unsafe name.
     """
     from tqdm import tqdm
 
@@ -154,7 +189,7 @@ def unpack(file: Path, root: Path, members: str) -> None:
         with zipfile.ZipFile(file) as archive:
             wanted = [m for m in archive.infolist() if m.filename.startswith(members) and not m.is_dir()]
             if not wanted:
-                raise DataError(f"{file}: expected {members} in it, got none; delete the file and run again")
+                raise DataError(f"{file}: expected members {members}*, got none; delete the file and run again")
             for member in tqdm(wanted, desc=f"unpacking {file.name}", unit="file", disable=None):
                 target = _inside(root, member, file)
                 if _is_unpacked(target, member):
@@ -169,17 +204,24 @@ def unpack(file: Path, root: Path, members: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """`python -m semfov.data.coco`."""
+    """Run `python -m semfov.data.coco`.
+
+    Args:
+        arguments: command-line arguments; None for those of the process.
+
+    Returns:
+        The exit status: 0, 1 after an error, 130 after an interrupt.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m semfov.data.coco",
         description="Fetch the official COCO 2017 photographs and their boxes. An interrupted run is resumed by "
-        "the same command; files that are there already are not fetched again.",
-        epilog="Without a network, bring the zip files from elsewhere, put them into DIR and run the same command.",
+        "the same command; files that are already complete are not fetched again.",
+        epilog="Without a network, copy the zip files from another machine into DIR and run the same command.",
     )
     parser.add_argument(
         "split", choices=sorted(SPLITS), help="val2017: 5,000 images, 1.1 GB; train2017: 118,287, 20 GB"
     )
-    parser.add_argument("--root", required=True, metavar="DIR", help="folder of the data set; made if need be")
+    parser.add_argument("--root", required=True, metavar="DIR", help="folder of the data set; created if missing")
     parser.add_argument("--address", default=ADDRESS, metavar="URL", help="server or mirror (default: %(default)s)")
     parser.add_argument("--keep", action="store_true", help="keep the zip files that were fetched")
     options = parser.parse_args(arguments)
@@ -198,7 +240,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _transfer(url: str, archive: Archive, part: Path) -> None:
-    """Append what is missing to `part`; returns also when the server stops early."""
+    """Append the missing bytes to `part`; raise `ConnectionError` where the server stops early."""
     from tqdm import tqdm
 
     start = _size(part)
@@ -210,7 +252,7 @@ def _transfer(url: str, archive: Archive, part: Path) -> None:
             raise
         raise DataError(f"{url}: the server answers {error.code} {error.reason}; check the address") from None
     with response:
-        if response.status != 206:  # the server knows no ranges and sends the whole
+        if response.status != 206:  # the server does not support ranges and sends the whole file
             start = 0
         length = response.headers.get("Content-Length")
         if length is not None and start + int(length) != archive.size:
@@ -241,7 +283,7 @@ def _transfer(url: str, archive: Archive, part: Path) -> None:
 def _read(response: HTTPResponse) -> bytes:
     try:
         return response.read(_CHUNK)
-    except OSError as error:  # of the network; errors of the disk stay what they are
+    except OSError as error:  # a network error; errors of the disk are not converted
         raise ConnectionError(error) from error
 
 
@@ -258,7 +300,7 @@ def _is_unpacked(target: Path, member: zipfile.ZipInfo) -> bool:
 
 
 def _inside(root: Path, member: zipfile.ZipInfo, file: Path) -> Path:
-    """Where a member goes, refusing names that lead out of `root` and links."""
+    """The path to unpack a member to; links and names that lead out of `root` are refused."""
     path = PurePosixPath(member.filename)
     if ".." in path.parts or path.is_absolute() or "\\" in member.filename or ":" in member.filename:
         raise DataError(f"{file}: holds a file with the unsafe name {member.filename!r}; delete it")
@@ -268,12 +310,12 @@ def _inside(root: Path, member: zipfile.ZipInfo, file: Path) -> Path:
 
 
 def _check_space(folder: Path, archive: Archive, part: Path) -> None:
-    needed = 2 * archive.size - _size(part)  # the archive, and its files beside it
+    needed = 2 * archive.size - _size(part)  # for the archive and for the files in it
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise DataError(
             f"{folder}: expected {needed / 1e9:.1f} GB of free space for {archive.name} and its files, "
-            f"got {free / 1e9:.1f} GB; free some or choose another --root"
+            f"got {free / 1e9:.1f} GB; free some space or choose another --root"
         )
 
 
@@ -287,5 +329,5 @@ def _is_complete(root: Path, split: str, instances: str) -> bool:
         return {image["file_name"] for image in images} <= set(os.listdir(root / split))
     except (FileNotFoundError, NotADirectoryError):
         return False
-    except (ValueError, KeyError, TypeError):  # not the official file, which will replace it
+    except (ValueError, KeyError, TypeError):  # not the official file, so it will be replaced by the official one
         return False

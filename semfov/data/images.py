@@ -1,4 +1,4 @@
-"""Reading photographs of any common kind into RGB tensors."""
+"""Reading image files of any common format into RGB tensors."""
 
 import warnings
 from os import PathLike
@@ -14,10 +14,11 @@ from semfov.errors import DataError
 from semfov.io.files import check_regular
 
 MAX_PIXELS = 89_478_485
-"""Largest picture that is read, in pixels (1 GiB as float32 RGB): Pillow's limit against decompression bombs."""
+"""Largest number of pixels of a picture that is read (1 GiB as float32 RGB): Pillow's limit on decompression bombs."""
 
 _ORIENTATION_TAG = 0x0112
-# How to turn a picture with this orientation upright; all undo themselves but 6 and 8, which undo each other.
+# Moves that turn a picture with this orientation upright. All are their own inverse except 6 and 8, which are inverse
+# to each other.
 _MOVES = {
     1: "",
     2: "FLIP_LEFT_RIGHT",
@@ -35,19 +36,19 @@ _SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N", "I")
 def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
     """Read an image file as RGB.
 
-    The EXIF orientation is applied, so the image stands as viewers show it. Grey images get three equal channels,
-    CMYK and YCbCr are converted, transparent pixels are laid on white, 16-bit greys keep their depth, and of an
-    animation the first frame is taken. Colour profiles are not applied.
+    The EXIF orientation is applied, so the image has the orientation that viewers show. Grey images get three equal
+    channels, CMYK and YCbCr are converted to RGB, and transparent pixels are blended with white. Grey images of 16 bits
+    keep their precision. The first frame of an animation is read. Colour profiles are not applied.
 
     Args:
         path: a file in any format that Pillow reads.
-        oriented: False leaves the pixels as they are stored, for annotations made in that frame.
+        oriented: whether to apply the EXIF orientation; False is for annotations of the pixels as they are stored.
 
     Returns:
         `(3, H, W)`, float32 in [0, 1].
 
     Raises:
-        DataError: the file is missing, unreadable, not an image, truncated, or of more than `MAX_PIXELS` pixels.
+        DataError: the file is missing, unreadable, truncated or not an image, or has more than `MAX_PIXELS` pixels.
 
     >>> import tempfile
     >>> from PIL import Image
@@ -60,10 +61,10 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
 
     name = f"image {Path(path)}"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of damaged metadata and of large files; the limit below refuses the latter
+        warnings.simplefilter("ignore")  # about damaged metadata, and about large files, which the limit refuses
         try:
             check_regular(path, name)
-            # By its name Pillow would map a plain TIFF into memory, and mix up its rows where it is to be turned.
+            # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
             with Path(path).open("rb") as file, Image.open(file) as image:
                 _check_pixels(image.size, name)
                 array = _pixels(image, name, upright=oriented)
@@ -71,34 +72,35 @@ def read_image(path: str | PathLike[str], *, oriented: bool = True) -> Tensor:
             raise
         except FileNotFoundError:
             raise DataError(
-                f"{name}: no such file; check data.root and the file names of the annotations, or its path"
+                f"{name}: no such file; check its path, or data.root and the file names in the annotations"
             ) from None
         except PermissionError:
             raise DataError(f"{name}: no permission to read it; check the file's mode and owner") from None
         except UnidentifiedImageError:
             raise DataError(f"{name}: not an image in a format that Pillow reads; replace or remove it") from None
         except Image.DecompressionBombError:
-            raise DataError(f"{name}: more than {MAX_PIXELS:,} pixels; reduce it") from None
+            raise DataError(f"{name}: expected at most {MAX_PIXELS:,} pixels, got more; reduce the image") from None
         except Exception as error:  # damaged files raise nearly anything in Pillow's decoders
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise DataError(
-                f"{name}: truncated, damaged or of a kind that is not supported ({reason}); replace it"
-            ) from error
+            raise DataError(f"{name}: truncated, damaged or of an unsupported kind ({reason}); replace it") from error
     return torch.from_numpy(array).permute(2, 0, 1).contiguous()
 
 
 def from_pillow(image: Any, name: str) -> Tensor:
-    """An image of Pillow's as `read_image` gives it: upright, RGB in [0, 1], `(3, H, W)`.
+    """Convert a Pillow image in the same way as `read_image` does.
 
     Args:
-        image: of any mode.
-        name: what messages call it.
+        image: a Pillow image of any mode.
+        name: its name in messages.
+
+    Returns:
+        The upright image, `(3, H, W)`, RGB in [0, 1].
 
     Raises:
-        DataError: it has no pixels, too many, or its file is damaged.
+        DataError: the image has no pixels or too many, or its file is damaged.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of damaged metadata
+        warnings.simplefilter("ignore")  # about damaged metadata
         try:
             _check_pixels(image.size, name)
             array = _pixels(image, name, upright=True)
@@ -111,14 +113,19 @@ def from_pillow(image: Any, name: str) -> Tensor:
 
 
 def read_sized(path: str | PathLike[str], size: tuple[int, int]) -> Tensor:
-    """Read an image file that annotations were made on: upright, or as stored where only that has the recorded size.
+    """Read an image file in the orientation in which it was annotated.
+
+    That is upright, or as stored where only the stored pixels have the recorded size.
 
     Args:
         path: the file.
-        size: `(width, height)` that the annotations tell.
+        size: `(width, height)` recorded in the annotations.
+
+    Returns:
+        `(3, height, width)`, RGB in [0, 1].
 
     Raises:
-        DataError: as `read_image`, or the image has another size.
+        DataError: the file cannot be read (see `read_image`), or the image has another size.
     """
     image = read_image(path)
     if image.shape[-2:] == size[::-1]:
@@ -128,7 +135,7 @@ def read_sized(path: str | PathLike[str], size: tuple[int, int]) -> Tensor:
     if image.shape[-2:] != size[::-1]:
         raise DataError(
             f"image {path}: expected {size[0]} × {size[1]} pixels as annotated, got {width} × {height}; "
-            f"use the image that the annotations were made on"
+            f"use the image that the annotations were made for"
         )
     return image
 
@@ -140,7 +147,7 @@ def _check_pixels(size: tuple[int, int], name: str) -> None:
 
 
 def orientation(image: Any) -> int:
-    """The EXIF orientation, 1 to 8; 1, as stored, where the data are damaged or say something else."""
+    """The EXIF orientation, 1 to 8; 1 (as stored) where the metadata are damaged or hold another value."""
     try:
         orientation = image.getexif().get(_ORIENTATION_TAG, 1)
     except Exception:
@@ -149,13 +156,16 @@ def orientation(image: Any) -> int:
 
 
 def turned(image: Any, stored: int, left: int, *, upright: bool) -> Any:
-    """A picture upright, or as stored.
+    """Turn a picture upright, or back to the orientation of its file.
 
     Args:
-        image: the picture.
+        image: the picture, a Pillow image.
         stored: orientation in its file.
-        left: orientation after it was loaded; Pillow turns TIFFs itself, and then nothing is left.
-        upright: False for the frame of the file.
+        left: orientation after loading. Pillow turns TIFFs upright by itself, and then this is 1.
+        upright: True to turn it upright, False for the orientation of the file.
+
+    Returns:
+        The turned picture.
     """
     from PIL.Image import Transpose
 

@@ -1,4 +1,4 @@
-"""Pictures and points as people have them, made into the tensors that the library works on."""
+"""Conversion of pictures and points of common types into the tensors that the library works on."""
 
 from collections.abc import Sequence
 from os import PathLike
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 ImageLike: TypeAlias = Union[Tensor, NDArray[Any], str, PathLike[str], "Image"]
-"""A picture: its file, an image of Pillow's, an array or a tensor; see `as_image`."""
+"""A picture: the path of its file, a Pillow image, an array or a tensor; see `as_image`."""
 
 PointLike: TypeAlias = Tensor | NDArray[Any] | Sequence[Any]
 """One point `(x, y)` or several: a tensor, an array, a tuple or a list."""
@@ -26,26 +26,29 @@ _SHAPES = "a picture of shape (3, H, W), (H, W, 3) or (H, W)"
 
 
 def as_image(image: ImageLike, *, like: Tensor | None = None, argument: str = "image") -> Tensor:
-    """One picture of any common kind as RGB in [0, 1].
+    """Convert a picture of any common type to RGB in [0, 1].
 
     - A path: a file that Pillow reads (`semfov.read_image`).
-    - An image of Pillow's, in any mode: it is turned upright, transparent pixels are laid on white.
-    - A NumPy array or a tensor: `(3, H, W)`, `(H, W, 3)`, grey `(H, W)`, `(1, H, W)` or `(H, W, 1)`, or a batch of one
-      of them. Floats are in [0, 1], bytes and 16-bit numbers go up to their largest. Channels are RGB: what OpenCV
-      reads is BGR, `array[..., ::-1]` turns it round. A tensor of shape `(3, H, 3)` has its channels first.
+    - A Pillow image of any mode: it is turned upright, and transparent pixels are blended with white.
+    - A NumPy array or a tensor of shape `(3, H, W)` or `(H, W, 3)`, or grey of shape `(H, W)`, `(1, H, W)` or
+      `(H, W, 1)`, or a batch of one such picture. Floats must lie in [0, 1]; bytes and 16-bit numbers are divided by
+      their largest value. Channels are RGB. OpenCV reads BGR: convert it with `array[..., ::-1]`. A tensor of shape
+      `(3, H, 3)` is taken as channels first.
 
     Gradients flow through tensors.
 
     Args:
         image: the picture.
-        like: a tensor whose dtype and device the result takes; None keeps those of floats, and makes the rest float32.
-        argument: what messages call the picture.
+        like: a tensor with the dtype and device of the result; None keeps the dtype of floats, converts other numbers
+            to float32, and leaves the picture on its device.
+        argument: name of the argument, for the message.
 
     Returns:
         `(3, H, W)`.
 
     Raises:
-        InputError: it is no picture, several, or has other values than [0, 1]; the message says what to do.
+        InputError: it is not a picture, there are several, or its values are not in [0, 1]; the message tells the
+            remedy.
         DataError: the file cannot be read.
 
     >>> as_image(np.zeros((48, 64, 3), np.uint8)).shape
@@ -57,7 +60,15 @@ def as_image(image: ImageLike, *, like: Tensor | None = None, argument: str = "i
 
 
 def as_images(images: ImageLike, *, like: Tensor | None = None, argument: str = "image") -> Tensor:
-    """One picture or a batch of them, `(B, 3, H, W)`; see `as_image`.
+    """Convert a picture, or a batch of pictures, to RGB in [0, 1]; see `as_image`.
+
+    Args:
+        images: the picture or pictures.
+        like: a tensor with the dtype and device of the result, as for `as_image`.
+        argument: name of the argument, for the message.
+
+    Returns:
+        `(B, 3, H, W)`.
 
     >>> as_images(torch.rand(2, 3, 8, 9)).shape
     torch.Size([2, 3, 8, 9])
@@ -69,12 +80,23 @@ def as_images(images: ImageLike, *, like: Tensor | None = None, argument: str = 
 
 
 def is_batch(image: object) -> bool:
-    """Whether this is a batch of pictures, not a single one."""
+    """Whether this is a batch of pictures instead of a single one."""
     return isinstance(image, Tensor | np.ndarray) and image.ndim > 3
 
 
 def pixels_of(image: ImageLike, argument: str = "image") -> Tensor:
-    """Pixels of a picture, in the layout and of the dtype that it has."""
+    """Read the pixels of a picture, and keep the layout and dtype of arrays and tensors.
+
+    Args:
+        image: the picture.
+        argument: name of the argument, for the message.
+
+    Returns:
+        The pixels.
+
+    Raises:
+        InputError: it is not a picture of a known type.
+    """
     if isinstance(image, Tensor):
         return image
     if isinstance(image, np.ndarray):
@@ -86,22 +108,28 @@ def pixels_of(image: ImageLike, argument: str = "image") -> Tensor:
 
     if isinstance(image, Image):
         return from_pillow(image, argument)
-    expected = "a path, an image of Pillow's, a NumPy array or a tensor"
+    expected = "a path, a Pillow image, a NumPy array or a tensor"
     got = type(image).__name__
     if image is None:
-        got = "None, which is what OpenCV gives for a file that it cannot read"
+        got = "None (OpenCV returns None for a file that it cannot read); check the path"
     elif isinstance(image, Sequence):
         got = f"a {got}; give pictures one by one"
     raise InputError(f"{argument}: expected {expected}, got {got}")
 
 
 def channels_first(pixels: Tensor, argument: str = "image", *, choose: bool = True) -> Tensor:
-    """Pixels `(B, 3, H, W)` from those of one picture or several in any layout that `as_image` knows.
+    """Convert pixels from any layout that `as_image` accepts to channels first.
 
     Args:
-        pixels: of any dtype.
-        argument: what messages call them.
-        choose: take a picture that has three rows and three columns of channels to have its channels first.
+        pixels: one picture or a batch, of any dtype.
+        argument: name of the argument, for the message.
+        choose: whether an ambiguous shape `(3, H, 3)` is taken as channels first; otherwise it is refused.
+
+    Returns:
+        Pixels `(B, 3, H, W)`.
+
+    Raises:
+        InputError: the shape is not the shape of pictures, or is ambiguous.
     """
     shape = tuple(pixels.shape)
     check(2 <= len(shape) <= 4, argument, _SHAPES, f"shape {shape}")
@@ -113,17 +141,27 @@ def channels_first(pixels: Tensor, argument: str = "image", *, choose: bool = Tr
         first, last = batch.shape[1] == channels, batch.shape[-1] == channels
         if first and last and not choose:
             raise InputError(
-                f"{argument}: expected {_SHAPES}, got shape {shape}, which may be either; give a tensor (3, H, W)"
+                f"{argument}: expected {_SHAPES}, got shape {shape}, which is ambiguous; give a tensor (3, H, W)"
             )
         if first or last:
             batch = batch if first else batch.movedim(-1, 1)
             return batch.expand(-1, 3, -1, -1)
-    remedy = "; of four channels drop the last, or give the image of Pillow's" if 4 in (shape[-1], shape[-3]) else ""
+    remedy = "; drop the fourth channel, or give the Pillow image" if 4 in (shape[-1], shape[-3]) else ""
     raise InputError(f"{argument}: expected {_SHAPES}, with 3 channels or 1, got shape {shape}{remedy}")
 
 
 def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
-    """Points `(x, y)` in pixels as a tensor `(..., 2)`: tensors as they are, numbers in double precision.
+    """Convert points to a tensor; tensors stay as they are, other numbers become float64.
+
+    Args:
+        points: one point `(x, y)` or several, in pixels.
+        argument: name of the argument, for the message.
+
+    Returns:
+        Points `(..., 2)`.
+
+    Raises:
+        InputError: they are not numbers, or not pairs.
 
     >>> as_points((320, 240))
     tensor([320., 240.], dtype=torch.float64)
@@ -139,7 +177,7 @@ def as_points(points: PointLike, argument: str = "gaze") -> Tensor:
 
 
 def _from_numpy(array: NDArray[Any], argument: str) -> Tensor:
-    """An array as a tensor, whatever its order in memory."""
+    """An array as a tensor; the array may have any order in memory."""
     kinds = {"u1", "u2", "f2", "f4", "f8", "f16"}
     name = f"{array.dtype.kind}{array.dtype.itemsize}"
     check(name in kinds, argument, "bytes, 16-bit numbers or floats", f"an array of {array.dtype}{_integers(array)}")
@@ -148,14 +186,14 @@ def _from_numpy(array: NDArray[Any], argument: str) -> Tensor:
 
 
 def _integers(array: NDArray[Any]) -> str:
-    return "; make it uint8, array.astype('uint8')" if array.dtype.kind == "i" else ""
+    return "; convert it to bytes, array.astype('uint8')" if array.dtype.kind == "i" else ""
 
 
 def _in_unit(pixels: Tensor, like: Tensor | None, argument: str) -> Tensor:
-    """Pixels as floats, bytes and 16-bit numbers divided by their largest; dtype and device as `like`."""
+    """Pixels as floats with the dtype and device of `like`; integers are divided by their largest value."""
     dtype = like.dtype if like is not None else pixels.dtype if pixels.is_floating_point() else torch.float32
     if pixels.is_floating_point():
         return pixels.to(pixels.device if like is None else like.device, dtype)
-    got = f"a tensor of {pixels.dtype}; make bytes of it, image.to(torch.uint8), or floats in [0, 1]"
+    got = f"a tensor of {pixels.dtype}; convert it to bytes, image.to(torch.uint8), or to floats in [0, 1]"
     check(pixels.dtype in _WHITE, argument, "bytes, 16-bit numbers or floats", got)
     return pixels.to(pixels.device if like is None else like.device, dtype) / _WHITE[pixels.dtype]

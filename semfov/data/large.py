@@ -1,4 +1,4 @@
-"""Pictures that are read by windows: in memory, mapped from a file, tiled TIFF, or decoded when first needed."""
+"""Large pictures that are read window by window: arrays, memory maps, tiled TIFFs, and files decoded when needed."""
 
 import warnings
 import weakref
@@ -21,12 +21,12 @@ from semfov.io.files import check_regular
 
 Box = tuple[int, int, int, int]
 
-_PLAIN = ("RGB", "L", "CMYK", "YCbCr")  # of 8 bits, and nothing is transparent
-_STRIP = 1 << 24  # pixels that are read at once for a reduced view
+_PLAIN = ("RGB", "L", "CMYK", "YCbCr")  # modes of 8 bits without transparency
+_STRIP = 1 << 24  # pixels of a strip that is read at once for a reduced view
 
 
 class LargePicture(ABC):
-    """A picture of bytes that gives its windows.
+    """Base of 8-bit pictures that are read window by window.
 
     Attributes:
         size: `(width, height)` in pixels.
@@ -36,24 +36,33 @@ class LargePicture(ABC):
 
     @abstractmethod
     def pixels(self, box: Box) -> NDArray[np.uint8]:
-        """Pixels `(h, w, 3)`, RGB, of a window `(x1, y1, x2, y2)` inside the picture."""
-
-    def read(self, box: Box, reduction: int = 1) -> Tensor:
-        """A window, reduced by a power of two where that keeps memory small.
-
-        Large windows are read in strips, each averaged over squares of `reduction` pixels, so that nothing larger than
-        a strip of 16 million pixels (48 MB) is held, whatever the window.
+        """Read a window.
 
         Args:
             box: `(x1, y1, x2, y2)` in whole pixels, inside the picture.
-            reduction: how far it may be reduced.
+
+        Returns:
+            RGB bytes `(h, w, 3)`.
+        """
+
+    def read(self, box: Box, reduction: int = 1) -> Tensor:
+        """Read a window, and reduce a large one to save memory.
+
+        Windows of more than 16 million pixels are read in strips, and each strip is averaged over squares of
+        `reduction` × `reduction` pixels. So no more than a strip of 16 million pixels (48 MB) is in memory at full
+        resolution.
+
+        Args:
+            box: `(x1, y1, x2, y2)` in whole pixels, inside the picture.
+            reduction: factor by which a large window may be reduced, a power of two.
 
         Returns:
             `(3, h, w)` bytes, channels last in memory.
         """
         x1, y1, x2, y2 = box
         width, height = self.size
-        check(0 <= x1 < x2 <= width and 0 <= y1 < y2 <= height, "box", f"inside {width} × {height}", box)
+        inside = 0 <= x1 < x2 <= width and 0 <= y1 < y2 <= height
+        check(inside, "box", f"a window inside {width} × {height} pixels", box)
         if reduction <= 1 or (x2 - x1) * (y2 - y1) <= _STRIP:
             return _tensor(self.pixels(box))
         from PIL import Image
@@ -67,7 +76,11 @@ class LargePicture(ABC):
 
 
 class ArrayPicture(LargePicture):
-    """An array `(H, W, 3)` or `(H, W)` of bytes, in memory or a `numpy.memmap`, of which only windows are touched."""
+    """A picture in an array, which may be a `numpy.memmap`; only the pixels of the windows are read.
+
+    Args:
+        array: bytes `(H, W, 3)` or `(H, W)`.
+    """
 
     def __init__(self, array: NDArray[np.uint8]) -> None:
         fits = array.dtype == np.uint8 and (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3))
@@ -76,18 +89,22 @@ class ArrayPicture(LargePicture):
         self.size = array.shape[1], array.shape[0]
 
     def pixels(self, box: Box) -> NDArray[np.uint8]:
-        """A window."""
+        """Read a window."""
         x1, y1, x2, y2 = box
         window = self._array[y1:y2, x1:x2]
         return np.repeat(window[..., None], 3, -1) if window.ndim == 2 else window
 
 
 class MemoryPicture(ArrayPicture):
-    """A picture of any common kind (`semfov.as_image`), kept as bytes."""
+    """A picture of any common type (`semfov.as_image`), kept in memory as bytes.
+
+    Args:
+        image: the picture.
+    """
 
     def __init__(self, image: ImageLike) -> None:
         if isinstance(image, Tensor | np.ndarray) and image.dtype in (torch.uint8, np.dtype(np.uint8)):
-            # Bytes are not made floats in between: a large picture would take four times the memory.
+            # Bytes are not converted to floats in between, which would take four times the memory.
             pixels = channels_first(pixels_of(image, "picture"), "picture", choose=isinstance(image, Tensor))
             check(len(pixels) == 1, "picture", "one picture", f"a batch of {len(pixels)}; give them one by one")
             super().__init__(to_bytes(pixels[0]))
@@ -96,7 +113,7 @@ class MemoryPicture(ArrayPicture):
 
 
 def to_bytes(image: Tensor) -> NDArray[np.uint8]:
-    """Pixels `(H, W, 3)` of an image `(3, H, W)`, RGB in [0, 1] or bytes already."""
+    """Bytes `(H, W, 3)` of an image `(3, H, W)`, which is RGB in [0, 1] or bytes."""
     if image.dtype != torch.uint8:
         check_pixels(image, "image")
         image = image.clamp(0, 1).mul(255).round()
@@ -105,17 +122,17 @@ def to_bytes(image: Tensor) -> NDArray[np.uint8]:
 
 
 class PhotographPicture(LargePicture):
-    """A file that Pillow reads.
+    """A picture in a file that Pillow reads.
 
-    Formats such as JPEG have no windows: the whole is decoded when a window is first needed (three bytes a pixel), and
-    kept. The overview of a JPEG comes before that from its own coarse decoding (`Image.draft`), in a small part of the
-    memory and of the time.
+    Formats such as JPEG cannot be read window by window. The whole picture is decoded when a window is first needed,
+    and is kept in memory (three bytes for each pixel). Before that, the overview of a JPEG is decoded at a coarse
+    resolution (`Image.draft`), which takes a small part of the memory and of the time.
 
     Args:
-        path: of the file.
+        path: the file.
 
     Raises:
-        DataError: there is no such file, or it is no picture.
+        DataError: the file is missing, or is not a picture.
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
@@ -128,16 +145,16 @@ class PhotographPicture(LargePicture):
             upright = orientation(image) == 1
             self._drafts = image.format == "JPEG" and image.mode in ("RGB", "L")
         if not upright:
-            # Upright it may have another size; its windows are those of the upright picture.
+            # Turned upright the picture may have another size, and windows refer to the upright picture.
             self.size = self._whole().shape[1::-1]
 
     def pixels(self, box: Box) -> NDArray[np.uint8]:
-        """A window."""
+        """Read a window."""
         x1, y1, x2, y2 = box
         return self._whole()[y1:y2, x1:x2]
 
     def read(self, box: Box, reduction: int = 1) -> Tensor:
-        """A window; the whole of a JPEG that was not decoded yet at the coarsest draft that the reduction allows."""
+        """Read a window; the whole of a JPEG that is not decoded yet is read as the coarsest draft allowed."""
         whole = box == (0, 0, *self.size)
         if not (whole and reduction > 1 and self._drafts and self._array is None):
             return super().read(box, reduction)
@@ -151,7 +168,7 @@ class PhotographPicture(LargePicture):
         if self._array is None:
             from PIL import Image
 
-            # By its name Pillow would map a plain TIFF into memory, and mix up its rows where it is to be turned.
+            # Given a file name, Pillow would map a plain TIFF into memory and mix up its rows when turning it.
             with _opening(self.path, "decoded"), self.path.open("rb") as file, Image.open(file) as image:
                 if image.mode in _PLAIN and "transparency" not in image.info:
                     stored = orientation(image)
@@ -163,22 +180,22 @@ class PhotographPicture(LargePicture):
 
 
 class TiffPicture(LargePicture):
-    """A TIFF of bytes, read tile by tile (or strip by strip) through `tifffile`.
+    """An 8-bit TIFF, read tile by tile (or strip by strip) through `tifffile`.
 
-    Only the tiles that a window touches are decoded, one at a time.
+    Only the tiles that overlap a window are decoded, one at a time.
 
     Args:
-        path: of the file; its first page is taken.
+        path: the file; its first page is read.
 
     Raises:
-        DataError: `tifffile` is not installed, or the page is not grey or RGB of 8 bits.
+        DataError: `tifffile` is not installed, or the page is not grey or RGB with 8 bits.
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
         try:
             import tifffile
         except ImportError:
-            raise DataError(f"{path}: tiled TIFFs need tifffile; pip install tifffile") from None
+            raise DataError(f"{path}: expected tifffile for reading TIFFs; pip install tifffile") from None
         self.path = Path(path)
         with _opening(self.path, "opened"):
             self._file = tifffile.TiffFile(path)
@@ -187,12 +204,13 @@ class TiffPicture(LargePicture):
             shape = page.shape
         fits = page.dtype == np.uint8 and (len(shape) == 2 or (len(shape) == 3 and shape[2] in (3, 4)))
         if not fits or page.planarconfig not in (None, 1):
-            raise DataError(f"{path}: expected grey or RGB of 8 bits, pixel by pixel, got {page.dtype} {shape}")
+            got = f"{page.dtype} {shape}"
+            raise DataError(f"{path}: expected grey or RGB with 8 bits and interleaved channels, got {got}; convert it")
         self._page = page
         self.size = shape[1], shape[0]
 
     def pixels(self, box: Box) -> NDArray[np.uint8]:
-        """A window."""
+        """Read a window."""
         with _opening(self.path, "decoded"):
             return self._tiles(box)
 
@@ -210,7 +228,7 @@ class TiffPicture(LargePicture):
         for number in numbers:
             offset, count = page.dataoffsets[number], page.databytecounts[number]
             if not count:
-                continue  # a tile that the file leaves out is empty
+                continue  # a tile that is not stored in the file is black
             self._file.filehandle.seek(offset)
             data = self._file.filehandle.read(count)
             tile = page.decode(data, number, jpegtables=page.jpegtables)[0][0]
@@ -225,9 +243,16 @@ class TiffPicture(LargePicture):
 
 
 def open_large(source: LargePicture | ImageLike) -> LargePicture:
-    """A picture that gives its windows, from any common kind (`semfov.as_image`; `.tif` and `.tiff` tile by tile).
+    """Open a picture of any common type (`semfov.as_image`) for reading window by window.
 
-    Arrays of bytes `(H, W, 3)` and `(H, W)` stay where they are: of a `numpy.memmap` only windows are read.
+    Files `.tif` and `.tiff` are read tile by tile. Arrays of bytes `(H, W, 3)` and `(H, W)` are not copied, so only the
+    windows of a `numpy.memmap` are read.
+
+    Args:
+        source: the picture.
+
+    Returns:
+        The opened picture.
 
     >>> open_large(torch.rand(3, 20, 30)).read((10, 5, 30, 15)).shape
     torch.Size([3, 10, 20])
@@ -245,20 +270,20 @@ def open_large(source: LargePicture | ImageLike) -> LargePicture:
 
 
 def _by_rows(shape: tuple[int, ...]) -> bool:
-    """Whether an array of this shape is `(H, W)` or `(H, W, 3)`, and cannot be `(3, H, W)`."""
+    """Whether a shape is `(H, W)` or `(H, W, 3)`, and cannot be `(3, H, W)`."""
     return len(shape) == 2 or (len(shape) == 3 and shape[2] == 3 and shape[0] != 3)
 
 
 @contextmanager
 def _opening(path: Path, what: str) -> Iterator[None]:
-    """Tell of a file that cannot be read as a picture, whatever a decoder raises."""
+    """Raise `DataError` for a file that cannot be read as a picture, for any error of a decoder."""
     check_regular(path, f"image {path}")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of damaged metadata and of large files
+        warnings.simplefilter("ignore")  # about damaged metadata and large files
         try:
             yield
         except FileNotFoundError:
-            raise DataError(f"image {path}: no such file") from None
+            raise DataError(f"image {path}: no such file; check its path") from None
         except SemfovError:
             raise
         except Exception as error:  # damaged files raise nearly anything in decoders
@@ -267,6 +292,6 @@ def _opening(path: Path, what: str) -> Iterator[None]:
 
 
 def _tensor(pixels: NDArray[np.uint8]) -> Tensor:
-    """Bytes `(h, w, 3)` as `(3, h, w)` without a copy where memory may be shared."""
+    """Bytes `(h, w, 3)` as `(3, h, w)`, without a copy where memory may be shared."""
     shared = pixels.flags.writeable and min(pixels.strides) >= 0
     return torch.from_numpy(pixels if shared else pixels.copy()).permute(2, 0, 1)

@@ -1,4 +1,4 @@
-"""Pictures larger than a detector's input, composed of photographs by seed: every object's box is known."""
+"""Pictures larger than a detector's input, composed of annotated photographs by a seed."""
 
 import hashlib
 import json
@@ -17,12 +17,12 @@ _VERSION = 1  # raise it whenever the same seed would give another picture
 
 @dataclass(frozen=True)
 class Tile:
-    """A photograph's place in a mosaic.
+    """The place of a photograph in a mosaic.
 
     Attributes:
-        index: of the photograph among its scenes.
-        slot: `(x1, y1, x2, y2)` of the slot that it lies in, in pixels of the mosaic.
-        box: `(x1, y1, x2, y2)` that the photograph itself fills, in the middle of its slot.
+        index: index of the photograph in its set of scenes.
+        slot: `(x1, y1, x2, y2)` of its slot, in pixels of the mosaic.
+        box: `(x1, y1, x2, y2)` of the photograph, centred in its slot.
     """
 
     index: int
@@ -31,19 +31,20 @@ class Tile:
 
 
 class Mosaics:
-    """Mosaics of `columns` × `rows` photographs, each as large as fits its slot with its proportions kept.
+    """Mosaics of `columns` × `rows` photographs.
 
-    Mosaic `i` of a seed depends on the seed, on `i` and on the photographs only. No photograph is in a mosaic twice,
-    unless there are fewer than slots. What the photographs leave free of a slot is grey.
+    Each photograph is resized to fit its slot, and keeps its proportions. The rest of the slot is grey. Mosaic `i`
+    depends only on the seed, on `i` and on the photographs. No photograph is in a mosaic twice, unless there are fewer
+    photographs than slots.
 
     Args:
         scenes: the photographs with their boxes, a COCO-format set or embedded scenes.
-        columns: photographs in a row.
-        rows: photographs in a column.
+        columns: number of photographs in a row.
+        rows: number of photographs in a column.
         tile: `(width, height)` of a slot in pixels.
         count: number of mosaics.
-        seed: of the compositions.
-        fill: value of what lies beside the photographs.
+        seed: seed of the compositions.
+        fill: value of the pixels outside the photographs.
 
     >>> from semfov.data import EmbeddedScenes
     >>> mosaics = Mosaics(EmbeddedScenes(("person", "cat"), count=3), 2, 2, tile=(320, 240), count=1)
@@ -78,7 +79,7 @@ class Mosaics:
         return len(self.ids)
 
     def tiles(self, index: int) -> list[Tile]:
-        """The photographs of a mosaic, row by row."""
+        """List the photographs of a mosaic, row by row."""
         generator = np.random.Generator(np.random.PCG64([self._seed, self.ids[index]]))
         slots, known = self.columns * self.rows, len(self.scenes)
         rounds = -(-slots // known)
@@ -107,18 +108,18 @@ class Mosaics:
         return Scene(self.ids[index], name, canvas, annotation.boxes, annotation.labels)
 
     def annotation(self, index: int) -> Annotation:
-        """The objects of a mosaic, without composing its image."""
+        """Return the objects of a mosaic, without composing its image."""
         parts = [(tile, self.scenes.annotation(tile.index)) for tile in self.tiles(index)]
         boxes = torch.cat([_moved(part, tile) for tile, part in parts])
         labels = torch.cat([part.labels for _, part in parts])
         return Annotation(boxes, labels, torch.cat([part.crowd for _, part in parts]), self.size)
 
     def targets(self, index: int) -> list[int]:
-        """Classes of a mosaic that may be searched for, ascending: none that covers more than a fifth of it."""
+        """List the classes of a mosaic that may be searched for, ascending: those that cover at most a fifth of it."""
         return legal_targets(self.annotation(index))
 
     def digest(self, index: int) -> str:
-        """sha256 of what the pixels of a mosaic depend on."""
+        """Compute a sha256 of everything that the pixels of a mosaic depend on."""
         parts = [(self.scenes.digest(tile.index), tile.box) for tile in self.tiles(index)]
         return hashlib.sha256(json.dumps([_VERSION, self.size, self.fill, parts]).encode()).hexdigest()
 

@@ -1,4 +1,4 @@
-"""Classes by what else they are called: in tables of others, and in plain text."""
+"""Matching of classes by synonyms: with the names of other tables, and in plain text."""
 
 import re
 from collections.abc import Sequence
@@ -9,7 +9,14 @@ from semfov.data.synonyms import SYNONYMS
 
 
 def alike(name: str, names: Sequence[str]) -> list[int]:
-    """Places of the names that stand for the same class, from 0: the name in any spelling, or else its synonyms.
+    """Find the names that stand for the same class: in another spelling or, where there is none, as synonyms.
+
+    Args:
+        name: name of the class.
+        names: names to search in.
+
+    Returns:
+        Positions of the matching names, from 0.
 
     >>> alike("tvmonitor", ["cat", "TV"]), alike("cup", ["glass", "mug", "cow"]), alike("cup", ["Cups", "mug"])
     ([1], [0, 1], [0])
@@ -23,7 +30,14 @@ def alike(name: str, names: Sequence[str]) -> list[int]:
 
 
 def named_in(text: str, classes: Sequence[str]) -> set[str]:
-    """Classes that a text names, in singular or plural, by their names or their synonyms.
+    """Find the classes that a text mentions, by their names or synonyms, in singular or plural.
+
+    Args:
+        text: plain text.
+        classes: names of the classes.
+
+    Returns:
+        The classes mentioned.
 
     >>> sorted(named_in("Knives, mugs and a hot dog.", ["knife", "cup", "dog", "hot dog"]))
     ['cup', 'hot dog', 'knife']
@@ -31,7 +45,7 @@ def named_in(text: str, classes: Sequence[str]) -> set[str]:
     meant = _vocabulary(tuple(classes))
     words, found, start = re.findall(r"[a-z]+", text.lower()), set[str](), 0
     while start < len(words):
-        # Who says hot dog does not speak of dogs.
+        # The longest match wins: "hot dog" does not mention a dog.
         runs = (run for run in (3, 2, 1) if "".join(words[start : start + run]) in meant)
         length = min(next(runs, 1), len(words) - start)
         found |= meant.get("".join(words[start : start + length]), frozenset())
@@ -41,7 +55,7 @@ def named_in(text: str, classes: Sequence[str]) -> set[str]:
 
 @cache
 def _vocabulary(classes: tuple[str, ...]) -> dict[str, frozenset[str]]:
-    """What each word means, without spaces, in singular and plural."""
+    """Classes by each of their names and synonyms, without spaces, in singular and plural."""
     keys = {plain_key(name): name for name in classes}
     called = {other: {*map(plain_key, meant)} & keys.keys() for other, meant in SYNONYMS.items() if other not in keys}
     said: dict[str, set[str]] = {}
@@ -52,5 +66,5 @@ def _vocabulary(classes: tuple[str, ...]) -> dict[str, frozenset[str]]:
 
 
 def _calls(other: str, key: str) -> bool:
-    """Whether people call a class by another name."""
+    """Whether `other` is a synonym of a class."""
     return key in map(plain_key, SYNONYMS.get(other, ()))

@@ -1,4 +1,4 @@
-"""Photographs of a folder about whose objects nothing is known."""
+"""Photographs in a folder, without annotations."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from semfov.io.files import check_regular, inside, sha256
 
 
 class Pictures:
-    """Photographs by the names of their files (a `Scenes` without objects).
+    """Photographs by the names of their files, as `Scenes` without objects.
 
     Args:
-        root: their folder.
-        names: of the files; each is taken once.
-        classes: the detector's.
+        root: folder of the photographs.
+        names: names of the files; repeated names count once.
+        classes: names of the detector's classes.
 
     Raises:
-        DataError: a name leads out of the folder, or there is no such file.
+        DataError: a name leads out of the folder, or a file is missing.
 
     Example::
 
@@ -39,11 +39,14 @@ class Pictures:
         self._sizes: dict[int, tuple[int, int]] = {}
         missing = [name for name in self.ids if not inside(self.root, name).is_file()]
         if missing:
-            raise DataError(f"{self.root}: expected {len(self.ids)} pictures, {len(missing)} are missing: {missing[0]}")
+            raise DataError(
+                f"{self.root}: expected {len(self.ids)} pictures, but {len(missing)} are missing, such as "
+                f"{missing[0]}; check the folder and the names"
+            )
 
     @property
     def fingerprint(self) -> str:
-        """sha256 of the names and of the files' content."""
+        """sha256 of the names and contents of the files."""
         what = [(name, self.digest(index)) for index, name in enumerate(self.ids)]
         return hashlib.sha256(json.dumps(what).encode()).hexdigest()
 
@@ -55,7 +58,7 @@ class Pictures:
         return Scene(self.ids[index], self.ids[index], image, torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64))
 
     def digest(self, index: int) -> str:
-        """sha256 of a file's content."""
+        """Compute the sha256 of a file's content."""
         path = self._path(index)
         check_regular(path, f"image {path}")
         try:
@@ -64,15 +67,15 @@ class Pictures:
             raise DataError(f"image {path}: cannot be read ({error.strerror})") from None
 
     def annotation(self, index: int) -> Annotation:
-        """No objects, and the size of the picture."""
+        """Return an annotation without objects, with the size of the picture."""
         if index not in self._sizes:
             height, width = read_image(self._path(index)).shape[-2:]
             self._sizes[index] = width, height
-        none = torch.zeros(0, dtype=torch.int64)
-        return Annotation(torch.zeros(0, 4), none, none.bool(), self._sizes[index])
+        labels = torch.zeros(0, dtype=torch.int64)
+        return Annotation(torch.zeros(0, 4), labels, labels.bool(), self._sizes[index])
 
     def targets(self, index: int) -> list[int]:
-        """None: nothing is known to be there."""
+        """Return an empty list: no objects are known."""
         return []
 
     def _path(self, index: int) -> Path:

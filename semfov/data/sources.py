@@ -1,4 +1,4 @@
-"""Pictures to show the agent: photographs, folders of them, videos, a camera, or an embedded scene."""
+"""Sources of pictures for the agent: photographs, folders, videos, cameras and embedded scenes."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture to look at.
+    """A picture from a source.
 
     Attributes:
-        name: what to call it, in print and in file names.
+        name: its name in messages and file names.
         image: `(3, H, W)`, RGB in [0, 1].
-        boxes: `(M, 4)`, where the target really is; None where that is not known.
+        boxes: ground-truth boxes of the target, `(M, 4)`; None where they are not known.
     """
 
     name: str
@@ -36,18 +36,21 @@ class Picture:
 
 
 def open_pictures(source: Path) -> Iterator[Picture]:
-    """Pictures from a photograph or a folder.
+    """Read a photograph, or the photographs of a folder.
 
     Args:
-        source: a file, or a folder whose photographs are taken in the order of their names.
+        source: a file, or a folder whose photographs are read in the order of their names.
+
+    Yields:
+        The pictures.
 
     Raises:
-        DataError: there is nothing to read.
+        DataError: the file is missing, or the folder has no photographs.
     """
     if source.is_dir():
         files = sorted(path for path in source.iterdir() if path.suffix.lower() in PHOTOGRAPHS)
         if not files:
-            raise DataError(f"photo: expected photographs ({', '.join(PHOTOGRAPHS)}) in {source}, found none")
+            raise DataError(f"photo: expected photographs ({', '.join(PHOTOGRAPHS)}) in {source}, got none")
         yield from (Picture(path.name, read_image(path)) for path in files)
     else:
         check_there(source)
@@ -55,13 +58,19 @@ def open_pictures(source: Path) -> Iterator[Picture]:
 
 
 def check_there(source: Path) -> None:
-    """Raise `DataError` where there is no such file or folder."""
+    """Raise `DataError` where a file or folder does not exist."""
     if not source.exists():
         raise DataError(f"photo: no such file or folder: {source}; check the path")
 
 
 def is_video(source: Path) -> bool:
-    """Whether this is a video, by its name.
+    """Tell by its name whether a file is a video.
+
+    Args:
+        source: the file.
+
+    Returns:
+        Whether it is a video.
 
     >>> is_video(Path("holiday.MP4"))
     True
@@ -70,7 +79,20 @@ def is_video(source: Path) -> bool:
 
 
 def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scenes: int = 16) -> Picture:
-    """The first embedded scene that holds the target, or the first of all."""
+    """Compose the first embedded scene that holds a target.
+
+    Args:
+        classes: names of the detector's classes.
+        target: name of the target; None for the first scene.
+        seed: seed of the scenes.
+        scenes: number of scenes to search.
+
+    Returns:
+        The scene, with the boxes of the target.
+
+    Raises:
+        InputError: no scene holds the target.
+    """
     embedded = EmbeddedScenes(classes, count=scenes, seed=seed)
     for index in range(len(embedded)):
         names = [embedded.classes[label - 1] for label in embedded.targets(index)]
@@ -79,7 +101,10 @@ def embedded_picture(classes: Sequence[str], target: str | None, seed: int, scen
             chosen = scene.labels == (0 if target is None else embedded.classes.index(target) + 1)
             return Picture(scene.name, scene.image, None if target is None else scene.boxes[chosen])
     held = sorted({embedded.classes[label - 1] for index in range(len(embedded)) for label in embedded.targets(index)})
-    raise InputError(f"target: the embedded scenes hold {', '.join(held)}; give a photograph to search for {target!r}")
+    raise InputError(
+        f"target: expected a class in the embedded scenes ({', '.join(held)}), got {target!r}; "
+        f"give a photograph to search for it"
+    )
 
 
 @dataclass(frozen=True)
@@ -87,9 +112,9 @@ class Stream:
     """A video or a camera.
 
     Attributes:
-        name: what to call it.
+        name: its name in messages.
         rate: frames per second; None where it is not known.
-        frames: one after the other, as they come.
+        frames: the frames, in order.
     """
 
     name: str
@@ -101,29 +126,32 @@ def open_stream(source: Path | int, most: int | None = None) -> Stream:
     """Open a video by its file, or a camera by its number.
 
     Args:
-        source: of the frames.
-        most: how many frames to take; None takes all.
+        source: file of the video, or number of the camera.
+        most: largest number of frames; None for all.
+
+    Returns:
+        The stream.
 
     Raises:
-        DataError: it cannot be opened or has no frame, or OpenCV is not installed.
+        DataError: the source cannot be opened or has no frame, or OpenCV is not installed.
     """
     name = f"camera {source}" if isinstance(source, int) else source.name
     try:
         import cv2
     except ImportError:
-        raise DataError(f"{name}: videos and cameras need OpenCV; pip install opencv-python-headless") from None
+        raise DataError(f"{name}: expected OpenCV for videos and cameras; pip install opencv-python-headless") from None
     if isinstance(source, Path):
         check_there(source)
         check_regular(source)
     level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # it is told below
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors are raised below
     try:
         recorder = cv2.VideoCapture(source if isinstance(source, int) else str(source))
     finally:
         cv2.utils.logging.setLogLevel(level)
     if not recorder.isOpened():
-        what = "is connected and free" if isinstance(source, int) else "is of a kind that OpenCV reads"
-        raise DataError(f"{name}: cannot be opened; check that it {what}")
+        what = "it is connected and not in use" if isinstance(source, int) else "OpenCV reads videos of this format"
+        raise DataError(f"{name}: cannot be opened; check that {what}")
     rate = float(recorder.get(cv2.CAP_PROP_FPS))
     frames = _record(recorder, name, most)
     first = next(frames)
@@ -131,7 +159,7 @@ def open_stream(source: Path | int, most: int | None = None) -> Stream:
 
 
 def _record(recorder: Any, name: str, most: int | None) -> Iterator[Picture]:
-    """Frames as they come, RGB in [0, 1]."""
+    """Frames of a stream, RGB in [0, 1]."""
     try:
         for number in count():
             if number == most:
@@ -139,7 +167,7 @@ def _record(recorder: Any, name: str, most: int | None) -> Iterator[Picture]:
             whole, pixels = recorder.read()
             if not whole:
                 if not number:
-                    raise DataError(f"{name}: no frame could be read; check that it is whole")
+                    raise DataError(f"{name}: no frame could be read; check that the source is not damaged")
                 return
             rgb = torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1)
             yield Picture(f"{name}, frame {number}", rgb.float() / 255)

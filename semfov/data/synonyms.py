@@ -1,4 +1,4 @@
-"""What people call the classes of COCO, for suggestions where a name is not known."""
+"""Synonyms of COCO's classes, for suggestions where a name is not known."""
 
 _TABLE = """
 person: man, men, woman, women, boy, girl, child, children, kid, baby, human, pedestrian, face, player, rider
@@ -70,7 +70,7 @@ hair drier: hair dryer, blow dryer, hairdryer, dryer
 
 
 def _read(table: str) -> dict[str, tuple[str, ...]]:
-    """Classes by each of their other names, which are without spaces."""
+    """Classes by each of their synonyms, which are written without spaces."""
     found: dict[str, tuple[str, ...]] = {}
     for line in table.strip().splitlines():
         name, _, others = line.partition(": ")
@@ -81,7 +81,7 @@ def _read(table: str) -> dict[str, tuple[str, ...]]:
 
 
 SYNONYMS = _read(_TABLE)
-"""Names of COCO's classes by what else they are called, in lower case and without spaces.
+"""Names of COCO's classes by their synonyms, in lower case and without spaces.
 
 >>> SYNONYMS["mug"], SYNONYMS["glass"]
 (('cup',), ('wine glass', 'cup'))
@@ -89,7 +89,13 @@ SYNONYMS = _read(_TABLE)
 
 
 def names_of(name: str) -> tuple[str, ...]:
-    """What else a class is called, as it is written.
+    """List the synonyms of a class, with spaces.
+
+    Args:
+        name: name of the class in COCO's spelling.
+
+    Returns:
+        The synonyms.
 
     >>> names_of("fork"), names_of("kite")
     (('cutlery',), ())

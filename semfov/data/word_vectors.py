@@ -1,4 +1,4 @@
-"""Vectors of words, from a file in GloVe's or word2vec's text format, and how near names are to each other by them."""
+"""Word vectors from files in GloVe's or word2vec's text format, and the similarity of names by them."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from semfov.data.classes import canonical_name
 from semfov.errors import DataError, InputError, check, check_number
 from semfov.io.files import check_regular, sha256
 
-_LONGEST = 1 << 20  # characters of a line
-_LITTLE = """
+_LONGEST = 1 << 20  # characters of a line that are read at once
+_COMMON = """
 a an the some any this that these those it its you your i my me we us one ones someone something anything thing things
 object objects item items kind kinds sort type of to in on at for from with by as into onto and or is are be was can
 could would will may might must do does which what where who when how
 """
-_EMPTY = frozenset(_LITTLE.split())
-"""Words of a description that stand in every other one."""
+_IGNORED = frozenset(_COMMON.split())
+"""Words of a description that are ignored because most descriptions have them."""
 
 TEMPERATURE = 0.08
-"""Of `spread`: chosen on other names of COCO's classes (docs/words.md)."""
+"""Temperature of `spread`, chosen on synonyms of COCO's classes (docs/words.md)."""
 
 
 class WordVectors:
-    """Vectors of the words that are asked for, of all that a file has.
+    """Word vectors, and the vectors of names.
 
-    A name of several words has the mean of the vectors of those that are known.
+    The vector of a name with several words is the mean of the vectors of its known words.
 
     Args:
-        vectors: `(D,)` by word, in lower case.
-        missing: words that were asked for and are not among them.
-        digest: sha256 of the file.
+        vectors: vectors `(D,)` by word, in lower case.
+        missing: words that were wanted and have no vector.
+        digest: sha256 of the file that the vectors come from.
 
     >>> words = WordVectors({"wine": torch.tensor([1.0, 0.0]), "glass": torch.tensor([0.0, 1.0])})
     >>> words.vector("wine glass")
@@ -49,15 +49,19 @@ class WordVectors:
 
     @classmethod
     def read(cls, path: str | PathLike[str], names: Iterable[str]) -> Self:
-        """The vectors of all words in some names.
+        """Read the vectors of the words in some names from a file.
 
         Args:
-            path: text, a word and its vector a line, with or without word2vec's first line of two numbers.
-            names: names and descriptions; what else the file has is passed over.
+            path: a text file with a word and its vector on each line, with or without word2vec's first line of two
+                numbers.
+            names: names and descriptions whose words are wanted; other words of the file are skipped.
+
+        Returns:
+            The vectors of those words.
 
         Raises:
-            DataError: the file is missing, or a line of it is no word with a vector as long as the others.
-            InputError: it has none of the words.
+            DataError: the file is missing, or the line of a wanted word does not hold a vector of the common length.
+            InputError: the file has none of the words.
         """
         wanted = sorted({word for name in names for word in words_of(name)})
         check_regular(path)
@@ -67,27 +71,46 @@ class WordVectors:
                 _read(iter(lambda: file.readline(_LONGEST), ""), set(wanted), found, str(path))
         except OSError as error:
             raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
-        check(bool(found), "embeddings", f"a file with some of the words {', '.join(wanted)}", f"{path} with none")
+        some = f"a file with vectors of some of the words {', '.join(wanted)}"
+        check(bool(found), "embeddings", some, f"{path}, which has none of them")
         return cls(found, [word for word in wanted if word not in found], sha256(Path(path)))
 
     def vector(self, name: str) -> Tensor:
-        """Mean vector of a name's words, `(D,)`.
+        """Compute the mean vector of a name's words.
+
+        Args:
+            name: a name or a description.
+
+        Returns:
+            The vector, `(D,)`.
 
         Raises:
-            InputError: none of them is known.
+            InputError: none of the words has a vector.
         """
         known = [self.vectors[word] for word in words_of(name) if word in self.vectors]
-        check(bool(known), "name", "a name of which a word is in the file of vectors", repr(name))
+        check(bool(known), "name", "a name with at least one word in the file of word vectors", repr(name))
         return torch.stack(known).mean(0)
 
     def knows(self, name: str) -> bool:
-        """Whether a word of a name has a vector."""
+        """Tell whether at least one word of a name has a vector.
+
+        Args:
+            name: a name or a description.
+
+        Returns:
+            Whether the name has a vector.
+        """
         return any(word in self.vectors for word in words_of(name))
 
     def similarity(self, names: Sequence[str], others: Sequence[str]) -> Tensor:
-        r"""Cosine of the angle between names, `(M, N)`: :math:`u \cdot v / \lVert u \rVert \lVert v \rVert`.
+        r"""Compute the cosine similarity of names, :math:`u \cdot v / (\lVert u \rVert \lVert v \rVert)`.
 
-        Names of which no word is known are NaN.
+        Args:
+            names: M names.
+            others: N names.
+
+        Returns:
+            Similarities `(M, N)`, NaN for names without a known word.
         """
         first, second = (self._unit(group) for group in (names, others))
         return first @ second.mT
@@ -101,13 +124,19 @@ class WordVectors:
 
 
 def words_of(name: str) -> list[str]:
-    """The words of a name or of a description that mean something by themselves.
+    """Split a name or a description into words, and leave out common words such as `the` and `something`.
+
+    Args:
+        name: a name or a description.
+
+    Returns:
+        The words in lower case; all of them where all are common words.
 
     >>> words_of("Wine_Glass"), words_of("something to drink from")
     (['wine', 'glass'], ['drink'])
     """
     words = re.findall(r"[^\W_]+(?:'[^\W_]+)?", canonical_name(name))
-    return [word for word in words if word not in _EMPTY] or words
+    return [word for word in words if word not in _IGNORED] or words
 
 
 def spread(
@@ -118,19 +147,24 @@ def spread(
     temperature: float = TEMPERATURE,
     least: float = 0.1,
 ) -> dict[str, float]:
-    r"""Which classes a description may mean, each with a weight, the likeliest first.
+    r"""Find the classes that a description may mean, with a weight for each.
+
+    The weight of class k for a description d falls off with their cosine similarity:
 
     .. math:: w_k = e^{(\cos(d, k) - \max_j \cos(d, j)) / T}
 
     Args:
         description: words such as `something to drink from`.
         classes: names of the detector's classes.
-        vectors: of the words of both.
+        vectors: vectors of the words of description and classes.
         temperature: T.
-        least: classes of a smaller weight are left out.
+        least: smallest weight; classes with a smaller weight are left out.
+
+    Returns:
+        Weights by class, largest first; the largest weight is 1.
 
     Raises:
-        InputError: no word of the description, or none of the classes, is known.
+        InputError: no word of the description, or of all the classes, has a vector.
 
     >>> vectors = {"drink": [1.0, 0.1], "cup": [1.0, 0.2], "bottle": [1.0, 0.5], "cow": [-1.0, 1.0]}
     >>> words = WordVectors({word: torch.tensor(vector) for word, vector in vectors.items()})
@@ -141,18 +175,19 @@ def spread(
     check(0 < temperature < math.inf, "temperature", "a number above 0", temperature)
     if not vectors.knows(description):
         raise InputError(
-            f"target: expected a class, or a description of which a word is in the file of vectors, got {description!r}"
+            f"target: expected a class, or a description with at least one word in the file of word vectors, "
+            f"got {description!r}"
         )
     near = vectors.similarity([description], classes)[0]
     known = ~near.isnan()
-    check(bool(known.any()), "classes", "some whose words are in the file of vectors", ", ".join(classes))
+    check(bool(known.any()), "classes", "classes with words in the file of word vectors", ", ".join(classes))
     weights = ((near - near[known].max()) / temperature).exp().nan_to_num(0)
     order = weights.argsort(descending=True, stable=True).tolist()
     return {classes[k]: float(weights[k]) for k in order if weights[k] >= least}
 
 
 def _read(lines: Iterable[str], wanted: set[str], found: dict[str, Tensor], path: str) -> None:
-    """Vectors of the wanted words among the lines."""
+    """Add the vectors of the wanted words to `found`."""
     size: int | None = None
     for number, line in enumerate(lines, 1):
         word, _, rest = line.strip().partition(" ")
@@ -160,7 +195,7 @@ def _read(lines: Iterable[str], wanted: set[str], found: dict[str, Tensor], path
             size = int(rest)
             continue
         key = word.lower()
-        # A word in lower case is the word itself; in upper case it may be a name.
+        # A word in lower case takes precedence; in upper case it may be a proper name.
         if key not in wanted or (key in found and word != key):
             continue
         try:

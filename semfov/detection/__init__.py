@@ -1,4 +1,4 @@
-"""Detectors and what they return: boxes with full class-score vectors."""
+"""Detectors and their detections: boxes with full class-score vectors."""
 
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector

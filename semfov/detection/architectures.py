@@ -14,7 +14,7 @@ def yolov3(classes: int = 80) -> list[Section]:
 
 
 def yolov3_spp(classes: int = 80) -> list[Section]:
-    """YOLOv3-spp: YOLOv3 with pools of 5, 9 and 13 side by side before the first head, at 608 x 608."""
+    """YOLOv3-spp: YOLOv3 with parallel max pools of sizes 5, 9 and 13 before the first head, at 608 x 608."""
     pyramid = [
         _pool(5, 1),
         _route(-2),
@@ -28,9 +28,15 @@ def yolov3_spp(classes: int = 80) -> list[Section]:
 
 
 def yolov3_tiny(classes: int = 80) -> list[Section]:
-    """YOLOv3-tiny: seven convolutions with pools between, heads at strides 32 and 16, at 416 x 416.
+    """YOLOv3-tiny: seven convolutions with max pools in between, heads at strides 32 and 16, at 416 x 416.
 
-    The second head takes anchors 1, 2, 3. Some cfgs say 0, 1, 2; the published weights were not trained so.
+    The second head has the anchors 1, 2, 3. Some cfgs have 0, 1, 2, but the published weights fit 1, 2, 3.
+
+    Args:
+        classes: number of classes.
+
+    Returns:
+        The sections of the cfg.
     """
     backbone = []
     for filters in (16, 32, 64, 128, 256):
@@ -60,7 +66,7 @@ def _yolov3(size: int, classes: int, pyramid: list[Section]) -> list[Section]:
     for filters, blocks in ((64, 1), (128, 2), (256, 8), (512, 8), (1024, 4)):
         sections.append(_convolution(filters, 3, stride=2))
         sections += [_convolution(filters // 2, 1), _convolution(filters, 3), _shortcut()] * blocks
-        ends.append(len(sections) - 2)  # [net] is not a layer
+        ends.append(len(sections) - 2)  # minus 2, because [net] is not a layer
     for width, mask, lateral in ((512, "6,7,8", None), (256, "3,4,5", ends[3]), (128, "0,1,2", ends[2])):
         if lateral is not None:
             sections += [_route(-4), _convolution(width, 1), _upsample(), _route(-1, lateral)]

@@ -1,4 +1,4 @@
-"""The 80 object classes of COCO, in the order of its category ids and of every common detector."""
+"""The 80 object classes of COCO, in the order of its category ids, which common detectors also use."""
 
 _NAMES = """
 person, bicycle, car, motorcycle, airplane, bus, train, truck, boat, traffic light,

@@ -1,4 +1,4 @@
-"""Darknet networks as torch modules, built from the sections of a cfg."""
+"""Darknet networks as PyTorch modules, built from the sections of a cfg."""
 
 import hashlib
 from collections.abc import Sequence
@@ -14,17 +14,20 @@ from semfov.errors import DataError, check, check_shape
 
 
 class Darknet(nn.Module):
-    """A network from the sections of a cfg, with random weights; `read_weights` gives it trained ones.
+    """A network from the sections of a cfg, with random weights; `read_weights` loads trained weights.
 
-    Layers: convolutional, maxpool, upsample, route, shortcut, yolo, and dropout, which does nothing here.
+    Supported layers are convolutional, maxpool, upsample, route, shortcut, yolo, and dropout, which does nothing.
+
+    Args:
+        sections: sections of the cfg, `[net]` first.
 
     Attributes:
-        input_size: `(width, height)` that the cfg asks for.
-        stride: both sides of an input must be multiples of it.
+        input_size: `(width, height)` of the input in the cfg.
+        stride: both sides of an input must be multiples of this number.
         heads: the yolo layers, in order.
-        sections: what it was built from.
-        sources: for each layer the layers that it reads; -1 is the image.
-        steps: for each layer, how many pixels of the image are one of its output.
+        sections: sections of the cfg.
+        sources: for each layer, the layers that it reads; -1 is the image.
+        steps: for each layer, the number of image pixels along one pixel of its output.
 
     Shape:
         - input: `(B, C, H, W)`
@@ -39,7 +42,8 @@ class Darknet(nn.Module):
         super().__init__()
         self.sections = tuple(sections)
         if not sections or sections[0].kind not in ("net", "network"):
-            raise DataError("cfg: expected [net] as its first section")
+            got = f"[{sections[0].kind}]" if sections else "no sections"
+            raise DataError(f"cfg: expected [net] as its first section, got {got}")
         self.input_size = (sections[0].integer("width", 416), sections[0].integer("height", 416))
         self.channels = sections[0].integer("channels", 3)
         check_canvas(sections[0].where, self.input_size)
@@ -51,15 +55,15 @@ class Darknet(nn.Module):
         self.stride = max(-(-shape.step.numerator // shape.step.denominator) for shape in builder.shapes)
         self.sources = builder.sources
         self.steps = [shape.step for shape in builder.shapes]
-        # The layer after which an output is needed no more; the maps of the heads are what the network returns.
+        # The last layer that reads each output, after which it is released; the network returns the maps of the heads.
         self._last_reader = {index: index for index in range(-1, len(self.layers))}
         self._last_reader |= {source: index for index, read in enumerate(self.sources) for source in read}
         self._last_reader |= {i: len(self.layers) for i, layer in enumerate(self.layers) if isinstance(layer, Head)}
-        # The first layers have maps so large that a CPU is faster with one image of a batch after the other.
+        # The maps of the first layers are so large that a CPU computes a batch faster one image at a time.
         self._stem = next((index for index, shape in enumerate(builder.shapes) if shape.step >= 8), 0)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """Raw maps of the heads."""
+        """Compute the raw maps of the heads."""
         self.check_image(image)
         image = image.contiguous(memory_format=torch.channels_last)
         stem = self._stem if image.device.type == "cpu" and image.shape[0] > 1 else 0
@@ -71,7 +75,7 @@ class Darknet(nn.Module):
         return [outputs[index] for index, layer in enumerate(self.layers) if isinstance(layer, Head)]
 
     def features(self, image: Tensor) -> Tensor:
-        """What the last convolution before the first head reads, `(B, C, H', W')`."""
+        """Compute the input of the last convolution before the first head, `(B, C, H', W')`."""
         self.check_image(image)
         head = next(index for index, layer in enumerate(self.layers) if layer is self.heads[0])
         wanted = self.sources[self.sources[head][0]][0]
@@ -90,15 +94,15 @@ class Darknet(nn.Module):
         check(fits, "image", f"sides that are multiples of {self.stride}", f"{width} x {height}")
 
     def run(self, outputs: dict[int, Tensor], start: int, stop: int) -> dict[int, Tensor]:
-        """Outputs that are read after layer `stop - 1`, from those that are read after layer `start - 1`.
+        """Run the layers from `start` to `stop - 1`.
 
         Args:
-            outputs: by the number of their layer; -1 is the image. They may be overwritten.
+            outputs: outputs of earlier layers by layer number; -1 is the image. They may be overwritten.
             start: first layer to run.
             stop: the layer after the last one to run.
 
         Returns:
-            Outputs by the number of their layer, the maps of the heads among them.
+            The outputs by layer number that later layers read, and the maps of the heads.
         """
         outputs = dict(outputs)
         for index in range(start, stop):

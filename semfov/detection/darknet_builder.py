@@ -1,4 +1,4 @@
-"""From the sections of a cfg to layers, with a check that they fit together."""
+"""Building layers from the sections of a cfg, with checks that the layers fit together."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,14 +9,15 @@ from torch import nn
 from semfov.detection.darknet_config import Section
 from semfov.detection.darknet_layers import ACTIVATIONS, Convolution, Head, MaxPool, Route, Shortcut, Upsample
 from semfov.errors import DataError
+from semfov.io.schema import shown
 
-# YOLOv3 has 62 million parameters, and a map of 12 million numbers; a typing error should not fill the memory.
+# YOLOv3 has 62 million parameters and a map of 12 million numbers; the limits keep a typing error from filling memory.
 _MOST_PARAMETERS = 3 * 10**8
 _MOST_ELEMENTS = 2**28
 _MOST_LAYERS = 2000
 _LARGEST_KERNEL = 255
 
-# Keys that would change what a layer computes, with the only value that is implemented.
+# Keys that change what a layer computes, with the only value that is implemented.
 _NEUTRAL = {
     "convolutional": {"binary": "0", "xnor": "0", "dilation": "1", "antialiasing": "0"},
     "maxpool": {"maxpool_depth": "0", "antialiasing": "0"},
@@ -35,7 +36,12 @@ class Shape:
 
 
 class Builder:
-    """Turns sections into layers, and keeps track of shapes and of what each layer reads."""
+    """Makes layers from sections, and keeps track of shapes and of the layers that each layer reads.
+
+    Args:
+        channels: number of channels of the image.
+        size: `(width, height)` of the image.
+    """
 
     def __init__(self, channels: int, size: tuple[int, int]) -> None:
         self._pixels = size[0] * size[1]
@@ -54,8 +60,9 @@ class Builder:
         }
 
     def add(self, section: Section) -> nn.Module:
+        """Make the layer of the next section."""
         if len(self.shapes) >= _MOST_LAYERS:
-            raise DataError(f"{section.where}: expected at most {_MOST_LAYERS} layers")
+            raise DataError(f"{section.where}: expected at most {_MOST_LAYERS} layers, got more; check the cfg")
         if section.kind not in self._makers:
             known = ", ".join(self._makers)
             raise DataError(f"{section.where}: layer [{section.kind}] is not supported; supported: {known}")
@@ -72,7 +79,7 @@ class Builder:
         self._append(Shape(channels, step), (len(self.shapes) - 1, *sources))
 
     def _append(self, shape: Shape, sources: tuple[int, ...]) -> None:
-        """Keep what is known of an output, unless it would be too large at the size that the cfg asks for."""
+        """Note the shape and the sources of a layer, unless its output is too large at the input size of the cfg."""
         if shape.channels * self._pixels > _MOST_ELEMENTS * shape.step**2:
             raise DataError(
                 f"cfg: layer {len(self.shapes)} has a map of more than {_MOST_ELEMENTS:,} numbers; check the cfg"
@@ -83,12 +90,18 @@ class Builder:
     def _convolution(self, section: Section) -> nn.Module:
         here, filters, groups = self._here, section.integer("filters", 1), section.integer("groups", 1)
         if here.channels % groups or filters % groups:
-            raise DataError(f"{section.where}: groups={groups} divides not both {here.channels} and {filters} channels")
+            raise DataError(
+                f"{section.where}: expected groups that divide {shown(here.channels)} input channels and "
+                f"{shown(filters)} filters, got {shown(groups)}"
+            )
         size, stride = section.integer("size", 1), section.integer("stride", 1)
-        # Counted before the layer is made, which allocates them.
+        # Parameters are counted before the layer is made, because making it allocates them.
         self._parameters += here.channels // groups * filters * size**2 + 4 * filters
         if self._parameters > _MOST_PARAMETERS:
-            raise DataError(f"{section.where}: more than {_MOST_PARAMETERS:,} parameters up to here; check the cfg")
+            raise DataError(
+                f"{section.where}: expected at most {_MOST_PARAMETERS:,} parameters up to this layer, got more; "
+                f"check the cfg"
+            )
         _check_kernel(section, size, stride, section.integer("padding", 0, minimum=0))
         same = section.integer("pad", 0, minimum=0)
         self._note(filters, here.step * stride)
@@ -123,14 +136,18 @@ class Builder:
         if len({shape.step for shape in shapes}) != 1:
             raise DataError(f"{section.where}: [route] expected layers of one size, got {section.text('layers')}")
         if group >= groups or any(shape.channels % groups for shape in shapes):
-            raise DataError(f"{section.where}: [route] has no part {group} of {groups} equal groups of channels")
+            counts = shown([shape.channels for shape in shapes])
+            raise DataError(
+                f"{section.where}: [route] expected a group_id below groups, and groups that divide the channels "
+                f"{counts}, got group_id={shown(group)} and groups={shown(groups)}"
+            )
         self._append(Shape(sum(shape.channels for shape in shapes) // groups, shapes[0].step), sources)
         return Route(groups, group)
 
     def _shortcut(self, section: Section) -> nn.Module:
         sources = [self._layer(section, "from", layer) for layer in section.integers("from")]
         if len(sources) != 1 or self.shapes[sources[0]] != self._here:
-            raise DataError(f"{section.where}: [shortcut] expected one layer of the same shape, got {sources}")
+            raise DataError(f"{section.where}: [shortcut] expected one layer of the same shape, got layers {sources}")
         self._note(self._here.channels, self._here.step, *sources)
         return Shortcut(_activation(section, "linear"))
 
@@ -139,7 +156,10 @@ class Builder:
         pairs = list(zip(numbers[::2], numbers[1::2], strict=False))
         mask = section.integers("mask", ",".join(map(str, range(len(pairs)))))
         if len(numbers) % 2 or not mask or any(not 0 <= index < len(pairs) for index in mask):
-            raise DataError(f"{section.where}: [yolo] mask {mask} does not choose from {len(numbers)} / 2 anchors")
+            raise DataError(
+                f"{section.where}: [yolo] expected pairs of anchors and a mask of their indices, got {len(numbers)} "
+                f"numbers and the mask {mask}"
+            )
         scale = section.numbers("scale_x_y", "1")
         head = Head(tuple(pairs[index] for index in mask), section.integer("classes", 20), scale[0])
         if head.channels != self._here.channels:
@@ -154,7 +174,9 @@ class Builder:
     def _layer(self, section: Section, key: str, number: int) -> int:
         index = number if number >= 0 else len(self.shapes) + number
         if not 0 <= index < len(self.shapes):
-            raise DataError(f"{section.where}: [{section.kind}] {key}={number} points to no earlier layer")
+            raise DataError(
+                f"{section.where}: [{section.kind}] expected {key} to name an earlier layer, got {key}={number}"
+            )
         return index
 
 

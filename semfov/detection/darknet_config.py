@@ -15,11 +15,11 @@ _MOST_BYTES = 2**20
 
 @dataclass(frozen=True)
 class Section:
-    """One `[kind]` section of a cfg: a layer, or the `[net]` that comes first.
+    """One `[kind]` section of a cfg: a layer, or `[net]`, which comes first.
 
     Attributes:
-        kind: what stands in the brackets.
-        options: keys and values as they are written.
+        kind: the name in brackets.
+        options: keys and values as written.
         where: file and line, for error messages.
 
     >>> Section("yolo", {"mask": "1,2,3"}).integers("mask")
@@ -31,10 +31,10 @@ class Section:
     where: str = "cfg"
 
     def text(self, key: str, default: str | None = None) -> str:
-        """The value of `key`; a key without a default must be there."""
+        """The value of `key` as text; a key without a default is required."""
         value = self.options.get(key, default)
         if value is None:
-            raise DataError(f"{self.where}: [{self.kind}] lacks {key!r}")
+            raise DataError(f"{self.where}: [{self.kind}] expected the key {key!r}, which is missing")
         return value
 
     def integers(self, key: str, default: str | None = None) -> tuple[int, ...]:
@@ -58,7 +58,7 @@ class Section:
         """The value of `key` as one whole number, at least `minimum`."""
         values = self.integers(key, None if default is None else str(default))
         if len(values) != 1 or values[0] < minimum:
-            raise self._refuse(key, f"one whole number from {minimum} up")
+            raise self._refuse(key, f"one whole number of at least {minimum}")
         return values[0]
 
     def _parts(self, key: str, default: str | None) -> list[str]:
@@ -69,12 +69,22 @@ class Section:
 
 
 def parse_cfg(text: str, source: str = "cfg") -> list[Section]:
-    """Sections of a cfg in the order of the text.
+    r"""Parse the text of a cfg.
 
-    Lines are `[kind]`, `key=value`, comments (`#` or `;`) or blank. Of a key that stands twice in a section the
-    first value holds, as in Darknet.
+    Lines are `[kind]`, `key=value`, comments (`#` or `;`) or blank. Where a key is repeated in a section, the first
+    value counts, as in Darknet.
 
-    >>> [s.kind for s in parse_cfg("[net]\\nwidth=416\\n\\n[maxpool]\\nsize=2")]
+    Args:
+        text: the text.
+        source: name of the file, for messages.
+
+    Returns:
+        The sections in the order of the text.
+
+    Raises:
+        DataError: a line is none of these.
+
+    >>> [s.kind for s in parse_cfg("[net]\nwidth=416\n\n[maxpool]\nsize=2")]
     ['net', 'maxpool']
     """
     sections: list[Section] = []
@@ -96,13 +106,14 @@ def parse_cfg(text: str, source: str = "cfg") -> list[Section]:
 
 
 def read_cfg(path: str | PathLike[str]) -> list[Section]:
-    """Sections of a cfg file."""
+    """Read the sections of a cfg file."""
     check_regular(path)
     try:
         if Path(path).stat().st_size > _MOST_BYTES:
-            raise DataError(f"{str(path)!r}: expected a cfg of at most {_MOST_BYTES:,} bytes")
+            size = Path(path).stat().st_size
+            raise DataError(f"{str(path)!r}: expected a cfg of at most {_MOST_BYTES:,} bytes, got {size:,}")
         return parse_cfg(Path(path).read_text(encoding="utf-8"), str(path))
     except OSError as error:
         raise DataError(f"cannot read the cfg {str(path)!r}: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise DataError(f"{str(path)!r} is not a text file, so it is no Darknet cfg") from error
+        raise DataError(f"{str(path)!r}: expected a Darknet cfg, got a file that is not text") from error

@@ -18,11 +18,11 @@ ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 class Convolution(nn.Conv2d):
-    """Convolution and activation. What batch norm does to a trained network is in the weight and the bias.
+    """Convolution and activation; batch norm is folded into the weight and the bias.
 
     Attributes:
         normalised: whether the weights file holds batch-norm statistics for this layer.
-        activation: name in `ACTIVATIONS`.
+        activation: name of the activation in `ACTIVATIONS`.
 
     Shape:
         - input: `(B, in_channels, H, W)`
@@ -50,9 +50,10 @@ class Convolution(nn.Conv2d):
 
 
 class MaxPool(nn.Module):
-    """Darknet's maximum pool: `padding` (by default `size - 1`) is split left and right, the odd one to the right.
+    """Darknet's max pool.
 
-    The output is `(W + padding - size) // stride + 1` wide, so `size=2, stride=1` keeps the size.
+    The padding (by default `size - 1`) is split between both sides; if it is odd, the larger half is on the right and
+    at the bottom. The output is `(W + padding - size) // stride + 1` wide, so `size=2, stride=1` keeps the size.
     """
 
     def __init__(self, size: int, stride: int, padding: int) -> None:
@@ -60,7 +61,7 @@ class MaxPool(nn.Module):
         self.size, self.stride, self.padding = size, stride, padding
 
     def forward(self, image: Tensor) -> Tensor:
-        """`(B, C, H, W)` -> `(B, C, H', W')`."""
+        """Pool `(B, C, H, W)` to `(B, C, H', W')`."""
         before = self.padding // 2
         right, bottom = (self._after(n, before) for n in (image.shape[-1], image.shape[-2]))
         if before == right == bottom and 2 * before <= self.size:
@@ -81,7 +82,7 @@ class Upsample(nn.Module):
         self.stride = stride
 
     def forward(self, image: Tensor) -> Tensor:
-        """`(B, C, H, W)` -> `(B, C, stride H, stride W)`."""
+        """Enlarge `(B, C, H, W)` to `(B, C, stride H, stride W)`."""
         return F.interpolate(image, scale_factor=float(self.stride), mode="nearest")
 
 
@@ -93,30 +94,30 @@ class Route(nn.Module):
         self.groups, self.group = groups, group
 
     def forward(self, *images: Tensor) -> Tensor:
-        """`(B, C_i, H, W)` each -> `(B, Σ C_i / groups, H, W)`."""
+        """Concatenate `(B, C_i, H, W)` to `(B, Σ C_i / groups, H, W)`."""
         parts = [image.chunk(self.groups, 1)[self.group] for image in images]
         return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
 class Shortcut(nn.Module):
-    """Add an earlier layer to the last one."""
+    """Add the output of an earlier layer to the output of the previous one, and activate."""
 
     def __init__(self, activation: str) -> None:
         super().__init__()
         self.activation = activation
 
     def forward(self, image: Tensor, earlier: Tensor) -> Tensor:
-        """`(B, C, H, W)` each -> `(B, C, H, W)`."""
+        """Add two maps `(B, C, H, W)`."""
         return ACTIVATIONS[self.activation](image + earlier)
 
 
 class Head(nn.Module):
-    """A yolo layer: passes its map on, and holds what is needed to read it.
+    """A yolo layer: it returns its map unchanged, and holds the settings for decoding it.
 
     Attributes:
-        anchors: `(width, height)`, in canvas pixels, of the boxes that a cell predicts.
+        anchors: `(width, height)` of the anchors in canvas pixels.
         classes: number of classes.
-        scale: how far centres may reach out of their cell; at 1 they cannot.
+        scale: Darknet's `scale_x_y`; with more than 1, centres of boxes may lie outside their cell.
     """
 
     def __init__(self, anchors: tuple[tuple[float, float], ...], classes: int, scale: float = 1.0) -> None:
@@ -125,9 +126,9 @@ class Head(nn.Module):
 
     @property
     def channels(self) -> int:
-        """Channels of the map: centre, size, objectness and classes of every anchor."""
+        """Number of channels of the map: centre, size, objectness and classes of every anchor."""
         return len(self.anchors) * (5 + self.classes)
 
     def forward(self, image: Tensor) -> Tensor:
-        """The map as it is."""
+        """Return the map unchanged."""
         return image

@@ -15,18 +15,25 @@ from semfov.errors import DataError
 from semfov.io.files import check_regular
 
 EPSILON = 1e-5
-"""Added to the variance by batch norm."""
+"""Constant ε that batch norm adds to the variance."""
 
 
 @torch.no_grad()
 def read_weights(network: Darknet, path: str | PathLike[str]) -> str:
-    """Fill `network` with the parameters in a weights file, batch norm folded in, and return the file's sha256.
+    """Load the parameters in a weights file into a network, with batch norm folded in.
 
-    Header: int32 major, minor and revision, then the number of images seen (uint64 from version 0.2 on, before that
-    uint32). For each convolution of the cfg: bias; with batch norm also its scale, mean and variance; the kernel
-    `(O, I / groups, k, k)`. Folding, in float64:
+    The header of the file holds major version, minor version and revision as int32, then the number of images seen in
+    training (uint64 since version 0.2, uint32 before). For each convolution of the cfg follow the bias, with batch norm
+    also its scale, mean and variance, and the kernel `(O, I / groups, k, k)`. Batch norm is folded in float64:
 
-        weight · γ / √(σ² + ε),   bias = β - μ γ / √(σ² + ε)
+        weight' = weight · γ / √(σ² + ε),   bias = β - μ γ / √(σ² + ε)
+
+    Args:
+        network: the network; its parameters are overwritten.
+        path: the weights file.
+
+    Returns:
+        sha256 of the file.
 
     Raises:
         DataError: the file cannot be read, or its length or its numbers do not fit the network.
@@ -36,7 +43,7 @@ def read_weights(network: Darknet, path: str | PathLike[str]) -> str:
     try:
         length = Path(path).stat().st_size
         longest = 20 + 4 * sum(_count(layer) for layer in layers)
-        # What is longer is refused below by what it says; that much is not worth reading.
+        # A longer file is refused below, so it is not read to its end.
         with Path(path).open("rb") as file:
             data = bytearray(file.read(longest + 1))
     except OSError as error:
@@ -46,10 +53,13 @@ def read_weights(network: Darknet, path: str | PathLike[str]) -> str:
     if length != needed or len(data) != needed:
         fault = "truncated" if length < needed else "too long"
         found = f"expected {needed} bytes for this network, got {length}"
-        raise DataError(f"weights {str(path)!r}: {found}; {fault}, or of another network")
+        raise DataError(f"weights {str(path)!r}: {found}; the file is {fault}, or belongs to another network")
     numbers = torch.frombuffer(data, dtype=torch.float32, offset=start)
     if not bool(torch.isfinite(numbers).all()):
-        raise DataError(f"weights {str(path)!r}: expected finite numbers, so the file is damaged or no weights file")
+        raise DataError(
+            f"weights {str(path)!r}: expected finite numbers, got NaN or infinite ones; the file is damaged or not a "
+            f"weights file"
+        )
     for layer in layers:
         numbers = _fill(layer, numbers, str(path))
     return hashlib.sha256(data).hexdigest()
@@ -67,7 +77,7 @@ def _count(layer: Convolution) -> int:
 
 
 def _fill(layer: Convolution, numbers: Tensor, path: str) -> Tensor:
-    """Take what belongs to `layer` from the front of `numbers` and return the rest."""
+    """Load the first numbers into `layer`, and return the rest."""
     channels = layer.out_channels
     vectors = numbers[: channels * (4 if layer.normalised else 1)].view(-1, channels).double()
     weight = numbers[vectors.numel() : _count(layer)].view(layer.weight.shape).double()
@@ -75,7 +85,9 @@ def _fill(layer: Convolution, numbers: Tensor, path: str) -> Tensor:
     if layer.normalised:
         _, scale, mean, variance = vectors
         if bool((variance < 0).any()):
-            raise DataError(f"weights {path!r}: expected variances from 0 up, so the file does not fit this cfg")
+            raise DataError(
+                f"weights {path!r}: expected variances of at least 0, got negative ones; the file does not fit the cfg"
+            )
         factor = scale / (variance + EPSILON).sqrt()
         weight, bias = weight * factor[:, None, None, None], bias - mean * factor
     layer.weight.copy_(weight)

@@ -1,4 +1,4 @@
-"""The interface that every detector keeps."""
+"""The interface of detectors."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -12,26 +12,40 @@ from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection, select
 from semfov.errors import InputError, check, check_pixels, check_whole
 
-_LARGEST = 65_536  # pixels of a side
+_LARGEST = 65_536  # largest side of a canvas in pixels
 
 
 class Detector(nn.Module, ABC):
-    """Turns images into `Detections` with the full score vector of every box that is kept.
+    """Base of detectors: from images to `Detections` with the full score vector of every box.
 
-    An adapter implements `propose`, which sees canvases (images already fitted to its input) and returns every
-    candidate of its head. `forward` does the whole: fit, detect, map the boxes back. An agent that foveates at the
-    detector's resolution calls `fit`, foveates the canvas and calls `detect` itself.
+    A subclass implements `propose`, which takes canvases (images already fitted to the detector's input) and returns
+    all boxes of its head. `forward` does everything: it fits the images, detects, and maps the boxes back. An agent
+    that foveates at the detector's resolution calls `fit`, foveates the canvas and calls `detect`.
 
-    Attributes:
-        name: what the model is called in tables and in fitted observation models.
+    The arguments are also attributes.
+
+    Args:
+        name: name of the model in tables and in fitted observation models.
         classes: names of the K classes, without background, in the order of the scores from index 1.
-        input_size: `(width, height)` of the canvas.
-        background: the background policy of the scores (`semfov.detection.scores`).
-        selection: which candidates are kept.
-        fill: padding value of the canvas.
-        stride: the canvas is padded to a multiple of it only; None pads to `input_size`.
+        input_size: `(width, height)` of the canvas in pixels.
+        background: background policy of the scores (`semfov.detection.scores`).
+        selection: settings of the selection of boxes; None for the defaults of `Selection`.
+        fill: value of the canvas's padding.
+        stride: pad the canvas only to a multiple of this number of pixels; None pads it to `input_size`.
         stretch: whether images are stretched to the canvas instead of letterboxed.
-        digest: sha256 of the weights, `""` where there is none (random weights).
+        digest: sha256 of the weights, `""` for random weights.
+
+    A detector that proposes the whole canvas as one box:
+
+    >>> import torch
+    >>> class Whole(Detector):
+    ...     def propose(self, canvas):
+    ...         height, width = canvas.shape[-2:]
+    ...         boxes = canvas.new_tensor([0, 0, width, height]).expand(len(canvas), 1, 4)
+    ...         return Candidates(boxes, torch.full((len(canvas), 1, 1), 0.9))
+    >>> detections = Whole("whole", ("photograph",), (64, 64))(torch.rand(2, 3, 30, 40))
+    >>> detections.boxes[0], detections.scores[0]
+    (tensor([[ 0.,  0., 40., 30.]]), tensor([[0.1000, 0.9000]]))
     """
 
     def __init__(
@@ -64,10 +78,24 @@ class Detector(nn.Module, ABC):
 
     @abstractmethod
     def propose(self, canvas: Tensor) -> Candidates:
-        """Every box of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1], as `fit` makes it."""
+        """Compute all boxes of the head.
+
+        Args:
+            canvas: `(B, 3, H, W)`, RGB in [0, 1], from `fit`.
+
+        Returns:
+            The boxes in canvas pixels, with their scores.
+        """
 
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
-        """Fit images `(B, 3, H, W)`, RGB in [0, 1], into the input: the canvas and where the image lies on it."""
+        """Fit images into the detector's input.
+
+        Args:
+            images: `(B, 3, H, W)`, RGB in [0, 1].
+
+        Returns:
+            The canvas `(B, 3, h, w)`, and the placement of the images on it.
+        """
         check_images(images)
         return letterbox(images, self.input_size, fill=self.fill, stride=self.stride, stretch=self.stretch)
 
@@ -78,12 +106,16 @@ class Detector(nn.Module, ABC):
         *,
         back: Callable[[Tensor], Tensor] | None = None,
     ) -> Detections:
-        """Detections on a canvas from `fit`, boxes in pixels of the image that `placement` tells.
+        """Detect objects on a canvas.
 
         Args:
-            canvas: `(B, 3, H, W)`, RGB in [0, 1].
-            placement: where the image lies on the canvas; without one, boxes stay in canvas pixels.
-            back: leads boxes `(B, N, 4)` of a canvas whose pixels were moved back to where they were on that of `fit`.
+            canvas: `(B, 3, H, W)`, RGB in [0, 1], from `fit`.
+            placement: placement of the images on the canvas; None leaves boxes in canvas pixels.
+            back: for a canvas whose pixels a sensor has moved: a function that maps boxes `(B, N, 4)` back to the
+                canvas of `fit`.
+
+        Returns:
+            The selected boxes, in image pixels, with their score vectors.
         """
         check(len(canvas) > 0, "canvas", "at least one image", 0)
         candidates = self.propose(canvas)
@@ -92,20 +124,39 @@ class Detector(nn.Module, ABC):
         return select(candidates, placement, self.selection, self.background)
 
     def forward(self, images: Tensor) -> Detections:
-        """Detections in images `(B, 3, H, W)`, RGB in [0, 1], boxes in pixels of those images."""
+        """Detect objects in images.
+
+        Args:
+            images: `(B, 3, H, W)`, RGB in [0, 1].
+
+        Returns:
+            The selected boxes, in image pixels, with their score vectors.
+        """
         canvas, placement = self.fit(images)
         return self.detect(canvas, placement)
 
     def features(self, canvas: Tensor) -> Tensor:
-        """Features of a canvas from `fit`, `(B, C, h, w)`, on which the first head works.
+        """Compute the features that the first head reads.
+
+        Args:
+            canvas: `(B, 3, H, W)`, RGB in [0, 1], from `fit`.
+
+        Returns:
+            Features `(B, C, h, w)`.
 
         Raises:
-            InputError: they are not at hand, as within an ONNX model.
+            InputError: the detector does not give access to its features, for instance because it is an ONNX model.
         """
-        raise InputError(f"detector: expected one whose features are at hand, such as yolov3-tiny, got {self.name}")
+        raise InputError(
+            f"detector: expected one that gives access to its features, such as yolov3-tiny, got {self.name}"
+        )
 
     def settings(self) -> dict[str, object]:
-        """What the detections depend on, for the keys of caches and the metadata of fitted models."""
+        """List the settings that the detections depend on, for the keys of caches and the metadata of fitted models.
+
+        Returns:
+            JSON values by name.
+        """
         return {
             "name": self.name,
             "digest": self.digest,
@@ -119,7 +170,7 @@ class Detector(nn.Module, ABC):
 
 
 def check_images(images: Tensor) -> None:
-    """Raise `InputError` unless `images` are what every detector takes."""
+    """Raise `InputError` unless `images` have the form that detectors take."""
     fits = images.ndim == 4 and images.shape[1] == 3 and images.numel() > 0 and images.is_floating_point()
     what = "floating-point RGB in [0, 1] of shape (B, 3, H, W), at least one image and one pixel"
     check(fits, "images", what, f"{images.dtype} of shape {tuple(images.shape)}")

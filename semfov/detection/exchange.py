@@ -1,4 +1,4 @@
-"""Detections in the forms of other libraries: Supervision, torchvision, COCO results."""
+"""Conversion of detections to and from other libraries: Supervision, torchvision, COCO results."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     import supervision
 
 SCORES = "scores"
-"""Name of the full score vectors where another library keeps data of its users' own beside its boxes."""
+"""Name of the full score vectors in a library that can store further data with its boxes."""
 
 
 class Exchange:
-    """What turns the detections of one image into those of other libraries, and back.
+    """Conversion of the detections of one image to other libraries, and back.
 
-    They all keep one class and one score of a box. Here these are the most probable class that is not background, and
-    its score; where there is room for more, the full vector goes along, and the way back then loses nothing.
+    These libraries store one class and one score for each box: the most probable class other than background, and its
+    score. Where a library can store further data, the full score vector is stored too, and converting back is exact.
     """
 
     boxes: Tensor
@@ -31,25 +31,31 @@ class Exchange:
     mask: Tensor
 
     def _of_one_image(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Boxes, score vectors, classes from 1, and scores of the only image there is."""
+        """Boxes, score vectors, classes from 1, and scores of the single image."""
         mask = self.mask
         if mask.shape[:-1].numel() != 1:
-            raise InputError(f"detections: expected those of one image (detections[0]), got {tuple(mask.shape[:-1])}")
+            raise InputError(
+                f"detections: expected the detections of one image, such as detections[0], got a batch of shape "
+                f"{tuple(mask.shape[:-1])}"
+            )
         kept = mask.reshape(-1)
         boxes, vectors = self.boxes.reshape(-1, 4)[kept], self.scores.reshape(-1, self.scores.shape[-1])[kept]
         best = vectors[:, 1:].max(-1) if vectors.shape[-1] > 1 else vectors.max(-1)
         return boxes, vectors, best.indices + 1, best.values
 
     def to_supervision(self, classes: Sequence[str] | None = None) -> supervision.Detections:
-        """The detections of one image as `supervision.Detections`, for its annotators, trackers and metrics.
+        """Convert the detections of one image to `supervision.Detections`, for its annotators, trackers and metrics.
 
-        Supervision numbers classes from 0, without background. The full vectors are in `data["scores"]`.
+        Supervision numbers classes from 0, without background. The full score vectors are in `data["scores"]`.
 
         Args:
-            classes: names of the classes, without background, for `data["class_name"]`.
+            classes: names of the classes, without background, for `data["class_name"]`; None leaves them out.
+
+        Returns:
+            The detections for Supervision.
 
         Raises:
-            InputError: these are of several images, names do not fit, or Supervision is not installed.
+            InputError: there are several images, the number of names is wrong, or Supervision is not installed.
 
         Example::
 
@@ -65,17 +71,20 @@ class Exchange:
 
     @classmethod
     def from_supervision(cls, detections: supervision.Detections, classes: int) -> Self:
-        """`supervision.Detections` of one image, as a batch of one.
+        """Convert `supervision.Detections` of one image to a batch of one image.
 
-        Full vectors are taken from `data["scores"]`. Without them a box has its confidence at its class, and what is
-        left of 1 at background.
+        Full score vectors are taken from `data["scores"]`. Without them, the vector of a box has the confidence at its
+        class, and the rest up to 1 at background.
 
         Args:
-            detections: with `class_id`, from 0, and `confidence` (none: 1).
-            classes: how many classes there are, without background.
+            detections: detections with `class_id`, from 0, and `confidence` (1 where it is missing).
+            classes: number of classes, without background.
+
+        Returns:
+            The detections.
 
         Raises:
-            InputError: a class or a confidence is missing or out of range.
+            InputError: classes are missing, or a class or a confidence is out of range.
         """
         boxes = torch.as_tensor(detections.xyxy).reshape(-1, 4)
         boxes = boxes if boxes.is_floating_point() else boxes.float()
@@ -92,30 +101,35 @@ class Exchange:
         return cls._one_image(boxes, vectors_of(labels, None if given is None else torch.as_tensor(given), classes))
 
     def to_torchvision(self) -> dict[str, Tensor]:
-        """The detections of one image as torchvision's detectors return them, and `torchmetrics` takes them.
+        """Convert the detections of one image to the form of torchvision's detectors, which `torchmetrics` also takes.
 
         Returns:
             `boxes` `(L, 4)`, `labels` `(L,)` from 1 (0 is background), and `scores` `(L,)`.
 
         Raises:
-            InputError: these are of several images.
+            InputError: there are several images.
         """
         boxes, _, labels, scores = self._of_one_image()
         return {"boxes": boxes.clone(), "labels": labels, "scores": scores}
 
     @classmethod
     def from_torchvision(cls, detections: Mapping[str, Tensor], classes: int) -> Self:
-        """What a torchvision detector returns for an image, as a batch of one; vectors as in `from_supervision`.
+        """Convert the output of a torchvision detector for one image to a batch of one image.
+
+        The score vector of a box has the score at its class, and the rest up to 1 at background.
 
         Args:
-            detections: `boxes`, `labels` from 1, and `scores` (none: 1, as targets of training have them).
-            classes: how many classes there are, without background.
+            detections: `boxes`, `labels` from 1, and `scores` (1 where they are missing, as in training targets).
+            classes: number of classes, without background.
+
+        Returns:
+            The detections.
 
         Raises:
             InputError: boxes or labels are missing, or a label or a score is out of range.
         """
         for name in ("boxes", "labels"):
-            check(name in detections, "detections", f"{name!r} among its keys", sorted(detections))
+            check(name in detections, "detections", f"the key {name!r}", f"the keys {sorted(detections)}")
         labels = detections["labels"]
         return cls._one_image(detections["boxes"], vectors_of(labels.long(), detections.get("scores"), classes))
 
@@ -125,19 +139,19 @@ class Exchange:
         categories: Sequence[int] | Sequence[Mapping[str, Any]],
         classes: Sequence[str] | None = None,
     ) -> list[dict[str, Any]]:
-        """The detections of one image as COCO results, for `pycocotools.COCO.loadRes`.
+        """Convert the detections of one image to COCO results, for `pycocotools.COCO.loadRes`.
 
         Args:
-            image_id: of the annotation file.
-            categories: the file's category id for each class, or its `categories` as they are; classes are then found
-                by name.
-            classes: names of the classes, without background, for the latter.
+            image_id: id of the image in the annotation file.
+            categories: the category id of each class, or the `categories` of the annotation file, in which classes are
+                then found by name.
+            classes: names of the classes, without background; needed to find classes by name.
 
         Returns:
             `image_id`, `category_id`, `bbox` as `[x, y, width, height]`, and `score` of each box.
 
         Raises:
-            InputError: these are of several images, or a class has no category.
+            InputError: there are several images, or a class has no category.
         """
         boxes, vectors, labels, scores = (tensor.detach().cpu() for tensor in self._of_one_image())
         ids = category_ids(categories, classes)
@@ -160,7 +174,15 @@ class Exchange:
 
 
 def vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
-    """Score vectors `(L, K+1)` of boxes of which only a class 1..K and its score are known; the rest is background.
+    """Make score vectors of boxes for which only one class and its score are known; the rest is background.
+
+    Args:
+        labels: class of each box, 1..K, `(L,)`.
+        scores: score of that class, `(L,)`; None for 1.
+        classes: number of classes K.
+
+    Returns:
+        Score vectors `(L, K+1)`.
 
     >>> vectors_of(torch.tensor([2]), torch.tensor([0.75]), 3)
     tensor([[0.2500, 0.0000, 0.7500, 0.0000]])
@@ -170,8 +192,8 @@ def vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
     known = known if known.is_floating_point() else known.float()
     check_shape(known, "scores", len(labels))
     inside = not len(labels) or (int(labels.min()) >= 1 and int(labels.max()) <= classes)
-    check(inside, "labels", f"classes of {classes}", sorted(set(labels.tolist()))[-3:])
-    # NaN is not between 0 and 1 either.
+    check(inside, "labels", f"classes from 1 to {classes}", sorted(set(labels.tolist()))[-3:])
+    # The comparison also refuses NaN.
     check(bool(((known >= 0) & (known <= 1)).all()), "scores", "numbers from 0 to 1", known.tolist()[:3])
     vectors = known.new_zeros(len(labels), classes + 1)
     vectors[:, 0] = 1 - known
@@ -181,7 +203,17 @@ def vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
 def category_ids(
     categories: Sequence[int] | Sequence[Mapping[str, Any]], classes: Sequence[str] | None = None
 ) -> list[int]:
-    """The id of the category of each class: as given, or by name from the `categories` of an annotation file.
+    """Find the category id of each class.
+
+    Args:
+        categories: the ids, which are returned as they are, or the `categories` of an annotation file.
+        classes: names of the classes, without background; needed for the `categories` of a file.
+
+    Returns:
+        The category id of each class.
+
+    Raises:
+        InputError: names are missing, or a class has no category.
 
     >>> category_ids([{"id": 72, "name": "tv"}, {"id": 1, "name": "person"}], ["person", "tvmonitor"])
     [1, 72]
@@ -190,12 +222,12 @@ def category_ids(
     if len(ids) == len(categories):
         return ids
     if classes is None:
-        raise InputError("classes: expected the names of the detector's classes, for categories by name, got None")
+        raise InputError("classes: expected the names of the detector's classes to find their categories, got None")
     named = [category for category in categories if isinstance(category, Mapping)]
     by_name = {canonical_name(str(category["name"])): int(category["id"]) for category in named}
     wanted = class_indices(classes)
     missing = [name for name in wanted if name not in by_name]
-    check(not missing, "categories", "one for each class", f"none for {', '.join(missing[:3])}")
+    check(not missing, "categories", "a category for each class", f"none for {', '.join(missing[:3])}")
     return [by_name[name] for name in wanted]
 
 
@@ -207,5 +239,7 @@ def _supervision() -> Any:
     try:
         import supervision
     except ImportError:
-        raise InputError("supervision: expected the package, got none; pip install supervision") from None
+        raise InputError(
+            "supervision: expected the package supervision, which is not installed; pip install supervision"
+        ) from None
     return supervision

@@ -1,4 +1,4 @@
-"""Export a Darknet detector to ONNX, boxes decoded, for `load_onnx` and for any other runtime.
+"""Export of Darknet detectors to ONNX, with decoded boxes, for `load_onnx` and for any other runtime.
 
 python -m semfov.detection.export yolov3-tiny out.onnx
 """
@@ -18,7 +18,7 @@ from semfov.errors import InputError
 from semfov.io.files import replacing
 
 CARD_KEY = "model_card"
-"""Key of the model's metadata under which an export keeps what people should know of it."""
+"""Key of the model card, a text for people, in the metadata of an exported model."""
 
 
 def export_onnx(
@@ -26,19 +26,19 @@ def export_onnx(
 ) -> None:
     """Write a Darknet detector as an ONNX model.
 
-    The model takes `images` `(B, 3, H, W)`, RGB in [0, 1], and gives `boxes` `(B, N, 4)`, `(x1, y1, x2, y2)` in
-    canvas pixels, `objectness` `(B, N)` and `classes` `(B, N, K)`: every box of every head, undecided. Class names,
-    input size and padding are in its metadata.
+    The model takes `images` `(B, 3, H, W)`, RGB in [0, 1]. It returns all boxes of all heads, before any selection:
+    `boxes` `(B, N, 4)`, `(x1, y1, x2, y2)` in canvas pixels, `objectness` `(B, N)` and `classes` `(B, N, K)`. Class
+    names, input size and padding are in its metadata.
 
     Args:
-        detector: a YOLOv3.
-        path: where the model goes.
-        static: one image of the detector's `input_size`, for runtimes that need to know; else any batch and any size
-            that is a multiple of the network's stride.
-        card: text for people that travels in the metadata, under the key `model_card`.
+        detector: a YOLOv3 detector.
+        path: path of the ONNX file.
+        static: fix the input to one image of the detector's `input_size`, for runtimes that need fixed sizes. Otherwise
+            the model takes any batch, and any size that is a multiple of the network's stride.
+        card: text for people, stored in the metadata under the key `model_card`.
 
     Raises:
-        InputError: the detector is none of Darknet's.
+        InputError: the detector is not a Darknet network.
         DataError: the file cannot be written.
     """
     if not isinstance(detector, YoloV3):
@@ -63,9 +63,16 @@ def _settings(detector: YoloV3, static: bool) -> dict[str, object]:
 
 
 def largest_difference(detector: Detector, path: str | PathLike[str]) -> float:
-    """Largest absolute difference of any number between a detector and its export, on one noise image.
+    """Compute the largest absolute difference between the outputs of a detector and its export, on one noise image.
 
     Boxes are compared as fractions of the canvas, so that all numbers are of order 1.
+
+    Args:
+        detector: the detector.
+        path: its exported ONNX file.
+
+    Returns:
+        The difference.
     """
     from semfov.detection.onnx import load_onnx
 
@@ -83,16 +90,16 @@ def largest_difference(detector: Detector, path: str | PathLike[str]) -> float:
 
 
 def main() -> None:
-    """Command line of the export."""
+    """Run the command line of the export."""
     from semfov.detection.load import load_yolo
 
     parser = argparse.ArgumentParser(prog="python -m semfov.detection.export", description="Darknet detector to ONNX")
     parser.add_argument("detector", help="yolov3-tiny, yolov3, yolov3-spp, or the path of a cfg")
     parser.add_argument("output", type=Path, help="the ONNX file to write")
     parser.add_argument("--weights", help="weights file, for a cfg or instead of the published weights")
-    parser.add_argument("--classes", help="text file with a class name on each line, if not COCO's")
+    parser.add_argument("--classes", help="text file with a class name on each line (default: COCO's)")
     parser.add_argument("--input-size", type=int, help="side of the canvas in pixels")
-    parser.add_argument("--static", action="store_true", help="fix the batch to one image, and the image's size")
+    parser.add_argument("--static", action="store_true", help="fix the batch to one image, and fix the image's size")
     arguments = parser.parse_args()
     detector = load_yolo(
         arguments.detector,

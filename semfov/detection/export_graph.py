@@ -1,4 +1,4 @@
-"""The ONNX model of a Darknet network, boxes decoded."""
+"""The ONNX model of a Darknet network, with decoded boxes."""
 
 from typing import Any
 
@@ -9,24 +9,24 @@ from semfov.detection.darknet import Darknet
 from semfov.detection.darknet_layers import Convolution, Head, MaxPool, Route, Shortcut, Upsample
 
 VERSION = 1
-"""Of what this file makes of a network: raised with every change, so that no earlier model is taken for a new one."""
+"""Version of the exported graph; raise it with every change, so that an earlier export is not taken for a new one."""
 
 OPSET = 17
 IR_VERSION = 8
-"""Of opset 17's time; newer ones are refused by runtimes that could run the model."""
+"""IR version from the time of opset 17; some runtimes that could run the model refuse newer versions."""
 
 OUTPUTS = ("boxes", "objectness", "classes")
 
 
 class Graph:
-    """Nodes and constants of a graph under construction; every method returns the name of its output."""
+    """A graph under construction: its nodes and constants. Methods that add a node return the name of its output."""
 
     def __init__(self) -> None:
         self.nodes: list[Any] = []
         self.constants: dict[str, Any] = {}
 
     def add(self, op: str, *inputs: str, outputs: int = 1, **attributes: Any) -> Any:
-        """A node, and the name of its output, or the names of several."""
+        """Add a node, and return the name of its output, or the list of names of several outputs."""
         from onnx import helper
 
         start = f"{op.lower()}_{len(self.nodes)}"
@@ -35,11 +35,11 @@ class Graph:
         return start if outputs == 1 else names
 
     def name_last(self, name: str) -> None:
-        """Call the output of the last node `name`."""
+        """Rename the output of the last node to `name`."""
         self.nodes[-1].output[0] = name
 
     def constant(self, values: Tensor | list[int] | list[float] | int | float) -> str:
-        """A constant; floating-point numbers have single precision unless they are a tensor of double precision."""
+        """Add a constant; floating-point numbers become float32 unless they are a float64 tensor."""
         from onnx import numpy_helper
 
         tensor = torch.as_tensor(values)
@@ -51,15 +51,15 @@ class Graph:
 
 
 class _NetworkGraph(Graph):
-    """The graph of a Darknet network, all of single precision."""
+    """The graph of a Darknet network, in float32."""
 
     def constant(self, values: Tensor | list[int] | list[float] | int | float) -> str:
-        """A constant; single precision whatever torch's default is."""
+        """Add a constant; floating-point numbers become float32, whatever torch's default dtype is."""
         tensor = torch.as_tensor(values)
         return super().constant(tensor.float() if tensor.is_floating_point() else tensor)
 
     def activation(self, kind: str, source: str) -> str:
-        """An activation of Darknet."""
+        """Add an activation of Darknet."""
         if kind == "linear":
             return source
         if kind == "leaky":
@@ -72,7 +72,7 @@ class _NetworkGraph(Graph):
         return self.add("Mul", source, gate) if kind == "swish" else gate
 
     def layer(self, layer: Any, *sources: str) -> str:
-        """A layer of a Darknet network."""
+        """Add a layer of a Darknet network."""
         if isinstance(layer, Convolution):
             return self.activation(layer.activation, self._convolution(layer, sources[0]))
         if isinstance(layer, MaxPool):
@@ -111,7 +111,7 @@ class _NetworkGraph(Graph):
         return source if layer.groups == 1 else self.add("Split", source, outputs=layer.groups, axis=1)[layer.group]
 
     def decode(self, head: Head, source: str, step: float) -> tuple[str, str, str]:
-        """Boxes `(B, h w A, 4)`, objectness `(B, h w A)` and classes `(B, h w A, K)` as `decode_yolo` computes them."""
+        """Add `decode_yolo`: boxes `(B, h w A, 4)`, objectness `(B, h w A)` and classes `(B, h w A, K)`."""
         anchors, channels = len(head.anchors), 5 + head.classes
         shape = self.constant([0, anchors, channels, -1])
         cells = self.add("Transpose", self.add("Reshape", source, shape), perm=[0, 3, 1, 2])
@@ -129,7 +129,7 @@ class _NetworkGraph(Graph):
         )
 
     def _corners(self, source: str) -> str:
-        """Column and row of every cell of a map, `(h w, 1, 2)`, for maps of any size."""
+        """Add the column and row of every cell of a map, `(h w, 1, 2)`, for maps of any size."""
         size = self.add("Shape", source)
         rows, columns = (self.add("Gather", size, self.constant(axis)) for axis in (2, 3))
         count = self.add("Mul", rows, columns)
@@ -141,15 +141,19 @@ class _NetworkGraph(Graph):
 
 
 def network_model(network: Darknet, name: str, size: tuple[int, int] | None = None) -> Any:
-    """An `onnx.ModelProto` of a network: from `images` `(B, 3, H, W)` to every box of every head, as `OUTPUTS`.
+    """Make the ONNX model of a network: from `images` `(B, 3, H, W)` to all boxes of all heads, the `OUTPUTS`.
 
     Args:
-        network: whose weights it takes, as float32.
-        name: of the graph.
-        size: `(width, height)` of the one image that it takes; None: any batch, of any size that the network takes.
+        network: the network; its weights are stored as float32.
+        name: name of the graph.
+        size: `(width, height)` of the single image that the model takes; None for any batch and any size that the
+            network takes.
+
+    Returns:
+        An `onnx.ModelProto`.
 
     Raises:
-        ModuleNotFoundError: the package onnx is not there.
+        ModuleNotFoundError: the package onnx is not installed.
     """
     try:
         from onnx import TensorProto, helper

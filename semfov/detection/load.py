@@ -1,4 +1,4 @@
-"""`load_detector`: every detector by its name or its file."""
+"""Loading of detectors by name or file: `load_detector`."""
 
 from collections.abc import Sequence
 from os import PathLike, fspath
@@ -21,23 +21,35 @@ from semfov.detection.yolo import YoloV3
 from semfov.errors import DataError, InputError, lookup
 from semfov.io.files import check_regular
 
-_WEIGHTS_ALONE = "detector: expected a cfg and its weights, load_detector('x.cfg', weights='{}')"
+_WEIGHTS_ALONE = "detector: expected a cfg and its weights, got weights only; use load_detector('x.cfg', weights='{}')"
 
 
 def load_detector(name_or_path: str | PathLike[str], **options: Any) -> Detector:
-    """A detector by its name or its file, ready for inference.
+    """Load a detector by its name or its file, ready for inference.
 
-    - `"yolov3-tiny"`, `"yolov3"`, `"yolov3-spp"`: options of `load_yolo`.
-    - a path that ends in `.cfg`, with `weights=`: any Darknet network with YOLOv3 heads; options of `load_yolo`.
-    - a path that ends in `.onnx`: a model of your own; options of `semfov.detection.onnx.load_onnx`.
-    - `"yolox-nano"`, `"yolox-tiny"`, `"yolox-s"`: published models; options of the same.
-    - `"torchvision:<model>"`: options of `semfov.detection.torchvision.load_torchvision`.
+    - `"yolov3-tiny"`, `"yolov3"`, `"yolov3-spp"`: published Darknet networks; options of `load_yolo`.
+    - A path that ends in `.cfg`, with `weights=`: any Darknet network with YOLOv3 heads; options of `load_yolo`.
+    - A path that ends in `.onnx`: your own ONNX model; options of `semfov.detection.onnx.load_onnx`.
+    - `"yolox-nano"`, `"yolox-tiny"`, `"yolox-s"`: published ONNX models; options of `semfov.detection.onnx.load_onnx`.
+    - `"torchvision:<model>"`: torchvision's models; options of `semfov.detection.torchvision.load_torchvision`.
 
-    The weights of a name are downloaded once (`semfov.detection.weights`); `weights=` reads a file instead.
+    The weights of a named detector are downloaded once (`semfov.detection.weights`); `weights=` reads a file instead.
+
+    Args:
+        name_or_path: name of the detector, or path of its `.cfg` or `.onnx` file.
+        **options: options of the loader of this kind of detector.
+
+    Returns:
+        The detector.
 
     Raises:
-        InputError: the name or an option is not known.
-        DataError: weights are damaged, or cannot be had.
+        InputError: the name or an option is unknown.
+        DataError: the weights are damaged, or cannot be downloaded.
+
+    Example::
+
+        detector = load_detector("yolox-nano", threshold=0.05)
+        detections = detector(images)  # (B, 3, H, W), RGB in [0, 1]
     """
     name = fspath(name_or_path)
     if name.endswith(".onnx") or (name in WEIGHTS and WEIGHTS[name].file.endswith(".onnx")):
@@ -56,11 +68,17 @@ def load_detector(name_or_path: str | PathLike[str], **options: Any) -> Detector
 
 
 def check_detector(name_or_path: str | PathLike[str]) -> tuple[str, ...] | None:
-    """Whether this names a detector, told without loading it: its classes, or None where only the model knows them.
+    """Check without loading it that a detector exists.
+
+    Args:
+        name_or_path: name of the detector, or path of its file.
+
+    Returns:
+        Names of its classes, or None where they are known only after loading.
 
     Raises:
         InputError: no detector has this name.
-        DataError: there is no such file.
+        DataError: the file does not exist.
 
     >>> check_detector("yolox-nano")[:2]
     ('person', 'bicycle')
@@ -95,24 +113,34 @@ def load_yolo(
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> YoloV3:
-    """YOLOv3, YOLOv3-tiny, YOLOv3-spp or a network from a cfg of your own, with trained weights.
+    """Load YOLOv3, YOLOv3-tiny, YOLOv3-spp or a network from your own cfg, with trained weights.
 
     Args:
-        name_or_cfg: name, or path of a cfg.
-        weights: path of a Darknet weights file; None takes the published weights of `name_or_cfg`.
-        classes: class names, or a text file with one on each line; None means the 80 of COCO.
-        input_size: canvas in pixels, one side or `(width, height)`; None takes the cfg's.
-        stride: pad the canvas only to a multiple of it; None pads to `input_size`.
+        name_or_cfg: name of the network, or path of a cfg.
+        weights: path of a Darknet weights file; None for the published weights of `name_or_cfg`.
+        classes: names of the classes, or path of a text file with a name on each line; None for the 80 of COCO.
+        input_size: size of the canvas in pixels, one side or `(width, height)`; None for the size in the cfg.
+        stride: pad the canvas only to a multiple of this number of pixels; None pads it to `input_size`.
         background: background policy of the scores (`semfov.detection.score_vectors`).
-        threshold: see `Selection`, as for `iou`, `limit` and `per_class`.
-        runtime: what computes the network: `"torch"`, `"onnxruntime"` on a CPU without gradients, or `"auto"`, which
-            takes onnxruntime where it can, as it is faster, and else torch (`semfov.detection.yolo.YoloV3`).
-        device: where the network lives.
-        dtype: of the network's parameters.
+        threshold: smallest confidence of a box (`Selection`).
+        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
+        limit: largest number of boxes of an image (`Selection`).
+        per_class: suppress only boxes of the same class (`Selection`).
+        runtime: the runtime of the network: `"torch"`; `"onnxruntime"`, on a CPU and without gradients; or `"auto"`,
+            which uses onnxruntime where it can, because it is faster there, and torch elsewhere
+            (`semfov.detection.yolo.YoloV3`).
+        device: device of the network.
+        dtype: dtype of the network's parameters.
+
+    Returns:
+        The detector, in `eval` mode.
+
+    Raises:
+        InputError: the name or an option is unknown, or the weights of a cfg are not given.
     """
     if name_or_cfg.endswith(".cfg"):
         if weights is None:
-            raise InputError(f"weights: expected the path of the weights for {name_or_cfg!r}, got None")
+            raise InputError(f"weights: expected the path of the weights of {name_or_cfg!r}, got None")
         name, sections = Path(name_or_cfg).stem, read_cfg(name_or_cfg)
     else:
         name = lookup(name_or_cfg, ARCHITECTURES, "detector")
@@ -135,7 +163,7 @@ def load_yolo(
 
 
 def _names(classes: Sequence[str] | str | PathLike[str] | None) -> tuple[str, ...]:
-    """Class names from a list, from the lines of a file, or COCO's."""
+    """Class names from a list or from the lines of a file; COCO's by default."""
     if not isinstance(classes, str | PathLike):
         return COCO_CLASSES if classes is None else tuple(classes)
     check_regular(classes)

@@ -1,4 +1,4 @@
-"""ONNX detection models of any common family, with the full score vector of every box."""
+"""Detectors from ONNX models of common families, with the full score vector of every box."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -31,19 +31,20 @@ ONNX_MODELS = tuple(name for name, weights in WEIGHTS.items() if weights.file.en
 
 
 class OnnxDetector(Detector):
-    """A model in onnxruntime as a `Detector`. Gradients do not flow through it.
+    """A model in onnxruntime as a `Detector`; gradients do not flow through it.
 
     Args:
         session: the model.
         head: name of its head, a key of `semfov.detection.onnx_recognition.HEADS`.
-        classes: name of each score, in order; `"N/A"` for scores that stand for no class.
-        name: what tables and fitted models call it.
-        input_size: `(width, height)` of the canvas; None takes the model's.
-        stride: pad the canvas to a multiple of it only, for models that take any size; None pads to `input_size`.
-        preprocessing: what the network expects; None means what its family is trained with.
-        logits: the scores come without their sigmoid.
-        background: background policy of the scores; None means the one that suits the head.
-        selection: which candidates are kept.
+        classes: name of each score, in order; `"N/A"` for scores that do not stand for a class.
+        name: name of the model in tables and in fitted models.
+        input_size: `(width, height)` of the canvas; None for the model's fixed size.
+        stride: for models that take any size: pad the canvas only to a multiple of this number of pixels; None pads it
+            to `input_size`.
+        preprocessing: preprocessing that the network expects; None for the preprocessing of its family.
+        logits: whether the model returns scores before the sigmoid.
+        background: background policy of the scores; None for the policy of the head.
+        selection: settings of the selection of boxes.
         digest: sha256 of the model's file.
     """
 
@@ -83,7 +84,7 @@ class OnnxDetector(Detector):
         self._places, self._scores = places, len(classes)
 
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
-        """Fit images `(B, 3, H, W)`, RGB in [0, 1], into the input as the network's preprocessing says."""
+        """Fit images `(B, 3, H, W)`, RGB in [0, 1], into the input, with the placement of the network's training."""
         check_images(images)
         wanted = self.preprocessing
         return letterbox(
@@ -96,7 +97,7 @@ class OnnxDetector(Detector):
         )
 
     def propose(self, canvas: Tensor) -> Candidates:
-        """Every box of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
+        """Compute all boxes of the head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
         check_shape(canvas, "canvas", None, 3, *self.session.shape[2:])
         if not canvas.is_floating_point():
             raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
@@ -104,7 +105,7 @@ class OnnxDetector(Detector):
         return self.decode(outputs, (canvas.shape[-1], canvas.shape[-2]))
 
     def decode(self, outputs: dict[str, Tensor], size: tuple[int, int]) -> Candidates:
-        """Candidates from the outputs of the network by name, for a canvas of `(width, height)`."""
+        """Decode the outputs of the network, given by name, for a canvas of `(width, height)`."""
         candidates = HEADS[self.head].decode(outputs, size)
         if self.logits:
             objectness = None if candidates.objectness is None else candidates.objectness.sigmoid()
@@ -114,19 +115,23 @@ class OnnxDetector(Detector):
         return keep_classes(candidates, self._places, self._scores)
 
     def _check(self, candidates: Candidates) -> None:
-        """Raise `DataError` where a wrong head or a missing sigmoid shows in the numbers."""
+        """Raise `DataError` where the numbers show a wrong head or a missing sigmoid."""
         if not bool(torch.isfinite(candidates.boxes).all()):
-            raise DataError(f"{self.name}: head {self.head!r} gives boxes that are not finite; is it another head?")
+            raise DataError(
+                f"{self.name}: expected finite boxes, got NaN or infinite ones with head {self.head!r}; "
+                f"check that head= names the model's head"
+            )
         for scores in (candidates.classes, candidates.objectness):
             if scores is not None and not bool(((scores >= 0) & (scores <= 1)).all()):
                 low, high = float(scores.min()), float(scores.max())
                 raise DataError(
                     f"{self.name}: expected scores in [0, 1], got [{low:.3g}, {high:.3g}]; "
-                    f"say logits=True if they lack their sigmoid, or is {self.head!r} the wrong head?"
+                    f"set logits=True if the model returns them before the sigmoid, and check that its head is "
+                    f"{self.head!r}"
                 )
 
     def settings(self) -> dict[str, object]:
-        """What the detections depend on."""
+        """List the settings that the detections depend on."""
         own = {"head": self.head, "logits": self.logits, "preprocessing": self.preprocessing.settings()}
         return super().settings() | own
 
@@ -149,24 +154,33 @@ def load_onnx(
     threads: int | None = None,
     device: torch.device | str = "cpu",
 ) -> OnnxDetector:
-    """A detector from an ONNX file, or a published one by its name (`ONNX_MODELS`).
+    """Load a detector from an ONNX file, or a published one by its name (`ONNX_MODELS`).
 
-    Every setting that is None is read from `model.json` beside `model.onnx`, else from the model's metadata, else it
-    follows from the model's family.
+    A setting that is None is read from `model.json` in the folder of `model.onnx`, else from the model's metadata. If
+    neither has it, it follows from the model's family.
 
     Args:
-        name_or_path: path of the model, or a name.
-        weights: for a name: the file, where it is not to be downloaded.
+        name_or_path: path of the model, or name of a published one.
+        weights: for a published model, the path of its file; None downloads it.
         head: one of `candidates` (boxes, scores and objectness under these names, as `semfov.detection.export`
-            writes them), `detr`, `nanodet`, `nanodet-plus`, `picodet`, `rtdetr`, `yolov5`, `yolov8`, `yolox`; None
-            recognises it.
-        classes: name of each score in order, `"N/A"` for none; without a list, 80 or 91 scores are COCO's.
-        input_size: canvas in pixels, one side or `(width, height)`, for models that take any size.
-        stride: see `OnnxDetector`, as for `logits` and `background`.
-        preprocessing: settings of `Preprocessing` that differ from what the family is trained with.
-        threshold: see `Selection`, as for `iou`, `limit` and `per_class`.
-        threads: threads of onnxruntime; None follows `torch.get_num_threads()`.
-        device: where onnxruntime computes.
+            writes them), `detr`, `nanodet`, `nanodet-plus`, `picodet`, `rtdetr`, `yolov5`, `yolov8`, `yolox`. None
+            recognises the head by names and shapes of the outputs.
+        classes: name of each score in order, `"N/A"` for scores that do not stand for a class. None is enough for
+            models with 80 or 91 scores, which are taken as COCO's.
+        input_size: size of the canvas in pixels, one side or `(width, height)`, for models that take any size.
+        stride: for models that take any size: pad the canvas only to a multiple of this number of pixels.
+        preprocessing: settings of `Preprocessing` that differ from those of the family.
+        logits: whether the model returns scores before the sigmoid.
+        background: background policy of the scores (`semfov.detection.score_vectors`).
+        threshold: smallest confidence of a box (`Selection`).
+        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
+        limit: largest number of boxes of an image (`Selection`).
+        per_class: suppress only boxes of the same class (`Selection`).
+        threads: number of threads of onnxruntime; None for `torch.get_num_threads()`.
+        device: device of onnxruntime.
+
+    Returns:
+        The detector.
 
     Raises:
         InputError: the head is not recognised, or an option does not fit the model (the message lists the choices).
@@ -200,8 +214,10 @@ def load_onnx(
     try:
         scores = known.decode(outputs, size).classes.shape[-1]
     except (KeyError, IndexError, RuntimeError, TypeError, StopIteration) as error:
-        told = ", ".join(f"{output} {tuple(tensor.shape)}" for output, tensor in outputs.items())
-        raise InputError(f"head: {chosen['head']!r} does not fit the outputs {told[:300]}") from error
+        listed = ", ".join(f"{output} {tuple(tensor.shape)}" for output, tensor in outputs.items())
+        raise InputError(
+            f"head: expected the model's head, got {chosen['head']!r}, which does not fit the outputs {listed[:300]}"
+        ) from error
     check(scores > 0, "outputs", "at least one score", f"{scores} with head {chosen['head']!r}")
     names = coco_names(scores) if names is None else names
     digest = sha256(path)
@@ -222,11 +238,13 @@ def load_onnx(
 
 
 def canvas_size(session: OnnxSession, wanted: int | Sequence[int] | None) -> tuple[int, int]:
-    """`(width, height)` of a model's canvas: its own where it is fixed, else the one that is wanted."""
+    """`(width, height)` of a model's canvas: its fixed size, or the wanted size of a model that takes any."""
     height, width = session.shape[2:]
     if wanted is None:
         if height is None or width is None:
-            raise InputError(f"input_size: expected (width, height), as {session.path.name} takes any size, got None")
+            raise InputError(
+                f"input_size: expected (width, height) because {session.path.name} takes any size, got None"
+            )
         check_canvas(session.path.name, (width, height))
         return width, height
     sizes = (wanted, wanted) if isinstance(wanted, int) else tuple(wanted)
@@ -234,12 +252,12 @@ def canvas_size(session: OnnxSession, wanted: int | Sequence[int] | None) -> tup
     check(whole, "input_size", "(width, height) in pixels", shown(sizes))
     check_canvas("input_size", (sizes[0], sizes[1]))
     fits = width in (None, sizes[0]) and height in (None, sizes[1])
-    check(fits, "input_size", f"the model's own, {width} x {height}", sizes)
+    check(fits, "input_size", f"the model's fixed size, {width} x {height}", sizes)
     return sizes[0], sizes[1]
 
 
 def probe(session: OnnxSession, size: tuple[int, int]) -> dict[str, Tensor]:
-    """Outputs in the shapes that they have for one canvas: zeros where the model states them, else from a run."""
+    """Outputs in their shapes for one canvas: zeros where the model states all shapes, else the outputs of a run."""
     stated = {name: [n for n in shape[1:] if n is not None] for name, shape in session.outputs}
     for name, sizes in stated.items():
         check_elements(f"{session.path.name}: output {name!r}", sizes)
@@ -249,7 +267,7 @@ def probe(session: OnnxSession, size: tuple[int, int]) -> dict[str, Tensor]:
 
 
 def coco_names(count: int) -> Sequence[str]:
-    """Names of 80 scores, COCO's classes, or of 91, COCO's category ids with their gaps."""
+    """Names of 80 scores (COCO's classes) or of 91 scores (COCO's category ids with their gaps)."""
     if count == 80:
         return COCO_CLASSES
     if count == 91:
@@ -260,7 +278,7 @@ def coco_names(count: int) -> Sequence[str]:
 
 
 def _locate(name: str, weights: str | PathLike[str] | None) -> Path:
-    """The file of a model that is named, or is a path."""
+    """The file of a model that is given by name or path."""
     if name in ONNX_MODELS:
         return Path(fetch(name) if weights is None else weights)
     if weights is not None or not name.endswith(".onnx"):

@@ -1,4 +1,4 @@
-"""What an ONNX file asks for, looked at before anything is allocated for it."""
+"""Checks of an ONNX file before memory is allocated for it."""
 
 import math
 from collections.abc import Iterable
@@ -10,25 +10,31 @@ from semfov.io.files import check_regular, inside
 from semfov.io.schema import shown
 
 MOST_ELEMENTS = 2**28
-"""Numbers of a tensor in a model; 1 GiB as float32."""
+"""Largest number of elements of a tensor in a model; 1 GiB as float32."""
 MOST_METADATA = 2**20
-"""Characters of a model's metadata."""
+"""Largest number of characters of a model's metadata."""
 MOST_BATCH = 1024
-"""Images that a model may ask for at once."""
+"""Largest fixed batch size of a model."""
 MOST_PIXELS = 89_478_485
-"""Pixels of a canvas, as of the largest picture that is read."""
+"""Largest number of pixels of a canvas, the same as for pictures that are read."""
 
 
 def check_file(path: Path) -> None:
-    """Raise `DataError` where a model's tensors are too large, or its weights lie in files outside of its folder.
+    """Check that a model's tensors are not too large, and that files with weights are inside its folder.
 
-    Sizes are those that the file states and those that follow from them (ONNX's shape inference); nothing is run.
+    The sizes are read from the file and inferred by ONNX's shape inference; nothing is run.
+
+    Args:
+        path: the file.
+
+    Raises:
+        DataError: a tensor is too large, a file with weights is outside the folder, or the file is damaged.
     """
     import onnx
 
     check_regular(path, f"ONNX model {str(path)!r}")
     if not path.is_file():
-        raise DataError(f"no ONNX model {str(path)!r}")
+        raise DataError(f"ONNX model {str(path)!r}: no such file; check the path")
     try:
         model = onnx.load(path, load_external_data=False)
         stored = [*model.graph.initializer]
@@ -38,7 +44,7 @@ def check_file(path: Path) -> None:
                     check_regular(inside(path.parent, entry.value))
         _check_sizes(path, ((tensor.name, tensor.dims) for tensor in stored))
         if sum(len(entry.key) + len(entry.value) for entry in model.metadata_props) > MOST_METADATA:
-            raise DataError(f"ONNX model {str(path)!r}: more than {MOST_METADATA:,} characters of metadata")
+            raise DataError(f"ONNX model {str(path)!r}: expected at most {MOST_METADATA:,} characters of metadata")
         inferred = onnx.shape_inference.infer_shapes(_without_weights(model), data_prop=True).graph
     except DataError:
         raise
@@ -68,12 +74,12 @@ def _check_sizes(path: Path, tensors: Iterable[tuple[str, Iterable[int]]]) -> No
 
 
 def _dims(value: Any) -> list[int]:
-    """Known sizes of a value; those that are not known count as 1."""
+    """Sizes of a value; unknown sizes count as 1."""
     return [d.dim_value if d.HasField("dim_value") else 1 for d in value.type.tensor_type.shape.dim]
 
 
 def _without_weights(model: Any) -> Any:
-    """The model with small tensors alone, which shapes may follow from; of large ones their own shape is enough."""
+    """The model without its large tensors: shapes may depend on values of small tensors only."""
     import onnx
 
     slim = onnx.ModelProto()

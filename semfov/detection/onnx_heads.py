@@ -1,4 +1,4 @@
-"""Decoders of detection heads: from the tensors that a network gives to every candidate box with all its scores.
+"""Decoders of detection heads: from the output tensors of a network to all boxes with all their scores.
 
 Boxes are `(x1, y1, x2, y2)` in canvas pixels, edges between pixels (0 is the left edge of the canvas).
 """
@@ -13,17 +13,17 @@ from semfov.errors import check, check_shape
 
 
 def cells(canvas: tuple[int, int], stride: int) -> tuple[int, int]:
-    """Columns and rows of the map of a level; a canvas that is no multiple of `stride` has one cell more."""
+    """Columns and rows of the map of a level, rounded up where the canvas is not a multiple of `stride`."""
     return -(-canvas[0] // stride), -(-canvas[1] // stride)
 
 
 def cell_count(canvas: tuple[int, int], strides: Sequence[int]) -> int:
-    """Cells of all levels together."""
+    """Total number of cells of all levels."""
     return sum(columns * rows for columns, rows in (cells(canvas, stride) for stride in strides))
 
 
 def grid_points(canvas: tuple[int, int], strides: Sequence[int], offset: float, like: Tensor) -> Tensor:
-    """Column and row of every cell plus `offset`, with the stride of its level: `(N, 3)`, row-major, level by level."""
+    """Column plus `offset`, row plus `offset`, and stride of every cell, `(N, 3)`, level by level and row-major."""
     levels = []
     for stride in strides:
         columns, rows = cells(canvas, stride)
@@ -35,14 +35,19 @@ def grid_points(canvas: tuple[int, int], strides: Sequence[int], offset: float, 
 
 
 def decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] = (8, 16, 32)) -> Candidates:
-    """YOLOX (Ge et al. 2021) without its own decoding: for the cell (i, j) of a level with stride s
+    """Decode the raw output of YOLOX (Ge et al. 2021).
+
+    For the cell (i, j) of a level with stride s, centre and size of the box are
 
         c_x = (t_x + i) s,   c_y = (t_y + j) s,   w = s exp(t_w),   h = s exp(t_h)
 
     Args:
-        raw: `(B, N, 5 + K)`: t_x, t_y, t_w, t_h, objectness and classes, the scores in [0, 1].
+        raw: `(B, N, 5 + K)`: t_x, t_y, t_w, t_h, then objectness and class scores in [0, 1].
         canvas: `(width, height)` of the network's input.
         strides: canvas pixels per cell of each level.
+
+    Returns:
+        All boxes with their scores.
 
     >>> decode_yolox(torch.zeros(1, 1, 6), (32, 32), strides=(32,)).boxes
     tensor([[[-16., -16.,  16.,  16.]]])
@@ -55,10 +60,13 @@ def decode_yolox(raw: Tensor, canvas: tuple[int, int], strides: Sequence[int] = 
 
 
 def decode_yolov5(rows: Tensor) -> Candidates:
-    """YOLOv5-style rows, boxes decoded by the network: centre, size (canvas pixels), objectness, classes.
+    """Decode YOLOv5-style rows, whose boxes the network itself has decoded.
 
     Args:
-        rows: `(B, N, 5 + K)`.
+        rows: `(B, N, 5 + K)`: centre and size in canvas pixels, objectness, class scores.
+
+    Returns:
+        All boxes with their scores.
 
     >>> decode_yolov5(torch.tensor([[[8.0, 8.0, 4.0, 2.0, 0.5, 1.0]]])).boxes
     tensor([[[ 6.,  7., 10.,  9.]]])
@@ -68,10 +76,13 @@ def decode_yolov5(rows: Tensor) -> Candidates:
 
 
 def decode_yolov8(columns: Tensor) -> Candidates:
-    """YOLOv8-style columns, boxes decoded by the network: centre, size (canvas pixels), classes; no objectness.
+    """Decode YOLOv8-style columns, whose boxes the network itself has decoded.
 
     Args:
-        columns: `(B, 4 + K, N)`.
+        columns: `(B, 4 + K, N)`: centre and size in canvas pixels, class scores; there is no objectness.
+
+    Returns:
+        All boxes with their scores.
 
     >>> decode_yolov8(torch.tensor([[[8.0], [8.0], [4.0], [2.0], [1.0]]])).boxes
     tensor([[[ 6.,  7., 10.,  9.]]])
@@ -89,16 +100,20 @@ def decode_distances(
     strides: Sequence[int] = (8, 16, 32, 64),
     offset: float = 0.5,
 ) -> Candidates:
-    r"""Boxes as distributions over the distance to each side (distribution focal loss, Li et al. 2020).
+    r"""Decode boxes given as distributions over the distance to each side (distribution focal loss, Li et al. 2020).
 
-    From the point `p = (cell + offset) s` to the left, upper, right and lower side: `d = s Σ_b b softmax(t)_b`.
+    The distance from the point `p = (cell + offset) s` to the left, upper, right or lower side is
+    `d = s Σ_b b softmax(t)_b`.
 
     Args:
-        classes: `(B, N, K)` in [0, 1], the cells of all levels.
-        distances: `(B, N, 4 bins)`.
+        classes: class scores `(B, N, K)` in [0, 1], for the cells of all levels.
+        distances: `(B, N, 4 bins)`, the logits t of each side.
         canvas: `(width, height)` of the network's input.
-        strides: canvas pixels per cell of each level.
-        offset: where in its cell a point lies; PicoDet and NanoDet 0.5, NanoDet-Plus 0.
+        strides: canvas pixels per cell of each level, s.
+        offset: position of the point in its cell: 0.5 for PicoDet and NanoDet, 0 for NanoDet-Plus.
+
+    Returns:
+        All boxes with their scores.
 
     >>> decode_distances(torch.ones(1, 1, 2), torch.zeros(1, 1, 12), (8, 8), strides=(8,)).boxes
     tensor([[[-4., -4., 12., 12.]]])
@@ -106,7 +121,8 @@ def decode_distances(
     check_shape(classes, "classes", None, None, None)
     check_shape(distances, "distances", None, classes.shape[1], None)
     bins = distances.shape[-1] // 4
-    check(bins > 0 and distances.shape[-1] == 4 * bins, "distances", "4 · bins channels", tuple(distances.shape))
+    whole = bins > 0 and distances.shape[-1] == 4 * bins
+    check(whole, "distances", "4 · bins channels, the same number of bins for each side", tuple(distances.shape))
     grid = _grid(distances, canvas, strides, offset)
     expected = distances.unflatten(-1, (4, bins)).softmax(-1) @ torch.arange(bins).to(distances)
     point, reach = grid[:, :2] * grid[:, 2:], expected * grid[:, 2:]
@@ -114,12 +130,15 @@ def decode_distances(
 
 
 def decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
-    """DETR (Carion et al. 2020): a softmax over the classes and "no object", which comes last and is background.
+    """Decode DETR (Carion et al. 2020), whose scores are a softmax over the classes and "no object".
 
     Args:
-        logits: `(B, Q, K + 1)`.
+        logits: `(B, Q, K + 1)`; the last one, "no object", is taken as background.
         boxes: `(B, Q, 4)`, centre and size as fractions of the canvas.
         canvas: `(width, height)` of the network's input.
+
+    Returns:
+        All boxes with their scores and the background probability.
 
     >>> decode_detr(torch.zeros(1, 1, 4), torch.tensor([[[0.5, 0.5, 1.0, 0.5]]]), (8, 8)).background
     tensor([[0.2500]])
@@ -130,12 +149,15 @@ def decode_detr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candi
 
 
 def decode_rtdetr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Candidates:
-    """RT-DETR and the other DETRs trained with focal loss: a sigmoid for each class, no "no object".
+    """Decode RT-DETR and other DETRs trained with focal loss: a sigmoid for each class, without "no object".
 
     Args:
         logits: `(B, Q, K)`.
         boxes: `(B, Q, 4)`, centre and size as fractions of the canvas.
         canvas: `(width, height)` of the network's input.
+
+    Returns:
+        All boxes with their scores.
 
     >>> decode_rtdetr(torch.zeros(1, 1, 4), torch.tensor([[[0.5, 0.5, 1.0, 0.5]]]), (8, 8)).boxes
     tensor([[[0., 2., 8., 6.]]])
@@ -145,11 +167,14 @@ def decode_rtdetr(logits: Tensor, boxes: Tensor, canvas: tuple[int, int]) -> Can
 
 
 def decode_rtdetr_rows(rows: Tensor, canvas: tuple[int, int]) -> Candidates:
-    """RT-DETR in one tensor: centre and size as fractions of the canvas, then class scores in [0, 1].
+    """Decode RT-DETR that returns one tensor.
 
     Args:
-        rows: `(B, Q, 4 + K)`.
+        rows: `(B, Q, 4 + K)`: centre and size as fractions of the canvas, then class scores in [0, 1].
         canvas: `(width, height)` of the network's input.
+
+    Returns:
+        All boxes with their scores.
 
     >>> decode_rtdetr_rows(torch.tensor([[[0.5, 0.5, 1.0, 0.5, 0.9]]]), (8, 8)).boxes
     tensor([[[0., 2., 8., 6.]]])
@@ -160,7 +185,7 @@ def decode_rtdetr_rows(rows: Tensor, canvas: tuple[int, int]) -> Candidates:
 
 def _grid(tensor: Tensor, canvas: tuple[int, int], strides: Sequence[int], offset: float) -> Tensor:
     expected = cell_count(canvas, strides)
-    what = f"{expected} rows, the cells of a {canvas[0]} x {canvas[1]} canvas at strides {tuple(strides)}"
+    what = f"{expected} rows, one for each cell of a {canvas[0]} x {canvas[1]} canvas at strides {tuple(strides)}"
     check(tensor.shape[1] == expected, "output of the head", what, tensor.shape[1])
     return grid_points(canvas, strides, offset, tensor)
 

@@ -1,4 +1,4 @@
-"""Which head an ONNX model has, told from its names and shapes where they leave no doubt."""
+"""Recognition of the head of an ONNX model by names and shapes, where only one head fits."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -26,12 +26,12 @@ DETR_LOGITS = ("logits", "pred_logits")
 
 @dataclass(frozen=True)
 class Head:
-    """A family of networks.
+    """The head of a family of networks.
 
     Attributes:
-        decode: from the outputs by name, in the model's order, and the canvas `(width, height)` to candidates.
-        preprocessing: what the family is trained with.
-        background: policy that suits its scores.
+        decode: function from the outputs by name, in the model's order, and the canvas `(width, height)` to all boxes.
+        preprocessing: preprocessing with which the family is trained.
+        background: background policy for its scores.
     """
 
     decode: Callable[[Outputs, Canvas], Candidates]
@@ -41,14 +41,14 @@ class Head:
 
 @dataclass(frozen=True)
 class Signature:
-    """What is known of a model before it is run on an image.
+    """Properties of a model that are known before it runs on an image.
 
     Attributes:
         image: name of the image input.
         outputs: name and shape of each output for a batch of one canvas.
-        canvas: `(width, height)`.
-        producer: what the file says made it.
-        classes: number of classes, None where it is not known.
+        canvas: `(width, height)` of the canvas.
+        producer: name of the exporter, as stored in the file.
+        classes: number of classes; None where it is not known.
     """
 
     image: str
@@ -59,10 +59,17 @@ class Signature:
 
 
 def recognise(signature: Signature) -> str:
-    """Name in `HEADS` of the head that a model has.
+    """Recognise the head of a model.
+
+    Args:
+        signature: properties of the model.
+
+    Returns:
+        The name of the head in `HEADS`.
 
     Raises:
-        InputError: no head or more than one fits (the message lists the choices), or boxes have lost their scores.
+        InputError: no head or several heads fit (the message lists the choices), or the model returns boxes without
+            their full scores.
 
     >>> recognise(Signature("images", (("output0", (1, 84, 8400)),), (640, 640)))
     'yolov8'
@@ -73,10 +80,10 @@ def recognise(signature: Signature) -> str:
     shapes = ", ".join(f"{name} {shape}" for name, shape in signature.outputs)
     width, height = signature.canvas
     known = "" if signature.classes is None else f" with {signature.classes} classes"
-    fits = f"{' and '.join(found)} fit" if found else "no head fits for certain"
+    fits = f"{' and '.join(found)} fit" if found else "no head fits with certainty"
     raise InputError(
         f"outputs {shapes} on a {width} x {height} canvas{known}: {fits}; "
-        f"name it with head=, one of {', '.join(sorted(HEADS))}"
+        f"name the head with head=, one of {', '.join(sorted(HEADS))}"
     )
 
 
@@ -86,7 +93,10 @@ def _fitting(signature: Signature) -> Iterator[str]:
     if "pred_boxes" in shapes and any(name in shapes for name in DETR_LOGITS):
         yield from _detr(shapes[_logits(shapes)][-1], signature.classes)
     elif {"labels", "boxes", "scores"} <= set(shapes):
-        raise InputError(f"outputs {', '.join(names)}: one class for each box; export the model without its top-k")
+        raise InputError(
+            f"outputs {', '.join(names)}: expected all class scores of each box, got one class; export the model "
+            f"without its top-k"
+        )
     elif {"boxes", _classes(shapes)} <= set(shapes):
         yield "candidates"
     elif len(shapes) > 1:
@@ -96,7 +106,7 @@ def _fitting(signature: Signature) -> Iterator[str]:
 
 
 def _detr(channels: int, classes: int | None) -> Iterator[str]:
-    """Softmax heads have one channel more than classes; without a list, COCO's 91 ids or 80 classes tell."""
+    """Heads of DETR; a softmax has one channel more than classes. Unknown classes are COCO's, 91 ids or 80 classes."""
     if channels == (80 if classes is None else classes):
         yield "rtdetr"
     elif channels == (92 if classes is None else classes + 1):
@@ -104,7 +114,7 @@ def _detr(channels: int, classes: int | None) -> Iterator[str]:
 
 
 def _distances(signature: Signature) -> Iterator[str]:
-    """Class and distance maps, a pair for each level."""
+    """Heads with a class map and a distance map for each level."""
     shapes = [shape for _, shape in signature.outputs]
     count = len(shapes) // 2
     rows = [columns * rows for columns, rows in (heads.cells(signature.canvas, s) for s in STRIDES[:count])]
@@ -127,14 +137,17 @@ def _single(signature: Signature, name: str, rows: int, columns: int) -> Iterato
         return channels > others and classes in (None, channels - others)
 
     if columns in (6, 7) and rows not in (three, four, 3 * three, 3 * four) and classes != columns - 4:
-        raise InputError(f"output {name} (1, {rows}, {columns}): boxes without their scores; export without NMS")
+        raise InputError(
+            f"output {name} (1, {rows}, {columns}): expected all class scores of each box, got boxes without them; "
+            f"export the model without NMS"
+        )
     if columns in (three, four) and scores(rows, 4):
         yield "yolov8"
     elif rows in (3 * three, 3 * four) and scores(columns, 5):
         yield "yolov5"
     elif rows == three and scores(columns, 5):
         yield "yolox"
-        if (signature.image, name) != ("images", "output"):  # what YOLOX calls them, undecoded
+        if (signature.image, name) != ("images", "output"):  # names in YOLOX's own exports of raw outputs
             yield "yolov5"
     elif rows == four and classes is None:
         yield from ("nanodet-plus", "yolov5")
@@ -163,7 +176,7 @@ def _candidates(outputs: Outputs, canvas: Canvas) -> Candidates:
 
 
 def _level_maps(outputs: Outputs, canvas: Canvas) -> Candidates:
-    """PicoDet and NanoDet: of the two maps of a level the class map comes first."""
+    """Decode PicoDet and NanoDet, where the class map of a level comes before its distance map."""
     strides = STRIDES[: len(outputs) // 2]
     maps = list(outputs.values())
     levels = []
@@ -178,7 +191,7 @@ def _level_maps(outputs: Outputs, canvas: Canvas) -> Candidates:
 
 
 def _nanodet_plus(outputs: Outputs, canvas: Canvas) -> Candidates:
-    """Class scores, then distances in 8 bins a side."""
+    """Decode NanoDet-Plus: class scores, then distances with 8 bins for each side."""
     rows = _first(outputs)
     return heads.decode_distances(rows[..., :-32], rows[..., -32:], canvas, strides=STRIDES, offset=0.0)
 
@@ -207,4 +220,4 @@ HEADS: dict[str, Head] = {
     ),
     "rtdetr": Head(_rtdetr, Preprocessing(stretch=True)),
 }
-"""Every head that can be named."""
+"""All known heads by name."""

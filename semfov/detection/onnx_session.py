@@ -13,7 +13,7 @@ from semfov.errors import DataError, InputError, check
 
 FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
 
-# Further inputs that exported detectors have, made from the canvas: sizes and scales to map boxes with.
+# Further inputs of some exported detectors, made from the canvas: sizes and scales for mapping boxes.
 EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
     "orig_target_sizes": lambda canvas: _repeat(canvas, [canvas.shape[-1], canvas.shape[-2]]),
     "im_shape": lambda canvas: _repeat(canvas, [canvas.shape[-2], canvas.shape[-1]]).to(canvas.dtype),
@@ -22,27 +22,27 @@ EXTRA_INPUTS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 class OnnxSession:
-    """One inference session on one file.
+    """An inference session of one ONNX file.
 
-    Spinning is off: threads of a pool that spin slow the next torch operation by an order of magnitude.
+    Spinning is off, because idle threads that spin slow down the next torch operation by an order of magnitude.
 
     Args:
         path: the model.
-        threads: threads of an operation; None follows `torch.get_num_threads()`.
+        threads: number of threads of an operation; None for `torch.get_num_threads()`.
         device: `"cpu"`, or `"cuda"` where onnxruntime has the CUDA provider.
         spinning: let idle threads spin; for measurements only.
-        checked: whether the file is looked at before it is opened (`semfov.detection.onnx_file`).
+        checked: whether the file is checked before it is opened (`semfov.detection.onnx_file`).
 
     Attributes:
-        image: name of the input that takes the image.
-        shape: its shape, None where it is dynamic.
-        outputs: name and shape of every output, None where a size is dynamic.
-        metadata: the model's own key-value pairs.
-        producer: what the file says made it.
+        image: name of the image input.
+        shape: shape of the image input; None for dynamic sizes.
+        outputs: name and shape of every output; None for dynamic sizes.
+        metadata: key-value pairs in the model's metadata.
+        producer: name of the exporter, as stored in the file.
 
     Raises:
-        DataError: no such file, or no model that onnxruntime can run, or it fails on an image.
-        InputError: the model has inputs that nothing is known of, or the device is not there.
+        DataError: the file does not exist, onnxruntime cannot load it, or the model fails on an image.
+        InputError: the model has unknown inputs, or the device is not available.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class OnnxSession:
             check_file(self.path)
         try:
             providers = _providers(self.device)
-            # Its fallback prints, and tries the same once more.
+            # onnxruntime's fallback would print messages and try the same again.
             self._session = ort.InferenceSession(fspath(path), options, providers=providers, disable_fallback=1)
         except InputError:
             raise
@@ -79,23 +79,23 @@ class OnnxSession:
         try:
             self._describe()
         except UnicodeDecodeError as error:
-            raise DataError(f"cannot load the ONNX model {str(path)!r}: its names are no text ({error})") from None
+            raise DataError(f"cannot load the ONNX model {str(path)!r}: its names are not text ({error})") from None
         check((self.shape[0] or 1) <= MOST_BATCH, "batch", f"at most {MOST_BATCH} images at once", self.shape[0])
 
     def _describe(self) -> None:
-        """Read what the model says of itself."""
+        """Read the model's description of itself."""
         meta = self._session.get_modelmeta()
         self.metadata: dict[str, str] = dict(meta.custom_metadata_map)
         self.producer: str = meta.producer_name
         for output in self._session.get_outputs():
             if output.type not in FLOATS:
                 what = f"{self.path.name}: output {output.name!r}"
-                raise InputError(f"{what}: expected numbers of floating point, got {output.type}")
+                raise InputError(f"{what}: expected floating-point numbers, got {output.type}")
         self.outputs = tuple((o.name, _sizes(o.shape)) for o in self._session.get_outputs())
         self.image, self.shape, self._dtype, self._extra = self._inputs()
 
     def _inputs(self) -> tuple[str, tuple[int | None, ...], torch.dtype, list[str]]:
-        """Name, shape and dtype of the image input, and the names of the others."""
+        """Name, shape and dtype of the image input, and the names of the other inputs."""
         inputs = self._session.get_inputs()
         images = [i for i in inputs if len(i.shape) == 4 and i.type in FLOATS]
         found = ", ".join(f"{i.name} {i.shape} {i.type}" for i in inputs)
@@ -103,13 +103,19 @@ class OnnxSession:
             raise InputError(f"{self.path.name}: expected one floating-point input (B, 3, H, W), got {found}")
         extra = [i.name for i in inputs if i is not images[0]]
         if not set(extra) <= set(EXTRA_INPUTS):
-            raise InputError(f"{self.path.name}: expected inputs image, {', '.join(EXTRA_INPUTS)}, got {found}")
+            raise InputError(
+                f"{self.path.name}: expected no inputs but an image and {', '.join(EXTRA_INPUTS)}, got {found}"
+            )
         return images[0].name, _sizes(images[0].shape), FLOATS[images[0].type], extra
 
     def __call__(self, image: Tensor) -> dict[str, Tensor]:
-        """Outputs by name, on the device and in the dtype of `image` `(B, 3, H, W)`; no gradients.
+        """Run the model on images, without gradients; a model with a fixed batch size runs several times if needed.
 
-        A model with a fixed batch size is run as often as needed.
+        Args:
+            image: `(B, 3, H, W)`.
+
+        Returns:
+            Outputs by name, with the dtype and device of `image`.
         """
         batch, fixed = image.shape[0], self.shape[0]
         check(batch > 0, "image", "at least one image", batch)
@@ -128,7 +134,7 @@ class OnnxSession:
             arrays = self._session.run(names, feed)
         except Exception as error:  # as above
             reason = " ".join(str(error).split())[:300]
-            raise DataError(f"{self.path.name} fails on images of shape {tuple(image.shape)}: {reason}") from error
+            raise DataError(f"{self.path.name}: fails on images of shape {tuple(image.shape)}: {reason}") from error
         for name, array in zip(names, arrays, strict=True):
             if array.ndim < 1 or array.shape[0] != len(image):
                 raise InputError(
@@ -146,7 +152,7 @@ def _reopen(path: Path, threads: int, device: torch.device, spinning: bool) -> O
 
 
 def _providers(device: torch.device) -> list[Any]:
-    """Execution providers for a device, the CPU's behind it for operations that it has not."""
+    """Execution providers for a device, followed by the CPU's for operations that it does not support."""
     import onnxruntime as ort
 
     if device.type == "cpu":
@@ -154,7 +160,7 @@ def _providers(device: torch.device) -> list[Any]:
     provider = f"{device.type.upper()}ExecutionProvider"
     if provider not in ort.get_available_providers():
         have = ", ".join(ort.get_available_providers())
-        raise InputError(f"device: expected one that onnxruntime can use, got {device} (its providers: {have})")
+        raise InputError(f"device: expected a device that onnxruntime can use, got {device} (its providers: {have})")
     return [(provider, {"device_id": device.index or 0}), "CPUExecutionProvider"]
 
 

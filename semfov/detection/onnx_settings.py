@@ -1,4 +1,4 @@
-"""Settings that travel with an ONNX model: inside it, or in a JSON file beside it."""
+"""Settings of an ONNX model, from its metadata or from a JSON file in the same folder."""
 
 import ast
 import json
@@ -12,7 +12,7 @@ from semfov.io.files import check_regular
 from semfov.io.schema import is_number, is_plain, shown
 
 METADATA_KEY = "semfov"
-"""Key of the model's metadata under which an export by semfov keeps its settings, as JSON."""
+"""Key of the settings, as JSON, in the metadata of models that semfov exports."""
 
 KEYS: dict[str, tuple[type, ...]] = {
     "name": (str,),
@@ -26,16 +26,24 @@ KEYS: dict[str, tuple[type, ...]] = {
     "licence": (str,),
     "source": (str,),
 }
-"""What a settings file may hold, with the types of the values; `licence` and `source` are for people."""
+"""Keys of a settings file, with the types of their values; `licence` and `source` are for people."""
 
 
 def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Settings of the model at `path`: `model.json` beside `model.onnx` over the model's own metadata.
+    """Read the settings of a model.
 
-    Metadata of exports by semfov and by Ultralytics (class names, input size) is understood.
+    Settings in `model.json` in the folder of `model.onnx` override settings in the model's metadata. The metadata of
+    models that semfov or Ultralytics (class names, input size) have exported are understood.
+
+    Args:
+        path: path of the model.
+        metadata: metadata of the model.
+
+    Returns:
+        The settings by name.
 
     Raises:
-        DataError: the file is no JSON object or has a key that is not one of `KEYS`.
+        DataError: the file is not a JSON object, or has a key that is not one of `KEYS`.
     """
     beside = path.with_suffix(".json")
     inside = _parse(metadata[METADATA_KEY], f"metadata of {path.name}") if METADATA_KEY in metadata else {}
@@ -47,7 +55,7 @@ def read_settings(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 def _read(path: Path) -> str:
     check_regular(path)
     if path.stat().st_size > MOST_METADATA:
-        raise DataError(f"{path}: expected at most {MOST_METADATA:,} bytes")
+        raise DataError(f"{path}: expected at most {MOST_METADATA:,} bytes, got {path.stat().st_size:,}")
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -60,12 +68,12 @@ def _parse(text: str, where: str) -> dict[str, Any]:
     except json.JSONDecodeError as error:
         raise DataError(f"{where}: expected JSON, got an error in line {error.lineno}: {error.msg}") from error
     except (ValueError, RecursionError):  # integers too long, lists too deep
-        raise DataError(f"{where}: expected JSON of ordinary numbers and depth") from None
+        raise DataError(f"{where}: expected JSON, got numbers that are too long or lists that are too deep") from None
     if not isinstance(settings, dict):
         raise DataError(f"{where}: expected an object, got {shown(settings)}")
     unknown = sorted(set(settings) - set(KEYS))
     if unknown:
-        raise DataError(f"{where}: unknown {', '.join(unknown)[:80]!a}; known: {', '.join(KEYS)}")
+        raise DataError(f"{where}: unknown key {', '.join(unknown)[:80]!a}; known: {', '.join(KEYS)}")
     for key, value in settings.items():
         if not isinstance(value, KEYS[key]):
             kinds = " or ".join(kind.__name__ for kind in KEYS[key])
@@ -80,7 +88,7 @@ def _parse(text: str, where: str) -> dict[str, Any]:
 
 
 def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Class names `{0: 'person', ...}` and input size `[height, width]` as Ultralytics writes them."""
+    """Class names `{0: 'person', ...}` and input size `[height, width]` from Ultralytics' metadata."""
     found: dict[str, Any] = {}
     try:
         if "names" in metadata:
@@ -92,5 +100,5 @@ def _ultralytics(metadata: Mapping[str, str]) -> dict[str, Any]:
             height, width = ast.literal_eval(metadata["imgsz"])
             found["input_size"] = [int(width), int(height)]
     except (ValueError, SyntaxError, TypeError, KeyError, IndexError, RecursionError, MemoryError, OverflowError):
-        return {}  # somebody else's keys of the same name
+        return {}  # keys of the same name from another exporter
     return found

@@ -1,4 +1,4 @@
-"""A Darknet network in onnxruntime: exported once, kept in the cache, and run where gradients are not asked for."""
+"""A Darknet network in onnxruntime: exported once, kept in the cache, and run where no gradients are needed."""
 
 import hashlib
 import json
@@ -27,13 +27,13 @@ RUNTIMES: tuple[Runtime, ...] = ("auto", "torch", "onnxruntime")
 
 
 class OnnxTwin:
-    """What a Darknet network computes, boxes decoded, in onnxruntime on a CPU.
+    """A Darknet network with decoded boxes, computed by onnxruntime on a CPU.
 
-    The ONNX model is made when it is first needed (`exported`). A session has as many threads as torch has at the time,
-    and is opened anew in another process: the threads of a pool do not survive a fork.
+    The ONNX model is made when it is first needed (`exported`). A session has as many threads as torch has at that
+    time. Every process opens its own session, because the threads of a pool do not survive a fork.
 
     Args:
-        digest: `network_digest` of the network with the weights that are to be run.
+        digest: `network_digest` of the network with its weights.
     """
 
     def __init__(self, digest: str) -> None:
@@ -46,7 +46,7 @@ class OnnxTwin:
         return OnnxTwin, (self.digest,)
 
     def obstacle(self, network: Darknet) -> str | None:
-        """Why a network cannot run here as it is now, in words; None if it can."""
+        """The reason, in words, why onnxruntime cannot run the network as it is now; None if it can."""
         parameters = list(network.parameters())
         dtype, devices = parameters[0].dtype, {parameter.device.type for parameter in parameters}
         if devices != {"cpu"}:
@@ -61,7 +61,7 @@ class OnnxTwin:
         return None if self._same else "weights that were changed after loading"
 
     def obstacle_here(self, network: Darknet, canvas: Tensor) -> str | None:
-        """Why a canvas cannot be looked at here, in words; None if it can."""
+        """The reason, in words, why onnxruntime cannot run the network on a canvas; None if it can."""
         if not values_known(canvas, *network.parameters()) or torch.jit.is_tracing():  # type: ignore[attr-defined]
             return "graphs that are traced, and function transforms"
         tensors = [canvas, *network.parameters()]
@@ -75,7 +75,7 @@ class OnnxTwin:
         return self.obstacle(network)
 
     def __call__(self, network: Darknet, canvas: Tensor) -> Candidates:
-        """Every box of every head on a canvas `(B, 3, H, W)`, as float32, without gradients."""
+        """Compute all boxes of all heads on a canvas `(B, 3, H, W)`, in float32, without gradients."""
         network.check_image(canvas)
         found = self._session(network)(canvas.float())
         return Candidates(found["boxes"], found["classes"], found["objectness"])
@@ -89,14 +89,14 @@ class OnnxTwin:
     def _open(self, network: Darknet) -> OnnxSession:
         try:
             path = exported(network, cache_folder() / "exported")
-        except DataError:  # nothing can be written there
+        except DataError:  # the cache cannot be written to
             with tempfile.TemporaryDirectory() as folder:
                 return OnnxSession(exported(network, Path(folder)), checked=False)
         return OnnxSession(path, checked=False)
 
 
 def network_digest(network: Darknet) -> str:
-    """sha256 of a network's cfg and of its parameters as float32."""
+    """Compute the sha256 of a network's cfg and of its parameters as float32."""
     digest = hashlib.sha256(network.cfg_digest().encode())
     for parameter in network.parameters():
         digest.update(parameter.detach().float().cpu().contiguous().numpy().data)
@@ -104,10 +104,17 @@ def network_digest(network: Darknet) -> str:
 
 
 def exported(network: Darknet, folder: Path) -> Path:
-    """Path of the ONNX model of a network in `folder`, made if it is not there yet.
+    """Find the ONNX model of a network in a folder, and export it if it is missing.
 
-    A file is named after what it was made from and after its own sha256, which is checked: a damaged one is made again.
-    It comes into the folder whole, so that any number of processes may do this at once.
+    The name of the file contains a digest of the network and exporter, and the file's own sha256. A damaged file does
+    not have this sha256 and is exported again. Files are written atomically, so several processes may do this at once.
+
+    Args:
+        network: the network.
+        folder: the folder.
+
+    Returns:
+        The path of the model.
 
     Raises:
         DataError: the model cannot be written.
@@ -125,7 +132,7 @@ def exported(network: Darknet, folder: Path) -> Path:
 
 
 def _whole(paths: Iterable[Path]) -> Path | None:
-    """The first file that can be read and has the sha256 in its name."""
+    """The first file that can be read and whose sha256 is the one in its name."""
     for path in sorted(paths):
         with suppress(OSError):
             if sha256(path) == path.name.split(".")[1]:

@@ -1,4 +1,4 @@
-"""Letterboxing: fitting an image into a detector's input, and the way back."""
+"""Letterboxing: fitting an image into a detector's input, and mapping boxes back."""
 
 from dataclasses import dataclass
 
@@ -11,9 +11,9 @@ from semfov.errors import check, check_shape
 
 @dataclass(frozen=True)
 class Placement:
-    """Where an image lies in a detector's input (its canvas).
+    """The placement of an image in a detector's input (its canvas).
 
-    Points are pixel centres at integers, so the corner of the image is at -0.5:
+    Points have pixel centres at integers, so the corner of the image is at -0.5:
 
         canvas + 0.5 = (image + 0.5) · scale + offset
 
@@ -23,6 +23,10 @@ class Placement:
         size: `(width, height)` of the image in pixels.
         scale: canvas pixels per image pixel, `(x, y)`; equal in both axes unless the image is stretched.
         offset: left and top padding on the canvas, in canvas pixels.
+
+    >>> placement = Placement((640, 480), (0.5, 0.5), (0, 40))
+    >>> placement.boxes_to_image(torch.tensor([10.0, 50.0, 30.0, 300.0]))
+    tensor([ 20.,  20.,  60., 480.])
     """
 
     size: tuple[int, int]
@@ -30,13 +34,27 @@ class Placement:
     offset: tuple[int, int]
 
     def points_to_canvas(self, points: Tensor) -> Tensor:
-        """Image points `(..., 2)` -> canvas points."""
+        """Map points from the image to the canvas.
+
+        Args:
+            points: `(..., 2)` in image pixels, pixel centres at integers.
+
+        Returns:
+            `(..., 2)` in canvas pixels.
+        """
         check_shape(points, "points", 2)
         scale, offset = points.new_tensor(self.scale), points.new_tensor(self.offset)
         return (points + 0.5) * scale + offset - 0.5
 
     def boxes_to_image(self, boxes: Tensor) -> Tensor:
-        """Canvas boxes `(..., 4)` -> image boxes, cut to the image."""
+        """Map boxes from the canvas to the image, and cut them to the image.
+
+        Args:
+            boxes: `(..., 4)`, `(x1, y1, x2, y2)` in canvas pixels.
+
+        Returns:
+            `(..., 4)` in image pixels.
+        """
         check_shape(boxes, "boxes", 4)
         scale, offset = boxes.new_tensor(self.scale * 2), boxes.new_tensor(self.offset * 2)
         image = (boxes - offset) / scale
@@ -53,16 +71,16 @@ def letterbox(
     stretch: bool = False,
     corner: bool = False,
 ) -> tuple[Tensor, Placement]:
-    """Resize `image` to fit into `size` with its proportions kept, and pad the rest with `fill`.
+    """Resize images to fit into a canvas with their proportions, and pad the rest.
 
     Args:
         image: `(B, C, H, W)`.
         size: `(width, height)` of the canvas.
         fill: value of the padding.
-        stride: if given, pad only to the next multiple of `stride` instead of the whole canvas
-            (fewer pixels to compute, and the same content).
-        stretch: give up the proportions and fill the canvas (then nothing is padded).
-        corner: pad only on the right and below instead of equally on all sides.
+        stride: pad only to the next multiple of this number of pixels, which gives the same content with fewer pixels;
+            None pads to the whole canvas.
+        stretch: fill the canvas without keeping the proportions; then nothing is padded.
+        corner: pad only on the right and at the bottom instead of equally on all sides.
 
     Returns:
         The canvas `(B, C, height, width)` and the `Placement` that maps points and boxes.
@@ -89,10 +107,17 @@ def letterbox(
 
 
 def resize(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Bilinear resize of `(B, C, H, W)` to `(width, height)`, antialiased where it shrinks to less than half.
+    """Resize images bilinearly, antialiased where they shrink to less than half their size.
 
-    Up to there plain bilinear sees every pixel, and it is what detectors are trained on: antialiasing COCO's
-    photographs to 416 pixels costs YOLOv3-tiny a point of AP50.
+    Down to half the size, plain bilinear interpolation reads every pixel, and detectors are trained with it:
+    antialiasing COCO's photographs to 416 pixels costs YOLOv3-tiny a point of AP50.
+
+    Args:
+        image: `(B, C, H, W)`.
+        size: `(width, height)` of the result.
+
+    Returns:
+        `(B, C, height, width)`.
     """
     width, height = size
     if tuple(image.shape[-2:]) == (height, width):

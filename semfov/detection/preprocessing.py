@@ -1,4 +1,4 @@
-"""What a network wants its input to look like, as data that can stand beside the model."""
+"""The preprocessing that a network expects, as settings that can be stored with the model."""
 
 import math
 from collections.abc import Mapping
@@ -14,16 +14,16 @@ ChannelOrder = Literal["rgb", "bgr"]
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """From a canvas, RGB in [0, 1], to the input of a network: `(canvas · scale - mean) / std`.
+    """Conversion of a canvas, RGB in [0, 1], to the input of a network: `(canvas · scale - mean) / std`.
 
     Attributes:
         channels: order of the network's channels.
         scale: value of white before mean and std; 255 for networks that take bytes.
-        mean: subtracted from each channel, in the network's channel order and after `scale`.
-        std: divides each channel.
-        stretch: the image fills the canvas; False keeps its proportions and pads (letterbox).
-        corner: the letterboxed image lies in the upper left corner of the canvas, not in its middle.
-        fill: padding value of the canvas, in [0, 1].
+        mean: mean of each channel, in the network's channel order, subtracted after `scale`.
+        std: standard deviation of each channel, in the network's channel order, by which it is divided.
+        stretch: whether the image is stretched to the canvas; False keeps its proportions and pads (letterbox).
+        corner: whether the letterboxed image is in the upper left corner of the canvas instead of its middle.
+        fill: value of the canvas's padding, in [0, 1].
 
     >>> import torch
     >>> Preprocessing(channels="bgr", scale=255.0)(torch.ones(1, 3, 1, 1)).flatten()
@@ -55,7 +55,7 @@ class Preprocessing:
         check(0 <= self.fill <= 1, "preprocessing.fill", "a number in [0, 1]", self.fill)
 
     def __call__(self, canvas: Tensor) -> Tensor:
-        """Canvas `(B, 3, H, W)` -> input of the network, a new tensor of the same shape."""
+        """Convert a canvas `(B, 3, H, W)` to the input of the network, a new tensor of the same shape."""
         check_shape(canvas, "canvas", None, 3, None, None)
         image = canvas.flip(1) if self.channels == "bgr" else canvas
         factor = canvas.new_tensor([self.scale / std for std in self.std]).view(3, 1, 1)
@@ -63,13 +63,13 @@ class Preprocessing:
         return image * factor - shift
 
     def merged(self, settings: Mapping[str, Any]) -> Self:
-        """The same with some settings replaced; unknown names are refused."""
+        """Return a copy with some settings replaced; unknown names are refused."""
         for name in settings:
             lookup(name, [field.name for field in fields(self)], "preprocessing setting")
         return replace(self, **settings)
 
     def settings(self) -> dict[str, Any]:
-        """All settings, as JSON takes them."""
+        """List all settings as JSON values."""
         return {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self).items()}
 
 

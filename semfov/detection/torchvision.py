@@ -26,22 +26,24 @@ PREFIX = "torchvision:"
 
 
 class TorchvisionDetector(Detector):
-    """Faster R-CNN, RetinaNet, FCOS, SSD or SSDlite of torchvision as a `Detector`; differentiable.
+    """A torchvision Faster R-CNN, RetinaNet, FCOS, SSD or SSDlite as a `Detector`; it is differentiable.
 
-    The canvas is the image as the model's own transform resizes it. The model's padding and normalisation, and its
-    proposals' own suppression, belong to the network; its thresholds and its final suppression are left out.
+    The canvas is the image, resized by the model's own transform. The model's padding, its normalisation and the
+    non-maximum suppression of its proposals are part of the network. Its thresholds and its final suppression are left
+    out.
 
-    Faster R-CNN gives every class of a proposal a box of its own: the box of the best class is taken.
+    Faster R-CNN predicts a separate box for every class of a proposal; the box of the best class is used.
 
     Args:
         model: the model.
-        classes: name of each of its outputs but the first, which is background; `"N/A"` for outputs that stand for
-            no class.
-        name: what tables and fitted models call it.
-        first: outputs before the first class; 0 for models with sigmoids that were trained without background.
-        background: background policy; None means the model's own background where it has one (softmax), else
+        classes: name of each of its outputs after the first, which is background; `"N/A"` for outputs that do not
+            stand for a class.
+        name: name of the model in tables and in fitted models.
+        first: number of outputs before the first class; 0 for models with sigmoids that were trained without
+            background.
+        background: background policy; None for the model's own background where it has one (softmax), else
             `residual`.
-        selection: which candidates are kept.
+        selection: settings of the selection of boxes.
         digest: sha256 of the weights.
     """
 
@@ -60,7 +62,7 @@ class TorchvisionDetector(Detector):
         if head is None:
             raise InputError(f"model: expected Faster R-CNN, RetinaNet, FCOS or SSD, got {type(model).__name__}")
         outputs, softmax = head
-        check(first == 1 or (first == 0 and not softmax), "first", "1, or 0 for heads with sigmoids", first)
+        check(first == 1 or (first == 0 and not softmax), "first", "1, or 0 for models with sigmoids", first)
         names, places = named(classes)
         transform: Any = model.transform
         fixed = transform.fixed_size
@@ -80,7 +82,7 @@ class TorchvisionDetector(Detector):
         self._places, self._count = places, len(classes)
 
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
-        """Resize images `(B, 3, H, W)`, RGB in [0, 1], as the model's transform does; nothing is padded."""
+        """Resize images `(B, 3, H, W)`, RGB in [0, 1], as the model's transform does, without padding."""
         check_images(images)
         height, width = images.shape[-2:]
         columns, rows = self._canvas_size(width, height)
@@ -96,9 +98,17 @@ class TorchvisionDetector(Detector):
         return max(1, math.floor(width * scale)), max(1, math.floor(height * scale))
 
     def outputs(self, canvas: Tensor) -> Raw:
-        """What the model filters: for each canvas boxes `(N, 4)` or `(N, C, 4)`, and scores `(N, C)`.
+        """Compute the boxes and scores of the model before it filters them.
 
-        C counts all outputs of the model, background first.
+        Args:
+            canvas: `(B, 3, H, W)`, RGB in [0, 1].
+
+        Returns:
+            For each canvas, boxes `(N, 4)` or `(N, C, 4)`, and scores `(N, C)`. C is the number of outputs of the
+            model, background first.
+
+        Raises:
+            InputError: the canvas does not have floating-point numbers.
         """
         from torchvision.models.detection.image_list import ImageList
 
@@ -112,7 +122,7 @@ class TorchvisionDetector(Detector):
         return self._outputs(self.model, ImageList(batch, sizes), self.first)
 
     def propose(self, canvas: Tensor) -> Candidates:
-        """Every box of the model on a canvas `(B, 3, H, W)`, RGB in [0, 1]; short rows are filled with empty boxes."""
+        """Compute all boxes on a canvas `(B, 3, H, W)`, RGB in [0, 1], padded with empty boxes to one number."""
         raw = self.outputs(canvas)
         longest = max((len(scores) for _, scores in raw), default=0)
         images = [self._candidates(boxes, scores) for boxes, scores in raw]
@@ -127,7 +137,7 @@ class TorchvisionDetector(Detector):
         return Candidates(boxes, classes, background=background)
 
     def _candidates(self, boxes: Tensor, scores: Tensor) -> Candidates:
-        """Real classes of one image, and one box for each row."""
+        """The classes of one image without placeholders, with one box for each row."""
         kept = keep_classes(Candidates(boxes, scores[:, self.first :]), self._places, self._count)
         if boxes.ndim == 2:
             return kept
@@ -137,7 +147,7 @@ class TorchvisionDetector(Detector):
         return Candidates(own, kept.classes)
 
     def settings(self) -> dict[str, object]:
-        """What the detections depend on."""
+        """List the settings that the detections depend on."""
         transform: Any = self.model.transform
         sizes = {"min_size": list(transform.min_size), "max_size": transform.max_size}
         return super().settings() | ({} if self.stretch else sizes)
@@ -157,21 +167,29 @@ def load_torchvision(
     device: torch.device | str = "cpu",
     **model: Any,
 ) -> TorchvisionDetector:
-    """A detection model of torchvision by its name, `"torchvision:retinanet_resnet50_fpn"` or without the prefix.
+    """Load a torchvision detection model by its name.
 
     Args:
-        name: one of `torchvision.models.list_models(module=torchvision.models.detection)`.
+        name: name of the model, such as `"torchvision:retinanet_resnet50_fpn"`, with or without the prefix; one of
+            `torchvision.models.list_models(module=torchvision.models.detection)`.
         weights: a name or member of the model's weights enum; the path of a state dict (`.pth`, `.safetensors`); or
             None for random weights. Files are never unpickled (`weights_only=True`).
-        classes: names of the outputs after the first, for a state dict of your own or random weights.
-        first: see `TorchvisionDetector`, as for `background`.
-        threshold: see `Selection`, as for `iou`, `limit` and `per_class`.
-        device: where the model lives.
+        classes: names of the outputs after the first, for your own state dict or random weights.
+        first: number of outputs before the first class, 1 or 0 (`TorchvisionDetector`).
+        background: background policy of the scores (`semfov.detection.score_vectors`).
+        threshold: smallest confidence of a box (`Selection`).
+        iou: intersection over union above which the less confident of two boxes is suppressed (`Selection`).
+        limit: largest number of boxes of an image (`Selection`).
+        per_class: suppress only boxes of the same class (`Selection`).
+        device: device of the model.
         **model: options of torchvision's builder, such as `min_size` and `max_size`.
 
+    Returns:
+        The detector, in `eval` mode.
+
     Raises:
-        InputError: no such model, weights or option, or `classes` is missing.
-        DataError: the weights are damaged, do not fit the model, or cannot be had.
+        InputError: the model, its weights or an option is unknown, or `classes` is missing.
+        DataError: the weights are damaged, do not fit the model, or cannot be downloaded.
     """
     from torchvision import models
 
@@ -180,7 +198,7 @@ def load_torchvision(
     enum = _member(models.get_model_weights(name), weights)
     if enum is not None:
         if classes is not None:
-            raise InputError("classes: expected None, as torchvision's weights have classes of their own")
+            raise InputError("classes: expected None, because torchvision's weights have their own classes, got names")
         classes = enum.meta["categories"][1:]
         digest = _download(enum)
     elif classes is None:
@@ -209,7 +227,7 @@ def load_torchvision(
 
 
 def _member(enum: Any, weights: Any) -> Any:
-    """The member of a weights enum that is meant, or None for a file and for random weights."""
+    """The member of a weights enum, or None for a file and for random weights."""
     if weights is None or isinstance(weights, enum):
         return weights
     text = fspath(weights).removeprefix(f"{enum.__name__}.")
@@ -219,7 +237,7 @@ def _member(enum: Any, weights: Any) -> Any:
 
 
 def _options(builder: Callable[..., nn.Module], kind: type[nn.Module]) -> list[str]:
-    """Options that a builder or its model's constructors know; all of them would swallow any other in silence."""
+    """Options of a builder and of its model's constructors, which would silently accept any other option."""
     callables: list[Any] = [builder, *(each for each in kind.__mro__ if issubclass(each, nn.Module))]
     return sorted({name for call in callables for name in inspect.signature(call).parameters})
 
@@ -227,34 +245,46 @@ def _options(builder: Callable[..., nn.Module], kind: type[nn.Module]) -> list[s
 def _file(weights: str | PathLike[str]) -> Path:
     path = Path(weights)
     if not path.is_file():
-        raise DataError(f"no weights file {fspath(weights)!r}")
+        raise DataError(f"weights {fspath(weights)!r}: no such file; check the path")
     return path
 
 
 def _download(enum: Any) -> str:
-    """Put the published weights into torch's cache and return their sha256.
+    """Download the published weights into torch's cache, and compute their sha256.
 
-    torchvision names the file by the start of its hash, and would unpickle it. Reading it once with nothing but
-    tensors allowed shows that there is nothing else in it.
+    torchvision would unpickle the file. Reading it once with only tensors allowed shows that it holds nothing else. The
+    name of the file contains the start of its sha256, which is checked.
+
+    Args:
+        enum: member of a weights enum.
+
+    Returns:
+        64 hexadecimal digits.
+
+    Raises:
+        DataError: the weights cannot be downloaded, are damaged, or hold more than tensors.
     """
     try:
         enum.get_state_dict(progress=False, check_hash=True, weights_only=True)
     except UnpicklingError as error:
-        raise DataError(f"weights {enum.url}: expected nothing but tensors: {error}") from error
+        raise DataError(f"weights {enum.url}: expected only tensors, got other objects ({error})") from error
     except (OSError, RuntimeError) as error:
         raise DataError(
-            f"cannot fetch the weights {enum.url} ({error}): give the path of their state dict as weights="
+            f"cannot fetch the weights {enum.url} ({error}); give the path of their state dict as weights="
         ) from error
     path = Path(torch.hub.get_dir()) / "checkpoints" / Path(enum.url).name
     digest = sha256(path)
     start = re.search(r"-([0-9a-f]{8,})\.", path.name)
     if start is not None and not digest.startswith(start[1]):
-        raise DataError(f"{path} is damaged (its sha256 is {digest}): delete it, and it will be fetched again")
+        raise DataError(
+            f"weights {path}: damaged, expected a sha256 that begins with {start[1]}, got {digest}; delete the file to "
+            f"fetch it again"
+        )
     return digest
 
 
 def _load_state(network: nn.Module, path: Path) -> None:
-    """Fill a model from a state dict, alone or under the key `model` as torchvision's training script leaves it."""
+    """Load a state dict into a model; it may be under the key `model`, as torchvision's training script writes it."""
     try:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
@@ -264,4 +294,4 @@ def _load_state(network: nn.Module, path: Path) -> None:
             state = torch.load(path, map_location="cpu", weights_only=True)
         network.load_state_dict(state.get("model", state))
     except Exception as error:  # torch, pickle, zip and safetensors each raise their own
-        raise DataError(f"weights {str(path)!r} do not fit the model, or are no state dict: {error}") from error
+        raise DataError(f"weights {str(path)!r}: do not fit the model, or are not a state dict ({error})") from error

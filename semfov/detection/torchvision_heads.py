@@ -1,4 +1,4 @@
-"""Every box of torchvision's detection models with all its scores, before the models filter them."""
+"""All boxes of torchvision's detection models with all their scores, before the models filter them."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 Raw = list[tuple[Tensor, Tensor]]
-"""For each image boxes `(N, 4)`, or `(N, C, 4)` where each class has its own, and scores `(N, C)`."""
+"""For each image, boxes `(N, 4)`, or `(N, C, 4)` where each class has its own box, and scores `(N, C)`."""
 
 
 def roi_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
@@ -18,7 +18,7 @@ def roi_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
     regions = heads.box_head(heads.box_roi_pool(features, proposals, images.image_sizes))
     logits, regression = heads.box_predictor(regions)
     counts = [len(each) for each in proposals]
-    # Without a proposal the coder leaves the boxes flat.
+    # Without proposals the box coder does not add the class dimension.
     boxes = heads.box_coder.decode(regression, proposals).reshape(len(logits), logits.shape[-1], 4).split(counts)
     scores = logits.softmax(-1).split(counts)
     return [(_clip(b, size), s) for b, s, size in zip(boxes, scores, images.image_sizes, strict=True)]
@@ -33,14 +33,14 @@ def ssd_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
 
 
 def retinanet_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
-    """RetinaNet (Lin et al. 2017): of every level the best anchors, with a sigmoid for each class."""
+    """RetinaNet (Lin et al. 2017): the best anchors of every level, with a sigmoid for each class."""
     outputs, anchors, pixels = _dense(model, images)
     scores = outputs["cls_logits"].sigmoid()
     return _best_of_levels(model, images, outputs, anchors, pixels, scores, backgrounds, model.box_coder.decode_single)
 
 
 def fcos_outputs(model: Any, images: Any, backgrounds: int) -> Raw:
-    """FCOS (Tian et al. 2019): of every level the best points; scores are `√(σ(class) σ(centreness))`."""
+    """FCOS (Tian et al. 2019): the best points of every level, with the scores `√(σ(class) σ(centreness))`."""
     outputs, anchors, pixels = _dense(model, images)
     scores = (outputs["cls_logits"].sigmoid() * outputs["bbox_ctrness"].sigmoid()).sqrt()
     return _best_of_levels(model, images, outputs, anchors, pixels, scores, backgrounds, model.box_coder.decode)
@@ -52,7 +52,7 @@ def _features(model: Any, images: Any) -> dict[str, Tensor]:
 
 
 def _dense(model: Any, images: Any) -> tuple[dict[str, Tensor], list[Tensor], list[int]]:
-    """Outputs of a head on all levels, `(B, N, ...)`, the anchors of each image, and the pixels of each level."""
+    """Outputs of a head on all levels, `(B, N, ...)`, the anchors of each image, and the number of pixels by level."""
     features = list(_features(model, images).values())
     outputs = model.head(features)
     anchors = model.anchor_generator(images, features)
@@ -69,9 +69,12 @@ def _best_of_levels(
     backgrounds: int,
     decode: Callable[[Tensor, Tensor], Tensor],
 ) -> Raw:
-    """The `topk_candidates` anchors of each level with the best class, for each image.
+    """The `topk_candidates` anchors of each level with the highest class score, for each image.
 
-    The model itself takes as many pairs of anchor and class, so its pairs are among these anchors.
+    The model itself takes as many pairs of anchor and class, so the anchors of its pairs are among these.
+
+    Returns:
+        Boxes and scores of each image.
     """
     raw: Raw = []
     each = len(anchors[0]) // sum(pixels)
@@ -94,7 +97,7 @@ def _clip(boxes: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def head_of(model: nn.Module) -> tuple[Callable[[Any, Any, int], Raw], bool] | None:
-    """The function above that suits a model, and whether its scores are a softmax; None if none does."""
+    """The function above for a kind of model, and whether its scores are a softmax; None for an unknown kind."""
     from torchvision.models.detection import FCOS, FasterRCNN, RetinaNet
     from torchvision.models.detection.ssd import SSD
 

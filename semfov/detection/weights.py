@@ -1,4 +1,4 @@
-"""Named weights: what they are, where they come from, and the cache that keeps them."""
+"""Named weights: their files and sources, and the cache that keeps them."""
 
 import os
 import warnings
@@ -12,14 +12,14 @@ from semfov.io.files import replacing, sha256
 
 @dataclass(frozen=True)
 class Weights:
-    """A weights file that can be had by name.
+    """A weights file that is downloaded by name.
 
     Attributes:
-        file: its name in the cache.
-        size: in bytes.
-        sha256: of its content.
-        licence: under which it is published.
-        sources: tried in order.
+        file: name of the file in the cache.
+        size: its size in bytes.
+        sha256: sha256 of its content.
+        licence: licence under which it is published.
+        sources: sources, tried in order.
     """
 
     file: str
@@ -83,28 +83,34 @@ WEIGHTS: dict[str, Weights] = {
 
 
 def cache_folder() -> Path:
-    """Where downloads are kept: `$SEMFOV_CACHE`, else the platform's cache folder for semfov."""
+    """The folder of downloads: `$SEMFOV_CACHE`, else the platform's cache folder for semfov."""
     import pooch
 
     return Path(os.environ.get("SEMFOV_CACHE") or pooch.os_cache("semfov")).expanduser()
 
 
 def fetch(name: str) -> Path:
-    """Path of named weights in the cache, downloaded if they are not there yet.
+    """Find named weights in the cache, and download them if they are missing.
 
-    The sha256 is checked at every call: a damaged file is never used, but replaced with a warning. A file comes into
-    the cache whole or not at all.
+    The sha256 is checked at every call. A damaged file is never used; it is replaced, with a warning. Files are written
+    atomically.
+
+    Args:
+        name: name of the weights, a key of `WEIGHTS`.
+
+    Returns:
+        The path of the file.
 
     Raises:
         InputError: no weights have this name.
-        DataError: no source could be reached or none gave the right file; the message says where to put it.
+        DataError: no source has returned the right file; the message tells where to put it.
     """
     entry = WEIGHTS[lookup(name, WEIGHTS, "weights")]
     path = cache_folder() / entry.file
     if path.exists():
         if sha256(path) == entry.sha256:
             return path
-        warnings.warn(f"{path} is damaged (its sha256 is wrong): fetching it again", stacklevel=2)
+        warnings.warn(f"{path} is damaged (its sha256 is wrong) and will be fetched again", stacklevel=2)
     faults = []
     for source in entry.sources:
         try:
@@ -116,7 +122,7 @@ def fetch(name: str) -> Path:
         else:
             return path
     raise DataError(
-        f"cannot fetch the weights {name!r} ({'; '.join(faults)}): put {entry.file} ({entry.size} bytes, sha256 "
+        f"cannot fetch the weights {name!r} ({'; '.join(faults)}); put {entry.file} ({entry.size} bytes, sha256 "
         f"{entry.sha256}) into {path.parent}, or give its path as weights="
     )
 

@@ -16,22 +16,22 @@ from semfov.errors import InputError, check
 def decode_yolo(
     raw: Tensor, anchors: Sequence[tuple[float, float]], canvas: tuple[int, int], scale: float = 1.0
 ) -> Candidates:
-    r"""Boxes and scores from the raw map of a YOLOv3 head (Redmon and Farhadi 2018, section 2.1).
+    r"""Decode the raw map of a YOLOv3 head to boxes and scores (Redmon and Farhadi 2018, section 2.1).
 
-    For the cell in column i and row j, with `s` the canvas pixels per cell and `(p_w, p_h)` the anchor:
+    For the cell in column i and row j, with `s` canvas pixels per cell and the anchor `(p_w, p_h)`:
 
         b_x = (σ(t_x) + i) s,   b_y = (σ(t_y) + j) s,   b_w = p_w exp(t_w),   b_h = p_h exp(t_h)
 
     Objectness and class scores are `σ(t)`.
 
     Args:
-        raw: `(B, A (5 + K), h, w)`; channels are anchor by anchor x, y, width, height, objectness, classes.
+        raw: `(B, A (5 + K), h, w)`; the channels of each anchor are x, y, width, height, objectness and classes.
         anchors: A pairs `(width, height)` in canvas pixels.
         canvas: `(width, height)` of the network's input.
-        scale: σ(t) of the centre is stretched to `scale · σ(t) - (scale - 1) / 2`.
+        scale: the centre's σ(t) is replaced by `scale · σ(t) - (scale - 1) / 2`.
 
     Returns:
-        `h · w · A` candidates for each image, row by row, anchors of a cell together.
+        `h · w · A` boxes for each image, row by row, with the anchors of a cell together.
 
     >>> decode_yolo(torch.zeros(1, 6, 1, 1), [(8, 4)], (32, 32)).boxes
     tensor([[[12., 14., 20., 18.]]])
@@ -53,23 +53,26 @@ def decode_yolo(
 class YoloV3(Detector):
     """A Darknet network with YOLOv3 heads as a `Detector`.
 
-    Differentiable from the scores and boxes to the image. A canvas of another dtype is converted to the network's.
+    Boxes and scores are differentiable with respect to the image. A canvas of another dtype is converted to the
+    network's dtype.
 
-    With runtime `"auto"` onnxruntime computes what no gradient is asked of, on a CPU: it is faster there, and equal up
-    to rounding. Torch computes all else: where gradients are enabled and the canvas or a parameter requires one, on
-    accelerators, in other precisions, with weights changed after loading, and in compiled, exported or transformed
-    functions. Forward hooks of the network see nothing of onnxruntime's work.
+    With runtime `"auto"`, onnxruntime computes the network on a CPU where no gradients are needed. It is faster there,
+    and its results are equal up to rounding. Torch computes the network in all other cases: where gradients are enabled
+    and the canvas or a parameter requires one, on accelerators, in other precisions, with weights that were changed
+    after loading, and in compiled, exported or transformed functions. Forward hooks of the network are not called where
+    onnxruntime computes it.
 
     Args:
-        network: the network, trained.
+        network: the trained network.
         classes: names of its K classes.
-        name: what tables and fitted models call it.
-        input_size: `(width, height)` of the canvas; None takes the cfg's.
-        stride: pad the canvas to a multiple of it only; None pads to `input_size`.
+        name: name of the model in tables and in fitted models.
+        input_size: `(width, height)` of the canvas; None for the size in the cfg.
+        stride: pad the canvas only to a multiple of this number of pixels; None pads it to `input_size`.
         background: background policy of the scores.
-        selection: which candidates are kept.
+        selection: settings of the selection of boxes.
         digest: sha256 of the weights.
-        runtime: `"auto"`, always `"torch"`, or always `"onnxruntime"`, which refuses what it cannot compute.
+        runtime: `"auto"`; `"torch"` in all cases; or `"onnxruntime"` in all cases, which raises an error where
+            onnxruntime cannot compute the network.
     """
 
     def __init__(
@@ -88,7 +91,8 @@ class YoloV3(Detector):
         check(runtime in RUNTIMES, "runtime", " or ".join(map(repr, RUNTIMES)), repr(runtime))
         size = network.input_size if input_size is None else input_size
         multiple = f"a multiple of {network.stride}"
-        check(all(n > 0 and n % network.stride == 0 for n in size), "input_size", f"{multiple} in both axes", size)
+        whole = all(n > 0 and n % network.stride == 0 for n in size)
+        check(whole, "input_size", f"{multiple} along both axes", size)
         fits = stride is None or (isinstance(stride, int) and stride > 0 and stride % network.stride == 0)
         check(fits, "stride", f"None or {multiple}", repr(stride))
         for head in network.heads:
@@ -99,7 +103,7 @@ class YoloV3(Detector):
         self._twin = None if runtime == "torch" else OnnxTwin(network_digest(network))
 
     def propose(self, canvas: Tensor) -> Candidates:
-        """Every box of every head on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
+        """Compute all boxes of all heads on a canvas `(B, 3, H, W)`, RGB in [0, 1]."""
         if not canvas.is_floating_point():
             raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
         if self._twin is not None and self._chosen(self._twin.obstacle_here(self.network, canvas)) == "onnxruntime":
@@ -116,18 +120,18 @@ class YoloV3(Detector):
         )
 
     def features(self, canvas: Tensor) -> Tensor:
-        """What the last convolution before the first head reads; torch computes it, whatever the runtime."""
+        """Compute the input of the last convolution before the first head, by torch with any runtime."""
         return self.network.features(canvas.to(next(self.network.parameters()).dtype))
 
     def _chosen(self, obstacle: str | None) -> Runtime:
-        """What computes, where `obstacle` is why onnxruntime cannot."""
+        """The runtime to use; `obstacle` is the reason why onnxruntime cannot be used."""
         if obstacle is None:
             return "onnxruntime"
         check(self.runtime == "auto", "runtime", f"'auto' or 'torch' for {obstacle}", repr(self.runtime))
         return "torch"
 
     def settings(self) -> dict[str, object]:
-        """What the detections depend on; `runtime` is what computes without gradients."""
+        """List the settings that the detections depend on; `runtime` is the one that is used without gradients."""
         return super().settings() | {
             "cfg": self.network.cfg_digest(),
             "runtime": "torch" if self._twin is None else self._chosen(self._twin.obstacle(self.network)),

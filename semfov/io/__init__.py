@@ -1,1 +1,1 @@
-"""Files: whole or not there, checksummed, never unpickled."""
+"""Files: written atomically, verified by checksum, never unpickled."""

@@ -1,4 +1,4 @@
-"""Digests of code, so that a result is never taken for what other code would give."""
+"""Digests of code, so that a stored result is never taken for the result of other code."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ _LIBRARIES = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib
 
 @cache
 def package_digest() -> str:
-    """sha256 over all modules of the package; comments and docstrings do not count.
+    """Compute a sha256 over all modules of the package; comments and docstrings do not count.
+
+    Returns:
+        64 hexadecimal digits.
 
     >>> len(package_digest())
     64
@@ -29,10 +32,13 @@ def package_digest() -> str:
 
 @cache
 def modules_digest(*modules: str) -> str:
-    """sha256 over modules of the package and all that they import of it, directly or not.
+    """Compute a sha256 over modules of the package and every module of it that they import, directly or not.
 
     Args:
         modules: dotted names.
+
+    Returns:
+        64 hexadecimal digits.
 
     >>> modules_digest("semfov.errors") == modules_digest("semfov.io.files")
     False
@@ -41,13 +47,16 @@ def modules_digest(*modules: str) -> str:
 
 
 def class_digest(kind: type) -> str:
-    """sha256 over the code of a class of the user's own: its file, those of its bases, and what of his they import.
+    """Compute a digest of the code of a user's class: its file, its bases' files, and the user's modules they import.
 
-    Libraries and this package do not count: the latter has `package_digest`. A class that was typed into an
-    interpreter has no file; its digest holds for this process alone.
+    Installed libraries do not count, and this package does not either: it has `package_digest`. A class that was typed
+    into an interpreter has no file, so its digest is valid in this process only.
 
     Args:
         kind: the class.
+
+    Returns:
+        64 hexadecimal digits, or the name of the class and of this process where the class has no file.
     """
     modules = [base.__module__ for base in kind.__mro__ if not _of_others(base.__module__) or base is kind]
     if any(_file(module) is None for module in modules):
@@ -58,11 +67,14 @@ def class_digest(kind: type) -> str:
 
 
 def closure(modules: Iterable[str], belongs: Callable[[str], bool]) -> set[Path]:
-    """Files of modules and of all that they import, directly or not.
+    """Find the files of modules and of every module that they import, directly or not.
 
     Args:
         modules: dotted names.
-        belongs: whether an imported module, by its dotted name, is followed.
+        belongs: tells by its dotted name whether an imported module is followed.
+
+    Returns:
+        The source files.
     """
     files: dict[Path, None] = {}
     todo = list(modules)
@@ -77,12 +89,12 @@ def closure(modules: Iterable[str], belongs: Callable[[str], bool]) -> set[Path]
 
 
 def _digest(files: Iterable[Path]) -> str:
-    """sha256 over files in the order of their content: where they lie and what they are called is all the same."""
+    """sha256 over files, sorted by content: it does not depend on their folders and names."""
     return hashlib.sha256("".join(sorted(map(_code, files))).encode()).hexdigest()
 
 
 def _code(file: Path) -> str:
-    """sha256 of what a file does: its syntax tree without the strings that only people read."""
+    """sha256 of a file's syntax tree without docstrings."""
     source = file.read_bytes()
     try:
         tree = ast.parse(source)
@@ -100,7 +112,7 @@ def _is_text(line: ast.AST) -> bool:
 
 
 def _imports(name: str, file: Path) -> Iterator[str]:
-    """Dotted names of everything that a module imports, anywhere in it; of `from a import b` both `a` and `a.b`."""
+    """Dotted names of all imports in a module, at any depth; `from a import b` gives both `a` and `a.b`."""
     package = name if file.name == "__init__.py" else name.rpartition(".")[0]
     for node in ast.walk(ast.parse(file.read_bytes())):
         if isinstance(node, ast.Import):
@@ -113,7 +125,7 @@ def _imports(name: str, file: Path) -> Iterator[str]:
 
 
 def _file(name: str) -> Path | None:
-    """The source of a module; None where there is none, or no such module."""
+    """The source file of a module; None where the module does not exist or has no source."""
     module = sys.modules.get(name)
     origin = getattr(module, "__file__", None)
     if module is None:
@@ -127,7 +139,7 @@ def _file(name: str) -> Path | None:
 
 
 def _of_others(name: str) -> bool:
-    """Whether a module is Python's, an installed library's, or this package's."""
+    """Whether a module belongs to Python, to an installed library or to this package."""
     top = name.partition(".")[0]
     if top == _PACKAGE or top in sys.stdlib_module_names:
         return True

@@ -1,4 +1,4 @@
-"""Whether a fitted model may stand beside a detector and a sensor."""
+"""Checks that a fitted model may be used together with a detector and a sensor."""
 
 import json
 import warnings
@@ -11,25 +11,32 @@ NETWORKS = {
     "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14": "yolox-nano",
     "c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d": "yolox-nano",
 }
-"""Networks that models are shipped for, by the sha256 of their file, whatever that is called.
+"""Networks that models are shipped for, by the sha256 of their file; the name of the file does not matter.
 
-Files of one name are conversions of one checkpoint: YOLOX-nano's by Kazuhito00, and by its authors.
+Files listed under one name are conversions of one checkpoint. YOLOX-nano's were made by Kazuhito00 and by its authors.
 """
 
 SHIPPED_SIGMA = 100.0
-"""Width of the fovea, in pixels of an image of 640, that learned models are shipped for."""
+"""Width σ of the fovea that learned models are shipped for, in pixels of an image whose longer side is 640."""
 SHIPPED_GROWTHS = (1.0, 2.0)
 """Growths of the fovea that learned models are shipped for."""
 
-_FIT = "take that, ActivePerception.raw with any sensor, or fit models for this one (python -m train.fit_search)"
+_FIT = "use that value, ActivePerception.raw with any sensor, or fit models for this one (python -m train.fit_search)"
 
-# Keys that are compared otherwise, and those of how a network is computed: its numbers are the same up to rounding.
-# (`winograd` is in models that were fitted before there was `runtime`.)
+# Keys that other checks compare, and keys of how a network is computed, which changes its numbers only by rounding.
+# (Models that were fitted before the key `runtime` existed have `winograd`.)
 _ALIKE = {"name", "digest", "background", "winograd", "runtime", "dtype"}
 
 
 def recommended(detector: str, growth: float) -> str:
-    """Name of the observation model for a detector behind a sensor of this growth.
+    """Name the observation model that is shipped for a detector with a sensor of this growth.
+
+    Args:
+        detector: name of the detector.
+        growth: growth of the foveal sensor.
+
+    Returns:
+        The name of the model.
 
     >>> recommended("yolov3-tiny", 2.0), recommended("yolov3-tiny", 1.0)
     ('yolov3-tiny', 'yolov3-tiny-sharp')
@@ -38,7 +45,14 @@ def recommended(detector: str, growth: float) -> str:
 
 
 def learned_for(detector: str, growth: float) -> str:
-    """Name of learned evidence and maps for a detector behind a sensor of this growth.
+    """Name the learned evidence and maps that are shipped for a detector with a sensor of this growth.
+
+    Args:
+        detector: name of the detector.
+        growth: growth of the foveal sensor.
+
+    Returns:
+        The name of the models.
 
     >>> learned_for("yolov3-tiny", 2.0), learned_for("yolov3-tiny", 1.0)
     ('yolov3-tiny', 'yolov3-tiny-published')
@@ -47,7 +61,7 @@ def learned_for(detector: str, growth: float) -> str:
 
 
 def check_classes(fitted: Sequence[str], classes: Sequence[str] | None, what: str) -> None:
-    """Raise `InputError` unless the class lists are the same."""
+    """Raise `InputError` where classes are given and differ from those that the model was fitted for."""
     if classes is None or tuple(classes) == tuple(fitted):
         return
     if len(classes) != len(fitted):
@@ -59,17 +73,17 @@ def check_classes(fitted: Sequence[str], classes: Sequence[str] | None, what: st
 
 
 def check_background(fitted: Mapping[str, Any], background: str | None, what: str) -> None:
-    """Raise `InputError` where the background policy is another one."""
+    """Raise `InputError` where the background policy is not the one that the model was fitted with."""
     known = fitted.get("background")
     if background is not None and known is not None and background != known:
         raise InputError(
             f"background: the {what} was fitted on scores with background policy {known!r}, got "
-            f"{background!r}; make the detector with background={known!r}, or fit a model for it"
+            f"{background!r}; load the detector with background={known!r}, or fit a model for {background!r}"
         )
 
 
 def check_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], what: str) -> None:
-    """Raise `InputError` where the weights or the background policy differ, warn where another setting does."""
+    """Raise `InputError` where the weights or the background policy differ; warn where another setting differs."""
     if not detector or not fitted:
         return
     mine, theirs = fitted.get("digest"), detector.get("digest")
@@ -79,50 +93,56 @@ def check_detector(fitted: Mapping[str, Any], detector: Mapping[str, Any], what:
     if not same:
         raise InputError(
             f"detector: the {what} was fitted for {_describe(fitted)}, got {_describe(detector)}; fit a "
-            f"model for this detector, or take the one it was fitted for"
+            f"model for this detector, or use the one it was fitted for"
         )
     check_background(fitted, detector.get("background"), what)
     _warn_of_others("detector", fitted, detector, _ALIKE, what)
 
 
 def check_sensor(fitted: Mapping[str, Any], sensor: Mapping[str, Any], what: str) -> None:
-    """Warn where the sensor has other settings."""
+    """Warn where the sensor has other settings than the one that the model was fitted with."""
     if sensor and fitted:
         _warn_of_others("sensor", fitted, sensor, set(), what)
 
 
 def check_grid(fitted: Mapping[str, Any], grid: tuple[int, int], what: str) -> None:
-    """Raise `InputError` where cells are more than twice as wide or as narrow as those that a model was fitted on.
+    """Check that a grid has between half and twice as many cells along each side as the grid of the training.
 
-    Learned evidence is told sizes and distances in parts of the image, and holds on finer and coarser grids. How often
-    a cell holds an object, and how far its neighbours reach, it has learned from cells of one size.
+    Learned evidence takes sizes and distances as fractions of the image, so it carries over to somewhat finer and
+    coarser grids. It has learned from cells of one size how often a cell holds an object and how far the influence of
+    its neighbours reaches.
 
     Args:
-        fitted: settings of its training; without `columns` and `rows` it may stand on any grid.
+        fitted: settings of the training; a model without `columns` and `rows` accepts any grid.
         grid: `(columns, rows)`.
-        what: title of the model.
+        what: title of the model, for the message.
+
+    Raises:
+        InputError: the grid has fewer than half or more than twice as many columns or rows.
     """
     known = fitted.get("columns"), fitted.get("rows")
     if None not in known and not all(n / 2 <= side <= 2 * n for n, side in zip(known, grid, strict=True)):  # type: ignore[operator]
         raise InputError(
-            f"grid: the {what} was fitted on {known[0]} × {known[1]} cells and holds for half to twice as many a side, "
-            f"got {grid[0]} × {grid[1]}; take grid={known}, or fit models on such a grid (python -m train.fit_search "
-            f"and train.fit_map, with --columns {grid[0]} --rows {grid[1]})"
+            f"grid: the {what} was fitted on {known[0]} × {known[1]} cells and is valid for half to twice as many "
+            f"along each side, got {grid[0]} × {grid[1]}; use grid={known}, or fit models on such a grid (python -m "
+            f"train.fit_search and train.fit_map, with --columns {grid[0]} --rows {grid[1]})"
         )
 
 
 def check_shipped_sensor(sigma: float, growth: float) -> None:
-    """Raise `InputError` for a fovea that no learned models are shipped for."""
+    """Raise `InputError` for a width or growth of the fovea that no learned models are shipped for."""
     if growth not in SHIPPED_GROWTHS:
         known = " and ".join(f"{value:g}" for value in SHIPPED_GROWTHS)
         raise InputError(f"growth: models are shipped for {known}, got {growth}; {_FIT}")
     if sigma != SHIPPED_SIGMA:
-        raise InputError(f"sigma: models are shipped for {SHIPPED_SIGMA:g} pixels of 640, got {sigma}; {_FIT}")
+        raise InputError(
+            f"sigma: models are shipped for {SHIPPED_SIGMA:g} pixels on an image of 640 pixels, got {sigma}; {_FIT}"
+        )
 
 
 def _warn_of_others(part: str, fitted: Mapping[str, Any], used: Mapping[str, Any], known: set[str], what: str) -> None:
     other = [
-        f"{key} is {used.get(key)}, fitted with {fitted.get(key)}"
+        f"{key} is {used.get(key)}, the model was fitted with {fitted.get(key)}"
         for key in sorted((fitted.keys() | used.keys()) - known)
         if _plain(fitted.get(key)) != _plain(used.get(key))
     ]
@@ -131,7 +151,7 @@ def _warn_of_others(part: str, fitted: Mapping[str, Any], used: Mapping[str, Any
 
 
 def _plain(value: Any) -> str:
-    """A value as JSON, in which lists and tuples are one."""
+    """A value as JSON, where lists and tuples look the same."""
     return json.dumps(value, sort_keys=True)
 
 

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: atomic writes and checksums."""
+"""Atomic writes, checksums and checks of paths."""
 
 import hashlib
 import os
@@ -15,16 +15,23 @@ _unfinished: set[Path] = set()
 
 
 def discard_unfinished() -> None:
-    """Remove what was being written, for a process that is about to leave without coming to its end."""
+    """Remove temporary files of unfinished writes, for a process that is about to exit without cleaning up."""
     for path in list(_unfinished):
         path.unlink(missing_ok=True)
 
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Give a temporary path beside `path` to write to, and move it there once the block has ended without error.
+    """Write a file atomically: a context manager that replaces `path` once its block has ended without an error.
 
-    Readers see the old file or the new one, never a part of it; a killed or failed writer leaves `path` alone.
+    Readers see the old file or the new one, never a part of it. A writer that fails or is killed leaves `path` as it
+    was.
+
+    Args:
+        path: the file to write or replace; its folder is created where it is missing.
+
+    Yields:
+        A temporary path in the same folder, to write to.
 
     Raises:
         DataError: the folder cannot be written to or the disk is full (the message names the file).
@@ -51,10 +58,17 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def inside(folder: str | Path, name: str) -> Path:
-    """The path of a file by this name in `folder` or below it.
+    """Join a folder and a file name that comes from elsewhere, and refuse names that lead out of the folder.
+
+    Args:
+        folder: the folder.
+        name: path of a file, relative to the folder.
+
+    Returns:
+        The path of the file, in the folder or below it.
 
     Raises:
-        DataError: the name leads out of the folder, also through a link.
+        DataError: the name leads out of the folder, directly or through a link.
     """
     folder = Path(folder)
     try:
@@ -68,7 +82,13 @@ def inside(folder: str | Path, name: str) -> Path:
 
 
 def clean(text: str) -> str:
-    """Text as a part of a file's name: letters, digits, `_`, `.` and `-`, at most 60 of them, no dot in front.
+    """Turn text into a part of a file name: at most 60 letters, digits, `_`, `.` and `-`, without a leading dot.
+
+    Args:
+        text: any text.
+
+    Returns:
+        The part of a file name; `none` where nothing of the text is left.
 
     >>> clean("dining table"), clean("/../../x/evil"), clean("")
     ('dining-table', 'x-evil', 'none')
@@ -77,11 +97,14 @@ def clean(text: str) -> str:
 
 
 def check_regular(path: str | os.PathLike[str], name: str | None = None) -> None:
-    """Raise `DataError` where `path` is there and is no regular file: a pipe or a device may never end.
+    """Check that a path that exists is a regular file, because reading a pipe or a device might never end.
 
     Args:
-        path: the file.
-        name: what messages call it; None is its path.
+        path: the file; a missing one passes.
+        name: its name in messages; None for its path.
+
+    Raises:
+        DataError: the path is a folder, a pipe, a socket or a device, or cannot be the name of a file.
 
     >>> check_regular(__file__)
     """
@@ -105,6 +128,6 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def sha256(path: str | Path) -> str:
-    """Hexadecimal sha256 of a file's content."""
+    """Compute the sha256 of a file's content, as hexadecimal digits."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

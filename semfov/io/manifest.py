@@ -1,4 +1,4 @@
-"""The record of a folder of models: which detector they were fitted to, which parts there are, and which are used."""
+"""The record of a folder of fitted models: their detector and sensor, the parts, and which of the parts are used."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from semfov.errors import DataError, InputError
 from semfov.io.files import check_regular, inside, sha256, write_text
-from semfov.io.schema import CLASSES, Anything, Array, Json, Maybe, Number, Object, Schema, Text
+from semfov.io.schema import CLASSES, Anything, Array, Flag, Maybe, Number, Object, Schema, Text
 from semfov.io.storage import checksum
 from semfov.version import __version__
 
@@ -19,25 +19,16 @@ _KIND = "semfov-models"
 _MOST_BYTES = 2**24
 
 PARTS = ("observation", "tempering", "evidence", "map")
-"""What a folder may hold, in the order in which it is fitted."""
+"""Parts that a folder may hold, in the order in which they are fitted."""
 
 _PLACE = Object({"relative": Text(), "absolute": Text()}, required=("relative", "absolute"))
-
-
-class _Flag(Json):
-    """True or false."""
-
-    def check(self, name: str, value: Any, sizes: dict[str, int]) -> None:
-        """See `Json`."""
-        if not isinstance(value, bool):
-            raise InputError(f"{name}: expected true or false, got {value!r}")
 
 
 _PART = Object(
     {
         "file": Maybe(Text()),
         "sha256": Maybe(Text()),
-        "used": _Flag(),
+        "used": Flag(),
         "why": Text(),
         "settings": Object(others=Anything()),
     },
@@ -80,14 +71,14 @@ _SCHEMA = Schema(
 
 @dataclass(frozen=True)
 class Part:
-    """One of the things that are fitted.
+    """One fitted part of an agent.
 
     Attributes:
-        file: its file in the folder; None where it is settings alone, or could not be fitted.
-        sha256: of the file.
-        used: whether the agent goes by it; else it does as an agent without models does.
-        why: what that rests on, in a sentence.
-        settings: JSON values that it is made of beside the file.
+        file: its file in the folder; None where the part consists of settings only, or could not be fitted.
+        sha256: sha256 of the file.
+        used: whether the agent uses the part. Where it does not, it acts as an agent without this model.
+        why: the reason for that choice, in a sentence.
+        settings: JSON values that belong to the part in addition to its file.
     """
 
     file: str | None
@@ -99,16 +90,17 @@ class Part:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a folder of models says of itself.
+    """The record that a folder of fitted models keeps about itself.
 
     Attributes:
         classes: names of the detector's K classes.
-        detector: `name`, `sha256` of its weights, the `options` of `semfov.load_detector`, and what that loads:
-            `model`, a name, or `model_file` and `weights_file`, each a path relative to the folder and an absolute one.
+        detector: `name`, `sha256` of its weights, the `options` of `semfov.load_detector`, and the model to load:
+            either `model`, a name, or `model_file` and `weights_file`, each as a path relative to the folder and as an
+            absolute path.
         sensor: settings of the foveal sensor.
         grid: `(columns, rows)` of the belief.
-        parts: by name, of `PARTS`.
-        training: JSON values that tell what the parts were fitted to.
+        parts: the parts by name; the names are among `PARTS`.
+        training: JSON values that describe the data and settings of the fits.
     """
 
     classes: tuple[str, ...]
@@ -119,7 +111,7 @@ class Manifest:
     training: Mapping[str, Any] = field(default_factory=dict)
 
     def write(self, folder: str | PathLike[str]) -> Path:
-        """Write the record into the folder, whole or not at all; returns the file."""
+        """Write the record into the folder atomically, and return the path of its file."""
         record = {"kind": _KIND, "version": __version__, **json.loads(json.dumps(asdict(self)))}
         path = Path(folder) / FILE
         write_text(path, json.dumps({**record, "sha256": checksum({}, record)}, indent=2) + "\n")
@@ -127,16 +119,22 @@ class Manifest:
 
     @classmethod
     def read(cls, folder: str | PathLike[str]) -> Self:
-        """The record of a folder, once it and the files that it names are found to be as they were written.
+        """Read the record of a folder, and verify it and the files that it names by their checksums.
+
+        Args:
+            folder: the folder.
+
+        Returns:
+            The record.
 
         Raises:
-            DataError: there is no record, or it or a file is missing, damaged or of another kind.
+            DataError: the record or a file that it names is missing, damaged or of another kind.
         """
         path = Path(folder) / FILE
         record = _read(path)
-        told = record.pop("sha256", None)
-        if told != checksum({}, record):
-            raise DataError(f"{path}: damaged or changed, it does not have the sha256 it was written with; {_AGAIN}")
+        recorded = record.pop("sha256", None)
+        if recorded != checksum({}, record):
+            raise DataError(f"{path}: damaged or changed, its sha256 is not the one it was written with; {_AGAIN}")
         try:
             _SCHEMA.check({}, record)
         except InputError as error:
@@ -154,7 +152,7 @@ _AGAIN = "run python -m train.fit_detector again, or copy the folder again"
 
 
 def place_of(file: str | PathLike[str], folder: str | PathLike[str]) -> dict[str, str]:
-    """Where a file lies, from a folder and for itself."""
+    """The path of a file, `relative` to a folder and `absolute`."""
     absolute = Path(file).resolve()
     try:
         relative = os.path.relpath(absolute, Path(folder).resolve())
@@ -164,7 +162,7 @@ def place_of(file: str | PathLike[str], folder: str | PathLike[str]) -> dict[str
 
 
 def find_file(place: Mapping[str, str], folder: str | PathLike[str]) -> Path | None:
-    """The file at a place that `place_of` told, seen from where the folder is now; None where it is gone."""
+    """The file at a place from `place_of`, for the folder's present location; None where the file is missing."""
     paths = Path(folder) / place["relative"], Path(place["absolute"])
     return next((path for path in paths if path.is_file()), None)
 
@@ -172,16 +170,16 @@ def find_file(place: Mapping[str, str], folder: str | PathLike[str]) -> Path | N
 def _check_file(path: Path, digest: str | None) -> None:
     check_regular(path)
     if not path.is_file():
-        raise DataError(f"{path}: no such file, though {FILE} beside it names it; {_AGAIN}")
+        raise DataError(f"{path}: no such file, but {FILE} in the same folder lists it; {_AGAIN}")
     if sha256(path) != digest:
-        raise DataError(f"{path}: damaged or changed, its sha256 is not that of {FILE}; {_AGAIN}")
+        raise DataError(f"{path}: damaged or changed, its sha256 is not the one listed in {FILE}; {_AGAIN}")
 
 
 def _read(path: Path) -> dict[str, Any]:
     check_regular(path)
     try:
         if path.stat().st_size > _MOST_BYTES:
-            raise DataError(f"{path}: expected at most {_MOST_BYTES:,} bytes")
+            raise DataError(f"{path}: expected at most {_MOST_BYTES:,} bytes, got {path.stat().st_size:,}; {_AGAIN}")
         record = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise DataError(

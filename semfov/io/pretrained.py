@@ -1,4 +1,4 @@
-"""Fitted modules that are kept in files, some of which are shipped with the package."""
+"""Fitted modules that are saved to files; some of the files are shipped with the package."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -19,15 +19,15 @@ _ENVELOPE = Schema({}, {"version": Text(), "metadata": METADATA})
 
 
 class Pretrained(nn.Module):
-    """A module with a form of its own on disk: tensors, and JSON values that say what they are.
+    """Base of modules that are saved to a file: tensors, and JSON values that describe them.
 
     Attributes:
-        kind: of file, as its record says.
-        title: what messages call it.
+        kind: kind of file, as its record tells it.
+        title: name of the kind of model in messages.
         shipped: folder of the models that come with the package.
-        schema: names, shapes, types and ranges of the tensors and of the JSON values of `_record`; a file that is not
-            so is refused.
-        metadata: JSON values kept with the model.
+        schema: names, shapes, types and ranges of the tensors and of the JSON values of `_record`; a file that does
+            not fit is refused.
+        metadata: JSON values that are saved with the model.
     """
 
     kind: ClassVar[str]
@@ -38,29 +38,39 @@ class Pretrained(nn.Module):
 
     @abstractmethod
     def _record(self) -> dict[str, Any]:
-        """JSON values that `_restore` needs beside tensors and metadata."""
+        """JSON values that `_restore` needs in addition to tensors and metadata."""
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Tensors that are kept."""
+        """Tensors that are saved."""
         return self.state_dict()
 
     @classmethod
     @abstractmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The module from what was kept; an error of any kind where something is missing or does not fit."""
+        """Make the module from a record and tensors; raise any error where something is missing or does not fit."""
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the model to a safetensors file with its metadata as JSON in the header, whole or not at all."""
+        """Write the model atomically to a safetensors file, with its metadata as JSON in the header.
+
+        Args:
+            path: the file.
+        """
         record = {"kind": self.kind, "version": __version__, **self._record(), "metadata": self.metadata}
         write(path, self._tensors(), record)
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:
-        """A model that is shipped with the package, by name, or one that `save` wrote, by path; in `eval` mode.
+        """Load a model that is shipped with the package or one that `save` wrote.
+
+        Args:
+            name_or_path: name of a shipped model, or path of a file.
+
+        Returns:
+            The model, in `eval` mode.
 
         Raises:
             InputError: no model of that name is shipped.
-            DataError: the file is missing, damaged or not such a model.
+            DataError: the file is missing, damaged or of another kind.
         """
         path = find(name_or_path, cls.shipped, cls.title)
         tensors, record = read(path, cls.kind)
@@ -78,13 +88,16 @@ class Pretrained(nn.Module):
 
 
 class PretrainedForEye(Pretrained):
-    """Base of the models that are trained behind one eye, whose `metadata` tells `detector` and `sensor`."""
+    """Base of models that were fitted for one eye; `metadata` holds the settings of its `detector` and `sensor`."""
 
     def check_compatible(self, settings: Mapping[str, Any], grid: tuple[int, int] | None = None) -> None:
-        """Raise `InputError` beside another detector than it was trained for or on a grid for others; warn of the rest.
+        """Check that the model may be used with an eye and a grid.
+
+        It raises `InputError` for another detector and for a grid of a very different size, and warns where other
+        settings differ.
 
         Args:
-            settings: `Eye.settings()`.
+            settings: settings of the eye, `Eye.settings()`.
             grid: `(columns, rows)` of the belief; None leaves it unchecked.
         """
         if grid is not None:

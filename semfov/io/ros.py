@@ -1,7 +1,7 @@
-"""What is seen, and where the gaze is, in the shape of ROS 2 messages: dictionaries, and messages filled from them.
+"""Detections and gaze as ROS 2 messages: dictionaries with the messages' fields, and messages filled from them.
 
 Nothing here imports ROS. The dictionaries have the fields of `vision_msgs/Detection2DArray` (version 4 of the package)
-and `geometry_msgs/PointStamped`; a node of its own is in `examples/ros_node.py`.
+and `geometry_msgs/PointStamped`. A complete node is in `examples/ros_node.py`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,27 +21,30 @@ _BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
 
 
 class Seen(Protocol):
-    """What `semfov.Detections` are made of."""
+    """The tensors of `semfov.Detections`."""
 
     @property
     def boxes(self) -> Tensor:
-        """`(..., L, 4)`."""
+        """Boxes `(..., L, 4)` in pixels."""
 
     @property
     def scores(self) -> Tensor:
-        """`(..., L, K+1)`."""
+        """Score vectors `(..., L, K+1)`, background first."""
 
     @property
     def mask(self) -> Tensor:
-        """`(..., L)`."""
+        """Which rows hold a detection, `(..., L)` boolean."""
 
 
 def header(stamp: Any, frame: str) -> Values:
-    """A `std_msgs/Header`.
+    """Make a `std_msgs/Header`.
 
     Args:
-        stamp: seconds, or another message's `header.stamp`.
+        stamp: time in seconds, or another message's `header.stamp`.
         frame: name of the frame of reference.
+
+    Returns:
+        The fields of the message.
 
     >>> header(1.5, "camera")
     {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'camera'}
@@ -56,21 +59,24 @@ def header(stamp: Any, frame: str) -> Values:
 def detection_array(
     detections: Seen, classes: Sequence[str], *, stamp: Any, frame: str, least: float = 0.1, most: int = 5
 ) -> Values:
-    """A `vision_msgs/Detection2DArray`: boxes in pixels, each with its likeliest classes.
+    """Make a `vision_msgs/Detection2DArray`: boxes in pixels, each with its most likely classes.
 
     Args:
-        detections: `semfov.Detections` of one image, with or without a dimension of the batch.
+        detections: `semfov.Detections` of one image, with or without a batch dimension.
         classes: names of the K classes, without background.
-        stamp: of the image, as for `header`.
-        frame: of the image.
-        least: detections and hypotheses of a smaller score are left out.
-        most: hypotheses of a detection.
+        stamp: time of the image, as for `header`.
+        frame: frame of reference of the image.
+        least: hypotheses with a lower score are left out, and detections without any other hypothesis.
+        most: largest number of hypotheses for a detection.
+
+    Returns:
+        The fields of the message.
 
     Raises:
-        InputError: the detections are of several images, or of other classes.
+        InputError: the detections belong to several images, or have another number of classes.
     """
     boxes, scores, mask = detections.boxes, detections.scores, detections.mask
-    check(mask.ndim == 1 or len(mask) == 1, "detections", "those of one image", f"a batch of {len(mask)}")
+    check(mask.ndim == 1 or len(mask) == 1, "detections", "detections of one image", f"a batch of {len(mask)}")
     check_shape(scores, "detections.scores", None, len(classes) + 1)
     if mask.ndim > 1:
         boxes, scores, mask = boxes[0], scores[0], mask[0]
@@ -88,7 +94,7 @@ def detection_array(
 
 
 def _bounds(box: Sequence[float]) -> Values:
-    """A `vision_msgs/BoundingBox2D`; its centre is in pixels from the image's left and upper edge, as the box is."""
+    """A `vision_msgs/BoundingBox2D`; like the box, its centre is in pixels from the image's left and upper edge."""
     x1, y1, x2, y2 = box
     position = {"x": (x1 + x2) / 2, "y": (y1 + y2) / 2}
     return {"center": {"position": position, "theta": 0.0}, "size_x": x2 - x1, "size_y": y2 - y1}
@@ -101,17 +107,27 @@ def gaze_point(
     frame: str,
     camera: tuple[float, float, float, float] | None = None,
 ) -> Values:
-    r"""A `geometry_msgs/PointStamped`: where the gaze is.
+    r"""Make a `geometry_msgs/PointStamped` of a fixation.
+
+    For a pinhole camera the point is
 
     .. math:: \left( \frac{u - c_x}{f_x}, \; \frac{v - c_y}{f_y}, \; 1 \right)
 
-    in the camera's optical frame (z ahead, x right, y down), for a pinhole camera; a head that turns there looks at it.
+    in the camera's optical frame (z ahead, x right, y down). A head that turns towards this point looks at the
+    fixation.
 
     Args:
-        fixation: `(u, v)` in pixels, centres at integers.
-        stamp: of the image, as for `header`.
-        frame: of the image; with a camera, its optical frame.
-        camera: `(f_x, f_y, c_x, c_y)` in pixels, of `sensor_msgs/CameraInfo.k`; None leaves the point in pixels, z 0.
+        fixation: `(u, v)` in pixels, pixel centres at integers.
+        stamp: time of the image, as for `header`.
+        frame: frame of reference of the image; with `camera`, the camera's optical frame.
+        camera: `(f_x, f_y, c_x, c_y)` in pixels, from `sensor_msgs/CameraInfo.k`; None leaves the point in pixels,
+            with z = 0.
+
+    Returns:
+        The fields of the message.
+
+    Raises:
+        InputError: a focal length is not positive, or the time stamp is not a time.
 
     >>> gaze_point((420.0, 240.0), stamp=0, frame="camera_optical", camera=(500.0, 500.0, 320.0, 240.0))["point"]
     {'x': 0.2, 'y': 0.0, 'z': 1.0}
@@ -119,23 +135,26 @@ def gaze_point(
     u, v = (float(value) for value in fixation)
     point = {"x": u, "y": v, "z": 0.0}
     if camera is not None:
-        width, height, centre_x, centre_y = (float(value) for value in camera)
-        check(width > 0 and height > 0, "camera", "focal lengths above 0", (width, height))
-        point = {"x": (u - centre_x) / width, "y": (v - centre_y) / height, "z": 1.0}
+        focal_x, focal_y, centre_x, centre_y = (float(value) for value in camera)
+        check(focal_x > 0 and focal_y > 0, "camera", "focal lengths above 0", (focal_x, focal_y))
+        point = {"x": (u - centre_x) / focal_x, "y": (v - centre_y) / focal_y, "z": 1.0}
     return {"header": header(stamp, frame), "point": point}
 
 
 def fill(message: Message, values: Mapping[str, Any], *kinds: type) -> Message:
-    """Fill a message from a dictionary, field by field, and return it.
+    """Fill a message from a dictionary, field by field.
 
     Args:
-        message: an instance of a message class of ROS 2; it tells the kinds of its fields itself
-            (`get_fields_and_field_types`), which is how lists get elements of the right kind.
-        values: by field; what is not among them stays as it is.
-        kinds: message classes that lists have as elements, such as `Detection2D` and `ObjectHypothesisWithPose`.
+        message: an instance of a message class of ROS 2. Its method `get_fields_and_field_types` tells which message
+            class the elements of a list must have.
+        values: values by field; fields that are not named stay as they are.
+        kinds: message classes of the elements of lists, such as `Detection2D` and `ObjectHypothesisWithPose`.
+
+    Returns:
+        The same message.
 
     Raises:
-        InputError: the message has no such field, or the class of a list's elements is not among the kinds.
+        InputError: the message has no such field, or `kinds` lacks the class of a list's elements.
     """
     fields: Mapping[str, str] = message.get_fields_and_field_types()  # type: ignore[attr-defined]
     for name, value in values.items():
@@ -156,21 +175,27 @@ def fill(message: Message, values: Mapping[str, Any], *kinds: type) -> Message:
 
 
 def picture(message: Any) -> NDArray[np.uint8]:
-    """The pixels of a `sensor_msgs/Image`, RGB `(h, w, 3)`, as `semfov.as_image` takes them.
+    """Read the pixels of a `sensor_msgs/Image`.
 
     Args:
-        message: with `encoding` rgb8, bgr8, rgba8, bgra8 or mono8; rows may be padded.
+        message: the message, with `encoding` rgb8, bgr8, rgba8, bgra8 or mono8; rows may be padded.
+
+    Returns:
+        RGB `(h, w, 3)` bytes, which `semfov.as_image` accepts.
 
     Raises:
-        InputError: it has another encoding, or fewer bytes than its size needs.
+        InputError: the message has another encoding, or fewer bytes than its size needs.
     """
     encoding, step = str(message.encoding), int(message.step)
     height, width = int(message.height), int(message.width)
     check(
-        encoding in _CHANNELS, "encoding", ", ".join(_CHANNELS), f"{encoding!r}; convert it by image_proc or cv_bridge"
+        encoding in _CHANNELS,
+        "encoding",
+        f"one of {', '.join(_CHANNELS)}",
+        f"{encoding!r}; convert it with image_proc or cv_bridge",
     )
     size, data = _BYTES[encoding], np.frombuffer(bytes(message.data), np.uint8)
     whole = height > 0 and width > 0 and step >= width * size and len(data) >= height * step
-    check(whole, "data", f"{width} × {height} pixels of {size} bytes", f"{len(data)} bytes, {step} in a row")
+    check(whole, "data", f"{width} × {height} pixels of {size} bytes", f"{len(data)} bytes, {step} in each row")
     rows = data[: height * step].reshape(height, step)[:, : width * size].reshape(height, width, size)
     return np.ascontiguousarray(rows[..., list(_CHANNELS[encoding])])

@@ -1,4 +1,4 @@
-"""What a file of tensors and JSON values must hold: names, shapes, types and ranges, told once and checked once."""
+"""Schemas of files of tensors and JSON values: names, shapes, types and ranges, and their checks."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from torch import Tensor
 from semfov.errors import check
 
 Size = int | str
-"""A number, or a name such as `K` that stands for the same number throughout, or `K+1`, `N-1`."""
+"""A number, a name such as `K` that stands for the same number in the whole file, or a sum such as `K+1` or `N-1`."""
 Sizes = dict[str, int]
-"""What the names of sizes stand for, as far as it is known."""
+"""The numbers that names of sizes stand for, as far as they are known."""
 
 FLOATS = (torch.float32, torch.float64)
 
 
 @dataclass(frozen=True)
 class Field:
-    """A tensor of numbers.
+    """Requirements of a tensor.
 
     Attributes:
-        shape: its sizes.
-        dtype: its type; None is float32 or float64, one and the same for all such tensors of a file.
-        low: least value.
-        high: largest value.
-        above: every value is larger than this.
-        ascending: values grow along the tensor.
-        simplex: the last dimension sums to 1.
-        optional: whether it may be missing.
-        finite: whether infinities and NaN are refused.
-        mixed: with no `dtype`, whether its type may be another than that of other tensors.
+        shape: size of each dimension.
+        dtype: its type; None stands for float32 or float64, the same for all such tensors of a file.
+        low: smallest value allowed.
+        high: largest value allowed.
+        above: every value must be larger than this.
+        ascending: whether values must increase along the last dimension.
+        simplex: whether values must sum to 1 along the last dimension.
+        optional: whether the tensor may be missing.
+        finite: whether infinite values and NaN are refused.
+        mixed: where `dtype` is None, whether its type may differ from the type of the other tensors.
     """
 
     shape: tuple[Size, ...]
@@ -52,32 +52,33 @@ class Field:
     mixed: bool = False
 
     def check(self, name: str, tensor: Tensor, sizes: Sizes) -> None:
-        """Raise `InputError` unless a tensor is so; names of sizes that were not known before are now."""
+        """Raise `InputError` unless a tensor meets the requirements; add the sizes that it determines to `sizes`."""
         fits = tensor.ndim == len(self.shape) and all(map(_fits, self.shape, tensor.shape, [sizes] * tensor.ndim))
-        told = ", ".join(str(size) for size in self.shape)
+        shape = ", ".join(str(size) for size in self.shape)
         known = ", ".join(f"{key} = {value}" for key, value in sizes.items())
-        check(fits, name, f"shape ({told})" + (f" with {known}" if known else ""), tuple(tensor.shape))
+        check(fits, name, f"shape ({shape})" + (f" with {known}" if known else ""), tuple(tensor.shape))
         types = FLOATS if self.dtype is None else (self.dtype,)
         check(tensor.dtype in types, name, " or ".join(map(str, types)), tensor.dtype)
         if not tensor.numel() or not self.finite:
             return
         values = tensor.to(torch.float64)
         bad = int((~values.isfinite()).sum())
-        check(bad == 0, name, "finite numbers", f"{bad} of {tensor.numel()} that are not")
+        check(bad == 0, name, "finite numbers", f"{bad} of {tensor.numel()} that are not finite")
         least, most = float(values.min()), float(values.max())
         inside = self.low <= least and most <= self.high and least > self.above
         check(inside, name, interval(self.low, self.high, self.above), least if most <= self.high else most)
-        check(not self.ascending or bool((values.diff() > 0).all()), name, "ascending numbers", "others")
+        check(not self.ascending or bool((values.diff() > 0).all()), name, "ascending numbers", "unsorted ones")
         off = float((values.sum(-1) - 1).abs().max()) if self.simplex else 0.0
-        check(off <= 1e-2, name, "numbers that sum to 1 along the last dimension", f"sums that are off by {off:.2g}")
+        expected = "numbers that sum to 1 along the last dimension"
+        check(off <= 1e-2, name, expected, f"sums that differ from 1 by {off:.2g}")
 
 
 class Json(ABC):
-    """What a JSON value must be."""
+    """Base of the requirements of a JSON value."""
 
     @abstractmethod
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """Raise `InputError` unless a value is so; names of sizes that were not known before are now."""
+        """Raise `InputError` unless a value meets the requirements; add the sizes that it determines to `sizes`."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +86,11 @@ class Number(Json):
     """A finite number.
 
     Attributes:
-        low: least value.
-        high: largest value.
-        above: it is larger than this.
-        size: name of a size that it tells; it is then a whole number from 1.
-        whole: whether it is a whole number.
+        low: smallest value allowed.
+        high: largest value allowed.
+        above: the value must be larger than this.
+        size: name of a size that the value determines; the value must then be a whole number of at least 1.
+        whole: whether the value must be a whole number.
     """
 
     low: float = -math.inf
@@ -99,7 +100,7 @@ class Number(Json):
     whole: bool = False
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         whole = self.whole or self.size is not None
         check(is_number(value, whole=whole), name, "a whole number" if whole else "a finite number", shown(value))
         if self.size is not None:
@@ -112,7 +113,7 @@ class Flag(Json):
     """True or false."""
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         check(isinstance(value, bool), name, "true or false", shown(value))
 
 
@@ -121,11 +122,11 @@ class Array(Json):
     """A list.
 
     Attributes:
-        of: what every item must be.
-        size: how many there are.
-        least: there are at least so many.
-        ascending: items grow.
-        distinct: no item is there twice.
+        of: requirements of every item.
+        size: number of items; None for any number.
+        least: smallest number of items allowed.
+        ascending: whether the items must increase.
+        distinct: whether all items must differ.
     """
 
     of: Json
@@ -135,7 +136,7 @@ class Array(Json):
     distinct: bool = False
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         check(isinstance(value, list | tuple), name, "a list", shown(value))
         fits = self.size is None or _fits(self.size, len(value), sizes)
         check(fits, name, f"{self.size} items", f"{len(value)} with {sizes}")
@@ -144,35 +145,39 @@ class Array(Json):
             self.of.check(f"{name}[{place}]", item, sizes)
         grows = not self.ascending or all(a < b for a, b in pairwise(value))
         check(grows, name, "ascending numbers", shown(value))
-        check(not self.distinct or len(set(value)) == len(value), name, "items that differ", "some twice")
+        check(not self.distinct or len(set(value)) == len(value), name, "items that differ", "repeated items")
 
 
 @dataclass(frozen=True)
 class Pair(Json):
-    """A list of so many items, each of its own kind."""
+    """A list of a fixed number of items.
+
+    Attributes:
+        items: requirements of each item.
+    """
 
     items: tuple[Json, ...]
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         fits = isinstance(value, list | tuple) and len(value) == len(self.items)
-        check(fits, name, f"a list of {len(self.items)}", shown(value))
+        check(fits, name, f"a list of {len(self.items)} items", shown(value))
         for place, (item, kind) in enumerate(zip(value, self.items, strict=True)):
             kind.check(f"{name}[{place}]", item, sizes)
 
 
 @dataclass(frozen=True)
 class Text(Json):
-    """A string, one of the options where there are any.
+    """A string without control characters.
 
     Attributes:
-        options: what it may be.
+        options: the strings allowed; any string where there are none.
     """
 
     options: tuple[str, ...] = ()
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         fits = isinstance(value, str) and (value in self.options or not self.options)
         check(fits, name, f"one of {', '.join(self.options)}" if self.options else "text", shown(value))
         check(is_plain(value), name, "text without control characters", shown(value))
@@ -183,9 +188,9 @@ class Object(Json):
     """A JSON object.
 
     Attributes:
-        known: what values under these keys must be.
-        others: what values under all other keys must be; None: there are none.
-        required: keys that may not be missing.
+        known: requirements of the values under these keys.
+        others: requirements of the values under all other keys; None allows no other keys.
+        required: keys that must be present.
     """
 
     known: Mapping[str, Json] = field(default_factory=dict)
@@ -193,7 +198,7 @@ class Object(Json):
     required: tuple[str, ...] = ()
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         check(isinstance(value, Mapping), name, "an object", shown(value))
         for key in self.required:
             check(key in value, f"{name}.{key}", "a value", "nothing")
@@ -206,12 +211,16 @@ class Object(Json):
 
 @dataclass(frozen=True)
 class Maybe(Json):
-    """A value, or null."""
+    """A value or null.
+
+    Attributes:
+        of: requirements of a value that is not null.
+    """
 
     of: Json
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
         if value is not None:
             self.of.check(name, value, sizes)
 
@@ -220,23 +229,23 @@ class Anything(Json):
     """Any JSON value."""
 
     def check(self, name: str, value: Any, sizes: Sizes) -> None:
-        """See `Json`."""
+        """Check a value, see `Json.check`."""
 
 
 CLASSES = Array(Text(), "K", least=1, distinct=True)
 """Names of the K classes of a detector."""
 
 METADATA = Object({"detector": Object(others=Anything()), "sensor": Object(others=Anything())}, Anything())
-"""What is kept with a model for people and for `semfov.io.compatibility` to read."""
+"""Metadata of a model, which people and `semfov.io.compatibility` read."""
 
 
 @dataclass(frozen=True)
 class Schema:
-    """Everything that a file holds.
+    """Requirements of a whole file.
 
     Attributes:
-        tensors: by name.
-        record: JSON values by name, those first that tell sizes.
+        tensors: requirements of the tensors, by name.
+        record: requirements of the JSON values, by name; values that determine sizes come first.
 
     >>> schema = Schema({"weight": Field(("K", 2), low=0)}, {"classes": Array(Text(), "K")})
     >>> schema.check({"weight": torch.ones(3, 2)}, {"classes": ["cat", "cup", "tv"]})
@@ -246,14 +255,14 @@ class Schema:
     record: Mapping[str, Json] = field(default_factory=dict)
 
     def check(self, tensors: Mapping[str, Tensor], record: Mapping[str, Any] | None = None) -> None:
-        """Raise `InputError` unless tensors and record are so: the name, what was expected and what came."""
+        """Raise `InputError` unless tensors and record meet the requirements."""
         sizes: Sizes = {}
-        told = record or {}
+        values = record or {}
         for name, kind in self.record.items():
-            check(name in told or isinstance(kind, Maybe), name, "a value", "nothing")
-            kind.check(name, told.get(name), sizes)
+            check(name in values or isinstance(kind, Maybe), name, "a value", "nothing")
+            kind.check(name, values.get(name), sizes)
         for name in tensors:
-            check(name in self.tensors, "tensors", f"none but {', '.join(self.tensors)}", shown(name))
+            check(name in self.tensors, "tensors", f"no others than {', '.join(self.tensors)}", shown(name))
         for name, each in self.tensors.items():
             check(name in tensors or each.optional, name, "a tensor", "nothing")
             if name in tensors:
@@ -264,7 +273,7 @@ class Schema:
 
 
 def perceptron(name: str, inputs: int, hidden: Size, outputs: int = 1, *, largest: float = 1e6) -> dict[str, Field]:
-    """Tensors of a network of two hidden layers, an `nn.Sequential` with an activation after each."""
+    """Requirements of the tensors of an `nn.Sequential` with two hidden layers, each followed by an activation."""
     layers: Sequence[tuple[Size, Size]] = ((hidden, inputs), (hidden, hidden), (outputs, hidden))
     tensors = {}
     for number, (out, into) in enumerate(layers):
@@ -274,13 +283,21 @@ def perceptron(name: str, inputs: int, hidden: Size, outputs: int = 1, *, larges
 
 
 def convolution(name: str, into: Size, out: Size, side: int, *, largest: float = 1e6) -> dict[str, Field]:
-    """Tensors of an `nn.Conv2d`."""
+    """Requirements of the tensors of an `nn.Conv2d`."""
     weight = Field((out, into, side, side), low=-largest, high=largest)
     return {f"{name}.weight": weight, f"{name}.bias": Field((out,), low=-largest, high=largest)}
 
 
 def interval(low: float, high: float, above: float = -math.inf) -> str:
-    """A range in words.
+    """Write a range in words.
+
+    Args:
+        low: smallest value allowed.
+        high: largest value allowed.
+        above: values must be larger than this.
+
+    Returns:
+        The words.
 
     >>> interval(0, 1), interval(-math.inf, 5, above=0)
     ('numbers from 0 to 1', 'numbers above 0, up to 5')
@@ -294,17 +311,23 @@ def interval(low: float, high: float, above: float = -math.inf) -> str:
 
 
 def is_number(value: object, *, whole: bool = False) -> bool:
-    """Whether a JSON value is a finite number, and a whole one where that is asked for."""
+    """Whether a JSON value is a finite number; with `whole`, whether it is a finite whole number."""
     if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
         return False
     try:
         return math.isfinite(value)
-    except OverflowError:  # an integer beyond the floats
+    except OverflowError:  # an integer larger than any float
         return False
 
 
 def is_plain(text: str) -> bool:
-    """Whether text can be written anywhere: no control characters and no halves of surrogate pairs.
+    """Tell whether text is safe to write anywhere: no control characters and no halves of surrogate pairs.
+
+    Args:
+        text: any text.
+
+    Returns:
+        Whether it is safe.
 
     >>> is_plain("dining table"), is_plain("a" + chr(0)), is_plain(chr(0xD800))
     (True, False, False)
@@ -313,7 +336,7 @@ def is_plain(text: str) -> bool:
 
 
 def shown(value: object) -> str:
-    """A value as an error prints it: on one line and short."""
+    """A value as error messages print it: on one line and short."""
     try:
         text = ascii(value)
     except (ValueError, RecursionError):  # integers too long to print, lists too deep
@@ -322,7 +345,7 @@ def shown(value: object) -> str:
 
 
 def _fits(size: Size, number: int, sizes: Sizes) -> bool:
-    """Whether a size is what it is known to be; from now on it is known."""
+    """Whether a number agrees with a size; a size that was unknown is known from then on."""
     if isinstance(size, int):
         return size == number
     for sign, factor in (("+", -1), ("-", 1)):

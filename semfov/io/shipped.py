@@ -1,11 +1,18 @@
-"""What to do where no model is shipped for a detector."""
+"""Shipped models by name, and the command that fits models where none are shipped for a detector."""
 
 from semfov.errors import InputError
 from semfov.io.pretrained import Pretrained
 
 
 def fit_command(model: str = "MODEL", out: str = "mymodels") -> str:
-    """The command that fits everything to a detector.
+    """Write the command that fits all models to a detector.
+
+    Args:
+        model: name or file of the detector.
+        out: folder for the models.
+
+    Returns:
+        The command line.
 
     >>> fit_command("mine.onnx")
     'python -m train.fit_detector mine.onnx --data.root PHOTOS --data.annotations instances.json --out mymodels'
@@ -14,21 +21,24 @@ def fit_command(model: str = "MODEL", out: str = "mymodels") -> str:
 
 
 def shipped_model(kind: type[Pretrained], name: str, model: str) -> str:
-    """The name, where a model of this kind is shipped under it.
+    """Check that a model is shipped under a name.
 
     Args:
-        kind: of model.
-        name: that it has for detector and sensor.
-        model: what the user calls the detector.
+        kind: kind of model.
+        name: name of the model for a detector and a sensor.
+        model: name or file of the detector, as the user gave it.
+
+    Returns:
+        The name.
 
     Raises:
-        InputError: none is shipped; the message has the command that makes it.
+        InputError: no such model is shipped; the message has the command that fits one.
     """
     if (kind.shipped / f"{name}.safetensors").is_file():
         return name
     known = sorted(path.stem for path in kind.shipped.glob("*.safetensors"))
     raise InputError(
-        f"detector: no {kind.title} is shipped for {name!r} (but for {', '.join(known)}); fit everything to it by "
-        f"`{fit_command(model)}` or semfov.fit_detector, and load that by "
+        f"detector: no {kind.title} is shipped for {name!r}, only for {', '.join(known)}; fit all models to it with "
+        f"`{fit_command(model)}` or semfov.fit_detector, and load them with "
         "ActivePerception.from_pretrained('mymodels'); ActivePerception.raw needs no model"
     )

@@ -1,4 +1,4 @@
-"""Tensors and what they mean in one file: safetensors with a JSON record in its header, and a checksum over both."""
+"""Tensors and their description in one file: safetensors with a JSON record in the header, and a checksum over both."""
 
 import hashlib
 import json
@@ -13,13 +13,18 @@ from torch import Tensor
 from semfov.errors import DataError, lookup
 from semfov.io.files import check_regular, replacing
 
-# One key only: the order of several would differ from one write to the next.
+# A single key, because the order of several keys would differ from one write to the next.
 _KEY = "semfov"
 _CHECKSUM = "sha256"
 
 
 def write(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> None:
-    """Write tensors and a record of JSON values to a file, whole or not at all; the same content gives the same bytes.
+    """Write tensors and a record of JSON values to a file atomically; the same content gives the same bytes.
+
+    Args:
+        path: the file.
+        tensors: tensors by name.
+        record: JSON values by name.
 
     Raises:
         DataError: the file cannot be written.
@@ -30,17 +35,20 @@ def write(path: str | PathLike[str], tensors: Mapping[str, Tensor], record: Mapp
     verified = {**record, _CHECKSUM: checksum(whole, record)}
     header = {_KEY: json.dumps(verified, sort_keys=True, allow_nan=False)}
     content = save(whole, header)
-    # The file is written here: `safetensors` tells of a full disk by an error that is no `OSError`.
+    # The file is written here, because `safetensors` reports a full disk by an error that is not an `OSError`.
     with replacing(Path(path)) as temporary:
         temporary.write_bytes(content)
 
 
 def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and record of a file that `write` made; nothing in the file is executed.
+    """Read a file that `write` made, and verify its checksum; nothing in the file is executed.
 
     Args:
         path: the file.
-        kind: what the record must say under `kind`.
+        kind: value that the record must have under `kind`.
+
+    Returns:
+        The tensors by name, and the record.
 
     Raises:
         DataError: the file is missing, damaged, or of another kind.
@@ -53,7 +61,7 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
             record = json.loads((file.metadata() or {})[_KEY], parse_constant=_refuse_constant)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
+        raise DataError(f"{path}: no such file; check the path") from None
     except (OSError, SafetensorError, ValueError, RecursionError, TypeError, AttributeError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise DataError(f"{path}: not a readable safetensors file ({reason}); write or fetch it again") from None
@@ -61,24 +69,32 @@ def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Tensor], dict[
         raise DataError(f"{path}: expected a file that semfov wrote, got one without its record") from None
     if not isinstance(record, dict) or record.get("kind") != kind:
         found = record.get("kind") if isinstance(record, dict) else type(record).__name__
-        raise DataError(f"{path}: expected {kind}, got {found}")
-    told = record.pop(_CHECKSUM, None)
-    if told is None:
+        raise DataError(f"{path}: expected a file of kind {kind}, got {found}; check the path")
+    recorded = record.pop(_CHECKSUM, None)
+    if recorded is None:
         raise DataError(f"{path}: expected a file with the sha256 of its content, got one without; write it again")
-    if told != checksum(tensors, record):
-        raise DataError(f"{path}: damaged, its content does not have the sha256 it was written with; fetch it again")
+    if recorded != checksum(tensors, record):
+        raise DataError(f"{path}: damaged, its sha256 is not the one it was written with; fetch it again")
     return tensors, record
 
 
 def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is no JSON")
+    raise ValueError(f"{name} is not valid JSON")
 
 
 def find(name_or_path: str | PathLike[str], shipped: Path, kind: str) -> Path:
-    """The path itself, or the file of that name among the models in `shipped`.
+    """Find the file of a model by its name or path.
+
+    Args:
+        name_or_path: name of a shipped model, or a path; a path has a folder or ends in `.safetensors`.
+        shipped: folder of the shipped models.
+        kind: kind of model, for the message.
+
+    Returns:
+        The path itself, or the path of the shipped model; a path need not exist.
 
     Raises:
-        InputError: no model of that name is shipped; `kind` says of what.
+        InputError: no model of that name is shipped.
     """
     path = Path(name_or_path)
     if path.suffix == ".safetensors" or len(path.parts) > 1:
@@ -88,7 +104,7 @@ def find(name_or_path: str | PathLike[str], shipped: Path, kind: str) -> Path:
 
 
 def checksum(tensors: Mapping[str, Tensor], record: Mapping[str, Any] | None = None) -> str:
-    """sha256 over the record, and over names, shapes, types and bytes of the tensors."""
+    """Compute a sha256 over the record and over the names, shapes, types and bytes of the tensors."""
     digest = hashlib.sha256(json.dumps(record or {}, sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()

@@ -1,4 +1,4 @@
-"""Foveal sensors: what an image looks like when it is fixated at a point."""
+"""Foveal sensors: the view of an image when it is fixated at a point."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,4 +1,4 @@
-"""Foveation at random places, as an augmentation of Kornia's."""
+"""Foveation at random positions, as a Kornia augmentation."""
 
 from math import inf
 from typing import Any, get_args
@@ -14,33 +14,33 @@ from semfov.sensor.pyramid import Convention
 
 
 class RandomFoveation(IntensityAugmentationBase2D):
-    r"""Foveate every image of a batch around a place drawn at random, with a fovea of random width.
+    r"""Foveate every image of a batch around a random position, with a fovea of random width.
 
     .. math:: x_0 \sim U[-\tfrac12, W - \tfrac12], \quad y_0 \sim U[-\tfrac12, H - \tfrac12], \quad
               \sigma \sim U[\sigma_{min}, \sigma_{max}]
 
-    and then `semfov.foveate`. It trains a network for views that are sharp anywhere. No pixel moves: boxes, masks and
-    keypoints stay as they are. Kornia's other augmentations say how `p`, `same_on_batch` and `keepdim` work, and what
-    draws depend on: torch's global generator. (The distributions are ours.)
+    and then `semfov.foveate`. (The distributions are ours.) It trains a network for views that are sharp at any
+    position. No pixel moves, so boxes, masks and keypoints stay as they are. `p`, `same_on_batch` and `keepdim` work
+    as in Kornia's other augmentations, and random numbers come from torch's global generator.
 
-    What was drawn is in `_params`: `gaze`, `(B, 2)`, fixations `(x, y)` in image pixels, and `sigma`, `(B,)`, in
-    pixels. Handed back as `params`, it gives the same views again. They are differentiable in the image and, with
-    `params` of one's own, in the fixations and widths.
+    `_params` holds the random numbers of the last call: `gaze`, `(B, 2)`, fixations `(x, y)` in image pixels, and
+    `sigma`, `(B,)`, in pixels. Passed as `params`, they give the same views again. Views are differentiable in the
+    image and, where you pass `params` yourself, in the fixations and widths.
 
     Args:
-        sigma: width σ of the fovea in image pixels, or the least and the largest.
+        sigma: width σ of the fovea in image pixels, or its smallest and largest value.
         levels: number of bands of the pyramid.
         growth: factor by which the window of each coarser band is wider.
-        convention: `kornia` or `opencv` pyramid.
-        same_on_batch: one fixation and one width for all images of a batch.
-        p: probability that an image is foveated; the others come back as they are.
-        keepdim: give an image `(C, H, W)` back as such.
+        convention: convention of the pyramid, `kornia` or `opencv`.
+        same_on_batch: draw one fixation and one width for all images of a batch.
+        p: probability that an image is foveated; the other images are returned unchanged.
+        keepdim: return an image `(C, H, W)` in this shape, without a batch dimension.
 
     Shape:
         `(C, H, W)` or `(B, C, H, W)`, floating-point; the result is `(B, C, H, W)`.
 
     Raises:
-        InputError: a setting is not what it should be.
+        InputError: a setting is out of its range.
 
     >>> augment = RandomFoveation((20.0, 60.0), p=1.0)
     >>> image = torch.rand(2, 3, 48, 64)
@@ -50,7 +50,7 @@ class RandomFoveation(IntensityAugmentationBase2D):
     >>> torch.equal(augment(image, params=augment._params), view)
     True
 
-    Beside other augmentations, with boxes:
+    Together with another augmentation, and with boxes:
 
     >>> from kornia.augmentation import AugmentationSequential, RandomHorizontalFlip
     >>> both = AugmentationSequential(RandomHorizontalFlip(), RandomFoveation(30.0), data_keys=["input", "bbox_xyxy"])
@@ -69,10 +69,10 @@ class RandomFoveation(IntensityAugmentationBase2D):
     ) -> None:
         super().__init__(p=p, same_on_batch=same_on_batch, keepdim=keepdim)
         low, high = sigma if isinstance(sigma, tuple | list) else (sigma, sigma)
-        check(0 < low <= high < inf, "sigma", "a positive number, or the least and the largest", sigma)
+        check(0 < low <= high < inf, "sigma", "a positive number, or the smallest and the largest one", sigma)
         check(levels >= 0, "levels", "0 or more", levels)
         check(growth > 0, "growth", "a positive number", growth)
-        check(0 <= p <= 1, "p", "a probability", p)
+        check(0 <= p <= 1, "p", "a probability from 0 to 1", p)
         lookup(convention, get_args(Convention), "pyramid convention")
         self._param_generator = _Fixations(float(low), float(high))
         self.flags = {"levels": levels, "growth": growth, "convention": convention}
@@ -80,14 +80,24 @@ class RandomFoveation(IntensityAugmentationBase2D):
     def apply_transform(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
-        """Foveate a batch around what was drawn."""
-        # Containers add flags of their own.
+        """Foveate a batch around the fixations that were drawn.
+
+        Args:
+            input: images `(B, C, H, W)`.
+            params: `gaze`, `(B, 2)`, and `sigma`, `(B,)`, in pixels.
+            flags: `levels`, `growth` and `convention`.
+            transform: unused; Kornia passes it to every augmentation.
+
+        Returns:
+            Foveated images `(B, C, H, W)`.
+        """
+        # Kornia's containers add further flags.
         settings = {name: flags[name] for name in ("levels", "growth", "convention")}
         return foveate(input, params["gaze"], sigma=params["sigma"], **settings)
 
 
 class _Fixations(PlainUniformGenerator):
-    """Draws fixations anywhere on an image, and widths."""
+    """Random fixations, uniform over an image, and random widths."""
 
     def __init__(self, low: float, high: float) -> None:
         whole = (0.0, 1.0)
@@ -99,6 +109,6 @@ class _Fixations(PlainUniformGenerator):
     def forward(self, batch_shape: tuple[int, ...], same_on_batch: bool = False) -> dict[str, Tensor]:
         """`gaze`, `(B, 2)`, and `sigma`, `(B,)`, for images `(B, C, H, W)`."""
         drawn = super().forward(batch_shape, same_on_batch)
-        # Pixels are areas around whole numbers.
+        # A pixel is an area around integer coordinates.
         x, y = (drawn[name] * n - 0.5 for name, n in (("x", batch_shape[-1]), ("y", batch_shape[-2])))
         return {"sigma": drawn["sigma"], "gaze": torch.stack([x, y], -1)}

@@ -1,4 +1,4 @@
-"""What an eye asks of its sensor."""
+"""The interface of the sensors of an eye."""
 
 from abc import ABC, abstractmethod
 from typing import Any
@@ -10,57 +10,93 @@ from semfov.errors import check, check_finite, values_known
 
 
 class Sensor(nn.Module, ABC):
-    """Base of the sensors of an eye: what a canvas looks like when it is fixated at a point.
+    """Base of the sensors of an eye: they compute the view of a canvas for a fixation.
 
-    A canvas is an image that was fitted into the detector's input. `open` does the work that does not depend on the
-    fixation, once for each image; `look` shows the canvas from many fixations. What is shown may lie elsewhere than on
-    the canvas, as that of a magnifying glass does: `boxes_to_canvas` then leads the detector's boxes back.
+    A canvas is an image that was resized and padded to the detector's input. `open` does the work that does not depend
+    on the fixation, once for each image. `look` computes the views for many fixations. Where a sensor moves pixels, as
+    a magnifying glass does, `boxes_to_canvas` maps the boxes that the detector found in a view back to the canvas.
+
+    >>> class Half(Sensor):
+    ...     def open(self, canvas, scale):
+    ...         return canvas
+    ...
+    ...     def look(self, state, gaze):
+    ...         return 0.5 * state.expand(len(gaze), -1, -1, -1)
+    ...
+    ...     def settings(self):
+    ...         return {"kind": "half"}
+    >>> sensor = Half()
+    >>> state = sensor.open(torch.ones(1, 3, 8, 8), torch.ones(2))
+    >>> sensor.look(state, torch.tensor([[2.0, 3.0], [5.0, 6.0]])).shape
+    torch.Size([2, 3, 8, 8])
     """
 
     def __init__(self) -> None:
         super().__init__()
-        # It goes where the module goes, and so tells its type where there is no parameter.
+        # The buffer follows the module to its device and type, also where the module has no parameter.
         self.register_buffer("_like", torch.empty(0), persistent=False)
 
     @property
     def like(self) -> Tensor:
-        """An empty tensor of the type, and on the device, of the images that it takes."""
+        """An empty tensor with the type and the device of the images that the sensor takes."""
         return torch.as_tensor(self._like)
 
     @abstractmethod
     def open(self, canvas: Tensor, scale: Tensor) -> Any:
-        """Hold a canvas: everything that does not depend on where it is fixated.
+        """Prepare a canvas: compute everything that does not depend on the fixation.
 
         Args:
             canvas: `(1, 3, H, W)`, RGB in [0, 1].
             scale: canvas pixels for each pixel of an image of the size that the sensor's settings are meant for,
                 `(2,)`, along x and y.
+
+        Returns:
+            The prepared canvas, in any form that `look` understands.
         """
 
     @abstractmethod
     def look(self, state: Any, gaze: Tensor) -> Tensor:
-        """What fixations show: `(F, 3, h, w)` for the detector.
+        """Compute the views of a canvas for fixations.
 
         Args:
-            state: of `open`.
+            state: the canvas as `open` prepared it.
             gaze: fixations `(F, 2)`, `(x, y)` in pixels of the canvas, inside or outside.
+
+        Returns:
+            Views `(F, 3, h, w)` for the detector.
         """
 
     def boxes_to_canvas(self, state: Any, gaze: Tensor, boxes: Tensor) -> Tensor:
-        """Boxes `(F, N, 4)` on what `look` showed, as boxes on the canvas: the same, unless the sensor moves pixels."""
+        """Map boxes from the views to the canvas; they stay as they are unless the sensor moves pixels.
+
+        Args:
+            state: the canvas as `open` prepared it.
+            gaze: fixations `(F, 2)`.
+            boxes: boxes `(F, N, 4)` in pixels of the views.
+
+        Returns:
+            Boxes `(F, N, 4)` in pixels of the canvas.
+        """
         return boxes
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """What its views depend on, as JSON takes it, for the keys of caches and the metadata of fitted models."""
+        """List the settings that the views depend on, for the keys of caches and the metadata of fitted models.
+
+        Returns:
+            JSON values by name.
+        """
 
 
 def fixations(gaze: Tensor, like: Tensor) -> tuple[Tensor, bool]:
-    """Fixations `(B, G, 2)` of images `like` `(B, C, H, W)`, and whether there were several for each.
+    """Bring fixations into one shape, and move them to the images' type and device.
 
     Args:
-        gaze: `(2,)` for all images, `(B, 2)` one for each, or `(B, G, 2)` G for each.
-        like: whose type and device they take.
+        gaze: `(2,)` for all images, `(B, 2)` for one fixation of each image, or `(B, G, 2)` for G of each.
+        like: the images, `(B, C, H, W)`.
+
+    Returns:
+        Fixations `(B, G, 2)`, and whether the gaze had the dimension G.
 
     Raises:
         InputError: a shape does not fit, or a fixation is not finite.

@@ -1,4 +1,4 @@
-"""The foveal sensor: an image that is sharp around a fixation and ever coarser away from it."""
+"""The foveal sensor: an image that is sharp around a fixation and gets coarser away from it."""
 
 from dataclasses import dataclass
 from typing import Any, get_args
@@ -24,35 +24,37 @@ def foveate(
 ) -> Tensor:
     r"""Foveate images around fixations.
 
-    Each band of a Laplacian pyramid is weighted with a Gaussian window around the fixation, and the pyramid put
+    Each band of a Laplacian pyramid is weighted with a Gaussian window around the fixation, and the pyramid is put
     together again (Almeida, Figueiredo, Bernardino and Santos-Victor, 2018):
 
     .. math:: R_K = G_K, \quad R_k = w_k L_k + \mathrm{expand}(R_{k+1}), \quad
               w_k(x, y) = \exp\left(-\frac{(x-x_0)^2 + (y-y_0)^2}{2 \sigma_k^2}\right), \quad
               \sigma_k = \sigma \cdot g^k
 
-    which is `expand^K(G_K) + Σ_k expand^k(w_k L_k)`. (The factor g is ours: their code has one window for all bands,
-    g = 1.) A window is evaluated at the places in the image where the
-    pixels of its band lie: pixel i of band k at `(i + ½) · W / W_k − ½` with Kornia's pyramid, at `2^k i` with
-    OpenCV's.
+    which is `expand^K(G_K) + Σ_k expand^k(w_k L_k)`. (The factor g is ours: the authors' code has one window for all
+    bands, g = 1.) The window of a band is evaluated at the positions of the band's pixels in the image. Pixel i of
+    band k is at `(i + ½) · W / W_k − ½` in Kornia's pyramid, and at `2^k i` in OpenCV's.
 
     Args:
-        image: `(B, C, H, W)`, or a pyramid of it from `Foveation.pyramid`, which any number of fixations can share
-            (`levels` and `convention` are then the pyramid's); or one picture of any common kind (`semfov.as_image`).
-        gaze: fixation `(x, y)` in image pixels, inside or outside, as a tensor, an array, a tuple or a list: `(2,)` for
-            all images, `(B, 2)` one for each, or `(B, G, 2)` G for each; of one picture `(2,)`, or `(G, 2)` G of them.
+        image: `(B, C, H, W)`, or its pyramid from `Foveation.pyramid`, which any number of fixations can share (the
+            pyramid then determines `levels` and `convention`); or one picture of any common type (`semfov.as_image`).
+        gaze: fixation `(x, y)` in image pixels, inside or outside, as a tensor, an array, a tuple or a list. For a
+            batch: `(2,)` for all images, `(B, 2)` for one fixation of each image, or `(B, G, 2)` for G of each. For
+            one picture: `(2,)`, or `(G, 2)` for G fixations.
         sigma: width σ of the fovea in image pixels: a number, `()`, `(B,)`, or `(B, 2)` for widths along x and y.
-            Infinity gives the image back.
+            With infinity the result equals the image.
         levels: number of bands, K.
-        growth: factor g by which the window of each coarser band is wider: with 1 all share one, with 2 acuity falls
-            off gradually (`semfov.sensor.SENSORS` names settings).
-        convention: `kornia` or `opencv` (`semfov.sensor.pyramid`).
+        growth: factor g by which the window of each coarser band is wider. With 1 all bands share one window; with 2
+            acuity falls off gradually. `semfov.sensor.SENSORS` lists named settings.
+        convention: convention of the pyramid, `kornia` or `opencv` (`semfov.sensor.pyramid`).
 
     Returns:
-        `(B, C, H, W)`, or `(B, G, C, H, W)` for G fixations; of one picture `(3, H, W)` or `(G, 3, H, W)`.
+        Foveated images `(B, C, H, W)`, or `(B, G, C, H, W)` for G fixations; for one picture `(3, H, W)` or
+        `(G, 3, H, W)`.
 
     Raises:
-        InputError: a shape does not fit, the gaze is not finite, σ or growth is not positive, or it is no picture.
+        InputError: a shape does not fit, the gaze is not finite, σ or growth is not positive, or the image is not a
+            picture.
         DataError: a file cannot be read.
 
     >>> image = torch.rand(1, 3, 48, 64)
@@ -77,10 +79,10 @@ def foveate(
 
 @dataclass(frozen=True)
 class Opened:
-    """A canvas as `Foveation` holds it.
+    """A canvas that `Foveation.open` has prepared.
 
     Attributes:
-        bands: Laplacian pyramid of the canvas, computed once.
+        bands: Laplacian pyramid of the canvas.
         sigma: width of the fovea in canvas pixels along x and y, `(1, 2)`.
     """
 
@@ -89,23 +91,23 @@ class Opened:
 
 
 class Foveation(Sensor):
-    r"""A foveal sensor, see `foveate`.
+    r"""A foveal sensor, the module form of `foveate`.
 
-    On a canvas s times as large as the image that σ is meant for, windows shrink by s, and a band of the canvas holds
-    what is :math:`\log_2 s` bands finer there, so that
+    A canvas may be s times as large as the image that σ is meant for. Distances on it are then s times as long, and
+    the detail of a band of the image is :math:`\log_2 s` bands coarser on the canvas. The widths
 
     .. math:: \sigma_k' = s \, \sigma \, \mathrm{growth}^{k - \log_2 s}, \qquad
               \sigma' = \sigma \, s^{1 - \log_2 \mathrm{growth}}
 
-    keeps the same detail at the same distance from the fovea. (With growth 2 acuity is a function of eccentricity
-    that has no scale, and σ' = σ.)
+    keep the same detail at the same distance from the fovea. (With growth 2, acuity as a function of eccentricity has
+    no scale of its own, and σ' = σ.)
 
     Args:
         sigma: width of the fovea in image pixels.
         levels: number of bands of the pyramid.
         growth: factor by which the window of each coarser band is wider.
-        convention: `kornia` or `opencv` pyramid.
-        learnable: make σ a parameter (its logarithm is what is learnt, so that it stays positive).
+        convention: convention of the pyramid, `kornia` or `opencv`.
+        learnable: make σ a learnable parameter (its logarithm is learned, so that σ stays positive).
 
     >>> sensor = Foveation(20.0)
     >>> bands = sensor.pyramid(torch.rand(2, 3, 64, 64))
@@ -138,20 +140,27 @@ class Foveation(Sensor):
         return self.log_sigma.exp()
 
     def pyramid(self, image: ImageLike) -> Bands:
-        """The part of the work that does not depend on the gaze, for images `(B, C, H, W)` or one of any kind."""
+        """Compute the part of the work that does not depend on the gaze, to share it among fixations.
+
+        Args:
+            image: images `(B, C, H, W)`, or one picture of any common type (`semfov.as_image`).
+
+        Returns:
+            The Laplacian pyramid.
+        """
         return laplacian_pyramid(_batch(image), self.levels, self.convention)
 
     def open(self, canvas: Tensor, scale: Tensor) -> Opened:
-        """Build the pyramid of a canvas, and scale the width of the fovea."""
+        """Compute the pyramid of a canvas, and scale the width of the fovea."""
         shrink = scale[None].pow(1 - torch.as_tensor(self.growth).to(scale).log2())
         return Opened(self.pyramid(canvas), self.sigma * shrink)
 
     def look(self, state: Opened, gaze: Tensor) -> Tensor:
-        """Canvases `(F, 3, H, W)` foveated around fixations `(F, 2)`."""
+        """Foveate a canvas around fixations `(F, 2)`: views `(F, 3, H, W)`."""
         return foveate(state.bands, gaze[None], sigma=state.sigma, growth=self.growth)[0]
 
     def settings(self) -> dict[str, Any]:
-        """What its views depend on."""
+        """List the settings that the views depend on."""
         return {
             "sigma": float(self.sigma),
             "levels": self.levels,
@@ -160,19 +169,31 @@ class Foveation(Sensor):
         }
 
     def forward(self, image: ImageLike | Bands, gaze: PointLike) -> Tensor:
-        """Foveate an image or a pyramid around `gaze`; shapes as for `foveate`."""
+        """Foveate images around fixations.
+
+        Args:
+            image: images, or their pyramid, as for `foveate`.
+            gaze: fixations `(x, y)` in image pixels, as for `foveate`.
+
+        Returns:
+            Foveated images, in the shapes of `foveate`.
+        """
         return foveate(
             image, gaze, sigma=self.sigma, levels=self.levels, growth=self.growth, convention=self.convention
         )
 
     def extra_repr(self) -> str:
-        """Settings, for `print`."""
+        """Write the settings, for `repr`.
+
+        Returns:
+            The settings as text.
+        """
         settings = f"levels={self.levels}, growth={self.growth:g}, convention={self.convention!r}"
         return f"sigma={float(self.sigma.detach()):g}, {settings}"
 
 
 def _batch(images: ImageLike) -> Tensor:
-    """Images `(B, C, H, W)`: batches of floats as they are, with any channels and of any range."""
+    """Images `(B, C, H, W)`; batches of floats stay as they are, with any number of channels and any range."""
     if isinstance(images, Tensor) and images.ndim == 4 and images.is_floating_point():
         return images
     return as_images(images)
@@ -195,17 +216,17 @@ def _collapse(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Ten
             result = torch.addcmul(expanded[:, None], window, band[:, None]).flatten(0, 1)
         else:
             views = expanded.unflatten(0, (batch, many))
-            # In place where nothing keeps a record of it, which saves memory that is fresh.
+            # In place where no graph is recorded, which avoids allocating memory.
             blend = views.addcmul_ if values_known(views, window, band) else views.addcmul
             result = blend(window, band[:, None]).flatten(0, 1)
     return result.unflatten(0, (batch, many))
 
 
 def _windows(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Gaussian windows `(B, G, w_k)` across and `(B, G, h_k)` down every band, all from one exponential."""
+    """Gaussian windows `(B, G, w_k)` along x and `(B, G, h_k)` along y for every band, from one exponential."""
     sizes = tuple((band.shape[-2], band.shape[-1]) for band in bands.details)
     place, power, axis, level = _layout(sizes, bands.convention, sigma.dtype, sigma.device)
-    least = torch.finfo(sigma.dtype).tiny  # a width that vanishes is that of a point, and 0 / 0 no number
+    least = torch.finfo(sigma.dtype).tiny  # a width that underflows to 0 would give 0 / 0 at the fixation
     widths = (sigma[..., None] * (growth**power).clamp(min=least)).clamp(min=least).flatten(1)
     offset = (place - fixation.index_select(-1, axis)) / widths.index_select(-1, level)[:, None]
     pieces = offset.square().mul(-0.5).exp().split([n for size in sizes for n in reversed(size)], -1)
@@ -216,7 +237,7 @@ def _windows(bands: Bands, fixation: Tensor, sigma: Tensor, growth: float | Tens
 def _layout(
     sizes: tuple[tuple[int, int], ...], convention: Convention, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """For pixels along x and y of every band: places; powers of the growth; the pixels' axes, and their widths."""
+    """Positions of the pixels along x and y of every band, exponents of the growth, and indices of axes and widths."""
     lines = [(axis, k) for k in range(len(sizes)) for axis in (0, 1)]
     place = [places(sizes[k][1 - axis], sizes[0][1 - axis], k, convention) for axis, k in lines]
     counts = torch.tensor([sizes[k][1 - axis] for axis, k in lines])

@@ -20,28 +20,28 @@ def glimpse(
 ) -> Tensor:
     r"""Resample windows of an image to one size.
 
-    Canvas pixel i of a window that starts at a and is s picture pixels wide for each canvas pixel is a mean of picture
-    pixels j with the weights of a triangle as wide as a canvas pixel, but never narrower than a picture pixel (the
-    antialiased bilinear filter of Pillow and torch):
+    Let a window start at a and let a canvas pixel be s picture pixels wide. Canvas pixel i is a weighted mean of the
+    picture pixels j. The weights form a triangle around its centre, which falls to zero one canvas pixel away, but not
+    less than one picture pixel away (the antialiased bilinear filter of Pillow and torch):
 
     .. math:: c_i = \frac{\sum_j t_{ij} I_j}{\sum_j t_{ij}}, \qquad
               t_{ij} = \max\left(0, 1 - \frac{|a + (i + ½) s - (j + ½)|}{\max(s, 1)}\right)
 
-    along x and along y. Pixels beyond the window's border are seen where the triangles of its outer pixels reach them.
-    It is differentiable in the image and in the boxes: in their place and in their size.
+    along x and along y. The triangles of the outer pixels also reach picture pixels just outside the window. The result
+    is differentiable in the image and in the boxes, in their position and in their size.
 
     Args:
         image: `(B, C, H, W)`.
-        boxes: windows `(B, G, 4)`, or `(B, 4)` for one in each image: `(x1, y1, x2, y2)`, edges between pixels, where 0
-            is the left (top) border of the image. They may reach beyond the image. (Those of Kornia:
-            `kornia.geometry.boxes.Boxes.to_tensor(mode="xyxy")`.)
+        boxes: windows `(B, G, 4)`, or `(B, 4)` for one window of each image: `(x1, y1, x2, y2)`. Coordinates are edges
+            between pixels, and 0 is the left (top) border of the image. Windows may extend beyond the image. (Kornia
+            gives such boxes by `kornia.geometry.boxes.Boxes.to_tensor(mode="xyxy")`.)
         size: `(width, height)` of the canvas.
-        padding_mode: what lies beyond the image, as in Kornia: `zeros`, the `border` pixels, or `fill` for
+        padding_mode: values outside the image, as in Kornia: `zeros`, the nearest `border` pixels, or `fill` for
             `fill_value`.
-        fill_value: see there.
+        fill_value: value outside the image with `padding_mode="fill"`.
 
     Returns:
-        `(B, G, C, height, width)`, or `(B, C, height, width)`.
+        Canvases `(B, G, C, height, width)`, or `(B, C, height, width)` for one window of each image.
 
     Raises:
         InputError: a shape does not fit, or a window is empty or not finite.
@@ -61,7 +61,7 @@ def glimpse(
     if values_known(boxes):
         check_finite(boxes.detach(), "boxes")
         full = bool(((boxes[..., 2:] - boxes[..., :2]) > 0).all())
-        check(full, "boxes", "windows with a positive width and height", "one without")
+        check(full, "boxes", "windows with a positive width and height", "an empty window")
     windows = boxes.to(image) if boxes.ndim == 3 else boxes[:, None].to(image)
     value = 0.0 if padding_mode == "zeros" else fill_value
     views = [
@@ -75,7 +75,7 @@ def glimpse(
 
 
 def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> Tensor:
-    r"""Windows that are centred at points and fill a canvas, `(..., 4)`.
+    r"""Compute the windows that are centred at points and fill a canvas at given magnifications.
 
     .. math:: (x_1, y_1, x_2, y_2) = (p + ½) \mp \frac{(w, h)}{2 m}
 
@@ -83,6 +83,9 @@ def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> 
         points: `(..., 2)`, pixel centres at integers.
         magnification: m, canvas pixels for each picture pixel, `(...)`.
         size: `(w, h)` of the canvas.
+
+    Returns:
+        Windows `(..., 4)`, `(x1, y1, x2, y2)`, edges between pixels.
 
     >>> windows_at(torch.tensor([[9.5, 9.5]]), torch.tensor([2.0]), (10, 20))
     tensor([[ 7.5000,  5.0000, 12.5000, 15.0000]])
@@ -93,12 +96,15 @@ def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> 
 
 
 def ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1.0) -> tuple[float, ...]:
-    """Magnifications one octave apart: from the whole picture up to the last that is not above `finest`.
+    """List magnifications one octave apart, from the one that shows the whole picture up to a finest one.
 
     Args:
-        picture: `(width, height)`.
+        picture: `(width, height)` of the picture.
         size: `(width, height)` of the canvas.
-        finest: canvas pixels for each picture pixel, 1 for native pixels.
+        finest: largest magnification allowed, in canvas pixels for each picture pixel; 1 for native pixels.
+
+    Returns:
+        The magnifications, smallest first; the first shows the whole picture.
 
     >>> ladder((2560, 1920), (416, 416))
     (0.1625, 0.325, 0.65)
@@ -113,12 +119,12 @@ def ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1
 
 
 class Glimpse(nn.Module):
-    """A sensor that shows a window of the picture at a magnification, see `glimpse`.
+    """A sensor that shows a window of the picture at a magnification, the module form of `glimpse`.
 
     Args:
-        size: `(width, height)` of the canvas, a detector's input.
-        padding_mode: what lies beyond the picture.
-        fill_value: value of `fill`.
+        size: `(width, height)` of the canvas, the detector's input.
+        padding_mode: values outside the picture: `zeros`, `border` or `fill`.
+        fill_value: value outside the picture with `padding_mode="fill"`.
 
     >>> sensor = Glimpse((32, 32))
     >>> sensor(torch.rand(1, 3, 64, 96), torch.tensor([[[20.0, 20.0]]]), torch.tensor([[0.5]])).shape
@@ -133,17 +139,30 @@ class Glimpse(nn.Module):
         self.fill_value = fill_value
 
     def forward(self, image: Tensor, points: Tensor, magnification: Tensor) -> Tensor:
-        """Views `(B, G, C, h, w)` of images `(B, C, H, W)` at points `(B, G, 2)` and magnifications `(B, G)`."""
+        """Compute views of images at points and magnifications.
+
+        Args:
+            image: `(B, C, H, W)`.
+            points: centres of the windows `(B, G, 2)`, `(x, y)` in picture pixels.
+            magnification: canvas pixels for each picture pixel, `(B, G)`.
+
+        Returns:
+            Views `(B, G, C, h, w)`.
+        """
         boxes = windows_at(points, magnification, self.size)
         return glimpse(image, boxes, self.size, padding_mode=self.padding_mode, fill_value=self.fill_value)
 
     def extra_repr(self) -> str:
-        """Settings, for `repr`."""
+        """Write the settings, for `repr`.
+
+        Returns:
+            The settings as text.
+        """
         return f"size={self.size}, padding_mode={self.padding_mode!r}, fill_value={self.fill_value:g}"
 
 
 def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: Padding, value: float) -> Tensor:
-    """One window of an image `(C, H, W)`: two products with banded weights, over the pixels that it shows alone."""
+    """One window of an image `(C, H, W)`: two matrix products, over the pixels that the window shows."""
     across, (left, right) = _weights(box[0], box[2], size[0], image.shape[-1], border=padding == "border")
     down, (top, bottom) = _weights(box[1], box[3], size[1], image.shape[-2], border=padding == "border")
     part = image[:, top:bottom, left:right]
@@ -153,7 +172,7 @@ def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: Padding,
 
 
 def _weights(low: Tensor, high: Tensor, count: int, length: int, *, border: bool) -> tuple[Tensor, tuple[int, int]]:
-    """Weights `(count, n)` of picture pixels in every canvas pixel along one axis, and which n pixels these are."""
+    """Weights `(count, n)` of n picture pixels in every canvas pixel along one axis, and the range of those pixels."""
     step = (high - low) / count
     reach = step.clamp(min=1.0)
     middle = low + (torch.arange(count).to(low) + 0.5) * step

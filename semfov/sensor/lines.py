@@ -1,8 +1,8 @@
-"""Separable filters of any kind as products of matrices with the lines of an image.
+"""Separable filters of any kind as matrix products with the lines of an image.
 
-A filter whose output pixels depend on few neighbours is a matrix that is zero far from its diagonal, which is cut into
-tiles. On a CPU their products are several times faster than convolutions of few channels, and a product reads a
-transposed image as quickly, so that two passes filter both axes without a copy.
+A filter whose output pixels depend on few neighbours is a matrix that is zero far from its diagonal. The matrix is cut
+into tiles along the diagonal. On a CPU the products of the tiles are several times faster than convolutions of few
+channels. A product reads a transposed image equally fast, so two passes filter both axes without a copy.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from semfov.errors import values_known
 
-# Lines up to this many pixels are made by one dense matrix, longer ones tile by tile.
+# Lines of up to this many pixels are computed by one dense matrix, longer lines tile by tile.
 _SMALL = 160
 
 Constant = TypeVar("Constant")
@@ -23,11 +23,11 @@ Settings = TypeVarTuple("Settings")
 
 
 def constant(function: Callable[[*Settings], Constant]) -> Callable[[*Settings], Constant]:
-    """Remember the tensors that a function makes of sizes and settings alone; a compiled graph makes its own."""
+    """Cache the results of a function of sizes and settings; a compiled graph computes its own."""
 
     @lru_cache(maxsize=256)
     def remember(*settings: Any) -> Any:
-        # What is made during inference must serve a later gradient too.
+        # A tensor that is made during inference must be usable with gradients later.
         with torch.inference_mode(False), torch.no_grad():
             return function(*settings)
 
@@ -43,11 +43,11 @@ def constant(function: Callable[[*Settings], Constant]) -> Callable[[*Settings],
 
 @dataclass(frozen=True)
 class Taps:
-    """What every pixel of a line is the weighted sum of.
+    """A linear filter of a line: every output pixel is a weighted sum of input pixels.
 
     Attributes:
-        index: pixels of the line that is read, `(length, taps)`; the same one may come several times.
-        weight: their weights, `(length, taps)`, double precision.
+        index: input pixels of each output pixel, `(length, taps)`; one pixel may be listed several times.
+        weight: weights of the input pixels, `(length, taps)`, float64.
     """
 
     index: Tensor
@@ -55,14 +55,15 @@ class Taps:
 
 
 class Lines(NamedTuple):
-    """A matrix that makes lines of other lengths out of lines.
+    """A matrix from input lines to output lines, dense or cut into tiles.
 
     Attributes:
-        first: what makes the first pixels of a line, `(a, n)`; without `middle`, all of them.
-        middle: what makes each of the tiles that follow, `(tiles, tile, window)`.
-        last: what makes the pixels that remain, `(b, m)`.
-        start: where on the line the window of the first tile in the middle begins.
-        shift: how far apart the windows of two in succession lie.
+        first: dense matrix of the first a output pixels from the first n input pixels, `(a, n)`; without `middle` it
+            is the whole matrix.
+        middle: matrices of the tiles that follow, `(tiles, tile, window)`.
+        last: dense matrix of the last b output pixels from the last m input pixels, `(b, m)`.
+        start: first input pixel of the window of the first tile in `middle`.
+        shift: distance in input pixels between the windows of successive tiles.
     """
 
     first: Tensor
@@ -73,7 +74,7 @@ class Lines(NamedTuple):
 
     @property
     def length(self) -> int:
-        """Pixels of the lines that are made."""
+        """Number of pixels of an output line."""
         made = len(self.first)
         if self.middle is not None and self.last is not None:
             made += self.middle.shape[0] * self.middle.shape[1] + len(self.last)
@@ -83,14 +84,19 @@ class Lines(NamedTuple):
 def banded(
     taps: Taps, count: int, tile: int, shift: int, reach: int, dtype: torch.dtype, device: torch.device
 ) -> Lines:
-    """The matrix of `taps`, cut into tiles.
+    """Make the matrix of a filter, cut into tiles where the line is long.
 
     Args:
-        taps: what the pixels are made of.
-        count: pixels of the line that is read.
-        tile: pixels made at once.
-        shift: pixels read that lie under a tile.
-        reach: pixels before and behind those that a tile reads too, at most.
+        taps: the filter.
+        count: number of input pixels.
+        tile: number of output pixels of a tile.
+        shift: number of input pixels that a tile covers.
+        reach: largest number of input pixels that a tile reads before and after those.
+        dtype: type of the matrix.
+        device: device of the matrix.
+
+    Returns:
+        The matrix.
     """
     index, weight = taps.index, taps.weight
     length, window = len(index), shift + 2 * reach
@@ -105,13 +111,13 @@ def banded(
     middle = _dense(inner, weight[rows:rest].reshape(inner.shape), window).to(device, dtype)
     last = _dense(index[rest:] - behind, weight[rest:], count - behind).to(device, dtype)
     if values_known(middle) and bool((middle == middle[0]).all()):
-        # Mostly all are alike, and one stays in the fastest cache.
+        # Usually all tiles are equal, and a single one stays in the fastest cache.
         middle = middle[:1].expand(tiles, -1, -1)
     return Lines(first, middle, last, start, shift)
 
 
 def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
-    """Columns of an image `(..., h, w)` made into others by `down`, its rows by `across`."""
+    """Filter the columns of an image `(..., h, w)` with `down` and its rows with `across`."""
     if not values_known(image) or (image.requires_grad and torch.is_grad_enabled()) or image.device.type != "cpu":
         return _product(_product(image.mT, across).mT, down)
     if down.middle is None and across.middle is None:
@@ -122,12 +128,12 @@ def separable(image: Tensor, down: Lines, across: Lines) -> Tensor:
 
 
 def _dense(index: Tensor, weight: Tensor, count: int) -> Tensor:
-    """The matrix `(..., count)` of some rows."""
+    """The dense matrix `(..., count)` of some output pixels."""
     return torch.zeros(*index.shape[:-1], count, dtype=weight.dtype).scatter_add(-1, index, weight)
 
 
 def _product(image: Tensor, lines: Lines) -> Tensor:
-    """Columns made into others."""
+    """Filter the columns of an image."""
     if lines.middle is None or lines.last is None:
         return lines.first @ image
     top, bottom = (
@@ -138,7 +144,7 @@ def _product(image: Tensor, lines: Lines) -> Tensor:
 
 
 def _write(planes: Tensor, lines: Lines) -> Tensor:
-    """The same of planes `(B, h, w)`, each part written where it belongs, which copies less."""
+    """Filter the columns of planes `(B, h, w)` and write each part into its place, which copies less."""
     if lines.middle is None or lines.last is None:
         return lines.first @ planes
     result = planes.new_empty(len(planes), lines.length, planes.shape[-1])
@@ -152,7 +158,7 @@ def _write(planes: Tensor, lines: Lines) -> Tensor:
 
 
 def _windows(image: Tensor, lines: Lines, middle: Tensor) -> Tensor:
-    """What the tiles are made of, overlapping: `(..., tiles, window, w)`."""
+    """The overlapping input windows of the tiles, `(..., tiles, window, w)`."""
     tiles, _, window = middle.shape
     stop = lines.start + (tiles - 1) * lines.shift + window
     return image[..., lines.start : stop, :].unfold(-2, window, lines.shift).mT

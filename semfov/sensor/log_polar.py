@@ -1,4 +1,4 @@
-"""The log-polar sensor: a cortical image of receptors that stand ever wider apart, and what it shows on the canvas."""
+"""The log-polar sensor: cortical images, whose receptors lie further apart with eccentricity, and their projections."""
 
 from dataclasses import dataclass
 from math import ceil, exp, hypot, inf, log1p, log2, pi, sqrt
@@ -23,13 +23,13 @@ _FARTHEST = 1e15  # pixels from the image to a fixation
 
 @dataclass(frozen=True)
 class Retina:
-    """Where receptors stand, in pixels of an image.
+    """The layout of the receptors.
 
     Attributes:
-        fovea: eccentricity a in units of one's own, at which they stand twice as far apart as in the middle.
-        spacing: distance δ of neighbours in the middle, in the same units.
-        pooling: width of a receptive field in distances of neighbours.
-        scale: image pixels for each unit, along x and y.
+        fovea: eccentricity a, in any unit of length, at which receptors are twice as far apart as at the fixation.
+        spacing: distance δ between neighbouring receptors at the fixation, in the same unit.
+        pooling: width of a receptive field, as a multiple of the distance between neighbours.
+        scale: image pixels for each unit of length, along x and y.
     """
 
     fovea: float
@@ -43,23 +43,24 @@ class Retina:
             check(0 < value < inf, name, "a positive number", value)
 
     def receptors(self, size: tuple[int, int]) -> tuple[int, int]:
-        """`(rings, wedges)` that reach from any pixel of an image of `(width, height)` to any other."""
+        """`(rings, wedges)` that cover an image of `(width, height)` from any fixation inside it."""
         wedges = 4 * max(1, round(pi * self.fovea / (2 * self.spacing)))
         rings = 2 + ceil(self.fovea * log1p(self._reach(size) / self.fovea) / self.spacing)
-        check(rings * wedges <= _MOST, "spacing", f"one that leaves no more than {_MOST:,} receptors", self.spacing)
+        expected = f"a distance large enough for at most {_MOST:,} receptors"
+        check(rings * wedges <= _MOST, "spacing", expected, self.spacing)
         return rings, wedges
 
     def levels(self, size: tuple[int, int]) -> int:
-        """How often an image of `(width, height)` has to be halved for its widest receptive field."""
+        """How often an image of `(width, height)` is halved for its widest receptive field."""
         return ceil(self.level(self._reach(size)))
 
     def level(self, eccentricity: float) -> float:
-        """Level of a Gaussian pyramid, whole or between two, whose pixels are as large as a receptive field."""
+        """Level of a Gaussian pyramid, possibly a fraction, whose pixels are as large as a receptive field."""
         field = self.pooling * self.spacing * (1 + eccentricity / self.fovea) * sqrt(self.scale[0] * self.scale[1])
         return min(max(log2(field), 0.0), float(_TALLEST))
 
     def eccentricity(self, ring: int) -> float:
-        """Distance from the fixation of the receptors of a ring."""
+        """Eccentricity of the receptors of a ring, in the unit of `fovea`."""
         return self.fovea * (exp((ring + 0.5) * self.spacing / self.fovea) - 1)
 
     def _reach(self, size: tuple[int, int]) -> float:
@@ -69,33 +70,35 @@ class Retina:
 def log_polar(
     image: Tensor | Levels, gaze: Tensor, *, fovea: float, spacing: float = 1.0, pooling: float = 1.0
 ) -> Tensor:
-    r"""Cortical images: what receptors on rings around a fixation see.
+    r"""Compute cortical images: the responses of receptors on rings around a fixation.
 
-    With the eccentricity r and the angle θ of a place relative to the fixation, the cortex has it at
+    A point at eccentricity r and angle θ relative to the fixation has the cortical coordinates
 
-    .. math:: \rho = a \ln\left(1 + \frac{r}{a}\right), \qquad \theta,
+    .. math:: \rho = a \ln\left(1 + \frac{r}{a}\right), \qquad \theta.
 
-    so that ring i and wedge j look at :math:`\rho_i = (i + ½) \delta` and :math:`\theta_j = 2 \pi j / N`. Neighbours
-    stand :math:`\delta (1 + r / a)` pixels apart: evenly up to about a, where it is twice as far as in the middle, and
-    in proportion to the eccentricity beyond, as in the primate's cortex (:math:`\ln(z + a)`, Schwartz, 1980; Traver and
-    Bernardino, 2010, review such maps). There are :math:`N = 2 \pi a / \delta` wedges (a multiple of 4), as far apart
-    as the rings are where r is large.
+    The receptor of ring i and wedge j is at :math:`\rho_i = (i + ½) \delta` and :math:`\theta_j = 2 \pi j / N`.
+    Neighbouring receptors are :math:`\delta (1 + r / a)` pixels apart. Their distance is nearly constant for r well
+    below a, is doubled at r = a, and is proportional to the eccentricity far beyond, as in the cortex of primates
+    (:math:`\ln(z + a)`, Schwartz, 1980; Traver and Bernardino, 2010, review such maps). There are
+    :math:`N = 2 \pi a / \delta` wedges (rounded to a multiple of 4), so that for large r wedges are as far apart as
+    rings.
 
-    A receptor pools its surroundings. It reads a Gaussian pyramid, by cubics between pixels and linearly between
-    levels, at level :math:`\log_2` of `pooling` times the distance of its neighbours (and the image itself where that
-    is less than a pixel). Receptors beyond the image see its border.
+    A receptor pools its surroundings: it samples a Gaussian pyramid at level :math:`\log_2` of `pooling` times the
+    distance to its neighbours, and the image itself where that distance is less than a pixel. Interpolation is bicubic
+    between pixels and linear between levels. Receptors outside the image respond to its nearest border pixel.
 
     Args:
         image: `(B, C, H, W)`, or its levels from `LogPolar.pyramid`, which any number of fixations can share.
-        gaze: fixation `(x, y)` in image pixels, inside or outside: `(2,)` for all images, `(B, 2)` one for each, or
-            `(B, G, 2)` G for each.
+        gaze: fixation `(x, y)` in image pixels, inside or outside: `(2,)` for all images, `(B, 2)` for one fixation of
+            each image, or `(B, G, 2)` for G of each.
         fovea: a in pixels.
         spacing: δ in pixels.
-        pooling: width of receptive fields in distances of neighbours: less aliases, more blurs.
+        pooling: width of receptive fields, as a multiple of the distance between neighbours. Smaller values alias,
+            larger values blur.
 
     Returns:
-        `(B, C, M, N)`, or `(B, G, C, M, N)` for G fixations: M rings, of which the first is the innermost, and N wedges
-        from the x-axis clockwise. The rings reach as far as the image's diagonal.
+        `(B, C, M, N)`, or `(B, G, C, M, N)` for G fixations: M rings, innermost first, and N wedges, clockwise from the
+        x-axis. The rings extend as far as the diagonal of the image is long.
 
     Raises:
         InputError: a shape does not fit, the gaze is not finite, or a setting is not positive.
@@ -114,19 +117,19 @@ def log_polar(
 def from_log_polar(
     cortical: Tensor, gaze: Tensor, size: tuple[int, int], *, fovea: float, spacing: float = 1.0
 ) -> Tensor:
-    """Back-projection: the image that a cortical image holds, interpolated by cubics between receptors.
+    """Project cortical images back to images, by bicubic interpolation between receptors.
 
-    Across the fixation the innermost ring is its own neighbour, turned by half a turn.
+    At the fixation the innermost ring is continued by itself, turned by half a turn.
 
     Args:
-        cortical: `(B, C, M, N)` or `(B, G, C, M, N)`, of `log_polar`.
-        gaze: where it was fixated, likewise.
+        cortical: `(B, C, M, N)` or `(B, G, C, M, N)`, from `log_polar`.
+        gaze: the fixations of the cortical images, as for `log_polar`.
         size: `(width, height)` of the image.
-        fovea: as for `log_polar`.
-        spacing: likewise.
+        fovea: a in pixels, as for `log_polar`.
+        spacing: δ in pixels, as for `log_polar`.
 
     Returns:
-        `(B, C, height, width)` or `(B, G, C, height, width)`.
+        Images `(B, C, height, width)` or `(B, G, C, height, width)`.
 
     Raises:
         InputError: a shape does not fit, the gaze is not finite, or a setting is not positive.
@@ -140,18 +143,18 @@ def from_log_polar(
     retina = Retina(fovea, spacing)
     check_shape(cortical, "cortical", None, None, *retina.receptors(size))
     fixation, many = fixations(gaze, cortical)
-    check(cortical.ndim == 4 + many, "cortical", f"{4 + many} dimensions beside such a gaze", cortical.ndim)
+    check(cortical.ndim == 4 + many, "cortical", f"{4 + many} dimensions with a gaze of this shape", cortical.ndim)
     result = _project(cortical if many else cortical[:, None], fixation, size, retina)
     return result if many else result[:, 0]
 
 
 @dataclass(frozen=True)
 class Opened:
-    """A canvas as `LogPolar` holds it.
+    """A canvas that `LogPolar.open` has prepared.
 
     Attributes:
-        levels: its Gaussian pyramid.
-        retina: receptors in pixels of the canvas.
+        levels: Gaussian pyramid of the canvas.
+        retina: layout of the receptors, scaled to the canvas.
     """
 
     levels: Levels
@@ -159,12 +162,12 @@ class Opened:
 
 
 class LogPolar(Sensor):
-    """A sensor with receptors on rings, see `log_polar`; a detector is shown the back-projection of what they see.
+    """A sensor with receptors on rings, see `log_polar`; its views are back-projections of the cortical images.
 
     Args:
-        fovea: eccentricity in pixels at which acuity is half of what it is at the fixation.
-        spacing: distance of receptors at the fixation, in pixels.
-        pooling: width of receptive fields in distances of neighbours.
+        fovea: eccentricity in pixels at which acuity is half the acuity at the fixation.
+        spacing: distance between neighbouring receptors at the fixation, in pixels.
+        pooling: width of receptive fields, as a multiple of the distance between neighbours.
 
     >>> sensor = LogPolar(20.0)
     >>> image = torch.rand(2, 3, 64, 64)
@@ -179,43 +182,79 @@ class LogPolar(Sensor):
         self.retina = Retina(fovea, spacing, pooling)
 
     def pyramid(self, image: Tensor) -> Levels:
-        """The part of the work that does not depend on the gaze, for an image `(B, C, H, W)`."""
+        """Compute the part of the work that does not depend on the gaze, to share it among fixations.
+
+        Args:
+            image: `(B, C, H, W)`.
+
+        Returns:
+            Levels of the Gaussian pyramid, finest first.
+        """
         return gaussian_pyramid(image, self.retina.levels(_size(image)))
 
     def cortical(self, image: Tensor | Levels, gaze: Tensor) -> Tensor:
-        """Cortical images, see `log_polar`."""
+        """Compute cortical images, see `log_polar`.
+
+        Args:
+            image: `(B, C, H, W)`, or its levels from `pyramid`.
+            gaze: fixations `(x, y)` in image pixels, `(2,)`, `(B, 2)` or `(B, G, 2)`.
+
+        Returns:
+            `(B, C, M, N)`, or `(B, G, C, M, N)` for G fixations.
+        """
         retina = self.retina
         return log_polar(image, gaze, fovea=retina.fovea, spacing=retina.spacing, pooling=retina.pooling)
 
     def back(self, cortical: Tensor, gaze: Tensor, size: tuple[int, int]) -> Tensor:
-        """Back-projection of cortical images to images of `(width, height)`, see `from_log_polar`."""
+        """Project cortical images back to images, see `from_log_polar`.
+
+        Args:
+            cortical: `(B, C, M, N)` or `(B, G, C, M, N)`.
+            gaze: the fixations of the cortical images.
+            size: `(width, height)` of the images.
+
+        Returns:
+            Images `(B, C, height, width)` or `(B, G, C, height, width)`.
+        """
         return from_log_polar(cortical, gaze, size, fovea=self.retina.fovea, spacing=self.retina.spacing)
 
     def forward(self, image: Tensor | Levels, gaze: Tensor) -> Tensor:
-        """The back-projection of what is seen of an image, or of its levels, from `gaze`; shapes as for `foveate`."""
+        """Compute the back-projection of the cortical images of fixations.
+
+        Args:
+            image: `(B, C, H, W)`, or its levels from `pyramid`.
+            gaze: fixations `(x, y)` in image pixels, `(2,)`, `(B, 2)` or `(B, G, 2)`.
+
+        Returns:
+            Images `(B, C, H, W)`, or `(B, G, C, H, W)` for G fixations.
+        """
         finest = image[0] if isinstance(image, tuple) else image
         return self.back(self.cortical(image, gaze), gaze, _size(finest))
 
     def open(self, canvas: Tensor, scale: Tensor) -> Opened:
-        """Build the pyramid of a canvas, and scale the receptors' places."""
+        """Compute the pyramid of a canvas, and scale the layout of the receptors."""
         across, down = scale.tolist()
         own = self.retina
         retina = Retina(own.fovea, own.spacing, own.pooling, (across, down))
         return Opened(gaussian_pyramid(canvas, retina.levels(_size(canvas))), retina)
 
     def look(self, state: Opened, gaze: Tensor) -> Tensor:
-        """Canvases `(F, 3, H, W)`: back-projections of what is seen from fixations `(F, 2)`."""
+        """Compute back-projections `(F, 3, H, W)` of the cortical images of fixations `(F, 2)`."""
         fixation, _ = fixations(gaze[None], state.levels[0])
         seen = _sample(state.levels, fixation, state.retina)
         return _project(seen, fixation, _size(state.levels[0]), state.retina)[0]
 
     def settings(self) -> dict[str, Any]:
-        """What its views depend on."""
+        """List the settings that the views depend on."""
         own = self.retina
         return {"kind": "log-polar", "fovea": own.fovea, "spacing": own.spacing, "pooling": own.pooling}
 
     def extra_repr(self) -> str:
-        """Settings, for `repr`."""
+        """Write the settings, for `repr`.
+
+        Returns:
+            The settings as text.
+        """
         own = self.retina
         return f"fovea={own.fovea:g}, spacing={own.spacing:g}, pooling={own.pooling:g}"
 
@@ -226,11 +265,11 @@ def _size(image: Tensor) -> tuple[int, int]:
 
 
 def _sample(levels: Levels, fixation: Tensor, retina: Retina) -> Tensor:
-    """What receptors around `(B, G, 2)` fixations see: `(B, G, C, M, N)`."""
+    """Responses `(B, G, C, M, N)` of the receptors around fixations `(B, G, 2)`."""
     finest = levels[0]
     size = _size(finest)
     offset = _places(retina, size, finest.dtype, finest.device)
-    # A level covers the image as its finest one does, so places as shares of the image's sides hold for all.
+    # All levels cover the same area, so positions as fractions of the image's sides are valid for all of them.
     place = (2 * (fixation[:, :, None, None] + offset) + 1) / finest.new_tensor(size) - 1
     rings, many = offset.shape[0], fixation.shape[1]
     parts = []
@@ -246,16 +285,16 @@ def _sample(levels: Levels, fixation: Tensor, retina: Retina) -> Tensor:
 
 
 def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: Retina) -> Tensor:
-    """Images `(B, G, C, H, W)` from cortical ones `(B, G, C, M, N)` around `(B, G, 2)` fixations."""
+    """Images `(B, G, C, H, W)` from cortical images `(B, G, C, M, N)` of fixations `(B, G, 2)`."""
     batch, many, _, rings, wedges = cortical.shape
-    # Nothing changes any more where squares overflow.
+    # Squares of longer distances overflow, and beyond this distance the view no longer changes.
     fixation = fixation.clamp(-_FARTHEST, _FARTHEST)
     x, y = (torch.arange(n, dtype=fixation.dtype, device=fixation.device) for n in size)
     scale = fixation.new_tensor(retina.scale)
     across = ((x - fixation[..., :1]) / scale[0])[:, :, None, :]
     down = ((y - fixation[..., 1:]) / scale[1])[:, :, :, None]
     squared = across.square() + down.square()
-    # At the fixation itself no angle is there to differentiate.
+    # The angle is not defined at the fixation itself, so no gradient may flow through it there.
     middle = squared == 0
     across = torch.where(middle, torch.ones_like(squared), across)
     radius = torch.where(middle, torch.ones_like(squared), squared).sqrt()
@@ -263,7 +302,8 @@ def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: 
     radius = torch.where(middle, torch.zeros_like(squared), radius)
     ring = retina.fovea * torch.log1p(radius / retina.fovea) / retina.spacing - 0.5
     wedge = angle.remainder(2 * pi) * (wedges / (2 * pi))
-    # What cubics reach for beyond the innermost ring lies across the fixation, beyond the last wedge the first.
+    # Bicubic interpolation needs neighbours: those of the innermost ring lie on the opposite side of the fixation, and
+    # the last wedge is next to the first.
     whole = torch.cat([cortical[..., :2, :].flip(-2).roll(wedges // 2, -1), cortical], -2)
     whole = torch.cat([whole[..., -1:], whole, whole[..., :2]], -1).flatten(0, 1)
     where = torch.stack([2 * (wedge + 1) / (wedges + 2) - 1, 2 * (ring + 2) / (rings + 1) - 1], -1).flatten(0, 1)
@@ -273,7 +313,7 @@ def _project(cortical: Tensor, fixation: Tensor, size: tuple[int, int], retina: 
 
 @constant
 def _places(retina: Retina, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Where receptors stand relative to the fixation, `(M, N, 2)`, in image pixels."""
+    """Positions of the receptors relative to the fixation, `(M, N, 2)`, in image pixels."""
     rings, wedges = retina.receptors(size)
     rho = (torch.arange(rings, dtype=torch.float64) + 0.5) * retina.spacing
     radius = retina.fovea * torch.expm1(rho / retina.fovea)
@@ -286,7 +326,7 @@ def _places(retina: Retina, size: tuple[int, int], dtype: torch.dtype, device: t
 def _shares(
     retina: Retina, size: tuple[int, int], dtype: torch.dtype, device: torch.device
 ) -> list[tuple[int, int, Tensor]]:
-    """Levels of the pyramid, the first ring that reads each, and the level's weights in its rings."""
+    """For each level of the pyramid that is read: its number, the first ring that reads it, and its weight by ring."""
     rings, top = retina.receptors(size)[0], retina.levels(size)
     levels = [min(retina.level(retina.eccentricity(ring)), top) for ring in range(rings)]
     found = []

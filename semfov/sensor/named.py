@@ -1,4 +1,4 @@
-"""Foveal sensors by name: the published ones, and the agent's own."""
+"""Foveal sensors by name: the published ones, and the one of the recommended agent."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -18,21 +18,25 @@ SENSORS: dict[SensorName, dict[str, float]] = {
 """Settings of the named sensors; σ is in pixels of an image whose longer side is 640.
 
 - `published`: the wide fovea of Luzio, Bernardino and Moreno (2024). They print neither σ nor growth nor levels. The
-  width is our choice; one window for all bands, growth 1, is what the code of the foveal system they cite computes.
+  width is our choice. Growth 1, one window for all bands, follows the code of the foveal system that they cite.
 - `published-narrow`: their narrow fovea, half as wide.
-- `gradual`: every coarser band's window is twice as wide, so that acuity falls off slowly. The recommended agent's.
+- `gradual`: the window of each coarser band is twice as wide, so that acuity falls off slowly. The recommended agent
+  has this sensor.
 """
 
 
 def named_sensor(name: str, **settings: Any) -> Foveation:
-    """The foveal sensor of that name.
+    """Make a foveal sensor by its name.
 
     Args:
-        name: of `SENSORS`.
-        settings: other settings of `Foveation`, or other values for those that the name stands for.
+        name: a name in `SENSORS`.
+        settings: further settings of `Foveation`; they replace the settings of the name.
+
+    Returns:
+        The sensor.
 
     Raises:
-        InputError: no sensor has this name (the nearest is suggested).
+        InputError: no sensor has this name (the message suggests the nearest names).
 
     >>> named_sensor("published-narrow", convention="opencv")
     Foveation(sigma=50, levels=5, growth=1, convention='opencv')
@@ -41,10 +45,16 @@ def named_sensor(name: str, **settings: Any) -> Foveation:
 
 
 def sensor_of(settings: Mapping[str, Any]) -> Sensor:
-    """The sensor with these settings (`Sensor.settings()`), one of the library's.
+    """Make one of the library's sensors from its settings.
+
+    Args:
+        settings: settings as `Sensor.settings()` lists them.
+
+    Returns:
+        The sensor.
 
     Raises:
-        InputError: they are those of another sensor.
+        InputError: they are the settings of another kind of sensor.
 
     >>> sensor_of(Foveation(20.0, growth=1.0).settings())
     Foveation(sigma=20, levels=5, growth=1, convention='kornia')
@@ -53,5 +63,5 @@ def sensor_of(settings: Mapping[str, Any]) -> Sensor:
         return LogPolar(settings["fovea"], settings["spacing"], settings["pooling"])
     names = "sigma", "levels", "growth", "convention"
     if not all(name in settings for name in names):
-        raise InputError(f"sensor: expected settings of a Foveation or of a LogPolar, got {dict(settings)}")
+        raise InputError(f"sensor: expected the settings of a Foveation or a LogPolar, got {dict(settings)}")
     return Foveation(**{name: settings[name] for name in names})

@@ -1,4 +1,4 @@
-"""What a camera sees of a panorama: perspective views of any direction and field of view."""
+"""Perspective views of a panorama, in any direction and with any field of view."""
 
 import math
 
@@ -11,26 +11,26 @@ from semfov.sensor.sphere import Camera, panorama_points
 
 
 def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bool = True) -> Tensor:
-    r"""Views of an equirectangular panorama through a camera that turns and zooms.
+    r"""Compute the views of an equirectangular panorama through a camera that turns and zooms.
 
-    Each pixel of a view is the bilinear sample of the panorama where it looks. Beyond the left and right border the
-    panorama goes on at the other one, and beyond a pole with the column half a turn away.
+    Each pixel of a view is a bilinear sample of the panorama in the pixel's direction. The left and the right border of
+    the panorama are joined. Beyond a pole a column continues in the column half a turn away.
 
-    Where a view shrinks the panorama, each of its pixels is a mean of k × k samples, one for each panorama pixel in the
-    middle of the view. Towards the poles a panorama has more pixels in a row than the sphere has room for: with
-    `antialias` rows are first smoothed to one resolution (`even_rows`).
+    Where a view shrinks the panorama, `antialias` takes the mean of k × k samples for each pixel; k is the number of
+    panorama pixels that a pixel in the middle of the view covers along each axis, rounded up. Towards the poles a row
+    of the panorama oversamples the sphere, so `antialias` first smooths all rows to one resolution (`even_rows`).
 
-    It is differentiable in the panorama, and in yaw, pitch and field of view.
+    The result is differentiable in the panorama and in yaw, pitch and field of view.
 
     Args:
-        panorama: `(B, C, H, W)`, an even number of columns; twice as wide as high where pixels are square.
-        pose: `(B, G, 3)`, or `(B, 3)` for one view of each: yaw, pitch and horizontal field of view in degrees
-            (`semfov.sensor.sphere.Camera`).
+        panorama: `(B, C, H, W)` with an even number of columns; twice as wide as high where pixels are square.
+        pose: `(B, G, 3)`, or `(B, 3)` for one view of each panorama: yaw, pitch and horizontal field of view in
+            degrees (`semfov.sensor.sphere.Camera`).
         size: `(width, height)` of the views.
-        antialias: smooth what a view shrinks; false takes one bilinear sample for each pixel.
+        antialias: smooth where a view shrinks the panorama; False takes one bilinear sample for each pixel.
 
     Returns:
-        `(B, G, C, height, width)`, or `(B, C, height, width)`.
+        Views `(B, G, C, height, width)`, or `(B, C, height, width)` for one view of each panorama.
 
     Raises:
         InputError: a shape does not fit, or a field of view is not between 0 and 180 degrees.
@@ -41,7 +41,7 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
     check_shape(panorama, "panorama", None, None, None, None)
     check(panorama.is_floating_point(), "panorama", "floating-point pixels", panorama.dtype)
     batch, wide = panorama.shape[0], panorama.shape[-1]
-    check(wide % 2 == 0, "panorama", "an even number of columns: a pole joins those half a turn apart", wide)
+    check(wide % 2 == 0, "panorama", "an even number of columns, because a pole joins columns half a turn apart", wide)
     check_shape(pose, "pose", 3)
     fits = pose.ndim in (2, 3) and pose.shape[0] == batch
     check(fits, "pose", f"shape ({batch}, G, 3) or ({batch}, 3)", tuple(pose.shape))
@@ -58,7 +58,7 @@ def perspective(panorama: Tensor, pose: Tensor, size: tuple[int, int], *, antial
 
 
 def go_around(panorama: Tensor) -> Tensor:
-    """A panorama `(B, C, H, W)` with a border of one pixel, as it goes on beyond its sides and its poles."""
+    """A panorama `(B, C, H, W)` with a border of one pixel that continues it beyond its sides and its poles."""
     half = panorama.shape[-1] // 2
     above, below = panorama[..., :1, :].roll(half, -1), panorama[..., -1:, :].roll(half, -1)
     high = torch.cat([above, panorama, below], -2)
@@ -66,16 +66,22 @@ def go_around(panorama: Tensor) -> Tensor:
 
 
 def even_rows(panorama: Tensor) -> Tensor:
-    r"""A panorama `(..., H, W)` as sharp along each row as it is along the horizon.
+    r"""Smooth every row of a panorama to the resolution of the horizon.
 
-    A pixel at latitude φ covers cos φ of the width of one at the horizon. Each becomes the mean of the row over
-    :math:`\min(1 / \cos\varphi, W)` pixels around it. The integral of a row is piecewise linear, so the mean is exact
-    for any width.
+    A pixel at latitude φ covers cos φ times the width of a pixel at the horizon. Each pixel becomes the mean of the row
+    over :math:`\min(1 / \cos\varphi, W)` pixels around it. The integral of a row is piecewise linear, so the mean is
+    exact for any width.
+
+    Args:
+        panorama: `(..., H, W)`.
+
+    Returns:
+        The smoothed panorama, `(..., H, W)`.
     """
     high, wide = panorama.shape[-2:]
     latitude = (torch.arange(high, dtype=torch.float64, device=panorama.device) + 0.5) / high - 0.5
     width = (1 / (latitude * torch.pi).cos()).clamp(max=wide)
-    # In float64, for a mean is a small difference of long sums.
+    # In float64, because a mean is a small difference of long sums.
     twice = torch.cat([panorama, panorama], -1).double()
     total = F.pad(twice.cumsum(-1), (1, 0))
     middle = torch.arange(wide, dtype=torch.float64, device=panorama.device) + wide / 2 + 0.5
@@ -90,7 +96,7 @@ def even_rows(panorama: Tensor) -> Tensor:
 
 
 def sample(source: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bool = True) -> Tensor:
-    """A view `(C, h, w)` of a panorama that goes around `(C, H + 2, W + 2)` (`go_around`); see `perspective`."""
+    """A view `(C, h, w)` of a panorama `(C, H + 2, W + 2)` with the border of `go_around`; see `perspective`."""
     (wide, high), (columns, rows) = (source.shape[-1] - 2, source.shape[-2] - 2), size
     camera = Camera(pose, size)
     shrink = wide / (2 * math.pi * float(camera.focal.detach()))
@@ -106,11 +112,11 @@ def sample(source: Tensor, pose: Tensor, size: tuple[int, int], *, antialias: bo
 
 
 class Perspective(nn.Module):
-    """A camera that sees views of a panorama, see `perspective`.
+    """A camera in a panorama, the module form of `perspective`.
 
     Args:
         size: `(width, height)` of the views.
-        antialias: smooth what a view shrinks.
+        antialias: smooth where a view shrinks the panorama.
 
     >>> Perspective((40, 30))(torch.rand(1, 3, 64, 128), torch.tensor([[30.0, 10.0, 60.0]])).shape
     torch.Size([1, 3, 30, 40])
@@ -122,9 +128,21 @@ class Perspective(nn.Module):
         self.size, self.antialias = size, antialias
 
     def forward(self, panorama: Tensor, pose: Tensor) -> Tensor:
-        """Views `(B, G, C, h, w)` of panoramas `(B, C, H, W)` from poses `(B, G, 3)`."""
+        """Compute views of panoramas.
+
+        Args:
+            panorama: `(B, C, H, W)`.
+            pose: yaw, pitch and horizontal field of view in degrees, `(B, G, 3)`, or `(B, 3)` for one view of each.
+
+        Returns:
+            Views `(B, G, C, h, w)`, or `(B, C, h, w)`.
+        """
         return perspective(panorama, pose, self.size, antialias=self.antialias)
 
     def extra_repr(self) -> str:
-        """Settings, for `repr`."""
+        """Write the settings, for `repr`.
+
+        Returns:
+            The settings as text.
+        """
         return f"size={self.size}, antialias={self.antialias}"

@@ -12,21 +12,28 @@ from semfov.sensor.lines import Lines, Taps, banded, constant, separable
 
 Convention = Literal["kornia", "opencv"]
 
-# Devices where `python -m benchmarks.pyramid` finds the matrices of `lines` ahead of Kornia, with gradients too.
+# Devices where `python -m benchmarks.pyramid` measures the matrices of `lines` as faster than Kornia, also with
+# gradients.
 _AHEAD = frozenset({"cpu"})
 _BLUR = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
-# Pixels read that lie under a tile of those made: fewer make the products slow, more multiply more zeros.
+# Input pixels that one tile covers: with fewer the products are slow, with more they multiply more zeros.
 _SHIFT = 8
 
 
 @dataclass(frozen=True)
 class Bands:
-    """A Laplacian pyramid.
+    """A Laplacian pyramid, see `laplacian_pyramid`.
 
     Attributes:
         details: bands `L_0..L_{K-1}`, `(B, C, h_k, w_k)`, finest first.
         base: the coarsest level `G_K`.
-        convention: the pyramid's, which tells where the pixels of a band lie in the image.
+        convention: convention of the pyramid, which determines the positions of a band's pixels in the image.
+
+    >>> bands = laplacian_pyramid(torch.rand(1, 3, 64, 48), 2)
+    >>> bands.size, len(bands.details)
+    ((64, 48), 2)
+    >>> bands.places(1, -1)[:3]
+    tensor([0.5000, 2.5000, 4.5000])
     """
 
     details: tuple[Tensor, ...]
@@ -40,31 +47,41 @@ class Bands:
         return height, width
 
     def places(self, k: int, axis: int) -> Tensor:
-        """Where in the image the pixels of band k lie, along y (axis -2) or x (-1): `(n,)`, in image pixels."""
+        """Positions of a band's pixels in the image.
+
+        Args:
+            k: number of the band; 0 is the finest.
+            axis: -2 for positions along y, -1 for positions along x.
+
+        Returns:
+            Positions `(n,)` in image pixels.
+        """
         band = self.details[k]
         return places(band.shape[axis], self.size[axis], k, self.convention).to(band)
 
 
 def places(count: int, length: int, k: int, convention: Convention) -> Tensor:
-    """Where on a line of `length` pixels those of its `count` in band k lie: `(count,)`, double precision."""
+    """Positions of the `count` pixels of band k along an image side of `length` pixels: `(count,)`, float64."""
     place = torch.arange(count, dtype=torch.float64)
     return place * 2**k if convention == "opencv" else (place + 0.5) * (length / count) - 0.5
 
 
 def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
-    """Blur and halve an image.
+    """Blur an image and halve its size.
 
-    - `kornia`: `kornia.geometry.transform.pyrdown`: 5 taps [1 4 6 4 1] / 16, reflected borders, then bilinear
-      resizing to half the size, rounded down (to at least 1 pixel).
-    - `opencv`: `cv2.pyrDown`: the same taps at every second pixel, half the size rounded up.
+    - `kornia`: `kornia.geometry.transform.pyrdown`. It blurs with the 5 taps [1 4 6 4 1] / 16 and reflected borders,
+      then resizes bilinearly to half the size, rounded down (to at least 1 pixel).
+    - `opencv`: `cv2.pyrDown`. It takes the same blur at every second pixel; half the size is rounded up.
 
-    On accelerators Kornia computes its own; on a CPU products of matrices are faster (`benchmarks.pyramid`).
+    On accelerators Kornia itself computes its convention. On a CPU matrix products compute the same numbers faster
+    (`benchmarks.pyramid`).
 
     Args:
         image: `(B, C, H, W)`.
+        convention: `kornia` or `opencv`.
 
     Returns:
-        `(B, C, H', W')`.
+        The smaller image, `(B, C, H', W')`.
 
     >>> pyrdown(torch.rand(1, 3, 48, 65)).shape, pyrdown(torch.rand(1, 3, 48, 65), "opencv").shape
     (torch.Size([1, 3, 24, 32]), torch.Size([1, 3, 24, 33]))
@@ -75,7 +92,7 @@ def pyrdown(image: Tensor, convention: Convention = "kornia") -> Tensor:
 
 
 def reduce(image: Tensor, convention: Convention) -> Tensor:
-    """`pyrdown` of what was checked before."""
+    """`pyrdown` without the checks."""
     if _runs_in_kornia(image, convention):
         return _kornia().pyrdown(image.contiguous())
     down, across = (_reducing(count, convention, image.dtype, image.device) for count in image.shape[-2:])
@@ -83,20 +100,25 @@ def reduce(image: Tensor, convention: Convention) -> Tensor:
 
 
 def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia") -> Tensor:
-    """Enlarge an image to `size` and blur it, the counterpart of `pyrdown`.
+    """Enlarge an image and blur it, the counterpart of `pyrdown`.
 
-    - `kornia`: bilinear resizing, then the 5 taps with reflected borders: `kornia.geometry.transform.pyrup` where
-      `size` is twice the image's.
+    - `kornia`: bilinear resizing, then a blur with the 5 taps and reflected borders. Where `size` is twice the image's
+      size, this is `kornia.geometry.transform.pyrup`.
     - `opencv`: `cv2.pyrUp` with `dstsize=size`.
 
-    On accelerators Kornia computes what it defines; on a CPU products of matrices are faster (`benchmarks.pyramid`).
+    On accelerators Kornia itself computes the sizes that it defines. On a CPU matrix products compute the same numbers
+    faster (`benchmarks.pyramid`).
 
     Args:
         image: `(B, C, H, W)`.
-        size: `(height, width)` of the result; with `opencv` 2n or 2n - 1 for n pixels.
+        size: `(height, width)` of the result; with `opencv`, 2n or 2n - 1 for a side of n pixels.
+        convention: `kornia` or `opencv`.
 
     Returns:
-        `(B, C, *size)`.
+        The larger image, `(B, C, *size)`.
+
+    >>> pyrup(torch.rand(1, 3, 24, 32), (48, 65)).shape
+    torch.Size([1, 3, 48, 65])
     """
     _check_image(image)
     lookup(convention, get_args(Convention), "pyramid convention")
@@ -107,7 +129,7 @@ def pyrup(image: Tensor, size: tuple[int, int], convention: Convention = "kornia
 
 
 def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tensor:
-    """`pyrup` of what was checked before."""
+    """`pyrup` without the checks."""
     if _runs_in_kornia(image, convention, size):
         return _kornia().pyrup(image.contiguous())
     lengths = zip(image.shape[-2:], size, strict=True)
@@ -116,11 +138,15 @@ def expand(image: Tensor, size: tuple[int, int], convention: Convention) -> Tens
 
 
 def gaussian_pyramid(image: Tensor, levels: int, convention: Convention = "kornia") -> tuple[Tensor, ...]:
-    """An image and its ever coarser levels, `G_0..G_K`, each blurred and halved from the one before (`pyrdown`).
+    """Compute a Gaussian pyramid: an image and its coarser levels, each by `pyrdown` of the level before.
 
     Args:
         image: `(B, C, H, W)`.
-        levels: K, how often it is halved.
+        levels: K, how often the image is halved.
+        convention: `kornia` or `opencv` (see `pyrdown`).
+
+    Returns:
+        Levels `G_0..G_K`, finest first; `G_0` is the image.
 
     >>> [tuple(level.shape[-2:]) for level in gaussian_pyramid(torch.rand(1, 3, 64, 48), 2)]
     [(64, 48), (32, 24), (16, 12)]
@@ -142,7 +168,11 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
 
     Args:
         image: `(B, C, H, W)`.
-        levels: number of bands, K; 0 leaves the image as the base.
+        levels: number of bands, K; with 0 the base is the image.
+        convention: `kornia` or `opencv` (see `pyrdown` and `pyrup`).
+
+    Returns:
+        The bands `L_0..L_{K-1}` and the base `G_K`.
 
     >>> bands = laplacian_pyramid(torch.rand(1, 3, 64, 48), 3)
     >>> [tuple(band.shape[-2:]) for band in bands.details], tuple(bands.base.shape[-2:])
@@ -156,7 +186,7 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
     for _ in range(levels):
         smaller = reduce(image, convention)
         expanded = expand(smaller, (image.shape[-2], image.shape[-1]), convention)
-        # Fresh memory costs more than the difference itself, so it is taken only where a gradient or a graph needs it.
+        # Allocating memory costs more than the subtraction, so it is done only where a gradient or a graph needs it.
         fresh = expanded.requires_grad or not values_known(image, expanded)
         details.append(image - expanded if fresh else torch.sub(image, expanded, out=expanded))
         image = smaller
@@ -164,24 +194,28 @@ def laplacian_pyramid(image: Tensor, levels: int, convention: Convention = "korn
 
 
 def _runs_in_kornia(image: Tensor, convention: Convention, size: tuple[int, int] | None = None) -> bool:
-    """Whether Kornia makes the next level of `image`, or enlarges it to `size`, rather than the matrices of `lines`.
+    """Whether Kornia computes the next level of `image`, or enlarges it to `size`, instead of the matrices of `lines`.
 
-    It does in its own convention, on devices where `benchmarks.pyramid` does not show ours ahead, with gradients and
-    without. What it does not define stays ours: levels of fewer than three pixels along an axis, and enlargement to
-    other than twice the size. So does what it would make less exact or less repeatable than asked for.
+    Kornia computes its own convention on devices where `benchmarks.pyramid` does not measure ours as faster, with and
+    without gradients. Ours computes what Kornia does not define: levels of fewer than three pixels along an axis, and
+    enlargement to other sizes than twice the image's. Ours also computes the cases in which Kornia would be less exact
+    or not deterministic.
+
+    Returns:
+        Whether Kornia does it.
     """
     if convention != "kornia" or image.device.type in _AHEAD:
         return False
     channels, height, width = image.shape[-3:]
-    # Of a single channel the convolution is no depthwise one, which CUDA rounds to ten bits unless told otherwise; and
-    # the gradient of reflected borders has no deterministic algorithm there.
+    # With a single channel the convolution is not a depthwise one, and CUDA rounds such convolutions to ten bits by
+    # default. The gradient of reflected borders has no deterministic algorithm on CUDA.
     if channels == 1 or torch.are_deterministic_algorithms_enabled():
         return False
     return min(height, width) > 2 if size is None else min(height, width) > 1 and tuple(size) == (2 * height, 2 * width)
 
 
 def _kornia() -> ModuleType:
-    """Kornia's geometry, imported when first needed: it takes a quarter of a second."""
+    """Kornia's geometry, imported when first needed because the import takes a quarter of a second."""
     import kornia.geometry.transform
 
     return kornia.geometry.transform
@@ -195,20 +229,20 @@ def _check_image(image: Tensor) -> None:
 
 @constant
 def _reducing(count: int, convention: Convention, dtype: torch.dtype, device: torch.device) -> Lines:
-    """`pyrdown` of lines of `count` pixels."""
+    """The matrix of `pyrdown` for a line of `count` pixels."""
     if convention == "opencv":
         taps = _blur(torch.arange(0, count, 2), count)
     else:
         taps = _compose(_resize(count, max(count // 2, 1), dtype), _blur(torch.arange(count), count))
-    # Halves of an odd number drift by a pixel from one end of the line to the other.
+    # Halving an odd number of pixels shifts positions by one pixel from one end of the line to the other.
     return banded(taps, count, _SHIFT // 2, _SHIFT, 2 + count % 2, dtype, device)
 
 
 @constant
 def _expanding(count: int, length: int, convention: Convention, dtype: torch.dtype, device: torch.device) -> Lines:
-    """`pyrup` of lines of `count` pixels to `length`."""
+    """The matrix of `pyrup` from a line of `count` pixels to one of `length` pixels."""
     if convention == "opencv":
-        # The blur of lines with zeros in between, mirrored before their first pixel and continued after their last.
+        # The blur of a line with zeros in between, mirrored before its first pixel and continued after its last.
         place = torch.arange(length)[:, None]
         half = place.div(2, rounding_mode="floor")
         index = torch.where(place % 2 == 0, half + torch.tensor([-1, 0, 1]), half + torch.tensor([0, 1, 1]))
@@ -221,8 +255,8 @@ def _expanding(count: int, length: int, convention: Convention, dtype: torch.dty
 
 
 def _blur(place: Tensor, count: int) -> Taps:
-    """Five taps at some pixels of a line of `count`, which is mirrored at its outermost pixels."""
-    # A line of one or two pixels is mirrored to and fro, as `BORDER_REFLECT_101` of OpenCV does.
+    """The five taps of the blur at some pixels of a line of `count` pixels, mirrored at its outermost pixels."""
+    # A line of one or two pixels is mirrored repeatedly, as `BORDER_REFLECT_101` of OpenCV does.
     index = (place[:, None] + torch.arange(-2, 3)).abs() % max(2 * count - 2, 1)
     return Taps(
         torch.minimum(index, 2 * count - 2 - index), torch.tensor(_BLUR, dtype=torch.float64).expand(len(place), 5)
@@ -230,8 +264,8 @@ def _blur(place: Tensor, count: int) -> Taps:
 
 
 def _resize(count: int, length: int, dtype: torch.dtype) -> Taps:
-    """Bilinear interpolation of a line of `count` pixels at `length`, pixels as areas, without antialiasing."""
-    # Places are rounded as those of `torch.nn.functional.interpolate` are.
+    """Taps of linear interpolation from `count` pixels to `length`, pixels as areas, without antialiasing."""
+    # Positions are rounded in the same way as in `torch.nn.functional.interpolate`.
     place = torch.arange(length, dtype=torch.promote_types(dtype, torch.float32)) + 0.5
     place = (place * (torch.tensor(count).to(place) / length) - 0.5).clamp(0, count - 1).double()
     before = place.floor()
@@ -240,6 +274,6 @@ def _resize(count: int, length: int, dtype: torch.dtype) -> Taps:
 
 
 def _compose(outer: Taps, inner: Taps) -> Taps:
-    """Taps of `outer` on what `inner` makes."""
+    """Taps of `outer` applied to the result of `inner`."""
     index, weight = inner.index[outer.index], outer.weight[..., None] * inner.weight[outer.index]
     return Taps(index.flatten(1), weight.flatten(1))

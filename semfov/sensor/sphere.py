@@ -1,6 +1,6 @@
-"""Directions on a sphere: pixels of a panorama, pixels of a camera that turns, and the boxes between them.
+"""Directions on a sphere, and their pixels and boxes in a panorama and in the image of a camera that turns.
 
-Directions are unit vectors `(x, y, z)` as OpenCV has them: x to the right, y down, z ahead. Angles are in degrees.
+Directions are unit vectors `(x, y, z)` in OpenCV's frame: x to the right, y down, z ahead. Angles are in degrees.
 """
 
 from dataclasses import dataclass
@@ -12,16 +12,19 @@ from semfov.errors import check, check_shape, values_known
 
 
 def panorama_directions(points: Tensor, size: tuple[int, int]) -> Tensor:
-    r"""Where the pixels of an equirectangular panorama lie, `(..., 3)`.
+    r"""Compute the directions of pixels of an equirectangular panorama.
 
     .. math:: \lambda = 360° \frac{x + ½}{W} - 180°, \quad \varphi = 90° - 180° \frac{y + ½}{H}, \quad
               d = (\cos\varphi \sin\lambda, -\sin\varphi, \cos\varphi \cos\lambda)
 
-    with the longitude λ, to the right from the middle, and the latitude φ, up from the horizon.
+    where the longitude λ increases to the right from the middle, and the latitude φ increases upwards from the horizon.
 
     Args:
-        points: `(..., 2)`, pixel centres at integers.
+        points: pixels `(..., 2)`, pixel centres at integers.
         size: `(W, H)` of the panorama.
+
+    Returns:
+        Unit vectors `(..., 3)`.
 
     >>> panorama_directions(torch.tensor([511.5, 255.5]), (1024, 512))
     tensor([0., -0., 1.])
@@ -34,9 +37,16 @@ def panorama_directions(points: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def panorama_points(directions: Tensor, size: tuple[int, int]) -> Tensor:
-    """Pixels `(..., 2)` of a panorama that lie in directions `(..., 3)` of any length; see `panorama_directions`.
+    """Compute the pixels of directions in an equirectangular panorama, the inverse of `panorama_directions`.
 
-    x is from -½ to W - ½. At a pole it can be any: no gradient flows through it there.
+    x is from -½ to W - ½. At a pole x is arbitrary, and no gradient flows through it.
+
+    Args:
+        directions: vectors `(..., 3)` of any length.
+        size: `(width, height)` of the panorama.
+
+    Returns:
+        Pixels `(..., 2)`, pixel centres at integers.
 
     >>> panorama_points(torch.tensor([0.0, -1.0, 1.0]), (1024, 512))
     tensor([511.5000, 127.5000])
@@ -45,17 +55,24 @@ def panorama_points(directions: Tensor, size: tuple[int, int]) -> Tensor:
     x, y, z = directions.unbind(-1)
     squared = x.square() + z.square()
     pole = squared <= 1e-12 * (squared + y.square())
-    one, none = torch.ones_like(x), torch.zeros_like(x)
-    longitude = torch.atan2(torch.where(pole, none, x), torch.where(pole, one, z))
-    latitude = torch.atan2(-y, torch.where(pole, none, torch.where(pole, one, squared).sqrt()))
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    longitude = torch.atan2(torch.where(pole, zero, x), torch.where(pole, one, z))
+    latitude = torch.atan2(-y, torch.where(pole, zero, torch.where(pole, one, squared).sqrt()))
     column = (longitude + torch.pi) * (size[0] / (2 * torch.pi)) - 0.5
-    # What is rounded up to half a turn is at the other end of the row.
+    # A longitude that is rounded up to half a turn belongs to the other end of the row.
     column = torch.where(column >= size[0] - 0.5, column - size[0], column)
     return torch.stack([column, (torch.pi / 2 - latitude) * (size[1] / torch.pi) - 0.5], -1)
 
 
 def angle_between(one: Tensor, other: Tensor) -> Tensor:
-    r"""Angle between directions `(..., 3)`, `(...)` in degrees: :math:`\operatorname{atan2}(|a × b|, a · b)`.
+    r"""Compute the angle between directions, :math:`\operatorname{atan2}(|a × b|, a · b)`.
+
+    Args:
+        one: a, vectors `(..., 3)` of any length.
+        other: b, vectors `(..., 3)` of any length.
+
+    Returns:
+        Angles `(...)` in degrees.
 
     >>> angle_between(torch.tensor([0.0, 0.0, 2.0]), torch.tensor([1.0, 0.0, 0.0]))
     tensor(90.)
@@ -67,16 +84,17 @@ def angle_between(one: Tensor, other: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Camera:
-    r"""Perspective cameras at the centre of a sphere, that turn and zoom.
+    r"""Perspective cameras at the centre of a sphere, which turn and zoom.
 
-    A camera turns by its yaw to the right, then by its pitch up, :math:`R = R_y(\text{yaw}) R_x(\text{pitch})`, and
-    never rolls. Its focal length in pixels is :math:`f = w / (2 \tan(\text{field} / 2))`. A pixel (u, v) looks along
+    A camera turns to the right by its yaw and up by its pitch, :math:`R = R_y(\text{yaw}) R_x(\text{pitch})`. It does
+    not roll. Its focal length in pixels is :math:`f = w / (2 \tan(\text{field} / 2))`. The direction of a pixel (u, v)
+    is
 
     .. math:: d = R \, \left(\frac{u + ½ - w/2}{f}, \frac{v + ½ - h/2}{f}, 1\right)
 
     Args:
         pose: `(..., 3)`, yaw, pitch and horizontal field of view in degrees.
-        size: `(w, h)` of its image in pixels.
+        size: `(w, h)` of the image in pixels.
 
     >>> camera = Camera(torch.tensor([90.0, 0.0, 90.0]), (101, 101))
     >>> camera.directions(torch.tensor([[50.0, 50.0]])).round().int().tolist()
@@ -100,14 +118,21 @@ class Camera:
 
     @property
     def rotation(self) -> Tensor:
-        """R, `(..., 3, 3)`: from the frame of the camera to that of the sphere."""
+        """Rotation R, `(..., 3, 3)`, from the frame of the camera to the frame of the sphere."""
         yaw, pitch = torch.deg2rad(self.pose[..., :2]).unbind(-1)
         (sy, cy), (sp, cp) = (yaw.sin(), yaw.cos()), (pitch.sin(), pitch.cos())
         rows = [cy, sy * sp, sy * cp, torch.zeros_like(cy), cp, -sp, -sy, cy * sp, cy * cp]
         return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
     def directions(self, points: Tensor) -> Tensor:
-        """Unit directions `(..., N, 3)` in which pixels `(..., N, 2)` or `(N, 2)` look."""
+        """Compute the directions of pixels of the camera's image.
+
+        Args:
+            points: pixels `(..., N, 2)` or `(N, 2)`, pixel centres at integers.
+
+        Returns:
+            Unit vectors `(..., N, 3)`.
+        """
         check_shape(points, "points", None, 2)
         middle = points.new_tensor(self.size) / 2 - 0.5
         flat = (points - middle) / self.focal[..., None, None]
@@ -115,14 +140,14 @@ class Camera:
         return rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
 
     def points(self, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels in which directions are seen, and which are seen at all.
+        """Compute the pixels of directions in the camera's image, and whether they are inside it.
 
         Args:
-            directions: `(..., N, 3)` or `(N, 3)`, of any length.
+            directions: vectors `(..., N, 3)` or `(N, 3)` of any length.
 
         Returns:
-            `(..., N, 2)`, and `(..., N)` boolean: in front of the camera and inside its image. What lies behind has no
-            pixel, and infinite ones are given.
+            Pixels `(..., N, 2)`, infinite for directions behind the camera, and `(..., N)` boolean: whether a direction
+            is in front of the camera and inside its image.
         """
         check_shape(directions, "directions", None, 3)
         rays = _turn(self.rotation.mT, directions)
@@ -135,17 +160,24 @@ class Camera:
 
 
 def _turn(rotation: Tensor, rays: Tensor) -> Tensor:
-    # Autocast would round a matrix product to 16 bits: a pixel is finer than that.
+    # Autocast would compute a matrix product in 16 bits, which is less exact than a pixel.
     return (rotation[..., None, :, :] * rays[..., None, :]).sum(-1)
 
 
 @dataclass(frozen=True)
 class Regions:
-    """What boxes in the images of cameras cover of the sphere: exact, at the poles and across the seam too.
+    """The regions of the sphere that boxes in camera images cover, exact also at the poles and across the seam.
 
     Attributes:
-        camera: of M poses.
+        camera: cameras of M poses.
         boxes: `(M, 4)`, `(x1, y1, x2, y2)` in pixels of each camera's image, edges between pixels.
+
+    >>> camera = Camera(torch.tensor([[0.0, 0.0, 90.0]]), (100, 100))
+    >>> region = Regions(camera, torch.tensor([[25.0, 25.0, 75.0, 75.0]]))
+    >>> region.contain(torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])).tolist()
+    [[True, False]]
+    >>> region.panorama_boxes((360, 180)).round().int().tolist()
+    [[153, 63, 207, 117]]
     """
 
     camera: Camera
@@ -156,17 +188,31 @@ class Regions:
         return len(self.boxes)
 
     def __getitem__(self, index: Tensor | slice) -> "Regions":
-        """Some of the regions."""
+        """Return some of the regions."""
         return Regions(Camera(self.camera.pose[index], self.camera.size), self.boxes[index])
 
     def contain(self, directions: Tensor) -> Tensor:
-        """Which directions `(N, 3)` lie in each region, `(M, N)` boolean."""
+        """Tell which directions lie in each region.
+
+        Args:
+            directions: vectors `(N, 3)` of any length.
+
+        Returns:
+            `(M, N)` boolean.
+        """
         points, _ = self.camera.points(directions)
         low, high = self.boxes[:, None, :2] - 0.5, self.boxes[:, None, 2:] - 0.5
         return ((points >= low) & (points <= high)).all(-1)
 
     def samples(self, count: int = 9) -> Tensor:
-        """A grid of directions in each region, its borders included, `(M, count², 3)`."""
+        """Sample a grid of directions in each region, its borders included.
+
+        Args:
+            count: number of directions along each side of the grid.
+
+        Returns:
+            Unit vectors `(M, count², 3)`.
+        """
         share = torch.linspace(0, 1, count).to(self.boxes)
         y, x = torch.meshgrid(share, share, indexing="ij")
         at = torch.stack([x, y], -1).flatten(0, 1)
@@ -174,7 +220,14 @@ class Regions:
         return self.camera.directions(low + at * (high - low) - 0.5)
 
     def outlines(self, count: int = 33) -> Tensor:
-        """Directions along the borders of each region, closed, `(M, 4 · count, 3)`."""
+        """Sample directions along the closed border of each region.
+
+        Args:
+            count: number of directions along each of the four edges.
+
+        Returns:
+            Unit vectors `(M, 4 · count, 3)`.
+        """
         share = torch.linspace(0, 1, count).to(self.boxes)
         zero, one = torch.zeros_like(share), torch.ones_like(share)
         sides = [(share, zero), (one, share), (1 - share, one), (zero, 1 - share)]
@@ -183,20 +236,23 @@ class Regions:
         return self.camera.directions(low + at * (high - low) - 0.5)
 
     def panorama_boxes(self, size: tuple[int, int], count: int = 257) -> Tensor:
-        """Smallest boxes around the regions in an equirectangular panorama, `(M, 4)`, edges between pixels.
+        """Compute the smallest boxes around the regions in an equirectangular panorama.
 
-        The edges of a region are curves there, and their extremes are found among `count` points of each. A box that
-        crosses the seam begins inside the panorama and ends beyond its right border. One that holds a pole is as wide
-        as the panorama.
+        The edges of a region are curves in the panorama; their extremes are taken among `count` points of each edge. A
+        box that crosses the seam begins inside the panorama and ends beyond its right border. A box that holds a pole
+        is as wide as the panorama.
 
         Args:
             size: `(width, height)` of the panorama.
-            count: points along each edge.
+            count: number of points along each edge.
+
+        Returns:
+            Boxes `(M, 4)`, `(x1, y1, x2, y2)` in panorama pixels, edges between pixels.
         """
         points = panorama_points(self.outlines(count), size)
         x, y = points.unbind(-1)
         width = float(size[0])
-        # Along its outline no two neighbours of a region are half a turn apart.
+        # Neighbouring points of an outline are less than half a turn apart.
         step = (x.diff(dim=-1) + width / 2) % width - width / 2
         along = torch.cat([x[:, :1], x[:, :1] + step.cumsum(-1)], -1)
         left, right = along.amin(-1), along.amax(-1)

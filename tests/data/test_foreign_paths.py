@@ -42,7 +42,7 @@ def test_files_outside_of_the_root_are_refused(data, name):
     (root / "link.png").symlink_to(root.parent / "outside.png")
     (root / "folder").symlink_to(root.parent)
     absolute = str(root.parent / "outside.png")
-    with pytest.raises(DataError, match=r"expected a file below data\.root"):
+    with pytest.raises(DataError, match=r"expected a file inside data\.root"):
         scenes(absolute if name == "/absolute" else name)
 
 

@@ -172,7 +172,7 @@ def test_odd_sizes(tmp_path, size):
 
 
 def test_missing_and_wrong_files(tmp_path):
-    with pytest.raises(DataError, match=r"no\.jpg: no such file; check data\.root"):
+    with pytest.raises(DataError, match=r"no\.jpg: no such file; check its path"):
         read_image(tmp_path / "no.jpg")
     with pytest.raises(DataError, match="expected a file, got a folder"):
         read_image(tmp_path)

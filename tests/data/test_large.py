@@ -129,7 +129,7 @@ def test_errors(tmp_path):
         open_large(3)
     with pytest.raises(InputError, match="picture: expected bytes, 16-bit numbers or floats"):
         open_large(np.zeros((4, 4, 3), np.int64))
-    with pytest.raises(InputError, match="box: expected inside"):
+    with pytest.raises(InputError, match="box: expected a window inside 4 × 4 pixels"):
         MemoryPicture(torch.zeros(3, 4, 4)).read((0, 0, 5, 4))
 
 

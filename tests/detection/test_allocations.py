@@ -86,7 +86,7 @@ def constant(name, values):
 
 def test_outputs_of_integers_or_of_no_rank_are_refused_by_name(tmp_path):
     cast = helper.make_node("Cast", ["image"], ["label"], to=TensorProto.INT64)
-    with pytest.raises(InputError, match=r"output 'label': expected numbers of floating point, got tensor\(int64\)"):
+    with pytest.raises(InputError, match=r"output 'label': expected floating-point numbers, got tensor\(int64\)"):
         load_onnx(save(tmp_path / "integers.onnx", [cast], [("label", TensorProto.INT64, [1, 3, 32, 32])]))
     mean = helper.make_node("ReduceMean", ["image"], ["score"], keepdims=0)
     path = save(tmp_path / "scalar.onnx", [mean], [("score", TensorProto.FLOAT, [])])

@@ -32,12 +32,12 @@ def test_values():
     assert section.numbers("anchors") == (1.5, 2.0, 3.0, 4.0)
     assert section.integer("size") == 3
     assert section.integer("stride", 2) == 2
-    with pytest.raises(DataError, match=r"a.cfg:7: \[yolo\] lacks 'classes'"):
+    with pytest.raises(DataError, match=r"a.cfg:7: \[yolo\] expected the key 'classes', which is missing"):
         section.integer("classes")
     for key in ("mask", "word"):
         with pytest.raises(DataError, match=rf"a.cfg:7: \[yolo\] {key}: expected"):
             section.integer(key)
-    with pytest.raises(DataError, match="from 4 up, got '3'"):
+    with pytest.raises(DataError, match="of at least 4, got '3'"):
         section.integer("size", minimum=4)
     with pytest.raises(DataError, match="expected numbers, got 'x'"):
         section.numbers("word")
@@ -54,5 +54,5 @@ def test_files_that_cannot_be_read(tmp_path):
         read_cfg(tmp_path / "missing.cfg")
     binary = tmp_path / "binary.cfg"
     binary.write_bytes(b"\xff\xfe\x00\x9f")
-    with pytest.raises(DataError, match="not a text file"):
+    with pytest.raises(DataError, match="a file that is not text"):
         read_cfg(binary)

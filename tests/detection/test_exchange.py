@@ -155,7 +155,7 @@ def test_names_in_either_spelling():
 def test_what_does_not_fit_is_refused_by_name():
     two = Detections.stack([some(), some()])
     for call in (two.to_supervision, two.to_torchvision, lambda: two.to_coco(1, [1, 2, 3])):
-        with pytest.raises(InputError, match=r"one image \(detections\[0\]\), got \(2,\)"):
+        with pytest.raises(InputError, match=r"one image, such as detections\[0\], got a batch of shape \(2,\)"):
             call()
     assert same(Detections.from_supervision(two[0].to_supervision(), 3), some())
     seen = some()

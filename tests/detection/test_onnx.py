@@ -246,12 +246,12 @@ def test_a_model_of_any_size(make_onnx):
 def test_options_that_do_not_fit_the_model(make_onnx):
     path = make_onnx(yolox()[0])
     for options, message in (
-        ({"input_size": 32}, "input_size: expected the model's own, 64 x 64"),
+        ({"input_size": 32}, "input_size: expected the model's fixed size, 64 x 64"),
         ({"stride": 32, "classes": NAMES}, "stride: expected None"),
         ({"input_size": (64.0, 64.0), "classes": NAMES}, "input_size: expected"),
         ({"classes": ["cat", "dog"]}, "with 2 classes"),
         ({"classes": ["cat", "dog"], "head": "yolox"}, "classes: expected 3 names, one for each score, got 2"),
-        ({"classes": ["cat", "cat", "dog"]}, "names that differ"),
+        ({"classes": ["cat", "cat", "dog"]}, "at least one name, all different"),
         ({"head": "yolo"}, "unknown head"),
         ({}, "classes: expected the names of the model's 3 classes"),
         ({"classes": NAMES, "preprocessing": {"colour": "bgr"}}, "unknown preprocessing setting"),
@@ -269,7 +269,7 @@ def test_options_that_do_not_fit_the_model(make_onnx):
 def test_the_wrong_head_shows(make_onnx):
     rows = pixels(random(1, 84, 8)) * 50  # decoded boxes, as YOLOv6 gives them in the shape of YOLOX
     detector = load_onnx(make_onnx({"output": rows}), classes=NAMES)
-    with pytest.raises(DataError, match="another head"):
+    with pytest.raises(DataError, match="expected finite boxes"):
         detector(torch.ones(1, 3, 64, 64))
 
 

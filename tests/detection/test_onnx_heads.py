@@ -128,7 +128,7 @@ def test_compiles():
 
 
 def test_wrong_shapes_are_named():
-    with pytest.raises(InputError, match="84 rows, the cells of a 64 x 64 canvas"):
+    with pytest.raises(InputError, match="84 rows, one for each cell of a 64 x 64 canvas"):
         heads.decode_yolox(noise(1, 83, 8), (64, 64))
     with pytest.raises(InputError, match="bins"):
         heads.decode_distances(noise(1, 84, 3), noise(1, 84, 30), (64, 64), strides=(8, 16, 32))

@@ -42,7 +42,7 @@ def test_other_metadata_of_that_name_is_left_alone(tmp_path, names):
         ('{"input_size": "416"}', "input_size: expected int or list, got '416'"),
         ('{"classes": "cat, dog"}', "classes: expected list"),
         ('{"logits": 1}', "logits: expected bool"),
-        ('{"heads": "yolox"}', "unknown 'heads'; known: name, head"),
+        ('{"heads": "yolox"}', "unknown key 'heads'; known: name, head"),
     ],
 )
 def test_damaged_files_are_named(tmp_path, text, message):

@@ -80,5 +80,5 @@ def test_refuses_an_unknown_policy():
 
 
 def test_own_needs_a_head_with_background():
-    with pytest.raises(InputError, match="background score of its own"):
+    with pytest.raises(InputError, match="expects a head with a background score"):
         score_vectors(candidates([0.5]), "own")

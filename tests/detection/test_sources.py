@@ -95,11 +95,11 @@ def test_address(address, tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     Address(f"{address}/x.weights").fetch(tmp_path / "out")
     assert Path(tmp_path / "out").read_bytes() == CONTENT
-    with pytest.raises(DataError, match=r"missing.weights: HTTPError"):
+    with pytest.raises(DataError, match=r"missing.weights: cannot be downloaded \(HTTPError\)"):
         Address(f"{address}/missing.weights").fetch(tmp_path / "out")
 
 
 def test_address_without_a_network(tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    with pytest.raises(DataError, match=r"http://127\.0\.0\.1:9/x: ConnectionError"):
+    with pytest.raises(DataError, match=r"http://127\.0\.0\.1:9/x: cannot be downloaded \(ConnectionError\)"):
         Address("http://127.0.0.1:9/x").fetch(tmp_path / "out")

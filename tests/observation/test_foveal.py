@@ -425,7 +425,7 @@ def test_a_detector_that_fits_is_accepted_and_others_are_not(tmp_path):
         load(path, detector=Toy(classes=("cup", "cow", "dog")))
     with pytest.raises(InputError, match="3 classes, got 2"):
         load(path, detector=Toy(classes=("cup", "cow")))
-    with pytest.warns(UserWarning, match=r"input_size is \[320, 320\], fitted with \[416, 416\]"):
+    with pytest.warns(UserWarning, match=r"input_size is \[320, 320\], the model was fitted with \[416, 416\]"):
         load(path, detector=Toy(input_size=[320, 320]))
 
 

@@ -164,7 +164,7 @@ NO_PICTURES = {
     "0 to 255": (lambda _: RGB * 255, r"expected RGB in \[0, 1\], got numbers from 0 to 255; divide by 255"),
     "array 0 to 255": (lambda _: PIXELS.astype(np.float32), "divide by 255"),
     "0 to 65535": (lambda _: RGB * 65535, "divide by the value of white"),
-    "normalised": (lambda _: NORMALISED, r"undo the normalisation: image \* std \+ mean, for ImageNet's"),
+    "normalised": (lambda _: NORMALISED, r"undo the normalisation: image \* std \+ mean, for ImageNet"),
     "-1 to 1": (lambda _: RGB * 2 - 1, r"\(image \+ 1\) / 2"),
     "resampled": (lambda _: RGB * 1.1, r"clamp to \[0, 1\]"),
     "NaN": (lambda _: RGB.masked_fill(RGB > 0.9, torch.nan), "got NaN; replace"),
@@ -172,18 +172,18 @@ NO_PICTURES = {
     "batch": (lambda _: RGB.expand(4, -1, -1, -1), "expected one picture, got a batch of 4; give them one by one"),
     "array batch": (lambda _: PIXELS[None].repeat(2, 0), "expected one picture, got a batch of 2"),
     "two channels": (lambda _: RGB[:2], r"expected a picture of shape .*with 3 channels or 1, got shape \(2, 30, 44\)"),
-    "four channels": (lambda _: np.dstack([PIXELS, GREY]), "of four channels drop the last, or give the image"),
+    "four channels": (lambda _: np.dstack([PIXELS, GREY]), "drop the fourth channel, or give the Pillow image"),
     "row": (lambda _: RGB[0, 0], r"expected a picture of shape .*got shape \(44,\)"),
     "five axes": (lambda _: RGB[None, None], r"got shape \(1, 1, 3, 30, 44\)"),
     "empty": (lambda _: RGB[:, :0], "expected at least one pixel"),
     "empty array": (lambda _: PIXELS[:, :0], "expected at least one pixel"),
-    "either way round": (lambda _: PIXELS[:3], r"got shape \(3, 44, 3\), which may be either"),
-    "long integers": (lambda _: PIXELS.astype(np.int64), r"expected bytes.*int64; make it uint8"),
-    "tensor of integers": (lambda _: (RGB * 255).int(), r"expected bytes.*torch\.int32; make bytes of it"),
+    "either way round": (lambda _: PIXELS[:3], r"got shape \(3, 44, 3\), which is ambiguous"),
+    "long integers": (lambda _: PIXELS.astype(np.int64), r"expected bytes.*int64; convert it to bytes"),
+    "tensor of integers": (lambda _: (RGB * 255).int(), r"expected bytes.*torch\.int32; convert it to bytes"),
     "mask": (lambda _: RGB > 0.5, r"expected bytes.*torch\.bool"),
     "complex": (lambda _: PIXELS * 1j, "expected bytes.*complex128"),
     "objects": (lambda _: PIXELS.astype(object), "expected bytes.*object"),
-    "None": (lambda _: None, "expected a path.*got None, which is what OpenCV gives"),
+    "None": (lambda _: None, "expected a path.*got None \\(OpenCV returns None"),
     "list": (lambda _: [RGB, RGB], "expected a path.*got a list; give pictures one by one"),
     "file object": (lambda _: io.BytesIO(b"x"), "expected a path.*got BytesIO"),
     "address": (lambda _: "https://example.org/cup.jpg", "expected a file on this machine.*download it first"),
@@ -311,7 +311,10 @@ def test_arguments_of_a_search(name, value, agent):
 @pytest.mark.parametrize(
     ("call", "told"),
     [
-        (lambda: ActivePerception.recommended(sigma=50), "sigma: models are shipped for 100 pixels of 640, got 50"),
+        (
+            lambda: ActivePerception.recommended(sigma=50),
+            "sigma: models are shipped for 100 pixels on an image of 640 pixels, got 50",
+        ),
         (lambda: ActivePerception.recommended(growth=3), "growth: models are shipped for 1 and 2, got 3"),
         (lambda: ActivePerception.recommended(grid=(0, 10)), "grid: expected a whole number from 1"),
         (lambda: ActivePerception.recommended(grid=10), r"grid: expected \(columns, rows\), got 10"),
@@ -335,7 +338,7 @@ def test_grids_that_learned_models_hold_for(kind):
     for grid in ((10, 10), (20, 20), (5, 5), (16, 12)):
         model.check_compatible(settings, grid)
     for grid in ((21, 10), (10, 4), (40, 40), (1, 1)):
-        with pytest.raises(SemfovError, match=r"^grid: the .* was fitted on 10 × 10 cells.*take grid=\(10, 10\)"):
+        with pytest.raises(SemfovError, match=r"^grid: the .* was fitted on 10 × 10 cells.*use grid=\(10, 10\)"):
             model.check_compatible(settings, grid)
 
 
@@ -344,7 +347,7 @@ COMMANDS = {
     "--target mug": "target: unknown class 'mug'; did you mean 'cup'?",
     "--target 1.5": "target: unknown class",
     "--target cup --explore": "target: expected none with --explore, got cup",
-    "--target zebra": "target: the embedded scenes hold",
+    "--target zebra": "target: expected a class in the embedded scenes",
     "nosuch.jpg --target cup": "photo: no such file or folder: nosuch.jpg; check the path",
     "nosuch.mp4 --explore": "nosuch.mp4; check the path",
     "FOLDER/empty --target cup": "photo: expected photographs (.jpg",

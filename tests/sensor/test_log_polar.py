@@ -274,7 +274,7 @@ IMAGE = torch.rand(2, 3, 8, 8)
         ({"fovea": 0.0}, "fovea: expected a positive number, got 0.0"),
         ({"fovea": math.inf}, "fovea: expected a positive number, got inf"),
         ({"spacing": -1.0}, "spacing: expected a positive number, got -1.0"),
-        ({"spacing": 1e-4}, "spacing: expected one that leaves no more than 67,108,864 receptors, got 0.0001"),
+        ({"spacing": 1e-4}, "spacing: expected a distance large enough for at most 67,108,864 receptors, got 0.0001"),
         ({"pooling": math.nan}, "pooling: expected a positive number, got nan"),
     ],
 )

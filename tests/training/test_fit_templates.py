@@ -100,5 +100,5 @@ def test_a_detector_whose_features_are_not_at_hand_says_so():
         def propose(self, canvas):
             raise NotImplementedError
 
-    with pytest.raises(InputError, match=r"features are at hand.*closed"):
+    with pytest.raises(InputError, match=r"access to its features.*closed"):
         Closed("closed", ("cup",), (32, 32)).features(torch.zeros(1, 3, 32, 32))

@@ -1,7 +1,7 @@
-"""Where people (and models of them) looked: one record, and the files that the field keeps it in.
+"""Fixations of people and of models: one record, and readers and writers for the file formats of the field.
 
-Points are `(x, y)` in pixels, pixel centres at integers, as everywhere in semfov. Files tell them in pixels of a
-screen, of a picture or in cells; `Letterbox` and `Fixations.resized` lead from one to the other.
+Points are `(x, y)` in pixels, pixel centres at integers, as everywhere in semfov. Files give them in pixels of a
+screen, in pixels of a picture, or in cells. `Letterbox` and `Fixations.resized` convert between these.
 """
 
 from semfov.data.fixations.cocosearch import read_cocosearch, write_cocosearch

@@ -1,4 +1,4 @@
-"""JSON files of COCO-Search18 (Chen et al., 2021), which others write their scanpaths in too."""
+"""JSON files of COCO-Search18 (Chen et al., 2021), a format that other data sets and models also use."""
 
 from __future__ import annotations
 
@@ -32,16 +32,31 @@ def read_cocosearch(
     screen: tuple[int, int] = (1680, 1050),
     sizes: Mapping[str, tuple[int, int]] | None = None,
 ) -> list[Fixations]:
-    """Trials of COCO-Search18: a list of objects with `name`, `subject`, `task`, `bbox`, `X`, `Y`, `T` and others.
+    """Read the trials of a COCO-Search18 file.
+
+    The file is a list of objects with `name`, `X` and `Y`, and optionally `subject`, `task`, `bbox`, `T`, `fixOnTarget`
+    and other keys.
 
     Args:
         path: the file.
-        screen: `(width, height)` in pixels that the coordinates are of.
-        sizes: `(width, height)` of the pictures by name; trials of pictures that are here are brought from the screen,
-            on which the picture is letterboxed, to pixels of the picture, and the others are left out.
+        screen: `(width, height)` of the screen in pixels, to which the coordinates refer.
+        sizes: `(width, height)` of the pictures by name. Where it is given, trials of these pictures are converted from
+            the screen, on which the picture is letterboxed, to pixels of the picture, and other trials are left out.
+
+    Returns:
+        One record for each trial, in the order of the file.
 
     Raises:
-        DataError: something in the file is not so; names the file, the trial and the field.
+        DataError: the content does not have this form; the message names the file, the trial and the field.
+
+    >>> import tempfile
+    >>> trial = '{"name": "1.jpg", "subject": 4, "task": "cup", "X": [840, 700.5], "Y": [525, 300], "T": [250, 180]}'
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "trials.json")
+    ...     _ = path.write_text(f"[{trial}]")
+    ...     scanpath = read_cocosearch(path)[0]
+    >>> scanpath.target, scanpath.points.tolist()
+    ('cup', [[840.0, 525.0], [700.5, 300.0]])
     """
     path, found = Path(path), []
     for number, trial in enumerate(read_json(path, _FILE)):
@@ -65,7 +80,20 @@ def read_cocosearch(
 
 
 def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:
-    """Write scanpaths, in pixels of their frames."""
+    """Write scanpaths in the format of COCO-Search18, in pixels of their frames.
+
+    Args:
+        path: the file.
+        fixations: the scanpaths.
+
+    >>> import tempfile
+    >>> import numpy as np
+    >>> scanpath = Fixations("1.jpg", "4", np.array([[839.5, 524.5]]), (1680, 1050), target="cup")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_cocosearch(Path(folder, "trials.json"), [scanpath])
+    ...     read_cocosearch(Path(folder, "trials.json"))[0].target
+    'cup'
+    """
     trials = []
     for each in fixations:
         trial: dict[str, Any] = {"name": each.picture, "subject": each.subject}

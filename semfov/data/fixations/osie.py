@@ -16,16 +16,30 @@ _FILE = Object(others=Array(Object({"x": PIXELS, "y": PIXELS, "duration_ms": MIL
 
 
 def read_osie(path: str | PathLike[str], *, size: tuple[int, int] = (800, 600)) -> list[Fixations]:
-    """Free viewing: an object with a list under each picture's name, in which each person has `x`, `y`, `duration_ms`.
+    """Read free-viewing fixations of OSIE from a JSON file.
 
-    People are numbered from 1 in the order of the list. The data set itself is a MATLAB file with the same in it.
+    The file is an object with a list under each picture's name. An item of the list has the `x`, `y` and `duration_ms`
+    of one person. People are numbered from 1 in the order of the list. (The data set itself is a MATLAB file with the
+    same content.)
 
     Args:
         path: the file.
         size: `(width, height)` of the pictures.
 
+    Returns:
+        One record for each picture and person.
+
     Raises:
-        DataError: something in the file is not so; names the file, the picture, the person and the field.
+        DataError: the content does not have this form; the message names the file, the picture, the person and the
+            field.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "osie.json")
+    ...     _ = path.write_text('{"1001.jpg": [{"x": [400, 350], "y": [300, 290], "duration_ms": [210, 180]}]}')
+    ...     scanpath = read_osie(path)[0]
+    >>> scanpath.picture, scanpath.subject, scanpath.durations.tolist()
+    ('1001.jpg', '1', [210.0, 180.0])
     """
     path, found = Path(path), []
     for picture, people in read_json(path, _FILE).items():
@@ -38,12 +52,23 @@ def read_osie(path: str | PathLike[str], *, size: tuple[int, int] = (800, 600)) 
 
 
 def write_osie(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:
-    """Write free viewing; people stand in the order that they are given in, and all pictures have one size.
+    """Write free-viewing fixations in the format that `read_osie` reads.
+
+    Args:
+        path: the file.
+        fixations: records of pictures of one size; the people of a picture are written in the order given.
 
     Raises:
-        InputError: pictures of different sizes, which the file has no place for.
+        InputError: the pictures have different sizes, for which the file has no field.
+
+    >>> import tempfile
+    >>> import numpy as np
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_osie(Path(folder, "osie.json"), [Fixations("1001.jpg", "7", np.zeros((3, 2)), (800, 600))])
+    ...     len(read_osie(Path(folder, "osie.json"))[0])
+    3
     """
-    check(len({each.size for each in fixations}) <= 1, "fixations", "pictures of one size", "several")
+    check(len({each.size for each in fixations}) <= 1, "fixations", "pictures of one size", "several sizes")
     pictures: dict[str, list[dict[str, Any]]] = {}
     for picture, people in by_picture(fixations).items():
         pictures[picture] = []

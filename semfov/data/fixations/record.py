@@ -17,17 +17,22 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Fixations:
-    """Fixations of one person, or of a model, in one picture, in order.
+    """Fixations of one person or one model in one picture, in order.
 
     Attributes:
-        picture: its name.
-        subject: who looked.
+        picture: name of the picture.
+        subject: name of the person or model.
         points: `(n, 2)`, `(x, y)` in pixels of a frame, pixel centres at integers.
         size: `(width, height)` of that frame: the picture, or the screen where the picture's size is not known.
         durations: `(n,)`, in milliseconds; None where they were not recorded.
-        target: name of what was searched for; None where nothing was.
-        box: `(x1, y1, x2, y2)`, pixel edges, of the target; None where it is not known.
-        found: whether the search ended on its target; None where nobody says.
+        target: name of the class that was searched for; None in free viewing.
+        box: box of the target, `(x1, y1, x2, y2)`, pixel edges; None where it is not known.
+        found: whether the search ended on its target; None where it is not known.
+
+    >>> scanpath = Fixations("1001.jpg", "1", np.array([[0.0, 1.0], [31.0, 23.0]]), (32, 24))
+    >>> scanpath.resized((64, 48)).points
+    array([[ 0.5,  2.5],
+           [62.5, 46.5]])
     """
 
     picture: str
@@ -43,7 +48,7 @@ class Fixations:
         """Check that the arrays belong together."""
         shape = self.points.shape
         check(len(shape) == 2 and shape[1] == 2 and shape[0] > 0, "points", "(n, 2), at least one fixation", shape)
-        check(bool(np.isfinite(self.points).all()), "points", "finite numbers", "others")
+        check(bool(np.isfinite(self.points).all()), "points", "finite numbers", "NaN or infinite ones")
         check(min(self.size) > 0, "size", "a width and a height above 0", self.size)
         if self.durations is not None:
             check(self.durations.shape == shape[:1], "durations", f"{shape[0]} numbers", self.durations.shape)
@@ -53,29 +58,62 @@ class Fixations:
         return len(self.points)
 
     def resized(self, size: tuple[int, int]) -> Fixations:
-        """In pixels of the same frame at another size."""
+        """Convert the fixations to pixels of the same frame at another size.
+
+        Args:
+            size: `(width, height)` of the frame.
+
+        Returns:
+            The converted record.
+        """
         box = None if self.box is None else resized_box(self.box, self.size, size)
         return replace(self, points=resized_points(self.points, self.size, size), size=size, box=box)
 
     def in_picture(self, size: tuple[int, int]) -> Fixations:
-        """In pixels of a picture of this size that was shown letterboxed on the frame; no point is clipped."""
+        """Convert the fixations to pixels of a picture that was shown letterboxed on the frame.
+
+        Args:
+            size: `(width, height)` of the picture.
+
+        Returns:
+            The converted record; points outside the picture are kept.
+        """
         placed = Letterbox(self.size, size)
         box = None if self.box is None else placed.box_to_picture(self.box)
         return replace(self, points=placed.to_picture(self.points), size=size, box=box)
 
     def first(self, count: int) -> Fixations:
-        """The first so many fixations."""
+        """Take the first fixations.
+
+        Args:
+            count: number of fixations.
+
+        Returns:
+            The shortened record.
+        """
         durations = None if self.durations is None else self.durations[:count]
         return replace(self, points=self.points[:count], durations=durations)
 
     @property
     def inside(self) -> NDArray[np.bool_]:
-        """Which fixations are in the frame, `(n,)`."""
+        """Whether each fixation is inside the frame, `(n,)` boolean."""
         return np.asarray(((self.points >= -0.5) & (self.points < np.array(self.size) - 0.5)).all(1))
 
 
 def by_picture(fixations: Iterable[Fixations]) -> dict[str, list[Fixations]]:
-    """The records of each picture, pictures in the order of their names."""
+    """Group records by picture.
+
+    Args:
+        fixations: the records.
+
+    Returns:
+        The records of each picture, pictures in the order of their names.
+
+    >>> points = np.zeros((1, 2))
+    >>> records = [Fixations(name, "1", points, (800, 600)) for name in ("b.jpg", "a.jpg", "b.jpg")]
+    >>> {name: len(group) for name, group in by_picture(records).items()}
+    {'a.jpg': 1, 'b.jpg': 2}
+    """
     pictures: dict[str, list[Fixations]] = {}
     for each in fixations:
         pictures.setdefault(each.picture, []).append(each)

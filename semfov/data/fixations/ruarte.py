@@ -1,4 +1,4 @@
-"""JSON files of scanpaths as the visual search benchmark of Travi, Ruarte, Bujia and Kamienkowski keeps them."""
+"""JSON files of scanpaths in the format of the visual search benchmark of Travi, Ruarte, Bujia and Kamienkowski."""
 
 from __future__ import annotations
 
@@ -39,20 +39,35 @@ def read_ruarte(
     sizes: Mapping[str, tuple[int, int]] | None = None,
     subject: str | None = None,
 ) -> list[Fixations]:
-    """Scanpaths of one person or one model: an object with a trial under each picture's name.
+    """Read the scanpaths of one person or one model.
 
-    People's are in pixels of the screen, models' in its cells. A trial's target box is rows and columns, first and last
-    one; of cells, the last ones belong to it. `T` is longer than `X` where a scanpath was cut at its target.
+    The file is an object with a trial under each picture's name. Coordinates of people are in pixels of the screen,
+    coordinates of models in cells of the screen. The target box of a trial is `[first row, first column, last row, last
+    column]`; in cells, the last row and column are inside the box. `T` is longer than `X` where a scanpath was cut at
+    its target.
 
     Args:
         path: the file.
-        screen: `(width, height)` in pixels that all trials are brought to; None leaves each in its own pixels or cells.
-        sizes: `(width, height)` of the pictures by name (`coco_name` leads to COCO's); trials of pictures that are here
-            are brought to pixels of the picture, and the others are left out.
-        subject: who looked; None: as the file says.
+        screen: `(width, height)` in pixels to which all trials are converted; None leaves each trial in its own pixels
+            or cells.
+        sizes: `(width, height)` of the pictures by name (`coco_name` gives COCO's name of a picture). Where it is
+            given, trials of these pictures are converted to pixels of the picture, and other trials are left out.
+        subject: name of the person or model; None for the name in the file.
+
+    Returns:
+        One record for each trial.
 
     Raises:
-        DataError: something in the file is not so; names the file, the trial and the field.
+        DataError: the content does not have this form; the message names the file, the trial and the field.
+
+    >>> import tempfile
+    >>> trial = '{"X": [0, 8], "Y": [0, 12], "image_width": 32, "image_height": 24, "target_object": "cup"}'
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "scanpaths.json")
+    ...     _ = path.write_text('{"000000000164.jpg": ' + trial + "}")
+    ...     scanpath = read_ruarte(path, screen=(1600, 1200))[0]
+    >>> scanpath.target, scanpath.points.tolist()
+    ('cup', [[24.5, 24.5], [424.5, 624.5]])
     """
     path, found = Path(path), []
     for name, trial in read_json(path, _FILE).items():
@@ -83,14 +98,26 @@ def read_ruarte(
 
 
 def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> None:
-    """Write the scanpaths of one person or model, one for each picture, in pixels of their frames.
+    """Write the scanpaths of one person or model in the format that `read_ruarte` reads, in pixels of their frames.
+
+    Args:
+        path: the file.
+        fixations: the scanpaths, one for each picture.
 
     Raises:
-        InputError: a picture has two.
+        InputError: a picture has two scanpaths.
+
+    >>> import tempfile
+    >>> import numpy as np
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_ruarte(Path(folder, "scanpaths.json"), [Fixations("1.jpg", "4", np.zeros((3, 2)), (800, 600))])
+    ...     len(read_ruarte(Path(folder, "scanpaths.json"))[0])
+    3
     """
     trials = {}
     for each in fixations:
-        check(each.picture not in trials, "fixations", "one scanpath for each picture", f"two for {each.picture}")
+        expected = "one scanpath for each picture"
+        check(each.picture not in trials, "fixations", expected, f"several for {each.picture}")
         width, height = each.size
         trial = {
             "subject": each.subject,
@@ -115,13 +142,24 @@ def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> N
 
 
 def coco_name(name: str) -> str:
-    """COCO's name of a picture that the benchmark uses for a second target and then counts up in its first digit.
+    """Find COCO's name of a picture of the benchmark.
+
+    Where the benchmark uses a picture again for a second target, it increases the first digit of its name.
+
+    Args:
+        name: name of the picture in the benchmark.
+
+    Returns:
+        Name of the picture in COCO.
+
+    Raises:
+        InputError: the name does not consist of twelve digits and `.jpg`.
 
     >>> coco_name("100000298773.jpg"), coco_name("000000000164.jpg")
     ('000000298773.jpg', '000000000164.jpg')
     """
     if not re.fullmatch(r"\d{12}\.jpg", name):
-        raise InputError(f"name: expected one such as '100000298773.jpg', got {name!r}")
+        raise InputError(f"name: expected twelve digits and .jpg, such as '100000298773.jpg', got {name!r}")
     return "0" + name[1:]
 
 
@@ -129,5 +167,5 @@ def _edges(rows_and_columns: list[float] | None, cells: bool) -> Box | None:
     if rows_and_columns is None:
         return None
     top, left, bottom, right = map(float, rows_and_columns)
-    # The last cell ends where the next begins.
+    # The last cell is inside the box, so the box ends where the next cell begins.
     return left, top, right + cells, bottom + cells

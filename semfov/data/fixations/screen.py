@@ -1,4 +1,4 @@
-"""From pixels of a screen to pixels of the picture on it."""
+"""Conversion between pixels of a screen and pixels of the picture on it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Letterbox:
-    """A picture shown on a screen as large as it fits, centred, its proportions kept.
+    """A picture on a screen, resized to the largest size that fits with its proportions, and centred.
 
     Attributes:
-        screen: `(width, height)`.
-        picture: `(width, height)`.
+        screen: `(width, height)` of the screen in pixels.
+        picture: `(width, height)` of the picture in pixels.
 
     >>> placed = Letterbox((1680, 1050), (640, 480))
     >>> placed.scale, placed.offset
@@ -43,32 +43,68 @@ class Letterbox:
 
     @property
     def offset(self) -> tuple[float, float]:
-        """Width of the border on the left and height of that at the top, in screen pixels."""
+        """Width of the border on the left and height of the border at the top, in screen pixels."""
         across, down = (whole - self.scale * part for whole, part in zip(self.screen, self.picture, strict=True))
         return across / 2, down / 2
 
     def to_picture(self, points: Array) -> Array:
-        """Points `(n, 2)` of the screen as points of the picture."""
+        """Convert points from the screen to the picture.
+
+        Args:
+            points: `(n, 2)` in screen pixels.
+
+        Returns:
+            `(n, 2)` in picture pixels.
+        """
         return np.asarray((points + 0.5 - self.offset) / self.scale - 0.5)
 
     def to_screen(self, points: Array) -> Array:
-        """Points `(n, 2)` of the picture as points of the screen."""
+        """Convert points from the picture to the screen.
+
+        Args:
+            points: `(n, 2)` in picture pixels.
+
+        Returns:
+            `(n, 2)` in screen pixels.
+        """
         return np.asarray((points + 0.5) * self.scale + self.offset - 0.5)
 
     def box_to_picture(self, box: tuple[float, ...]) -> tuple[float, float, float, float]:
-        """Pixel edges on the screen as pixel edges of the picture."""
+        """Convert a box from the screen to the picture.
+
+        Args:
+            box: `(x1, y1, x2, y2)`, edges of screen pixels.
+
+        Returns:
+            `(x1, y1, x2, y2)`, edges of picture pixels.
+        """
         corners = (np.array(box).reshape(2, 2) - self.offset) / self.scale
         return _box(corners)
 
     def box_to_screen(self, box: tuple[float, ...]) -> tuple[float, float, float, float]:
-        """Pixel edges of the picture as pixel edges on the screen."""
+        """Convert a box from the picture to the screen.
+
+        Args:
+            box: `(x1, y1, x2, y2)`, edges of picture pixels.
+
+        Returns:
+            `(x1, y1, x2, y2)`, edges of screen pixels.
+        """
         return _box(np.array(box).reshape(2, 2) * self.scale + self.offset)
 
 
 def resized_points(points: Array, size: Size, new: Size) -> Array:
-    """Points `(n, 2)` of a frame in pixels of the same frame at another size.
+    """Convert points to pixels of the same frame at another size.
 
-    The centre of a cell of 50 pixels, 0 in cells, is 24.5 in pixels:
+    Args:
+        points: `(n, 2)`.
+        size: `(width, height)` of the frame that the points refer to.
+        new: the other `(width, height)` of the frame.
+
+    Returns:
+        `(n, 2)` in pixels of the frame at the other size.
+
+    The centre of the first cell has coordinate 0 in cells. With cells of 50 pixels it is at 24.5 in pixels:
 
     >>> resized_points(np.array([[0.0, 1.0]]), (32, 24), (1600, 1200))
     array([[24.5, 74.5]])
@@ -77,7 +113,7 @@ def resized_points(points: Array, size: Size, new: Size) -> Array:
 
 
 def resized_box(box: tuple[float, ...], size: Size, new: Size) -> tuple[float, float, float, float]:
-    """Pixel edges in a frame as those in the same frame at another size."""
+    """A box `(x1, y1, x2, y2)`, pixel edges, in pixels of the same frame at another size."""
     return _box(np.array(box).reshape(2, 2) * (np.array(new) / np.array(size)))
 
 

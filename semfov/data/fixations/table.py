@@ -1,4 +1,4 @@
-"""Fixations as a plain table (CSV): a line for each fixation, which any program can write."""
+"""Fixations as a plain table (CSV) with a line for each fixation, which any program can write."""
 
 from __future__ import annotations
 
@@ -17,28 +17,43 @@ from semfov.io.files import check_regular, write_text
 COLUMNS = ("picture", "subject", "x", "y", "width", "height")
 """Columns that a table must have."""
 MORE = ("target", "duration", "x1", "y1", "x2", "y2", "found")
-"""Columns that it may have besides, after those; fields may be empty."""
+"""Further columns that a table may have; their fields may be empty."""
 
 
 def read_table(path: str | PathLike[str]) -> list[Fixations]:
-    """Fixations from a table with a line of column names; lines of one scanpath follow each other in order.
+    r"""Read fixations from a table.
 
-    `x` and `y` are pixels of a frame of `width` × `height`, pixel centres at integers; `duration` is in milliseconds;
-    `x1` to `y2` are the target's box and `found` is true or false. A scanpath ends where picture, subject or target
-    change. pandas writes such a table by `frame.to_csv(path, index=False)`.
+    The first line holds the names of the columns (`COLUMNS` and `MORE`). The lines of one scanpath follow each other in
+    order, and a new scanpath begins where picture, subject or target change. `x` and `y` are in pixels of a frame of
+    `width` × `height`, pixel centres at integers. `duration` is in milliseconds. `x1`, `y1`, `x2` and `y2` are the
+    target's box. `found` is `true` or `false`. pandas writes such a table by `frame.to_csv(path, index=False)`.
+
+    Args:
+        path: the file.
+
+    Returns:
+        One record for each scanpath.
 
     Raises:
-        DataError: something in the file is not so; names the file, the line and the column.
+        DataError: the content does not have this form; the message names the file, the line and the column.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "fixations.csv")
+    ...     text = "picture,subject,x,y,width,height\na.jpg,1,40,30,80,60\na.jpg,1,52.5,31,80,60"
+    ...     _ = path.write_text(text)
+    ...     read_table(path)[0].points.tolist()
+    [[40.0, 30.0], [52.5, 31.0]]
     """
     path = Path(path)
     check_regular(path)
     try:
         lines = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"), newline=""), strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path}: cannot be read as a table ({error})") from None
+        raise DataError(f"{path}: cannot be read as a table ({error}); correct or replace the file") from None
     missing = [name for name in COLUMNS if lines and name not in lines[0]]
     if missing:
-        raise DataError(f"{path}: expected the columns {', '.join(COLUMNS)}; {', '.join(missing)} missing")
+        raise DataError(f"{path}: expected the columns {', '.join(COLUMNS)}, got none named {', '.join(missing)}")
     groups: list[list[tuple[int, Mapping[str, str]]]] = []
     previous = None
     for number, line in enumerate(lines, start=2):
@@ -51,7 +66,19 @@ def read_table(path: str | PathLike[str]) -> list[Fixations]:
 
 
 def write_table(path: str | PathLike[str], fixations: Iterable[Fixations]) -> None:
-    """Write fixations as a table that `read_table` reads back."""
+    """Write fixations as a table that `read_table` reads.
+
+    Args:
+        path: the file.
+        fixations: the records.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "fixations.csv")
+    ...     write_table(path, [Fixations("a.jpg", "1", np.array([[40.0, 30.0]]), (80, 60), target="cup")])
+    ...     print(path.read_text().splitlines()[1])
+    a.jpg,1,40.0,30.0,80,60,cup,,,,,,
+    """
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow([*COLUMNS, *MORE])

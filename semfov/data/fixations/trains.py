@@ -1,4 +1,4 @@
-"""To and from the fixation trains of pysaliency."""
+"""Conversion to and from the fixation trains of pysaliency."""
 
 from __future__ import annotations
 
@@ -12,25 +12,34 @@ from semfov.errors import InputError, check
 
 
 def to_pysaliency(fixations: Sequence[Fixations], pictures: Sequence[str]) -> Any:
-    """Fixations as `pysaliency.FixationTrains`.
+    """Convert fixations to `pysaliency.FixationTrains`.
 
-    pysaliency counts from the left and the top edge and rounds down, so that a pixel's centre is at .5; times there are
-    those of the onsets, in seconds, and 0, 1, … where durations are not known.
+    pysaliency measures coordinates from the left and the top edge of the picture, so a pixel's centre is at .5. Times
+    are the onsets of the fixations in seconds, or 0, 1, … where durations are not known.
 
     Args:
-        fixations: in pixels of the pictures.
-        pictures: names of the stimuli, in their order there.
+        fixations: records in pixels of the pictures.
+        pictures: names of the stimuli, in pysaliency's order.
+
+    Returns:
+        The fixation trains.
 
     Raises:
         InputError: pysaliency is not installed, or a picture is not among the stimuli.
+
+    Example::
+
+        trains = to_pysaliency(fixations, ["1001.jpg", "1002.jpg"])
     """
     try:
         from pysaliency import FixationTrains
     except ImportError:
-        raise InputError("to_pysaliency: expected pysaliency; pip install pysaliency") from None
+        raise InputError(
+            "to_pysaliency: expected the package pysaliency, which cannot be imported; pip install pysaliency"
+        ) from None
     number = {name: index for index, name in enumerate(pictures)}
     unknown = [each.picture for each in fixations if each.picture not in number]
-    check(not unknown, "pictures", "all pictures of the fixations", f"none called {unknown[:1]}")
+    check(not unknown, "pictures", "all pictures of the fixations", f"none named {unknown[:1]}")
     people = {name: index for index, name in enumerate(sorted({each.subject for each in fixations}))}
     return FixationTrains.from_fixation_trains(
         xs=[each.points[:, 0] + 0.5 for each in fixations],
@@ -42,12 +51,19 @@ def to_pysaliency(fixations: Sequence[Fixations], pictures: Sequence[str]) -> An
 
 
 def from_pysaliency(trains: Any, pictures: Sequence[str], sizes: Mapping[str, tuple[int, int]]) -> list[Fixations]:
-    """Fixations from `pysaliency.FixationTrains`; their durations are not told there.
+    """Convert `pysaliency.FixationTrains`, which have no durations, to fixations.
 
     Args:
         trains: the fixation trains.
-        pictures: names of the stimuli, in their order there.
+        pictures: names of the stimuli, in pysaliency's order.
         sizes: `(width, height)` of the pictures by name.
+
+    Returns:
+        One record for each train, in pixels of the picture.
+
+    Example::
+
+        fixations = from_pysaliency(trains, ["1001.jpg", "1002.jpg"], {"1001.jpg": (800, 600), "1002.jpg": (800, 600)})
     """
     found = []
     columns = (trains.train_xs, trains.train_ys, trains.train_ns, trains.train_subjects)

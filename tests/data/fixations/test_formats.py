@@ -141,7 +141,7 @@ def test_errors_name_file_record_and_field(tmp_path, changes, said):
         ('{"a.jpg": [{"x": [1]}]}', read_osie, r"a\.jpg\[0\]\.y: expected a value"),
         ('[{"X": [1], "Y": [1]}]', read_cocosearch, r"\[0\]\.name: expected a value"),
         ('[{"name": "a", "X": [1], "Y": [1, 2]}]', read_cocosearch, r"\[0\] \(a\): expected as many Y as X"),
-        ("picture,subject,x,y\na,1,2,3\n", read_table, "width, height missing"),
+        ("picture,subject,x,y\na,1,2,3\n", read_table, "got none named width, height"),
         ("picture,subject,x,y,width,height\na,1,2,?,8,6\n", read_table, r"line 2, y: expected a number, got '\?'"),
         ("picture,subject,x,y,width,height\na,1,2,,8,6\n", read_table, "line 2, y: expected a number, got nothing"),
         ("picture,subject,x,y,width,height\na,1,2,3,0,6\n", read_table, "line 2, size"),
@@ -160,7 +160,7 @@ def test_a_missing_file_is_named(tmp_path):
 
 
 def test_one_person_looks_at_a_picture_once_in_ruartes_file(tmp_path):
-    with pytest.raises(InputError, match=r"two for a\.jpg"):
+    with pytest.raises(InputError, match=r"several for a\.jpg"):
         write_ruarte(tmp_path / "s.json", [record(), record()])
 
 
