@@ -29,15 +29,15 @@ class FovealObservationModel(Pretrained):
     .. math:: p(S \mid C = k, d) = \mathrm{Dir}(S \mid \alpha_{k,d})
 
     This is the model of Luzio, Bernardino and Moreno (2024, section III-D), after Dias, Simões, Moreno and Bernardino
-    (2022). Its calibrated scores (`calibrate`) are the posterior
+    (2022). `calibrate` gives the posterior
 
     .. math:: P(C = k \mid S, d) \propto \mathrm{Dir}(S \mid \alpha_{k,d})^\tau \, \pi_{k,d}
 
     With `τ = 1` and a uniform π, the defaults of `fit`, these are the published calibrated scores (equation 11). They
     are overconfident: the density treats its K+1 components as independent evidence, while most scores of a detection
-    are near zero together. A class prior and τ < 1 help. The recommended models use
-    `semfov.observation.fit_discriminative`, which trains α and π for the posterior itself. The paper gives neither the
-    number of levels nor their borders, nor its treatment of scores of 0: `edges` and `epsilon` are our choice.
+    are near zero together. A class prior and τ < 1 help. The recommended models use `fit_discriminative`, which trains
+    α and π for the posterior itself. The paper gives neither the number of levels nor their borders, nor its treatment
+    of scores of 0: `edges` and `epsilon` are our choice.
 
     The logit of a class is linear in the log scores, with weights `τ (α - 1)`. The model with `α_k = 1 + e_k`, τ = 1
     and a uniform prior therefore returns the scores unchanged (`identity`).
@@ -236,9 +236,7 @@ class FovealObservationModel(Pretrained):
             InputError: the model has no `miss_rate`.
         """
         if self.miss_rate is None:
-            raise InputError(
-                "miss_rate: expected a model with miss rates (fit one with `train.fit_fom`), got a model without"
-            )
+            raise InputError("miss_rate: expected a model fitted with miss rates (`train.fit_fom`), got one without")
         return F.embedding(self.level(distance), self.miss_rate.t())
 
     def forward(self, scores: Tensor, distance: Tensor) -> Tensor:

@@ -183,7 +183,7 @@ def test_the_published_agent_takes_the_folder(home, search):
     assert isinstance(agent.exploring.policy, KL)
     image = torch.rand(3, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
     assert len(agent.search(image, "blue", shifts=2, confirm=1.0).cells) == 3
-    with pytest.raises(InputError, match="sensor: expected None beside a folder of models"):
+    with pytest.raises(InputError, match="sensor: expected None with a folder of models"):
         ActivePerception.published(home / "models", sensor="published")
 
 
