@@ -190,7 +190,7 @@ def test_the_published_agent_takes_the_folder(home, search):
 def test_the_published_agent_needs_an_observation_model(home, tmp_path):
     folder = copied(home, tmp_path)
     rewrite(folder, observation=replace(Manifest.read(folder).parts["observation"], file=None, used=False))
-    with pytest.raises(InputError, match=r"observation model, which .* lacks; fit one: python -m train\.fit_detector"):
+    with pytest.raises(InputError, match=r"observation model, got .* without; fit one: python -m train\.fit_detector"):
         ActivePerception.published(folder)
 
 
