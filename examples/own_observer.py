@@ -1,6 +1,6 @@
-"""An observer of your own: remember the largest score of every class in every cell.
+"""Your own observer: remember the largest score of every class in every cell.
 
-It needs no prior and no rule of fusion, and one confident look outweighs any number of doubtful ones.
+It needs no prior and no fusion rule. One confident look outweighs any number of doubtful ones.
 
 Run it from a checkout: python -m examples.own_observer
 """
@@ -19,24 +19,24 @@ from semfov.sensor import named_sensor
 
 @dataclass(frozen=True)
 class ScoreLook(semfov.observers.Look):
-    """What looks say: the largest score of each class in each cell."""
+    """Evidence of looks: the largest score of each class in each cell."""
 
     scores: Tensor  # (B, X·Y, K+1)
     distance: Tensor  # (B, X·Y), from the fixation
 
     def __getitem__(self, index: Tensor | slice) -> "ScoreLook":
-        """Some of the looks."""
+        """The selected looks of the batch."""
         return ScoreLook(self.scores[index], self.distance[index])
 
     @classmethod
     def join(cls, looks: Sequence["ScoreLook"]) -> "ScoreLook":
-        """All looks of several batches."""
+        """Concatenate several batches of looks."""
         return cls(torch.cat([look.scores for look in looks]), torch.cat([look.distance for look in looks]))
 
 
 @dataclass(frozen=True)
 class ScoreBelief(semfov.Belief):
-    """What is believed: the largest score so far."""
+    """The belief: the largest score of each class in each cell so far."""
 
     scores: Tensor  # (B, X·Y, K+1)
     closest: Tensor  # (B, X·Y), distance to the closest fixation; every belief has it
@@ -46,7 +46,7 @@ class ScoreBelief(semfov.Belief):
         return self.scores[torch.arange(len(self.scores)), :, target]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "ScoreBelief":
-        """The belief with both tensors replaced."""
+        """Apply a function to every tensor of the belief."""
         return ScoreBelief(function(self.scores), function(self.closest))
 
 
@@ -58,7 +58,7 @@ class BestScore(semfov.observers.Observer):
         self.components = components
 
     def start(self, batch: int, grid: semfov.Grid, like: Tensor) -> ScoreBelief:
-        """Nothing was seen."""
+        """The belief before the first look: all scores are 0."""
         scores = like.new_zeros(batch, len(grid), self.components)
         return ScoreBelief(scores, torch.full_like(scores[..., 0], torch.inf))
 
@@ -91,7 +91,7 @@ def main() -> None:
         LiveLooks(eye, eye.open(image), grid),
         BestScore(len(detector.classes) + 1),
         semfov.acquisition.TargetPosterior(cup),
-        torch.tensor([0]),  # the cell that each episode starts in; here is one episode
+        torch.tensor([0]),  # first cell of each episode; here there is one episode
         Greedy(drawn_by(torch.Generator().manual_seed(0), len(grid), image)),
         most=20,
         ends=lambda step: goal[step.cell],
