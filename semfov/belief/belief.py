@@ -196,8 +196,8 @@ def dirichlet_belief(belief: Belief) -> DirichletBelief:
     """
     if not isinstance(belief, DirichletBelief):
         raise InputError(
-            f"belief: expected a DirichletBelief (of observers.Semantic), got {type(belief).__name__}; use that "
-            "observer, or an acquisition function that goes by the probability of the target"
+            f"belief: expected a belief about all classes (DirichletBelief), got {type(belief).__name__}; use "
+            "observers.Semantic, or an acquisition function that uses the probability of the target alone"
         )
     return belief
 
