@@ -246,8 +246,8 @@ class ActivePerception(nn.Module):
         goal = None if boxes is None else goal_cells(boxes, grid, image)
         chosen = self.searching.observer.thresholds
         if price is not None and (chosen is None or confirm is not None or give_up is not None):
-            reason = "the belief has no calibrated presence" if chosen is None else "confirm or give_up is given"
-            raise InputError(f"price: expected None where {reason}, got {price}; leave out one of them")
+            case = "for an agent without thresholds" if chosen is None else "together with confirm or give_up"
+            raise InputError(f"price: expected None {case}, got {price}; the recommended agent takes one of them")
         thresholds = None if chosen is None else chosen.changed(confirm, give_up)
 
         outcome = outcome_of(wanted, grid, goal, price, thresholds, 0.5 if confirm is None else confirm)
@@ -376,9 +376,9 @@ class ActivePerception(nn.Module):
 
         def ends(step: Step) -> Tensor:
             nonlocal ended
-            came = torch.zeros_like(step.cell) if outcome is None else outcome(step)
-            ended = int(came), step
-            return came > 0
+            number = torch.zeros_like(step.cell) if outcome is None else outcome(step)
+            ended = int(number), step
+            return number > 0
 
         steps = rollout(
             looks,

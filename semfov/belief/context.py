@@ -195,7 +195,7 @@ class ContextPrior(Pretrained):
         """Permute the classes at random: a control with the same amount of information, about the wrong classes.
 
         Args:
-            seed: of the random permutation.
+            seed: seed of the random permutation.
 
         Returns:
             A new prior.

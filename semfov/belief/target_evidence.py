@@ -26,8 +26,8 @@ class Thresholds:
     Attributes:
         confirm: least probability that the image holds the target for a search to end with `found`. A cell nearly as
             probable as the most probable one must have been fixated, too.
-        give_up: a search ends without finding the target if no cell that was not fixated reaches this probability of
-            holding the target, given that no fixated cell holds it.
+        give_up: least probability for a cell to be worth a look, given that no fixated cell holds the target. A search
+            ends when no remaining cell reaches it.
         place: least probability that the fixated cell itself holds the target, for `found`. Below it the image may
             hold the target, but its place is not known.
 

@@ -43,10 +43,10 @@ class Looks(ABC):
 
     Example::
 
-        class FirstDetector(semfov.episode.Looks):
+        class Recorded(semfov.episode.Looks):
             def see(self, observer, episodes, cell, fixation):
-                detections = ...  # boxes and scores seen from the fixations, a batch of A
-                return Sight(observer.weigh(detections, fixation, self.grid, self.target), lambda: detections, {})
+                detections = self.recorded[cell]  # a batch of A
+                return Sight(observer.weigh(detections, fixation, self.grid), lambda: detections, {})
     """
 
     grid: Grid

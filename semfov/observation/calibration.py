@@ -29,7 +29,7 @@ def fit_discriminative(
     scaling"); here there is one for each level of distance. Requiring positive α costs no generality, because adding
     the same number to the weights of all classes changes nothing.
 
-    There are 82 weights for each class and level of 80 classes, and few examples of most classes, so the priors
+    With 80 classes there are 82 weights for each class and level, and few examples of most classes, so the priors
     matter. They are normal distributions that tie the levels together. Their centre is the model that returns the
     scores unchanged, `α_k = 1 + e_k`; classes without examples stay there:
 
