@@ -210,7 +210,7 @@ class ModelFolder:
         path = find_file(place, self.path)
         if path is None:
             raise DataError(
-                f"detector: expected the file {place['absolute']}, to which {self.path} was fitted, but it is missing; "
-                "give its new place as detector= (on a command line --detector FILE), or put it back"
+                f"detector: expected {place['absolute']}, the file that {self.path} was fitted to, got none; give its "
+                "new place as detector= (on a command line --detector FILE), or put it back"
             )
         return path

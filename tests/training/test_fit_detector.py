@@ -258,9 +258,9 @@ def copied(home, tmp_path):
 def test_another_network_is_refused(home, tmp_path):
     folder = copied(home, tmp_path)
     write_network(tmp_path / "colours.onnx", bias=-3.0)
-    with pytest.raises(DataError, match=r"detector: .*another network .*python -m train\.fit_detector"):
+    with pytest.raises(DataError, match=r"detector: .*expected the network .*python -m train\.fit_detector"):
         ActivePerception.from_pretrained(folder)
-    with pytest.raises(DataError, match="another network"):
+    with pytest.raises(DataError, match="expected the network"):
         ActivePerception.from_pretrained(home / "models", detector=tmp_path / "colours.onnx")
 
 
