@@ -86,7 +86,9 @@ class ContextPrior(Pretrained):
         components = len(classes) + 1
         check_shape(place, "place", components, place.shape[-1], place.shape[-1])
         check_shape(cooccurrence, "cooccurrence", components, components, len(edges) + 1)
-        check(list(edges) == sorted(edges) and min(edges, default=0) >= 0, "edges", "ascending, from 0", edges)
+        check(
+            list(edges) == sorted(edges) and min(edges, default=0) >= 0, "edges", "ascending numbers, 0 or more", edges
+        )
         self.classes = tuple(classes)
         self.edges = tuple(edges)
         self.weights = {kind: (float(pair[0]), float(pair[1])) for kind, pair in (weights or {}).items()}

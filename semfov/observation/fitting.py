@@ -42,7 +42,7 @@ def fit_tables(
     if fallback:
         told = ", ".join(f"level {n} as level {source}" for n, source in fallback.items() if n > 0)
         told += "; level 0 has no inner neighbour and uses the classes' other levels" * (0 in fallback)
-        # The caller of `FovealObservationModel.fit`, which has torch's decorator around it.
+        # Level 4 is the caller of `FovealObservationModel.fit`: the decorator of `fit` adds a frame.
         warnings.warn(f"levels with fewer than {minimum} objects fall back: {told}", stacklevel=4)
     prior, expected = estimate_prior(statistics.count, shrinkage), expected_table(statistics, fallback, shrinkage)
     record = {

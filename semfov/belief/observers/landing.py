@@ -105,7 +105,7 @@ class Landing(Observer):
         super().__init__()
         check(classes >= 1, "classes", "at least 1", classes)
         check(person is None or 1 <= person <= classes, "person", f"a class from 1 to {classes}, or None", person)
-        check(0 < reach <= 1, "reach", "longer sides above 0, up to 1", reach)
+        check(0 < reach <= 1, "reach", "a number above 0, up to 1, in longer sides of the image", reach)
         self.classes, self.person, self.reach = classes, person, reach
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> LandingBelief:
