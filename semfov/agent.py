@@ -8,7 +8,6 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from semfov import presets
 from semfov.belief.grid import Grid, check_cells
 from semfov.belief.observers import AnyBelief, AnyOf, LearnedMap, Observer
 from semfov.belief.observers.any_of import TargetLike, weights_by_class
@@ -24,6 +23,7 @@ from semfov.gaze.policies import NonPredictive, Policy, Random
 from semfov.io.schema import is_number
 from semfov.live import RATE, LivePerception
 from semfov.model_folder import open_folder
+from semfov.presets import published_parts, raw_parts, recommended_parts
 from semfov.scanpath import Ending, Scanpath, Stimulus, trace
 
 PRICE = 0.1
@@ -110,7 +110,7 @@ class ActivePerception(nn.Module):
             InputError: no models are shipped for this detector, this sensor or this grid.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(presets.recommended(name, sigma, growth, grid, context, **options))
+        return cls._of(recommended_parts(name, sigma, growth, grid, context, **options))
 
     @classmethod
     def from_pretrained(cls, name: str | PathLike[str] = "yolov3-tiny", **options: Any) -> Self:
@@ -162,7 +162,7 @@ class ActivePerception(nn.Module):
             InputError: no models are shipped for this detector or this sensor, or the folder has no observation model.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(presets.published(name, sensor, search, calibrated, **options))
+        return cls._of(published_parts(name, sensor, search, calibrated, **options))
 
     @classmethod
     def raw(cls, name: str = "yolov3-tiny", *, sensor: str = "published", **options: Any) -> Self:
@@ -180,7 +180,7 @@ class ActivePerception(nn.Module):
             InputError: the detector or the sensor is unknown.
             DataError: the weights cannot be downloaded, or are damaged.
         """
-        return cls._of(presets.raw(name, sensor, **options))
+        return cls._of(raw_parts(name, sensor, **options))
 
     @classmethod
     def _of(cls, parts: dict[str, Any]) -> Self:

@@ -1,6 +1,7 @@
 """Preset agents: eye, observers and policies by the name of a detector or of a folder of models.
 
-Each function returns the arguments of `semfov.ActivePerception`, whose class methods of the same names document theirs.
+Each function returns the arguments of `semfov.ActivePerception`. The class methods `recommended`, `published` and `raw`
+document the parameters.
 """
 
 from os import PathLike, fspath
@@ -26,7 +27,7 @@ PUBLISHED_SENSORS = ("published", "published-narrow")
 """Named sensors of the paper; observation models fitted by maximum likelihood are shipped for them."""
 
 
-def recommended(
+def recommended_parts(
     name: str, sigma: float, growth: float, grid: tuple[int, int], context: bool, **options: Any
 ) -> dict[str, Any]:
     """Parts of `ActivePerception.recommended`: learned target evidence for search, a learned map for exploration."""
@@ -48,7 +49,7 @@ def recommended(
     return {"eye": eye, "search": (observer, NonPredictive()), "explore": mapping, "grid": grid}
 
 
-def published(
+def published_parts(
     name: str | PathLike[str], sensor: str | None, search: str, calibrated: bool, **options: Any
 ) -> dict[str, Any]:
     """Parts of `ActivePerception.published`, by the name of a detector or from a folder of models."""
@@ -68,7 +69,7 @@ def published(
     return {"eye": eye, "search": (observer, policy), "explore": (observer, KL(model)), "grid": grid}
 
 
-def raw(name: str, sensor: str, **options: Any) -> dict[str, Any]:
+def raw_parts(name: str, sensor: str, **options: Any) -> dict[str, Any]:
     """Parts of `ActivePerception.raw`: raw scores as likelihoods, and random exploration."""
     eye = Eye(named_sensor(sensor), load_detector(name, **options))
     observer = Semantic(len(eye.detector.classes) + 1)
