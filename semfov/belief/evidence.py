@@ -15,8 +15,7 @@ from semfov.io.pretrained import PretrainedForEye
 READOUT = 14
 """Number of inputs that describe a cell after several looks."""
 
-# With every such distance between the fixation and a cell (in longer sides of the image), a look counts e times less
-# in the mean of all looks.
+# Distance between fixation and cell, in longer sides of the image, over which the weight of a look falls by a factor e.
 _REACH = 1 / 6
 
 
