@@ -8,31 +8,60 @@ dependencies = ["torch", "torchvision", "kornia", "numpy", "PIL", "safetensors",
 
 
 def foveation(sigma: float = 100.0, **options: Any) -> _semfov.Foveation:
-    """The foveal sensor; arguments of `semfov.Foveation`."""
+    """Make the foveal sensor.
+
+    Args:
+        sigma: width of the fovea in pixels, positive.
+        options: further arguments of `semfov.Foveation`.
+
+    Returns:
+        The sensor.
+    """
     return _semfov.Foveation(sigma, **options)
 
 
 def yolov3_tiny_detector(**options: Any) -> _semfov.Detector:
-    """YOLOv3-tiny with full score vectors, its weights downloaded once; options of `semfov.load_detector`."""
+    """Load YOLOv3-tiny with full score vectors; the weights are downloaded once.
+
+    Args:
+        options: options of `semfov.load_detector`.
+
+    Returns:
+        The detector.
+    """
     return _semfov.load_detector("yolov3-tiny", **options)
 
 
 def yolov3_tiny_observation() -> _semfov.FovealObservationModel:
-    """The observation model that is shipped for YOLOv3-tiny and a fovea of 100 pixels."""
+    """Load the observation model that is shipped for YOLOv3-tiny and a fovea of 100 pixels."""
     return _semfov.FovealObservationModel.from_pretrained("yolov3-tiny")
 
 
 def yolov3_tiny_eye(sigma: float = 100.0, **options: Any) -> _semfov.Eye:
-    """Sensor and detector as one module: `eye(image, fixations) -> semfov.Detections`; options of the detector."""
+    """Make sensor and detector as one module: `eye(image, fixations) -> semfov.Detections`.
+
+    Args:
+        sigma: width of the fovea, in pixels of an image whose longer side is 640.
+        options: options of `semfov.load_detector`.
+
+    Returns:
+        The eye, in `eval` mode.
+    """
     return _semfov.Eye(foveation(sigma), yolov3_tiny_detector(**options)).eval()
 
 
 def yolov3_tiny_agent(kind: str = "recommended", **options: Any) -> _semfov.ActivePerception:
-    """An agent that searches: `agent.search(image, "cup") -> semfov.Scanpath`.
+    """Make an agent that searches: `agent.search(image, "cup") -> semfov.Scanpath`.
 
     Args:
         kind: `recommended`, `published` or `raw`.
-        options: of `semfov.ActivePerception.recommended`, `.published` or `.raw`.
+        options: options of `semfov.ActivePerception.recommended`, `.published` or `.raw`.
+
+    Returns:
+        The agent, in `eval` mode.
+
+    Raises:
+        semfov.InputError: the kind is unknown.
     """
     agents = {
         "recommended": _semfov.ActivePerception.recommended,

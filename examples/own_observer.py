@@ -1,6 +1,6 @@
-"""Write your own observer: remember the highest score of every class in every cell.
+"""Your own observer: remember the largest score of every class in every cell.
 
-This observer needs no prior and no fusion rule. One confident look outweighs any number of uncertain ones.
+It needs no prior and no fusion rule. One confident look outweighs any number of doubtful ones.
 
 Run it from a checkout: python -m examples.own_observer
 """
@@ -19,53 +19,53 @@ from semfov.sensor import named_sensor
 
 @dataclass(frozen=True)
 class ScoreLook(semfov.observers.Look):
-    """The evidence of B looks: the highest score of each class in each cell."""
+    """Evidence of looks: the largest score of each class in each cell."""
 
     scores: Tensor  # (B, X·Y, K+1)
     distance: Tensor  # (B, X·Y), from the fixation
 
     def __getitem__(self, index: Tensor | slice) -> "ScoreLook":
-        """Select looks by index or slice."""
+        """The selected looks of the batch."""
         return ScoreLook(self.scores[index], self.distance[index])
 
     @classmethod
     def join(cls, looks: Sequence["ScoreLook"]) -> "ScoreLook":
-        """Join the looks of several batches."""
+        """Concatenate several batches of looks."""
         return cls(torch.cat([look.scores for look in looks]), torch.cat([look.distance for look in looks]))
 
 
 @dataclass(frozen=True)
 class ScoreBelief(semfov.Belief):
-    """The belief: the highest score so far of each class in each cell."""
+    """The belief: the largest score of each class in each cell so far."""
 
     scores: Tensor  # (B, X·Y, K+1)
-    closest: Tensor  # (B, X·Y), distance to the closest fixation, which every belief has
+    closest: Tensor  # (B, X·Y), distance to the closest fixation; every belief has it
 
     def probability(self, target: int | Tensor) -> Tensor:
-        """Return the highest score of the target in each cell, `(B, X·Y)`."""
+        """Largest score of the target in each cell, `(B, X·Y)`."""
         return self.scores[torch.arange(len(self.scores)), :, target]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "ScoreBelief":
-        """Apply a function to both tensors."""
+        """Apply a function to every tensor of the belief."""
         return ScoreBelief(function(self.scores), function(self.closest))
 
 
 class BestScore(semfov.observers.Observer):
-    """Keep the highest score of each class in each cell."""
+    """Keeps the largest score of each class in each cell."""
 
     def __init__(self, components: int) -> None:
         super().__init__()
         self.components = components
 
     def start(self, batch: int, grid: semfov.Grid, like: Tensor) -> ScoreBelief:
-        """Start with a score of 0 everywhere, as nothing has been seen."""
+        """The belief before the first look: all scores are 0."""
         scores = like.new_zeros(batch, len(grid), self.components)
         return ScoreBelief(scores, torch.full_like(scores[..., 0], torch.inf))
 
     def weigh(
         self, detections: semfov.Detections, fixation: Tensor, grid: semfov.Grid, target: int | None = None
     ) -> ScoreLook:
-        """Take the highest score of each class among the boxes that overlap a cell."""
+        """The largest score among the boxes that overlap a cell."""
         covered = grid.footprint(detections.boxes) & detections.mask[..., None]  # (B, L, X·Y)
         scores = detections.scores.new_zeros(len(fixation), len(grid), self.components)
         for box in range(covered.shape[1]):
@@ -73,7 +73,7 @@ class BestScore(semfov.observers.Observer):
         return ScoreLook(scores, grid.distance(fixation))
 
     def update(self, belief: semfov.Belief, look: semfov.observers.Look) -> ScoreBelief:
-        """Update the belief with one more look."""
+        """The belief after one more look."""
         assert isinstance(belief, ScoreBelief)
         assert isinstance(look, ScoreLook)
         return ScoreBelief(torch.maximum(belief.scores, look.scores), torch.minimum(belief.closest, look.distance))
@@ -91,7 +91,7 @@ def main() -> None:
         LiveLooks(eye, eye.open(image), grid),
         BestScore(len(detector.classes) + 1),
         semfov.acquisition.TargetPosterior(cup),
-        torch.tensor([0]),  # the start cell of each episode; here, there is one episode
+        torch.tensor([0]),  # first cell of each episode; here there is one episode
         Greedy(drawn_by(torch.Generator().manual_seed(0), len(grid), image)),
         most=20,
         ends=lambda step: goal[step.cell],

@@ -62,12 +62,12 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "CocoScenes":
-        # `semfov.data.coco` is also a program: Python warns when it has been imported before it is run.
+        # `semfov.data.coco` is also a program: Python warns if it is imported before it is run.
         from semfov.data.coco import CocoScenes
 
         return CocoScenes
     if name == "fit_detector":
-        # Training needs what importing the package should not cost.
+        # Training needs imports that would make the import of the package slow.
         from semfov.training.detector import fit_detector
 
         return fit_detector

@@ -1,4 +1,4 @@
-"""What a search decides: whether the target is there, where, and how sure that is."""
+"""The decision of a search: whether the image holds the target, where, and with what probability."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -14,26 +14,29 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.detection.detections import Detections
 from semfov.episode import Step
 from semfov.errors import check, check_finite, check_shape
+from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.io.schema import is_number
 
 Outcome = Literal["found", "absent", "undecided"]
 OUTCOMES: tuple[Outcome, ...] = ("undecided", "found", "absent", "undecided")
-"""Outcomes by the number that `decide` gives them; the first is that of searches that run out of gaze shifts."""
+"""Outcomes by their number in `decide`; the first is that of searches that run out of gaze shifts."""
 
 NEARLY = 0.9
-"""A fixated cell this many times as probable as the most probable one is looked at well enough to find its object."""
+"""A target counts as looked at if a fixated cell has at least this share of the largest probability of any cell."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What came of a search.
+    """Decision of a search.
 
     Attributes:
-        outcome: `found`; `absent`, when nothing is left to look at and the image rather does not hold the target; or
-            `undecided`, when it rather does, but is not sure enough, or gaze shifts ran out before.
-        probability: that the target is in the image, after the last look.
-        cell: for `found`, where the target is (`conclude`).
-        box: `(4,)`, of all detections the one that says most of the target in that cell; None where there is none.
+        outcome: `found`; `absent`, if no cell is left that is worth a look and the image holds the target with a
+            probability below one half; or `undecided`, if that probability is larger but not large enough, or if the
+            search ran out of gaze shifts.
+        probability: probability that the image holds the target, after the last look.
+        cell: for `found`, the cell of the target (`conclude`).
+        box: `(4,)`, the box `(x1, y1, x2, y2)` of the detection with the strongest evidence for the target in that
+            cell; None if there is none.
     """
 
     outcome: Outcome
@@ -43,17 +46,20 @@ class Decision:
 
 
 def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
-    """Which searches end with this step, `(A,)`: 0 for none, else the number of the outcome in `OUTCOMES`.
+    """Decide by thresholds which searches end with this step.
 
-    A search has found its target when it is probable enough that the image holds it, and a cell was fixated that is
-    about as probable as any, at least `NEARLY` times, and probable enough itself. It gives up when no cell is left that
-    is worth a look, which another would be if no fixated cell holds the target (`Belief.chance`); the target is then
-    absent, unless the image rather holds it than not.
+    A search has found its target if the image holds the target with enough probability, and a fixated cell is nearly as
+    probable as the most probable one (`NEARLY`) and probable enough itself. A search gives up if no remaining cell is
+    probable enough to be worth a look, given that no fixated cell holds the target (`Belief.chance`). The target is
+    then absent, unless the image holds it with a probability of at least one half.
 
     Args:
-        step: of searches, from `semfov.episode.rollout`.
-        target: class 1..K, or `(A,)`.
-        thresholds: probabilities.
+        step: a step of searches, from `semfov.episode.rollout`.
+        target: class 1..K, or `(A,)` with one class for each search.
+        thresholds: the thresholds.
+
+    Returns:
+        `(A,)`, 0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
     """
     looked = place_known(step.belief.probability(target), step.visited, thresholds.place)
     left = step.belief.chance(target).masked_fill(step.visited, 0).amax(-1)
@@ -61,13 +67,16 @@ def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
 
 
 def settle(presence: Tensor, looked: Tensor, left: Tensor, thresholds: Thresholds) -> Tensor:
-    """Which searches end, as for `decide`, by what is known of them, `(A,)` each.
+    """Apply the thresholds of `decide` to the probabilities of searches.
 
     Args:
-        presence: probability that the target is there.
-        looked: boolean, whether the place that it is most probably in was looked at.
-        left: what the best look that is left is worth.
-        thresholds: probabilities.
+        presence: `(A,)`, probability that the image holds the target.
+        looked: `(A,)` boolean, whether the most probable place of the target was looked at.
+        left: `(A,)`, value of the best look that is left.
+        thresholds: the thresholds.
+
+    Returns:
+        `(A,)`, 0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
 
     >>> settle(torch.tensor([0.95, 0.95, 0.2]), torch.tensor([True, False, False]), torch.tensor([0.1, 0.1, 0.01]),
     ...        Thresholds(confirm=0.9, give_up=0.05)).tolist()
@@ -78,27 +87,31 @@ def settle(presence: Tensor, looked: Tensor, left: Tensor, thresholds: Threshold
 
 
 def decide_by_price(step: Step, target: int | Tensor, price: float) -> Tensor:
-    r"""Which searches end with this step, `(A,)`, as for `decide`: when looking on is not worth the price of the looks.
+    r"""Decide by the price of a look which searches end with this step.
 
-    A right decision is worth 1 and a look costs `price`. With P the probability that the image holds the target, to
-    decide now is worth :math:`\max(P, 1 - P)`. The next m looks would go to the cells left with the highest
-    probabilities p(x); they meet the target with probability :math:`U_m`, and it is then found for sure:
+    A right decision has the value 1, and a look costs `price`. Let P be the probability that the image holds the
+    target. A decision now has the expected value :math:`\max(P, 1 - P)`. The next m looks would go to the remaining
+    cells with the highest probabilities p(x). They meet the target with probability :math:`U_m`, and it is then
+    certainly found:
 
     .. math:: U_m = P \, \frac{\sum_{i \le m} p(x_i)}{\sum_x p(x)}, \qquad
               V_m = U_m + \max(P - U_m, \; 1 - P) - \text{price} \sum_{i < m} (1 - U_i)
 
-    The search goes on as long as :math:`V_m` is greater than the value of deciding for any m, and ends with what is
-    rather the case than not. (Ross, 1969, *A problem in optimal search and stop*; here over a fixed order of cells.)
+    The search continues as long as, for any m, :math:`V_m` is greater than the value of a decision now. It ends with
+    the more probable answer. (Ross, 1969, *A problem in optimal search and stop*; here for a fixed order of cells.)
 
     Args:
-        step: of searches, from `semfov.episode.rollout`.
-        target: class 1..K, or `(A,)`.
-        price: of a look, in right decisions.
+        step: a step of searches, from `semfov.episode.rollout`.
+        target: class 1..K, or `(A,)` with one class for each search.
+        price: price of a look, as a share of the value of a right decision.
+
+    Returns:
+        `(A,)`, 0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
 
     Raises:
         InputError: the price is negative or not finite.
     """
-    check(0 <= price < math.inf, "price", "0 or more right decisions", price)
+    check(0 <= price < math.inf, "price", "0 or more (a right decision counts 1)", price)
     presence = step.belief.presence(target)[:, None]
     cells = step.belief.probability(target)
     left = cells.masked_fill(step.visited, 0).sort(-1, descending=True).values
@@ -106,20 +119,23 @@ def decide_by_price(step: Step, target: int | Tensor, price: float) -> Tensor:
     before = torch.cat([torch.zeros_like(met[:, :1]), met[:, :-1]], -1)
     paid = price * (1 - before).cumsum(-1)
     value = met + torch.maximum(presence - met, 1 - presence) - paid
-    # What is left is always at least nothing: rounding alone must not make a search go on.
+    # The margin keeps rounding errors from continuing a search.
     on = value.amax(-1) > torch.maximum(presence, 1 - presence)[:, 0] + 1e-6
     return torch.where(on, 0, torch.where(presence[:, 0] >= 0.5, 1, 2))
 
 
 def place_known(cells: Tensor, visited: Tensor, place: float = 0.0) -> Tensor:
-    """Whether a fixated cell is about as probable as the most probable one, and as probable as `place`, `(..., )`.
+    """Whether a fixated cell is nearly as probable as the most probable one, and at least as probable as `place`.
 
-    All cells of a large object are about as probable; to fixate each of them would tell nothing more.
+    All cells of a large object are about equally probable, and there is no need to fixate each of them.
 
     Args:
-        cells: `(..., X·Y)`, probabilities.
+        cells: `(..., X·Y)`, probabilities of the target.
         visited: `(..., X·Y)` boolean, cells that were fixated.
-        place: probability that the cell must have.
+        place: least probability of the fixated cell.
+
+    Returns:
+        `(...)` boolean.
 
     >>> place_known(torch.tensor([[0.95, 0.9, 0.1]]), torch.tensor([[False, True, False]]), 0.8)
     tensor([True])
@@ -131,21 +147,24 @@ def place_known(cells: Tensor, visited: Tensor, place: float = 0.0) -> Tensor:
 def conclude(
     outcome: int, belief: Belief, looks: Sequence[Detections], grid: Grid, target: int, cell: int | None = None
 ) -> Decision:
-    r"""The decision of one search that ended.
+    r"""Make the decision of one search that ended.
 
-    A target that was found is in the cell where belief and detections together say most of it,
+    The cell of a found target is the one with the strongest evidence of belief and detections together,
 
     .. math:: x = \arg\max_x P(t \in x) \max_l s_{lt} w_l(x)
 
-    over the detections l of all looks, with scores s and `soft` footprints w.
+    where l runs over the detections of all looks, with scores s and `soft` footprints w.
 
     Args:
         outcome: number of the outcome in `OUTCOMES`.
-        belief: after the last look, of one episode.
-        looks: what was seen, batches of one.
+        belief: belief of one episode after the last look.
+        looks: the detections of each look, batches of one.
         grid: the cells.
         target: class 1..K.
-        cell: where it was found, if that is known.
+        cell: cell in which the target was found; None computes it.
+
+    Returns:
+        The decision.
     """
     probability = float(belief.presence(target))
     if OUTCOMES[outcome] != "found":
@@ -158,19 +177,22 @@ def conclude(
 
 
 def strength(seen: Detections, grid: Grid, target: int) -> Tensor:
-    """How strongly the detections of one look show the target in each cell, `(X·Y,)`: score times `soft` footprint."""
+    """Evidence of the detections of one look for the target in each cell, `(X·Y,)`: score times `soft` footprint."""
     shown = grid.footprint(seen.boxes, "soft")[0] * (seen.mask[0] * seen.scores[0, :, target])[:, None]
     return shown.amax(0) if len(shown) else shown.sum(0)
 
 
 def best_box(looks: Sequence[Detections], grid: Grid, cell: int, target: int) -> Tensor | None:
-    """Of all detections the box that says most of the target in a cell, `(4,)`: score times `soft` footprint.
+    """Box with the strongest evidence for the target in a cell: score times `soft` footprint.
 
     Args:
-        looks: batches of one.
+        looks: the detections of each look, batches of one.
         grid: the cells.
-        cell: where the target is.
+        cell: the cell.
         target: class 1..K.
+
+    Returns:
+        `(4,)`, as `(x1, y1, x2, y2)`; None if no detection overlaps the cell.
     """
     score, box = 0.0, None
     for seen in looks:
@@ -182,7 +204,7 @@ def best_box(looks: Sequence[Detections], grid: Grid, cell: int, target: int) ->
 
 
 def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:
-    """Whether a detection that overlaps `cell` `(B,)` has `target` as its best class with such a score, `(B,)`."""
+    """Whether a detection over each cell `(B,)` has `target` as its best class with at least this score, `(B,)`."""
     sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score) & detections.mask
     there = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
     return (there & sure).any(-1)
@@ -196,15 +218,18 @@ def outcome_of(
     thresholds: Thresholds | None,
     confirm: float,
 ) -> Callable[[Step], Tensor]:
-    """What tells which searches end with a step, as numbers in `OUTCOMES`, `(A,)`.
+    """Make the function that decides which searches end with a step.
 
     Args:
-        wanted: by class 1..K the probability that it is what is meant; the belief is about all of them.
+        wanted: for each class 1..K of the target, the probability that it is meant; the belief is about all of them.
         grid: the cells.
-        goal: `(X·Y,)`, cells on which a search ends; None decides.
-        price: of a look, to decide by; None decides by thresholds.
-        thresholds: of the belief; None where it has none, and detections confirm.
-        confirm: score of such a detection, times the probability that its class is meant.
+        goal: `(X·Y,)` boolean, cells on which a search ends; None ends it by a decision.
+        price: price of a look, to decide by (`decide_by_price`); None decides by thresholds.
+        thresholds: thresholds of the belief; None lets a detection in the fixated cell confirm the target.
+        confirm: least score of such a detection, times the probability that its class is meant.
+
+    Returns:
+        A function from a step to `(A,)`, 0 for a search that continues, otherwise its outcome in `OUTCOMES`.
     """
     first = next(iter(wanted))
 
@@ -225,27 +250,53 @@ def outcome_of(
     return outcome
 
 
-def goal_cells(boxes: Tensor | Sequence[Sequence[float]], grid: Grid, like: Tensor) -> Tensor:
-    """Which cells boxes overlap, `(X·Y,)`: where a search is at its end by the protocol of the paper.
+def outcome_by_gain(gain: AcquisitionFunction, price: float) -> Callable[[Step], Tensor]:
+    """Make the function that decides which explorations end with a step.
 
     Args:
-        boxes: `(M, 4)`, `(x1, y1, x2, y2)` in pixels of the image.
+        gain: expected gain of a look at each cell.
+        price: least expected gain that is worth a look; 0 never ends an exploration.
+
+    Returns:
+        A function from a step to `(A,)`, 1 for an exploration in which no cell is worth a look, otherwise 0.
+    """
+
+    def outcome(step: Step) -> Tensor:
+        best = gain(step.belief, step.visited).masked_fill(step.visited, -math.inf).amax(-1)
+        return ((best < price) & (price > 0) & ~step.visited.all(-1)).long()
+
+    return outcome
+
+
+def goal_cells(boxes: Tensor | Sequence[Sequence[float]], grid: Grid, like: Tensor) -> Tensor:
+    """Cells that boxes overlap; by the protocol of the paper a search ends when it fixates one of them.
+
+    Args:
+        boxes: `(M, 4)`, as `(x1, y1, x2, y2)` in pixels of the image.
         grid: the cells.
-        like: whose type and device they take.
+        like: a tensor that gives dtype and device.
+
+    Returns:
+        `(X·Y,)` boolean.
 
     Raises:
-        InputError: they are no boxes.
+        InputError: the shape is wrong, a number is not finite, or a box has no area.
     """
     tensor = torch.as_tensor(boxes).to(like)
     check_shape(tensor, "boxes", None, 4)
     check(tensor.ndim == 2, "boxes", "shape (M, 4)", tuple(tensor.shape))
     check_finite(tensor, "boxes")
     full = bool((tensor[:, 2:] > tensor[:, :2]).all())
-    check(full, "boxes", "(x1, y1, x2, y2) with x1 < x2 and y1 < y2", "others; of (x, y, width, height) make x + width")
+    check(
+        full,
+        "boxes",
+        "(x1, y1, x2, y2) with x1 < x2 and y1 < y2",
+        "others; convert (x, y, width, height) to (x, y, x + width, y + height)",
+    )
     return grid.footprint(tensor).any(-2)
 
 
 def check_thresholds(confirm: float | None, give_up: float | None) -> None:
-    """Raise `InputError` unless the thresholds that are given are probabilities."""
+    """Raise `InputError` unless each threshold is None or a probability."""
     for name, value in (("confirm", confirm), ("give_up", give_up)):
         check(value is None or (is_number(value) and 0 <= value <= 1), name, "a probability from 0 to 1", value)

@@ -1,4 +1,4 @@
-"""Sensor and detector as one eye: what is detected when an image is fixated at a point."""
+"""The eye: a sensor and a detector together, which give the detections for a fixation in an image."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -16,12 +16,12 @@ from semfov.sensor.base import Sensor
 
 @dataclass(frozen=True)
 class View:
-    """An image as the eye holds it: everything that does not depend on where it looks.
+    """An opened image: everything that does not depend on the fixation.
 
     Attributes:
-        canvas: the image fitted into the detector's input, `(1, 3, h, w)`.
-        placement: where the image lies on the canvas.
-        state: what the sensor keeps of the canvas.
+        canvas: `(1, 3, h, w)`, the image fitted into the detector's input.
+        placement: scale and position of the image on the canvas.
+        state: data that the sensor computes once from the canvas, such as a pyramid.
     """
 
     canvas: Tensor
@@ -30,18 +30,27 @@ class View:
 
 
 class Eye(nn.Module):
-    """Looks at an image through a sensor, at the detector's resolution, and detects.
+    """Applies a sensor to an image at the detector's resolution, and detects objects in the result.
 
-    The image is fitted into the detector's input first and shown to the sensor there: that is what a fixed number of
-    receptors does, and it costs less than blurring every pixel of the photograph. The canvas sees what the sensor shows
-    of an image whose longer side is `reference`.
+    The image is first fitted into the detector's input, the canvas, and the sensor is applied there. An eye with a
+    fixed number of receptors does the same, and it costs less than blurring every pixel of the photograph. The
+    settings of the sensor are scaled from an image whose longer side is `reference` to the canvas.
 
     Args:
-        sensor: `Foveation`, `LogPolar`, or any other `semfov.sensor.Sensor`; its settings are in pixels of an image
-            whose longer side is `reference`.
+        sensor: `Foveation`, `LogPolar` or any other `semfov.sensor.Sensor`, with settings in pixels of an image whose
+            longer side is `reference`.
         detector: any detector.
-        reference: longer side, in pixels, that the sensor's settings are meant for (those of `semfov.sensor.SENSORS`
-            are meant for 640).
+        reference: longer side, in pixels, of the image that the settings of the sensor are for; 640 for those of
+            `semfov.sensor.SENSORS`.
+
+    Raises:
+        InputError: `reference` is not positive.
+
+    Example::
+
+        eye = semfov.Eye(semfov.Foveation(100.0), semfov.load_detector("yolov3-tiny"))
+        view = eye.open("kitchen.jpg")
+        detections = eye.look(view, [(320.0, 240.0), (100.0, 50.0)])  # a batch of two looks
     """
 
     def __init__(self, sensor: Sensor, detector: Detector, *, reference: float = 640.0) -> None:
@@ -52,7 +61,18 @@ class Eye(nn.Module):
         self.reference = reference
 
     def open(self, image: ImageLike) -> View:
-        """Fit an image of any common kind (`semfov.as_image`) into the input, and open the sensor on it."""
+        """Fit an image into the detector's input, and compute what the sensor needs once per image.
+
+        Args:
+            image: a picture of any common kind (`semfov.as_image`), or a tensor `(1, 3, H, W)`.
+
+        Returns:
+            The opened image.
+
+        Raises:
+            InputError: it is no picture.
+            DataError: the file of the image cannot be read.
+        """
         if not (isinstance(image, Tensor) and image.ndim == 4 and image.is_floating_point()):
             image = as_image(image, like=self.sensor.like)[None]
         check_shape(image, "image", 1, 3, None, None)
@@ -61,32 +81,75 @@ class Eye(nn.Module):
         return View(canvas, placement, self.sensor.open(canvas, scale))
 
     def foveated(self, view: View, fixations: PointLike) -> Tensor:
-        """What the sensor gives for fixations `(F, 2)` in image pixels, or one `(x, y)`: canvases `(F, 3, h, w)`."""
+        """Apply the sensor at fixations.
+
+        Args:
+            view: the opened image.
+            fixations: `(F, 2)`, as `(x, y)` in pixels of the image, or a single point.
+
+        Returns:
+            `(F, 3, h, w)`, one canvas for each fixation.
+
+        Raises:
+            InputError: the shape of `fixations` is wrong.
+        """
         return self.sensor.look(view.state, view.placement.points_to_canvas(_points(fixations, view)))
 
     def detect(self, view: View, fixations: Tensor, canvases: Tensor) -> Detections:
-        """Detections on what `foveated` gave for the fixations, boxes in pixels of the image."""
+        """Detect objects in foveated canvases.
+
+        Args:
+            view: the opened image.
+            fixations: `(F, 2)`, as `(x, y)` in pixels of the image.
+            canvases: `(F, 3, h, w)`, from `foveated`.
+
+        Returns:
+            The detections, a batch of F, boxes in pixels of the image.
+        """
         gaze = view.placement.points_to_canvas(fixations)
         back = partial(self.sensor.boxes_to_canvas, view.state, gaze)
         return self.detector.detect(canvases, view.placement, back=back)
 
     def look(self, view: View, fixations: PointLike) -> Detections:
-        """Detections seen from fixations `(F, 2)`, a batch of F, boxes in pixels of the image."""
+        """Look from fixations: apply the sensor, then detect.
+
+        Args:
+            view: the opened image.
+            fixations: `(F, 2)`, as `(x, y)` in pixels of the image, or a single point.
+
+        Returns:
+            The detections, a batch of F, boxes in pixels of the image.
+
+        Raises:
+            InputError: the shape of `fixations` is wrong.
+        """
         points = _points(fixations, view)
         return self.detect(view, points, self.foveated(view, points))
 
     def forward(self, image: ImageLike, fixations: PointLike) -> Detections:
-        """`look` at an image from fixations `(F, 2)`."""
+        """Open an image and look from fixations.
+
+        Args:
+            image: a picture of any common kind (`semfov.as_image`), or a tensor `(1, 3, H, W)`.
+            fixations: `(F, 2)`, as `(x, y)` in pixels of the image, or a single point.
+
+        Returns:
+            The detections, a batch of F, boxes in pixels of the image.
+        """
         return self.look(self.open(image), fixations)
 
     def settings(self) -> dict[str, Any]:
-        """What the detections depend on, for the keys of caches and the metadata of fitted models."""
+        """Settings that the detections depend on, for the keys of caches and the metadata of fitted models.
+
+        Returns:
+            JSON values by `sensor` and `detector`.
+        """
         sensor = self.sensor.settings() | {"reference": self.reference}
         return {"sensor": sensor, "detector": self.detector.settings()}
 
 
 def _points(fixations: PointLike, view: View) -> Tensor:
-    """Fixations `(F, 2)`; one `(x, y)` is one."""
+    """Fixations as `(F, 2)`; a single point becomes a batch of one."""
     points = as_points(fixations, "fixations").to(view.canvas)
     points = points[None] if points.ndim == 1 else points
     check_shape(points, "fixations", None, 2)

@@ -1,4 +1,4 @@
-"""Active perception of a camera or a video: a look at every frame, and a belief that goes on from one to the next."""
+"""Active perception of a camera or a video: one look at every frame, and a belief that continues between frames."""
 
 import sys
 from collections import deque
@@ -22,28 +22,33 @@ from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.gaze.policies import Policy
 
 RATE = 0.1
-"""Rate at which belief fades from frame to frame, unless another is asked for."""
+"""Default rate at which belief fades, per frame."""
 
-_MOST = 1000  # looks that are kept where nothing is forgotten
+_MOST = 1000  # largest number of looks whose detections are kept
 
 
 @dataclass(frozen=True)
 class Moment:
-    """What is seen and believed at one frame.
+    """Look, belief and decision at one frame.
 
     Attributes:
-        number: of the frame, from 0.
+        number: number of the frame, from 0.
         grid: the cells.
-        target: class that is searched for; None for exploration.
-        cell: that is fixated.
-        fixation: `(2,)`, its centre `(x, y)`.
-        detections: what is seen from there, a batch of one.
-        belief: after the look, of one episode.
-        decision: what a search makes of the frame: `found`, `absent` or, as long as it is neither, `undecided`; None
-            for exploration, and where the belief is none to decide by.
-        visited: `(X·Y,)` boolean, cells that the gaze is kept from.
-        next_cell: that the gaze goes to for the next frame.
-        seconds: that the look took, by stage; `open` is fitting the frame into the detector's input.
+        target: class 1..K that is searched for; None for exploration.
+        cell: the fixated cell.
+        fixation: `(2,)`, the centre of the cell as `(x, y)` in pixels.
+        detections: detections of the look, a batch of one.
+        belief: belief of one episode after the look.
+        decision: decision at this frame: `found`, `absent`, or `undecided` as long as it is neither; None for
+            exploration and for a belief without thresholds.
+        visited: `(X·Y,)` boolean, cells that inhibition of return keeps the gaze from.
+        next_cell: the cell to fixate in the next frame.
+        seconds: time of the look by stage; `open` is the fitting of the frame into the detector's input.
+
+    Example::
+
+        moment = live.step(frame)
+        print(moment.decision.outcome, moment.probability.max())
     """
 
     number: int
@@ -60,31 +65,31 @@ class Moment:
 
     @property
     def probability(self) -> Tensor:
-        """Probability of the target in each cell, `(X·Y,)`; in an exploration, that the cell holds any object."""
+        """Probability that each cell holds the target, or any object in an exploration, `(X·Y,)`."""
         if self.target is None:
             return 1 - self.belief.class_probabilities()[0, :, 0]
         return self.belief.probability(self.target)[0]
 
 
 class LivePerception:
-    r"""Looks at the frames of a stream, one gaze shift a frame, and keeps its belief from frame to frame.
+    r"""Looks at the frames of a stream, with one gaze shift per frame, and keeps its belief between frames.
 
-    The gaze goes on from where it was. What earlier frames showed is discounted by :math:`e^{-r}` a frame, r the rate,
-    so that the map returns to what is known without looking, and follows a scene that moves; cells that were fixated
-    are free again after :math:`\ln 2 / r` frames (`semfov.episode.Forgetting`, `Observer.fade`). With rate 0 the frames
-    of a still picture give the belief of a search of it.
+    The gaze continues from its last position. Each frame multiplies the evidence of earlier frames by :math:`e^{-r}`,
+    with the rate r. Without new evidence the map thus returns to the prior, and it can follow a scene that moves.
+    Fixated cells are free again after :math:`\ln 2 / r` frames (`semfov.episode.Forgetting`, `Observer.fade`). With
+    rate 0, frames of a still picture give the same belief as a search of the picture.
 
     Args:
         eye: sensor and detector.
-        observer: turns looks into belief.
-        policy: chooses where to look by it.
-        classes: names, background first.
+        observer: turns looks into a belief.
+        policy: chooses the next fixation from the belief.
+        classes: names of the classes, background first.
         cells: `(columns, rows)` of the belief.
         target: class 1..K to search for; None explores.
-        rate: r, per frame.
-        start: first cell; None draws one.
-        seed: of the generator that draws the start and breaks ties.
-        thresholds: at which a search decides; None takes those of the observer.
+        rate: r, per frame, 0 or more.
+        start: first cell; None draws one at random.
+        seed: seed of the generator that draws the start and breaks ties.
+        thresholds: thresholds at which a search decides; None takes those of the observer.
 
     Example::
 
@@ -115,17 +120,21 @@ class LivePerception:
         self._first = first_cell(start, seed, cells[0] * cells[1])
         self._looks: LiveLooks | None = None
         self._steps: Iterator[Step] = iter(())
-        # What was seen while half of it is left.
+        # Detections of the looks of which at least half the evidence is left.
         self._recent: deque[Detections] = deque(maxlen=max(1, int(min(self.forgetting.span, _MOST))))
 
     def step(self, frame: ImageLike) -> Moment:
         """Look at the next frame.
 
         Args:
-            frame: a picture of any common kind (`semfov.as_image`), of the same size as the first.
+            frame: a picture of any common kind (`semfov.as_image`), of the same size as the first frame.
+
+        Returns:
+            Look, belief and decision at this frame.
 
         Raises:
-            InputError: it is no picture, or of another size.
+            InputError: it is no picture, or has another size.
+            DataError: the file of the frame cannot be read.
         """
         with torch.inference_mode():
             image = as_image(frame, like=self.eye.sensor.like, argument="frame")[None]
@@ -137,7 +146,7 @@ class LivePerception:
             grid = self._looks.grid
             wanted = " × ".join(f"{side:.0f}" for side in grid.extent.tolist())
             size = f"{image.shape[-1]} × {image.shape[-2]}"
-            check(size == wanted, "frame", f"{wanted} pixels as the first", size)
+            check(size == wanted, "frame", f"{wanted} pixels, the size of the first frame", size)
             self._looks.view = view
             step = next(self._steps)
             self._recent.append(step.detections)

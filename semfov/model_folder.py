@@ -1,4 +1,4 @@
-"""A folder of models: everything that was fitted to one detector, and the detector itself."""
+"""A folder of models: everything that was fitted to one detector, with a reference to the detector."""
 
 from __future__ import annotations
 
@@ -32,11 +32,17 @@ KINDS: dict[str, type[Model]] = {
     "evidence": TargetEvidence,
     "map": MapEvidence,
 }
-"""Parts that are models."""
+"""Classes of the parts that are models."""
 
 
 def open_folder(name: str | PathLike[str]) -> ModelFolder | None:
-    """The folder of models of this name; None where a detector has the name.
+    """Open a folder of models.
+
+    Args:
+        name: path of the folder, or the name of a detector.
+
+    Returns:
+        The folder; None for a detector.
 
     Raises:
         InputError: it is neither.
@@ -54,16 +60,15 @@ def open_folder(name: str | PathLike[str]) -> ModelFolder | None:
 
 
 class ModelFolder:
-    """What `train.fit_detector` leaves: models of one detector behind one sensor, and which of them are to be used.
+    """The result of `train.fit_detector`: models for one detector and one sensor, and which of them the agent uses.
 
-    A part that did no better than raw scores on photographs that were held out is there, but is not used: `search` and
-    `explore` do without it.
+    The agent does not use a part that was no better than raw scores on held-out photographs, but the folder keeps it.
 
     Args:
         path: the folder.
 
     Attributes:
-        manifest: what the folder says of itself.
+        manifest: description of the folder.
 
     Raises:
         DataError: it is no such folder, or a file in it is missing, damaged or changed.
@@ -74,26 +79,29 @@ class ModelFolder:
         self.manifest = Manifest.read(self.path)
 
     def file(self, part: str) -> Path | None:
-        """File of a part, whether it is used or not; None where there is none."""
+        """File of a part, whether the agent uses it or not; None if there is none."""
         known = self.manifest.parts.get(lookup(part, PARTS, "part"))
         return None if known is None or known.file is None else inside(self.path, known.file)
 
     def used(self, part: str) -> bool:
-        """Whether the agent goes by a part."""
+        """Whether the agent uses a part."""
         known = self.manifest.parts.get(lookup(part, PARTS, "part"))
         return known is not None and known.used
 
     def detector_source(
         self, detector: str | PathLike[str] | None = None, weights: str | PathLike[str] | None = None
     ) -> tuple[str, dict[str, Any]]:
-        """What `semfov.load_detector` loads the detector by: a name or a path, and options.
+        """Arguments with which `semfov.load_detector` loads the detector.
 
         Args:
-            detector: the network's file where it lies elsewhere now.
-            weights: the file of its weights, where these are in a file of their own.
+            detector: file of the network, if it was moved.
+            weights: file of the weights, if they are in a separate file that was moved.
+
+        Returns:
+            A name or a path, and options.
 
         Raises:
-            DataError: the file is not where it was, seen from the folder or by its absolute path.
+            DataError: a file is neither at its path relative to the folder nor at its absolute path.
         """
         known = self.manifest.detector
         options = dict(known["options"])
@@ -113,22 +121,27 @@ class ModelFolder:
         weights: str | PathLike[str] | None = None,
         **options: Any,
     ) -> Detector:
-        """The detector, with the options that it had when the models were fitted.
+        """Load the detector, with the options of the time when the models were fitted.
 
         Args:
-            detector: see `detector_source`, as for `weights`.
-            options: others of `semfov.load_detector`.
+            detector: file of the network, if it was moved.
+            weights: file of the weights, if they are in a separate file that was moved.
+            options: further options of `semfov.load_detector`, which replace those of the folder.
+
+        Returns:
+            The detector.
 
         Raises:
-            DataError: it is gone, or is another network than that by its sha256.
+            DataError: the file is missing, or is another network by its sha256.
         """
         source, own = self.detector_source(detector, weights)
         loaded = load_detector(source, **{**own, **options})
         told = self.manifest.detector["sha256"]
         if NETWORKS.get(loaded.digest, loaded.digest) != NETWORKS.get(told, told):
             raise DataError(
-                f"detector: {source} is another network than {self.path} was fitted to (sha256 {loaded.digest[:12]}…, "
-                f"expected {told[:12]}…); give the right file as detector=, or fit to this one: {fit_command(source)}"
+                f"detector: expected the network that {self.path} was fitted to (sha256 {told[:12]}…), got {source} "
+                f"(sha256 {loaded.digest[:12]}…); give the right file as detector=, or fit to this one: "
+                f"{fit_command(source)}"
             )
         return loaded
 
@@ -138,7 +151,7 @@ class ModelFolder:
         return Foveation(**{name: self.manifest.sensor[name] for name in names})
 
     def eye(self, **source: Any) -> Eye:
-        """Sensor and detector; arguments of `load_detector`."""
+        """Load the eye, sensor and detector, with arguments for `load_detector`; checks the models against it."""
         eye = Eye(self.sensor(), self.load_detector(**source), reference=self.manifest.sensor["reference"])
         for model in self._models.values():
             model.check_compatible(eye.settings())
@@ -146,12 +159,15 @@ class ModelFolder:
 
     @cached_property
     def _models(self) -> dict[str, Model]:
-        """Models that are used."""
+        """The models that the agent uses."""
         files = {part: self.file(part) for part in KINDS if self.used(part)}
         return {part: KINDS[part].from_pretrained(file) for part, file in files.items() if file is not None}
 
     def observation(self) -> FovealObservationModel:
-        """The observation model, whether the agent goes by it or not.
+        """Load the observation model, whether the agent uses it or not.
+
+        Returns:
+            The model.
 
         Raises:
             InputError: none was fitted.
@@ -159,12 +175,12 @@ class ModelFolder:
         file = self.file("observation")
         if file is None:
             raise InputError(
-                f"name: expected a folder with an observation model, which {self.path} lacks; fit one: {fit_command()}"
+                f"name: expected a folder with an observation model, got {self.path} without; fit one: {fit_command()}"
             )
         return FovealObservationModel.from_pretrained(file)
 
     def semantic(self) -> Semantic:
-        """The belief about all classes that fuses scores: tempered, and calibrated, where that was found better."""
+        """The observer that fuses scores of all classes; tempered and calibrated, if that was better when fitted."""
         components = len(self.manifest.classes) + 1
         if not self.used("tempering"):
             return Semantic(components)
@@ -174,19 +190,19 @@ class ModelFolder:
         return Semantic(components, model, footprint=settings["footprint"], tempering=settings["exponent"])
 
     def search(self) -> tuple[Observer, Policy]:
-        """Observer and policy of searches."""
+        """Observer and policy for search."""
         evidence = self._models.get("evidence")
         return (Target(evidence) if isinstance(evidence, TargetEvidence) else self.semantic()), NonPredictive()
 
     def explore(self) -> tuple[Observer, Policy]:
-        """Observer and policy of explorations."""
+        """Observer and policy for exploration."""
         learned, sensor = self._models.get("map"), self.manifest.sensor
         if isinstance(learned, MapEvidence):
             return LearnedMap(learned), Closer(sensor["sigma"] / sensor["reference"])
         return Semantic(len(self.manifest.classes) + 1), Random()
 
     def parts(self, **source: Any) -> dict[str, Any]:
-        """What `semfov.ActivePerception` is made of; arguments of `load_detector`."""
+        """Arguments of `semfov.ActivePerception`; takes arguments for `load_detector`."""
         grid = self.manifest.grid
         return {"eye": self.eye(**source), "search": self.search(), "explore": self.explore(), "grid": grid}
 
@@ -194,7 +210,7 @@ class ModelFolder:
         path = find_file(place, self.path)
         if path is None:
             raise DataError(
-                f"detector: {place['absolute']} is gone, to which {self.path} was fitted; give its file as detector= "
-                "(on a command line --detector FILE), or put it back"
+                f"detector: expected {place['absolute']}, the file that {self.path} was fitted to, got none; give its "
+                "new place as detector= (on a command line --detector FILE), or put it back"
             )
         return path

@@ -86,7 +86,7 @@ def test_search_for_any_of_several_finds_the_one_that_is_there(agent, image):
 def test_policies_that_look_ahead_search_for_one_class(image):
     model = FovealObservationModel.identity(["red", "green"], [0.2])
     ahead = ActivePerception(squares_eye(), (Semantic(3), Predictive(model)), (Semantic(3), Random()), grid=(8, 6))
-    with pytest.raises(InputError, match="one class, for policy 'predictive'"):
+    with pytest.raises(InputError, match="one class for policy 'predictive'"):
         ahead.search(image, {"red": 1.0, "green": 0.8})
 
 

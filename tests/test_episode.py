@@ -597,7 +597,7 @@ def test_a_choice_of_ones_own():
 def test_every_stage_of_a_cycle_is_timed_and_nothing_else(monkeypatch):
     """By a clock that runs only while a stage works."""
     clock = SimpleNamespace(now=0.0)
-    monkeypatch.setattr("semfov.episode.time", SimpleNamespace(perf_counter=lambda: clock.now))
+    monkeypatch.setattr("semfov.episode.stopwatch.time", SimpleNamespace(perf_counter=lambda: clock.now))
 
     def taking(seconds, work):
         def slow(*arguments, **options):

@@ -235,7 +235,7 @@ def test_decisions_of_the_moment():
 def test_frames_of_any_kind_and_of_one_size():
     live = agent_with(Semantic(3)).live("green")
     live.step((scene(8).permute(1, 2, 0).numpy() * 255).astype(np.uint8))
-    with pytest.raises(InputError, match=r"frame: expected 160 × 120 pixels as the first, got 80 × 60"):
+    with pytest.raises(InputError, match=r"frame: expected 160 × 120 pixels, the size of the first frame, got 80 × 60"):
         live.step(torch.rand(3, 60, 80))
     with pytest.raises(InputError, match="frame: expected one picture"):
         live.step(torch.rand(2, 3, 120, 160))

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import semfov
-from semfov.agent import PUBLISHED_SENSORS
 from semfov.belief import ContextPrior, DirichletBelief
 from semfov.io.compatibility import learned_for, recommended
+from semfov.presets import PUBLISHED_SENSORS
 from semfov.sensor import SENSORS
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.evidence import features

@@ -71,6 +71,7 @@ ROOMS = [
     "head",
     "live",
     "model_folder",
+    "presets",
     "agent",
     "metrics",
     "viz",

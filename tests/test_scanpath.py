@@ -283,7 +283,7 @@ def test_files_that_cannot_be_are_refused_by_name(scanpath, tmp_path):
             continue
         path = tmp_path / f"{number}.safetensors"
         write(path, parts, {"kind": KIND, **told})
-        with pytest.raises(DataError, match="not a complete scanpath") as caught:
+        with pytest.raises(DataError, match="expected a complete scanpath") as caught:
             Scanpath.load(path)
         assert named in str(caught.value), (named, caught.value)
 

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # A belief in ten lines
 #
-# A detector that sees a blurred picture is often wrong, and says so with scores that are no probabilities. What it
-# reports from several fixations is gathered in a belief: a Dirichlet over the classes for every cell of a grid. This
-# tutorial writes that belief out, and then shows the module that does the same.
+# A detector is often wrong in blurred parts of a picture, and its scores are not calibrated probabilities. A belief
+# gathers its detections from several fixations: a Dirichlet over the classes for every cell of a grid. This tutorial
+# computes such a belief step by step, and then shows the module that does the same.
 
 # %%
 import matplotlib.pyplot as plt
@@ -17,13 +17,13 @@ detector = semfov.load_detector("yolov3-tiny")
 model = semfov.FovealObservationModel.from_pretrained("yolov3-tiny")
 eye = semfov.Eye(named_sensor("gradual"), detector).eval()
 
-scene = semfov.EmbeddedScenes(detector.classes)[1]  # made of photographs that installed packages carry
+scene = semfov.EmbeddedScenes(detector.classes)[1]  # made of photographs that come with installed packages
 view = eye.open(scene.image[None])
 grid = semfov.Grid(10, 10, scene.size)
 fixations = (scene.boxes[:, :2] + scene.boxes[:, 2:]) / 2 - 0.5  # one on each of its five objects
 
 # %% [markdown]
-# ## What the looks show
+# ## The views
 
 # %% alt="Five foveated views of the same collage of photographs, each sharp around its fixation"
 figure, axes = plt.subplots(1, 5, figsize=(12, 2.1), layout="compressed")
@@ -34,10 +34,10 @@ for axis, picture, (x, y) in zip(axes, eye.foveated(view, fixations), fixations.
 # %% [markdown]
 # ## The ten lines
 #
-# Every detection is a point of the simplex: scores of background and of all classes, which sum to 1. The observation
-# model knows how such scores are distributed, given the class and the distance to the fovea, and turns them into
-# likelihoods of the classes. Kaplan's rule fuses these into the Dirichlets of the cells that the box overlaps. Where
-# boxes share cells, the most confident comes first.
+# The scores of a detection are a point of the simplex: scores of background and of all classes, which sum to 1. The
+# observation model has the distribution of such scores for each class and distance to the fovea, and turns scores into
+# likelihoods of the classes. Kaplan's rule fuses these likelihoods into the Dirichlets of the cells that the box
+# overlaps. If several boxes overlap a cell, the most confident detection comes first.
 
 # %%
 beta = torch.full((len(grid), 81), 0.5)  # a flat prior for every cell
@@ -51,9 +51,9 @@ for fixation in fixations:
     beliefs.append(beta.clone())
 
 # %% [markdown]
-# What a cell holds, by its belief, is the mean of its Dirichlet. Here is the probability of a person after each look.
-# A flat prior of 0.5 for each of 81 classes weighs as much as forty looks, so it climbs slowly. What counts is which
-# class is ahead.
+# The mean of its Dirichlet gives the class probabilities of a cell. Here is the probability of a person after each look.
+# A flat prior of 0.5 for each of 81 classes weighs as much as forty looks, so the probability rises slowly. What matters
+# is which class has the largest probability.
 
 # %% alt="The collage in grey with the probability of a person in each cell, after each of five looks"
 person = detector.classes.index("person") + 1  # 0 is background
@@ -73,13 +73,13 @@ _ = figure.colorbar(drawn, ax=axes, label="probability")
 cells = grid.cell_of(fixations)
 leaders = beliefs[-1][cells, 1:].argmax(-1)
 for label, leader in zip(scene.labels.tolist(), leaders.tolist()):
-    print(f"there is a {detector.classes[label - 1]}; ahead is {detector.classes[leader]}")
+    print(f"true class: {detector.classes[label - 1]}; most probable class: {detector.classes[leader]}")
 
 # %% [markdown]
 # ## The module that does the same
 #
-# `semfov.observers.Semantic` is this belief for batches of episodes, and for all detections of a look at once. It
-# gives the same numbers.
+# `semfov.observers.Semantic` computes this belief for batches of episodes, and for all detections of a look at once.
+# It gives the same numbers.
 
 # %%
 observer = semfov.observers.Semantic(81, model)
@@ -90,5 +90,4 @@ torch.testing.assert_close(belief.beta[0], beta, rtol=1e-3, atol=1e-3)
 print("largest difference", float((belief.beta[0] - beta).abs().max()))
 
 # %% [markdown]
-# Next: [search a photograph](search.py) with a belief that was learned, and the guide to
-# [beliefs](../guides/belief.md).
+# Next: [search a photograph](search.py) with a learned belief. See also the guide to [beliefs](../guides/belief.md).

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Foveate
 #
-# An eye is sharp only where it looks. `semfov.foveate` shows a picture as such an eye sees it: a Laplacian pyramid is
-# weighted with Gaussian windows around the fixation, and put together again.
+# An eye is sharp only around its fixation. `semfov.foveate` shows a picture as such an eye sees it: it weights the
+# bands of a Laplacian pyramid with Gaussian windows around the fixation, and collapses the pyramid again.
 
 # %%
 import matplotlib.pyplot as plt
@@ -11,7 +11,7 @@ from skimage import data
 
 import semfov
 
-image = semfov.as_image(data.astronaut())  # a photograph that scikit-image carries; (3, 512, 512), RGB in [0, 1]
+image = semfov.as_image(data.astronaut())  # a photograph of scikit-image; (3, 512, 512), RGB in [0, 1]
 gaze = [(224, 110), (400, 300)]  # the face, and the model of the shuttle
 views = semfov.foveate(image, gaze, sigma=50, growth=1)
 print(views.shape)
@@ -33,9 +33,9 @@ show([image, *views], ["photograph", "looking at the face", "looking at the shut
 # %% [markdown]
 # ## How acuity falls off
 #
-# `sigma` is the width of the fovea in pixels. `growth` says how much wider the window of each coarser band is. With
-# `growth=1`, as published, all bands share one window: a sharp disc on a blurred picture. With `growth=2` acuity
-# falls off gradually.
+# `sigma` is the width of the fovea in pixels. `growth` is the ratio of the window widths of successive bands, from fine
+# to coarse. With `growth=1`, as published, all bands share one window: a sharp disc on a blurred picture. With
+# `growth=2` acuity falls off gradually.
 
 # %% alt="The astronaut with a fovea of 50 pixels: with growth 1 a sharp disc on a blurred picture, with growth 2 a gradual fall-off"
 kinds = {"growth 1, σ = 50": (50, 1.0), "growth 2, σ = 50": (50, 2.0), "growth 2, σ = 20": (20, 2.0)}
@@ -43,10 +43,10 @@ pictures = [semfov.foveate(image, gaze[0], sigma=sigma, growth=growth) for sigma
 show(pictures, list(kinds))
 
 # %% [markdown]
-# ## Look again, for little
+# ## Another look is cheap
 #
-# The pyramid does not depend on the fixation. A module keeps its settings, and builds the pyramid once for any number
-# of looks.
+# The pyramid does not depend on the fixation. A module keeps its settings, and you can build the pyramid once for any
+# number of looks.
 
 # %%
 sensor = semfov.Foveation(50.0, growth=1.0)
@@ -55,11 +55,10 @@ fixations = torch.rand(1, 8, 2) * 512
 print(sensor(bands, fixations).shape)  # eight looks
 
 # %% [markdown]
-# ## Where did somebody look?
+# ## Recover an unknown fixation
 #
-# Everything is differentiable: in the picture, in σ, and in the fixation. So a fixation can be found by gradient
-# descent. Somebody shows us the view from an unknown place. We start at the centre and move the gaze until our view
-# is the same.
+# Foveation is differentiable in the picture, in σ and in the fixation. So gradient descent can find a fixation. Suppose
+# that we have the view from an unknown fixation. We start at the centre and move the gaze until our view is the same.
 
 # %%
 unknown = torch.tensor([300.0, 150.0])
@@ -88,5 +87,5 @@ right.set(title="difference of the views", xlabel="step", ylabel="mean squared e
 right.grid(alpha=0.3)
 
 # %% [markdown]
-# Next: [a belief in ten lines](belief.py), and the guide to [sensors](../guides/sensor.md). The formulas are in the
+# Next: [a belief in ten lines](belief.py). See also the guide to [sensors](../guides/sensor.md). The formulas are in the
 # reference of `semfov.foveate`.

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Your detector
 #
-# The eye needs a detector: anything that returns boxes with a score for every class. An ONNX file takes no code at
-# all ([detectors](../detectors.md)). Here is the other way, a detector that is written down in twenty lines. It knows
-# two classes, large and small coins, by thresholding, and has no weights.
+# The eye needs a detector: anything that returns boxes with a score for every class. A detector in an ONNX file needs
+# no code at all ([detectors](../detectors.md)). This tutorial shows the other way, a detector written in twenty lines.
+# It finds large and small coins by thresholding, and has no weights.
 
 # %%
 import matplotlib.pyplot as plt
@@ -19,7 +19,7 @@ torch.set_grad_enabled(False)
 
 
 class CoinDetector(semfov.Detector):
-    """Bright discs, by Otsu's threshold; the score falls with their contrast, the class goes by their diameter."""
+    """Finds bright discs by Otsu's threshold; the score depends on their contrast, the class on their diameter."""
 
     def __init__(self) -> None:
         super().__init__("coins", ("large coin", "small coin"), (384, 303))
@@ -44,14 +44,14 @@ class CoinDetector(semfov.Detector):
         return Candidates(*(part.to(canvas) for part in stack))
 
 
-image = semfov.as_image(data.coins())  # a photograph that scikit-image carries
+image = semfov.as_image(data.coins())  # a photograph that comes with scikit-image
 detector = CoinDetector().eval()
 print(detector.classes, image.shape)
 
 
 # %% alt="A photograph of Roman coins: sharp all over, and seen from one fixation, with the boxes that the detector finds"
 def show(axis, picture, seen, title):
-    """A picture with boxes, one colour for each class, as opaque as their scores are high."""
+    """Draw a picture with boxes: the colour is the class, the opacity the score."""
     axis.imshow(picture.permute(1, 2, 0).clamp(0, 1).numpy())
     for (x1, y1, x2, y2), scores in zip(seen.boxes.tolist(), seen.scores):
         label = int(scores[1:].argmax())
@@ -70,11 +70,11 @@ show(axes[0], image, sharp, f"sharp: {len(sharp.boxes)} coins")
 show(axes[1], eye.foveated(view, gaze)[0], foveal, f"from (290, 60): {len(foveal.boxes)} coins")
 
 # %% [markdown]
-# ## What are its scores worth away from the fovea?
+# ## How do its scores depend on the distance to the fovea?
 #
-# Blurred coins have soft rims, and score less. An observation model learns how scores are distributed, by class and
-# distance to the fovea. We take what the detector says of the sharp picture as the truth, look around at random, and
-# fit.
+# Blurred coins have soft rims and get lower scores. An observation model learns the distribution of the scores for each
+# class and distance to the fovea. We take the detections in the sharp picture as the truth, look at random points, and
+# fit the model.
 
 # %%
 from semfov.observation import match
@@ -92,23 +92,23 @@ for fixation in fixations:
 model.fit(statistics, minimum=1, prior=True, **eye.settings()).eval().requires_grad_(False)
 print(int(statistics.count.sum()), "detections")
 
-# %% alt="Scores to expect of large coins, small coins and background, by level of distance to the fovea"
+# %% alt="Expected scores of large coins, small coins and background, by level of distance to the fovea"
 expected = model.expected_scores()
 figure, axes = plt.subplots(1, 3, figsize=(9, 2.8), layout="compressed", sharey=True)
 for axis, name, scores in zip(axes, ("background", *detector.classes), expected):
     for component, label in enumerate(("background", *detector.classes)):
         axis.plot(range(len(edges) + 1), scores[:, component].numpy(), "o-", label=f"score of {label}")
-    axis.set(title=f"what is a {name}" if name != "background" else "what is no coin", xlabel="level of distance")
+    axis.set(title=name, xlabel="level of distance")
 axes[0].set(ylabel="expected score")
 _ = axes[0].legend()
 
 # %% [markdown]
 # ## Search with it
 #
-# An agent is the eye with an observer and a policy. With its own observation model it knows what a blurred coin is
-# worth.
+# An agent is an eye with an observer and a policy. With its own observation model it gives the scores of a blurred coin
+# the right weight.
 
-# %% alt="The gaze's way over the coins to a large one, with what the eye saw and the probability of large coins at each fixation"
+# %% alt="The scanpath over the coins to a large one, with the foveated view and the probability of large coins at each fixation"
 observer = semfov.observers.Semantic(3, model)
 search, explore = semfov.policies.NonPredictive(), semfov.policies.KL(model)
 agent = semfov.ActivePerception(eye, (observer, search), (observer, explore), grid=(10, 8)).eval()
@@ -117,7 +117,7 @@ print(scanpath)
 viz.plot_episode(scanpath)
 
 # %% [markdown]
-# For a detector of real use, fit on thousands of photographs: `python -m train.fit_detector` fits everything that the
+# For practical use, fit on thousands of photographs: `python -m train.fit_detector` fits everything that the
 # recommended agent needs ([your detector in three commands](../detectors.md#your-detector-in-three-commands)).
 #
 # Next: [your policy](own_policy.py).

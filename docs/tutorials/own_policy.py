@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Your policy
 #
-# A policy chooses where to look next. It gives an acquisition function, which gives every cell a value; the next
-# fixation is the best cell not visited. This one explores by keeping away from all that was seen: it goes where the
-# closest fixation is farthest. It asks nothing of what was detected.
+# A policy chooses the next fixation. It provides an acquisition function, which gives every cell a value, and the next
+# fixation is the best cell not visited. The policy of this tutorial keeps away from earlier fixations: it looks at the
+# cell that is farthest from its closest fixation. It does not use the detections.
 
 # %%
 import matplotlib.pyplot as plt
@@ -25,7 +25,7 @@ class Farthest(semfov.acquisition.AcquisitionFunction):
 
 
 class KeepAway(policies.Policy):
-    """Explore by `Farthest`; the definition of the class registers it under its name."""
+    """Explore with `Farthest`; the definition of the class registers the policy under its name."""
 
     name = "keep-away"
     tasks = ("exploration",)
@@ -40,10 +40,10 @@ print(policies.policy_names("exploration"))
 # %% [markdown]
 # ## Put it into an agent
 #
-# An agent is an eye with one way to search and one to explore. We take the recommended one for the published fovea
-# apart, and give its eye and its learned map the new policy.
+# An agent is an eye with a strategy for search and one for exploration. We take the eye and the learned map of the
+# recommended agent for the published fovea, and combine them with the new policy.
 
-# %% alt="The way of the gaze over a collage of photographs by the new policy, with what the eye saw and what the map names"
+# %% alt="The scanpath over a collage of photographs by the new policy, with the foveated views and the classes of the map"
 recommended = semfov.ActivePerception.recommended("yolov3-tiny", sigma=100, growth=1)
 search = recommended.searching.observer, recommended.searching.policy
 mapper, closer = recommended.exploring.observer, recommended.exploring.policy
@@ -56,10 +56,10 @@ explored = agents["keep-away"].explore(scenes[1].image, start=0, shifts=6, until
 viz.plot_episode(explored)
 
 # %% [markdown]
-# ## Was that wise?
+# ## How good is it?
 #
-# We count the cells with objects that the map names right after each look, in four scenes, from two corners. Names
-# are those of the most probable class but background.
+# We count the cells with objects that the map classifies correctly after each look, in four scenes, from two corners.
+# The class of a cell is its most probable class without background.
 
 # %%
 looks = 8
@@ -76,15 +76,15 @@ for index in range(len(scenes)):
 share = {name: counts / cells for name, counts in right.items()}
 print({name: f"{100 * counts[-1]:.0f} %" for name, counts in share.items()})
 
-# %% alt="Share of the cells that are named right, by number of gaze shifts, for three policies"
+# %% alt="Share of correctly classified cells, by number of gaze shifts, for three policies"
 figure, axis = plt.subplots(figsize=(6, 3.4), layout="compressed")
 for name, counts in share.items():
     axis.plot(100 * counts.numpy(), "o-", label=name)
-axis.set(xlabel="gaze shifts", ylabel="cells named right (%)")
+axis.set(xlabel="gaze shifts", ylabel="correctly classified cells (%)")
 axis.grid(alpha=0.3)
 _ = axis.legend()
 
 # %% [markdown]
-# These scenes are a toy: five objects each, as large as the fovea. For figures that mean something, name the
-# registered policy in the settings of `eval.explore`, and measure it on photographs: [write your own
-# policy](../guides/write_your_own_policy.md) shows how, with a policy of search.
+# These scenes are toy examples with five objects each, as large as the fovea. For meaningful figures, name the
+# registered policy in the settings of `eval.explore` and measure it on photographs. [Write your own
+# policy](../guides/write_your_own_policy.md) shows how to do this, for a search policy.

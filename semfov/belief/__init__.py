@@ -1,4 +1,7 @@
-"""Beliefs about the scene: a grid of cells, what looks say of them, and how that is fused."""
+"""Beliefs about the scene: a grid of cells, the evidence of each look about them, and the fusion of looks.
+
+A look is one fixation with the detections that are seen from there.
+"""
 
 from semfov.belief import fusion, observers
 from semfov.belief.belief import Belief, DirichletBelief

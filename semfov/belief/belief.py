@@ -1,4 +1,4 @@
-"""What a batch of episodes believes."""
+"""Beliefs of a batch of episodes about the cells of an image."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -13,55 +13,97 @@ from semfov.observation import dirichlet
 
 
 class Belief(ABC):
-    """Base of all beliefs about the cells of a batch of episodes.
+    """Base of all beliefs about the cells of an image, for a batch of episodes.
+
+    A subclass implements `probability` and `map`.
 
     Attributes:
-        closest: `(B, X·Y)`, distance to the closest fixation so far, in longer sides; infinite before the first look.
+        closest: `(B, X·Y)`, distance from each cell to the closest fixation so far, in units of the image's longer
+            side; infinite before the first look.
+
+    >>> belief = DirichletBelief(torch.tensor([[[1.0, 3.0], [1.0, 1.0]]]))  # one episode, two cells, one class
+    >>> belief.probability(1), belief.presence(1)
+    (tensor([[0.7500, 0.5000]]), tensor([0.7500]))
     """
 
     closest: Tensor
 
     @abstractmethod
     def probability(self, target: int | Tensor) -> Tensor:
-        """Probability that each cell holds the target, `(B, X·Y)`.
+        """Probability that each cell holds the target, given all looks.
 
         Args:
-            target: class 1..K, or a tensor `(B,)` with one for each episode. A belief about one target alone answers
-                for that target, whatever is asked.
+            target: class 1..K, or a tensor `(B,)` with one class for each episode. A belief about a single target
+                ignores this argument and answers for its own target.
+
+        Returns:
+            `(B, X·Y)`.
         """
 
     def chance(self, target: int | Tensor) -> Tensor:
-        """Probability that each cell holds the target if no fixated cell does, as in a search that goes on, `(B, X·Y)`.
+        """Probability that each cell holds the target, given that no fixated cell holds it.
 
-        Without knowing better that is `probability`. Values of fixated cells have no meaning.
+        This is the case while a search continues. The base class returns `probability`.
+
+        Args:
+            target: as for `probability`.
+
+        Returns:
+            `(B, X·Y)`. The values of fixated cells have no meaning.
         """
         return self.probability(target)
 
     def presence(self, target: int | Tensor) -> Tensor:
-        """Probability that the target is anywhere in the image, `(B,)`.
+        """Probability that the target is anywhere in the image.
 
-        A belief that was not made to tell gives a bound: the probability of the most probable cell.
+        The base class returns a lower bound: the probability of the most probable cell.
+
+        Args:
+            target: as for `probability`.
+
+        Returns:
+            `(B,)`.
         """
         return self.probability(target).amax(-1)
 
     def class_probabilities(self) -> Tensor:
-        """Probability of every class in every cell, background first, `(B, X·Y, K+1)`.
+        """Probability of every class in every cell.
+
+        Returns:
+            `(B, X·Y, K+1)`, background first.
 
         Raises:
-            InputError: the belief is about a target alone.
+            InputError: the belief is about a single target.
         """
-        raise InputError(f"belief: expected a belief about all classes, got {type(self).__name__}")
+        raise InputError(
+            f"belief: expected a belief about all classes (of observers.Semantic or LearnedMap), got "
+            f"{type(self).__name__}"
+        )
 
     @abstractmethod
     def map(self, function: Callable[[Tensor], Tensor]) -> Self:
-        """The belief with every tensor, each `(B, ...)`, replaced by `function` of it."""
+        """Apply a function to every tensor of the belief.
+
+        Args:
+            function: maps a tensor `(B, ...)` to another one.
+
+        Returns:
+            A new belief.
+        """
 
     def __getitem__(self, index: Tensor | slice) -> Self:
-        """Beliefs of some of the episodes."""
+        """The belief of the selected episodes."""
         return self.map(lambda tensor: tensor[index])
 
     def put(self, index: Tensor, other: Self) -> Self:
-        """The belief in which the episodes `index` `(n,)` believe what those of `other` do.
+        """Replace the belief of some episodes.
+
+        Args:
+            index: `(n,)`, the episodes.
+            other: their new belief, of n episodes.
+
+        Returns:
+            A new belief of all B episodes.
 
         >>> before = DirichletBelief(torch.ones(2, 1, 2))
         >>> before.put(torch.tensor([1]), DirichletBelief(torch.tensor([[[1.0, 3.0]]]))).probability(1)
@@ -79,7 +121,11 @@ class Belief(ABC):
         return self.map(lambda tensor: tensor.index_copy(0, index, next(rows)))
 
     def detach(self) -> Self:
-        """The same belief as a constant, through which no gradient flows."""
+        """Detach every tensor from the graph, so that no gradient flows through the belief.
+
+        Returns:
+            A new belief.
+        """
         return self.map(Tensor.detach)
 
 
@@ -87,11 +133,11 @@ class Belief(ABC):
 class DirichletBelief(Belief):
     r"""A Dirichlet belief about the class of every cell, :math:`P(C^x) \sim \mathrm{Dir}(\beta^x)`.
 
-    (Luzio, Bernardino and Moreno, 2024, the equation of the map B.)
+    This is the map B of Luzio, Bernardino and Moreno (2024, equation 3).
 
     Attributes:
-        beta: `(B, X·Y, K+1)`, Dirichlet parameters, background first.
-        closest: `(B, X·Y)`, see `Belief`; left out, there was no look yet.
+        beta: `(B, X·Y, K+1)`, Dirichlet parameters, positive, background first.
+        closest: `(B, X·Y)`, see `Belief`; by default no look was made yet.
 
     >>> belief = DirichletBelief(torch.tensor([[[1.0, 3.0], [1.0, 1.0]]]))
     >>> belief.probability(1)
@@ -111,7 +157,18 @@ class DirichletBelief(Belief):
 
     @classmethod
     def uniform(cls, batch: int, cells: int, components: int, prior: float, like: Tensor) -> "DirichletBelief":
-        """The same parameter for every class, before any look; dtype and device as `like`."""
+        """Make the belief before the first look, with the same parameter for every class.
+
+        Args:
+            batch: B, number of episodes.
+            cells: X·Y, number of cells.
+            components: K + 1, number of classes with background.
+            prior: the parameter, positive.
+            like: a tensor; the belief takes its dtype and device.
+
+        Returns:
+            The belief.
+        """
         return cls(like.new_full((batch, cells, components), prior))
 
     @property
@@ -129,21 +186,34 @@ class DirichletBelief(Belief):
 
 
 def dirichlet_belief(belief: Belief) -> DirichletBelief:
-    """The belief, as one about all classes.
+    """Check that a belief is a `DirichletBelief`.
+
+    Returns:
+        The belief.
 
     Raises:
-        InputError: it is about a target alone.
+        InputError: it is of another kind.
     """
     if not isinstance(belief, DirichletBelief):
-        raise InputError(f"belief: expected a belief about all classes (DirichletBelief), got {type(belief).__name__}")
+        raise InputError(
+            f"belief: expected a belief about all classes (DirichletBelief), got {type(belief).__name__}; use "
+            "observers.Semantic, or an acquisition function that uses the probability of the target alone"
+        )
     return belief
 
 
 def pick(values: Tensor, target: Tensor) -> Tensor:
-    """Component `target` (a scalar, or `(B,)`) of `values` `(B, ..., K+1)`, `(B, ...)`.
+    """Select the component of a class.
+
+    Args:
+        values: `(B, ..., K+1)`.
+        target: class index, a scalar or `(B,)` with one for each episode.
+
+    Returns:
+        `(B, ...)`.
 
     Raises:
-        InputError: there is no such component.
+        InputError: an index is out of range.
 
     >>> pick(torch.tensor([[[0.1, 0.9]], [[0.3, 0.7]]]), torch.tensor([1, 0]))
     tensor([[0.9000],
@@ -160,11 +230,19 @@ def pick(values: Tensor, target: Tensor) -> Tensor:
 
 
 def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """`function` of the rows of tensors `(B, ...)`, each row alone, joined again.
+    """Apply a function to each row of tensors separately, and concatenate the results.
 
-    Matrix products of other sizes may round otherwise, and so may exponentials and logarithms, of which the last few of
-    a tensor are not computed in vectors. Taken alone, an episode's figures do not depend on how many others are run
-    with it. Where a graph is traced, and inside `torch.func.vmap`, all rows are taken at once.
+    The rounding of matrix products depends on their size. So does that of exponentials and logarithms, because the
+    last few elements of a tensor are not computed in vectors. Computed separately, the result for an episode does not
+    depend on how many other episodes run with it. While a graph is traced, and inside `torch.func.vmap`, all rows are
+    computed at once.
+
+    Args:
+        function: takes one batch of size 1 for each tensor, and returns a tensor.
+        rows: tensors `(B, ...)`.
+
+    Returns:
+        The results, concatenated to `(B, ...)`.
 
     >>> one_by_one(lambda row: row @ torch.ones(3, 1), torch.ones(2, 1, 3)).shape
     torch.Size([2, 1, 1])

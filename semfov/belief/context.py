@@ -1,4 +1,4 @@
-"""Context: the places that a class is usually at, and the things that it is usually beside."""
+"""Context: the usual places of a class in the image, and the classes that it usually occurs with."""
 
 import hashlib
 import json
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.belief.context_table import company_of, places_of, read_table
+from semfov.belief.context_table import cooccurrence_from, places_from, read_table
 from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
 from semfov.errors import DataError, check, check_shape, lookup, values_known
@@ -22,27 +22,31 @@ from semfov.io.schema import CLASSES, Array, Field, Number, Object, Pair, Schema
 
 
 class ContextPrior(Pretrained):
-    r"""Log odds that context adds to those of a target t in each cell x, from annotations alone.
+    r"""Log odds that context adds to a belief about a target t in each cell x; learned from annotations alone.
 
     .. math:: c_t(x) = w_1 \, a_t(x) + w_2 \sum_{j \ne t} \sum_n q_{jn}(x) \, r_{tjn}
 
-    with :math:`a_t(x)` the log odds that an object of t is at x, less those of its mean place, and
+    The first term is the place: :math:`a_t(x)` are the log odds that an object of t is at x, minus their mean over the
+    image. The second term is co-occurrence. In a picture that holds t and j,
 
     .. math:: r_{tjn} = \ln \frac{P(t \in x \mid \text{the nearest } j \text{ lies in band } n \text{ of } x)}
               {P(t \in x)}
 
-    how much likelier t is in a cell that has j at that distance, in a picture that holds both.
-    :math:`q_{jn}(x)` is the probability that the nearest j lies in band n (`reaches`). Classes count as if they were
-    independent, which they are not: the weights w, fitted together with the belief that the context is added to, make
-    up for it. (Context by place and by company: Torralba, 2003; Galleguillos and Belongie, 2010.)
+    says how much likelier t is in a cell with j at that distance; :math:`q_{jn}(x)` is the probability that the nearest
+    j lies in band n (`reaches`). The sum treats classes as independent, which they are not. The weights w compensate
+    for it: they are fitted together with the belief that the context is added to. (Context by place and by
+    co-occurrence: Torralba, 2003; Galleguillos and Belongie, 2010.)
 
     Args:
         classes: names of the K classes, without background.
-        place: `(K+1, R, R)`, a; the map is stretched over the image, whatever its grid.
-        cooccurrence: `(K+1, K+1, N)`, r: target, other class, band.
-        edges: upper borders of all bands but the last, ascending, in longer sides of the image.
-        weights: `(w_1, w_2)` by the kind of belief, `evidence` (`TargetEvidence`) or `map` (a class posterior).
-        metadata: JSON values kept with the model.
+        place: `(K+1, R, R)`, a; the map is interpolated over the image, for any grid.
+        cooccurrence: `(K+1, K+1, N)`, r: target, other class, band of distance.
+        edges: N - 1 upper borders of the bands, ascending, in longer sides of the image; the last band is open.
+        weights: `(w_1, w_2)` for each kind of belief, `evidence` (`TargetEvidence`) or `map` (a class posterior).
+        metadata: JSON values saved with the model.
+
+    Raises:
+        InputError: a shape does not fit, or `edges` are not ascending.
 
     >>> place = torch.zeros(3, 2, 2)
     >>> place[1, 1] = 1.0  # cups are in the lower half
@@ -82,7 +86,9 @@ class ContextPrior(Pretrained):
         components = len(classes) + 1
         check_shape(place, "place", components, place.shape[-1], place.shape[-1])
         check_shape(cooccurrence, "cooccurrence", components, components, len(edges) + 1)
-        check(list(edges) == sorted(edges) and min(edges, default=0) >= 0, "edges", "ascending, from 0", edges)
+        check(
+            list(edges) == sorted(edges) and min(edges, default=0) >= 0, "edges", "ascending numbers, 0 or more", edges
+        )
         self.classes = tuple(classes)
         self.edges = tuple(edges)
         self.weights = {kind: (float(pair[0]), float(pair[1])) for kind, pair in (weights or {}).items()}
@@ -93,13 +99,19 @@ class ContextPrior(Pretrained):
     def forward(
         self, presence: Tensor, grid: Grid, target: int | Tensor, weights: tuple[float, float] = (1.0, 1.0)
     ) -> Tensor:
-        """Log odds to add in each cell, `(B, X·Y)`.
+        """Log odds to add in each cell.
 
         Args:
             presence: `(B, X·Y, K+1)`, probability of each class in each cell (`presence_of`, or the means of a map).
             grid: the cells of one image.
-            target: class 1..K, or `(B,)` with one for each belief.
+            target: class 1..K, or `(B,)` with one class for each belief.
             weights: of place and of co-occurrence.
+
+        Returns:
+            `(B, X·Y)`.
+
+        Raises:
+            InputError: the shape of `presence` does not fit, or a class is out of range.
         """
         index = torch.as_tensor(target, device=presence.device)
         components = len(self.classes) + 1
@@ -107,39 +119,67 @@ class ContextPrior(Pretrained):
         if values_known(index):
             inside = bool(((index >= 1) & (index < components)).all())
             check(inside, "target", f"a class from 1 to {components - 1}", target)
-        place, company = weights
+        place_weight, cooccurrence_weight = weights
         value = presence.new_zeros(presence.shape[:2])
-        if place:
-            value = value + place * self.place_at(grid)[index].to(presence)
-        if company:
+        if place_weight:
+            value = value + place_weight * self.place_at(grid)[index].to(presence)
+        if cooccurrence_weight:
             ratio = self.cooccurrence[index.expand(len(presence))].to(presence)
             nearer = torch.zeros_like(presence)
             for band, reach in enumerate(reaches(presence, grid, self.edges)):
-                value = value + company * ((reach - nearer) @ ratio[:, :, band, None])[..., 0]
+                value = value + cooccurrence_weight * ((reach - nearer) @ ratio[:, :, band, None])[..., 0]
                 nearer = reach
         return value
 
     def place_at(self, grid: Grid) -> Tensor:
-        """The map of places at the centres of a grid's cells, by bilinear interpolation, `(K+1, X·Y)`."""
+        """Interpolate the map of places at the centres of the cells, bilinearly.
+
+        Args:
+            grid: the cells of one image.
+
+        Returns:
+            `(K+1, X·Y)`, log odds.
+        """
         size = grid.rows, grid.columns
         return F.interpolate(self.place[:, None], size, mode="bilinear", align_corners=False).flatten(1)
 
     def weights_for(self, kind: str) -> tuple[float, float]:
-        """Fitted weights of place and co-occurrence beside a belief of this kind; InputError for an unknown one."""
+        """Fitted weights of place and co-occurrence for a kind of belief.
+
+        Args:
+            kind: `evidence` or `map`.
+
+        Returns:
+            The two weights.
+
+        Raises:
+            InputError: no weights were fitted for this kind.
+        """
         return self.weights[lookup(kind, self.weights, "kind of belief")]
 
     def check_compatible(self, classes: Sequence[str]) -> None:
-        """Raise `InputError` unless a detector with these classes can be used."""
+        """Check that the prior was made for the classes of a detector.
+
+        Args:
+            classes: names of the K classes.
+
+        Raises:
+            InputError: the names differ.
+        """
         compatibility.check_classes(self.classes, classes, self.title)
 
     def digest(self) -> str:
-        """sha256 of all that `forward` and `weights_for` depend on."""
+        """Checksum of everything that the results depend on: tables, classes, edges, weights and metadata.
+
+        Returns:
+            The sha256 in hexadecimal.
+        """
         what = json.dumps([self.classes, self.edges, self.weights, self.metadata], sort_keys=True).encode()
         tensors = [tensor.cpu().contiguous().view(torch.uint8).numpy().tobytes() for tensor in self.buffers()]
         return hashlib.sha256(b"".join([what, *tensors])).hexdigest()
 
     def _record(self) -> dict[str, Any]:
-        """Classes, bands and weights."""
+        """The classes, the bands and the weights."""
         return {"classes": self.classes, "edges": self.edges, "weights": self.weights}
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -148,13 +188,20 @@ class ContextPrior(Pretrained):
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The prior from what was kept."""
+        """The prior with the saved tensors and record."""
         tables = tensors["place"].float(), tensors["cooccurrence"].float()
         settings = {"weights": record["weights"], "metadata": record["metadata"]}
         return cls(record["classes"], *tables, record["edges"], **settings)
 
     def permuted(self, seed: int = 0) -> "ContextPrior":
-        """The same tables with the classes exchanged at random: a control that knows as much, of the wrong things."""
+        """Permute the classes at random: a control with the same amount of information, about the wrong classes.
+
+        Args:
+            seed: seed of the random permutation.
+
+        Returns:
+            A new prior.
+        """
         generator = torch.Generator().manual_seed(seed)
         order = torch.cat(
             [torch.zeros(1, dtype=torch.long), 1 + torch.randperm(len(self.classes), generator=generator)]
@@ -174,51 +221,60 @@ class ContextPrior(Pretrained):
         sha256: str | None = None,
         edges: Sequence[float] = (0.0, 0.15, 0.35),
     ) -> Self:
-        r"""Context from any table of classes by classes: from language, from a person, from another data set.
+        r"""Make a prior from a table of classes by classes, for example from a language model or another data set.
 
         .. math:: r_{tjn} = b_n \bigl(v_{tj} - \bar v_{t\cdot} - \bar v_{\cdot j} + \bar v\bigr), \qquad
                   b_n = 1 - \frac{2 n}{N - 1}
 
-        with v the table's value of class j beside a target t, on any scale, the larger the more they belong together.
-        It counts by comparison alone, with what either class has beside others; so does a place with others of its
-        class. What is unknown counts nothing. How much the table should count is another matter: `train.fit_context`
-        fits the weights, which are 1 here.
+        The value v of a target t and another class j may have any scale; larger values mean that the classes belong
+        together. Only differences count: a value is compared with the other values of either class, and a place with
+        the other places of its class. Unknown values count as 0 after this comparison. The weights are 1;
+        `train.fit_context` fits them.
 
         Args:
-            path: CSV with the names of other classes in its first row, and of targets in its first column; an empty
-                cell is unknown.
-            classes: names of the detector's classes; the table's are matched to them by name, in any spelling, or by
+            path: CSV file with the names of other classes in the first row and of targets in the first column; an
+                empty cell is unknown.
+            classes: names of the detector's classes; names in the table are matched to them in any spelling, or by
                 their synonyms (`semfov.data.naming.alike`).
-            source: where the table comes from; it is kept in the metadata, with the table's sha256.
-            places: CSV with the names of classes in its first column, and how likely they are at each height of a
-                picture, as log odds from the top row to the bottom one; None knows of no places.
-            sha256: that the table must have.
-            edges: upper borders of all bands of distance but the last, in longer sides of the image.
+            source: where the table comes from; it is saved in the metadata, with the sha256 of the table.
+            places: CSV file with the names of classes in the first column, and the log odds of the class at each
+                height of a picture, from the top row to the bottom row; None uses no places.
+            sha256: expected checksum of the table; None does not check it.
+            edges: N - 1 upper borders of the bands of distance, in longer sides of the image.
+
+        Returns:
+            The prior.
 
         Raises:
-            DataError: a file is missing, no such table, or not the one of the checksum.
-            InputError: it knows none of the classes, or an argument does not fit.
+            DataError: a file is missing, is not such a table, or has another checksum.
+            InputError: the table has none of the classes, or an argument does not fit.
         """
-        check(bool(source.strip()), "source", "where the table comes from", repr(source))
+        check(bool(source.strip()), "source", "a text that says where the table comes from", repr(source))
         digest = _digest(path)
         if sha256 is not None and sha256.lower() != digest:
-            raise DataError(f"{path}: expected a table with sha256 {sha256}, got {digest}; fetch it again")
-        company, missing = company_of(read_table(path), classes, len(edges) + 1)
+            raise DataError(f"{path}: expected a table with sha256 {sha256}, got {digest}; download it again")
+        cooccurrence, missing = cooccurrence_from(read_table(path), classes, len(edges) + 1)
         place = torch.zeros(len(classes) + 1, 1, 1)
         told: dict[str, Any] = {"source": source, "sha256": digest, "missing": missing}
         if places is not None:
-            place = places_of(read_table(places), classes)
+            place = places_from(read_table(places), classes)
             told["places_sha256"] = _digest(places)
         weights = dict.fromkeys(("evidence", "map"), (1.0, 1.0))
-        return cls(classes, place, company, edges, weights=weights, metadata={"table": told})
+        return cls(classes, place, cooccurrence, edges, weights=weights, metadata={"table": told})
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str] = "coco") -> Self:
-        """A prior that is shipped with the package, by name, or one that `save` wrote, by path; in `eval` mode.
+        """Load a prior: one shipped with the package, by its name, or a file that `save` wrote, by its path.
+
+        Args:
+            name_or_path: name of a shipped prior, or path of a `.safetensors` file.
+
+        Returns:
+            The prior, in `eval` mode.
 
         Raises:
             InputError: no prior of that name is shipped.
-            DataError: the file is missing, damaged or not such a prior.
+            DataError: the file is missing or damaged, or holds no context prior.
         """
         return super().from_pretrained(name_or_path)
 
@@ -231,7 +287,7 @@ def _digest(path: str | PathLike[str]) -> str:
 
 
 def presence_of(detections: Detections, grid: Grid) -> Tensor:
-    """Highest score of each class among the detections that overlap a cell, `(B, X·Y, K+1)`, 0 where there are none."""
+    """Highest score of each class among the detections that overlap a cell, `(B, X·Y, K+1)`; 0 without detections."""
     batch, count, components = detections.scores.shape
     seen = detections.scores.new_zeros(batch, len(grid), components)
     covered = grid.footprint(detections.boxes) & detections.mask[..., None]
@@ -241,23 +297,35 @@ def presence_of(detections: Detections, grid: Grid) -> Tensor:
 
 
 def reaches(presence: Tensor, grid: Grid, edges: Sequence[float]) -> Iterator[Tensor]:
-    r"""Probability of each class no farther from a cell than each edge, then anywhere: N tensors `(B, X·Y, C)`.
+    r"""Probability of each class within the distance of each edge from a cell.
 
     .. math:: R_{jn}(x) = \max_{y : d(x, y) \le e_n} p_j(y), \qquad q_{jn} = R_{jn} - R_{j,n-1}
 
-    with d the larger of the horizontal and the vertical distance between the cells' centres, in longer sides of the
-    image. The largest rather than one minus the product: neighbouring cells show one and the same object.
+    d is the larger of the horizontal and the vertical distance between the centres of the cells, in longer sides of the
+    image. The maximum is used instead of one minus the product because neighbouring cells often show the same object.
 
     Args:
         presence: `(B, X·Y, C)`, p.
         grid: the cells of one image.
-        edges: e, ascending.
+        edges: N - 1 borders e, ascending, in longer sides of the image.
+
+    Yields:
+        R for each edge, and last for the whole image: N tensors `(B, X·Y, C)`.
+
+    Raises:
+        InputError: the grid has a batch of sizes.
+
+    >>> presence = torch.tensor([[[0.9], [0.0], [0.0]]])  # three cells in a row, one class
+    >>> for reach in reaches(presence, Grid(3, 1, (30, 10)), edges=[0.4]):
+    ...     print(reach[0, :, 0])
+    tensor([0.9000, 0.9000, 0.0000])
+    tensor([0.9000, 0.9000, 0.9000])
     """
     check(grid.extent.ndim == 1, "grid", "the size of one image", grid.size)
     planes = presence.transpose(1, 2).unflatten(-1, (grid.rows, grid.columns))
     width, height = (float(side) / max(map(float, grid.size)) for side in grid.size)
     for edge in edges:
-        # Rounding must not take cells out that lie just at the edge.
+        # The small addition keeps rounding from excluding cells exactly at the edge.
         across = min(int(edge * grid.columns / width + 1e-6), grid.columns - 1)
         down = min(int(edge * grid.rows / height + 1e-6), grid.rows - 1)
         pooled = F.max_pool2d(planes, (2 * down + 1, 2 * across + 1), 1, (down, across))

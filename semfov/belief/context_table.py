@@ -1,4 +1,4 @@
-"""Tables of classes by classes, or by places, as context is made of."""
+"""Tables of classes by classes, or of classes by heights in the picture, from which context is made."""
 
 import csv
 import io
@@ -21,12 +21,12 @@ _LARGEST = 1e3
 
 @dataclass(frozen=True)
 class NamedTable:
-    """A table of numbers.
+    """A table of numbers with named rows and columns.
 
     Attributes:
         rows: names of the rows.
         columns: names of the columns.
-        values: `(rows, columns)`, NaN where unknown.
+        values: `(rows, columns)`, NaN for unknown values.
     """
 
     rows: tuple[str, ...]
@@ -35,10 +35,16 @@ class NamedTable:
 
 
 def read_table(path: str | PathLike[str]) -> NamedTable:
-    """A table from CSV: names in the first row and in the first column, numbers or nothing elsewhere.
+    """Read a table from CSV: names in the first row and the first column, numbers or empty cells elsewhere.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The table.
 
     Raises:
-        DataError: the file is missing, or is no such table; the message has the line.
+        DataError: the file is missing, or is not such a table; the message has the line.
     """
     check_regular(path)
     try:
@@ -46,9 +52,11 @@ def read_table(path: str | PathLike[str]) -> NamedTable:
             reader = csv.reader(file)
             lines = [(reader.line_num, line) for line in reader if any(cell.strip() for cell in line)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path}: cannot be read as CSV: {error}") from error
+        raise DataError(f"{path}: expected a CSV file, got: {error}") from error
     if not 2 <= len(lines) <= _MOST + 1 or not 2 <= len(lines[0][1]) <= _MOST + 1:
-        raise DataError(f"{path}: expected names in the first row and in the first column, and 1 to {_MOST:,} of each")
+        raise DataError(
+            f"{path}: expected 1 to {_MOST:,} names in the first row and in the first column, got {len(lines)} lines"
+        )
     columns = [name.strip() for name in lines[0][1][1:]]
     rows, values = [], []
     for number, (name, *cells) in lines[1:]:
@@ -66,7 +74,7 @@ def read_table(path: str | PathLike[str]) -> NamedTable:
 
 
 def write_table(path: Path, rows: Sequence[str], columns: Sequence[str], values: Tensor) -> None:
-    """Write a table as `read_table` reads it, whole or not at all; NaN is left empty."""
+    """Write a table in the format of `read_table`, atomically; NaN becomes an empty cell."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["", *columns])
@@ -83,20 +91,25 @@ def _number(cell: str, where: str) -> float:
     except ValueError:
         value = math.inf
     if not abs(value) <= _LARGEST:
-        raise DataError(f"{where}: expected numbers from -1000 to 1000, or nothing where unknown, got {cell[:40]!r}")
+        raise DataError(
+            f"{where}: expected numbers from -1000 to 1000, or empty cells for unknown values, got {cell[:40]!r}"
+        )
     return value
 
 
-def company_of(table: NamedTable, classes: Sequence[str], bands: int) -> tuple[Tensor, list[str]]:
-    """Log ratios `(K+1, K+1, N)` of `ContextPrior.from_table`, and the classes that the table does not know.
+def cooccurrence_from(table: NamedTable, classes: Sequence[str], bands: int) -> tuple[Tensor, list[str]]:
+    """Log ratios of co-occurrence from a table, by the formula of `ContextPrior.from_table`.
 
     Args:
-        table: of targets by other classes.
+        table: values of targets (rows) by other classes (columns).
         classes: names of the K classes.
-        bands: N.
+        bands: N, number of bands of distance.
+
+    Returns:
+        `(K+1, K+1, N)`, and the names of the classes that the table lacks.
 
     Raises:
-        InputError: it knows none of them.
+        InputError: the table has none of the classes.
     """
     known = _picked(_picked(table.values, table.rows, classes).mT, table.columns, classes).mT
     known.fill_diagonal_(torch.nan)
@@ -104,16 +117,16 @@ def company_of(table: NamedTable, classes: Sequence[str], bands: int) -> tuple[T
                if row.isnan().all() and column.isnan().all()]  # fmt: skip
     if len(missing) == len(classes):
         some = ", ".join(table.rows[:5])
-        raise InputError(f"classes: expected some that the table knows ({some}, …), got {', '.join(classes[:5])}, …")
+        raise InputError(f"classes: expected some that are in the table ({some}, …), got {', '.join(classes[:5])}, …")
     relative = known - known.nanmean(1, keepdim=True) - known.nanmean(0, keepdim=True) + known.nanmean()
     profile = torch.linspace(1, -1, bands) if bands > 1 else torch.ones(1)
-    company = torch.zeros(len(classes) + 1, len(classes) + 1, bands)
-    company[1:, 1:] = relative.nan_to_num(0)[..., None] * profile
-    return company, missing
+    cooccurrence = torch.zeros(len(classes) + 1, len(classes) + 1, bands)
+    cooccurrence[1:, 1:] = relative.nan_to_num(0)[..., None] * profile
+    return cooccurrence, missing
 
 
-def places_of(table: NamedTable, classes: Sequence[str]) -> Tensor:
-    """Log odds of places `(K+1, R, R)`, each less the mean of its class, from a table of classes by heights."""
+def places_from(table: NamedTable, classes: Sequence[str]) -> Tensor:
+    """Log odds of places `(K+1, R, R)`, minus the mean of each class, from a table of classes by heights."""
     known = _picked(table.values, table.rows, classes)
     relative = (known - known.nanmean(1, keepdim=True)).nan_to_num(0)
     rows = relative.shape[1]
@@ -123,7 +136,7 @@ def places_of(table: NamedTable, classes: Sequence[str]) -> Tensor:
 
 
 def _picked(values: Tensor, names: Sequence[str], classes: Sequence[str]) -> Tensor:
-    """Rows for the classes: of the name itself, or the mean of those of its synonyms; NaN where there is none."""
+    """Rows for the classes: the row of the name, or the mean of the rows of its synonyms, or NaN."""
     nothing = torch.full_like(values[0], torch.nan)
     found = [alike(name, names) for name in classes]
     return torch.stack([values[places].nanmean(0) if places else nothing for places in found])

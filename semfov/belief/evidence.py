@@ -1,4 +1,4 @@
-"""Learned evidence: what one look says of a class in a cell, and what all looks together say."""
+"""Learned evidence for a class in a cell: a network for a single look, and one for all looks together."""
 
 import math
 from collections.abc import Mapping
@@ -13,23 +13,23 @@ from semfov.belief.look_features import FEATURES, nothing_seen
 from semfov.io.pretrained import PretrainedForEye
 
 READOUT = 14
-"""What the looks say of a cell, as numbers for a network."""
+"""Number of inputs that describe a cell after several looks."""
 
-# Looks from farther than this, in longer sides of the image, count e times less in the mean of all.
+# Distance between fixation and cell, in longer sides of the image, over which the weight of a look falls by a factor e.
 _REACH = 1 / 6
 
 
 @dataclass(frozen=True)
 class Gathered:
-    """What all looks of an episode so far say of a class.
+    """Evidence of all looks of an episode so far about one class.
 
     Attributes:
         nearest: `(B, X·Y)`, evidence of the closest look at each cell.
         best: `(B, X·Y)`, strongest evidence of any look.
-        mean: `(B, X·Y)`, mean evidence of all looks, those from near counting more.
-        distance: `(B, X·Y)`, of the closest look, in longer sides of the image.
+        mean: `(B, X·Y)`, mean evidence of all looks, in which closer looks have larger weights (`nearness`).
+        distance: `(B, X·Y)`, from each cell to its closest fixation, in longer sides of the image.
         score: `(B,)`, highest score of the class in any detection.
-        looks: `(B,)`, how many there were.
+        looks: `(B,)`, number of looks.
         visited: `(B, X·Y)` boolean, cells that were fixated.
         target: `(B,)`, the class.
     """
@@ -45,26 +45,26 @@ class Gathered:
 
 
 class Evidence(PretrainedForEye):
-    r"""Base of learned evidence for a class: a network for one look, and one that reads several.
+    r"""Base of learned evidence for a class: one network for a single look, and one for all looks together.
 
-    Kaplan's rule takes looks for independent. Looks at a static scene are not: a blurred, wrong
-    detection repeats itself and buries an object for good. Here a cell keeps the evidence of its closest look, and
-    a small network weighs it together with the strongest evidence of any look, with the mean of all, and with what
-    stands around the cell. A look that shows nothing is evidence too: much at the fovea, little far out.
+    Kaplan's rule treats looks as independent. Looks at a static scene are not: a wrong detection of a blurred object
+    recurs in many looks, and the belief may never recover from it. Here a cell keeps the evidence of its closest look.
+    A small network corrects it, given the strongest evidence of any look, the mean of all looks, and the neighbourhood
+    of the cell. A look without detections is evidence, too: strong at the fovea, weak far from it.
 
     .. math:: e_f(x) = g(\phi_f(x)), \qquad
               \operatorname{logit} P(k \in x \mid f_1 \ldots f_n) = e_{f^*(x)}(x) + h(\cdot), \qquad
               f^*(x) = \arg\min_i d(x, f_i)
 
-    with φ of `look_features`, and g and h networks of two hidden layers. The evidence depends on the class through its
-    score and through a prior, one number for each class.
+    where φ are the features of `look_features`, and g and h are networks with two hidden layers. The evidence depends
+    on the class through its score and through a prior, one number for each class.
 
     Args:
         look_width: hidden units of g.
         readout_width: hidden units of h.
-        components: classes of the detector, background included.
-        more: numbers that h reads beyond `READOUT`.
-        metadata: JSON values kept with the model: `detector` and `sensor` (settings it was trained for).
+        components: K + 1, number of classes of the detector with background.
+        more: number of further inputs of h, beyond `READOUT`.
+        metadata: JSON values saved with the model: `detector` and `sensor` (the settings it was trained for).
     """
 
     def __init__(
@@ -84,16 +84,41 @@ class Evidence(PretrainedForEye):
         self.prior = nn.Parameter(torch.zeros(components))
 
     def evidence(self, features: Tensor) -> Tensor:
-        """Evidence `(...)` from features `(..., 10)`."""
+        """Evidence of looks, from their features.
+
+        Args:
+            features: `(..., 10)` (`look_features`).
+
+        Returns:
+            `(...)`, log odds.
+        """
         value: Tensor = self.look(features)
         return value[..., 0]
 
     def unseen(self, like: Tensor) -> Tensor:
-        """Evidence `()` of a look from a whole longer side away that shows nothing; dtype and device as `like`."""
+        """Evidence of a look from one longer side away without detections.
+
+        Args:
+            like: a tensor that gives dtype and device.
+
+        Returns:
+            `()`, log odds.
+        """
         return self.evidence(nothing_seen(like.new_ones(1)))[0]
 
     def read_out(self, reader: nn.Module, nearest: Tensor, gathered: Gathered, columns: int, *more: Tensor) -> Tensor:
-        """`nearest` corrected by a network that reads all that was gathered, `(B, X·Y)`."""
+        """Correct the evidence of the closest looks, given all gathered evidence.
+
+        Args:
+            reader: the network.
+            nearest: `(B, X·Y)`, the evidence to correct.
+            gathered: evidence of all looks.
+            columns: X, cells in a row.
+            more: further inputs of the network, each broadcast to `(B, X·Y)`.
+
+        Returns:
+            `(B, X·Y)`, log odds.
+        """
         odds = nearest.sigmoid()
         rows = nearest.shape[-1] // columns
         row = torch.linspace(-1, 1, rows).to(nearest).repeat_interleave(columns) if rows > 1 else nearest.new_zeros(1)
@@ -120,27 +145,27 @@ class Evidence(PretrainedForEye):
 
 
 def network(inputs: int, width: int) -> nn.Sequential:
-    """Two hidden layers, one number out."""
+    """A network with two hidden layers of `width` units and one output."""
     return nn.Sequential(nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU(), nn.Linear(width, 1))
 
 
 def nearness(distance: Tensor) -> Tensor:
-    """How much looks from a distance, in longer sides of the image, count in the mean of all."""
+    """Weight in the mean of all looks for a look from a distance, in longer sides of the image: e^(-d/R)."""
     return (-distance / _REACH).exp()
 
 
 def farther(keep: float) -> float:
-    """How much farther away a look is, in longer sides of the image, whose nearness is `keep` times as great."""
+    """Increase of the distance, in longer sides of the image, that multiplies the nearness by `keep`."""
     return -math.log(keep) * _REACH
 
 
 def logarithm(odds: Tensor) -> Tensor:
-    """Of probabilities or odds, kept finite and scaled to about unit size."""
+    """Logarithm of probabilities or odds, kept finite and scaled to about unit size."""
     return (odds + 1e-3).log() / 2 + 1
 
 
 def blur(values: Tensor, columns: int, sigma: float) -> Tensor:
-    """Gaussian average over the neighbourhood, σ in cells; what lies outside the grid counts as 0."""
+    """Gaussian average over the neighbourhood, with σ in cells; cells outside the grid count as 0."""
     steps = torch.arange(-3, 4).to(values)
     kernel = (-steps.square() / (2 * sigma**2)).exp()
     kernel = kernel / kernel.sum()
@@ -150,5 +175,5 @@ def blur(values: Tensor, columns: int, sigma: float) -> Tensor:
 
 
 def _peak(values: Tensor, columns: int) -> Tensor:
-    """Largest value within one cell's distance."""
+    """Largest value of each cell and its eight neighbours."""
     return F.max_pool2d(values.unflatten(-1, (-1, columns))[:, None], 3, 1, 1)[:, 0].flatten(1)

@@ -1,4 +1,4 @@
-"""Fusion: rules that update a Dirichlet belief with the likelihood of a detection, and a batch of maps with a look."""
+"""Fusion rules: update a Dirichlet belief with the likelihoods of detections."""
 
 from collections.abc import Callable
 
@@ -11,24 +11,24 @@ Rule = Callable[[Tensor, Tensor], Tensor]
 
 
 def kaplan(beta: Tensor, likelihood: Tensor) -> Tensor:
-    r"""Kaplan's rule: match the mean of the exact posterior, keep the least likely class where it is.
+    r"""Kaplan's rule: match the mean of the exact posterior, and keep the parameter of the least likely class.
 
     .. math:: \beta'_k = \beta_k \frac{1 + \lambda_k / D}{1 + \min_j \lambda_j / D}, \quad
               D = \sum_j \beta_j \lambda_j
 
-    (Luzio, Bernardino and Moreno, 2024, equation 7, after Kaplan, Chakraborty and Bisdikian, "Fusion of classifiers: A
-    subjective logic perspective", IEEE Aerospace Conference 2012.) The whole numerator stands over the whole
-    denominator. The exact posterior is a mixture of the Dirichlets Dir(β + e_k) with weights β_k λ_k / D, and its mean
-    is that of Dir(β'). It is computed as `β + β (λ − min λ) / (D + min λ)`, which is the same and adds only terms that
-    are not negative.
+    This is equation 7 of Luzio, Bernardino and Moreno (2024), after Kaplan, Chakraborty and Bisdikian, "Fusion of
+    classifiers: A subjective logic perspective", IEEE Aerospace Conference 2012. The whole numerator is divided by the
+    whole denominator. The exact posterior is a mixture of the Dirichlets Dir(β + e_k) with weights β_k λ_k / D; it has
+    the same mean as Dir(β'). The rule is computed in the equal form `β + β (λ − min λ) / (D + min λ)`, which adds no
+    negative terms.
 
     Args:
         beta: `(..., K+1)`, Dirichlet parameters, positive.
-        likelihood: `(..., K+1)`, λ_k = P(S | C = k) of the scores S that were seen, up to a common factor; not
-            negative, not all zero; broadcasts with `beta`.
+        likelihood: `(..., K+1)`, λ_k = P(S | C = k) of the observed scores S, up to a common factor; not negative,
+            not all zero; broadcasts with `beta`.
 
     Returns:
-        New parameters, `(..., K+1)`, nowhere smaller than `beta`.
+        `(..., K+1)`, new parameters, none smaller than before.
 
     Raises:
         InputError: a likelihood is zero for every class, negative or not finite, or a parameter is not positive.
@@ -41,13 +41,23 @@ def kaplan(beta: Tensor, likelihood: Tensor) -> Tensor:
 
 
 def product(beta: Tensor, likelihood: Tensor) -> Tensor:
-    r"""Product rule: Bayes for a class that is fixed, with one unit of evidence more.
+    r"""Product rule: Bayes' rule for the mean, with one more unit of evidence.
 
     .. math:: \beta'_k = (1 + \sum_j \beta_j) \, \beta_k \lambda_k / \sum_j \beta_j \lambda_j
 
-    The mean is the categorical posterior `p_k λ_k / Σ p λ`. Luzio, Bernardino and Moreno (2024, section III-B) name the
-    product and the sum rule, with which Kaplan et al. (2012) compare theirs, and print neither. That a look adds 1 to
-    the sum of the parameters is our choice. Arguments and errors as for `kaplan`.
+    The mean is the categorical posterior `p_k λ_k / Σ p λ`. Luzio, Bernardino and Moreno (2024, section III-B) name
+    the product rule and the sum rule, with which Kaplan et al. (2012) compare theirs, but give no formulas. It is our
+    choice that a detection adds 1 to the sum of the parameters.
+
+    Args:
+        beta: `(..., K+1)`, Dirichlet parameters, positive.
+        likelihood: `(..., K+1)`, λ, up to a common factor; not negative, not all zero; broadcasts with `beta`.
+
+    Returns:
+        `(..., K+1)`, new parameters.
+
+    Raises:
+        InputError: a likelihood is zero for every class, negative or not finite, or a parameter is not positive.
 
     >>> product(torch.ones(2), torch.tensor([3.0, 1.0]))
     tensor([2.2500, 0.7500])
@@ -61,8 +71,18 @@ def sum(beta: Tensor, likelihood: Tensor) -> Tensor:
 
     .. math:: \beta'_k = \beta_k + \lambda_k / \sum_j \lambda_j
 
-    After n looks the mean is the average of the n normalised likelihoods and of the prior's mean, which counts Σβ
-    times. As with `product`, the form for Dirichlet parameters is our choice. Arguments and errors as for `kaplan`.
+    After n detections the mean is the average of the n normalised likelihoods and the prior's mean, which has the
+    weight Σβ. As for `product`, the form for Dirichlet parameters is our choice.
+
+    Args:
+        beta: `(..., K+1)`, Dirichlet parameters, positive.
+        likelihood: `(..., K+1)`, λ, up to a common factor; not negative, not all zero; broadcasts with `beta`.
+
+    Returns:
+        `(..., K+1)`, new parameters.
+
+    Raises:
+        InputError: a likelihood is zero for every class, negative or not finite, or a parameter is not positive.
 
     >>> sum(torch.ones(2), torch.tensor([3.0, 1.0]))
     tensor([1.7500, 1.2500])
@@ -72,22 +92,55 @@ def sum(beta: Tensor, likelihood: Tensor) -> Tensor:
 
 
 def kaplan_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
-    """`kaplan` for likelihoods that `scale_likelihood` has checked and scaled."""
+    """Kaplan's rule (`kaplan`) without checks, for scaled likelihoods.
+
+    Args:
+        beta: `(..., K+1)`, Dirichlet parameters, positive.
+        scaled: `(..., K+1)`, likelihoods from `scale_likelihood`.
+
+    Returns:
+        `(..., K+1)`, new parameters.
+
+    >>> kaplan_scaled(torch.ones(2), torch.tensor([1.0, 0.5]))
+    tensor([1.2500, 1.0000])
+    """
     least = scaled.amin(-1, keepdim=True)
     expected = (beta * scaled).sum(-1, keepdim=True)
     return torch.addcdiv(beta, beta * (scaled - least), expected + least)
 
 
 def product_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
-    """`product` for likelihoods that `scale_likelihood` has checked and scaled."""
+    """Product rule (`product`) without checks, for scaled likelihoods.
+
+    Args:
+        beta: `(..., K+1)`, Dirichlet parameters, positive.
+        scaled: `(..., K+1)`, likelihoods from `scale_likelihood`.
+
+    Returns:
+        `(..., K+1)`, new parameters.
+
+    >>> product_scaled(torch.ones(2), torch.tensor([1.0, 0.5]))
+    tensor([2., 1.])
+    """
     joint = beta * scaled
-    # A floor keeps parameters positive where many likelihoods of 0 in a row would leave none.
+    # The floor keeps parameters positive after any number of likelihoods of 0.
     joint = joint.clamp(min=torch.finfo(joint.dtype).tiny)
     return (1 + beta.sum(-1, keepdim=True)) * joint / joint.sum(-1, keepdim=True)
 
 
 def sum_scaled(beta: Tensor, scaled: Tensor) -> Tensor:
-    """`sum` for likelihoods that `scale_likelihood` has checked and scaled."""
+    """Sum rule (`sum`) without checks, for scaled likelihoods.
+
+    Args:
+        beta: `(..., K+1)`, Dirichlet parameters, positive.
+        scaled: `(..., K+1)`, likelihoods from `scale_likelihood`.
+
+    Returns:
+        `(..., K+1)`, new parameters.
+
+    >>> sum_scaled(torch.ones(2), torch.tensor([1.0, 0.25]))
+    tensor([1.8000, 1.2000])
+    """
     return beta + scaled / scaled.sum(-1, keepdim=True)
 
 
@@ -95,20 +148,45 @@ RULES: dict[str, Rule] = {"kaplan": kaplan_scaled, "product": product_scaled, "s
 
 
 def check_parameters(beta: Tensor) -> None:
-    """Raise `InputError` unless Dirichlet parameters are positive and finite."""
+    """Check that Dirichlet parameters are positive and finite.
+
+    Args:
+        beta: `(...)`, the parameters.
+
+    Raises:
+        InputError: one is not.
+
+    >>> check_parameters(torch.tensor([1.0, 0.0]))
+    Traceback (most recent call last):
+    ...
+    semfov.errors.InputError: beta: expected positive, finite Dirichlet parameters, got 0 to 1
+    """
     if not beta.numel() or not values_known(beta):
         return
-    # NaN survives both.
+    # The minimum and the maximum of a tensor with a NaN are NaN.
     least, largest = beta.detach().aminmax()
     usable = bool((least > 0) & (largest < torch.inf))
     check(usable, "beta", "positive, finite Dirichlet parameters", f"{float(least):g} to {float(largest):g}")
 
 
 def scale_likelihood(likelihood: Tensor) -> Tensor:
-    """Check likelihoods and scale each row to a largest value of 1 (every rule is blind to a common factor)."""
+    """Check likelihoods, and scale each row to a maximum of 1. No fusion rule depends on a common factor.
+
+    Args:
+        likelihood: `(..., K+1)`, not negative, not all zero in a row.
+
+    Returns:
+        `(..., K+1)`, scaled.
+
+    Raises:
+        InputError: a row is zero, or a likelihood is negative or not finite.
+
+    >>> scale_likelihood(torch.tensor([0.1, 0.4]))
+    tensor([0.2500, 1.0000])
+    """
     largest = likelihood.amax(-1, keepdim=True)
     if values_known(likelihood):
-        # NaN and infinity survive the maximum and the minimum, so two reductions answer everything.
+        # NaN and infinity pass through the maximum and the minimum, so two reductions check every condition.
         least = likelihood.detach().amin()
         usable = bool((least >= 0) & ((largest > 0) & (largest < torch.inf)).all()) if likelihood.numel() else True
         check(usable, "likelihood", "finite values, none negative, not all zero", _describe(likelihood))
@@ -124,23 +202,27 @@ def _describe(likelihood: Tensor) -> str:
 def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kaplan") -> Tensor:
     """Update every cell with the detections that cover it, one after another.
 
-    Kaplan's rule depends on their order. Luzio, Bernardino and Moreno (2024, section IV-A) fuse them "in no particular
-    order"; here it is the order of the rows, and our detectors give the most confident first.
+    The result of Kaplan's rule depends on the order of the detections. Luzio, Bernardino and Moreno (2024, section
+    IV-A) fuse them "in no particular order". Here it is the order of the rows; our detectors put the most confident
+    detection first.
 
-    Cells are independent, so the r-th detection of every cell of every map is fused in the same step: there are as
-    many steps as detections pile up on one cell, not as there are detections, and only covered cells are touched.
-    Where a graph is traced, and inside `torch.func.vmap`, every detection is a step and meets every cell: the shape of
-    the graph may not depend on what was seen.
+    Cells are independent of each other, so one step fuses the r-th detection of every cell of every map. The number of
+    steps is therefore the largest number of detections on one cell, not the number of detections, and only covered
+    cells are computed. While a graph is traced, and inside `torch.func.vmap`, the shape of the graph must not depend
+    on the detections: each detection is then a step of its own, over all cells.
 
     Args:
-        beta: `(B, X·Y, K+1)`, Dirichlet parameters.
+        beta: `(B, X·Y, K+1)`, Dirichlet parameters, positive.
         likelihood: `(B, L, K+1)`, likelihoods of the classes given each detection, in order of fusion.
-        footprint: `(B, L, X·Y)`, the cells that each detection updates (false or 0 for padding): boolean, or weights
-            in [0, 1] that are taken as exponents of the likelihood.
+        footprint: `(B, L, X·Y)`, the cells that each detection updates, false or 0 for padding: boolean, or weights
+            in [0, 1] that are used as exponents of the likelihood.
         rule: `kaplan`, `product` or `sum` (`semfov.fusion`).
 
     Returns:
-        New parameters `(B, X·Y, K+1)`.
+        `(B, X·Y, K+1)`, new parameters.
+
+    Raises:
+        InputError: shapes do not fit, the rule is unknown, or a value is out of range.
 
     >>> fuse(torch.ones(1, 2, 2), torch.tensor([[[0.0, 1.0]]]), torch.tensor([[[True, False]]]))
     tensor([[[1., 2.],
@@ -176,12 +258,12 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
 
 
 def _scaled(likelihood: Tensor, covered: Tensor) -> Tensor:
-    """Scaled likelihoods. Padding may hold zeros, which no rule accepts; nothing reads it."""
+    """Scaled likelihoods, with ones for padding, which may hold zeros that no rule accepts."""
     return scale_likelihood(torch.where(covered.any(-1, keepdim=True), likelihood, 1.0))
 
 
 def _fuse_one_by_one(beta: Tensor, evidence: Tensor, footprint: Tensor, update: Rule) -> Tensor:
-    """`fuse` as one graph, from scaled likelihoods."""
+    """`fuse` as one graph, given scaled likelihoods."""
     for number in range(evidence.shape[1]):
         said, covers = evidence[:, number, None], footprint[:, number, :, None]
         if covers.is_floating_point():

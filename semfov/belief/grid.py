@@ -1,4 +1,4 @@
-"""The grid of cells over an image: centres, which cells a box covers, distances to the fixation."""
+"""The grid of cells over an image: centres, cells that a box covers, and distances to the fixation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,13 +16,16 @@ Footprint = Literal["overlap", "centre", "box_centre", "soft"]
 class Grid:
     """`columns` × `rows` equal cells over an image, numbered row by row: `cell = row * columns + column`.
 
-    Points have pixel centres at integers; box edges count from the image's left and top edge (COCO), so a point
-    `p` lies at `p + 0.5` on the scale of the boxes.
+    For points, pixel centres are at integers. For boxes, coordinates count from the left and top edge of the image, as
+    in COCO. A point `p` is therefore at `p + 0.5` in the coordinates of boxes.
 
     Args:
-        columns: number of cells in a row, X.
-        rows: number of cells in a column, Y.
-        size: `(width, height)` in pixels of one image, or a tensor `(B, 2)`, one row for each image of a batch.
+        columns: X, number of cells in a row.
+        rows: Y, number of cells in a column.
+        size: `(width, height)` of one image in pixels, or a tensor `(B, 2)` with one row for each image of a batch.
+
+    Raises:
+        InputError: a number is not positive, or the shape of `size` is wrong.
 
     >>> grid = Grid(4, 2, (640, 480))
     >>> grid.centres[5]
@@ -66,9 +69,19 @@ class Grid:
         return self.extent / self.extent.new_tensor([self.columns, self.rows])
 
     def cell_of(self, points: Tensor) -> Tensor:
-        """Cell in which each point `(..., 2)` lies, `(...)`; a point outside counts to the nearest cell.
+        """Cell that holds each point; for a point outside the image, the nearest cell.
 
-        With a batch of sizes `(B, 2)` the points are `(B, ..., 2)`.
+        Args:
+            points: `(..., 2)`, as `(x, y)` in pixels; `(B, ..., 2)` for a batch of sizes.
+
+        Returns:
+            `(...)` int64, cell numbers.
+
+        Raises:
+            InputError: a coordinate is not finite, or the shape is wrong.
+
+        >>> Grid(4, 2, (640, 480)).cell_of(torch.tensor([[0.0, 0.0], [200.0, 300.0]]))
+        tensor([0, 5])
         """
         check_shape(points, "points", 2)
         _check_numbers(points, "points")
@@ -78,21 +91,30 @@ class Grid:
         return row * self.columns + column
 
     def footprint(self, boxes: Tensor, rule: Footprint = "overlap") -> Tensor:
-        r"""Which cells each box covers, `(..., L, X·Y)`, for boxes `(..., L, 4)`; boolean, or weights if `soft`.
+        r"""Cells that each box covers.
 
         - `overlap`: cells that share a positive area with the box. Luzio, Bernardino and Moreno (2024, section IV-A)
           update the cells that a detection overlaps; the other rules are not theirs.
-        - `centre`: cells whose centre lies in the box, or the cell of the box's centre where there is none.
-        - `box_centre`: only the cell in which the centre of the box lies.
-        - `soft`: cells that share an area with the box, with weights that fall off towards its borders, for objects
-          rarely fill the corners of their boxes. For a box of half sizes (a, b), a cell of half sizes (u, v) and the
-          offset (x, y) between their centres,
+        - `centre`: cells whose centre lies in the box; if there are none, the cell that holds the centre of the box.
+        - `box_centre`: only the cell that holds the centre of the box.
+        - `soft`: cells that share a positive area with the box, with weights that fall off towards its borders,
+          because objects rarely fill the corners of their boxes. For a box of half sizes (a, b), a cell of half sizes
+          (u, v) and the offset (x, y) between their centres,
 
           .. math:: w = \exp\left(-\frac{x^2}{2 (a^2 + u^2)/3} - \frac{y^2}{2 (b^2 + v^2)/3}\right),
 
           a normal window with the variance of a uniform box blurred by the cell.
 
-        With a batch of sizes `(B, 2)` the boxes are `(B, L, 4)`. Boxes without area cover nothing.
+        Args:
+            boxes: `(..., L, 4)`, as `(x1, y1, x2, y2)` in pixels; `(B, L, 4)` for a batch of sizes. A box without area
+                covers no cell.
+            rule: `overlap`, `centre`, `box_centre` or `soft`.
+
+        Returns:
+            `(..., L, X·Y)`, boolean; weights in [0, 1] for `soft`.
+
+        Raises:
+            InputError: a coordinate is not finite, the shape is wrong, or the rule is unknown.
 
         >>> Grid(2, 1, (10, 10)).footprint(torch.tensor([[1.0, 1.0, 5.0, 5.0], [4.0, 0.0, 6.0, 2.0]]))
         tensor([[ True, False],
@@ -118,10 +140,23 @@ class Grid:
         return central & full[..., None]
 
     def box_distance(self, boxes: Tensor, fixation: Tensor) -> Tensor:
-        """Distance from the centre of each box `(..., L, 4)` to the fixation `(..., 2)`, `(..., L)`.
+        """Distance from the centre of each box to the fixation.
 
-        It is the d = ‖(u, v)‖ of Luzio, Bernardino and Moreno (2024, section III-D), here in units of the image's
-        longer side, so that one observation model serves every resolution.
+        This is d = ‖(u, v)‖ of Luzio, Bernardino and Moreno (2024, section III-D), here in units of the image's longer
+        side, so that one observation model serves every resolution.
+
+        Args:
+            boxes: `(..., L, 4)`, as `(x1, y1, x2, y2)` in pixels.
+            fixation: `(..., 2)`, as `(x, y)` in pixels.
+
+        Returns:
+            `(..., L)`, in units of the image's longer side.
+
+        Raises:
+            InputError: a coordinate is not finite, or a shape is wrong.
+
+        >>> Grid(2, 1, (10, 10)).box_distance(torch.tensor([[4.0, 4.0, 6.0, 6.0]]), torch.tensor([4.5, 9.5]))
+        tensor([0.5000])
         """
         check_shape(boxes, "boxes", None, 4)
         check_shape(fixation, "fixation", 2)
@@ -132,9 +167,16 @@ class Grid:
         return offset / self.extent.amax(-1)[..., None].to(offset)
 
     def distance(self, fixation: Tensor) -> Tensor:
-        """Distance from each fixation `(..., 2)` to the centre of every cell, `(..., X·Y)`, in longer sides.
+        """Distance from each fixation to the centre of every cell.
 
-        With a batch of sizes `(B, 2)` the fixations are `(B, 2)`.
+        Args:
+            fixation: `(..., 2)`, as `(x, y)` in pixels; `(B, 2)` for a batch of sizes.
+
+        Returns:
+            `(..., X·Y)`, in units of the image's longer side.
+
+        Raises:
+            InputError: the shape is wrong.
 
         >>> Grid(2, 1, (10, 10)).distance(torch.tensor([2.0, 4.5]))
         tensor([0.0000, 0.5000])
@@ -144,7 +186,7 @@ class Grid:
         return torch.linalg.vector_norm(offset, dim=-1) / self.extent.amax(-1).to(fixation)[..., None]
 
     def _window(self, boxes: Tensor) -> Tensor:
-        """Weights of the `soft` footprint, before cells that a box does not touch are taken out."""
+        """Weights of the `soft` footprint, including cells that a box does not overlap."""
         half = self._align(self._cell_size(), boxes[..., :2])[..., None, :] / 2
         box_half = (boxes[..., None, 2:] - boxes[..., None, :2]) / 2
         middle = (boxes[..., None, :2] + boxes[..., None, 2:]) / 2
@@ -153,9 +195,9 @@ class Grid:
 
     @property
     def cell_distance(self) -> Tensor:
-        """Distance between the centres of every two cells, `(X·Y, X·Y)` or `(B, X·Y, X·Y)`, in longer sides.
+        """Distance between the centres of each pair of cells, in longer sides: `(X·Y, X·Y)` or `(B, X·Y, X·Y)`.
 
-        It is the d' = ‖x − f'‖ with which Luzio, Bernardino and Moreno (2024, equation 16) predict scores.
+        Luzio, Bernardino and Moreno (2024, equation 16) predict scores at this distance d' = ‖x − f'‖.
         """
         if self.extent.ndim == 1:
             return self.distance(self.centres)
@@ -169,7 +211,7 @@ class Grid:
         return torch.arange(count + 1, device=extent.device) * (extent / count)
 
     def _align(self, values: Tensor, points: Tensor) -> Tensor:
-        """Per-image values `(B, 2)` as a shape that broadcasts over points `(B, ..., 2)`."""
+        """Reshape per-image values `(B, 2)` so that they broadcast over points `(B, ..., 2)`."""
         extra = points.ndim - values.ndim
         aligned = values if values.ndim == 1 else values.reshape(values.shape[0], *[1] * extra, 2)
         return aligned.to(points)
@@ -181,12 +223,12 @@ def _check_numbers(values: Tensor, argument: str) -> None:
 
 
 def _overlaps(borders: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Which intervals between successive `borders` share a positive length with `low`..`high`."""
+    """Whether each interval between successive `borders` shares a positive length with `low`..`high`."""
     return (borders[..., :-1] < high) & (borders[..., 1:] > low)
 
 
 def check_cells(grid: tuple[int, int]) -> None:
-    """Raise `InputError` unless this is a grid, `(columns, rows)`."""
+    """Raise `InputError` unless this is `(columns, rows)`, whole numbers from 1 to 200."""
     check(isinstance(grid, Sequence) and len(grid) == 2, "grid", "(columns, rows)", grid)
     for side in grid:
         check_whole(side, "grid", 1, 200)

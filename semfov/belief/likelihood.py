@@ -1,4 +1,4 @@
-"""What a detection says about the class of a cell: the likelihood of its scores."""
+"""Likelihoods of the classes, given the scores of a detection."""
 
 from typing import Protocol
 
@@ -11,10 +11,26 @@ from semfov.errors import check, check_shape
 
 
 class Observation(Protocol):
-    """A model that turns scores seen at a distance into likelihoods (`semfov.FovealObservationModel`)."""
+    """Protocol of a model that turns scores at a distance into likelihoods, as `semfov.FovealObservationModel` does.
+
+    >>> class Sharpened:
+    ...     def calibrate(self, scores, distance):
+    ...         return scores.square()
+    >>> seen = Detections(torch.tensor([[[0.0, 0, 4, 4]]]), torch.tensor([[[0.4, 0.6]]]), torch.ones(1, 1).bool())
+    >>> likelihoods(seen, torch.zeros(1, 2), Grid(2, 1, (10, 10)), Sharpened())
+    tensor([[[0.1600, 0.3600]]])
+    """
 
     def calibrate(self, scores: Tensor, distance: Tensor) -> Tensor:
-        """Likelihoods `(..., K+1)` up to a common factor, for scores `(..., K+1)` at distances `(...)`."""
+        """Likelihoods of the classes, up to a common factor.
+
+        Args:
+            scores: `(..., K+1)`, score vectors, background first.
+            distance: `(...)`, from the fixation to the centre of the box, in units of the image's longer side.
+
+        Returns:
+            `(..., K+1)`.
+        """
         ...
 
 
@@ -26,24 +42,30 @@ def likelihoods(
     *,
     tempering: float = 1.0,
 ) -> Tensor:
-    r"""Likelihood of every class given each detection, up to a factor, `(B, L, K+1)`; uniform for padding.
+    r"""Likelihood of every class given each detection, up to a common factor.
 
-    The likelihoods are the scores as they are, or what the observation model calibrates them to
-    (Luzio, Bernardino and Moreno, 2024, section III-B and equation 11):
+    The likelihoods are the raw scores, or the scores calibrated by an observation model (Luzio, Bernardino and Moreno,
+    2024, section III-B and equation 11):
 
     .. math:: \lambda_k = s_k \quad \text{or} \quad \lambda_k \propto p(S \mid C = k, d)
 
-    With a class prior in the model λ is the posterior, and the prior counts anew with every detection.
+    If the model has a class prior, λ is the posterior, and the prior counts again with every detection.
 
-    Successive looks at a static scene are not independent. With `tempering` τ < 1 a likelihood counts as
-    :math:`\lambda_k^\tau`, which is not in the paper.
+    Successive looks at a static scene are not independent. A `tempering` τ < 1 replaces the likelihood by
+    :math:`\lambda_k^\tau`; this is not in the paper.
 
     Args:
-        detections: boxes in pixels of the grid's image, batch `(B, L)`.
-        fixation: `(B, 2)`, where each image of the batch was fixated.
+        detections: a batch `(B, L)`, boxes in pixels of the grid's image.
+        fixation: `(B, 2)`, fixation in each image of the batch, in pixels.
         grid: the cells.
-        observation: calibrates the scores by class and distance; None takes the raw scores as likelihoods.
-        tempering: exponent τ of the likelihoods.
+        observation: model that calibrates the scores by distance; None uses the raw scores.
+        tempering: exponent τ of the likelihoods, positive.
+
+    Returns:
+        `(B, L, K+1)`, λ; padding counts as uniform scores.
+
+    Raises:
+        InputError: the shape of `fixation` does not fit, or `tempering` is not positive.
 
     >>> seen = Detections(torch.tensor([[[0.0, 0, 4, 4]]]), torch.tensor([[[0.36, 0.64]]]), torch.ones(1, 1).bool())
     >>> likelihoods(seen, torch.zeros(1, 2), Grid(2, 1, (10, 10)), tempering=0.5)
@@ -51,7 +73,7 @@ def likelihoods(
     """
     check_shape(fixation, "fixation", detections.mask.shape[0], 2)
     check(tempering > 0, "tempering", "a positive number", tempering)
-    # Padding has no scores that a model could read.
+    # Padding may have scores that a model refuses.
     uniform = torch.full_like(detections.scores, 1 / detections.scores.shape[-1])
     likelihood = torch.where(detections.mask[..., None], detections.scores, uniform)
     if observation is not None:

@@ -1,4 +1,4 @@
-"""What a look shows of a target in each cell, as a few numbers that do not depend on the class."""
+"""Features of a look for a target in each cell: a few numbers whose meaning does not depend on the class."""
 
 import torch
 from torch import Tensor
@@ -12,9 +12,18 @@ _FLOOR = 1e-6
 
 
 def highest_score(detections: Detections, target: int | Tensor) -> Tensor:
-    """Highest score of a class among the detections of each look, `(B,)`; 0 where there are none.
+    """Highest score of a class among the detections of each look; 0 without detections.
 
-    Of several classes `(T,)` that of each, `(B, T)`.
+    Args:
+        detections: a batch of B looks.
+        target: a class, or several `(T,)`.
+
+    Returns:
+        `(B,)`, or `(B, T)` for several classes.
+
+    >>> seen = Detections(torch.zeros(1, 2, 4), torch.tensor([[[0.2, 0.8], [0.7, 0.3]]]), torch.ones(1, 2).bool())
+    >>> highest_score(seen, 1)
+    tensor([0.8000])
     """
     scores = detections.scores * detections.mask[..., None]
     highest = scores.amax(1) if scores.shape[1] else scores.new_zeros(len(scores), scores.shape[-1])
@@ -22,20 +31,33 @@ def highest_score(detections: Detections, target: int | Tensor) -> Tensor:
 
 
 def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: int) -> Tensor:
-    r"""Describe what looks show of `target` in every cell, `(B, X·Y, 10)`.
+    r"""Ten features that describe the evidence of looks for a target in every cell.
 
-    With :math:`s_l` the scores of detection l, :math:`w_l(x)` its weight in cell x (the `soft` footprint of `Grid`),
-    and b the detection with the largest :math:`s_{lt} w_l(x)`, they are, each scaled to about unit size: the distance
-    from the fixation to the cell; :math:`\ln s_{bt} w_b`; :math:`\ln \max_l s_{lt}` over the detections that touch the
-    cell; of b the objectness :math:`1 - s_{b0}`, the weight, the size, and the share of the target in the objectness;
-    the strongest objectness :math:`\max_l (1 - s_{l0}) w_l`, and of other classes :math:`\max_l (1 - s_{l0} - s_{lt})
-    w_l`; and whether no detection touches the cell.
+    Let :math:`s_l` be the scores of detection l, :math:`w_l(x)` its weight in cell x (the `soft` footprint of `Grid`),
+    and b the detection with the largest :math:`s_{lt} w_l(x)`. The features, each scaled to about unit size, are
+
+    1. the distance from the fixation to the cell,
+    2. :math:`\ln s_{bt} w_b`,
+    3. :math:`\ln \max_l s_{lt}` over the detections that overlap the cell,
+    4. the objectness of b, :math:`1 - s_{b0}`,
+    5. the weight of b,
+    6. the size of b,
+    7. the share of the target in the objectness of b,
+    8. the strongest objectness, :math:`\max_l (1 - s_{l0}) w_l`,
+    9. the strongest evidence for other classes, :math:`\max_l (1 - s_{l0} - s_{lt}) w_l`,
+    10. whether no detection overlaps the cell.
 
     Args:
         detections: a batch `(B, L)` of looks, boxes in pixels of the grid's image.
-        fixation: `(B, 2)`.
+        fixation: `(B, 2)`, as `(x, y)` in pixels.
         grid: the cells of one image.
         target: class 1..K.
+
+    Returns:
+        `(B, X·Y, 10)`.
+
+    Raises:
+        InputError: the class is out of range, or the shape of `fixation` does not fit.
     """
     components = detections.scores.shape[-1]
     check(1 <= target < components, "target", f"a class from 1 to {components - 1}", target)
@@ -44,7 +66,7 @@ def look_features(detections: Detections, fixation: Tensor, grid: Grid, target: 
 
 
 def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets: Tensor) -> Tensor:
-    """`look_features` of several classes `(T,)`, `(B, T, X·Y, 10)`."""
+    """`look_features` for several classes `(T,)`: `(B, T, X·Y, 10)`."""
     batch = detections.mask.shape[0]
     check_shape(fixation, "fixation", batch, 2)
     components = detections.scores.shape[-1]
@@ -52,7 +74,7 @@ def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets
     if detections.mask.shape[1] == 0:
         nothing = fixation.new_zeros(batch, 1, components)
         detections = Detections(fixation.new_zeros(batch, 1, 4), nothing, nothing[..., 0] > 0)
-    # Looks, classes, detections, cells.
+    # Dimensions: looks, classes, detections, cells.
     weight = (grid.footprint(detections.boxes, "soft") * detections.mask[..., None])[:, None]
     touches = weight > 0
     score = detections.scores[..., targets].transpose(1, 2)[..., None]
@@ -60,7 +82,7 @@ def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets
     strongest, best = (score * weight).max(2)
 
     def of_best(values: Tensor) -> Tensor:
-        """Of each class's best detection in each cell, from `(B, 1 or T, L, 1 or X·Y)`."""
+        """Select the value of the best detection of each class in each cell, from `(B, 1 or T, L, 1 or X·Y)`."""
         wide = values.expand(batch, len(targets), *weight.shape[2:])
         return wide.gather(2, best[:, :, None])[:, :, 0] * seen
 
@@ -83,7 +105,13 @@ def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets
 
 
 def nothing_seen(distance: Tensor) -> Tensor:
-    """`look_features` `(..., 10)` of cells at distances `(...)` that no detection touches, in a look without any.
+    """`look_features` for a look without detections.
+
+    Args:
+        distance: `(...)`, from the fixation to the cells, in longer sides of the image.
+
+    Returns:
+        `(..., 10)`.
 
     >>> nothing_seen(torch.tensor([0.5])).shape
     torch.Size([1, 10])

@@ -1,4 +1,4 @@
-"""Learned evidence for a map: the probability of every class, and of none, in every cell."""
+"""Learned evidence for a map: the probability of every class, and of background, in every cell."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,31 +17,40 @@ from semfov.io.schema import Field, Number, Pair, Schema, perceptron
 _EMPTINESS = 9
 _GAIN = 7
 
-# Of a distance in float32, in longer sides of the image.
+# Rounding error of a distance in float32, in longer sides of the image.
 _ROUNDING = 1e-6
 
 
 class MapEvidence(Evidence):
     r"""Probability of every class in every cell, learned from looks at photographs with boxes.
 
-    Each class is weighed as in `Evidence`, with the strongest evidence :math:`r` of the other classes in the cell
-    beside it. Several classes can share a cell: their probabilities need not sum to 1. That a cell holds none, the
-    background, is told by a network of its own,
+    Each class is treated as in `Evidence`, with one more input: the strongest evidence :math:`r` of the other classes
+    in the cell. Several classes can share a cell, so their probabilities need not sum to 1. A second network gives the
+    probability that a cell holds no object (background):
 
     .. math:: \operatorname{logit} P(\emptyset \in x) = \operatorname{logit} \prod_k (1 - P(k \in x)) + v(\cdot)
 
-    and another one learns how many more cells a look will name right:
+    A third network predicts how many more cells will be classified correctly after a look at f:
 
     .. math:: E[\Delta \mid f] = \sum_x w\bigl(p_{(1)}(x), p_{(2)}(x), P(\emptyset \in x), d^*(x), d(x, f), n\bigr)
 
-    with the two greatest probabilities of the cell, the distance of its closest look and of the next, and the number of
-    looks. Classes are as frequent as in the photographs that it was trained on.
+    where :math:`p_{(1)}` and :math:`p_{(2)}` are the two largest class probabilities of the cell, :math:`d^*` is the
+    distance to its closest fixation, and n is the number of looks. The class frequencies are those of the photographs
+    that the model was trained on.
 
     Args:
         look_width: hidden units of g.
         readout_width: hidden units of h, v and w.
-        components: classes of the detector, background included.
-        metadata: JSON values kept with the model: `detector` and `sensor` (settings it was trained for).
+        components: K + 1, number of classes of the detector with background.
+        metadata: JSON values saved with the model: `detector` and `sensor` (the settings it was trained for).
+
+    Raises:
+        InputError: a width or the number of classes is out of range.
+
+    >>> model = MapEvidence(8, 4, components=3)  # not trained yet
+    >>> seen = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 3), torch.zeros(1, 0, dtype=torch.bool))
+    >>> model(seen, torch.zeros(1, 2), Grid(4, 4, (80, 80)), torch.tensor([1, 2])).shape
+    torch.Size([1, 2, 16])
     """
 
     kind: ClassVar[str] = "map-evidence"
@@ -78,16 +87,29 @@ class MapEvidence(Evidence):
         self.worth = network(_GAIN, readout_width)
 
     def forward(self, detections: Detections, fixation: Tensor, grid: Grid, targets: Tensor) -> Tensor:
-        """Evidence of each look for classes `(T,)`, `(B, T, X·Y)`; arguments as for `class_features`."""
+        """Evidence of each look for several classes in every cell.
+
+        Args:
+            detections: a batch `(B, L)` of looks, boxes in pixels of the grid's image.
+            fixation: `(B, 2)`, as `(x, y)` in pixels.
+            grid: the cells of one image.
+            targets: `(T,)`, classes 1..K.
+
+        Returns:
+            `(B, T, X·Y)`, log odds.
+        """
         return self.evidence(class_features(detections, fixation, grid, targets))
 
     def log_odds(self, gathered: Gathered, columns: int, classes: int) -> Tensor:
-        """Log odds of each class in each cell after several looks, `(B, T, X·Y)`.
+        """Log odds of each class in each cell after several looks.
 
         Args:
-            gathered: what the looks say, a row for each episode and class, `(B·T, ...)`.
-            columns: cells in a row.
+            gathered: evidence of the looks, one row for each episode and class, `(B·T, ...)`.
+            columns: X, cells in a row.
             classes: T, 2 or more.
+
+        Returns:
+            `(B, T, X·Y)`.
         """
         nearest = gathered.nearest.unflatten(0, (-1, classes))
         greatest = nearest.topk(2, 1)
@@ -99,14 +121,17 @@ class MapEvidence(Evidence):
     def emptiness(
         self, log_odds: Tensor, distance: Tensor, looks: Tensor, columns: int, stands_for: Tensor | None = None
     ) -> Tensor:
-        """Log odds that a cell holds nothing, `(B, X·Y)`.
+        """Log odds that a cell holds no object.
 
         Args:
-            log_odds: `(B, T, X·Y)`.
-            distance: `(B, X·Y)`, of the closest look.
-            looks: `(B,)`, how many there were.
-            columns: cells in a row.
-            stands_for: `(B, T)`, how many classes each one stands for, where not all are given; None: one.
+            log_odds: `(B, T, X·Y)`, log odds of the classes (`log_odds`).
+            distance: `(B, X·Y)`, from each cell to its closest fixation, in longer sides of the image.
+            looks: `(B,)`, number of looks.
+            columns: X, cells in a row.
+            stands_for: `(B, T)`, number of classes that each given class represents, where T < K; None is 1 for each.
+
+        Returns:
+            `(B, X·Y)`.
         """
         each = torch.nn.functional.logsigmoid(-log_odds)
         none = (each if stands_for is None else each * stands_for[..., None]).sum(1)
@@ -127,13 +152,16 @@ class MapEvidence(Evidence):
         return none - anything.clamp(min=1e-6).log() + value[..., 0]
 
     def gain(self, probabilities: Tensor, closest: Tensor, looks: Tensor, distance: Tensor) -> Tensor:
-        """How many more cells a look is expected to name right, by cell, `(B, F, X·Y)`.
+        """Expected increase in the number of correctly classified cells after one more look, cell by cell.
 
         Args:
-            probabilities: `(B, X·Y, K+1)`, of a map.
-            closest: `(B, X·Y)`, distance of the closest look so far.
-            looks: `(B,)`, how many there were.
-            distance: `(B, F, X·Y)`, from each of F possible fixations to every cell, or `(F, X·Y)`.
+            probabilities: `(B, X·Y, K+1)`, class probabilities of a map, background first.
+            closest: `(B, X·Y)`, from each cell to its closest fixation so far, in longer sides of the image.
+            looks: `(B,)`, number of looks so far.
+            distance: `(B, F, X·Y)` or `(F, X·Y)`, from each of F possible fixations to every cell.
+
+        Returns:
+            `(B, F, X·Y)`; the sum over the cells is the expected increase for a fixation.
         """
         objects, nothing = probabilities[..., 1:].topk(2, -1).values, probabilities[..., 0]
         nearer = (closest[:, None] - distance).clamp(min=0)
@@ -147,16 +175,16 @@ class MapEvidence(Evidence):
             looks[:, None, None].log() / 2,
         ]
         value: Tensor = self.worth(torch.stack([each.expand_as(nearer) for each in inputs], -1))
-        # As far is no nearer, however the two distances were rounded.
+        # Two equal distances may differ by rounding; such a look is not closer.
         return value[..., 0] * (nearer > _ROUNDING)
 
     def _record(self) -> dict[str, Any]:
-        """Widths of the networks and number of classes."""
+        """The widths of the networks and the number of classes."""
         return {"widths": self.widths, "components": len(self.prior)}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The networks from what was kept."""
+        """The model with the saved tensors and record."""
         model = cls(*record["widths"], components=record["components"], metadata=record["metadata"])
         model.load_state_dict(tensors)
         return model

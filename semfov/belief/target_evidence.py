@@ -1,4 +1,4 @@
-"""Learned evidence for a target: what one look says of a cell, what all looks say of it, and of the whole image."""
+"""Learned evidence for a target: in a cell from one look, in a cell from all looks, and in the whole image."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -15,21 +15,24 @@ from semfov.detection.detections import Detections
 from semfov.io.schema import Field, Maybe, Number, Object, Pair, Schema, perceptron
 
 _PRESENCE = 9
-# Log odds of a cell that does not hold the target.
+# Log odds for a cell that is assumed not to hold the target.
 _EMPTY = -8.0
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Probabilities at which a search decides.
+    """Thresholds on probabilities at which a search decides.
 
     Attributes:
-        confirm: that the image holds the target, from which on it is found, once a cell about as probable as any was
-            fixated.
-        give_up: that a cell not fixated yet holds the target if no fixated cell does; where none reaches it, no look is
-            worth its price.
-        place: that the fixated cell itself holds the target: where it is less, the image may well hold it, but it was
-            not seen where.
+        confirm: least probability that the image holds the target for a search to end with `found`. A cell nearly as
+            probable as the most probable one must have been fixated, too.
+        give_up: least probability for a cell to be worth a look, given that no fixated cell holds the target. A search
+            ends when no remaining cell reaches it.
+        place: least probability that the fixated cell itself holds the target, for `found`. Below it the image may
+            hold the target, but its place is not known.
+
+    >>> Thresholds(confirm=0.9, give_up=0.3).changed(confirm=0.8)
+    Thresholds(confirm=0.8, give_up=0.3, place=0.0)
     """
 
     confirm: float
@@ -39,7 +42,7 @@ class Thresholds:
     def changed(
         self, confirm: float | None = None, give_up: float | None = None, place: float | None = None
     ) -> "Thresholds":
-        """The same with those that are given instead."""
+        """Copy with other values; None keeps a value."""
         given = {"confirm": confirm, "give_up": give_up, "place": place}
         return replace(self, **{name: value for name, value in given.items() if value is not None})
 
@@ -47,26 +50,32 @@ class Thresholds:
 THRESHOLDS = Maybe(
     Object({"confirm": Number(0, 1), "give_up": Number(0, 1), "place": Number(0, 1)}, required=("confirm", "give_up"))
 )
-"""As a file keeps them."""
+"""Schema of thresholds in the file of a model."""
 
 
 class TargetEvidence(Evidence):
-    r"""Probability that a cell, and the image, holds the target: learned from looks at photographs with boxes.
+    r"""Probability that a cell, and that the image, holds the target; learned from looks at photographs with boxes.
 
-    To what `Evidence` says of every cell comes whether the image holds the target at all:
+    `Evidence` gives the probability for every cell. This model adds the probability that the image holds the target:
 
     .. math:: \operatorname{logit} P(t \mid f_1 \ldots f_n) = \max_x \operatorname{logit} P(t \in x) + j(\cdot)
 
-    All looks count, those at the target and those at cells that do not hold it: what is fixated is known best. Where
-    to look next is another question: a search goes on because no fixated cell holds the target, and a network like h
-    tells the odds of that case (`chance`). Half of the searches that it was trained on had no target to find.
+    All looks count, at the target and elsewhere; the belief is most certain about fixated cells. The choice of the next
+    fixation needs another probability: a search continues only if no fixated cell holds the target. A further network,
+    of the same form as h, gives the odds for this case (`chance`). In half of the searches that the model was trained
+    on, the photograph did not hold the target.
 
     Args:
         look_width: hidden units of g.
         readout_width: hidden units of h and of j.
-        components: classes of the detector, background included.
-        thresholds: at which searches decide; None where none were chosen.
-        metadata: JSON values kept with the model: `detector` and `sensor` (settings it was trained for).
+        components: K + 1, number of classes of the detector with background.
+        thresholds: thresholds at which searches decide; None if none were chosen.
+        metadata: JSON values saved with the model: `detector` and `sensor` (the settings it was trained for).
+
+    >>> model = TargetEvidence(8, 4, components=3)  # not trained yet
+    >>> seen = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 3), torch.zeros(1, 0, dtype=torch.bool))
+    >>> model(seen, torch.zeros(1, 2), Grid(4, 4, (80, 80)), target=1).shape
+    torch.Size([1, 16])
     """
 
     kind: ClassVar[str] = "target-evidence"
@@ -102,30 +111,54 @@ class TargetEvidence(Evidence):
         self.judge = network(_PRESENCE, readout_width)
 
     def forward(self, detections: Detections, fixation: Tensor, grid: Grid, target: int) -> Tensor:
-        """Evidence of each look, `(B, X·Y)`; arguments as for `look_features`."""
+        """Evidence of each look for the target in every cell.
+
+        Args:
+            detections: a batch `(B, L)` of looks, boxes in pixels of the grid's image.
+            fixation: `(B, 2)`, as `(x, y)` in pixels.
+            grid: the cells of one image.
+            target: class 1..K.
+
+        Returns:
+            `(B, X·Y)`, log odds.
+        """
         return self.evidence(look_features(detections, fixation, grid, target))
 
     def log_odds(self, gathered: Gathered, columns: int) -> Tensor:
-        """Log odds of the target in each cell after several looks, `(B, X·Y)`.
+        """Log odds of the target in each cell after several looks.
 
         Args:
-            gathered: what the looks say.
-            columns: cells in a row.
+            gathered: evidence of the looks.
+            columns: X, cells in a row.
+
+        Returns:
+            `(B, X·Y)`.
         """
         return self.read_out(self.read, gathered.nearest, gathered, columns)
 
     def chance(self, gathered: Gathered, columns: int) -> Tensor:
-        """Log odds of the target in each cell if no fixated cell holds it, `(B, X·Y)`; arguments as for `log_odds`."""
+        """Log odds of the target in each cell, given that no fixated cell holds it.
+
+        Args:
+            gathered: evidence of the looks.
+            columns: X, cells in a row.
+
+        Returns:
+            `(B, X·Y)`; the values of fixated cells have no meaning.
+        """
         visited = gathered.visited
         beside = blur(visited.to(gathered.nearest), columns, 0.6)
         return self.read_out(self.guide, gathered.nearest.masked_fill(visited, _EMPTY), gathered, columns, beside)
 
     def presence(self, log_odds: Tensor, gathered: Gathered) -> Tensor:
-        """Log odds that the target is anywhere in the image, `(B,)`.
+        """Log odds that the target is anywhere in the image.
 
         Args:
-            log_odds: `(B, X·Y)`, of `log_odds`.
-            gathered: what the looks say.
+            log_odds: `(B, X·Y)`, log odds of the cells (`log_odds`).
+            gathered: evidence of the looks.
+
+        Returns:
+            `(B,)`.
         """
         peak = log_odds.amax(-1)
         inputs = [
@@ -143,13 +176,13 @@ class TargetEvidence(Evidence):
         return peak + value[..., 0]
 
     def _record(self) -> dict[str, Any]:
-        """Widths of the networks, number of classes, and thresholds."""
+        """The widths of the networks, the number of classes, and the thresholds."""
         thresholds = None if self.thresholds is None else asdict(self.thresholds)
         return {"widths": self.widths, "components": len(self.prior), "thresholds": thresholds}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The networks from what was kept."""
+        """The model with the saved tensors and record."""
         thresholds = None if record["thresholds"] is None else Thresholds(**record["thresholds"])
         model = cls(
             *record["widths"], components=record["components"], thresholds=thresholds, metadata=record["metadata"]

@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 
-from semfov.agent import PUBLISHED_SENSORS
 from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
 from semfov.data.scene import Scenes
 from semfov.detection.detector import Detector
@@ -25,6 +24,7 @@ from semfov.io.compatibility import learned_for, recommended
 from semfov.io.files import check_regular
 from semfov.io.shipped import shipped_model
 from semfov.observation.foveal import FovealObservationModel
+from semfov.presets import PUBLISHED_SENSORS
 from semfov.sensor import Foveation
 from semfov.zoom.eye import ZoomEye
 

@@ -1,4 +1,7 @@
-"""How scores depend on class and distance to the fovea: Dirichlets, their statistics, and the foveal model."""
+"""How a detector's scores depend on the class and on the distance to the fovea.
+
+The room has the Dirichlet distribution, sufficient statistics that merge, and the foveal observation model.
+"""
 
 from semfov.observation import dirichlet
 from semfov.observation.calibration import fit_discriminative

@@ -1,4 +1,4 @@
-"""Training an observation model for the posterior of the class, rather than for the density of the scores."""
+"""Discriminative fit of an observation model: train the posterior of the class, not the density of the scores."""
 
 import math
 
@@ -22,41 +22,51 @@ def fit_discriminative(
     bias_decay: float = 10.0,
     iterations: int = 100,
 ) -> FovealObservationModel:
-    r"""A model whose posterior is calibrated: α and π minimise the cross-entropy of the true classes.
+    r"""Fit a model with a calibrated posterior: its α and π minimise the cross-entropy of the true classes.
 
-    The logits of the posterior are linear in the log scores, `Σ_j (α_kdj - 1) ln s_j + c_kd`, so this is multinomial
-    logistic regression, and is known as Dirichlet calibration (Kull et al. 2019, "Beyond temperature scaling"), here
-    one for each level of distance. Positive α are no restriction: a shift common to all classes changes nothing.
+    The logits of the posterior are linear in the log scores, `Σ_j (α_kdj - 1) ln s_j + c_kd`. The fit is therefore a
+    multinomial logistic regression. It is known as Dirichlet calibration (Kull et al. 2019, "Beyond temperature
+    scaling"); here there is one for each level of distance. Requiring positive α costs no generality, because adding
+    the same number to the weights of all classes changes nothing.
 
-    With 82 weights a class and level, and few examples of most, priors matter. They are normal, centred on returning
-    the scores as they are (`α_k = 1 + e_k`, where classes without examples stay), and tie the levels together:
+    With 80 classes there are 82 weights for each class and level, and few examples of most classes, so the priors
+    matter. They are normal distributions that tie the levels together. Their centre is the model that returns the
+    scores unchanged, `α_k = 1 + e_k`; classes without examples stay there:
 
     .. math:: \ln \alpha_{kdj} = \ln(1 + \delta_{kj}) + u_{kj} + v_{kdj}, \quad
               u \sim N(0, 1/\texttt{decay}), \; v \sim N(0, 1/\texttt{level\_decay}), \;
               c \sim N(0, 1/\texttt{bias\_decay})
 
-    with `c` again the sum of a common part and one for each level. The diagonal of u, which acts as a temperature of
-    each score, has the weaker prior of c. The maximum a posteriori is found by L-BFGS on all samples from a fixed
-    start, so that the result depends on nothing random.
+    where `c` is again the sum of a common part and one part for each level. The diagonal of u acts as a temperature of
+    each score and has the same weak prior as c. L-BFGS finds the maximum a posteriori on all samples from a fixed
+    start, so nothing in the result is random.
 
-    Trained so, Dir(α) no longer describes the scores: the expected scores are kept from `model`. The paper of Luzio,
-    Bernardino and Moreno (2024) has nothing of the kind: its Dirichlets are fitted to the scores.
+    After this fit Dir(α) no longer describes the scores, so the new model keeps the expected scores of `model`. The
+    method is not in Luzio, Bernardino and Moreno (2024), whose Dirichlets are fitted to the scores.
 
     Args:
-        model: gives edges, classes, epsilon, metadata, and the expected scores; fitted by `fit`.
-        scores: `(M, K+1)`, score vectors of detections. Computed in their dtype.
-        distance: `(M,)`, in units of the image's longer side.
+        model: a fitted model (`FovealObservationModel.fit`); gives the edges, classes, epsilon, metadata, miss rates
+            and expected scores.
+        scores: `(M, K+1)`, score vectors of detections. The fit is computed in their dtype.
+        distance: `(M,)`, from the fixation to the centre of the box, in units of the image's longer side.
         labels: `(M,)`, index of the true class, 0 for background.
-        decay: precision of the prior of u, off the diagonal.
+        decay: precision of the prior of u off the diagonal.
         level_decay: precision of the prior of v.
-        bias_decay: precision of the prior of c.
-        iterations: steps of L-BFGS, at most.
+        bias_decay: precision of the prior of c and of the diagonal of u.
+        iterations: largest number of L-BFGS steps.
 
     Returns:
-        A new model; `model` stays as it is.
+        A new model; `model` is not changed.
 
     Raises:
         InputError: shapes do not fit, a label is out of range, or there are no samples.
+
+    >>> model = FovealObservationModel.identity(["cup"], edges=[0.2])
+    >>> overconfident = torch.tensor([0.1, 0.9]).repeat(1000, 1)  # right in 600 of 1000 cases
+    >>> labels = torch.arange(1000) % 5 < 3
+    >>> trained = fit_discriminative(model, overconfident, torch.zeros(1000), labels.long())
+    >>> trained.calibrate(overconfident[0], torch.tensor(0.0)).detach()
+    tensor([0.4000, 0.6000])
     """
     components, levels = len(model.classes) + 1, len(model.edges) + 1
     check_shape(scores, "scores", None, components)
@@ -69,7 +79,7 @@ def fit_discriminative(
     for name, value in [("decay", decay), ("level_decay", level_decay), ("bias_decay", bias_decay)]:
         check(value > 0, name, "a positive number", value)
 
-    # Measured from the floor, scores that are next to nothing are next to zero, and L-BFGS converges faster.
+    # Log scores are measured from the floor: those of tiny scores are then close to 0, and L-BFGS converges faster.
     lowest = math.log(model.epsilon)
     evidence = floor(scores.detach(), model.epsilon).log() - lowest
     level = model.level(distance)
@@ -110,7 +120,7 @@ def fit_discriminative(
 
     across, within, common, own = (value.detach() for value in current())
     alpha, constant = (start + across + within).exp(), common + own
-    # c is ln π, less the normaliser of Dir(α), plus the shift by the floor.
+    # c = ln π - (log normaliser of Dir(α)) + (shift by the floor); solve for ln π.
     shift = log_normaliser(alpha.double()).to(alpha) - (alpha - 1).sum(-1) * lowest
     trained = {"decay": decay, "level_decay": level_decay, "bias_decay": bias_decay, "iterations": iterations}
     return FovealObservationModel(
@@ -126,9 +136,13 @@ def fit_discriminative(
 
 
 def _curvatures(groups: list[tuple[Tensor, Tensor]], alpha: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Diagonal of the Hessian of the cross-entropy at the start, for u, v and the two parts of c.
+    """Diagonal of the Hessian of the cross-entropy at the start.
 
-    Scaled by it, directions of which the samples tell much and little are on one footing for L-BFGS.
+    Scaling the variables by it conditions the problem for L-BFGS: some directions are supported by many samples,
+    others by few.
+
+    Returns:
+        The diagonals for u, v, the common part of c and its part for each level.
     """
     weights, constants = [], []
     for rows, _ in groups:

@@ -1,4 +1,4 @@
-"""The Dirichlet distribution: density, moments, entropy, divergence, and its maximum-likelihood fit."""
+"""The Dirichlet distribution: density, moments, entropy, divergence and maximum-likelihood fit."""
 
 import math
 
@@ -27,7 +27,16 @@ __all__ = [
 
 
 def log_normaliser(alpha: Tensor) -> Tensor:
-    r"""Logarithm of what a Dirichlet density is divided by, `(...)`: `Σ ln Γ(α_k) - ln Γ(A)`, `A = Σ α_k`.
+    r"""Logarithm of the normalising constant of a Dirichlet: `ln B(α) = Σ ln Γ(α_k) - ln Γ(A)`, with `A = Σ α_k`.
+
+    Args:
+        alpha: `(..., K)`, parameters, positive.
+
+    Returns:
+        `(...)`, the logarithm.
+
+    Raises:
+        InputError: a parameter is not positive.
 
     >>> log_normaliser(torch.tensor([1.0, 1.0, 1.0]))
     tensor(-0.6931)
@@ -37,18 +46,21 @@ def log_normaliser(alpha: Tensor) -> Tensor:
 
 
 def log_prob(alpha: Tensor, log_scores: Tensor) -> Tensor:
-    r"""Log density of scores on the simplex, from their logarithms.
+    r"""Log density of scores on the simplex, given the logarithms of the scores.
 
     .. math:: \ln p(s | \alpha) = \ln\Gamma(A) - \sum_k \ln\Gamma(\alpha_k) + \sum_k (\alpha_k - 1) \ln s_k
 
-    (The logarithm of equation 9 of Luzio, Bernardino and Moreno, 2024.)
+    This is the logarithm of equation 9 of Luzio, Bernardino and Moreno (2024).
 
     Args:
         alpha: `(..., K)`, parameters, positive.
         log_scores: `(..., K)`, logarithms of scores that sum to 1; broadcasts with `alpha`.
 
     Returns:
-        `(...)`.
+        `(...)`, log densities in nats.
+
+    Raises:
+        InputError: the numbers of components differ, or a parameter is not positive.
 
     >>> log_prob(torch.tensor([1.0, 1.0, 1.0]), torch.tensor([0.2, 0.3, 0.5]).log())
     tensor(0.6931)
@@ -58,10 +70,19 @@ def log_prob(alpha: Tensor, log_scores: Tensor) -> Tensor:
 
 
 def mean(alpha: Tensor) -> Tensor:
-    """Expected scores, `(..., K)`: `α_k / A`.
+    """Mean of a Dirichlet: the expected scores, `α_k / A`.
 
-    Of a belief Dir(β) this is the probability of each class: one draw of the Dirichlet-compound multinomial
-    (Luzio, Bernardino and Moreno, 2024, equations 4 and 5).
+    For a belief Dir(β) it is the probability of each class, one draw of the Dirichlet-compound multinomial (Luzio,
+    Bernardino and Moreno, 2024, equations 4 and 5).
+
+    Args:
+        alpha: `(..., K)`, parameters, positive.
+
+    Returns:
+        `(..., K)`, which sums to 1.
+
+    Raises:
+        InputError: a parameter is not positive.
 
     >>> mean(torch.tensor([1.0, 3.0]))
     tensor([0.2500, 0.7500])
@@ -71,9 +92,15 @@ def mean(alpha: Tensor) -> Tensor:
 
 
 def covariance(alpha: Tensor) -> Tensor:
-    r"""Covariance of the scores under Dir(α), `(..., K, K)`: `p_i (δ_ij - p_j) / (A + 1)`, with `p = α / A`.
+    r"""Covariance of the scores under Dir(α): `p_i (δ_ij - p_j) / (A + 1)`, with `p = α / A`.
 
     It shrinks as evidence grows; `categorical_covariance` does not.
+
+    Args:
+        alpha: `(..., K)`, parameters, positive.
+
+    Returns:
+        `(..., K, K)`, symmetric.
 
     >>> covariance(torch.tensor([1.0, 1.0]))
     tensor([[ 0.0833, -0.0833],
@@ -83,10 +110,16 @@ def covariance(alpha: Tensor) -> Tensor:
 
 
 def categorical_covariance(alpha: Tensor) -> Tensor:
-    r"""Covariance of the class as a one-hot vector, drawn once from the mean, `(..., K, K)`: `p_i (δ_ij - p_j)`.
+    r"""Covariance of the class, as a one-hot vector drawn once from the mean: `p_i (δ_ij - p_j)`.
 
-    Off the diagonal this is the `σ_ij = -p_i p_j` of Luzio, Bernardino and Moreno (2024, equation 6), "co-variances of
-    the class distribution". It is not the covariance of the probabilities under the Dirichlet (`covariance`).
+    Off the diagonal this is `σ_ij = -p_i p_j`, the "co-variances of the class distribution" of Luzio, Bernardino and
+    Moreno (2024, equation 6). It is not the covariance of the probabilities under the Dirichlet (`covariance`).
+
+    Args:
+        alpha: `(..., K)`, parameters, positive.
+
+    Returns:
+        `(..., K, K)`, symmetric.
 
     >>> categorical_covariance(torch.tensor([1.0, 1.0]))
     tensor([[ 0.2500, -0.2500],
@@ -97,11 +130,18 @@ def categorical_covariance(alpha: Tensor) -> Tensor:
 
 
 def entropy(alpha: Tensor) -> Tensor:
-    r"""Differential entropy, in nats, `(...)`.
+    r"""Differential entropy of a Dirichlet density.
 
     .. math:: H = \ln B(\alpha) + (A - K) \psi(A) - \sum_k (\alpha_k - 1) \psi(\alpha_k)
 
-    It is that of the density. The negentropy of Luzio, Bernardino and Moreno (2024, equation 20) is that of the mean.
+    The negentropy of Luzio, Bernardino and Moreno (2024, equation 20) is another quantity: it is computed from the
+    mean of the Dirichlet, which is a categorical distribution.
+
+    Args:
+        alpha: `(..., K)`, parameters, positive.
+
+    Returns:
+        `(...)`, entropies in nats.
 
     >>> entropy(torch.tensor([1.0, 1.0]))
     tensor(0.)
@@ -111,17 +151,23 @@ def entropy(alpha: Tensor) -> Tensor:
 
 
 def kl_divergence(alpha: Tensor, other: Tensor) -> Tensor:
-    r"""Kullback-Leibler divergence :math:`D_{KL}(\mathrm{Dir}(\alpha) \| \mathrm{Dir}(\beta))`, in nats, `(...)`.
+    r"""Kullback-Leibler divergence :math:`D_{KL}(\mathrm{Dir}(\alpha) \| \mathrm{Dir}(\beta))`.
 
     .. math:: KL(\alpha \| \beta) = \ln B(\beta) - \ln B(\alpha)
               + \sum_k (\alpha_k - \beta_k) (\psi(\alpha_k) - \psi(A))
 
-    Exploration by Luzio, Bernardino and Moreno (2024, equation 19) takes it from a cell's belief, as `alpha`, to the
-    prior, `other` with 0.5 for every class.
+    Luzio, Bernardino and Moreno (2024, equation 19) explore with it: `alpha` is the belief about a cell, and `other`
+    is the prior, 0.5 for every class.
 
     Args:
-        alpha: `(..., K)`, the distribution that the expectation is over.
-        other: `(..., K)`, β; broadcasts with `alpha`.
+        alpha: `(..., K)`, parameters of the distribution that the expectation is taken over, positive.
+        other: `(..., K)`, β, positive; broadcasts with `alpha`.
+
+    Returns:
+        `(...)`, divergences in nats.
+
+    Raises:
+        InputError: the numbers of components differ, or a parameter is not positive.
 
     >>> kl_divergence(torch.tensor([2.0, 1.0]), torch.tensor([1.0, 1.0]))
     tensor(0.1931)
@@ -132,34 +178,47 @@ def kl_divergence(alpha: Tensor, other: Tensor) -> Tensor:
 
 
 def kl_from_symmetric(alpha: Tensor, parameter: float) -> Tensor:
-    r"""`kl_divergence` to a symmetric Dirichlet, whose parameters are all c, in nats, `(...)`.
+    r"""Kullback-Leibler divergence to a symmetric Dirichlet, whose parameters all equal c.
 
     .. math:: \mathrm{KL} = \sum_k h(\alpha_k; c) - h(A; K c), \qquad
               h(x; c) = (x - c) \, \psi(x) - \ln\frac{\Gamma(x)}{\Gamma(c)}
 
-    h is 0 at c and nowhere negative (`semfov.observation.special.log_gamma_divergence`), so what differs little from c
-    does not come from large terms that cancel.
+    h is 0 at c and never negative (`semfov.observation.special.log_gamma_divergence`). For parameters close to c this
+    form avoids the cancellation of large terms that `kl_divergence` has.
 
     Args:
         alpha: `(..., K)`, parameters, positive.
         parameter: c, positive.
+
+    Returns:
+        `(...)`, divergences in nats.
+
+    Raises:
+        InputError: `parameter` is not positive.
 
     >>> kl_from_symmetric(torch.tensor([2.0, 1.0]), 1.0)
     tensor(0.1931)
     """
     check(parameter > 0, "parameter", "a positive number", parameter)
     base = alpha.shape[-1] * parameter
-    # Sums are few, and their terms large: double precision costs nothing here.
+    # There are few sums and their terms are large: double precision costs little here.
     total = alpha.sum(-1).double()
     whole = (total - base) * total.digamma() - total.lgamma() + math.lgamma(base)
     return log_gamma_divergence(alpha, parameter).sum(-1) - whole.to(alpha)
 
 
 def floor(scores: Tensor, epsilon: float) -> Tensor:
-    """Scores `(..., K)` raised to at least `epsilon` and scaled to sum to 1, so that their logarithms are finite.
+    """Raise scores to at least `epsilon` and scale them to sum to 1, so that their logarithms are finite.
+
+    Args:
+        scores: `(..., K)`, not negative.
+        epsilon: the lower bound, applied before scaling; positive.
+
+    Returns:
+        `(..., K)`, which sums to 1.
 
     Raises:
-        InputError: a score is negative or not finite.
+        InputError: a score is negative or not finite, or `epsilon` is not positive.
 
     >>> floor(torch.tensor([0.0, 3.0]), 1.0)
     tensor([0.2500, 0.7500])
@@ -167,7 +226,7 @@ def floor(scores: Tensor, epsilon: float) -> Tensor:
     check_shape(scores, "scores", None)
     check(epsilon > 0, "epsilon", "a positive number", epsilon)
     if scores.numel() and values_known(scores):
-        # NaN survives the minimum and the maximum, so one pass answers both questions.
+        # The minimum and the maximum of a tensor with a NaN are NaN, so one pass checks both conditions.
         least, largest = scores.detach().aminmax()
         if not bool(torch.isfinite(least) & torch.isfinite(largest)):
             check_finite(scores, "scores")

@@ -1,4 +1,8 @@
-"""From statistics by class and level to the Dirichlets of an observation model."""
+"""Fit the Dirichlets of an observation model from statistics by class and level."""
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -7,10 +11,49 @@ from semfov.errors import check
 from semfov.observation.mle import Method, mle, shrink, vacuous
 from semfov.observation.statistics import DirichletStatistics
 
-# Scores of single precision cannot tell a precision beyond this from certainty.
+# Beyond this precision A, single-precision scores cannot be told from a single point.
 MAX_PRECISION = 1e6
-# Samples of the uniform density that a class is mixed with, whatever it has of its own.
+# Pseudo-counts that draw each class to the uniform density.
 UNIFORM = 1.0
+
+
+@dataclass(frozen=True)
+class FittedTables:
+    """Everything that an observation model takes from the statistics of a training set.
+
+    Attributes:
+        alpha: `(K+1, N, K+1)` in float64, Dirichlet parameters (`fit_table`).
+        log_prior: `(K+1, N)` in float64, log frequencies of the classes (`estimate_prior`).
+        expected: `(K+1, N, K+1)` in float64, mean scores (`expected_table`).
+        record: JSON values that say how they were fitted: the counts, the levels that fell back, and the settings.
+    """
+
+    alpha: Tensor
+    log_prior: Tensor
+    expected: Tensor
+    record: dict[str, Any]
+
+
+def fit_tables(
+    statistics: DirichletStatistics, *, method: Method, shrinkage: float, minimum: int, enough: int | None
+) -> FittedTables:
+    """Fit all tables of an observation model, and warn of levels that fell back; arguments as for `fit_table`."""
+    alpha, fallback = fit_table(statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough)
+    if fallback:
+        told = ", ".join(f"level {n} as level {source}" for n, source in fallback.items() if n > 0)
+        told += "; level 0 has no inner neighbour and uses the classes' other levels" * (0 in fallback)
+        # Level 4 is the caller of `FovealObservationModel.fit`: the decorator of `fit` adds a frame.
+        warnings.warn(f"levels with fewer than {minimum} objects fall back: {told}", stacklevel=4)
+    prior, expected = estimate_prior(statistics.count, shrinkage), expected_table(statistics, fallback, shrinkage)
+    record = {
+        "counts": statistics.count.tolist(),
+        "fallback": {str(level): source for level, source in fallback.items()},
+        "method": method,
+        "shrinkage": shrinkage,
+        "minimum": minimum,
+        "enough": enough,
+    }
+    return FittedTables(alpha, prior, expected, record)
 
 
 def fit_table(
@@ -21,30 +64,36 @@ def fit_table(
     minimum: int = 100,
     enough: int | None = None,
 ) -> tuple[Tensor, dict[int, int]]:
-    r"""Maximum a posteriori α for every class and level, `(K+1, N, K+1)` in float64.
+    r"""Maximum a posteriori α for every class and level.
 
-    The mean logs of a cell are shrunk to those of its class over all levels, and these by one sample to those of
-    Dir(1, ..., 1) (`semfov.dirichlet.shrink`):
+    The mean log scores of a table cell (one class at one level) are shrunk towards those of its class over all
+    levels. The latter are shrunk, with a weight of one sample, towards those of Dir(1, ..., 1)
+    (`semfov.dirichlet.shrink`):
 
     .. math:: g_{k,d} = \frac{n_{k,d} \bar g_{k,d} + w g_k}{n_{k,d} + w}, \qquad
               g_k = \frac{n_k \bar g_k + \psi(1) - \psi(K+1)}{n_k + 1}
 
-    so that a class without samples gets the uniform density, and a cell without samples that of its class. A level
-    with fewer than `minimum` objects in all takes the parameters of its inner neighbour.
+    A class without samples gets the uniform density, and a cell without samples gets the density of its class. A level
+    with fewer than `minimum` objects takes the parameters of its inner neighbour.
 
-    Luzio, Bernardino and Moreno (2024, section III-C) maximise the likelihood alone, and do not say what becomes of
-    cells with few samples or none. Cells with `enough` get that maximum; how the others are filled is our choice.
+    Luzio, Bernardino and Moreno (2024, section III-C) maximise the likelihood alone, and do not say how they treat
+    cells with few samples or none. Cells with `enough` detections get the maximum of the likelihood; the treatment of
+    the others is our choice.
 
     Args:
         statistics: of shape `(K+1, N)`, background first.
-        method: of `semfov.dirichlet.mle`.
+        method: a method of `semfov.dirichlet.mle`.
         shrinkage: pseudo-counts w.
-        minimum: objects, background not counted, that a level needs.
-        enough: detections from which a cell is not shrunk, but fitted by maximum likelihood; None shrinks all.
+        minimum: least number of objects in a level, background not counted.
+        enough: a cell with at least this many detections is fitted by maximum likelihood alone; None shrinks all
+            cells.
 
     Returns:
-        α, and the levels that fell back: level -> the level that its parameters are of. Level 0 has no inner
-        neighbour: it is recorded as falling back on itself, and is what shrinking makes of it.
+        α, `(K+1, N, K+1)` in float64, and the levels that fell back, each with the level whose parameters it took.
+        Level 0 has no inner neighbour: it is recorded as falling back on itself, and keeps its shrunk estimate.
+
+    Raises:
+        InputError: the statistics are not a table, or a setting is out of range.
     """
     check(len(statistics.shape) == 2, "statistics", "a table (K+1, N)", statistics.shape)
     classes = statistics.sum(1)
@@ -64,7 +113,7 @@ def fit_table(
 
 
 def expected_table(statistics: DirichletStatistics, fallback: dict[int, int], shrinkage: float = 10.0) -> Tensor:
-    """Mean scores of every class and level, `(K+1, N, K+1)` in float64, shrunk and falling back as in `fit_table`."""
+    """Mean scores of every class and level, `(K+1, N, K+1)` in float64; shrinkage and fallback as in `fit_table`."""
     classes = statistics.sum(1)
     uniform = torch.full_like(classes.mean[0], 1 / statistics.components)
     parent = shrink(classes.mean, classes.count, uniform, UNIFORM)
@@ -75,9 +124,19 @@ def expected_table(statistics: DirichletStatistics, fallback: dict[int, int], sh
 
 
 def estimate_prior(count: Tensor, shrinkage: float = 10.0) -> Tensor:
-    r"""Log frequencies of the classes at each level, `(K+1, N)` in float64.
+    r"""Logarithms of the class frequencies at each level, shrunk towards those over all levels.
 
     .. math:: \pi_{k,d} = \frac{n_{k,d} + w \pi_k}{n_d + w}, \qquad \pi_k = \frac{n_k + 1}{n + K + 1}
+
+    Args:
+        count: `(K+1, N)`, detections n of each class at each level, background first.
+        shrinkage: pseudo-counts w, positive.
+
+    Returns:
+        `(K+1, N)` in float64, `ln π`.
+
+    Raises:
+        InputError: `shrinkage` is not positive.
 
     >>> estimate_prior(torch.tensor([[8], [0]]), 10.0).exp().flatten()
     tensor([0.9444, 0.0556], dtype=torch.float64)

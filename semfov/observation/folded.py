@@ -1,19 +1,20 @@
-"""An observation model whose constants are computed once and for all, to be exported."""
+"""An observation model with precomputed constants, for export to other runtimes."""
 
 import torch
 from torch import Tensor
 
 from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.log_linear import linear_map
 
 
 class FoldedObservationModel(FovealObservationModel):
-    """The same model as a fixed linear map of log scores.
+    """An observation model stored as a fixed linear map of log scores.
 
-    Gamma functions then stay out of the graph: ONNX has none. It calibrates to the same bits as `model`, and does not
-    follow it when that is trained on.
+    Its computation graph has no gamma functions, which ONNX lacks. It gives the same calibrated scores as `model`, to
+    the bit. Later training of `model` does not change it.
 
     Args:
-        model: the observation model.
+        model: the observation model to copy.
 
     >>> model = FovealObservationModel.identity(["cup", "cat"], edges=[0.1, 0.2])
     >>> FoldedObservationModel(model).calibrate(torch.tensor([0.2, 0.7, 0.1]), torch.tensor(0.15))
@@ -36,7 +37,7 @@ class FoldedObservationModel(FovealObservationModel):
             metadata=model.metadata,
         )
         with torch.no_grad():
-            weight, constant = model._make_linear()
+            weight, constant = linear_map(model.alpha)
         self.register_buffer("weight", weight)
         self.register_buffer("constant", constant)
         self.requires_grad_(False).eval()

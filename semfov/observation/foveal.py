@@ -1,6 +1,5 @@
 """The foveal observation model: how a detector scores objects of each class at each distance from the fovea."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -15,8 +14,9 @@ from semfov.errors import InputError, check, check_finite, check_shape, lookup, 
 from semfov.io import compatibility
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import CLASSES, Field, Number, Schema
-from semfov.observation.dirichlet import floor, log_normaliser
-from semfov.observation.fitting import estimate_prior, expected_table, fit_table
+from semfov.observation.dirichlet import floor
+from semfov.observation.fitting import fit_tables
+from semfov.observation.log_linear import LinearCache, at_level, linear_map
 from semfov.observation.mle import Method
 from semfov.observation.statistics import DirichletStatistics
 
@@ -28,37 +28,40 @@ class FovealObservationModel(Pretrained):
 
     .. math:: p(S \mid C = k, d) = \mathrm{Dir}(S \mid \alpha_{k,d})
 
-    (Luzio, Bernardino and Moreno, 2024, section III-D, after Dias, Simões, Moreno and Bernardino, 2022.) The posterior
-    that `calibrate` gives is
+    This is the model of Luzio, Bernardino and Moreno (2024, section III-D), after Dias, Simões, Moreno and Bernardino
+    (2022). `calibrate` gives the posterior
 
     .. math:: P(C = k \mid S, d) \propto \mathrm{Dir}(S \mid \alpha_{k,d})^\tau \, \pi_{k,d}
 
-    With `τ = 1` and a uniform π, as `fit` leaves them, these are the published calibrated scores (equation 11). They
-    are overconfident: the density multiplies K+1 dimensions as if each were evidence of its own, though most scores
-    are near zero together. A class prior and τ < 1 help; `semfov.observation.fit_discriminative` trains α and π for
-    the posterior itself, and is what the recommended models use. The paper prints neither the number of levels nor
-    their borders, nor what is done with scores of 0: `edges` and `epsilon` are our choice.
+    With `τ = 1` and a uniform π, the defaults of `fit`, these are the published calibrated scores (equation 11). They
+    are overconfident: the density treats its K+1 components as independent evidence, while most scores of a detection
+    are near zero together. A class prior and τ < 1 help. The recommended models use `fit_discriminative`, which trains
+    α and π for the posterior itself. The paper gives neither the number of levels nor their borders, nor its treatment
+    of scores of 0: `edges` and `epsilon` are our choice.
 
-    The logit of a class is linear in the log scores, with weights `τ (α - 1)`. So `α_k = 1 + e_k` with all else
-    uniform (`identity`) gives back the scores as they are.
+    The logit of a class is linear in the log scores, with weights `τ (α - 1)`. The model with `α_k = 1 + e_k`, τ = 1
+    and a uniform prior therefore returns the scores unchanged (`identity`).
 
     Args:
         alpha: `(K+1, N, K+1)`, positive: class (background first), level, component of the score vector.
         edges: N - 1 ascending borders of the levels, in units of the image's longer side. A distance that equals a
             border belongs to the inner level.
         classes: names of the K classes, without background.
-        epsilon: scores are raised to at least this, and scaled to sum to 1.
-        log_prior: `(K+1, N)`, ln π up to a constant for each level; None is uniform.
+        epsilon: lower bound of the scores, from 0 to 1; scores are raised to it and scaled to sum to 1.
+        log_prior: `(K+1, N)`, ln π, up to a constant for each level; None is a uniform prior.
         tempering: τ, positive.
-        expected: `(K+1, N, K+1)`, what `expected_scores` returns where that is not the mean of Dir(α), as in models
-            trained for the posterior; None takes the mean.
-        miss_rate: `(K+1, N)`, probability that nothing is detected where there is an object of a class (background
-            first) at a level of distance (`MissCounts.rates`); None where it is not known.
-        metadata: JSON values that are kept with the model: `detector` and `sensor` (settings it was fitted for),
-            `counts`, and whatever else is worth knowing.
+        expected: `(K+1, N, K+1)`, the expected scores (`expected_scores`) of models whose Dir(α) does not describe
+            the scores, as after `fit_discriminative`; None takes the mean of Dir(α).
+        miss_rate: `(K+1, N)`, probability that nothing is detected in a cell of each class (background first) at each
+            level of distance (`MissCounts.rates`); None if it is not known.
+        metadata: JSON values that are saved with the model: `detector` and `sensor` (the settings that it was fitted
+            for), `counts`, and further information.
 
     Attributes:
         log_alpha: the learnable parameter, `ln α`.
+
+    Raises:
+        InputError: a shape does not fit, or a value is out of range.
 
     >>> model = FovealObservationModel.identity(["cup", "cat"], edges=[0.1, 0.2])
     >>> model.calibrate(torch.tensor([0.2, 0.7, 0.1]), torch.tensor(0.15)).detach()
@@ -130,11 +133,20 @@ class FovealObservationModel(Pretrained):
                 table = alpha.new_zeros(size)
             self.register_buffer(name, table)
         self.register_buffer("tempering", alpha.new_tensor(tempering))
-        self._cache: tuple[Tensor, int, int, Tensor, Tensor] | None = None
+        self._cache = LinearCache()
 
     @classmethod
     def identity(cls, classes: Sequence[str], edges: Sequence[float] | Tensor, **settings: Any) -> Self:
-        """The model that calibrates nothing: `α_k = 1 + e_k`, so that `calibrate` returns the scores."""
+        """Make the model with `α_k = 1 + e_k`, whose `calibrate` returns the scores unchanged.
+
+        Args:
+            classes: names of the K classes, without background.
+            edges: N - 1 ascending borders of the levels, in units of the image's longer side.
+            settings: further arguments of the class.
+
+        Returns:
+            The model.
+        """
         levels = len(edges) + 1
         alpha = 1 + torch.eye(len(classes) + 1)[:, None].repeat(1, levels, 1)
         return cls(alpha, edges, classes, **settings)
@@ -145,17 +157,30 @@ class FovealObservationModel(Pretrained):
         return self.log_alpha.exp()
 
     def level(self, distance: Tensor) -> Tensor:
-        """Level of each distance, `(...)` from 0 (the fovea) to N - 1."""
+        """Level of each distance.
+
+        Args:
+            distance: `(...)`, in units of the image's longer side, 0 or more.
+
+        Returns:
+            `(...)` int64, from 0 (the fovea) to N - 1.
+
+        Raises:
+            InputError: a distance is negative or NaN.
+        """
         if distance.numel() and values_known(distance):
             check(bool((distance >= 0).all()), "distance", "numbers from 0 up", "NaN or a negative number")
         return torch.bucketize(distance.to(self.edges).contiguous(), self.edges)
 
     def log_likelihood(self, scores: Tensor, distance: Tensor) -> Tensor:
-        """`ln Dir(S | α_{k,d})` for every class k, `(..., K+1)` (Luzio, Bernardino and Moreno, 2024, equation 9).
+        """Log likelihood of every class k, `ln Dir(S | α_{k,d})` (Luzio, Bernardino and Moreno, 2024, equation 9).
 
         Args:
-            scores: `(..., K+1)`, points of the simplex; floored at `epsilon`.
+            scores: `(..., K+1)`, points of the simplex; raised to at least `epsilon`.
             distance: `(...)`, from the fixation to the centre of the box, in units of the image's longer side.
+
+        Returns:
+            `(..., K+1)`, in the dtype of the scores.
 
         Raises:
             InputError: shapes do not fit, or a score is negative or not finite.
@@ -167,38 +192,63 @@ class FovealObservationModel(Pretrained):
         )
         weight, constant = self._linear()
         log_scores = floor(scores, self.epsilon).log().to(weight.dtype)
-        # One product for all levels, and a pick, costs less than fetching a matrix for each detection.
-        every = F.linear(log_scores, weight, constant).unflatten(-1, (-1, components))
-        index = self.level(distance)[..., None, None].expand(*distance.shape, 1, components)
-        return every.gather(-2, index).squeeze(-2).to(scores.dtype)
+        return at_level(log_scores, self.level(distance), weight, constant).to(scores.dtype)
 
     def calibrate(self, scores: Tensor, distance: Tensor) -> Tensor:
-        """Calibrated scores, the posterior of the classes, `(..., K+1)`; arguments and errors as `log_likelihood`.
+        """Calibrated scores: the posterior probability of every class.
 
-        With a uniform prior they are proportional to the likelihoods, which is all that fusion needs.
+        With a uniform prior and τ = 1 they are proportional to the likelihoods, and fusion needs no more.
+
+        Args:
+            scores: `(..., K+1)`, points of the simplex; raised to at least `epsilon`.
+            distance: `(...)`, from the fixation to the centre of the box, in units of the image's longer side.
+
+        Returns:
+            `(..., K+1)`, which sums to 1, in the dtype of the scores.
+
+        Raises:
+            InputError: shapes do not fit, or a score is negative or not finite.
         """
         logits = self.log_likelihood(scores, distance) * self.tempering
         return (logits + F.embedding(self.level(distance), self.log_prior.t())).softmax(-1).to(scores.dtype)
 
     def expected_scores(self) -> Tensor:
-        """Scores to expect of an object, `E[S | C = k, d]`, `(K+1, N, K+1)`.
+        """Expected score vector of every class at every level, `E[S | C = k, d]`.
 
-        Published is the mean of the Dirichlet, `α_kd / Σ_j α_kdj` (Luzio, Bernardino and Moreno, 2024, equation 16).
+        In the published model it is the mean of the Dirichlet, `α_kd / Σ_j α_kdj`, the first factor in equation 16 of
+        Luzio, Bernardino and Moreno (2024).
+
+        Returns:
+            `(K+1, N, K+1)`: class, level, component.
         """
         return self.log_alpha.softmax(-1) if self.expected is None else self.expected
 
     def miss_likelihood(self, distance: Tensor) -> Tensor:
-        """Likelihood of seeing nothing at a distance `(...)` for what may be there, `(..., K+1)`.
+        """Likelihood of every class where nothing is detected: its miss rate at that distance.
+
+        Args:
+            distance: `(...)`, in units of the image's longer side.
+
+        Returns:
+            `(..., K+1)`, background first.
 
         Raises:
             InputError: the model has no `miss_rate`.
         """
         if self.miss_rate is None:
-            raise InputError("miss_rate: expected a model that was fitted with miss rates, got none")
+            raise InputError("miss_rate: expected a model fitted with miss rates (`train.fit_fom`), got one without")
         return F.embedding(self.level(distance), self.miss_rate.t())
 
     def forward(self, scores: Tensor, distance: Tensor) -> Tensor:
-        """As `calibrate`."""
+        """Calibrated scores; see `calibrate`.
+
+        Args:
+            scores: `(..., K+1)`.
+            distance: `(...)`.
+
+        Returns:
+            `(..., K+1)`.
+        """
         return self.calibrate(scores, distance)
 
     @torch.no_grad()
@@ -215,49 +265,43 @@ class FovealObservationModel(Pretrained):
         expected: Literal["dirichlet", "empirical"] = "dirichlet",
         **metadata: Any,
     ) -> Self:
-        """Set α to the maximum a posteriori under the statistics of a training set, and return the model itself.
+        """Set α to its maximum a posteriori estimate, given the statistics of a training set.
 
-        See `semfov.observation.fitting.fit_table` for the estimate, and for how it differs from the paper's. A level
-        with fewer than `minimum` objects takes the parameters of its inner neighbour; a warning and
-        `metadata["fallback"]` say so.
+        `semfov.observation.fitting.fit_table` explains the estimate and how it differs from that of the paper. A level
+        with fewer than `minimum` objects takes the parameters of its inner neighbour; a warning reports it, and
+        `metadata["fallback"]` records it.
 
         Args:
             statistics: sums of the scores by class and level, of shape `(K+1, N)`.
             method: `newton`, `fixed_point` or `gradient` (`semfov.dirichlet.mle`).
-            shrinkage: pseudo-counts that draw a cell to its class.
-            minimum: objects, background not counted, that a level needs.
-            enough: detections from which a cell is fitted by maximum likelihood alone; None shrinks all cells.
-            prior: take the frequencies of the classes as prior; False leaves it uniform, as published.
+            shrinkage: pseudo-counts that draw each table cell towards its class.
+            minimum: least number of objects in a level, background not counted.
+            enough: a cell with at least this many detections is fitted by maximum likelihood alone; None shrinks all
+                cells.
+            prior: use the class frequencies as prior; False uses a uniform prior, as published.
             tempering: exponent τ of the likelihood.
-            expected: what `expected_scores` returns: the means of the fitted Dirichlets, as published, or those of
-                the data. They differ, for a Dirichlet that is fitted to mean logs need not have the mean of the data.
-            metadata: JSON values to keep with the model.
+            expected: source of `expected_scores`: `dirichlet`, the means of the fitted Dirichlets, as published, or
+                `empirical`, the means of the data. They differ, because a Dirichlet fitted to mean log scores need
+                not have the mean of the scores.
+            metadata: JSON values to save with the model.
+
+        Returns:
+            This model.
+
+        Raises:
+            InputError: the statistics are for another table or epsilon, or a setting is out of range.
         """
         components, levels = self.log_alpha.shape[:2]
         wanted, got = ((components, levels), self.epsilon), (statistics.shape, statistics.epsilon)
         check(got == wanted, "statistics", f"shape and epsilon {wanted}", got)
         check(0 < tempering <= _MOST_TEMPERING, "tempering", f"a number above 0, up to {_MOST_TEMPERING}", tempering)
         lookup(expected, ["dirichlet", "empirical"], "kind of expected scores")
-        alpha, fallback = fit_table(statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough)
-        if fallback:
-            told = ", ".join(f"level {n} as level {source}" for n, source in fallback.items() if n > 0)
-            told += "; level 0 has no inner neighbour and rests on the classes' other levels" * (0 in fallback)
-            warnings.warn(f"levels with fewer than {minimum} objects fall back: {told}", stacklevel=2)
-        self.log_alpha.copy_(alpha.log())
-        self.log_prior.copy_(estimate_prior(statistics.count, shrinkage) if prior else torch.tensor(0.0))
+        tables = fit_tables(statistics, method=method, shrinkage=shrinkage, minimum=minimum, enough=enough)
+        self.log_alpha.copy_(tables.alpha.log())
+        self.log_prior.copy_(tables.log_prior if prior else torch.tensor(0.0))
         self.tempering.fill_(tempering)
-        own = expected == "empirical"
-        self.expected = expected_table(statistics, fallback, shrinkage).to(self.log_alpha) if own else None
-        self.metadata |= {
-            "counts": statistics.count.tolist(),
-            "fallback": {str(level): source for level, source in fallback.items()},
-            "method": method,
-            "shrinkage": shrinkage,
-            "minimum": minimum,
-            "enough": enough,
-            "expected": expected,
-            **metadata,
-        }
+        self.expected = tables.expected.to(self.log_alpha) if expected == "empirical" else None
+        self.metadata |= {**tables.record, "expected": expected, **metadata}
         return self
 
     def check_compatible(
@@ -266,15 +310,18 @@ class FovealObservationModel(Pretrained):
         classes: Sequence[str] | None = None,
         background: str | None = None,
     ) -> None:
-        """Raise `InputError` where the model is to be used beside something that it was not fitted for.
+        """Check that the model was fitted for a detector or an eye.
 
-        Weights, classes and background policy must be those of the fit, as far as `metadata` tells them; other
-        settings that differ are warned of.
+        Weights, classes and background policy must equal those of the fit, as far as `metadata` records them. Other
+        settings that differ give a warning.
 
         Args:
-            settings: `Detector.settings()`, or an eye's: `{"detector": ..., "sensor": ...}`.
-            classes: names of the K classes.
-            background: background policy of the scores.
+            settings: `Detector.settings()`, or `Eye.settings()`: `{"detector": ..., "sensor": ...}`.
+            classes: names of the K classes; None does not check them.
+            background: background policy of the scores; None does not check it.
+
+        Raises:
+            InputError: the weights, the classes or the background policy differ.
         """
         settings = settings or {}
         eye = settings if "detector" in settings else {"detector": settings}
@@ -285,12 +332,12 @@ class FovealObservationModel(Pretrained):
         compatibility.check_sensor(self.metadata.get("sensor", {}), eye.get("sensor", {}), self.title)
 
     def _record(self) -> dict[str, Any]:
-        """Classes and ε."""
+        """The classes and ε."""
         return {"classes": self.classes, "epsilon": self.epsilon}
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The model from what was kept."""
+        """The model with the saved tensors and record."""
         model = cls(
             tensors["log_alpha"].exp(),
             tensors["edges"],
@@ -305,15 +352,18 @@ class FovealObservationModel(Pretrained):
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str], *, detector: Detector | None = None) -> Self:
-        """A model that is shipped with the package, by name, or one that `save` wrote, by path; in `eval` mode.
+        """Load a model: one shipped with the package, by its name, or a file that `save` wrote, by its path.
 
         Args:
-            name_or_path: name, or path of a `.safetensors` file.
-            detector: a `semfov.Detector` that the model will be used with; checked by `check_compatible`.
+            name_or_path: name of a shipped model, or path of a `.safetensors` file.
+            detector: the `semfov.Detector` that the model will be used with; checked by `check_compatible`.
+
+        Returns:
+            The model, in `eval` mode.
 
         Raises:
             InputError: no model of that name is shipped, or it was not fitted for `detector`.
-            DataError: the file is missing, damaged or not a model.
+            DataError: the file is missing or damaged, or holds no observation model.
         """
         model = super().from_pretrained(name_or_path)
         if detector is not None:
@@ -321,31 +371,29 @@ class FovealObservationModel(Pretrained):
         return model
 
     def train(self, mode: bool = True) -> Self:
-        """As for every module; also forgets what `eval` mode keeps between calls."""
-        self._cache = None
+        """Switch between training and evaluation mode, and drop the constants that evaluation mode caches.
+
+        Args:
+            mode: True for training mode.
+
+        Returns:
+            This model.
+        """
+        self._cache = LinearCache()
         return super().train(mode)
 
     def extra_repr(self) -> str:
-        """Sizes, for `repr`."""
+        """Sizes for the `repr` of the module.
+
+        Returns:
+            Numbers of classes and levels, and ε.
+        """
         return f"classes={len(self.classes)}, levels={len(self.edges) + 1}, epsilon={self.epsilon}"
 
     def _linear(self) -> tuple[Tensor, Tensor]:
-        """Weights `(N (K+1), K+1)` and constants of the log likelihoods, level by level.
-
-        Without gradients and in `eval` mode they are kept until `log_alpha` changes.
-        """
+        """Weights and constants of the log likelihoods (`linear_map`), cached in `eval` mode and without gradients."""
         parameter = self.log_alpha
         learning = self.training or (torch.is_grad_enabled() and parameter.requires_grad)
         if learning or torch.compiler.is_compiling() or parameter.is_inference():
-            return self._make_linear()
-        key = (parameter, parameter._version, parameter.data_ptr())
-        if self._cache is None or self._cache[0] is not parameter or self._cache[1:3] != key[1:]:
-            with torch.inference_mode(False), torch.no_grad():
-                self._cache = (*key, *self._make_linear())
-        return self._cache[3:]
-
-    def _make_linear(self) -> tuple[Tensor, Tensor]:
-        alpha = self.alpha.transpose(0, 1)
-        # ln Γ of large parameters needs the digits: likelihoods differ by less than it is large.
-        constant = -log_normaliser(alpha.to(torch.float64)).to(alpha.dtype)
-        return (alpha - 1).flatten(0, 1), constant.flatten()
+            return linear_map(self.alpha)
+        return self._cache(parameter)

@@ -1,4 +1,4 @@
-"""Which object a detection shows: greedy matching of detected to annotated boxes."""
+"""Match detections to annotated objects, greedily."""
 
 import torch
 from torch import Tensor
@@ -7,7 +7,17 @@ from semfov.errors import check_shape
 
 
 def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
-    """Intersection over union of every two boxes, `(M, 4)` and `(N, 4)` -> `(M, N)`; 0 for boxes without area.
+    """Intersection over union of every pair of boxes; 0 for boxes without area.
+
+    Args:
+        boxes: `(M, 4)`, corners `(x1, y1, x2, y2)`.
+        others: `(N, 4)`, in the same frame.
+
+    Returns:
+        `(M, N)`, from 0 to 1.
+
+    Raises:
+        InputError: a shape is wrong.
 
     >>> box_iou(torch.tensor([[0.0, 0, 2, 2]]), torch.tensor([[1.0, 0, 3, 2], [5, 5, 6, 6]]))
     tensor([[0.3333, 0.0000]])
@@ -23,22 +33,26 @@ def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
 
 
 def match(boxes: Tensor, truth: Tensor, labels: Tensor, *, iou: float = 0.5) -> Tensor:
-    """True class of each detection, 0 (background) where it shows no object.
+    """True class of each detection, 0 (background) for a detection that matches no object.
 
-    Detections choose in their order (most confident first) the object that they overlap most among those not taken,
-    if the overlap is at least `iou`; no object is matched twice. The detected class plays no part.
+    Each detection in turn, the most confident first, is matched to the object that it overlaps most among the objects
+    not matched yet, if their intersection over union is at least `iou`. No object is matched twice. The detected class
+    plays no part.
 
-    This is our choice: Luzio, Bernardino and Moreno (2024, section IV-A) fit scores "according to the corresponding
-    ground truth object" and do not say how it is found, nor which detections are background.
+    This is our choice. Luzio, Bernardino and Moreno (2024, section IV-A) fit scores "according to the corresponding
+    ground truth object"; they do not say how that object is found, nor which detections are background.
 
     Args:
-        boxes: `(L, 4)`, detections, most confident first.
-        truth: `(M, 4)`, annotated boxes.
-        labels: `(M,)`, their classes, 1..K.
-        iou: least intersection over union.
+        boxes: `(L, 4)`, detected boxes `(x1, y1, x2, y2)`, most confident first.
+        truth: `(M, 4)`, annotated boxes in the same frame.
+        labels: `(M,)`, classes of the annotated boxes, 1..K.
+        iou: least intersection over union of a match.
 
     Returns:
         `(L,)`, class indices.
+
+    Raises:
+        InputError: a shape is wrong.
 
     >>> match(torch.tensor([[0.0, 0, 9, 9], [0, 0, 8, 8]]), torch.tensor([[0.0, 0, 9, 9]]), torch.tensor([7]))
     tensor([7, 0])

@@ -1,4 +1,4 @@
-"""How often nothing is detected where there is something: the likelihood of an empty look."""
+"""Miss rates: how often the detector finds nothing where there is an object."""
 
 from collections.abc import Iterable
 
@@ -9,15 +9,21 @@ from semfov.errors import check, check_shape
 
 
 class MissCounts:
-    """Cells in which nothing was detected, by the class that was there and the level of distance; sums that merge.
+    """Counts of grid cells without a detection, by the true class and the level of distance; counts can be added.
 
     Args:
-        components: classes K + 1, background first.
-        levels: number of levels of distance N.
+        components: K + 1, the number of classes with background, which comes first.
+        levels: N, the number of levels of distance.
 
     Attributes:
-        missed: `(K+1, N)` int64, cells of the class seen from this level that no detection covered.
-        total: `(K+1, N)` int64, all cells of the class seen from this level.
+        missed: `(K+1, N)` int64, cells of each class at each level that no detection covered.
+        total: `(K+1, N)` int64, all cells of each class at each level.
+
+    >>> counts = MissCounts(components=2, levels=1)  # background and one class
+    >>> cup, detected = torch.tensor([[True, True, False]]), torch.tensor([True, False, False])
+    >>> counts = counts.update(detected, cup, torch.tensor([1]), torch.tensor([0, 0, 0]))
+    >>> counts.missed.tolist(), counts.total.tolist()  # of two cells with the cup, one was missed
+    ([[1], [1]], [[1], [2]])
     """
 
     def __init__(self, components: int, levels: int) -> None:
@@ -25,14 +31,21 @@ class MissCounts:
         self.total = torch.zeros_like(self.missed)
 
     def update(self, detected: Tensor, objects: Tensor, labels: Tensor, level: Tensor) -> "MissCounts":
-        """Count one look and return the counts themselves.
+        """Add the cells of one look.
+
+        A cell without objects counts as background. A cell with several objects counts once for each of their classes.
 
         Args:
-            detected: `(X·Y)` boolean, cells that a detection covers.
+            detected: `(X·Y,)` boolean, cells that a detection covers.
             objects: `(M, X·Y)` boolean, cells that each object covers.
-            labels: `(M,)`, class of each object, 1..K. A cell without objects counts as background, one with several
-                counts once for each of their classes.
-            level: `(X·Y)`, level of distance from the fixation to each cell.
+            labels: `(M,)`, class of each object, 1..K.
+            level: `(X·Y,)`, level of distance from the fixation to each cell.
+
+        Returns:
+            These counts.
+
+        Raises:
+            InputError: a shape does not fit the others.
         """
         cells = len(detected)
         check_shape(objects, "objects", len(labels), cells)
@@ -48,7 +61,16 @@ class MissCounts:
 
     @classmethod
     def merge(cls, counts: Iterable["MissCounts"], components: int, levels: int) -> "MissCounts":
-        """The sum of several counts."""
+        """Add several counts.
+
+        Args:
+            counts: the counts, all of the same size.
+            components: K + 1, number of classes with background.
+            levels: N, number of levels of distance.
+
+        Returns:
+            New counts: the sum.
+        """
         merged = cls(components, levels)
         for each in counts:
             merged.missed += each.missed
@@ -56,15 +78,22 @@ class MissCounts:
         return merged
 
     def rates(self, shrinkage: float = 50.0) -> Tensor:
-        r"""Probability that nothing is detected in a cell of class k seen from level n, `(K+1, N)`.
+        r"""Probability that nothing is detected in a cell of class k at level n.
 
         .. math:: m_{kn} = \frac{\mathrm{missed}_{kn} + s \, \bar m_n}{\mathrm{total}_{kn} + s}, \quad
                   \bar m_n = \frac{1 + \sum_{k \ge 1} \mathrm{missed}_{kn}}{2 + \sum_{k \ge 1} \mathrm{total}_{kn}}
 
-        Classes of which little was seen take the rate of all objects at that level; background keeps its own.
+        Rare classes are drawn towards the rate of all objects at that level. Background is not: its rate has one
+        pseudo-count for a miss and one for a hit.
 
         Args:
-            shrinkage: s, pseudo-counts.
+            shrinkage: s, pseudo-counts, positive.
+
+        Returns:
+            `(K+1, N)`, m, background first.
+
+        Raises:
+            InputError: `shrinkage` is not positive.
 
         >>> counts = MissCounts(2, 1)
         >>> counts.total += torch.tensor([[8], [2]]); counts.missed += torch.tensor([[6], [1]])

@@ -1,4 +1,4 @@
-"""Maximum-likelihood Dirichlets from mean log sufficient statistics, many at once."""
+"""Maximum-likelihood fit of many Dirichlets at once, from their mean log scores."""
 
 import math
 from collections.abc import Callable
@@ -11,51 +11,54 @@ from semfov.errors import SemfovError, check, check_finite, check_shape, lookup
 
 Method = Literal["newton", "fixed_point", "gradient"]
 
-# Below this, the inverse of ψ is read off ψ(x) ≈ -1/x - γ, above it off ψ(x) ≈ ln(x - 1/2) (Minka 2000).
+# The first guess of ψ⁻¹(y) uses ψ(x) ≈ -1/x - γ for y below this, and ψ(x) ≈ ln(x - 1/2) above it (Minka 2000).
 _KNEE = -2.22
 _EULER = 0.5772156649015329
-# Rounding of float64 can leave this much of Σ exp(mean_log) above 1 in statistics that came in float32.
+# Σ exp(mean_log) may exceed 1 by this much through rounding, where the statistics came in float32.
 _FEASIBLE = 1e-5
-# No step changes the logarithm of a parameter by more.
+# Largest change of the logarithm of a parameter in one step.
 _LONGEST = 2.0
-# Newton's steps that change every parameter by less than a tenth are taken as they are.
+# Newton steps that change every parameter by less than a tenth are taken without a line search.
 _SAFE = 0.1
 _ROUNDS = 60
 
 
 def mle(mean_log: Tensor, *, method: Method = "newton", max_precision: float = 1e8) -> Tensor:
-    r"""Maximum-likelihood parameters of Dirichlets, from the mean of the logarithms of their samples.
+    r"""Maximum-likelihood parameters of Dirichlets, given the mean logarithms of their samples.
 
     .. math:: \max_\alpha \; \ln\Gamma(A) - \sum_k \ln\Gamma(\alpha_k) + \sum_k (\alpha_k - 1) g_k, \quad
               A = \sum_k \alpha_k, \quad g_k = \frac{1}{n} \sum_i \ln s_{ik}
 
-    The objective is concave, and has a maximum where `Σ exp(g) < 1`. All methods find the same one:
+    The objective is concave and has a maximum if `Σ exp(g) < 1`. All methods find the same maximum:
 
-    - `newton`: the Hessian is diagonal plus rank one, so that a step costs O(K) (Minka 2000, "Estimating a Dirichlet
-      distribution", equations 15 to 18); taken on `ln α`, which keeps α positive, and halved until it climbs.
-    - `fixed_point`: `ψ(α_k) = ψ(A) + g_k` (Minka 2000, equation 9). On its own each round leaves a fixed share of the
-      error, nearly all where A is large; as that share is known, A is moved all the way at once.
+    - `newton`: Newton's method. The Hessian is diagonal plus rank one, so a step costs O(K) (Minka 2000, "Estimating a
+      Dirichlet distribution", equations 15 to 18). Steps are taken on `ln α`, which keeps α positive, and halved until
+      the likelihood does not fall.
+    - `fixed_point`: iterate `ψ(α_k) = ψ(A) + g_k` (Minka 2000, equation 9). The plain iteration keeps a fixed share
+      of the error in each round, nearly all of it if A is large. This share can be computed, so each round here
+      extrapolates A to the limit.
     - `gradient`: L-BFGS on `ln α`, in coordinates in which the Fisher information is the identity.
 
-    Luzio, Bernardino and Moreno (2024) take "a simple and efficient iterative method, proposed by Minka", and do not
-    say which of his two.
+    Luzio, Bernardino and Moreno (2024) use "a simple and efficient iterative method, proposed by Minka", without
+    saying which of his two.
 
-    Identical samples have `Σ exp(g) = 1` and a likelihood without bound. The precision A is kept to at most
-    `max_precision`; the result is then the maximum among Dirichlets of that precision.
+    Identical samples have `Σ exp(g) = 1` and an unbounded likelihood. The precision A is therefore limited to
+    `max_precision`; at the limit the result is the maximum among Dirichlets of that precision.
 
-    Computed in float64. Differentiable in `mean_log` (once, by the implicit function theorem).
+    Computed in float64. Differentiable once in `mean_log`, by the implicit function theorem.
 
     Args:
-        mean_log: `(..., K)`, K ≥ 2; mean log scores. For scores with zeros see `semfov.dirichlet.floor`, for little
-            or no data `semfov.dirichlet.shrink`.
-        method: how the maximum is found.
-        max_precision: upper bound of A.
+        mean_log: `(..., K)`, K ≥ 2; mean log scores. Use `semfov.dirichlet.floor` for scores with zeros, and
+            `semfov.dirichlet.shrink` for little or no data.
+        method: `newton`, `fixed_point` or `gradient`.
+        max_precision: upper bound of A, positive.
 
     Returns:
         α, `(..., K)`.
 
     Raises:
-        InputError: `mean_log` is not finite, or no sample of the simplex can have it.
+        InputError: `mean_log` is not finite, or no samples on the simplex can have it; or a setting is out of range.
+        SemfovError: the method has not converged.
 
     >>> mle(torch.tensor([-1.0, -1.0]))
     tensor([1., 1.])
@@ -69,7 +72,12 @@ def mle(mean_log: Tensor, *, method: Method = "newton", max_precision: float = 1
     rows = mean_log.detach().to(torch.float64).reshape(-1, components)
     total = rows.exp().sum(-1)
     largest = float(total.max()) if len(rows) else 0.0
-    check(largest <= 1 + _FEASIBLE, "mean_log", "means of logarithms of scores that sum to 1", f"Σ exp = {largest}")
+    check(
+        largest <= 1 + _FEASIBLE,
+        "mean_log",
+        "mean logarithms of scores that sum to 1, so Σ exp(mean_log) up to 1",
+        f"Σ exp(mean_log) = {largest}",
+    )
 
     capped = _reaches(rows, total, max_precision)
     alpha = torch.empty_like(rows)
@@ -82,18 +90,25 @@ def mle(mean_log: Tensor, *, method: Method = "newton", max_precision: float = 1
 
 
 def shrink(mean_log: Tensor, count: Tensor, parent: Tensor, strength: float) -> Tensor:
-    r"""Mean logs of cells with little data, drawn towards those of a parent by pseudo-counts.
+    r"""Shrink the mean log scores of cells with little data towards those of a parent, by pseudo-counts.
 
     .. math:: g = \frac{n \bar g + w \, g_0}{n + w}
 
-    The MLE of the result is the MAP estimate under the conjugate prior of `w` samples with mean log `g_0`. Where the
-    parent is feasible, `Σ exp(g_0) < 1`, so is the result, whatever the data.
+    The maximum-likelihood fit of the result is the maximum a posteriori estimate under the conjugate prior of `w`
+    samples with mean log score `g_0`. If the parent is feasible, `Σ exp(g_0) < 1`, then so is the result, for any
+    data.
 
     Args:
-        mean_log: `(..., K)`, mean logs of the cells; not read where `count` is 0.
-        count: `(...)`, samples n of each cell.
-        parent: `(..., K)`, mean logs of the parent.
+        mean_log: `(..., K)`, mean log scores of the cells; ignored where `count` is 0.
+        count: `(...)`, number of samples n of each cell.
+        parent: `(..., K)`, mean log scores of the parent.
         strength: pseudo-counts w, positive.
+
+    Returns:
+        `(..., K)`, g.
+
+    Raises:
+        InputError: `strength` is not positive.
 
     >>> shrink(torch.tensor([-2.0, -1.0]), torch.tensor(1), torch.tensor([-1.0, -1.0]), 1.0)
     tensor([-1.5000, -1.0000])
@@ -105,7 +120,13 @@ def shrink(mean_log: Tensor, count: Tensor, parent: Tensor, strength: float) -> 
 
 
 def vacuous(components: int) -> Tensor:
-    """Mean logs of Dir(1, ..., 1), the uniform density on the simplex, `(K,)` in float64: `ψ(1) - ψ(K)`.
+    """Mean log scores of Dir(1, ..., 1), the uniform density on the simplex: `ψ(1) - ψ(K)`.
+
+    Args:
+        components: K, the length of the score vectors.
+
+    Returns:
+        `(K,)` in float64.
 
     >>> mle(vacuous(3))
     tensor([1.0000, 1.0000, 1.0000], dtype=torch.float64)
@@ -115,7 +136,13 @@ def vacuous(components: int) -> Tensor:
 
 
 def inverse_digamma(y: Tensor) -> Tensor:
-    """The positive x with ψ(x) = y, by Newton's method (Minka 2000, appendix C).
+    """Inverse of the digamma function: the positive x with ψ(x) = y, by Newton's method (Minka 2000, appendix C).
+
+    Args:
+        y: `(...)`, any numbers.
+
+    Returns:
+        `(...)`, x.
 
     >>> inverse_digamma(torch.digamma(torch.tensor([0.01, 1.0, 100.0], dtype=torch.float64)))
     tensor([1.0000e-02, 1.0000e+00, 1.0000e+02], dtype=torch.float64)
@@ -135,9 +162,13 @@ def _trigamma(x: Tensor) -> Tensor:
 
 
 def _reaches(rows: Tensor, total: Tensor, precision: float) -> Tensor:
-    """Which rows have their maximum at `precision` or above.
+    """Whether the maximum of each row has a precision of at least `precision`.
 
-    The right side of A = Σ ψ⁻¹(ψ(A) + g) is above the left below the solution, and nowhere above A Σ exp(g) + K/2.
+    The solution is the root of A = Σ ψ⁻¹(ψ(A) + g). Below the root the right side exceeds the left, and it never
+    exceeds A Σ exp(g) + K/2.
+
+    Returns:
+        `(rows,)` boolean.
     """
     reaches = 1 - total <= rows.shape[-1] / (2 * precision)
     level = total.new_tensor(precision).digamma()
@@ -146,7 +177,7 @@ def _reaches(rows: Tensor, total: Tensor, precision: float) -> Tensor:
 
 
 def _at_precision(rows: Tensor, precision: float) -> Tensor:
-    """Maximum under Σ α = precision: ψ(α_k) = y + g_k, where y makes the sum right."""
+    """Maximum under the constraint Σ α = precision: ψ(α_k) = y + g_k, with y chosen to satisfy it."""
     level = math.log(precision) - rows.logsumexp(-1, keepdim=True)
     for _ in range(_ROUNDS):
         alpha = inverse_digamma(level + rows)
@@ -159,7 +190,7 @@ def _at_precision(rows: Tensor, precision: float) -> Tensor:
 
 
 def _first_guess(rows: Tensor) -> Tensor:
-    """Parameters within some ten per cent: A = Σ ψ⁻¹(ψ(A) + g) solved with a rough inverse of ψ."""
+    """Parameters within about ten per cent: A = Σ ψ⁻¹(ψ(A) + g), solved with an approximate inverse of ψ."""
     slack = (-torch.expm1(rows.logsumexp(-1, keepdim=True))).clamp(min=torch.finfo(rows.dtype).eps)
     log_precision = ((rows.shape[-1] - 1) / 2 / slack).log()
     for _ in range(3):
@@ -175,14 +206,17 @@ def _first_guess(rows: Tensor) -> Tensor:
 
 
 def _residual(alpha: Tensor, rows: Tensor) -> Tensor:
-    """Gradient of the mean log likelihood in α: ψ(A) - ψ(α_k) + g_k."""
+    """Gradient of the mean log likelihood with respect to α: ψ(A) - ψ(α_k) + g_k."""
     return alpha.sum(-1, keepdim=True).digamma() - alpha.digamma() + rows
 
 
 def _response(alpha: Tensor, change: Tensor, capped: Tensor | None = None) -> Tensor:
-    """Solve `(diag ψ'(α) - ψ'(A)) x = change`: how far the maximum moves when the mean logs change.
+    """Solve `(diag ψ'(α) - ψ'(A)) x = change`: the change of the maximum for a change of the mean log scores.
 
-    Where a row is `capped`, under Σ x = 0.
+    For rows that are `capped` the solution is under the constraint Σ x = 0.
+
+    Returns:
+        x, in the shape of `alpha`.
     """
     rates = _trigamma(alpha).reciprocal()
     total, precision = rates.sum(-1, keepdim=True), alpha.sum(-1, keepdim=True)
@@ -194,12 +228,12 @@ def _response(alpha: Tensor, change: Tensor, capped: Tensor | None = None) -> Te
 
 
 def _tolerance(precision: Tensor) -> Tensor:
-    """Relative change of the parameters that counts as none; rounding of ψ leaves about 1e-15 A of it."""
+    """Relative change of the parameters at which the iteration stops; rounding of ψ alone causes about 1e-15 A."""
     return 1e-8 + 1e-14 * precision
 
 
 def _objective(alpha: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean log likelihood of each row but for Σ g, and a bound on its rounding error."""
+    """Mean log likelihood of each row, without the constant Σ g, and a bound on its rounding error."""
     outer, inner, linear = alpha.sum(-1).lgamma(), alpha.lgamma(), alpha * rows
     value = outer + (linear - inner).sum(-1)
     size = outer.abs() + (inner.abs() + linear.abs()).sum(-1)
@@ -244,7 +278,7 @@ def _fixed_point(rows: Tensor) -> Tensor:
         alpha = inverse_digamma(precision.digamma()[:, None] + rows)
         result[active] = alpha
         total = alpha.sum(-1)
-        # What is left of an error after the round: d ln(Σ α) / d ln(A).
+        # Share of an error that is left after the round: d ln(Σ α) / d ln(A).
         left = precision * _trigamma(precision) * _trigamma(alpha).reciprocal().sum(-1) / total
         step = (total / precision).log() / (1 - left).clamp(min=torch.finfo(rows.dtype).eps)
         going = step.abs() > _tolerance(total)
@@ -258,7 +292,7 @@ def _fixed_point(rows: Tensor) -> Tensor:
 def _gradient(rows: Tensor) -> Tensor:
     alpha, distance = _first_guess(rows), torch.inf
     for _ in range(_ROUNDS if len(rows) else 0):
-        # Close to the maximum the likelihood changes by less than its rounding, so a line search would stall.
+        # Close to the maximum the likelihood changes by less than its rounding error, so a line search would stall.
         alpha = _descend(alpha, rows, "strong_wolfe" if distance > 1e-3 else None)
         step = (_response(alpha, _residual(alpha, rows)) / alpha).abs().amax(-1)
         if bool((step <= _tolerance(alpha.sum(-1))).all()):
@@ -272,8 +306,11 @@ def _gradient(rows: Tensor) -> Tensor:
 def _descend(start: Tensor, rows: Tensor, line_search: str | None) -> Tensor:
     """One run of L-BFGS from `start`.
 
-    The Fisher information of ln α is `diag(α² ψ'(α)) - ψ'(A) α αᵀ`: scaling by `across` takes the diagonal to 1, and
-    `along` is the one direction in which the rank-one part leaves another value than 1.
+    The Fisher information of ln α is `diag(α² ψ'(α)) - ψ'(A) α αᵀ`. Scaling by `across` turns the diagonal into ones.
+    `along` is the only direction in which the rank-one part then gives another value than 1.
+
+    Returns:
+        α after the run.
     """
     rates = _trigamma(start).reciprocal()
     total = rates.sum(-1, keepdim=True)
@@ -293,7 +330,7 @@ def _descend(start: Tensor, rows: Tensor, line_search: str | None) -> Tensor:
     def loss() -> Tensor:
         optimiser.zero_grad()
         alpha = current()
-        # Term by term against the start, which keeps digits that the difference of two sums would lose.
+        # Differences are taken term by term: the difference of two sums would lose digits.
         gain = (alpha.sum(-1).lgamma() - outer) - (alpha.lgamma() - inner).sum(-1) + ((alpha - start) * rows).sum(-1)
         lost = -gain.sum()
         lost.backward()
@@ -304,7 +341,10 @@ def _descend(start: Tensor, rows: Tensor, line_search: str | None) -> Tensor:
 
 
 def _not_converged(method: str, rows: int) -> SemfovError:
-    return SemfovError(f"mle: method {method!r} has not converged after {_ROUNDS} rounds in {rows} Dirichlets")
+    return SemfovError(
+        f"mle: expected method {method!r} to converge within {_ROUNDS} rounds, got {rows} Dirichlets that did not; "
+        "try another method"
+    )
 
 
 _METHODS: dict[str, Callable[[Tensor], Tensor]] = {

@@ -1,4 +1,4 @@
-"""How well a target can be told from background at each level of distance: the d' of signal detection."""
+"""Visibility: how well a target can be told from background at each level of distance, as d' of signal detection."""
 
 from typing import Protocol
 
@@ -10,7 +10,7 @@ from semfov.observation.dirichlet import kl_divergence
 
 
 class ScoringModel(Protocol):
-    """What visibility needs of an observation model (`semfov.FovealObservationModel`)."""
+    """The part of an observation model that `visibility` uses (see `semfov.FovealObservationModel`)."""
 
     miss_rate: Tensor | None
 
@@ -21,11 +21,11 @@ class ScoringModel(Protocol):
 
 
 def visibility(model: ScoringModel) -> Tensor:
-    r"""d' of every class at every level of distance, `(K+1, N)`; background's own is 0.
+    r"""Detectability index d' of every class against background, at every level of distance.
 
-    The signal of a cell is the log likelihood ratio of target and background for what is detected there, R = ln Dir(S |
-    α_k) - ln Dir(S | α_0). Where nothing is detected there is no signal, R = 0, as a belief that fuses detections alone
-    has it. With the miss rates m its means and variances are those of a mixture, and
+    The signal in a cell is the log likelihood ratio of target and background given the detection there, R = ln Dir(S |
+    α_k) - ln Dir(S | α_0). Without a detection there is no signal, R = 0, as in a belief that fuses detections alone.
+    R is therefore distributed as a mixture, weighted by the miss rates m:
 
     .. math::
 
@@ -35,15 +35,18 @@ def visibility(model: ScoringModel) -> Tensor:
         \sigma_c^2 = \sum_j w_j^2 \psi'(\alpha_{cj}) - \Bigl(\sum_j w_j\Bigr)^2 \psi'(A_c), \quad
         w = \alpha_k - \alpha_0
 
-    (d' of two distributions of unequal variances, `d_a` of Simpson and Fitter, 1973; the moments of log scores are
-    those of Minka, 2000.) It is never negative, 0 where a class is never detected and background neither, and does not
-    depend on the tempering.
+    This is d' for two distributions of unequal variance, the `d_a` of Simpson and Fitter (1973); the moments of log
+    scores are those of Minka (2000). It is never negative. It is 0 for a class if neither the class nor background is
+    ever detected. It does not depend on the tempering.
 
-    The Dirichlets must be densities of the scores, as in models fitted by maximum likelihood (`...-published`). Those
-    of models trained for the posterior of the class are not: theirs is nearly the same at all levels.
+    The Dirichlets must be densities of the scores, as in models fitted by maximum likelihood (`...-published`). Models
+    trained for the posterior of the class do not qualify: their d' is nearly the same at all levels.
 
     Args:
         model: the observation model, with miss rates.
+
+    Returns:
+        `(K+1, N)`, d'; that of background is 0.
 
     Raises:
         InputError: the model has no miss rates.
@@ -57,7 +60,9 @@ def visibility(model: ScoringModel) -> Tensor:
             [2.4116, 0.3841]])
     """
     if model.miss_rate is None:
-        raise InputError("model: expected an observation model with miss rates, got one without")
+        raise InputError(
+            "model: expected an observation model with miss rates (fit one with `train.fit_fom`), got one without"
+        )
     alpha, background = model.alpha, model.alpha[:1]
     target = _mixed(*log_ratio_moments(alpha, alpha, background), model.miss_rate)
     nothing = _mixed(*log_ratio_moments(background, alpha, background), model.miss_rate[:1])
@@ -67,12 +72,18 @@ def visibility(model: ScoringModel) -> Tensor:
 
 
 def log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance of `ln Dir(S | target) - ln Dir(S | background)` for scores S of Dir(alpha), each `(...)`.
+    """Mean and variance of `ln Dir(S | target) - ln Dir(S | background)` for scores S drawn from Dir(alpha).
 
     Args:
-        alpha: `(..., K)`, what the scores come from.
-        target: `(..., K)`; broadcasts with `alpha`.
-        background: `(..., K)`; broadcasts with `alpha`.
+        alpha: `(..., K)`, parameters of the distribution of the scores, positive.
+        target: `(..., K)`, parameters of the target's Dirichlet; broadcasts with `alpha`.
+        background: `(..., K)`, parameters of the background's Dirichlet; broadcasts with `alpha`.
+
+    Returns:
+        The mean and the variance, each `(...)`.
+
+    Raises:
+        InputError: the numbers of components differ, or a parameter is not positive.
 
     >>> mean, variance = log_ratio_moments(*torch.tensor([[2.0, 2.0], [2.0, 1.0], [1.0, 2.0]]))
     >>> mean, variance
@@ -85,11 +96,11 @@ def log_ratio_moments(alpha: Tensor, target: Tensor, background: Tensor) -> tupl
     weight = target - background
     total = torch.polygamma(1, alpha.sum(-1))
     variance = (weight.square() * torch.polygamma(1, alpha)).sum(-1) - weight.sum(-1).square() * total
-    # A variance of 0 comes out of the difference as a rounding error.
+    # Where the variance is 0, rounding can make the difference negative.
     return mean, variance.clamp(min=0)
 
 
 def _mixed(mean: Tensor, variance: Tensor, missed: Tensor) -> tuple[Tensor, Tensor]:
-    """Moments of what is 0 with the probability `missed` and has these moments otherwise."""
+    """Mean and variance of a variable that is 0 with probability `missed` and otherwise has the given moments."""
     seen = 1 - missed
     return seen * mean, seen * (variance + missed * mean.square())

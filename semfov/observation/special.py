@@ -1,4 +1,4 @@
-"""Special functions that torch has not."""
+"""Special functions that torch lacks."""
 
 from functools import lru_cache
 from math import prod
@@ -7,18 +7,18 @@ import torch
 from numpy.polynomial import Polynomial
 from torch import Tensor
 
-# B_2k / 2k for k = 1, 2, … What is left out after three terms is below 3e-8 from 4 on, after eight 1e-15 from 8 on.
+# B_2k / 2k for k = 1, 2, … The error of three terms is below 3e-8 for arguments from 4, of eight below 1e-15 from 8.
 _STIRLING = (1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12, -3617 / 8160)
 
 
 def log_gamma_divergence(x: Tensor, c: float) -> Tensor:
-    r"""How far ln Γ is at c above its tangent at x, for positive numbers: the Bregman divergence of ln Γ.
+    r"""Bregman divergence of ln Γ: the height of ln Γ at c above its tangent at x, for positive numbers.
 
     .. math:: h(x) = \ln\Gamma(c) - \ln\Gamma(x) - (c - x) \, \psi(x)
 
-    It is 0 at c and nowhere negative. The recurrences of Γ and ψ lead from x up to x + n, and from there Stirling's
-    series (Abramowitz and Stegun, 1964, 6.1.40, 6.3.6 and 6.3.18). In terms of g, which is 0 at c, all but two terms
-    are one logarithm and three polynomials, and nothing large cancels:
+    It is 0 at c and never negative. The recurrences of Γ and ψ shift x to x + n, where Stirling's series is accurate
+    (Abramowitz and Stegun, 1964, 6.1.40, 6.3.6 and 6.3.18). In terms of g, which is 0 at c, all terms but two reduce
+    to one logarithm and three polynomials, and no large terms cancel:
 
     .. math::
 
@@ -26,7 +26,14 @@ def log_gamma_divergence(x: Tensor, c: float) -> Tensor:
         + (x - c) \Bigl(1 - \frac{1}{x}\Bigr) + \Bigl(\frac{1}{2} - c\Bigr) \ln\frac{x + n}{c + n} \\
         g &= \frac{x - c}{x + n}, \qquad P(g) = \prod_{i=1}^{n-1} \Bigl(1 + \frac{n - i}{c + i} \, g\Bigr)
 
-    g Q(g) is Stirling's series less its value at c, less (n - 1/2) g. Differentiable; dtype and device as `x`.
+    g Q(g) is Stirling's series minus its value at c, minus (n - 1/2) g. Differentiable in x.
+
+    Args:
+        x: `(...)`, positive numbers.
+        c: a positive number.
+
+    Returns:
+        `(...)`, h; dtype and device as `x`.
 
     >>> log_gamma_divergence(torch.tensor([1.0, 2.0]), 1.0)
     tensor([0.0000, 0.4228])
@@ -37,7 +44,7 @@ def log_gamma_divergence(x: Tensor, c: float) -> Tensor:
     lift = above / (x + shift)
     rest = _evaluate(rise, lift).mul_(lift)
     product = 1 + rest
-    # Near x = 0, where c/x is all, rounding would make it the logarithm of 0.
+    # Near x = 0, where c/x dominates, rounding could make this the logarithm of 0.
     whole = torch.addcmul(rest, product, lift, value=shift / c).clamp(min=torch.finfo(x.dtype).eps - 1).log1p()
     slopes = torch.addcdiv(_evaluate(series, lift), _evaluate(slope, lift), product, value=-1)
     value = torch.addcdiv(torch.addcmul(whole, slopes, lift), above, x, value=-1).add_(above)
@@ -45,7 +52,7 @@ def log_gamma_divergence(x: Tensor, c: float) -> Tensor:
 
 
 def _evaluate(coefficients: tuple[float, ...], x: Tensor) -> Tensor:
-    """A polynomial, constant first. In place, for fresh memory costs more than the sums do."""
+    """Value of a polynomial, coefficients constant first; in place, because allocation costs more than the sums."""
     value = x * coefficients[-1]
     for coefficient in coefficients[-2:0:-1]:
         value = value.add_(coefficient).mul_(x)
@@ -57,7 +64,8 @@ def _polynomials(c: float, shift: int, terms: int) -> tuple[tuple[float, ...], .
     return _expand(c, shift, terms)
 
 
-# What `torch.compiler.assume_constant_result` does, which imports the compiler: a second for whoever compiles nothing.
+# This is all that `torch.compiler.assume_constant_result` does. Calling it would import the compiler, which takes a
+# second even for users who compile nothing.
 _polynomials._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 

@@ -1,4 +1,4 @@
-"""Sufficient statistics of Dirichlets: sums that merge, and do not depend on the order in which they were made."""
+"""Sufficient statistics of Dirichlets: sums that can be merged, with a result that does not depend on the order."""
 
 import math
 from collections.abc import Sequence
@@ -12,9 +12,10 @@ from semfov.errors import DataError, InputError, check, check_finite, check_shap
 from semfov.io.schema import Field, Number, Schema
 from semfov.io.storage import read, write
 
-# Sums count quanta of 2^-32. Integers add exactly, so any order and any split of the samples give the same bits.
+# Sums are integers in units of 2^-32. Integers add exactly, so any order and any split of the samples give the same
+# bits.
 FRACTION_BITS = 32
-# Scores in half precision sum to 1 within this.
+# Largest deviation of a sum of half-precision scores from 1.
 _OFF_SIMPLEX = 1e-2
 
 
@@ -22,18 +23,21 @@ class DirichletStatistics:
     r"""Count, `Σ ln s`, `Σ s` and `Σ s²` of score vectors, for every cell of a table of Dirichlets.
 
     Scores are raised to `epsilon` and scaled to sum to 1, in float64. Each term is then rounded to a multiple of
-    2^-32 and added as an integer, which makes the sums independent of the order of updates and merges, of batch sizes
-    and of the number of workers, to the last bit. A mean is off by at most 2^-33 (1.2e-10) for it; a cell holds
-    about 1.5e8 samples at the default `epsilon`, and going beyond raises.
+    2^-32 and added as an integer. The sums are therefore the same to the last bit for any order of updates and merges,
+    any batch size and any number of workers. The rounding changes a mean by at most 2^-33 (1.2e-10). At the default
+    `epsilon` a cell can hold about 1.5e8 samples; more raise an error.
 
     Args:
         shape: shape of the table, for example `(K+1, N)` for classes and levels.
-        components: length of the score vectors.
-        epsilon: the least score.
+        components: length of the score vectors, 2 or more.
+        epsilon: lower bound of the scores, between 0 and 1.
 
     Attributes:
         count: `(*shape)` int64, number of samples.
         sums: `(3, *shape, components)` int64, `Σ ln s`, `Σ s` and `Σ s²` in units of 2^-32.
+
+    Raises:
+        InputError: a size or `epsilon` is out of range.
 
     >>> statistics = DirichletStatistics((2,), components=3)
     >>> scores = torch.tensor([[0.2, 0.3, 0.5], [0.4, 0.1, 0.5]])
@@ -53,12 +57,15 @@ class DirichletStatistics:
 
     @torch.no_grad()
     def update(self, scores: Tensor, index: Tensor | Sequence[Tensor]) -> Self:
-        """Add score vectors to their cells, and return the statistics themselves.
+        """Add score vectors to their cells.
 
         Args:
             scores: `(M, components)`, points of the simplex.
-            index: the cell of each vector, as for indexing a tensor of `shape`: a tuple of `len(shape)` integer
-                tensors `(M,)`, or one tensor `(M,)` of row-major cell numbers.
+            index: the cell of each vector: a tuple of `len(shape)` integer tensors `(M,)`, one for each dimension of
+                the table, or one tensor `(M,)` of row-major cell numbers.
+
+        Returns:
+            These statistics.
 
         Raises:
             InputError: a vector is off the simplex, an index is outside the table, or a sum would overflow.
@@ -78,10 +85,16 @@ class DirichletStatistics:
         return self
 
     def merge(self, other: "DirichletStatistics") -> Self:
-        """Add the sums of other samples, and return the statistics themselves.
+        """Add the sums of other samples.
+
+        Args:
+            other: statistics of the same shape, number of components and epsilon; they are not changed.
+
+        Returns:
+            These statistics.
 
         Raises:
-            InputError: the other table has another shape, number of components or epsilon.
+            InputError: the other table has another shape, number of components or epsilon, or a sum would overflow.
         """
         mine, theirs = (self.shape, self.components, self.epsilon), (other.shape, other.components, other.epsilon)
         check(mine == theirs, "other", f"statistics of shape, components and epsilon {mine}", theirs)
@@ -107,7 +120,17 @@ class DirichletStatistics:
         return (self._mean(2) - self._mean(1).square()).clamp(min=0.0)
 
     def sum(self, dim: int) -> "DirichletStatistics":
-        """Statistics pooled over a dimension of the table, which must have more than one."""
+        """Pool the statistics over a dimension of the table.
+
+        Args:
+            dim: the dimension; negative numbers count from the end.
+
+        Returns:
+            New statistics, with one dimension less.
+
+        Raises:
+            InputError: the table has one dimension only, or a sum would overflow.
+        """
         check(len(self.shape) > 1, "dim", "a table of two dimensions or more", self.shape)
         dim = range(len(self.shape))[dim]
         pooled = DirichletStatistics(self.shape[:dim] + self.shape[dim + 1 :], self.components, epsilon=self.epsilon)
@@ -116,27 +139,33 @@ class DirichletStatistics:
         return pooled
 
     def save(self, path: str | PathLike[str], **record: Any) -> None:
-        """Write a safetensors file, whole or not at all; the same sums give the same bytes.
+        """Write the statistics to a safetensors file, atomically; the same sums give the same bytes.
 
         Args:
             path: the file.
-            record: JSON values to keep with it.
+            record: JSON values to save with the statistics.
         """
         own = {"kind": "dirichlet-statistics", "epsilon": self.epsilon, "fraction_bits": FRACTION_BITS}
         write(path, {"count": self.count, "sums": self.sums}, {**record, **own})
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> tuple[Self, dict[str, Any]]:
-        """Statistics from a file, and the record that was saved with them.
+        """Load statistics that `save` wrote.
+
+        Args:
+            path: the file.
+
+        Returns:
+            The statistics, and the record that was saved with them.
 
         Raises:
-            DataError: the file is missing, damaged or not one of `save`.
+            DataError: the file is missing or damaged, or was not written by `save`.
         """
         tensors, record = read(path, "dirichlet-statistics")
         count, sums = tensors.get("count"), tensors.get("sums")
         if count is None or sums is None or count.ndim < 1 or sums.shape[:-1] != (3, *count.shape):
             shapes = {name: tuple(t.shape) for name, t in tensors.items()}
-            raise DataError(f"{path}: expected tensors count and sums that fit together, got {shapes}")
+            raise DataError(f"{path}: expected tensors `count` and `sums` of matching shapes, got {shapes}")
         whole = Field(tuple(count.shape), torch.int64, low=0)
         try:
             Schema(
@@ -144,7 +173,7 @@ class DirichletStatistics:
                 {"epsilon": Number(above=0, high=1)},
             ).check(tensors, record)
         except InputError as error:
-            raise DataError(f"{path}: not a complete file of statistics ({error})") from None
+            raise DataError(f"{path}: expected a complete file of Dirichlet statistics, got: {error}") from None
         if record.get("fraction_bits") != FRACTION_BITS:
             raise DataError(f"{path}: expected sums in units of 2^-{FRACTION_BITS}, got {record.get('fraction_bits')}")
         statistics = cls(tuple(count.shape), sums.shape[-1], epsilon=record["epsilon"])
@@ -169,7 +198,7 @@ class DirichletStatistics:
         return self.sums[which].to(torch.float64) / 2.0**FRACTION_BITS / self.count[..., None]
 
     def _cells(self, index: Tensor | Sequence[Tensor], samples: int) -> Tensor:
-        """Row-major numbers of the cells, checked."""
+        """Row-major cell numbers, after checking the index."""
         parts = (index,) if isinstance(index, Tensor) else tuple(index)
         sizes = (self.count.numel(),) if isinstance(index, Tensor) else self.shape
         check(len(parts) == len(sizes), "index", f"{len(sizes)} tensors, one for each dimension", len(parts))
@@ -183,18 +212,30 @@ class DirichletStatistics:
         return cells
 
     def _check_room(self, count: Tensor) -> None:
-        """Raise `InputError` where the sums of so many samples might not fit into 63 bits."""
+        """Raise `InputError` if the sums of so many samples could exceed 63 bits."""
         longest = math.log((2 + self.components * self.epsilon) / self.epsilon)
         room = int(2.0 ** (63 - FRACTION_BITS) / longest)
         if int(count.max()) > room:
-            raise InputError(f"statistics: a cell has room for {room} samples, got {int(count.max())}; fit on fewer")
+            raise InputError(
+                f"statistics: expected at most {room} samples in a cell, got {int(count.max())}; fit on fewer samples"
+            )
 
 
 def quantise(scores: Tensor, epsilon: float) -> Tensor:
-    """`ln s`, `s` and `s²` of floored scores `(M, K)`, rounded to integers in units of 2^-32, `(3, M, K)`.
+    """Round `ln s`, `s` and `s²` of scores to integers in units of 2^-32.
 
-    The sum that scales the scores is itself taken over integers: a sum of floats may differ in its last bit with the
+    The sum that scales the scores is computed over integers, too: the last bit of a sum of floats can depend on the
     layout of the batch.
+
+    Args:
+        scores: `(M, K)`, not negative.
+        epsilon: lower bound of the scores.
+
+    Returns:
+        `(3, M, K)` int64.
+
+    >>> quantise(torch.tensor([[0.5, 0.5]]), 1e-6)[1] / 2**32
+    tensor([[0.5000, 0.5000]])
     """
     raised = scores.to(torch.float64).clamp(min=epsilon).contiguous()
     total = (raised * 2.0**48).round().to(torch.int64).sum(-1, keepdim=True)

@@ -1,4 +1,4 @@
-"""The record of an episode: where the gaze went, what was seen, what was believed, and what came of it."""
+"""The record of an episode: fixations, detections, beliefs and the decision."""
 
 from semfov.scanpath.record import Ending, Scanpath, describe, why_it_ended
 from semfov.scanpath.stimulus import Stimulus, sensor_in_words

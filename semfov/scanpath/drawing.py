@@ -1,4 +1,8 @@
-"""Who draws scanpaths: rooms that know of them, so these enter what they draw, and scanpaths ask for it by name."""
+"""A registry of functions that draw scanpaths.
+
+Imports run one way, and the rooms that draw scanpaths come after this one. They register their functions here, and
+scanpaths call them by name.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +13,10 @@ _drawing: dict[str, Callable[..., Any]] = {}
 
 
 def draws(name: str, function: Callable[..., Any]) -> None:
-    """Enter what draws a scanpath: called with it, and with what the caller gave."""
+    """Register a function that draws a scanpath; its first argument is the scanpath."""
     _drawing[name] = function
 
 
 def drawn_by(name: str) -> Callable[..., Any]:
-    """What was entered by this name."""
+    """The function registered under this name."""
     return _drawing[name]

@@ -1,4 +1,4 @@
-"""Scanpaths as files: tensors, and JSON values that say what they are."""
+"""Files of scanpaths: tensors, with JSON values that describe them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _SENSOR = {
 }
 _SETTINGS = Object(
     {
-        # Of a sensor of the user's own other settings than these are kept as they are.
+        # Other settings, of a user's own sensor, are kept without a check.
         "sensor": Object(_SENSOR, Anything(), ("reference",)),
         "detector": Object({"name": Text()}, Anything(), ("name",)),
     },
@@ -86,7 +86,7 @@ def write_fields(path: str | PathLike[str], fields: Mapping[str, Any]) -> None:
     looks: tuple[Detections, ...] = fields["detections"]
     tensors = {name: fields[name] for name in ("cells", "fixations", "probabilities", "values")}
     tensors |= {name: fields[name] for name in ("posterior", "presence") if fields[name] is not None}
-    # Looks one after the other, each as long as it is: what comes back is what was there.
+    # The detections of all looks in a row, without padding; `lengths` separates them again.
     tensors |= {name: torch.cat([getattr(look, name)[0] for look in looks]) for name in ("boxes", "scores", "mask")}
     size = grid.size.tolist() if isinstance(grid.size, Tensor) else list(grid.size)
     record: dict[str, Any] = {
@@ -114,10 +114,13 @@ def write_fields(path: str | PathLike[str], fields: Mapping[str, Any]) -> None:
 
 
 def read_fields(path: str | PathLike[str]) -> dict[str, Any]:
-    """The fields of the scanpath that `write_fields` wrote.
+    """Read the fields of a scanpath that `write_fields` wrote.
+
+    Returns:
+        The fields by name.
 
     Raises:
-        DataError: the file is missing, damaged or no scanpath.
+        DataError: the file is missing or damaged, or holds no scanpath.
     """
     tensors, record = read(path, KIND)
     record.pop("kind")
@@ -127,26 +130,26 @@ def read_fields(path: str | PathLike[str]) -> dict[str, Any]:
         SCHEMA.check(tensors, record)
         return _restored(tensors, record)
     except InputError as error:
-        raise DataError(f"{path}: not a complete scanpath ({' '.join(str(error).split())})") from None
+        raise DataError(f"{path}: expected a complete scanpath, got: {' '.join(str(error).split())}") from None
 
 
 def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields from what was read, where they fit each other."""
+    """Make the fields from the tensors and the record, and check that they fit each other."""
     columns, rows = record["grid"]
     grid, cells = Grid(columns, rows, tuple(record["size"])), tensors["cells"]
     count, target, seconds = len(cells), record["target"], record["seconds"]
     check(tensors["values"].shape[-1] == len(grid), "values", f"one for each of {len(grid)} cells",
           tensors["values"].shape[-1])  # fmt: skip
-    check(int(cells.max()) < len(grid), "cells", f"cells of {len(grid)}", int(cells.max()))
-    check(target is None or 1 <= target < len(record["classes"]), "target", "a class", target)
-    check(len(seconds) in (0, count), "seconds", f"none, or those of {count} looks", len(seconds))
+    check(int(cells.max()) < len(grid), "cells", f"cell numbers below {len(grid)}", int(cells.max()))
+    check(target is None or 1 <= target < len(record["classes"]), "target", "the index of a class", target)
+    check(len(seconds) in (0, count), "seconds", f"times of {count} looks, or none", len(seconds))
     lengths = record["lengths"]
-    check(sum(lengths) == len(tensors["mask"]), "lengths", f"{len(tensors['mask'])} in all", sum(lengths))
+    check(sum(lengths) == len(tensors["mask"]), "lengths", f"a sum of {len(tensors['mask'])}", sum(lengths))
     parts = zip(*(tensors[name].split(lengths) for name in ("boxes", "scores", "mask")), strict=True)
     decision = record["decision"]
     if decision is not None:
         cell = decision["cell"]
-        check(cell is None or cell < len(grid), "decision.cell", f"a cell of {len(grid)}", cell)
+        check(cell is None or cell < len(grid), "decision.cell", f"a cell number below {len(grid)}", cell)
         decision = Decision(**decision, box=tensors.get("box"))
     return {
         "grid": grid,
@@ -168,13 +171,18 @@ def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> dict[
 
 
 def _stimulus(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> Stimulus | None:
-    """What was looked at, where it was kept."""
+    """The stimulus, if it was saved."""
     parts = [tensors.get(name) for name in ("photograph", "canvas")]
     kept = [part for part in parts if part is not None]
     told = [record["placement"] is not None, record["settings"] is not None]
     if not kept and not any(told):
         return None
-    check(len(kept) == 2 and all(told), "photograph", "all that views are made of", f"{len(kept) + sum(told)} of 4")
+    check(
+        len(kept) == 2 and all(told),
+        "photograph",
+        "photograph, canvas, placement and settings together",
+        f"{len(kept) + sum(told)} of these 4",
+    )
     photograph, canvas = kept
     longest = max(photograph.shape[1:])
     check(min(photograph.shape[1:]) >= 1 and longest <= LONGEST, "photograph", f"1 to {LONGEST} px", longest)

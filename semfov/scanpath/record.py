@@ -1,4 +1,4 @@
-"""The record of an episode: where the gaze went, what was seen and what was believed."""
+"""The record of an episode: fixations, detections, beliefs and the decision."""
 
 from __future__ import annotations
 
@@ -26,35 +26,35 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Ending = Literal["box", "decision", "price", "shifts", "cells"]
-"""Why an episode ended: the gaze was on a given box, the search decided, no look was worth its price, all gaze shifts
-were made, or every cell was fixated."""
+"""Reason for the end of an episode: the gaze was on a given box, the search decided, no look was worth its price, all
+gaze shifts were made, or every cell was fixated."""
 
 
 @dataclass(frozen=True)
 class Scanpath:
-    """Fixations of one episode in order, with what was seen and believed at each.
+    """Fixations of one episode in order, with the detections and the belief at each of them.
 
-    In a notebook it shows itself as a page to step through. `plot`, `animate`, `to_frame` and `save` make pictures, a
-    film, a table and a file of it.
+    A notebook shows a scanpath as an interactive page. `plot`, `animate`, `to_frame` and `save` make a picture, an
+    animation, a table and a file.
 
     Attributes:
         grid: the cells of the image.
         classes: names of the classes, background first, in the order of the belief's components.
-        target: index of the class that was searched for; None for exploration.
+        target: class index 1..K that was searched for; None for exploration.
         cells: `(n,)`, fixated cells.
-        fixations: `(n, 2)`, their centres as points `(x, y)`.
-        detections: what was seen from each fixation, batches of one.
-        probabilities: `(n, X·Y, K+1)`, that each cell holds each class, after each look; the first is background. Of a
-            learned map they are marginal: several classes can share a cell, and they need not sum to 1.
-        values: `(n, X·Y)`, acquisition values that the next fixation was chosen by.
-        found: whether the search ended on its target.
-        posterior: `(n, X·Y)`, probability of the target in each cell as the search believed it after each look; None
+        fixations: `(n, 2)`, centres of the fixated cells as `(x, y)` in pixels.
+        detections: detections from each fixation, batches of one.
+        probabilities: `(n, X·Y, K+1)`, probability that each cell holds each class after each look, background first.
+            A learned map gives marginal probabilities: several classes can share a cell, so they need not sum to 1.
+        values: `(n, X·Y)`, values of the acquisition function, by which the next fixation was chosen.
+        found: whether the search found its target.
+        posterior: `(n, X·Y)`, probability of the target in each cell after each look, by the belief of the search; None
             for exploration.
-        presence: `(n,)`, probability that the image holds the target, after each look; None for exploration.
-        decision: what the search decided; None for exploration, and where the protocol ended it on a given box.
-        ending: why it ended; None where that is not known.
-        seconds: what each look took, by stage (`semfov.episode.STAGES`).
-        stimulus: the photograph, and what the eye's views of it are made of; None where it was not kept.
+        presence: `(n,)`, probability that the image holds the target after each look; None for exploration.
+        decision: decision of the search; None for exploration, and for a search that ended on a given box.
+        ending: reason for the end; None if it is not known.
+        seconds: time of each look by stage (`semfov.episode.STAGES`).
+        stimulus: the photograph, and the data for the foveated views of it; None if it was not kept.
 
     Example::
 
@@ -89,11 +89,14 @@ class Scanpath:
         return len(self) - 1
 
     def as_fixations(self, picture: str, subject: str = "semfov") -> Fixations:
-        """The fixations alone, as people's are kept, for `semfov.data.fixations` to write and metrics to compare.
+        """The fixations in the format of human data, to write with `semfov.data.fixations` or to compare by metrics.
 
         Args:
-            picture: its name.
-            subject: who looked.
+            picture: name of the picture.
+            subject: name of the observer.
+
+        Returns:
+            The fixations, with the target of a search and whether it was found.
         """
         width, height = (int(side) for side in self.grid.extent)
         return Fixations(
@@ -107,21 +110,24 @@ class Scanpath:
 
     @property
     def image(self) -> Tensor | None:
-        """The photograph that was looked at, `(3, h, w)` in [0, 1], as far as it was kept."""
+        """The photograph, `(3, h, w)` in [0, 1]; None if it was not kept."""
         return None if self.stimulus is None else self.stimulus.image
 
     def views(self) -> list[Tensor]:
-        """What the eye was shown at each fixation: the foveated photograph, `(3, h, w)` each.
+        """The foveated photograph at each fixation.
+
+        Returns:
+            One view `(3, h, w)` in [0, 1] for each fixation.
 
         Raises:
             InputError: the photograph was not kept.
         """
         if self.stimulus is None:
-            raise InputError("scanpath: expected one with its stimulus (the agents' have one), got one without")
+            raise InputError("scanpath: expected one with its stimulus, as an agent makes it, got one without")
         return self.stimulus.views(self.fixations)
 
     def __repr__(self) -> str:
-        """What came of it, where the gaze went, and what was seen last."""
+        """The outcome, the fixated cells and the detections of the last look."""
         grid, cells = self.grid, [self._place(cell) for cell in self.cells.tolist()]
         path = cells if len(cells) <= 8 else [*cells[:6], "…", cells[-1]]
         width, height = grid.extent.tolist()
@@ -135,32 +141,35 @@ class Scanpath:
         )
 
     def _repr_html_(self) -> str:
-        """A page to step through, in a frame of its own."""
+        """The interactive page, in a frame."""
         return str(drawn_by("notebook")(self))
 
     def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
         """Draw the fixations on the photograph (`semfov.viz.plot_scanpath`).
 
         Args:
-            ax: axes to draw in; None makes a figure.
-            options: of `semfov.viz.plot_scanpath`.
+            ax: axes to draw in; None makes a new figure.
+            options: options of `semfov.viz.plot_scanpath`.
+
+        Returns:
+            The figure.
 
         Raises:
-            InputError: there is no photograph, neither kept nor given as `image=`.
+            InputError: the photograph was not kept, and none is given as `image=`.
         """
         figure: Figure = drawn_by("plot")(self, ax=ax, **options)
         return figure
 
     def animate(self, path: str | PathLike[str] | None = None, **options: Any) -> Path | Any:
-        """Draw the episode as a film, one frame for each fixation.
+        """Draw the episode as an animation, one frame for each fixation.
 
         Args:
-            path: of a GIF to write; None gives the film to be shown in a notebook.
-            options: `seconds` that a frame stays, `hold` that the last stays longer, and `boxes` `(M, 4)` where the
-                target really is.
+            path: path of the GIF to write; None returns the animation for a notebook.
+            options: `seconds`, the duration of a frame; `hold`, the additional duration of the last frame; and `boxes`
+                `(M, 4)`, the true boxes of the target.
 
         Returns:
-            The path, or an object that a notebook shows as a film.
+            The path, or an object that a notebook shows as an animation.
 
         Raises:
             InputError: the photograph was not kept.
@@ -168,11 +177,14 @@ class Scanpath:
         return drawn_by("animate")(self, path, **options)
 
     def rows(self) -> list[dict[str, Any]]:
-        """What was done, a row of plain values for each fixation.
+        """The episode as a table of plain values, one row for each fixation.
 
-        `probability` is that of the target in the fixated cell, `highest` the greatest of all cells, and `presence`
-        that the image holds the target; None where nothing was searched for. `seen` is the most confident detection,
-        with its `score`, of `detections` in all.
+        `probability` is the probability of the target in the fixated cell, `highest` the largest one of all cells, and
+        `presence` the probability that the image holds the target; all are None for exploration. `detections` is the
+        number of detections, `seen` the class of the most confident one, and `score` its confidence.
+
+        Returns:
+            One dictionary for each fixation.
         """
         belief = self.posterior
         if belief is None and self.target is not None:
@@ -203,7 +215,10 @@ class Scanpath:
         return rows
 
     def to_frame(self) -> pandas.DataFrame:
-        """`rows` as a pandas table.
+        """The table of `rows` as a pandas data frame.
+
+        Returns:
+            One row for each fixation.
 
         Raises:
             InputError: pandas is not installed.
@@ -211,11 +226,16 @@ class Scanpath:
         try:
             import pandas
         except ImportError:
-            raise InputError("pandas: expected the package, got none; pip install pandas, or take rows()") from None
+            raise InputError(
+                "pandas: expected the package to be installed, got none; run pip install pandas, or use rows()"
+            ) from None
         return pandas.DataFrame(self.rows())
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write everything to one safetensors file, the photograph too where it was kept, whole or not at all.
+        """Write the scanpath to a safetensors file, with the photograph if it was kept; atomically.
+
+        Args:
+            path: the file.
 
         Raises:
             DataError: the file cannot be written.
@@ -224,10 +244,16 @@ class Scanpath:
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
-        """The scanpath that `save` wrote; nothing in the file is executed.
+        """Load a scanpath that `save` wrote; nothing in the file is executed.
+
+        Args:
+            path: the file.
+
+        Returns:
+            The scanpath.
 
         Raises:
-            DataError: the file is missing, damaged or no scanpath.
+            DataError: the file is missing or damaged, or holds no scanpath.
         """
         return cls(**read_fields(path))
 
@@ -236,7 +262,7 @@ class Scanpath:
         return f"({column}, {row})"
 
     def _seen(self, fixation: int, most: int = 3) -> str:
-        """The most confident detections of a look, in words."""
+        """The most confident detections of a look, as text."""
         seen = self.detections[fixation]
         pairs = list(zip(seen.labels.flatten().tolist(), seen.confidence.flatten().tolist(), strict=True))
         count = int(seen.count.sum())
@@ -245,16 +271,29 @@ class Scanpath:
 
 
 def why_it_ended(scanpath: Scanpath) -> str:
-    """Why an episode ended, in a sentence; nothing where that is not known."""
+    """Explain in one sentence why an episode ended.
+
+    Args:
+        scanpath: the episode.
+
+    Returns:
+        The sentence; empty if the reason is not known.
+
+    >>> import torch
+    >>> grid, none = Grid(2, 1, (10, 10)), torch.zeros(2, 2)
+    >>> path = Scanpath(grid, ("background", "cup"), 1, torch.arange(2), none, (), none, none, True, ending="box")
+    >>> why_it_ended(path)
+    'The gaze is on a box of the target.'
+    """
     if scanpath.ending == "decision" and scanpath.decision is not None:
         return {
             "found": "The target is probable enough, and was looked at closely enough.",
-            "absent": "No cell is left that is worth a look, and the target is rather not there.",
-            "undecided": "No cell is left that is worth a look, but the target rather is there.",
+            "absent": "No remaining cell is worth a look, and the target is probably absent.",
+            "undecided": "No remaining cell is worth a look, but the target is probably there.",
         }[scanpath.decision.outcome]
     reasons = {
         "box": "The gaze is on a box of the target.",
-        "price": "No look is expected to name enough more cells right.",
+        "price": "No look is expected to classify enough more cells correctly.",
         "shifts": f"All {scanpath.shifts} gaze shifts were made.",
         "cells": "Every cell was fixated.",
     }
@@ -262,7 +301,19 @@ def why_it_ended(scanpath: Scanpath) -> str:
 
 
 def describe(scanpath: Scanpath) -> str:
-    """What came of an episode, in a line."""
+    """Describe the outcome of an episode in one line.
+
+    Args:
+        scanpath: the episode.
+
+    Returns:
+        The line.
+
+    >>> import torch
+    >>> grid, none = Grid(2, 1, (10, 10)), torch.zeros(2, 2)
+    >>> describe(Scanpath(grid, ("background", "cup"), 1, torch.arange(2), none, (), none, none, found=True))
+    '“cup” found after 1 gaze shift'
+    """
     shifts = f"{scanpath.shifts} gaze shift{'s' if scanpath.shifts != 1 else ''}"
     if scanpath.target is None:
         return f"explored with {shifts}"

@@ -1,4 +1,4 @@
-"""What an episode looked at, small enough to be kept with it."""
+"""The stimulus of an episode: the photograph, and the data for its foveated views, small enough to keep."""
 
 from __future__ import annotations
 
@@ -15,22 +15,28 @@ from semfov.eye import Eye
 from semfov.sensor import Sensor, sensor_of
 
 LONGEST = 1280
-"""Longer side of a photograph that is kept, in pixels; larger ones are reduced to it."""
+"""Longer side of a kept photograph, in pixels; larger photographs are reduced to it."""
 
 
 @dataclass(frozen=True)
 class Stimulus:
-    """A photograph as pictures of an episode need it, and what the eye's views of it are made of, both as bytes.
+    """A photograph for figures, and the canvas from which foveated views are made, both as bytes.
 
-    A view is made when it is asked for: from the canvas, which is the photograph as the detector takes it in, by the
-    eye's sensor. One that comes from a file has no sensor: it is made anew from its settings (`sensor_of`).
+    The canvas is the photograph fitted into the detector's input. A view is computed on request, by applying the
+    sensor of the eye to the canvas. A stimulus from a file has no sensor, so the sensor is made from its settings
+    (`sensor_of`).
 
     Attributes:
-        photograph: `(3, h, w)` bytes, RGB, at most `LONGEST` pixels long.
-        canvas: `(3, H, W)` bytes, RGB.
-        placement: where the photograph lies on the canvas.
-        settings: of sensor and detector, `Eye.settings()`.
-        sensor: the eye's; None makes one of the settings.
+        photograph: `(3, h, w)` uint8, RGB, longer side at most `LONGEST` pixels.
+        canvas: `(3, H, W)` uint8, RGB.
+        placement: scale and position of the photograph on the canvas.
+        settings: settings of sensor and detector (`Eye.settings`).
+        sensor: sensor of the eye; None makes one from the settings.
+
+    Example::
+
+        stimulus = Stimulus.of(eye, image)
+        sharp_left, sharp_right = stimulus.views(torch.tensor([[100.0, 240.0], [500.0, 240.0]]))
     """
 
     photograph: Tensor
@@ -41,11 +47,17 @@ class Stimulus:
 
     @classmethod
     def of(cls, eye: Eye, image: Tensor) -> Self:
-        """What an eye is shown.
+        """Make the stimulus of an image for an eye.
 
         Args:
             eye: sensor and detector.
             image: `(3, H, W)` or `(1, 3, H, W)`, RGB in [0, 1].
+
+        Returns:
+            The stimulus.
+
+        Raises:
+            InputError: the shape of the image is wrong.
         """
         image = image[None] if image.ndim == 3 else image
         check_shape(image, "image", 1, 3, None, None)
@@ -59,12 +71,18 @@ class Stimulus:
         return self.photograph.float() / 255
 
     def views(self, fixations: Tensor) -> list[Tensor]:
-        """What the detector was shown from each of the fixations `(n, 2)`, without the canvas around it: `(3, h, w)`.
+        """Foveated views of the photograph, as the detector received them, without the border of the canvas.
 
-        Equal to what `Eye.foveated` gives up to the rounding of bytes.
+        They equal the result of `Eye.foveated` up to the rounding to bytes.
+
+        Args:
+            fixations: `(n, 2)`, as `(x, y)` in pixels of the image.
+
+        Returns:
+            One view `(3, h, w)` in [0, 1] for each fixation.
 
         Raises:
-            InputError: the scanpath comes from a file, and its sensor is none of the library's.
+            InputError: the shape is wrong; or the stimulus comes from a file, and its sensor is not one of the library.
         """
         check_shape(fixations, "fixations", None, 2)
         return list(self._views(fixations))
@@ -78,14 +96,20 @@ class Stimulus:
         with torch.no_grad():
             canvas = (self.canvas[None].double() / 255).to(sensor.like)
             state = sensor.open(canvas, canvas.new_tensor(self.placement.scale) * larger)
-            # One at a time: all views of a large canvas at once take gigabytes.
+            # One at a time: all views of a large canvas at once would take gigabytes.
             for point in self.placement.points_to_canvas(fixations.to(canvas)):
                 view = sensor.look(state, point[None])[0]
                 yield view[:, top : top + height, left : left + width].float().cpu().clone()
 
 
 def sensor_in_words(sensor: Mapping[str, Any]) -> str:
-    """What a sensor is like, from its part of `Eye.settings()`.
+    """Describe a sensor in words.
+
+    Args:
+        sensor: the settings of the sensor, from `Eye.settings`.
+
+    Returns:
+        The description.
 
     >>> sensor_in_words({"sigma": 100.0, "reference": 640.0, "growth": 2.0})
     'fovea of 100 px in 640, growth 2'
@@ -99,7 +123,7 @@ def sensor_in_words(sensor: Mapping[str, Any]) -> str:
 
 
 def reduced(image: Tensor, longest: int = LONGEST) -> Tensor:
-    """An image `(3, h, w)` whose longer side is at most `longest` pixels."""
+    """Reduce an image `(3, h, w)` so that its longer side is at most `longest` pixels."""
     check(longest >= 1, "longest", "at least 1 pixel", longest)
     scale = longest / max(image.shape[-2:])
     if scale >= 1:
@@ -109,7 +133,13 @@ def reduced(image: Tensor, longest: int = LONGEST) -> Tensor:
 
 
 def in_bytes(image: Tensor) -> Tensor:
-    """Pixels in [0, 1] as bytes, on the CPU.
+    """Convert pixels in [0, 1] to bytes, on the CPU.
+
+    Args:
+        image: `(...)`; values outside [0, 1] are clipped.
+
+    Returns:
+        `(...)` uint8.
 
     >>> in_bytes(torch.tensor([0.0, 0.5, 1.0])).tolist()
     [0, 128, 255]

@@ -1,4 +1,4 @@
-"""Scanpaths from the steps of an episode."""
+"""Make a scanpath from the steps of an episode."""
 
 from collections.abc import Iterable
 
@@ -14,14 +14,23 @@ from semfov.scanpath.record import Scanpath
 def trace(
     steps: Iterable[Step], grid: Grid, classes: tuple[str, ...], target: int | None, beside: Observer | None
 ) -> Scanpath:
-    """The scanpath of one episode.
+    """Make the scanpath of one episode.
 
     Args:
-        steps: of the episode, from `semfov.episode.rollout`.
+        steps: steps of one episode, from `semfov.episode.rollout`.
         grid: the cells.
         classes: names of the classes, background first.
-        target: class that is searched for; None for exploration.
-        beside: observer that keeps a map of all classes; None where the episode's own belief is one.
+        target: class 1..K that is searched for; None for exploration.
+        beside: observer that keeps a map of all classes next to the belief of the episode; None if that belief is
+            about all classes itself.
+
+    Returns:
+        The scanpath, without a decision.
+
+    Example::
+
+        steps = rollout(looks, observer, acquisition, start, choice, most=10)
+        scanpath = trace(steps, grid, ("background", "cup"), target=1, beside=None)
     """
     cells, fixations, detections, maps, values, present, anywhere, seconds = [], [], [], [], [], [], [], []
     known: Belief | None = None

@@ -97,7 +97,7 @@ def test_a_table_is_written_as_it_is_read(tmp_path):
 def test_checksum_and_source_are_asked_for(path):
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     ContextPrior.from_table(path, CLASSES, source="s", sha256=digest.upper())
-    with pytest.raises(DataError, match="fetch it again"):
+    with pytest.raises(DataError, match="download it again"):
         ContextPrior.from_table(path, CLASSES, source="s", sha256="0" * 64)
     with pytest.raises(InputError, match="source"):
         ContextPrior.from_table(path, CLASSES, source=" ")

@@ -122,7 +122,7 @@ def test_damaged_and_foreign_files_are_refused(tmp_path):
     with pytest.raises(DataError, match="not a readable"):
         DirichletStatistics.load(path)
     write(path, {"count": torch.zeros(2)}, {"kind": "dirichlet-statistics", "epsilon": 1e-6, "fraction_bits": 32})
-    with pytest.raises(DataError, match="fit together"):
+    with pytest.raises(DataError, match="matching shapes"):
         DirichletStatistics.load(path)
     write(path, {}, {"kind": "something else"})
     with pytest.raises(DataError, match="something else"):
@@ -173,7 +173,7 @@ def test_unlike_tables_do_not_merge():
 def test_a_full_cell_is_an_error():
     statistics = DirichletStatistics((1,), 2).update(torch.tensor([[1.0, 0.0]]), CELL)
     # Zeros have the largest logarithm there is; the sums must be sound up to the last merge that is accepted.
-    with pytest.raises(InputError, match=r"has room for 1.*samples"):  # noqa: PT012 (doubling is the point)
+    with pytest.raises(InputError, match=r"at most 1.*samples"):  # noqa: PT012 (doubling is the point)
         for _ in range(40):
             statistics.merge(statistics)
     floored = np.log(1e-6 / (1 + 1e-6))

@@ -184,14 +184,14 @@ def test_the_published_agent_takes_the_folder(home, search):
     assert isinstance(agent.exploring.policy, KL)
     image = torch.rand(3, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
     assert len(agent.search(image, "blue", shifts=2, confirm=1.0).cells) == 3
-    with pytest.raises(InputError, match="sensor: expected None beside a folder of models"):
+    with pytest.raises(InputError, match="sensor: expected None with a folder of models"):
         ActivePerception.published(home / "models", sensor="published")
 
 
 def test_the_published_agent_needs_an_observation_model(home, tmp_path):
     folder = copied(home, tmp_path)
     rewrite(folder, observation=replace(Manifest.read(folder).parts["observation"], file=None, used=False))
-    with pytest.raises(InputError, match=r"observation model, which .* lacks; fit one: python -m train\.fit_detector"):
+    with pytest.raises(InputError, match=r"observation model, got .* without; fit one: python -m train\.fit_detector"):
         ActivePerception.published(folder)
 
 
@@ -259,9 +259,9 @@ def copied(home, tmp_path):
 def test_another_network_is_refused(home, tmp_path):
     folder = copied(home, tmp_path)
     write_network(tmp_path / "colours.onnx", bias=-3.0)
-    with pytest.raises(DataError, match=r"detector: .*another network .*python -m train\.fit_detector"):
+    with pytest.raises(DataError, match=r"detector: .*expected the network .*python -m train\.fit_detector"):
         ActivePerception.from_pretrained(folder)
-    with pytest.raises(DataError, match="another network"):
+    with pytest.raises(DataError, match="expected the network"):
         ActivePerception.from_pretrained(home / "models", detector=tmp_path / "colours.onnx")
 
 

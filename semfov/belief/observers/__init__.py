@@ -1,4 +1,7 @@
-"""Observers: how looks become a belief, and which looks count."""
+"""Observers: they turn looks into a belief.
+
+A look is one fixation with the detections that are seen from there.
+"""
 
 from semfov.belief.observers.any_of import AnyBelief, AnyLook, AnyOf
 from semfov.belief.observers.base import Look, Observer

@@ -1,4 +1,4 @@
-"""An observer of searches for any of several classes."""
+"""The observer of a search for any of several classes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,36 +16,50 @@ from semfov.detection.detections import Detections
 from semfov.errors import check, check_number
 
 TargetLike = str | int | Mapping[str, float] | Mapping[int, float]
-"""A class by name or by index 1..K, or several, each with the probability that it is meant."""
+"""A class by name or by index 1..K, or several classes, each with the probability that it is the one meant."""
 
 
 @dataclass(frozen=True)
 class AnyLook(Look):
-    """What looks say, as the other observer weighs it: of each class in turn, or of all of them."""
+    """Evidence of looks about several classes.
+
+    Attributes:
+        inner: looks of the inner observer: one for each class, or a single one about all classes.
+
+    >>> from semfov.belief.observers import LandingLook
+    >>> look = AnyLook((LandingLook(torch.zeros(2, 4, 1), torch.zeros(2, 4)),))
+    >>> look[:1].inner[0].distance.shape
+    torch.Size([1, 4])
+    """
 
     inner: tuple[Look, ...]
 
     def __getitem__(self, index: Tensor | slice) -> "AnyLook":
-        """Some of the looks."""
+        """The selected looks of the batch."""
         return AnyLook(tuple(look[index] for look in self.inner))
 
     @classmethod
     def join(cls, looks: Sequence[Self]) -> "AnyLook":
-        """All looks of several batches."""
+        """Concatenate several batches of looks."""
         parts = zip(*(look.inner for look in looks), strict=True)
         return AnyLook(tuple(type(part[0]).join(part) for part in parts))
 
 
 @dataclass(frozen=True)
 class AnyBelief(Belief):
-    r"""Belief about any of several classes; it answers for all of them together, whatever target is asked for.
+    r"""Belief about any of several classes. It answers for all of them together, and ignores the target asked for.
 
     .. math:: P(x) = 1 - \prod_k (1 - w_k \, p_k(x))
 
     Attributes:
-        inner: beliefs of the other observer: about each class in turn, or one about all of them.
+        inner: beliefs of the inner observer: one for each class, or a single one about all classes.
         weights: w, by class.
         closest: `(B, X·Y)`, see `Belief`.
+
+    >>> from semfov.belief import DirichletBelief
+    >>> inner = DirichletBelief(torch.tensor([[[1.0, 2.0, 1.0]]]))  # one cell; probabilities 0.25, 0.5, 0.25
+    >>> AnyBelief((inner,), {1: 1.0, 2: 0.4}, inner.closest).probability(1)
+    tensor([[0.5500]])
     """
 
     inner: tuple[Belief, ...]
@@ -53,24 +67,28 @@ class AnyBelief(Belief):
     closest: Tensor
 
     def probability(self, target: int | Tensor) -> Tensor:
-        """Probability that a cell holds one that is meant, `(B, X·Y)`."""
+        """Probability that a cell holds an object that is meant, `(B, X·Y)`."""
         return self._any(lambda belief, index: belief.probability(index))
 
     def chance(self, target: int | Tensor) -> Tensor:
-        """As for `probability`, if no fixated cell holds one."""
+        """As `probability`, given that no fixated cell holds such an object."""
         return self._any(lambda belief, index: belief.chance(index))
 
     def presence(self, target: int | Tensor) -> Tensor:
-        """Probability that one that is meant is anywhere in the image, `(B,)`."""
+        """Probability that an object that is meant is anywhere in the image, `(B,)`."""
         return self._any(lambda belief, index: belief.presence(index))
 
     def likeliest(self) -> Tensor:
-        """The class of which a cell most probably holds one that is meant, `(B,)`."""
+        """The class with the most probable cell, weights included.
+
+        Returns:
+            `(B,)`, class indices.
+        """
         peaks = [weight * belief.probability(index).amax(-1) for belief, index, weight in self._each()]
         return torch.tensor(list(self.weights), device=peaks[0].device)[torch.stack(peaks).argmax(0)]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "AnyBelief":
-        """The belief with all tensors replaced."""
+        """Apply a function to every tensor of the belief."""
         return AnyBelief(tuple(belief.map(function) for belief in self.inner), self.weights, function(self.closest))
 
     def _each(self) -> list[tuple[Belief, int, float]]:
@@ -83,17 +101,22 @@ class AnyBelief(Belief):
 
 
 class AnyOf(Observer):
-    """Searches for any of several classes, as another observer searches for one.
+    """Observer of a search for any of several classes, built on an observer for one class.
 
-    A class counts by its weight, the probability that an object of it is one that is meant. Classes count as if they
-    were independent. It suits policies that go by the probability of the target alone (`TargetPosterior`).
+    The weight of a class is the probability that an object of this class is one that is meant. Classes are treated as
+    independent. It fits policies that use the probability of the target alone (`TargetPosterior`).
 
     Args:
-        observer: what it asks about each class.
-        weights: by class 1..K, in [0, 1], the largest of them above 0.
+        observer: the inner observer, applied to each class.
+        weights: by class 1..K, in [0, 1], at least one above 0.
 
     Raises:
-        InputError: there is no class, or a weight is out of its range.
+        InputError: no class has a weight above 0, or a weight is out of range.
+
+    >>> from semfov.belief.observers import Semantic
+    >>> observer, grid = AnyOf(Semantic(3), {1: 1.0, 2: 0.5}), Grid(1, 1, (10, 10))
+    >>> observer.start(1, grid, torch.zeros(1)).probability(1)  # each class has the probability 1/3
+    tensor([[0.4444]])
     """
 
     def __init__(self, observer: Observer, weights: Mapping[int, float]) -> None:
@@ -107,26 +130,26 @@ class AnyOf(Observer):
 
     @property
     def thresholds(self) -> Thresholds | None:
-        """Those of the other observer."""
+        """Thresholds of the inner observer."""
         return self.observer.thresholds
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> AnyBelief:
-        """As the other observer starts, for each class."""
+        """The first belief of the inner observer, for each class."""
         inner = tuple(self.observer.start(batch, grid, like) for _ in self._asked)
         return AnyBelief(inner, self.weights, inner[0].closest)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> AnyLook:
-        """What looks say of each class; `target` is not asked for."""
+        """Evidence for each class; `target` is ignored."""
         return AnyLook(tuple(self.observer.weigh(detections, fixation, grid, index) for index in self._asked))
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> AnyBelief:
-        """The other observer's beliefs fade."""
+        """Fade the beliefs of the inner observer."""
         known, said = own(belief, AnyBelief, "belief"), own(look, AnyLook, "look")
         pairs = zip(known.inner, said.inner, strict=True)
         return _with(known, tuple(self.observer.fade(each, of, keep, visited) for each, of in pairs))
 
     def update(self, belief: Belief, look: Look) -> AnyBelief:
-        """Belief after a look in each episode."""
+        """Update the beliefs of the inner observer."""
         known, said = own(belief, AnyBelief, "belief"), own(look, AnyLook, "look")
         pairs = zip(known.inner, said.inner, strict=True)
         return _with(known, tuple(self.observer.update(each, of) for each, of in pairs))
@@ -137,12 +160,19 @@ def _with(belief: AnyBelief, inner: tuple[Belief, ...]) -> AnyBelief:
 
 
 def weights_by_class(target: Mapping[str, float] | Mapping[int, float], classes: Sequence[str]) -> dict[int, float]:
-    """Weights by class 1..K of a target that is any of several; names are found as `class_index` does.
+    """Weights by class index for a target that is any of several classes.
+
+    Args:
+        target: weights by class name or index 1..K; names are looked up by `class_index`.
+        classes: names of the K classes.
+
+    Returns:
+        Weights by class index 1..K.
 
     Raises:
-        InputError: a class is unknown, there twice, or there is none.
+        InputError: a class is unknown or given twice, or no class is given.
     """
-    check(len(target) > 0, "target", "a class, or several with weights", "none")
+    check(len(target) > 0, "target", "a class, or several classes with weights", "none")
     found: dict[int, float] = {}
     for name, weight in target.items():
         index = class_index(name, classes, "target")

@@ -1,4 +1,4 @@
-"""What an observer is: it turns looks into a belief."""
+"""Base classes of observers, which turn looks into a belief."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -16,84 +16,154 @@ Kind = TypeVar("Kind")
 
 
 class Look(ABC):
-    """Base of what a batch of looks says about the cells, as an observer weighs it."""
+    """Base of the evidence of a batch of looks about the cells. `Observer.weigh` returns it, `Observer.update` uses it.
+
+    A subclass implements indexing and `join`.
+
+    >>> import torch
+    >>> from semfov.belief.observers import SemanticLook
+    >>> look = SemanticLook(torch.ones(2, 5, 3), torch.ones(2, 5, 4), torch.zeros(2, 4))  # two looks, four cells
+    >>> SemanticLook.join([look[:1], look]).distance.shape
+    torch.Size([3, 4])
+    """
 
     @abstractmethod
     def __getitem__(self, index: Tensor | slice) -> Self:
-        """Some of the looks."""
+        """The selected looks of the batch."""
 
     @classmethod
     @abstractmethod
     def join(cls, looks: Sequence[Self]) -> Self:
-        """All looks of several batches."""
+        """Concatenate several batches of looks.
+
+        Args:
+            looks: the batches, all of this class.
+
+        Returns:
+            One batch with all looks, in order.
+        """
 
 
 class Observer(nn.Module, ABC):
-    """Base of all observers: what looks say, and what is believed after them.
+    """Base of all observers, which turn looks into a belief.
 
-    A subclass implements `start`, `weigh` and `update`. What `weigh` returns is read by its own `update` alone, so that
-    looks can be weighed once and used by many episodes.
+    A subclass implements `start`, `weigh` and `update`. Only the observer's own `update` reads the result of `weigh`,
+    and `weigh` does not depend on the episode, so a look can be weighed once and used by many episodes.
 
     Attributes:
-        by_target: whether what a look says depends on the target that is searched for.
+        by_target: whether the evidence of a look depends on the target that is searched for.
+
+    >>> import torch
+    >>> from semfov.belief.observers import Semantic
+    >>> observer, grid = Semantic(2), Grid(2, 1, (10, 10))  # background and one class, two cells
+    >>> seen = Detections(torch.tensor([[[0.0, 0, 4, 4]]]), torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1).bool())
+    >>> look = observer.weigh(seen, torch.zeros(1, 2), grid)
+    >>> observer.update(observer.start(1, grid, torch.zeros(1)), look).probability(1)
+    tensor([[0.6500, 0.5000]])
     """
 
     by_target: ClassVar[bool] = False
 
     @property
     def thresholds(self) -> Thresholds | None:
-        """Probabilities at which a search decides; None where the belief is none to decide by."""
+        """Thresholds at which a search decides; None for a belief without calibrated thresholds."""
         return None
 
     @abstractmethod
     def start(self, batch: int, grid: Grid, like: Tensor) -> Belief:
-        """The belief of `batch` episodes before the first look; dtype and device as `like`."""
+        """Make the belief before the first look.
+
+        Args:
+            batch: B, number of episodes.
+            grid: the cells.
+            like: a tensor; the belief takes its dtype and device.
+
+        Returns:
+            The belief of B episodes.
+        """
 
     @abstractmethod
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> Look:
-        """What looks say.
+        """Weigh the evidence of looks about the cells.
 
         Args:
-            detections: what was seen, boxes in pixels of the grid's image, a batch of B looks.
-            fixation: `(B, 2)`, where each look was fixated.
+            detections: the detections of B looks, boxes in pixels of the grid's image.
+            fixation: `(B, 2)`, fixation of each look as `(x, y)` in pixels.
             grid: the cells.
-            target: class 1..K that is searched for; an observer that is not `by_target` has no use for it.
+            target: class 1..K that is searched for; ignored by an observer that is not `by_target`.
+
+        Returns:
+            The evidence, a batch of B looks.
         """
 
     @abstractmethod
     def update(self, belief: Belief, look: Look) -> Belief:
-        """The belief after one more look in each episode."""
+        """Update the belief with one more look in each episode.
+
+        Args:
+            belief: of B episodes.
+            look: B looks of this observer's `weigh`.
+
+        Returns:
+            The new belief.
+        """
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> Belief:
-        r"""The belief by the time of the next look at a scene that changes: what was gathered counts less.
+        r"""Discount the evidence of past looks before the next look at a changing scene.
 
         .. math:: e \leftarrow e_0 + k \, (e - e_0)
 
-        with the evidence :math:`e` of all looks so far, what would be known without any, :math:`e_0`, and `keep`, k.
-        Subclasses say what that is of their own. Figures that are read from the evidence are those of before, until
-        `update` reads them anew.
+        :math:`e` is the evidence of all looks so far, :math:`e_0` the evidence without any look, and k is `keep`.
+        Subclasses define both. Probabilities that are computed from the evidence stay as they are until the next
+        `update`.
 
         Args:
-            belief: after the looks so far.
-            look: the next one, which is not taken in yet.
-            keep: share that is left, in (0, 1].
+            belief: the belief after the looks so far.
+            look: the next look, which is not in the belief yet.
+            keep: k, the share of the evidence to keep, in (0, 1].
             visited: `(B, X·Y)` boolean, cells that still count as fixated.
+
+        Returns:
+            The faded belief.
+
+        Raises:
+            InputError: this observer's belief cannot fade.
         """
-        raise InputError(f"observer: expected one whose belief can fade, got {type(self).__name__}")
+        raise InputError(
+            f"observer: expected one whose belief can fade, got {type(self).__name__}; define its method `fade`, or "
+            "use it on still pictures alone"
+        )
 
     def forward(
         self, belief: Belief, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None
     ) -> Belief:
-        """`update` by what `weigh` makes of the looks."""
+        """Weigh looks and update the belief with them.
+
+        Args:
+            belief: of B episodes.
+            detections: the detections of B looks, boxes in pixels of the grid's image.
+            fixation: `(B, 2)`, fixation of each look as `(x, y)` in pixels.
+            grid: the cells.
+            target: class 1..K that is searched for.
+
+        Returns:
+            The new belief.
+        """
         return self.update(belief, self.weigh(detections, fixation, grid, target))
 
 
 def own(value: object, kind: type[Kind], argument: str) -> Kind:
-    """The value, which must be of the observer's own kind.
+    """Check that a belief or a look is of the kind that an observer makes.
+
+    Returns:
+        The belief or the look.
 
     Raises:
         InputError: it comes from another observer.
     """
     if not isinstance(value, kind):
-        raise InputError(f"{argument}: expected {kind.__name__}, got {type(value).__name__}")
+        raise InputError(
+            f"{argument}: expected {kind.__name__}, got {type(value).__name__}; use the belief and the looks of one "
+            "observer"
+        )
     return value

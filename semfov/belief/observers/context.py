@@ -1,4 +1,4 @@
-"""An observer that adds context to what another one believes of the target."""
+"""An observer that adds context to another observer's belief about the target."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,12 +17,12 @@ from semfov.errors import InputError
 
 @dataclass(frozen=True)
 class ContextLook(Look):
-    """What looks say of the target, and which classes they show where.
+    """Evidence of looks about the target, and the classes that they show in each cell.
 
     Attributes:
-        inner: what the other observer takes the looks to say.
-        presence: `(B, X·Y, K+1)`, of `presence_of`.
-        target: `(B,)`, class that is searched for.
+        inner: looks of the inner observer.
+        presence: `(B, X·Y, K+1)`, highest score of each class in each cell (`presence_of`).
+        target: `(B,)`, the class that is searched for.
         grid: the cells.
     """
 
@@ -32,12 +32,12 @@ class ContextLook(Look):
     grid: Grid
 
     def __getitem__(self, index: Tensor | slice) -> "ContextLook":
-        """Some of the looks."""
+        """The selected looks of the batch."""
         return replace(self, inner=self.inner[index], presence=self.presence[index], target=self.target[index])
 
     @classmethod
     def join(cls, looks: Sequence["ContextLook"]) -> "ContextLook":
-        """All looks of several batches."""
+        """Concatenate several batches of looks."""
         inner = [look.inner for look in looks]
         presence = torch.cat([look.presence for look in looks])
         return cls(type(inner[0]).join(inner), presence, torch.cat([look.target for look in looks]), looks[0].grid)
@@ -45,14 +45,19 @@ class ContextLook(Look):
 
 @dataclass(frozen=True)
 class ContextBelief(Belief):
-    """Belief about one target alone.
+    """Belief about a single target, with context.
 
     Attributes:
         present: `(B, X·Y)`, probability that a cell holds the target.
-        following: `(B, X·Y)`, the same if no fixated cell holds it.
+        following: `(B, X·Y)`, probability that a cell holds the target, given that no fixated cell holds it.
         closest: `(B, X·Y)`, see `Belief`.
-        inner: belief of the other observer.
+        inner: belief of the inner observer, without context.
         shown: `(B, X·Y, K+1)`, highest score of each class in each cell in any look.
+
+    >>> from semfov.belief.observers import Semantic
+    >>> prior = ContextPrior(["cup"], torch.zeros(2, 1, 1), torch.zeros(2, 2, 1), [])
+    >>> Context(Semantic(2), prior, weights=(1.0, 1.0)).start(1, Grid(2, 1, (10, 10)), torch.zeros(1)).probability(1)
+    tensor([[0.5000, 0.5000]])
     """
 
     present: Tensor
@@ -62,19 +67,19 @@ class ContextBelief(Belief):
     shown: Tensor
 
     def probability(self, target: int | Tensor) -> Tensor:
-        """Probability of the target that was searched for, `(B, X·Y)`, whatever `target` is."""
+        """Probability that each cell holds the target of the search, `(B, X·Y)`; `target` is ignored."""
         return self.present
 
     def chance(self, target: int | Tensor) -> Tensor:
-        """As for `probability`, if no fixated cell holds the target."""
+        """As `probability`, given that no fixated cell holds the target."""
         return self.following
 
     def presence(self, target: int | Tensor) -> Tensor:
-        """As the other observer has it: context tells of places."""
+        """Probability of the inner observer: context changes where the target is, not whether it is there."""
         return self.inner.presence(target)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "ContextBelief":
-        """The belief with all tensors replaced, those of the other observer's among them."""
+        """Apply a function to every tensor of the belief and of the inner belief."""
         inner = self.inner.map(function)
         return ContextBelief(
             function(self.present), function(self.following), function(self.closest), inner, function(self.shown)
@@ -82,17 +87,26 @@ class ContextBelief(Belief):
 
 
 class Context(Observer):
-    r"""Adds context to the log odds of the target that another observer arrives at.
+    r"""Observer that adds context to the log odds of the target that another observer computes.
 
     .. math:: \operatorname{logit} P(t \in x) = \operatorname{logit} p_t(x) + c_t(x)
 
-    with c of `ContextPrior`, from the strongest sight of every class so far. It suits policies that go by the
-    probability of the target alone (`TargetPosterior`).
+    c is the context of `ContextPrior`, given the highest score of every class in each cell so far. It fits policies
+    that use the probability of the target alone (`TargetPosterior`).
 
     Args:
-        observer: what it adds to.
+        observer: the inner observer.
         prior: the context.
-        weights: of place and co-occurrence; None takes those fitted for the kind of observer.
+        weights: weights of place and co-occurrence; None takes those fitted for the kind of observer.
+
+    >>> from semfov.belief.observers import Semantic
+    >>> place = torch.zeros(2, 2, 2)
+    >>> place[1, 1] = 1.0  # cups are in the lower half
+    >>> prior = ContextPrior(["cup"], place, torch.zeros(2, 2, 1), [])
+    >>> observer, grid = Context(Semantic(2), prior, weights=(1.0, 1.0)), Grid(1, 2, (10, 10))
+    >>> seen = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 2), torch.zeros(1, 0, dtype=torch.bool))
+    >>> observer(observer.start(1, grid, torch.zeros(1)), seen, torch.zeros(1, 2), grid, target=1).probability(1)
+    tensor([[0.5000, 0.7311]])
     """
 
     by_target = True
@@ -105,18 +119,25 @@ class Context(Observer):
 
     @property
     def thresholds(self) -> Thresholds | None:
-        """Those of the other observer."""
+        """Thresholds of the inner observer."""
         return self.observer.thresholds
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> ContextBelief:
-        """Even odds in every cell, nothing seen."""
+        """Even odds in every cell, and no evidence."""
         inner = self.observer.start(batch, grid, like)
         even = like.new_full((batch, len(grid)), 0.5)
         nothing = like.new_zeros(batch, len(grid), len(self.prior.classes) + 1)
         return ContextBelief(even, even, inner.closest, inner, nothing)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> ContextLook:
-        """What looks from `fixation` `(B, 2)` say of the target, and what they show around it."""
+        """Evidence for the target, and the classes that are shown in each cell.
+
+        Returns:
+            A batch of B looks.
+
+        Raises:
+            InputError: `target` is None.
+        """
         if target is None:
             raise InputError("target: expected a class to search for, got None")
         inner = self.observer.weigh(detections, fixation, grid, target)
@@ -124,13 +145,13 @@ class Context(Observer):
         return ContextLook(inner, presence_of(detections, grid), wanted, grid)
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> ContextBelief:
-        """The other observer's belief fades, and so do the scores that were shown."""
+        """Fade the belief of the inner observer and the scores of the shown classes."""
         known, said = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")
         inner = self.observer.fade(known.inner, said.inner, keep, visited)
         return replace(known, inner=inner, closest=inner.closest, shown=keep * known.shown)
 
     def update(self, belief: Belief, look: Look) -> ContextBelief:
-        """Belief after a look in each episode."""
+        """Update the inner belief and the shown classes, and add the context."""
         known, said = own(belief, ContextBelief, "belief"), own(look, ContextLook, "look")
         inner = self.observer.update(known.inner, said.inner)
         presence = torch.maximum(known.shown, said.presence)
@@ -146,5 +167,5 @@ class Context(Observer):
 
 
 def log_odds(probability: Tensor) -> Tensor:
-    """What context is added to: the logit, kept finite."""
+    """Log odds of a probability, kept finite."""
     return probability.logit(eps=1e-6)

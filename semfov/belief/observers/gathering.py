@@ -1,4 +1,4 @@
-"""What observers have in common that weigh all looks by networks: what looks say, what is gathered, and how."""
+"""Base classes of the observers with learned evidence: their looks, their beliefs, and how evidence is gathered."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Look, Observer
 
 READ = ("closest", "score", "looks", "visited")
-"""What networks read as it is, in the order of `Gathered`."""
+"""Gathered values that the networks read without change, in the order of `Gathered`."""
 
 
 @dataclass(frozen=True)
 class EvidenceLook(Look):
-    """What looks say of a class in every cell, or of T classes at once.
+    """Evidence of looks about one class in every cell, or about T classes at once.
 
     Attributes:
         evidence: `(B, X·Y)` or `(B, T, X·Y)`, log odds.
-        distance: `(B, X·Y)`, from the fixation, in longer sides of the image.
+        distance: `(B, X·Y)`, from the fixation to every cell, in longer sides of the image.
         score: `(B,)` or `(B, T)`, highest score of each class in any detection.
-        fixated: `(B,)`, cell that holds the fixation.
+        fixated: `(B,)`, the cell that holds the fixation.
         target: `(B,)` or `(B, T)`, the classes.
-        columns: cells in a row.
+        columns: X, cells in a row.
     """
 
     evidence: Tensor
@@ -40,31 +40,31 @@ class EvidenceLook(Look):
     columns: int
 
     def __getitem__(self, index: Tensor | slice) -> Self:
-        """Some of the looks."""
+        """The selected looks of the batch."""
         chosen: dict[str, Any] = {name: tensor[index] for name, tensor in self._tensors().items()}
         return replace(self, **chosen)
 
     @classmethod
     def join(cls, looks: Sequence[Self]) -> Self:
-        """All looks of several batches."""
+        """Concatenate several batches of looks."""
         names = looks[0]._tensors()
         joined: dict[str, Any] = {name: torch.cat([getattr(look, name) for look in looks]) for name in names}
         return replace(looks[0], **joined)
 
     def _tensors(self) -> dict[str, Tensor]:
-        """All but the number of columns, which is the same for all looks."""
+        """All attributes except the number of columns, which is the same for all looks."""
         return {each.name: getattr(self, each.name) for each in fields(self) if each.name != "columns"}
 
 
 @dataclass(frozen=True)
 class GatheredBelief(Belief, ABC):
-    """Base of beliefs that are read from what all looks gathered, of one class or of each of K.
+    """Base of beliefs that are computed from the evidence of all looks, about one class or about each of K classes.
 
     Attributes:
         closest: `(B, X·Y)`, see `Belief`.
         nearest: `(B, X·Y)` or `(B, K, X·Y)`, evidence of the closest look at each cell.
-        best: as `nearest`, strongest evidence of any look.
-        total: as `nearest`, evidence of all looks, each counted by its nearness.
+        best: in the same shape, strongest evidence of any look.
+        total: in the same shape, sum of the evidence of all looks, weighted by their nearness.
         weight: `(B, X·Y)`, sum of the nearness of all looks.
         score: `(B,)` or `(B, K)`, highest score of each class in any detection.
         looks: `(B,)`, number of looks.
@@ -81,15 +81,15 @@ class GatheredBelief(Belief, ABC):
     visited: Tensor
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Self:
-        """The belief with all tensors replaced."""
+        """Apply a function to every tensor of the belief."""
         return replace(self, **{each.name: function(getattr(self, each.name)) for each in fields(self)})
 
 
 class Gatherer(Observer):
-    """Base of the observers that weigh what all looks say by networks.
+    """Base of the observers with learned evidence.
 
     Args:
-        together: compute all episodes of a batch at once: faster, but how figures are rounded depends on the batch.
+        together: compute all episodes of a batch at once; faster, but the rounding then depends on the batch.
     """
 
     model: Evidence
@@ -99,13 +99,16 @@ class Gatherer(Observer):
         self.together = together
 
     def nothing(self, batch: int, grid: Grid, like: Tensor, *classes: int) -> dict[str, Tensor]:
-        """What is gathered before the first look: the attributes of `GatheredBelief`.
+        """Gathered evidence before the first look.
 
         Args:
-            batch: number of episodes.
+            batch: B, number of episodes.
             grid: the cells.
-            like: whose dtype and device they take.
-            classes: how many rows there are in each episode, 1 of which stands for any number; none for one class.
+            like: a tensor that gives dtype and device.
+            classes: number of rows for each episode, where 1 broadcasts to any number; left out for a single class.
+
+        Returns:
+            The attributes of `GatheredBelief`.
         """
         cells, each = like.new_zeros(batch, len(grid)), like.new_zeros(batch, *classes, len(grid))
         return {
@@ -120,7 +123,15 @@ class Gatherer(Observer):
         }
 
     def gather(self, known: GatheredBelief, said: EvidenceLook) -> dict[str, Tensor]:
-        """What is gathered after one more look in each episode: the attributes of `GatheredBelief`."""
+        """Gather the evidence of one more look in each episode.
+
+        Args:
+            known: the belief so far.
+            said: the evidence of the look.
+
+        Returns:
+            The attributes of `GatheredBelief`.
+        """
 
         def by_cell(values: Tensor) -> Tensor:
             """`(B, X·Y)`, the same for all classes."""
@@ -139,18 +150,21 @@ class Gatherer(Observer):
         }
 
     def read(self, gathered: dict[str, Tensor]) -> list[Tensor]:
-        """What networks read of all looks: the attributes of `Gathered` up to the class, of one class or of several."""
+        """Inputs of the networks: the attributes of `Gathered` up to the class, for one class or several."""
         total, weight = gathered["total"], gathered["weight"]
         mean = total / (weight if total.ndim == weight.ndim else weight[:, None])
         return [gathered["nearest"], gathered["best"], mean, *(gathered[name] for name in READ)]
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> Belief:
-        r"""What looks gathered counts less, and a closest look counts as one from farther away; see `Observer.fade`.
+        r"""Discount the gathered evidence, and count the closest look as one from farther away; see `Observer.fade`.
 
-        With r = -ln k, what is gathered for a cell moves by :math:`e \leftarrow e_0 + k (e - e_0)` towards the evidence
-        :math:`e_0` of a look from far away that shows nothing. Looks count by their nearness :math:`e^{-d/R}`
-        (`semfov.belief.evidence.nearness`), which fades with them: so does that of the closest look, by
-        :math:`d \leftarrow d + r R`, and a fresh look from farther takes its place in time.
+        Let r = -ln k. The evidence for a cell moves by :math:`e \leftarrow e_0 + k (e - e_0)` towards :math:`e_0`, the
+        evidence of a look from far away without detections. Looks are weighted by their nearness :math:`e^{-d/R}`
+        (`semfov.belief.evidence.nearness`), which is multiplied by k. For the closest look this means
+        :math:`d \leftarrow d + r R`, so that in time a new look from farther away takes its place.
+
+        Returns:
+            The faded belief.
         """
         if keep == 1:
             return belief
@@ -161,5 +175,5 @@ class Gatherer(Observer):
         return replace(belief, **faded, closest=known["closest"] + farther(keep), visited=visited)  # type: ignore[type-var]
 
     def each(self, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-        """`function` of the rows of tensors `(B, ...)`, each alone (`one_by_one`) or all at once."""
+        """Apply a function to the rows of tensors `(B, ...)`: one by one (`one_by_one`), or all at once."""
         return function(*rows) if self.together else one_by_one(function, *rows)

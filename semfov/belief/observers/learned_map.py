@@ -1,4 +1,4 @@
-"""The observer that learned to tell what is where: every class, and none, in every cell."""
+"""The observer with a learned map: the probability of every class, and of background, in every cell."""
 
 from dataclasses import dataclass
 
@@ -17,10 +17,21 @@ from semfov.detection.detections import Detections
 
 @dataclass(frozen=True)
 class MapLook(EvidenceLook):
-    """What looks say about T classes in every cell; attributes as for T classes in `EvidenceLook`, and:
+    """Evidence of looks about T classes in every cell.
 
     Attributes:
-        stands_for: `(B, T)`, how many classes each one stands for; 1 where all are given.
+        evidence: `(B, T, X·Y)`, log odds.
+        distance: `(B, X·Y)`, from the fixation to every cell, in longer sides of the image.
+        score: `(B, T)`, highest score of each class in any detection.
+        fixated: `(B,)`, the cell that holds the fixation.
+        target: `(B, T)`, the classes.
+        columns: X, cells in a row.
+        stands_for: `(B, T)`, number of classes that each given class represents; 1 if all K are given.
+
+    >>> observer, grid = LearnedMap(MapEvidence(8, 4, components=3)), Grid(4, 4, (80, 80))  # not trained yet
+    >>> seen = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 3), torch.zeros(1, 0, dtype=torch.bool))
+    >>> observer.weigh(seen, torch.tensor([[30.0, 10.0]]), grid).fixated
+    tensor([1])
     """
 
     stands_for: Tensor
@@ -28,18 +39,29 @@ class MapLook(EvidenceLook):
 
 @dataclass(frozen=True)
 class MapBelief(GatheredBelief):
-    """Belief about all classes, as marginal probabilities; attributes as for K classes in `GatheredBelief`, and:
-
-    Several classes can share a cell.
+    """Belief about all classes, as marginal probabilities. Several classes can share a cell.
 
     Attributes:
-        probabilities: `(B, X·Y, K+1)`, that a cell holds each class; the first is that it holds none.
+        closest: `(B, X·Y)`, see `Belief`.
+        nearest: `(B, K, X·Y)`, evidence of the closest look at each cell.
+        best: `(B, K, X·Y)`, strongest evidence of any look.
+        total: `(B, K, X·Y)`, sum of the evidence of all looks, weighted by their nearness.
+        weight: `(B, X·Y)`, sum of the nearness of all looks.
+        score: `(B, K)`, highest score of each class in any detection.
+        looks: `(B,)`, number of looks.
+        visited: `(B, X·Y)` boolean, cells that were fixated.
+        probabilities: `(B, X·Y, K+1)`, probability that a cell holds each class; the first is background, that it holds
+            none.
+
+    >>> observer, grid = LearnedMap(MapEvidence(8, 4, components=3)), Grid(4, 4, (80, 80))  # not trained yet
+    >>> observer.start(1, grid, torch.zeros(1)).probabilities[0, 0]
+    tensor([0.3333, 0.3333, 0.3333])
     """
 
     probabilities: Tensor
 
     def class_probabilities(self) -> Tensor:
-        """Probabilities of all classes; they need not sum to 1."""
+        """Probabilities of all classes, background first; they need not sum to 1."""
         return self.probabilities
 
     def probability(self, target: int | Tensor) -> Tensor:
@@ -48,11 +70,17 @@ class MapBelief(GatheredBelief):
 
 
 class LearnedMap(Gatherer):
-    """Gathers evidence for all classes as `MapEvidence` learned to: the closest look at each cell counts most.
+    """Observer with learned evidence for all classes (`MapEvidence`), in which the closest look at a cell counts most.
 
     Args:
         model: the learned evidence.
-        together: compute all episodes of a batch at once: faster, but how figures are rounded depends on the batch.
+        together: compute all episodes of a batch at once; faster, but the rounding then depends on the batch.
+
+    >>> observer, grid = LearnedMap(MapEvidence(8, 4, components=3)), Grid(4, 4, (80, 80))  # not trained yet
+    >>> seen = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 3), torch.zeros(1, 0, dtype=torch.bool))
+    >>> belief = observer(observer.start(1, grid, torch.zeros(1)), seen, torch.tensor([[30.0, 10.0]]), grid)
+    >>> belief.class_probabilities().shape, belief.visited.nonzero().tolist()
+    (torch.Size([1, 16, 3]), [[0, 1]])
     """
 
     model: MapEvidence
@@ -62,14 +90,14 @@ class LearnedMap(Gatherer):
         self.model = model
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> MapBelief:
-        """The same for every class in every cell, and nothing gathered."""
+        """The same probability for every class in every cell, and no evidence."""
         classes = len(self.model.prior) - 1
         even = like.new_full((batch, len(grid), classes + 1), 1 / (classes + 1))
-        # One row for all classes: it broadcasts over those that the first look tells of.
+        # One row for all classes; it broadcasts over the classes of the first look.
         return MapBelief(**self.nothing(batch, grid, like, 1), probabilities=even)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> MapLook:
-        """What looks from `fixation` `(B, 2)` say about all classes, whatever `target` is."""
+        """Evidence for all classes, the same for every target."""
         targets = torch.arange(1, len(self.model.prior), device=fixation.device)
 
         def evidence(boxes: Tensor, scores: Tensor, mask: Tensor, point: Tensor) -> Tensor:
@@ -82,7 +110,7 @@ class LearnedMap(Gatherer):
         return MapLook(said, *where, every, grid.columns, torch.ones_like(every))
 
     def update(self, belief: Belief, look: Look) -> MapBelief:
-        """Belief after a look in each episode."""
+        """Gather the evidence of one more look, and compute the probabilities from all of it."""
         known, said = own(belief, MapBelief, "belief"), own(look, MapLook, "look")
         all_looks = self.gather(known, said)
         gathered = *self.read(all_looks), said.target, said.stands_for
@@ -103,7 +131,7 @@ class LearnedMap(Gatherer):
         *,
         columns: int,
     ) -> Tensor:
-        """Probabilities `(B, X·Y, T+1)` from what was gathered."""
+        """Probabilities `(B, X·Y, T+1)` from the gathered evidence."""
         classes = nearest.shape[1]
 
         def of_class(values: Tensor) -> Tensor:

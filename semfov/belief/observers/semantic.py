@@ -1,4 +1,4 @@
-"""The paper's observer: a Dirichlet about all classes in every cell."""
+"""The paper's observer: a Dirichlet belief about all classes in every cell."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,22 +21,26 @@ Memory = Literal["all", "closest"]
 
 
 class MissModel(Protocol):
-    """A model that tells how likely it is to see nothing (`semfov.FovealObservationModel`)."""
+    """Protocol of a model of miss rates, as `semfov.FovealObservationModel` is one."""
 
     def miss_likelihood(self, distance: Tensor) -> Tensor:
-        """Likelihoods `(..., K+1)` of each class where nothing was detected, at distances `(...)`."""
+        """Likelihood `(..., K+1)` of every class where nothing was detected, at distances `(...)`."""
         ...
 
 
 @dataclass(frozen=True)
 class SemanticLook(Look):
-    """Likelihoods of a batch of looks, ready to be fused.
+    """Likelihoods of a batch of looks, ready for fusion.
 
     Attributes:
-        likelihood: `(B, L, K+1)`, likelihood of each class for each detection, up to a factor.
-        footprint: `(B, L, X·Y)`, the cells that each detection concerns: boolean, or weights in [0, 1] that are the
+        likelihood: `(B, L, K+1)`, likelihood of each class given each detection, up to a common factor.
+        footprint: `(B, L, X·Y)`, the cells that each detection updates: boolean, or weights in [0, 1] that are used as
             exponents of the likelihood; false or 0 for padding.
         distance: `(B, X·Y)`, from the fixation to every cell, in longer sides of the image.
+
+    >>> look = SemanticLook(torch.ones(2, 5, 3), torch.ones(2, 5, 4), torch.zeros(2, 4))  # two looks, four cells
+    >>> look[:1].likelihood.shape
+    torch.Size([1, 5, 3])
     """
 
     likelihood: Tensor
@@ -44,12 +48,12 @@ class SemanticLook(Look):
     distance: Tensor
 
     def __getitem__(self, index: Tensor | slice) -> "SemanticLook":
-        """Some of the looks."""
+        """The selected looks of the batch."""
         return SemanticLook(self.likelihood[index], self.footprint[index], self.distance[index])
 
     @classmethod
     def join(cls, looks: Sequence["SemanticLook"]) -> "SemanticLook":
-        """All looks of several batches; what has fewer detections is filled up with some that concern no cell."""
+        """Concatenate several batches of looks, padded to the largest number of detections."""
         most = max(look.likelihood.shape[-2] for look in looks)
 
         def filled(values: Tensor, value: float) -> Tensor:
@@ -63,28 +67,30 @@ class SemanticLook(Look):
 
 
 class Semantic(Observer):
-    r"""The paper's belief: a Dirichlet over all classes in every cell, updated by every detection that covers it.
+    r"""The paper's observer: a Dirichlet over all classes in every cell, updated by every detection that covers it.
 
-    Options go beyond it, for looks at a static scene are not independent, and what is not detected says something
-    too:
+    Three options are not in the paper. They exist because looks at a static scene are not independent, and because
+    cells without detections are evidence, too:
 
-    - `tempering` τ: a likelihood counts as `λ^τ` (`likelihoods`).
-    - `memory="closest"`: a cell's belief is what its closest look says, refreshed by a closer look and not multiplied,
+    - `tempering` τ: the likelihood λ is replaced by `λ^τ` (`likelihoods`).
+    - `memory="closest"`: the belief about a cell comes from its closest look alone; a closer look replaces it,
 
       .. math:: \beta(x) \leftarrow \mathrm{fuse}(\beta_0, \lambda) \quad \text{if } d(x, f) < \min_{f' < f} d(x, f')
 
-    - `misses`: cells in which nothing was detected are updated with the probability of that for each class at this
-      distance.
+    - `misses`: cells without detections are updated with the miss rate of each class at their distance.
 
     Args:
-        components: number of classes, background included.
-        observation: calibrates the scores; None takes raw scores as likelihoods.
-        prior: Dirichlet parameter of every class before the first look.
+        components: K + 1, number of classes with background.
+        observation: model that calibrates the scores; None uses the raw scores as likelihoods.
+        prior: Dirichlet parameter of every class before the first look, positive.
         fusion: `kaplan`, `product` or `sum` (`semfov.fusion`).
-        footprint: which cells a detection updates (`Grid.footprint`).
-        tempering: exponent of the likelihoods.
-        memory: `all` looks are fused, as published, or only what the `closest` look at each cell says.
-        misses: the model that tells how likely it is to see nothing; None takes that to say nothing.
+        footprint: rule for the cells that a detection updates (`Grid.footprint`).
+        tempering: exponent τ of the likelihoods, positive.
+        memory: `all` fuses all looks, as published; `closest` keeps only the closest look at each cell.
+        misses: model of the miss rates; None makes no update in cells without detections.
+
+    Raises:
+        InputError: `prior` is not positive, or the fusion rule or the memory is unknown.
 
     >>> from semfov import Detections
     >>> grid, fixation = Grid(2, 1, (10, 10)), torch.tensor([[2.0, 2.0]])
@@ -133,7 +139,7 @@ class Semantic(Observer):
         return SemanticLook(likelihood, cells, grid.distance(fixation).to(likelihood))
 
     def update(self, belief: Belief, look: Look) -> DirichletBelief:
-        """Fuse a look in each episode."""
+        """Fuse one more look in each episode."""
         known, said = dirichlet_belief(belief), own(look, SemanticLook, "look")
         closest = torch.minimum(known.closest, said.distance)
         if self.memory == "all":
@@ -143,9 +149,12 @@ class Semantic(Observer):
         return DirichletBelief(torch.where(closer[..., None], fresh, known.beta), closest)
 
     def fade(self, belief: Belief, look: Look, keep: float, visited: Tensor) -> DirichletBelief:
-        r"""Dirichlet parameters return to the prior, :math:`\beta \leftarrow \beta_0 + k (\beta - \beta_0)`.
+        r"""Move the Dirichlet parameters towards the prior, :math:`\beta \leftarrow \beta_0 + k (\beta - \beta_0)`.
 
-        The closest look counts as one from farther away, as that of a learned belief does (`Gatherer.fade`).
+        The closest look counts as one from farther away, as in the learned observers (`Gatherer.fade`).
+
+        Returns:
+            The faded belief.
         """
         known = dirichlet_belief(belief)
         if keep == 1:
@@ -161,5 +170,9 @@ class Semantic(Observer):
         return torch.where(nothing[..., None], unseen, fused)
 
     def extra_repr(self) -> str:
-        """Settings, for `repr`."""
+        """Settings for the `repr` of the module.
+
+        Returns:
+            Prior, fusion rule, footprint and tempering.
+        """
         return f"prior={self.prior:g}, fusion={self.fusion}, footprint={self.footprint}, tempering={self.tempering:g}"

@@ -1,4 +1,4 @@
-"""The observer of a searcher that knows what it wants: only where the target is."""
+"""The observer of a search for one target, with learned evidence."""
 
 from dataclasses import dataclass
 
@@ -18,17 +18,29 @@ from semfov.errors import InputError
 
 @dataclass(frozen=True)
 class TargetLook(EvidenceLook):
-    """What looks say about the target in every cell; attributes as for one class in `EvidenceLook`."""
+    """Evidence of looks about the target in every cell; the attributes are those of `EvidenceLook` for one class."""
 
 
 @dataclass(frozen=True)
 class TargetBelief(GatheredBelief):
-    """Belief about one target alone; attributes as for one class in `GatheredBelief`, and:
+    """Belief about a single target.
 
     Attributes:
+        closest: `(B, X·Y)`, see `Belief`.
+        nearest: `(B, X·Y)`, evidence of the closest look at each cell.
+        best: `(B, X·Y)`, strongest evidence of any look.
+        total: `(B, X·Y)`, sum of the evidence of all looks, weighted by their nearness.
+        weight: `(B, X·Y)`, sum of the nearness of all looks.
+        score: `(B,)`, highest score of the target in any detection.
+        looks: `(B,)`, number of looks.
+        visited: `(B, X·Y)` boolean, cells that were fixated.
         present: `(B, X·Y)`, probability that a cell holds the target.
-        following: `(B, X·Y)`, the same if no fixated cell holds it.
-        anywhere: `(B,)`, probability that the image holds it.
+        following: `(B, X·Y)`, probability that a cell holds the target, given that no fixated cell holds it.
+        anywhere: `(B,)`, probability that the image holds the target.
+
+    >>> observer, grid = Target(TargetEvidence(8, 4, components=3)), Grid(4, 4, (80, 80))  # not trained yet
+    >>> observer.start(1, grid, torch.zeros(1)).presence(1)
+    tensor([0.5000])
     """
 
     present: Tensor
@@ -36,24 +48,30 @@ class TargetBelief(GatheredBelief):
     anywhere: Tensor
 
     def chance(self, target: int | Tensor) -> Tensor:
-        """As for `probability`, if no fixated cell holds the target."""
+        """As `probability`, given that no fixated cell holds the target."""
         return self.following
 
     def probability(self, target: int | Tensor) -> Tensor:
-        """Probability of the target that was searched for, `(B, X·Y)`, whatever `target` is."""
+        """Probability that each cell holds the target of the search, `(B, X·Y)`; `target` is ignored."""
         return self.present
 
     def presence(self, target: int | Tensor) -> Tensor:
-        """Probability that the target that was searched for is anywhere, `(B,)`, whatever `target` is."""
+        """Probability that the image holds the target of the search, `(B,)`; `target` is ignored."""
         return self.anywhere
 
 
 class Target(Gatherer):
-    """Gathers evidence for the target as `TargetEvidence` learned to: the closest look at each cell counts most.
+    """Observer with learned evidence for a target (`TargetEvidence`), in which the closest look at a cell counts most.
 
     Args:
         model: the learned evidence.
-        together: compute all episodes of a batch at once: faster, but how figures are rounded depends on the batch.
+        together: compute all episodes of a batch at once; faster, but the rounding then depends on the batch.
+
+    >>> observer, grid = Target(TargetEvidence(8, 4, components=3)), Grid(4, 4, (80, 80))  # not trained yet
+    >>> seen = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 3), torch.zeros(1, 0, dtype=torch.bool))
+    >>> belief = observer(observer.start(1, grid, torch.zeros(1)), seen, torch.tensor([[30.0, 10.0]]), grid, target=1)
+    >>> belief.probability(1).shape, belief.visited.nonzero().tolist()
+    (torch.Size([1, 16]), [[0, 1]])
     """
 
     model: TargetEvidence
@@ -65,16 +83,23 @@ class Target(Gatherer):
 
     @property
     def thresholds(self) -> Thresholds | None:
-        """Those of the model."""
+        """Thresholds of the model."""
         return self.model.thresholds
 
     def start(self, batch: int, grid: Grid, like: Tensor) -> TargetBelief:
-        """Even odds in every cell, and nothing gathered."""
+        """Even odds in every cell, and no evidence."""
         even, anywhere = like.new_full((batch, len(grid)), 0.5), like.new_full((batch,), 0.5)
         return TargetBelief(**self.nothing(batch, grid, like), present=even, following=even, anywhere=anywhere)
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> TargetLook:
-        """What looks from `fixation` `(B, 2)` say about the target."""
+        """Evidence for the target.
+
+        Returns:
+            A batch of B looks.
+
+        Raises:
+            InputError: `target` is None.
+        """
         if target is None:
             raise InputError("target: expected a class to search for, got None")
         evidence = self.model(detections, fixation, grid, target)
@@ -83,7 +108,7 @@ class Target(Gatherer):
         return TargetLook(evidence, grid.distance(fixation), score, grid.cell_of(fixation), wanted, grid.columns)
 
     def update(self, belief: Belief, look: Look) -> TargetBelief:
-        """Belief after a look in each episode."""
+        """Gather the evidence of one more look, and compute the probabilities from all of it."""
         known, said = own(belief, TargetBelief, "belief"), own(look, TargetLook, "look")
         all_looks = self.gather(known, said)
 

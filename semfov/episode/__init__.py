@@ -1,0 +1,21 @@
+"""Episodes: the loop of active perception, where its looks come from, and the state between two looks."""
+
+from semfov.episode.looks import LiveLooks, Looks, Sight, StoredLooks
+from semfov.episode.loop import Acquire, Step, attend, rollout
+from semfov.episode.memory import Forgetting, Memory
+from semfov.episode.stopwatch import STAGES, Stopwatch
+
+__all__ = [
+    "STAGES",
+    "Acquire",
+    "Forgetting",
+    "LiveLooks",
+    "Looks",
+    "Memory",
+    "Sight",
+    "Step",
+    "Stopwatch",
+    "StoredLooks",
+    "attend",
+    "rollout",
+]

@@ -1,0 +1,173 @@
+"""Sources of looks for episodes: an eye at an image, or stored detections."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.belief.observers.base import Look, Observer
+from semfov.detection.detections import Detections
+from semfov.episode.stopwatch import Stopwatch
+from semfov.eye import Eye, View
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One look of each of A episodes.
+
+    Attributes:
+        look: evidence of the looks, from `Observer.weigh`.
+        detections: function that returns the detections, a batch of A.
+        seconds: time by stage.
+
+    >>> from semfov.belief.observers import LandingLook
+    >>> sight = Sight(LandingLook(torch.zeros(1, 4, 1), torch.zeros(1, 4)), lambda: None, {"detect": 0.02})
+    >>> sight.seconds
+    {'detect': 0.02}
+    """
+
+    look: Look
+    detections: Callable[[], Detections]
+    seconds: dict[str, float]
+
+
+class Looks(ABC):
+    """Base of the sources of looks for episodes: an eye (`LiveLooks`) or stored detections (`StoredLooks`).
+
+    Attributes:
+        grid: the cells.
+        like: a tensor; beliefs take its dtype and device.
+
+    Example::
+
+        class Recorded(semfov.episode.Looks):
+            def see(self, observer, episodes, cell, fixation):
+                detections = self.recorded[cell]  # a batch of A
+                return Sight(observer.weigh(detections, fixation, self.grid), lambda: detections, {})
+    """
+
+    grid: Grid
+    like: Tensor
+
+    @abstractmethod
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """Make one look in each of A episodes.
+
+        Args:
+            observer: weighs the detections.
+            episodes: `(A,)`, numbers of the episodes.
+            cell: `(A,)`, fixated cells.
+            fixation: `(A, 2)`, fixated points as `(x, y)` in pixels.
+
+        Returns:
+            The looks.
+        """
+
+
+class LiveLooks(Looks):
+    """Looks of an eye at one image.
+
+    Args:
+        eye: sensor and detector.
+        view: the image, opened by the eye.
+        grid: the cells over the image.
+        target: class 1..K that all episodes search for; needed by observers that are `by_target`.
+
+    Example::
+
+        looks = LiveLooks(eye, eye.open(image), grid, target=1)
+        for step in rollout(looks, observer, acquisition, start, choice, most=10):
+            print(step.cell, step.detections.count)
+    """
+
+    def __init__(self, eye: Eye, view: View, grid: Grid, target: int | None = None) -> None:
+        self.eye, self.view, self.grid, self.target = eye, view, grid, target
+        self.like = view.canvas
+
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """Foveate, detect and weigh."""
+        watch = Stopwatch()
+        canvases = self.eye.foveated(self.view, fixation)
+        watch.lap("foveate")
+        detections = self.eye.detect(self.view, fixation, canvases)
+        watch.lap("detect")
+        look = observer.weigh(detections, fixation, self.grid, self.target)
+        watch.lap("weigh")
+        return Sight(look, lambda: detections, watch.seconds)
+
+
+class StoredLooks(Looks):
+    """Looks at one image with stored detections, one set for the centre of each cell. Each look is weighed only once.
+
+    Args:
+        detections: the detections from every cell, a batch of X·Y.
+        grid: the cells.
+        targets: `(B,)`, class 1..K that each episode searches for; None for exploration.
+
+    >>> from semfov.belief.observers import Semantic
+    >>> scores = torch.tensor([[[0.9, 0.1]], [[0.2, 0.8]]])  # of one detection from each of two cells
+    >>> seen = Detections(torch.tensor([[[6.0, 0, 9, 9]]]).repeat(2, 1, 1), scores, torch.ones(2, 1).bool())
+    >>> looks = StoredLooks(seen, Grid(2, 1, (10, 10)), torch.tensor([1]))
+    >>> sight = looks.see(Semantic(2), torch.tensor([0]), torch.tensor([1]), torch.tensor([[7.0, 4.5]]))
+    >>> sight.detections().scores[0]
+    tensor([[0.2000, 0.8000]])
+    """
+
+    def __init__(self, detections: Detections, grid: Grid, targets: Tensor | None = None) -> None:
+        self.detections, self.grid, self.targets = detections, grid, targets
+        self.like = detections.scores
+        self._weighed: tuple[Observer, Look] | None = None
+        self._classes = [] if targets is None else targets.unique().tolist()
+
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """Take the stored looks of the cells; the fixations must be their centres."""
+        watch = Stopwatch()
+        targets = None if self.targets is None else self.targets[episodes]
+        look = self.weighed(observer)[self.first_row(observer, targets) + cell]
+        watch.lap("weigh")
+        return Sight(look, lambda: self.detections[cell], watch.seconds)
+
+    def first_row(self, observer: Observer, targets: Tensor | None) -> Tensor:
+        """Row of `weighed` with the look from cell 0, for each target.
+
+        Args:
+            observer: the observer.
+            targets: `(A,)`, classes 1..K, or None.
+
+        Returns:
+            `(A,)` row numbers, or `()` if the looks do not depend on the target.
+        """
+        if not observer.by_target or targets is None:
+            return torch.zeros((), dtype=torch.int64)
+        # One row for each target and cell.
+        return torch.searchsorted(targets.new_tensor(self._classes), targets) * len(self.grid)
+
+    def rows(self, observer: Observer) -> int:
+        """Number of rows of `weighed`.
+
+        Args:
+            observer: the observer.
+
+        Returns:
+            The number of looks.
+        """
+        return len(self.grid) * (len(self._classes) if observer.by_target and self._classes else 1)
+
+    def weighed(self, observer: Observer) -> Look:
+        """Evidence of the looks from all cells, computed on the first call.
+
+        Args:
+            observer: the observer that weighs them.
+
+        Returns:
+            A batch of X·Y looks; if the observer is `by_target`, X·Y looks for each target, one target after another.
+        """
+        if self._weighed is None or self._weighed[0] is not observer:
+            centres = self.grid.centres.to(self.like)
+            targets = self._classes if observer.by_target else [None]
+            said = [observer.weigh(self.detections, centres, self.grid, target) for target in targets]
+            self._weighed = observer, said[0] if len(said) == 1 else type(said[0]).join(said)
+        return self._weighed[1]

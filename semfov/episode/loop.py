@@ -1,0 +1,192 @@
+"""The loop of active perception: look, weigh the detections, update the belief, choose the next fixation."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from semfov.belief.belief import Belief
+from semfov.belief.observers.base import Observer
+from semfov.detection.detections import Detections
+from semfov.episode.looks import Looks, Sight
+from semfov.episode.memory import Forgetting, Memory
+from semfov.episode.stopwatch import Stopwatch
+from semfov.gaze.acquisition.base import AcquisitionFunction
+from semfov.gaze.choice import Choice
+
+Acquire = Callable[[Tensor, Tensor], AcquisitionFunction]
+"""Makes the acquisition function for episodes `(A,)` that fixate cells `(A,)`."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One cycle of the A episodes that have not ended.
+
+    Attributes:
+        shift: number of gaze shifts before this look.
+        episodes: `(A,)`, numbers of the episodes, from 0 to B - 1.
+        cell: `(A,)`, the fixated cell.
+        fixation: `(A, 2)`, the fixated point as `(x, y)` in pixels.
+        sight: the looks.
+        belief: the belief after the looks.
+        visited: `(A, X·Y)` boolean, cells that inhibition of return keeps the gaze from, including this one.
+        values: `(A, X·Y)`, values of the acquisition function.
+        next_cell: `(A,)`, the chosen cell; without meaning if all cells were visited.
+        next_fixation: `(A, 2)`, the chosen point.
+        seconds: time by stage (`STAGES`).
+
+    Example::
+
+        for step in rollout(looks, observer, acquisition, start, choice, most=10):
+            print(step.shift, step.cell, step.belief.probability(target).amax(-1))
+    """
+
+    shift: int
+    episodes: Tensor
+    cell: Tensor
+    fixation: Tensor
+    sight: Sight
+    belief: Belief
+    visited: Tensor
+    values: Tensor
+    next_cell: Tensor
+    next_fixation: Tensor
+    seconds: dict[str, float]
+
+    @property
+    def detections(self) -> Detections:
+        """The detections, a batch of A."""
+        return self.sight.detections()
+
+
+def attend(
+    looks: Looks,
+    observer: Observer,
+    memory: Memory,
+    episodes: Tensor,
+    cell: Tensor,
+    fixation: Tensor,
+    forgetting: Forgetting | None = None,
+) -> tuple[Sight, Memory]:
+    """Make one look in each episode and update its state. `rollout` and the environments share this step.
+
+    Args:
+        looks: the source of looks.
+        observer: turns looks into a belief.
+        memory: state of the A episodes.
+        episodes: `(A,)`, numbers of the episodes.
+        cell: `(A,)`, fixated cells.
+        fixation: `(A, 2)`, fixated points as `(x, y)` in pixels.
+        forgetting: forgetting between looks; None forgets nothing (see `rollout`).
+
+    Returns:
+        The looks, and the new state.
+
+    >>> from semfov import Detections, Grid
+    >>> from semfov.belief.observers import Semantic
+    >>> from semfov.episode import StoredLooks
+    >>> nothing = Detections(torch.zeros(2, 0, 4), torch.zeros(2, 0, 2), torch.zeros(2, 0, dtype=torch.bool))
+    >>> looks, observer = StoredLooks(nothing, Grid(2, 1, (10, 10))), Semantic(2)
+    >>> memory, cell = Memory.empty(looks, observer, episodes=1), torch.tensor([1])
+    >>> sight, memory = attend(looks, observer, memory, torch.tensor([0]), cell, looks.grid.centres[cell])
+    >>> memory.visited
+    tensor([[False,  True]])
+    """
+    sight = looks.see(observer, episodes, cell, fixation)
+    watch = Stopwatch(sight.seconds)
+    belief, age = memory.belief, memory.age
+    if forgetting is not None:
+        age = age + 1
+        belief = observer.fade(belief, sight.look, forgetting.keep, forgetting.visited(age))
+    belief = observer.update(belief, sight.look)
+    watch.lap("update belief")
+    visited = memory.visited.scatter(-1, cell[:, None], True)
+    if forgetting is not None:
+        age = age.scatter(-1, cell[:, None], 0)
+        visited = forgetting.visited(age)
+    return Sight(sight.look, sight.detections, watch.seconds), Memory(belief, visited, age)
+
+
+def rollout(
+    looks: Looks,
+    observer: Observer,
+    acquisition: AcquisitionFunction | Acquire,
+    start: Tensor,
+    choice: Choice,
+    *,
+    most: int,
+    ends: Callable[[Step], Tensor] | None = None,
+    window: int | None = None,
+    forgetting: Forgetting | None = None,
+) -> Iterator[Step]:
+    """Run episodes of active perception in one image, one step of all episodes at a time.
+
+    An episode ends when `ends` says so, when every cell was visited, or after `most` looks.
+
+    Args:
+        looks: the source of looks: an eye (`LiveLooks`) or stored detections (`StoredLooks`).
+        observer: turns looks into a belief.
+        acquisition: acquisition function that values the cells; or a function that makes one for the current episodes
+            and cells, if it differs between episodes.
+        start: `(B,)`, first cell of each episode.
+        choice: way to choose the next fixation: `Greedy`, `Relaxed` for gradients, or `Given`.
+        most: largest number of looks in an episode.
+        ends: function from a step to `(A,)` boolean, the episodes that end with it.
+        window: number of looks that a gradient flows through. At the end of each window, after the step was yielded,
+            belief and fixation are detached (truncated backpropagation through time). None detaches nothing.
+        forgetting: fading of belief and inhibition of return, for scenes that change between looks; None for scenes
+            that do not change.
+
+    Yields:
+        One step for each look.
+
+    >>> from semfov import Detections, Grid
+    >>> from semfov.belief.observers import Semantic
+    >>> from semfov.episode import StoredLooks
+    >>> from semfov.gaze.acquisition import TargetPosterior
+    >>> from semfov.gaze.choice import Greedy
+    >>> scores = torch.tensor([[[0.1, 0.9]]]).repeat(4, 1, 1)  # the target is seen in the right cell from anywhere
+    >>> seen = Detections(torch.tensor([[[32.0, 0, 38, 9]]]).repeat(4, 1, 1), scores, torch.ones(4, 1).bool())
+    >>> looks, choice = StoredLooks(seen, Grid(4, 1, (40, 10))), Greedy(lambda shift, episodes: torch.rand(1, 4))
+    >>> for step in rollout(looks, Semantic(2), TargetPosterior(1), torch.tensor([0]), choice, most=2):
+    ...     print(step.cell, step.belief.probability(1))
+    tensor([0]) tensor([[0.5000, 0.5000, 0.5000, 0.7000]])
+    tensor([3]) tensor([[0.5000, 0.5000, 0.5000, 0.7955]])
+    """
+    if not len(start):
+        return
+    acquire = (lambda episodes, cell: acquisition) if isinstance(acquisition, AcquisitionFunction) else acquisition
+    centres = looks.grid.centres.to(looks.like)
+    episodes, cell, fixation = torch.arange(len(start), device=start.device), start, centres[start]
+    memory = Memory.empty(looks, observer, len(start))
+    for shift in range(most):
+        sight, memory = attend(looks, observer, memory, episodes, cell, fixation, forgetting)
+        belief, visited = memory.belief, memory.visited
+        watch = Stopwatch(sight.seconds)
+        values = acquire(episodes, cell)(belief, visited)
+        next_fixation, next_cell = choice(shift, episodes, values, visited, centres)
+        watch.lap("choose")
+        step = Step(
+            shift,
+            episodes,
+            cell,
+            fixation,
+            sight,
+            belief,
+            visited,
+            values,
+            next_cell,
+            next_fixation,
+            seconds=watch.seconds,
+        )
+        yield step
+        over = visited.all(-1)
+        going = ~over if ends is None else ~(over | ends(step))
+        if not going.any():
+            return
+        if window is not None and (shift + 1) % window == 0:
+            memory, next_fixation = replace(memory, belief=belief.detach()), next_fixation.detach()
+        cell, fixation = next_cell, next_fixation
+        if not going.all():
+            episodes, cell, fixation, memory = episodes[going], cell[going], fixation[going], memory[going]

@@ -1,0 +1,119 @@
+"""State of episodes between two looks, and how it is forgotten."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.belief.belief import Belief
+from semfov.belief.observers.base import Observer
+from semfov.episode.looks import Looks
+from semfov.errors import check_number
+
+
+@dataclass(frozen=True)
+class Forgetting:
+    r"""Forgetting in a scene that changes between looks.
+
+    Each look multiplies past evidence by :math:`e^{-r}` (`Observer.fade`). Inhibition of return keeps the gaze from a
+    fixated cell for :math:`\ln 2 / r` looks, until half of its evidence is left. If all cells are inhibited, the one
+    that was fixated longest ago is free.
+
+    Attributes:
+        rate: r, 0 or more; 0 forgets nothing.
+
+    Raises:
+        InputError: `rate` is negative or above 100.
+
+    >>> round(Forgetting(0.1).keep, 3), round(Forgetting(0.1).span, 1)
+    (0.905, 6.9)
+    """
+
+    rate: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_number(self.rate, "rate", 0, 100)
+
+    @property
+    def keep(self) -> float:
+        """Share of the evidence that is left after a look, :math:`e^{-r}`."""
+        return math.exp(-self.rate)
+
+    @property
+    def span(self) -> float:
+        r"""Number of looks for which a fixated cell is inhibited, :math:`\ln 2 / r`."""
+        return math.log(2) / self.rate if self.rate else math.inf
+
+    def visited(self, age: Tensor) -> Tensor:
+        """Cells that inhibition of return keeps the gaze from.
+
+        Args:
+            age: `(A, X·Y)`, number of looks since each cell was fixated; infinity for never.
+
+        Returns:
+            `(A, X·Y)` boolean.
+
+        >>> Forgetting(0.5).visited(torch.tensor([[0.0, 1.0, 2.0, torch.inf]]))
+        tensor([[ True,  True, False, False]])
+        """
+        recent = (age <= self.span) & age.isfinite()
+        oldest = age == age.amax(-1, keepdim=True)
+        return recent & ~(recent.all(-1, keepdim=True) & oldest)
+
+
+@dataclass(frozen=True)
+class Memory:
+    """State of A episodes between two looks.
+
+    Attributes:
+        belief: the belief.
+        visited: `(A, X·Y)` boolean, cells that inhibition of return keeps the gaze from.
+        age: `(A, X·Y)`, number of looks since each cell was fixated, infinity for never; only counted with forgetting.
+
+    >>> from semfov import Detections, Grid
+    >>> from semfov.belief.observers import Semantic
+    >>> from semfov.episode import StoredLooks
+    >>> nothing = Detections(torch.zeros(2, 0, 4), torch.zeros(2, 0, 2), torch.zeros(2, 0, dtype=torch.bool))
+    >>> memory = Memory.empty(StoredLooks(nothing, Grid(2, 1, (10, 10))), Semantic(2), episodes=3)
+    >>> memory.visited.shape
+    torch.Size([3, 2])
+    """
+
+    belief: Belief
+    visited: Tensor
+    age: Tensor
+
+    @classmethod
+    def empty(cls, looks: Looks, observer: Observer, episodes: int) -> "Memory":
+        """State before the first look.
+
+        Args:
+            looks: the source of looks.
+            observer: the observer.
+            episodes: A, number of episodes.
+
+        Returns:
+            The state.
+        """
+        cells, device = len(looks.grid), looks.like.device
+        visited = torch.zeros(episodes, cells, dtype=torch.bool, device=device)
+        age = torch.full(visited.shape, torch.inf, device=device)
+        return cls(observer.start(episodes, looks.grid, looks.like), visited, age)
+
+    def __getitem__(self, index: Tensor) -> "Memory":
+        """State of the selected episodes."""
+        return Memory(self.belief[index], self.visited[index], self.age[index])
+
+    def put(self, index: Tensor, other: "Memory") -> "Memory":
+        """Replace the state of some episodes. Both states must have had a look.
+
+        Args:
+            index: `(n,)`, the episodes.
+            other: their new state, of n episodes.
+
+        Returns:
+            A new state of all episodes.
+        """
+        visited, age = self.visited.index_copy(0, index, other.visited), self.age.index_copy(0, index, other.age)
+        return Memory(self.belief.put(index, other.belief), visited, age)

@@ -1,0 +1,76 @@
+"""Preset agents: eye, observers and policies by the name of a detector or of a folder of models.
+
+Each function returns the arguments of `semfov.ActivePerception`. The class methods `recommended`, `published` and `raw`
+document the parameters.
+"""
+
+from os import PathLike, fspath
+from typing import Any
+
+from semfov.belief.context import ContextPrior
+from semfov.belief.grid import check_cells
+from semfov.belief.map_evidence import MapEvidence
+from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
+from semfov.belief.target_evidence import TargetEvidence
+from semfov.detection.load import load_detector
+from semfov.errors import check, lookup
+from semfov.eye import Eye
+from semfov.gaze.policies import KL, Closer, NonPredictive, Predictive, Random
+from semfov.io.compatibility import check_shipped_sensor, learned_for
+from semfov.io.shipped import shipped_model
+from semfov.model_folder import open_folder
+from semfov.observation.foveal import FovealObservationModel
+from semfov.sensor.foveation import Foveation
+from semfov.sensor.named import named_sensor
+
+PUBLISHED_SENSORS = ("published", "published-narrow")
+"""Named sensors of the paper; observation models fitted by maximum likelihood are shipped for them."""
+
+
+def recommended_parts(
+    name: str, sigma: float, growth: float, grid: tuple[int, int], context: bool, **options: Any
+) -> dict[str, Any]:
+    """Parts of `ActivePerception.recommended`: learned target evidence for search, a learned map for exploration."""
+    check_shipped_sensor(sigma, growth)
+    check_cells(grid)
+    detector = load_detector(name, **options)
+    eye = Eye(Foveation(sigma, growth=growth), detector)
+    name = shipped_model(TargetEvidence, learned_for(detector.name, growth), name)
+    evidence = TargetEvidence.from_pretrained(name)
+    evidence.check_compatible(eye.settings(), grid)
+    everything = MapEvidence.from_pretrained(name)
+    everything.check_compatible(eye.settings(), grid)
+    observer: Observer = Target(evidence)
+    if context:
+        prior = ContextPrior.from_pretrained()
+        prior.check_compatible(detector.classes)
+        observer = Context(observer, prior)
+    mapping = LearnedMap(everything), Closer(sigma / eye.reference)
+    return {"eye": eye, "search": (observer, NonPredictive()), "explore": mapping, "grid": grid}
+
+
+def published_parts(
+    name: str | PathLike[str], sensor: str | None, search: str, calibrated: bool, **options: Any
+) -> dict[str, Any]:
+    """Parts of `ActivePerception.published`, by the name of a detector or from a folder of models."""
+    lookup(search, ["predictive", "non-predictive"], "published search policy")
+    folder = open_folder(name)
+    if folder is not None:
+        check(sensor is None, "sensor", "None with a folder of models, which has its own sensor", sensor)
+        eye, model, grid = folder.eye(**options), folder.observation(), folder.manifest.grid
+    else:
+        fovea, grid = lookup(sensor or "published", PUBLISHED_SENSORS, "published sensor"), (10, 10)
+        eye = Eye(named_sensor(fovea), load_detector(name, **options))
+        shipped = shipped_model(FovealObservationModel, f"{eye.detector.name}-{fovea}", fspath(name))
+        model = FovealObservationModel.from_pretrained(shipped)
+    model.check_compatible(eye.settings(), eye.detector.classes)
+    observer = Semantic(len(eye.detector.classes) + 1, model if calibrated else None)
+    policy = Predictive(model) if search == "predictive" else NonPredictive()
+    return {"eye": eye, "search": (observer, policy), "explore": (observer, KL(model)), "grid": grid}
+
+
+def raw_parts(name: str, sensor: str, **options: Any) -> dict[str, Any]:
+    """Parts of `ActivePerception.raw`: raw scores as likelihoods, and random exploration."""
+    eye = Eye(named_sensor(sensor), load_detector(name, **options))
+    observer = Semantic(len(eye.detector.classes) + 1)
+    return {"eye": eye, "search": (observer, NonPredictive()), "explore": (observer, Random())}
