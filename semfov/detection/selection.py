@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
+from semfov.detection.near_duplicates import LEAST, distinct
 from semfov.detection.placement import Placement
 from semfov.detection.scores import BackgroundPolicy, Candidates, score_vectors
 from semfov.errors import check, check_finite, check_number, check_whole, values_known
@@ -40,9 +41,9 @@ def select(
 
     Gradients flow to boxes and scores of what is kept; the choice itself is not differentiable.
     """
-    return Detections.stack(
-        [_select_one(candidates, image, placement, selection, policy) for image in range(candidates.boxes.shape[0])]
-    )
+    count = candidates.boxes.shape[0]
+    found = [_select_one(candidates, image, placement, selection, policy) for image in range(count)]
+    return found[0] if count == 1 else Detections.stack(found)
 
 
 def _check(image: int, confidence: Tensor, boxes: Tensor) -> None:
@@ -93,7 +94,12 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
     if boxes.dtype in (torch.float16, torch.bfloat16):  # too coarse for pixels, and not there on a CPU
         boxes, confidence = boxes.float(), confidence.float()
 
+    strict = selection.iou >= LEAST and not selection.per_class
+    strict = strict and boxes.dtype == torch.float32 and boxes.device.type == "cpu"
+
     def survivors(rows: Tensor) -> Tensor:
+        if strict:
+            return rows[torch.from_numpy(distinct(boxes[rows].detach().numpy(), selection.iou))]
         if selection.per_class:
             return rows[batched_nms(boxes[rows], confidence[rows], labels[rows], selection.iou)]
         return rows[nms(boxes[rows], confidence[rows], selection.iou)]

@@ -47,15 +47,15 @@ class Seen:
 
     Attributes:
         detections: boxes in picture pixels, a batch of F.
-        hints: weak candidates, overlapping ones among them, likewise.
-        windows: `(F, 4)`, what was looked at, cut to the picture.
         cut: `(F, L)`, which detections the border of their window cuts.
+        hints: weak candidates, overlapping ones among them, boxes in picture pixels.
+        windows: `(F, 4)`, what was looked at, cut to the picture.
     """
 
     detections: Detections
+    cut: Tensor
     hints: Detections
     windows: Tensor
-    cut: Tensor
 
 
 class ZoomEye(nn.Module):
@@ -113,9 +113,8 @@ class ZoomEye(nn.Module):
         policy = self.detector.background
         detections = select(candidates, None, self.detector.selection, policy)
         hints = select(candidates, None, HINTS, policy)
-        cut = _at_border(detections, frames, view.picture.size) & detections.mask
-        mapped = self._treat(_to_picture(detections, frames), cut)
-        return Seen(mapped, _to_picture(hints, frames), frames[:, :4], cut)
+        cut = _at_border(detections, frames, view.picture.size)
+        return Seen(*self._treat(_to_picture(detections, frames), cut), _to_picture(hints, frames), frames[:, :4])
 
     def glimpse(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None
@@ -132,16 +131,18 @@ class ZoomEye(nn.Module):
         check(bool((fixations[:, 2] > 0).all()), "fixations", "positive magnifications", fixations[:, 2].tolist())
         windows = windows_at(fixations[:, :2].double(), fixations[:, 2].double(), self.detector.input_size)
         limits = [None] * len(fixations) if within is None else within
-        shown = [
-            self._show(view.picture, window, m, limit)
-            for window, m, limit in zip(windows.tolist(), fixations[:, 2].tolist(), limits, strict=True)
+        wide, high = self.detector.input_size
+        canvases = torch.empty(len(fixations), 3, high, wide)
+        frames = [
+            self._show(canvas, view.picture, window, m, limit)
+            for canvas, window, m, limit in zip(canvases, windows.tolist(), fixations[:, 2].tolist(), limits, strict=True)
         ]
-        return torch.stack([canvas for canvas, _ in shown]), torch.tensor([frame for _, frame in shown])
+        return canvases, torch.tensor(frames).view(-1, 8)
 
     def _show(
-        self, picture: LargePicture, window: list[float], magnification: float, limit: Limit | None
-    ) -> tuple[Tensor, list[float]]:
-        """One canvas, and where it lies in the picture."""
+        self, canvas: Tensor, picture: LargePicture, window: list[float], magnification: float, limit: Limit | None
+    ) -> list[float]:
+        """Write a canvas; returns where it lies in the picture."""
         wide, high = self.detector.input_size
         low, right = (0.0, 0.0), (float(picture.size[0]), float(picture.size[1]))
         if limit is not None:
@@ -168,28 +169,28 @@ class ZoomEye(nn.Module):
             # A window whose rows lie apart in memory is resampled half as fast.
             pixels = pixels.contiguous(memory_format=torch.channels_last)
             pixels = F.interpolate(pixels, (v2 - v1, u2 - u1), mode="bilinear", antialias=True)
-        shown = pixels[0].to(torch.float32, memory_format=torch.contiguous_format).div_(255)
-        if shown.shape[-2:] == (high, wide):
-            canvas = shown
-        else:
-            canvas = torch.full((3, high, wide), self._fill())
-            canvas[:, v1:v2, u1:u2] = shown
-        return canvas, [float(n) for n in (x1, y1, x2, y2, u1, v1, u2, v2)]
+        if (u1, v1, u2, v2) != (0, 0, wide, high):
+            canvas.fill_(float(self.detector.fill))
+            canvas = canvas[:, v1:v2, u1:u2]
+        canvas.copy_(pixels[0]).div_(255)
+        return [float(n) for n in (x1, y1, x2, y2, u1, v1, u2, v2)]
 
-    def _fill(self) -> float:
-        return float(self.detector.fill)
-
-    def _treat(self, detections: Detections, cut: Tensor) -> Detections:
+    def _treat(self, detections: Detections, cut: Tensor) -> tuple[Detections, Tensor]:
+        """Detections after the eye's treatment of those that are cut, and which of them are cut."""
         if self.cut == "keep" or not bool(cut.any()):
-            return detections
+            return detections, cut
         if self.cut == "drop":
-            kept = [detections[n : n + 1] for n in range(len(cut))]
-            return Detections.stack(
-                [Detections(d.boxes[:, ~c], d.scores[:, ~c], d.mask[:, ~c]) for d, c in zip(kept, cut, strict=True)]
-            )
+            kept = [detections.mask[n] & ~cut[n] for n in range(len(cut))]
+            whole = [
+                Detections(detections.boxes[n : n + 1, keep], detections.scores[n : n + 1, keep], keep[keep][None])
+                for n, keep in enumerate(kept)
+            ]
+            left = Detections.stack(whole)
+            return left, torch.zeros_like(left.mask)
         nothing = torch.zeros_like(detections.scores[..., :1, :])
         nothing[..., 0] = 1
-        return Detections(detections.boxes, torch.where(cut[..., None], nothing, detections.scores), detections.mask)
+        scores = torch.where(cut[..., None], nothing, detections.scores)
+        return Detections(detections.boxes, scores, detections.mask), cut
 
     def forward(self, picture: Tensor, fixations: Tensor) -> Detections:
         """`look` at an image from fixations."""
@@ -203,26 +204,21 @@ class ZoomEye(nn.Module):
 
 def _to_picture(detections: Detections, frames: Tensor) -> Detections:
     """Canvas boxes as boxes in picture pixels, cut to their windows."""
-    window, canvas = frames[:, None, :4].to(detections.boxes), frames[:, None, 4:].to(detections.boxes)
-    scale = (window[..., 2:] - window[..., :2]) / (canvas[..., 2:] - canvas[..., :2])
-    boxes = (detections.boxes - canvas[..., :2].repeat(1, 1, 2)) * scale.repeat(1, 1, 2) + window[..., :2].repeat(
-        1, 1, 2
-    )
-    low, high = window[..., :2].repeat(1, 1, 2), window[..., 2:].repeat(1, 1, 2)
-    boxes = torch.minimum(torch.maximum(boxes, low), high) * detections.mask[..., None]
+    window, canvas = frames.to(detections.boxes)[:, None].split(4, -1)
+    low, high = window[..., [0, 1, 0, 1]], window[..., [2, 3, 2, 3]]
+    first, last = canvas[..., [0, 1, 0, 1]], canvas[..., [2, 3, 2, 3]]
+    boxes = (detections.boxes - first) * ((high - low) / (last - first)) + low
+    boxes = boxes.clamp(low, high) * detections.mask[..., None]
     return Detections(boxes, detections.scores, detections.mask)
 
 
 def _at_border(detections: Detections, frames: Tensor, size: tuple[int, int]) -> Tensor:
     """Which boxes touch a border of their window that lies inside the picture, `(F, L)`."""
-    window, canvas = frames[:, None, :4], frames[:, None, 4:].to(detections.boxes)
-    limit = torch.tensor([0.0, 0.0, *size])
-    inside = torch.cat([window[..., :2] > limit[:2], window[..., 2:] < limit[2:]], -1)
-    near = torch.cat(
-        [
-            detections.boxes[..., :2] <= canvas[..., :2] + BORDER,
-            detections.boxes[..., 2:] >= canvas[..., 2:] - BORDER,
-        ],
-        -1,
-    )
-    return (inside & near).any(-1)
+    frames = frames.to(detections.boxes)
+    window, canvas = frames.split(4, -1)
+    # A border of the picture cuts nothing.
+    limit = frames.new_tensor(size)
+    low = torch.where(window[:, :2] > 0, canvas[:, :2] + BORDER, -torch.inf)[:, None]
+    high = torch.where(window[:, 2:] < limit, canvas[:, 2:] - BORDER, torch.inf)[:, None]
+    near = (detections.boxes[..., :2] <= low) | (detections.boxes[..., 2:] >= high)
+    return near.any(-1) & detections.mask

@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.detection.detections import Detections
@@ -40,7 +42,7 @@ def gist(hints: Detections, detections: Detections, lattice: Lattice, action: tu
     """The gist of a look at a window of the lattice.
 
     Args:
-        hints: of the look, a batch of one in picture pixels.
+        hints: of the look, a batch of one without padding, in picture pixels.
         detections: of the look, likewise.
         lattice: of the picture.
         action: level, column and row of the window.
@@ -50,27 +52,30 @@ def gist(hints: Detections, detections: Detections, lattice: Lattice, action: tu
     scale = max(1, span // FINEST)
     columns = -(-min(span, lattice.columns - column) // scale)
     rows = -(-min(span, lattice.rows - row) // scale)
-    low = torch.tensor([column * lattice.pitch[0], row * lattice.pitch[1]])
-    pitch = torch.tensor(lattice.pitch) * scale
+    low = np.array([column * lattice.pitch[0], row * lattice.pitch[1]], np.float32)
+    pitch = np.array(lattice.pitch, np.float32) * scale
     kinds = hints.scores.shape[-1] - 1
 
-    def cells(boxes: Tensor) -> Tensor:
-        place = (((boxes[:, :2] + boxes[:, 2:]) / 2 - low) / pitch).floor().long()
-        return place[:, 1].clamp(0, rows - 1) * columns + place[:, 0].clamp(0, columns - 1)
+    def cells(boxes: Tensor) -> NDArray[np.int64]:
+        corners = boxes.float().numpy()
+        place = np.floor(((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch).astype(np.int64)
+        return place[:, 1].clip(0, rows - 1) * columns + place[:, 0].clip(0, columns - 1)
 
-    kept = hints.mask[0]
-    boxes, scores = hints.boxes[0, kept], hints.scores[0, kept, 1:].float()
-    at = cells(boxes)
-    strongest = scores.new_zeros(rows * columns, kinds).scatter_reduce(0, at[:, None].expand(-1, kinds), scores, "amax")
-    size = scores.new_zeros(rows * columns)
-    order = scores.amax(-1).argsort() if len(scores) else at
-    canvas = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3).log2().mean(-1)
-    canvas = canvas + torch.tensor(lattice.magnifications[level]).log2()
-    # Of several hints in a cell the last that is written stays: the most confident.
-    for place, value in zip(at[order].tolist(), canvas[order].clamp(min=0).tolist(), strict=True):
-        size[place] = value
-    found = torch.zeros(rows * columns, kinds, dtype=torch.bool)
-    sure = detections.mask[0] & (detections.confidence[0] >= FOUND)
-    found[cells(detections.boxes[0, sure]), detections.labels[0, sure] - 1] = True
-    shape = rows, columns
-    return Gist(level, (column, row), scale, strongest.view(*shape, -1), size.view(shape), found.view(*shape, -1))
+    boxes, scores = hints.boxes[0].detach(), hints.scores[0, :, 1:].detach().float()
+    strongest, size = np.zeros((rows * columns, kinds), np.float32), np.zeros(rows * columns, np.float32)
+    if len(boxes):
+        at = cells(boxes)
+        order = at.argsort(kind="stable")
+        place = at[order]
+        first = np.flatnonzero(np.diff(place, prepend=-1))
+        strongest[place[first]] = np.maximum.reduceat(scores.numpy()[order], first, axis=0)
+        canvas = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3).log2().mean(-1)
+        canvas = (canvas + torch.tensor(lattice.magnifications[level]).log2()).clamp(min=0)
+        # Of several hints in a cell the last that is written stays: the most confident.
+        order = scores.amax(-1).argsort(stable=True).numpy()
+        size[at[order]] = canvas.numpy()[order]
+    found = np.zeros((rows * columns, kinds), np.bool_)
+    sure = detections.confidence[0] >= FOUND
+    found[cells(detections.boxes[0, sure].detach()), detections.labels[0, sure].numpy() - 1] = True
+    maps = (torch.from_numpy(values).view(rows, columns, *values.shape[1:]) for values in (strongest, size, found))
+    return Gist(level, (column, row), scale, *maps)

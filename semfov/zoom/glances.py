@@ -52,7 +52,7 @@ class Glance:
 def on_lattice(lattice: Lattice, action: tuple[int, int, int]) -> Window:
     """The window of an action: level, column and row."""
     level, column, row = action
-    x, y, magnification = lattice.fixations(torch.tensor(action)).tolist()
+    x, y, magnification = lattice.fixation(level, column, row)
     span = lattice.span(level)
     return Window((x, y, magnification), level, (column, row, column + span, row + span))
 
@@ -111,11 +111,17 @@ class LiveGlances(Glances):
 
 def glance(seen: Seen, number: int, window: Window, lattice: Lattice) -> Glance:
     """One of the looks of an eye."""
-    hints, detections = seen.hints[number : number + 1], seen.detections[number : number + 1]
-    kept = detections.mask[0]
-    detections = Detections(detections.boxes[:, kept], detections.scores[:, kept], detections.mask[:, kept])
-    scores = (hints.scores[0, :, 1:] * hints.mask[0, :, None]).float()
+    hints, detections = _only(seen.hints, number), _only(seen.detections, number)
+    scores = hints.scores[0, :, 1:].float()
     show = scores.amax(0) if len(scores) else scores.new_zeros(scores.shape[-1])
     whole = window.within is None and window.level < lattice.levels - 1
     told = gist(hints, detections, lattice, (window.level, *window.cells[:2])) if whole else None
-    return Glance(window, detections, seen.cut[number, kept], show, told)
+    return Glance(window, detections, seen.cut[number, : detections.mask.shape[1]], show, told)
+
+
+def _only(looks: Detections, number: int) -> Detections:
+    """Detections of one look, a batch of one without padding."""
+    if len(looks.mask) == 1:
+        return looks
+    kept, one = int(looks.mask[number].sum()), slice(number, number + 1)
+    return Detections(looks.boxes[one, :kept], looks.scores[one, :kept], looks.mask[one, :kept])

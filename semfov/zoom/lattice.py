@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -58,18 +59,18 @@ class Lattice:
         """
         return -torch.tensor(self.magnifications).log2().clamp(max=0)
 
-    @property
+    @cached_property
     def pitch(self) -> tuple[float, float]:
         """`(width, height)` of a cell in picture pixels."""
         wide, high = self.window(self.levels - 1)
         return wide / CELLS, high / CELLS
 
-    @property
+    @cached_property
     def columns(self) -> int:
         """Cells in a row."""
         return _up(self.size[0] / self.pitch[0])
 
-    @property
+    @cached_property
     def rows(self) -> int:
         """Cells in a column."""
         return _up(self.size[1] / self.pitch[1])
@@ -114,6 +115,15 @@ class Lattice:
         boxes = self.boxes(actions).double()
         magnification = torch.tensor(self.magnifications, dtype=torch.float64)[actions[..., 0]]
         return torch.cat([(boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5, magnification[..., None]], -1).float()
+
+    def fixation(self, level: int, column: int, row: int) -> tuple[float, float, float]:
+        """`fixations` of one window, as numbers."""
+        x, y = (
+            (float(np.float32(first * pitch)) + float(np.float32(first * pitch + side))) / 2 - 0.5
+            for first, pitch, side in zip((column, row), self.pitch, self.window(level), strict=True)
+        )
+        x, y, magnification = np.array([x, y, self.magnifications[level]], np.float32).tolist()
+        return x, y, magnification
 
     def number(self, level: int, column: int, row: int) -> int:
         """Place of a window in `actions`."""
