@@ -38,17 +38,18 @@ def distinct(boxes: NDArray[np.float32], iou: float) -> NDArray[np.intp]:
     ends = neighbours.cumsum()
     first = np.arange(count).repeat(neighbours)
     second = np.arange(int(ends[-1])) + (np.arange(1, count + 1) - ends + neighbours).repeat(neighbours)
-    near = np.abs(y[first] - y[second]) <= reach_y[first]
+    apart = np.abs(y.repeat(neighbours) - y[second])
+    near = np.flatnonzero(apart <= reach_y.repeat(neighbours))
     first, second = first[near], second[near]
     shared_x = np.minimum(x2[first], x2[second]) - np.maximum(x1[first], x1[second])
     shared_y = np.minimum(y2[first], y2[second]) - np.maximum(y1[first], y1[second])
     shared = np.maximum(shared_x, 0) * np.maximum(shared_y, 0)
     # As torchvision does: the quotient in single precision, the comparison in double precision.
     same = shared / (area[first] + area[second] - shared) > np.float64(iou)
-    pairs = np.sort(np.stack([order[first[same]], order[second[same]]]), axis=0)
-    pairs = pairs[:, pairs[0].argsort(kind="stable")]
+    one, other = order[first[same]], order[second[same]]
+    pairs = np.sort(np.minimum(one, other) * count + np.maximum(one, other))
     alive = [True] * count
-    for one, other in zip(*pairs.tolist(), strict=True):
-        if alive[one]:
-            alive[other] = False
+    for confident, like in zip((pairs // count).tolist(), (pairs % count).tolist(), strict=True):
+        if alive[confident]:
+            alive[like] = False
     return np.flatnonzero(alive)

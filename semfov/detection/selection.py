@@ -106,7 +106,7 @@ def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selec
 
     # A box is suppressed by more confident ones alone, so the first survivors are those of the first boxes. Time grows
     # with the square of their number.
-    order, first = confidence.argsort(descending=True, stable=True), 2 * selection.limit
+    order, first = confidence.argsort(descending=True, stable=True), (2 if strict else 4) * selection.limit
     keep = survivors(order[:first])
     while len(keep) < selection.limit and first < len(order):
         first *= 2

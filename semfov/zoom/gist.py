@@ -61,21 +61,18 @@ def gist(hints: Detections, detections: Detections, lattice: Lattice, action: tu
         place = np.floor(((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch).astype(np.int64)
         return place[:, 1].clip(0, rows - 1) * columns + place[:, 0].clip(0, columns - 1)
 
-    boxes, scores = hints.boxes[0].detach(), hints.scores[0, :, 1:].detach().float()
-    strongest, size = np.zeros((rows * columns, kinds), np.float32), np.zeros(rows * columns, np.float32)
-    if len(boxes):
-        at = cells(boxes)
-        order = at.argsort(kind="stable")
-        place = at[order]
-        first = np.flatnonzero(np.diff(place, prepend=-1))
-        strongest[place[first]] = np.maximum.reduceat(scores.numpy()[order], first, axis=0)
-        canvas = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3).log2().mean(-1)
-        canvas = (canvas + torch.tensor(lattice.magnifications[level]).log2()).clamp(min=0)
-        # Of several hints in a cell the last that is written stays: the most confident.
-        order = scores.amax(-1).argsort(stable=True).numpy()
-        size[at[order]] = canvas.numpy()[order]
+    boxes, scores = hints.boxes[0].detach(), hints.scores[0, :, 1:].detach().float().contiguous()
+    at = cells(boxes)
+    place = torch.from_numpy(at)[:, None].expand(-1, kinds)
+    strongest = scores.new_zeros(rows * columns, kinds).scatter_reduce_(0, place, scores, "amax")
+    canvas = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3).log2().mean(-1)
+    canvas = (canvas + torch.tensor(lattice.magnifications[level]).log2()).clamp(min=0)
+    size, order = np.zeros(rows * columns, np.float32), scores.amax(-1).argsort().numpy()
+    # Of several hints in a cell the last that is written stays: the most confident.
+    size[at[order]] = canvas.numpy()[order]
     found = np.zeros((rows * columns, kinds), np.bool_)
     sure = detections.confidence[0] >= FOUND
     found[cells(detections.boxes[0, sure].detach()), detections.labels[0, sure].numpy() - 1] = True
-    maps = (torch.from_numpy(values).view(rows, columns, *values.shape[1:]) for values in (strongest, size, found))
-    return Gist(level, (column, row), scale, *maps)
+    shape = rows, columns
+    size, found = torch.from_numpy(size).view(shape), torch.from_numpy(found).view(*shape, -1)
+    return Gist(level, (column, row), scale, strongest.view(*shape, -1), size, found)
