@@ -1,6 +1,6 @@
 """Learned evidence by magnification: what a look at a window says of closer looks at its parts."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -168,10 +168,9 @@ class GlimpseEvidence(Pretrained):
         Returns:
             `(T, 3, rows, columns)`, for looks one, two and three octaves closer; logarithms.
         """
-        hints = features(look.scores)
-        best = hints.amax(-1)
-        own = _of(hints, best, targets)
-        found = _of(look.found.to(hints), look.found.any(-1).to(hints), targets)
+        strongest = look.scores.amax(-1)
+        best, own = features(strongest), features(_of(look.scores, strongest, targets))
+        found = _of(look.found, look.found.any(-1), targets).to(own)
         shape = own.shape
 
         def wide(values: Tensor) -> Tensor:
@@ -269,18 +268,29 @@ def pool_all(scores: Tensor, span: int) -> tuple[Tensor, Tensor]:
 
     A side shorter than that is one window.
     """
-    high, wide = (min(span, n) for n in scores.shape[:2])
-    top = _slide(_slide(scores, 0, high), 1, wide)
+    return pool_spans(scores, [span])[0]
+
+
+def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
+    """`pool_all` for windows of several sizes, each pooled from the next smaller ones."""
     best = scores.amax(-1)
     parts = torch.stack([best, (best > 0).to(best), (best > 0.02).to(best)])
-    area = torch.tensor([1.0, 1 / (high * wide), 1.0])[:, None, None]
-    sums = F.avg_pool2d(parts, (high, wide), 1) * (high * wide) * area
-    return top.flatten(0, 1), sums.flatten(1).mT
+    found: dict[int, tuple[Tensor, Tensor]] = {}
+    top, have = scores, (1, 1)
+    for span in sorted(spans):
+        size = min(span, scores.shape[0]), min(span, scores.shape[1])
+        for axis in (0, 1):
+            top = _slide(top, axis, size[axis], have[axis])
+        have = size
+        area = torch.tensor([1.0, 1 / (size[0] * size[1]), 1.0])[:, None]
+        sums = F.avg_pool2d(parts, size, 1).flatten(1) * (size[0] * size[1]) * area
+        # Rows of their own, in the order of windows: they are updated in place.
+        found[span] = top.flatten(0, 1).clone(), sums.T.contiguous()
+    return [found[span] for span in spans]
 
 
-def _slide(values: Tensor, axis: int, width: int) -> Tensor:
-    """Largest of every `width` neighbours along an axis, by windows that double: many times faster than pooling."""
-    have = 1
+def _slide(values: Tensor, axis: int, width: int, have: int = 1) -> Tensor:
+    """Largest of every `width` neighbours along an axis, from those of every `have`, by windows that double."""
     while have < width:
         step = min(have, width - have)
         length = values.shape[axis] - step
@@ -295,7 +305,8 @@ def _summary(best: Tensor) -> Tensor:
 
 def _of(values: Tensor, anything: Tensor, targets: Tensor) -> Tensor:
     """Maps `(T, rows, columns)` of some classes, 0 for any, from `(rows, columns, K)`."""
-    return torch.cat([anything[..., None], values], -1)[..., targets].movedim(-1, 0)
+    maps = values.movedim(-1, 0)[(targets - 1).clamp(min=0)]
+    return torch.where((targets > 0)[:, None, None], maps, anything)
 
 
 def _peak(values: Tensor, side: int) -> Tensor:

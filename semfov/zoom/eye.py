@@ -12,7 +12,7 @@ from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, open_large
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
-from semfov.detection.selection import Selection, select
+from semfov.detection.selection import Selection, select_several
 from semfov.errors import check, check_finite, check_number, check_shape, lookup
 from semfov.sensor.glimpse import windows_at
 from semfov.zoom.lattice import Lattice
@@ -110,9 +110,8 @@ class ZoomEye(nn.Module):
         """
         canvas, frames = self.glimpse(view, fixations, within)
         candidates = self.detector.propose(canvas)
-        policy = self.detector.background
-        detections = select(candidates, None, self.detector.selection, policy)
-        hints = select(candidates, None, HINTS, policy)
+        wanted = [self.detector.selection, HINTS]
+        detections, hints = select_several(candidates, None, wanted, self.detector.background)
         cut = _at_border(detections, frames, view.picture.size)
         return Seen(*self._treat(_to_picture(detections, frames), cut), _to_picture(hints, frames), frames[:, :4])
 

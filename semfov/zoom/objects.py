@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.observation.matching import box_iou
+from semfov.detection.near_duplicates import intersection, neighbours, survivors
 from semfov.zoom.glances import Glance
 
 
@@ -87,16 +87,18 @@ def merge(
 
 def _unlike(box: Tensor, label: Tensor, cut: Tensor, number: Tensor, iou: float, inside: float) -> Tensor:
     """Which boxes stay when each, in order, drops those after it that are the same object."""
-    if not len(box):
-        return torch.zeros(0, dtype=torch.long)
-    low, high = torch.maximum(box[:, None, :2], box[None, :, :2]), torch.minimum(box[:, None, 2:], box[None, :, 2:])
-    area = (box[:, 2:] - box[:, :2]).prod(-1).clamp(min=1e-6)
-    part = (high - low).clamp(min=0).prod(-1) / area[None]
-    same = (box_iou(box, box) >= iou) | ((part >= inside) & cut[None] & (number[:, None] != number[None]))
-    same &= label[:, None] == label[None]
-    later = same.triu(1).numpy()
-    alive = np.ones(len(box), dtype=bool)
-    for first in range(len(box)):
-        if alive[first]:
-            alive &= ~later[first]
-    return torch.from_numpy(alive).nonzero()[:, 0]
+    corners, labels, looks = box.numpy(), label.numpy().astype(np.float64), number.numpy()
+    # Classes are moved apart, so that neighbours along x are of one class.
+    shift = labels * (2 * np.abs(corners).max(initial=0) + 1)
+    start, end = corners[:, 0] + shift, corners[:, 2] + shift
+    order = start.argsort(kind="stable")
+    one, other = neighbours(start[order], end[order])
+    one, other = order[one], order[other]
+    first, second = np.minimum(one, other), np.maximum(one, other)
+    x1, y1, x2, y2 = np.ascontiguousarray(corners.T)
+    shared, area = intersection(x1, y1, x2, y2, first, second), (x2 - x1) * (y2 - y1)
+    union = area[first] + area[second] - shared
+    same = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0) >= np.float32(iou)
+    part = shared / np.maximum(area, 1e-6)[second]
+    same |= (part >= np.float32(inside)) & cut.numpy()[second] & (looks[first] != looks[second])
+    return torch.from_numpy(survivors(len(box), first[same], second[same]))

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
-from torch import Tensor
-from torch.nn import functional as F
 
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.glances import Window, on_lattice
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.sums import Cells
 
 Choice = tuple[Window, float]
 """A window, and what a look at it is worth."""
@@ -25,20 +25,8 @@ def best_find(belief: ZoomBelief, done: set[Window], foresight: float = 0.0) -> 
     lattice = belief.lattice
     best: Choice | None = None
     for level in range(1, lattice.levels):
-        values = belief.finds(level)
-        if foresight and level + 1 < lattice.levels:
-            values = values + foresight * _deeper(belief, level)
-        best = _better(best, values, level, lattice, done)
+        best = _better(best, belief.value(level, foresight), level, lattice, done)
     return best
-
-
-def _deeper(belief: ZoomBelief, level: int) -> Tensor:
-    """What looks one octave closer would find in each window of a level."""
-    span = belief.lattice.span(level)
-    image = (belief.expected(level + 1) * (belief.source < level))[None, None]
-    wide, high = (max(span - n, 0) for n in (belief.lattice.columns, belief.lattice.rows))
-    line = torch.ones(1, 1, 1, span)
-    return F.conv2d(F.conv2d(F.pad(image, (0, wide, 0, high)), line), line.mT)[0, 0]
 
 
 def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) -> Choice | None:
@@ -56,40 +44,37 @@ def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) ->
     best: Choice | None = None
     for level in range(1, lattice.levels):
         last = level == lattice.levels - 1
-        values = torch.zeros(lattice.places(level)[::-1])
-        if last or not closest:
-            values = belief.odds(level).sigmoid()
+        values = belief.chances(level)
+        if closest and not last:
+            values = np.zeros_like(values)
         if not last:
-            deeper = _sums(belief, level)
-            values = torch.maximum(values, deeper / patience)
+            values = np.maximum(values, _sums(belief, level) / np.float32(patience))
         best = _better(best, values, level, lattice, done)
     return best
 
 
-def _sums(belief: ZoomBelief, level: int) -> Tensor:
+def _sums(belief: ZoomBelief, level: int) -> Cells:
     """Sum over the closer windows, side by side, in each window of a level that was not looked at as closely yet."""
-    lattice = belief.lattice
+    lattice, source = belief.lattice, belief.source.numpy()
     down, across = lattice.places(level)[::-1]
-    total = torch.zeros(down, across)
+    total = np.zeros((down, across), np.float32)
     for deeper in range(level + 1, lattice.levels):
-        odds = belief.odds(deeper)
+        chances = belief.chances(deeper)
         span, times = lattice.span(deeper), 1 << (deeper - level)
         half = span // 2
-        source = belief.source[half : half + odds.shape[0], half : half + odds.shape[1]]
-        source = F.pad(source[None].float(), (0, odds.shape[1] - source.shape[1], 0, odds.shape[0] - source.shape[0]),
-                       value=torch.inf)[0]  # fmt: skip
-        table = odds.sigmoid() * (source < level)
-        high, wide = ((times - 1) * span + n for n in (down, across))
-        table = F.pad(table, (0, max(wide - table.shape[1], 0), 0, max(high - table.shape[0], 0)))
-        sums = F.conv2d(table[None, None], torch.ones(1, 1, times, times), dilation=span)[0, 0]
-        total = torch.maximum(total, sums[:down, :across])
+        middle = source[half : half + chances.shape[0], half : half + chances.shape[1]]
+        rows, columns = middle.shape
+        # Where windows of the level reach beyond the picture there is nothing to sum.
+        table = np.zeros([max((times - 1) * span + n, m) for n, m in ((down, rows), (across, columns))], np.float32)
+        np.multiply(chances[:rows, :columns], middle < level, out=table[:rows, :columns])
+        lines = sum(table[span * n : span * n + down] for n in range(times))
+        total = np.maximum(total, sum(lines[:, span * n : span * n + across] for n in range(times)))
     return total
 
 
-def _better(best: Choice | None, values: Tensor, level: int, lattice: Lattice, done: set[Window]) -> Choice | None:
+def _better(best: Choice | None, values: Cells, level: int, lattice: Lattice, done: set[Window]) -> Choice | None:
     """The better of a choice and of the windows of a level that were not looked at."""
-    flat = values.flatten()
-    across = values.shape[1]
+    flat, across = values.ravel(), values.shape[1]
     for _ in range(len(done) + 1):
         place = int(flat.argmax())
         value = float(flat[place])
@@ -98,8 +83,8 @@ def _better(best: Choice | None, values: Tensor, level: int, lattice: Lattice, d
         window = on_lattice(lattice, (level, place % across, place // across))
         if window not in done:
             return window, value
-        flat = flat.clone()
-        flat[place] = -torch.inf
+        flat = flat.copy()
+        flat[place] = -np.inf
     return best
 
 
