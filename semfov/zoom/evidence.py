@@ -142,18 +142,16 @@ class GlimpseEvidence(Pretrained):
         inputs = torch.cat([hints, crowd, octaves], -1)
         own, slope, offset = hints, torch.as_tensor(self.slope), torch.as_tensor(self.offset)
         if target is None:
-            company = self.company(inputs)
+            company = _through(self.company, inputs)
         else:
             one = slice(target - 1, target)
             own, slope, offset = own[:, one], slope[one], offset[one]
-            last = self.company[3]
-            assert isinstance(last, nn.Linear)
-            company = F.linear(self.company[:3](inputs), last.weight[one], last.bias[one])
+            company = _through(self.company, inputs, one)
         top = hints.amax(-1, keepdim=True).expand_as(own)
         known = torch.zeros_like(own) if before is None else before.view_as(own) / 3
         first = torch.full_like(own, float(before is not None))
         parts = [own, top, own - top, octaves.expand_as(own), crowd[:, 2:].expand_as(own), known, first]
-        value: Tensor = slope * own + offset + company + self.shape(torch.stack(parts, -1))[..., 0]
+        value: Tensor = slope * own + offset + company + _through(self.shape, torch.stack(parts, -1))[..., 0]
         return value if target is None else value[:, 0]
 
     def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
@@ -170,7 +168,7 @@ class GlimpseEvidence(Pretrained):
         """
         strongest = look.scores.amax(-1)
         best, own = features(strongest), features(_of(look.scores, strongest, targets))
-        found = _of(look.found, look.found.any(-1), targets).to(own)
+        found = _of(look.found, look.found.any(-1), targets)
         shape = own.shape
 
         def wide(values: Tensor) -> Tensor:
@@ -194,7 +192,7 @@ class GlimpseEvidence(Pretrained):
             torch.full_like(own, -1.0) if before is None else before / 4,
             torch.full_like(own, float(before is not None)),
         ]
-        value: Tensor = self.rate(torch.stack(parts, -1)) + bias[:, None, None, None] - 6
+        value: Tensor = _through(self.rate, torch.stack(parts, -1)) + bias[:, None, None, None] - 6
         return value.clamp(max=3).movedim(-1, 1)
 
     def anywhere(self, best: Tensor, case: Tensor) -> Tensor:
@@ -204,7 +202,7 @@ class GlimpseEvidence(Pretrained):
             best: `(...)`, highest score of the class in any look.
             case: `(..., 11)`, what else is known (`semfov.zoom.tally.Tally.case`).
         """
-        value: Tensor = torch.logit(best, eps=1e-4) + self.judge(case)[..., 0]
+        value: Tensor = torch.logit(best, eps=1e-4) + _through(self.judge, case)[..., 0]
         return value
 
     def taper(self, span: int) -> Tensor:
@@ -306,7 +304,7 @@ def _summary(best: Tensor) -> Tensor:
 def _of(values: Tensor, anything: Tensor, targets: Tensor) -> Tensor:
     """Maps `(T, rows, columns)` of some classes, 0 for any, from `(rows, columns, K)`."""
     maps = values.movedim(-1, 0)[(targets - 1).clamp(min=0)]
-    return torch.where((targets > 0)[:, None, None], maps, anything)
+    return torch.where((targets > 0)[:, None, None], maps.float(), anything.float())
 
 
 def _peak(values: Tensor, side: int) -> Tensor:
@@ -315,6 +313,20 @@ def _peak(values: Tensor, side: int) -> Tensor:
 
 def _mean(values: Tensor, side: int) -> Tensor:
     return F.avg_pool2d(values[:, None], side, 1, side // 2)[:, 0]
+
+
+def _through(network: nn.Sequential, values: Tensor, outputs: slice = slice(None)) -> Tensor:
+    """Some of a network's outputs. Networks this small spend most of their time in calls of modules, left out here."""
+    last = len(network) - 1
+    for place, layer in enumerate(network):
+        if isinstance(layer, nn.Linear):
+            kept = outputs if place == last else slice(None)
+            values = F.linear(values, layer.weight[kept], layer.bias[kept])
+        elif isinstance(layer, nn.GELU):
+            values = F.gelu(values)
+        elif layer.training:  # dropout
+            values = layer(values)
+    return values
 
 
 def _network(inputs: int, width: int, outputs: int) -> nn.Sequential:

@@ -1,9 +1,11 @@
 """An eye for pictures larger than a detector's input: a look is a choice of where and how close."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -13,7 +15,7 @@ from semfov.data.large import LargePicture, open_large
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.selection import Selection, select_several
-from semfov.errors import check, check_finite, check_number, check_shape, lookup
+from semfov.errors import check, check_number, check_shape, lookup
 from semfov.sensor.glimpse import windows_at
 from semfov.zoom.lattice import Lattice
 
@@ -112,8 +114,9 @@ class ZoomEye(nn.Module):
         candidates = self.detector.propose(canvas)
         wanted = [self.detector.selection, HINTS]
         detections, hints = select_several(candidates, None, wanted, self.detector.background)
-        cut = _at_border(detections, frames, view.picture.size)
-        return Seen(*self._treat(_to_picture(detections, frames), cut), _to_picture(hints, frames), frames[:, :4])
+        place = _Placement(frames, view.picture.size, detections.boxes)
+        found, cut = self._treat(place.to_picture(detections), place.cut(detections))
+        return Seen(found, cut, place.to_picture(hints), frames[:, :4])
 
     def glimpse(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None
@@ -126,15 +129,16 @@ class ZoomEye(nn.Module):
             closest = fixations.new_full((*fixations.shape[:-1], 1), view.lattice.magnifications[-1])
             fixations = torch.cat([fixations, closest], -1)
         check_shape(fixations, "fixations", None, 3)
-        check_finite(fixations, "fixations")
-        check(bool((fixations[:, 2] > 0).all()), "fixations", "positive magnifications", fixations[:, 2].tolist())
+        rows = fixations.tolist()
+        check(all(math.isfinite(n) for row in rows for n in row), "fixations", "finite numbers", rows)
+        check(all(row[2] > 0 for row in rows), "fixations", "positive magnifications", [row[2] for row in rows])
         windows = windows_at(fixations[:, :2].double(), fixations[:, 2].double(), self.detector.input_size)
         limits = [None] * len(fixations) if within is None else within
         wide, high = self.detector.input_size
         canvases = torch.empty(len(fixations), 3, high, wide)
         frames = [
             self._show(canvas, view.picture, window, m, limit)
-            for canvas, window, m, limit in zip(canvases, windows.tolist(), fixations[:, 2].tolist(), limits, strict=True)
+            for canvas, window, (_, _, m), limit in zip(canvases, windows.tolist(), rows, limits, strict=True)
         ]
         return canvases, torch.tensor(frames).view(-1, 8)
 
@@ -201,23 +205,34 @@ class ZoomEye(nn.Module):
         return {"sensor": sensor, "detector": self.detector.settings()}
 
 
-def _to_picture(detections: Detections, frames: Tensor) -> Detections:
-    """Canvas boxes as boxes in picture pixels, cut to their windows."""
-    window, canvas = frames.to(detections.boxes)[:, None].split(4, -1)
-    low, high = window[..., [0, 1, 0, 1]], window[..., [2, 3, 2, 3]]
-    first, last = canvas[..., [0, 1, 0, 1]], canvas[..., [2, 3, 2, 3]]
-    boxes = (detections.boxes - first) * ((high - low) / (last - first)) + low
-    boxes = boxes.clamp(low, high) * detections.mask[..., None]
-    return Detections(boxes, detections.scores, detections.mask)
+class _Placement:
+    """Where the canvases of a few looks lie in the picture.
 
+    Args:
+        frames: `(F, 8)`, the window in the picture and the same on the canvas.
+        size: `(width, height)` of the picture.
+        like: boxes whose dtype and device are taken.
+    """
 
-def _at_border(detections: Detections, frames: Tensor, size: tuple[int, int]) -> Tensor:
-    """Which boxes touch a border of their window that lies inside the picture, `(F, L)`."""
-    frames = frames.to(detections.boxes)
-    window, canvas = frames.split(4, -1)
-    # A border of the picture cuts nothing.
-    limit = frames.new_tensor(size)
-    low = torch.where(window[:, :2] > 0, canvas[:, :2] + BORDER, -torch.inf)[:, None]
-    high = torch.where(window[:, 2:] < limit, canvas[:, 2:] - BORDER, torch.inf)[:, None]
-    near = (detections.boxes[..., :2] <= low) | (detections.boxes[..., 2:] >= high)
-    return near.any(-1) & detections.mask
+    def __init__(self, frames: Tensor, size: tuple[int, int], like: Tensor) -> None:
+        values = frames.numpy().astype(np.float64 if like.dtype == torch.float64 else np.float32)
+        window, canvas = values[:, :4], values[:, 4:]
+        scale = (window[:, 2:] - window[:, :2]) / (canvas[:, 2:] - canvas[:, :2])
+        # A border of the picture cuts nothing.
+        near = np.where(window[:, :2] > 0, canvas[:, :2] + BORDER, -np.inf)
+        far = np.where(window[:, 2:] < size, canvas[:, 2:] - BORDER, np.inf)
+        corners = window[:, :2], window[:, 2:], canvas[:, :2], scale
+        rows = np.stack([*(np.tile(corner, 2) for corner in corners), np.concatenate([near, far], 1)])
+        self._low, self._high, self._first, self._scale, self._border = torch.from_numpy(rows).to(like)[:, :, None]
+
+    def to_picture(self, detections: Detections) -> Detections:
+        """Canvas boxes as boxes in picture pixels, cut to their windows."""
+        boxes = (detections.boxes - self._first) * self._scale + self._low
+        boxes = boxes.clamp(self._low, self._high) * detections.mask[..., None]
+        return Detections(boxes, detections.scores, detections.mask)
+
+    def cut(self, detections: Detections) -> Tensor:
+        """Which boxes touch a border of their window that lies inside the picture, `(F, L)`."""
+        low, high = self._border.split(2, -1)
+        touches = (detections.boxes[..., :2] <= low) | (detections.boxes[..., 2:] >= high)
+        return touches.any(-1) & detections.mask

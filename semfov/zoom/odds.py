@@ -155,10 +155,10 @@ class WindowOdds:
                     _pool_again(table, scores, left, _reach(rows, table, 0), _reach(columns, table, 1), stale[level])
         if gist.level > 0:
             for level, table in look.tables.items():
-                high, wide = table.shape
-                known = self._odds[level][y : y + high * gist.scale, x : x + wide * gist.scale]
-                before = known[:: gist.scale, :: gist.scale].reshape(-1)
-                before = np.where(before == -np.inf, np.float32(_UNKNOWN), before)
+                # A cell of a coarse look can reach beyond the last window of a level: it goes by that one.
+                rows, columns = (low + gist.scale * np.arange(n) for low, n in zip((y, x), table.shape, strict=True))
+                known = self._odds[level].take(rows, 0, mode="clip").take(columns, 1, mode="clip").reshape(-1)
+                before = np.where(known == -np.inf, np.float32(_UNKNOWN), known)
                 if table.before is not None:
                     stale[level] |= before != table.before
                 table.before = before
