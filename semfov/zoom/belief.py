@@ -1,4 +1,4 @@
-"""What looks at a picture say of where closer looks pay."""
+"""Belief about a large picture: what looks at it predict for closer looks."""
 
 from typing import Protocol
 
@@ -17,7 +17,7 @@ from semfov.zoom.sums import Cells, WindowSums
 
 
 class Rates(Protocol):
-    """What tells how many objects closer looks find: `GlimpseEvidence`, or `semfov.zoom.observed.ObservedRates`."""
+    """Predicts how many objects closer looks find: `GlimpseEvidence`, or `semfov.zoom.observed.ObservedRates`."""
 
     @property
     def foresight(self) -> float:
@@ -34,18 +34,25 @@ class Rates(Protocol):
 
 
 class ZoomBelief:
-    """What is expected of every window of a picture, for one class.
+    """What looks at any window of a picture are expected to show, for one class.
 
-    A cell goes by the closest look at it. It keeps five numbers, 24 bytes: the level of that look, how many objects
-    centred in it are expected to be found one, two and three octaves closer, and what is left to see in it. All classes
-    are kept for looked-at windows alone, at most 32 × 32 cells of each. A picture of 20,000 × 15,000 px has 49,152
-    cells: 1.2 MB, and for 80 classes at most 0.41 MB for each look.
+    Each cell is predicted from the closest look at it. The belief keeps five numbers, 24 bytes, for a cell: the level of
+    that look, the number of objects centred in the cell that looks one, two and three octaves closer are expected to
+    find, and the share of the cell that is left to see. Hints of all classes are kept for the windows that were looked
+    at, at most 32 × 32 cells of each. A picture of 20,000 × 15,000 px has 49,152 cells: 1.2 MB, and for 80 classes at
+    most 0.41 MB for each look. Searches also keep the hints of each look pooled over its windows.
 
     Args:
-        lattice: of the picture.
-        evidence: learned, by magnification. What tells rates alone is enough to look for all objects.
+        lattice: lattice of the picture.
+        evidence: learned evidence. An explorer that looks for all objects needs its rates alone.
         target: class 1..K, or 0 for any.
-        context: what is added to the odds of a class for what windows show of others; None adds nothing.
+        context: adds to the log odds of the class by the other classes in a window; None adds nothing.
+
+    Attributes:
+        rate: `(3, rows, columns)`, expected objects centred in each cell, for looks one to three octaves closer.
+        source: `(rows, columns)`, level of the closest look at each cell that has closer ones; -1 for none.
+        left: `(rows, columns)`, share of each cell that is left to see, 0 or 1.
+        gists: gists of the looks so far.
     """
 
     def __init__(self, lattice: Lattice, evidence: Rates, target: int, context: WindowContext | None = None) -> None:
@@ -63,17 +70,21 @@ class ZoomBelief:
 
     @property
     def evidence(self) -> GlimpseEvidence:
-        """Learned evidence."""
+        """The learned evidence; only searches ask for it."""
         assert isinstance(self._rates, GlimpseEvidence), "searches go by learned evidence"
         return self._rates
 
     def restore(self, left: Tensor) -> None:
-        """Go back to what was left to see before windows were discounted."""
+        """Set back what is left to see, to undo `discount`.
+
+        Args:
+            left: `(rows, columns)`, a copy of `left` from before.
+        """
         np.copyto(self.left.numpy(), left.numpy())
         self._expected.clear()
 
     def add(self, glance: Glance) -> None:
-        """Take account of a look."""
+        """Update the belief with the result of a look."""
         if glance.gist is None:
             self.discount(glance.window)
             return
@@ -83,17 +94,17 @@ class ZoomBelief:
         self._expected.clear()
 
     def discount(self, window: Window) -> None:
-        """Expect no more of what a window shows: it was looked at, or is about to be.
+        """Expect nothing more inside a window, because it was looked at as closely as possible, or is about to be.
 
-        That holds to its borders. What they cut is centred in the next window as often as in this one, and windows that
-        look at borders again find less than windows where nobody looked.
+        This includes the cells at its borders. Objects that a border cuts are centred in the next window as often as in
+        this one, and looking at borders again finds less than looking elsewhere.
         """
         x1, y1, x2, y2 = window.cells
         self.left.numpy()[max(y1, 0) : max(y2, 0), max(x1, 0) : max(x2, 0)] = 0
         self._expected.clear()
 
     def _spread(self, look: Gist) -> None:
-        """Rates of a look on the cells that were not looked at as closely before."""
+        """Write the rates of a look to the cells that were not looked at as closely before."""
         rows = min(look.scores.shape[0] * look.scale, self.lattice.rows - look.first[1])
         columns = min(look.scores.shape[1] * look.scale, self.lattice.columns - look.first[0])
         at = (slice(look.first[1], look.first[1] + rows), slice(look.first[0], look.first[0] + columns))
@@ -111,7 +122,7 @@ class ZoomBelief:
         source[newer] = look.level
 
     def expected(self, level: int) -> Tensor:
-        """Objects that looks of a level are expected to find, cell by cell, `(rows, columns)`."""
+        """Number of objects that looks of a level are expected to find in each cell, `(rows, columns)`."""
         return torch.from_numpy(self._expect(level).copy())
 
     def _expect(self, level: int) -> Cells:
@@ -122,11 +133,19 @@ class ZoomBelief:
         return self._expected[level]
 
     def finds(self, level: int) -> Tensor:
-        """Objects that each window of a level is expected to find, `(down, across)`."""
+        """Number of objects that a look at each window of a level is expected to find, `(down, across)`."""
         return torch.from_numpy(self._sum(level, tapered=True)(self._expect(level)).copy())
 
     def value(self, level: int, foresight: float) -> Cells:
-        """Objects that looks at each window of a level find, and what closer ones in it would; see `best_find`."""
+        """Value of each window of a level for finding objects (`semfov.zoom.policy.best_find`).
+
+        Args:
+            level: level of the windows.
+            foresight: κ.
+
+        Returns:
+            `(down, across)`, not to be written to.
+        """
         values = self._sum(level, tapered=True)(self._expect(level))
         if not foresight or level + 1 >= self.lattice.levels:
             return values
@@ -134,7 +153,7 @@ class ZoomBelief:
         return values + np.float32(foresight) * self._sum(level, tapered=False)(deeper)
 
     def _sum(self, level: int, *, tapered: bool) -> WindowSums:
-        """Sums over the windows of a level, tapered to their borders or not."""
+        """Sums over the windows of a level, with weights that fall off towards their borders or without."""
         if (level, tapered) not in self._sums:
             span = self.lattice.span(level)
             weight = self._rates.taper(span).detach().numpy() if tapered else np.ones(span, np.float32)
@@ -142,11 +161,11 @@ class ZoomBelief:
         return self._sums[level, tapered]
 
     def odds(self, level: int) -> Tensor:
-        """Log odds that each window of a level shows the class, `(down, across)`; -inf where nothing is known."""
+        """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf if nothing is known."""
         return torch.from_numpy(self._shown().odds(level).copy())
 
     def chances(self, level: int) -> Cells:
-        """Probability that each window of a level shows the class, `(down, across)`; not to be written to."""
+        """Probability that a look at each window of a level shows the class, `(down, across)`, not to be written to."""
         return self._shown().chances(level)
 
     def _shown(self) -> WindowOdds:
@@ -154,12 +173,12 @@ class ZoomBelief:
         return self._odds
 
     def _presence(self, pooled: Tensor, summary: Tensor, steps: Tensor, before: Tensor | None) -> Tensor:
-        """Log odds of the evidence (`GlimpseEvidence.presence`), with those of the context."""
+        """Log odds of the evidence (`GlimpseEvidence.presence`) plus those of the context."""
         odds = self.evidence.presence(pooled, summary, steps, self.target, before)
         return odds if self.context is None else odds + self.context(pooled, self.target)
 
     def odds_of(self, window: Window) -> float:
-        """Log odds that a window shows the class, which need not be one of the lattice."""
+        """Log odds that a look at a window shows the class; the window need not lie on the lattice."""
         if window in self._told:
             return self._told[window]
         value: Tensor | None = None
@@ -186,12 +205,15 @@ class ZoomBelief:
 
 
 def before_of(rate: Tensor, source: Tensor, look: Gist) -> Tensor:
-    """Logarithm of the rates that were expected of looks one octave closer than a look, in its cells.
+    """Logarithms of the rates that earlier looks gave, in the cells of a look, for looks one octave closer than it.
 
     Args:
-        rate: `(3, rows, columns)` of the lattice's cells that the look shows.
-        source: `(rows, columns)`, level of the look that told each.
+        rate: `(3, rows, columns)`, rates of the lattice cells that the look shows.
+        source: `(rows, columns)`, level of the look that gave the rates of each cell.
         look: the new look.
+
+    Returns:
+        `(rows, columns)` of the gist.
     """
     steps = (look.level + 1 - source).clamp(1, STEPS)
     told = rate.gather(0, (steps - 1)[None])[0]

@@ -1,4 +1,4 @@
-"""An eye for pictures larger than a detector's input: a look is a choice of where and how close."""
+"""An eye for pictures larger than the detector's input, which looks at windows at a chosen magnification."""
 
 import math
 from collections.abc import Sequence
@@ -23,20 +23,25 @@ Cut = Literal["keep", "drop", "background"]
 Limit = tuple[float, float, float, float]
 
 HINTS = Selection(threshold=0.002, iou=0.95, limit=300)
-"""Candidates that are too weak to be detections, but tell where a closer look pays."""
+"""Selection of hints: candidates that are too weak to be detections, but show where a closer look pays."""
 
 _REDUCE = 2  # a window is reduced in the source as long as it keeps this many pixels for each canvas pixel
 BORDER = 2.0
-"""Canvas pixels; a box that comes as near to the window's border is cut by it."""
+"""A box this near to the border of its window, in canvas pixels, counts as cut by it."""
 
 
 @dataclass(frozen=True)
 class ZoomView:
-    """A picture as the eye holds it: nothing is read yet.
+    """A picture that an eye can look at. Opening it reads no pixels.
 
     Attributes:
-        picture: gives its windows.
-        lattice: the cells over it, and the windows of every level.
+        picture: source of the pixels, read by windows.
+        lattice: cells over the picture, and the windows of every level.
+
+    Example::
+
+        view = ZoomEye(load_detector("yolox-nano")).open("harbour.tif")
+        view.picture.size, view.lattice.levels
     """
 
     picture: LargePicture
@@ -45,13 +50,13 @@ class ZoomView:
 
 @dataclass(frozen=True)
 class Seen:
-    """What a few looks show.
+    """The result of several looks.
 
     Attributes:
-        detections: boxes in picture pixels, a batch of F.
-        cut: `(F, L)`, which detections the border of their window cuts.
-        hints: weak candidates, overlapping ones among them, boxes in picture pixels.
-        windows: `(F, 4)`, what was looked at, cut to the picture.
+        detections: a batch of F, boxes in picture pixels.
+        cut: `(F, L)`, boolean, true where the border of the window cuts the box.
+        hints: weak candidates, which may overlap; a batch of F, boxes in picture pixels.
+        windows: `(F, 4)`, the windows in picture pixels, cut to the picture.
     """
 
     detections: Detections
@@ -61,19 +66,23 @@ class Seen:
 
 
 class ZoomEye(nn.Module):
-    """Looks at windows of a picture, each at a magnification and resampled to the detector's input.
+    """Looks at windows of a picture: resamples a window to the detector's input and detects in it.
 
-    A look costs one pass of the detector, whatever the size of the picture. Windows are rounded to whole pixels and
-    resampled by the antialiased filter of `semfov.sensor.glimpse`, from bytes, within their own border.
+    A look costs one pass of the detector, whatever the size of the picture. The borders of windows are rounded to whole
+    pixels. Windows are resampled as bytes by the antialiased filter of `semfov.sensor.glimpse`, from the pixels inside
+    them alone.
 
-    An object that the border of a window cuts shows a part of itself there, and its box is the part's. Such a box can
-    be kept (`keep`), left out (`drop`), or keep its place with the scores of a background (`background`). A border of
-    the picture cuts nothing.
+    Where the border of a window cuts an object, only a part of the object is visible, and its box encloses that part.
+    Such boxes can be kept (`keep`), left out (`drop`), or kept with the scores of background (`background`). The border
+    of the picture cuts no object.
 
     Args:
         detector: any detector.
-        finest: largest magnification, in canvas pixels for each picture pixel; 1 ends at native pixels.
-        cut: what becomes of boxes at a window's border.
+        finest: largest magnification, in canvas pixels per picture pixel; 1 ends at native pixels.
+        cut: treatment of boxes that the border of a window cuts.
+
+    Raises:
+        InputError: a setting is outside its range.
 
     Example::
 
@@ -91,24 +100,40 @@ class ZoomEye(nn.Module):
         self.cut: Cut = lookup(cut, get_args(Cut), "treatment of cut boxes")
 
     def open(self, picture: LargePicture | ImageLike) -> ZoomView:
-        """Hold a picture: a file, another of any common kind (`semfov.as_image`), or a `LargePicture`."""
+        """Open a picture to look at it.
+
+        Args:
+            picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
+
+        Returns:
+            The picture with its lattice.
+        """
         source = open_large(picture)
         return ZoomView(source, Lattice.over(source.size, self.detector.input_size, finest=self.finest))
 
     def look(self, view: ZoomView, fixations: Tensor) -> Detections:
-        """Detections from fixations `(F, 3)`, `(x, y, magnification)`: a batch of F, boxes in picture pixels.
+        """Look at a picture and detect.
 
-        Points of two numbers `(F, 2)` are looked at at the largest magnification.
+        Args:
+            view: the picture, from `open`.
+            fixations: `(F, 3)`, `(x, y, magnification)`: centres of the windows in picture pixels, and canvas pixels
+                per picture pixel. Points `(F, 2)` are looked at with the largest magnification.
+
+        Returns:
+            A batch of F detections, boxes in picture pixels.
         """
         return self.glance(view, fixations).detections
 
     def glance(self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None) -> Seen:
-        """Detections with their hints.
+        """Look at a picture and return weak candidates too.
 
         Args:
-            view: of `open`.
-            fixations: as for `look`.
-            within: box of the picture that each look shows no more than; None for all that fits the canvas.
+            view: the picture, from `open`.
+            fixations: `(F, 3)` or `(F, 2)`, as for `look`.
+            within: for each look the box of the picture that it shows; None shows all that fits the canvas.
+
+        Returns:
+            Detections and hints of each look.
         """
         canvas, frames = self.glimpse(view, fixations, within)
         candidates = self.detector.propose(canvas)
@@ -121,9 +146,19 @@ class ZoomEye(nn.Module):
     def glimpse(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Canvases `(F, 3, h, w)`, and `(F, 8)`: the window in the picture and the same on the canvas.
+        """Resample windows without detecting in them.
 
-        Arguments as for `glance`.
+        Args:
+            view: the picture, from `open`.
+            fixations: `(F, 3)` or `(F, 2)`, as for `look`.
+            within: for each look the box of the picture that it shows; None shows all that fits the canvas.
+
+        Returns:
+            Canvases `(F, 3, h, w)`, RGB in [0, 1], and frames `(F, 8)`: each window in picture pixels
+            `(x1, y1, x2, y2)`, and its place on the canvas.
+
+        Raises:
+            InputError: a fixation is not finite, or its magnification is not positive.
         """
         if fixations.shape[-1] == 2:
             closest = fixations.new_full((*fixations.shape[:-1], 1), view.lattice.magnifications[-1])
@@ -145,7 +180,7 @@ class ZoomEye(nn.Module):
     def _show(
         self, canvas: Tensor, picture: LargePicture, window: list[float], magnification: float, limit: Limit | None
     ) -> list[float]:
-        """Write a canvas; returns where it lies in the picture."""
+        """Write one canvas; return its frame (`glimpse`)."""
         wide, high = self.detector.input_size
         low, right = (0.0, 0.0), (float(picture.size[0]), float(picture.size[1]))
         if limit is not None:
@@ -169,7 +204,7 @@ class ZoomEye(nn.Module):
             reduction *= 2
         pixels = picture.read((x1, y1, x2, y2), reduction)[None]
         if pixels.shape[-2:] != (v2 - v1, u2 - u1):
-            # A window whose rows lie apart in memory is resampled half as fast.
+            # torch takes twice as long where the rows of a window are not adjacent in memory.
             pixels = pixels.contiguous(memory_format=torch.channels_last)
             pixels = F.interpolate(pixels, (v2 - v1, u2 - u1), mode="bilinear", antialias=True)
         if (u1, v1, u2, v2) != (0, 0, wide, high):
@@ -179,7 +214,7 @@ class ZoomEye(nn.Module):
         return [float(n) for n in (x1, y1, x2, y2, u1, v1, u2, v2)]
 
     def _treat(self, detections: Detections, cut: Tensor) -> tuple[Detections, Tensor]:
-        """Detections after the eye's treatment of those that are cut, and which of them are cut."""
+        """Treat cut boxes as the eye's setting says; also return which of the resulting boxes are cut."""
         if self.cut == "keep" or not bool(cut.any()):
             return detections, cut
         if self.cut == "drop":
@@ -196,29 +231,41 @@ class ZoomEye(nn.Module):
         return Detections(detections.boxes, scores, detections.mask), cut
 
     def forward(self, picture: Tensor, fixations: Tensor) -> Detections:
-        """`look` at an image from fixations."""
+        """Open a picture, look at it and detect.
+
+        Args:
+            picture: `(3, H, W)`, RGB in [0, 1] or bytes.
+            fixations: `(F, 3)` or `(F, 2)`, as for `look`.
+
+        Returns:
+            A batch of F detections, boxes in picture pixels.
+        """
         return self.look(self.open(picture), fixations)
 
     def settings(self) -> dict[str, Any]:
-        """What the detections depend on, for the keys of caches and the metadata of fitted models."""
+        """Settings on which the detections depend, for the keys of caches and the metadata of fitted models.
+
+        Returns:
+            JSON values.
+        """
         sensor = {"glimpse": "antialiased bilinear", "finest": self.finest, "cut": self.cut}
         return {"sensor": sensor, "detector": self.detector.settings()}
 
 
 class _Placement:
-    """Where the canvases of a few looks lie in the picture.
+    """Maps boxes from the canvases of several looks to the picture.
 
     Args:
-        frames: `(F, 8)`, the window in the picture and the same on the canvas.
+        frames: `(F, 8)`, from `ZoomEye.glimpse`.
         size: `(width, height)` of the picture.
-        like: boxes whose dtype and device are taken.
+        like: boxes that have the dtype and device to compute in.
     """
 
     def __init__(self, frames: Tensor, size: tuple[int, int], like: Tensor) -> None:
         values = frames.numpy().astype(np.float64 if like.dtype == torch.float64 else np.float32)
         window, canvas = values[:, :4], values[:, 4:]
         scale = (window[:, 2:] - window[:, :2]) / (canvas[:, 2:] - canvas[:, :2])
-        # A border of the picture cuts nothing.
+        # The border of the picture cuts no object.
         near = np.where(window[:, :2] > 0, canvas[:, :2] + BORDER, -np.inf)
         far = np.where(window[:, 2:] < size, canvas[:, 2:] - BORDER, np.inf)
         corners = window[:, :2], window[:, 2:], canvas[:, :2], scale
@@ -226,13 +273,13 @@ class _Placement:
         self._low, self._high, self._first, self._scale, self._border = torch.from_numpy(rows).to(like)[:, :, None]
 
     def to_picture(self, detections: Detections) -> Detections:
-        """Canvas boxes as boxes in picture pixels, cut to their windows."""
+        """Map canvas boxes to picture pixels and cut them to their windows."""
         boxes = (detections.boxes - self._first) * self._scale + self._low
         boxes = boxes.clamp(self._low, self._high) * detections.mask[..., None]
         return Detections(boxes, detections.scores, detections.mask)
 
     def cut(self, detections: Detections) -> Tensor:
-        """Which boxes touch a border of their window that lies inside the picture, `(F, L)`."""
+        """Tell which boxes touch a border of their window that lies inside the picture, `(F, L)`."""
         low, high = self._border.split(2, -1)
         touches = (detections.boxes[..., :2] <= low) | (detections.boxes[..., 2:] >= high)
         return touches.any(-1) & detections.mask

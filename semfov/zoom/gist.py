@@ -1,4 +1,4 @@
-"""What a look at a window says of its cells: the strongest hint of every class in each."""
+"""The gist of a look at a window: the strongest hint of every class in each cell."""
 
 from dataclasses import dataclass
 
@@ -11,23 +11,28 @@ from semfov.detection.detections import Detections
 from semfov.zoom.lattice import Lattice
 
 FINEST = 32
-"""Cells along a side of a gist, at most."""
+"""Largest number of cells along a side of a gist."""
 
 FOUND = 0.1
-"""Score of a detection, from which on its object counts as found."""
+"""Score from which on a detection counts as a found object."""
 
 
 @dataclass(frozen=True)
 class Gist:
-    """A look at a window, cell by cell. Cells are those of the lattice, or squares of them where these are too fine.
+    """A look at a window, cell by cell.
+
+    The cells are those of the lattice. In windows with more than 32 cells along a side, several cells of the lattice
+    form one cell of the gist.
 
     Attributes:
-        level: of the window.
+        level: level of the window.
         first: `(column, row)` of the window's first cell on the lattice.
-        scale: cells of the lattice along a side of a cell of the gist.
-        scores: `(rows, columns, K)`, highest score of each class in a hint whose centre lies in the cell, 0 for none.
-        size: `(rows, columns)`, logarithm (base 2) of the size in canvas pixels of the most confident hint, 0 for none.
-        found: `(rows, columns, K)` boolean, classes of detections whose centre lies in the cell.
+        scale: number of lattice cells along a side of a cell of the gist.
+        scores: `(rows, columns, K)`, highest score of each class among hints whose centre lies in the cell; 0 without
+            hints.
+        size: `(rows, columns)`, logarithm (base 2) of the size in canvas pixels of the most confident hint; 0 without
+            hints.
+        found: `(rows, columns, K)`, boolean, classes of detections whose centre lies in the cell.
     """
 
     level: int
@@ -39,13 +44,16 @@ class Gist:
 
 
 def gist(hints: Detections, detections: Detections, lattice: Lattice, action: tuple[int, int, int]) -> Gist:
-    """The gist of a look at a window of the lattice.
+    """Compute the gist of a look at a window of the lattice.
 
     Args:
-        hints: of the look, a batch of one without padding, in picture pixels.
-        detections: of the look, likewise.
-        lattice: of the picture.
-        action: level, column and row of the window.
+        hints: hints of the look, a batch of one without padding, in picture pixels.
+        detections: detections of the look, likewise.
+        lattice: lattice of the picture.
+        action: `(level, column, row)` of the window.
+
+    Returns:
+        The gist.
     """
     level, column, row = action
     span = lattice.span(level)
@@ -68,7 +76,7 @@ def gist(hints: Detections, detections: Detections, lattice: Lattice, action: tu
     canvas = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3).log2().mean(-1)
     canvas = (canvas + torch.tensor(lattice.magnifications[level]).log2()).clamp(min=0)
     size, order = np.zeros(rows * columns, np.float32), scores.amax(-1).argsort().numpy()
-    # Of several hints in a cell the last that is written stays: the most confident.
+    # Of several hints in a cell the one written last remains: the most confident.
     size[at[order]] = canvas.numpy()[order]
     found = np.zeros((rows * columns, kinds), np.bool_)
     sure = detections.confidence[0] >= FOUND

@@ -1,4 +1,4 @@
-"""Log odds that windows show a class, by all looks at a picture, computed anew only where something has changed."""
+"""Log odds that windows show a class, from all looks at a picture, computed anew only where something has changed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -17,20 +17,20 @@ Box = tuple[int, int, int, int]
 Presence = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
 
 _UNKNOWN = -4.0
-"""Log odds that stand for those of an earlier look where there was none."""
+"""Log odds that are used where no earlier look gave any."""
 
 
 @dataclass
 class _Table:
-    """What a look tells of the windows of a level that lie in it, row by row.
+    """Predictions of a look for the N windows of a level that lie in it, row by row.
 
     Attributes:
-        span: cells of the look along a side of a window.
-        shape: `(down, across)` of the windows, N in all.
-        pooled: `(N, K)`, strongest hints in each window.
-        summary: `(N, 3)`, of all hints in it.
-        before: `(N,)`, log odds by looks from farther off; None for an overview.
-        odds: `(N,)`.
+        span: number of cells of the gist along a side of a window.
+        shape: `(down, across)`, number of windows.
+        pooled: `(N, K)`, strongest hint of each class in each window.
+        summary: `(N, 3)`, summary of all hints in each window (`pool`).
+        before: `(N,)`, log odds from coarser looks; None for the overview.
+        odds: `(N,)`, log odds from this look.
     """
 
     span: int
@@ -43,12 +43,12 @@ class _Table:
 
 @dataclass
 class _Look:
-    """A look, and what it tells.
+    """A look and its predictions.
 
     Attributes:
-        gist: of the look.
-        left: `(rows, columns)`, share of each of its cells that is left to see, when the tables were computed.
-        tables: by level of the windows.
+        gist: gist of the look.
+        left: `(rows, columns)`, share of each of its cells that was left to see when the tables were computed.
+        tables: predictions for the windows of each level.
     """
 
     gist: Gist
@@ -57,19 +57,19 @@ class _Look:
 
     @property
     def box(self) -> Box:
-        """Its cells on the lattice, `(x1, y1, x2, y2)`."""
+        """The cells of the lattice that it shows, `(x1, y1, x2, y2)`."""
         (x, y), scale, (rows, columns) = self.gist.first, self.gist.scale, self.gist.scores.shape[:2]
         return x, y, x + columns * scale, y + rows * scale
 
 
 class WindowOdds:
-    """Log odds that closer looks show a class, for the windows of all levels.
+    """Log odds that a look at a window shows a class, for the windows of all levels.
 
-    Looks are taken from the coarsest to the closest. A closer one replaces what those before it told of its windows,
-    and starts from that.
+    Looks contribute from the coarsest to the closest. A closer look replaces the predictions of coarser ones for the
+    windows inside it, and takes them as an input.
 
     Args:
-        lattice: of the picture.
+        lattice: lattice of the picture.
         presence: `GlimpseEvidence.presence` for the class.
     """
 
@@ -87,21 +87,21 @@ class WindowOdds:
             self._odds[level] = np.full(self._lattice.places(level)[::-1], -np.inf, np.float32)
 
     def odds(self, level: int) -> Cells:
-        """`(down, across)`, -inf where nothing is known."""
+        """Log odds of the windows of a level, `(down, across)`; -inf where nothing is known."""
         return self._odds[level]
 
     def chances(self, level: int) -> Cells:
-        """Probabilities, `(down, across)`."""
+        """Probabilities of the windows of a level, `(down, across)`."""
         if level not in self._chances:
             self._chances[level] = torch.from_numpy(self._odds[level]).sigmoid().numpy()
         return self._chances[level]
 
     def update(self, gists: Sequence[Gist], left: Cells) -> None:
-        """Take account of further looks, and of what is left to see.
+        """Update the log odds after further looks.
 
         Args:
-            gists: of all looks so far, in their order.
-            left: `(rows, columns)` of the lattice.
+            gists: gists of all looks so far, in their order.
+            left: `(rows, columns)` of the lattice, share of each cell that is left to see.
         """
         fresh = [_Look(gist) for gist in gists[len(self._looks) :]]
         changed = [look.box for look in fresh]
@@ -116,43 +116,25 @@ class WindowOdds:
         self._clear()
         for look in sorted(self._looks, key=lambda look: look.gist.level):
             if any(_overlap(look.box, box) for box in changed):
-                self._tell(look)
-            self._put(look)
+                self._predict(look)
+            self._write(look)
 
-    def _put(self, look: _Look) -> None:
-        """Write what a look tells over what coarser ones do."""
+    def _write(self, look: _Look) -> None:
+        """Write the predictions of a look over those of coarser ones."""
         (x, y), scale = look.gist.first, look.gist.scale
         for level, table in look.tables.items():
-            told = table.odds.reshape(table.shape)
+            odds = table.odds.reshape(table.shape)
             if scale > 1:
-                # Windows between the places that a coarse look tells go by the place before them.
-                told = told.repeat(scale, 0).repeat(scale, 1)
-            place = self._odds[level][y : y + told.shape[0], x : x + told.shape[1]]
-            place[:] = told[: place.shape[0], : place.shape[1]]
+                # A gist of large cells has no windows that start inside a cell: they get the odds of the one before.
+                odds = odds.repeat(scale, 0).repeat(scale, 1)
+            place = self._odds[level][y : y + odds.shape[0], x : x + odds.shape[1]]
+            place[:] = odds[: place.shape[0], : place.shape[1]]
 
     @torch.no_grad()
-    def _tell(self, look: _Look) -> None:
-        """Bring what a look tells up to date: of windows in which something has changed."""
+    def _predict(self, look: _Look) -> None:
+        """Compute the predictions of a look anew for the windows in which something has changed."""
         gist, (x, y) = look.gist, look.gist.first
-        left, last = self._left_of(gist), look.left
-        look.left = left
-        levels = range(gist.level + 1, min(gist.level + STEPS, self._lattice.levels - 1) + 1)
-        scores = gist.scores
-        stale: dict[int, NDArray[np.bool_]] = {}
-        if last is None:
-            spans = {level: span for level in levels if (span := self._lattice.span(level) // gist.scale)}
-            told = pool_spans(scores * torch.from_numpy(left)[..., None], list(spans.values()))
-            for (level, span), (pooled, summary) in zip(spans.items(), told, strict=True):
-                shape = _places(scores, span)
-                look.tables[level] = _Table(span, shape, pooled, summary, None, np.zeros(len(pooled), np.float32))
-                stale[level] = np.ones(len(pooled), np.bool_)
-        else:
-            differs = left != last
-            rows, columns = differs.any(1).nonzero()[0], differs.any(0).nonzero()[0]
-            for level, table in look.tables.items():
-                stale[level] = np.zeros(len(table.odds), np.bool_)
-                if len(rows):
-                    _pool_again(table, scores, left, _reach(rows, table, 0), _reach(columns, table, 1), stale[level])
+        stale = self._pool(look)
         if gist.level > 0:
             for level, table in look.tables.items():
                 # A cell of a coarse look can reach beyond the last window of a level: it goes by that one.
@@ -164,8 +146,32 @@ class WindowOdds:
                 table.before = before
         self._judge(look, stale)
 
+    def _pool(self, look: _Look) -> dict[int, NDArray[np.bool_]]:
+        """Pool the hints that are left to see in a look; return which windows of each level were pooled."""
+        gist, last = look.gist, look.left
+        look.left = left = self._left_of(gist)
+        stale: dict[int, NDArray[np.bool_]] = {}
+        if last is None:
+            levels = range(gist.level + 1, min(gist.level + STEPS, self._lattice.levels - 1) + 1)
+            spans = {level: span for level in levels if (span := self._lattice.span(level) // gist.scale)}
+            pools = pool_spans(gist.scores * torch.from_numpy(left)[..., None], list(spans.values()))
+            for (level, span), (pooled, summary) in zip(spans.items(), pools, strict=True):
+                shape = _places(gist.scores, span)
+                look.tables[level] = _Table(span, shape, pooled, summary, None, np.zeros(len(pooled), np.float32))
+                stale[level] = np.ones(len(pooled), np.bool_)
+            return stale
+        differs = left != last
+        rows, columns = differs.any(1).nonzero()[0], differs.any(0).nonzero()[0]
+        for level, table in look.tables.items():
+            stale[level] = np.zeros(len(table.odds), np.bool_)
+            if len(rows):
+                some = _reach(rows, table, 0), _reach(columns, table, 1)
+                _pool_some(table, gist.scores, left, some)
+                stale[level].reshape(table.shape)[some] = True
+        return stale
+
     def _judge(self, look: _Look, stale: dict[int, NDArray[np.bool_]]) -> None:
-        """Compute the odds of windows whose inputs have changed, of all levels at once."""
+        """Compute the log odds of windows whose inputs have changed, of all levels in one call of the network."""
         jobs = [(level, look.tables[level], rows) for level, mask in stale.items() if len(rows := mask.nonzero()[0])]
         if not jobs:
             return
@@ -183,7 +189,7 @@ class WindowOdds:
             table.odds[rows] = part
 
     def _left_of(self, gist: Gist) -> Cells:
-        """What is left to see in the cells of a look, `(rows, columns)`: 0 where they were looked at closely."""
+        """Share of each cell of a gist that is left to see, `(rows, columns)`."""
         rows, columns = gist.scores.shape[:2]
         high, wide = rows * gist.scale, columns * gist.scale
         (x, y), scale = gist.first, gist.scale
@@ -198,23 +204,21 @@ def _overlap(box: Box, other: Box) -> bool:
 
 
 def _places(scores: Tensor, span: int) -> tuple[int, int]:
-    """How many windows of `span` cells a look of `(rows, columns, K)` holds down a column and along a row."""
+    """Number of windows of `span` cells in a gist of `(rows, columns, K)`, down a column and along a row."""
     rows, columns = scores.shape[:2]
     return max(rows - span, 0) + 1, max(columns - span, 0) + 1
 
 
 def _reach(changed: NDArray[np.intp], table: _Table, axis: int) -> slice:
-    """Which windows along an axis hold a cell that has changed."""
+    """Windows of a table that hold a changed cell, along an axis."""
     return slice(max(int(changed[0]) - table.span + 1, 0), min(int(changed[-1]) + 1, table.shape[axis]))
 
 
-def _pool_again(
-    table: _Table, scores: Tensor, left: Cells, rows: slice, columns: slice, stale: NDArray[np.bool_]
-) -> None:
-    """Pool hints again in some of the windows of a table, and mark them."""
+def _pool_some(table: _Table, scores: Tensor, left: Cells, some: tuple[slice, slice]) -> None:
+    """Pool the hints of some windows of a table again, given by their rows and columns."""
+    rows, columns = some
     here = slice(rows.start, rows.stop + table.span - 1), slice(columns.start, columns.stop + table.span - 1)
     best, crowd = pool_all(scores[here] * torch.from_numpy(left[here])[..., None], table.span)
     shape = rows.stop - rows.start, columns.stop - columns.start, -1
     table.pooled.view(*table.shape, -1)[rows, columns] = best.view(shape)
     table.summary.view(*table.shape, -1)[rows, columns] = crowd.view(shape)
-    stale.reshape(table.shape)[rows, columns] = True

@@ -11,11 +11,11 @@ class WindowSums:
 
     .. math:: S_{ij} = \sum_{k,l} r_k r_l \, x_{i+k,\,j+l}
 
-    A sum along an axis is a product with a banded matrix. Sums are kept between calls, and of the next cells only the
-    windows that hold a changed one are summed again.
+    A sum along an axis is a product with a banded matrix. Sums are kept between calls. A call sums again the windows
+    that hold a cell which has changed since the last call.
 
     Args:
-        weight: `(span,)`, r, for the cells along a side of a window.
+        weight: `(span,)`, r, weights of the cells along a side of a window.
         shape: `(rows, columns)` of the cells.
 
     >>> sums = WindowSums(np.ones(2, np.float32), (3, 3))
@@ -34,10 +34,14 @@ class WindowSums:
         self._sums = np.zeros(self._places, np.float32)
 
     def __call__(self, cells: Cells) -> Cells:
-        """The sums `(down, across)` of cells `(rows, columns)`; a view that the next call changes.
+        """Sum the cells of every window.
 
         Args:
-            cells: x; a window that reaches beyond them sums those it holds.
+            cells: `(rows, columns)`, x; kept until the next call, so not to be written to. A window that reaches beyond
+                the cells sums those that it holds.
+
+        Returns:
+            `(down, across)`; the next call changes it.
         """
         if self._cells is None:
             rows, columns = (slice(0, n) for n in self._places)
