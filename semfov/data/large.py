@@ -22,11 +22,11 @@ from semfov.io.files import check_regular
 Box = tuple[int, int, int, int]
 
 _PLAIN = ("RGB", "L", "CMYK", "YCbCr")  # of 8 bits, and nothing is transparent
-_STRIP = 1 << 24  # pixels that are read at once for a reduced view
+_STRIP = 1 << 24  # number of pixels that are read at once for a reduced view
 
 
 class LargePicture(ABC):
-    """A picture of bytes that gives its windows.
+    """A picture of bytes that is read by windows.
 
     Attributes:
         size: `(width, height)` in pixels.
@@ -39,17 +39,20 @@ class LargePicture(ABC):
         """Pixels `(h, w, 3)`, RGB, of a window `(x1, y1, x2, y2)` inside the picture."""
 
     def read(self, box: Box, reduction: int = 1) -> Tensor:
-        """A window, reduced by a power of two where that keeps memory small.
+        """Read a window, reduced by a power of two where that keeps memory small.
 
-        Large windows are read in strips, each averaged over squares of `reduction` pixels, so that nothing larger than
-        a strip of 16 million pixels (48 MB) is held, whatever the window.
+        Large windows are read in strips. Each strip is averaged over squares of `reduction` pixels. So no more than a
+        strip of 16 million pixels (48 MB) is held in memory, however large the window is.
 
         Args:
             box: `(x1, y1, x2, y2)` in whole pixels, inside the picture.
-            reduction: how far it may be reduced.
+            reduction: factor, a power of two, by which the window may be reduced.
 
         Returns:
-            `(3, h, w)` bytes, channels last in memory.
+            `(3, h, w)`, bytes, channels last in memory.
+
+        Raises:
+            InputError: the box is empty or not inside the picture.
         """
         x1, y1, x2, y2 = box
         width, height = self.size
@@ -67,7 +70,14 @@ class LargePicture(ABC):
 
 
 class ArrayPicture(LargePicture):
-    """An array `(H, W, 3)` or `(H, W)` of bytes, in memory or a `numpy.memmap`, of which only windows are touched."""
+    """An array of bytes, in memory or a `numpy.memmap`, of which only windows are read.
+
+    Args:
+        array: `(H, W, 3)` or `(H, W)`.
+
+    Raises:
+        InputError: the array has another shape or dtype, or no pixel.
+    """
 
     def __init__(self, array: NDArray[np.uint8]) -> None:
         fits = array.dtype == np.uint8 and (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3))
@@ -83,11 +93,18 @@ class ArrayPicture(LargePicture):
 
 
 class MemoryPicture(ArrayPicture):
-    """A picture of any common kind (`semfov.as_image`), kept as bytes."""
+    """A picture of any common kind (`semfov.as_image`), kept in memory as bytes.
+
+    Args:
+        image: the picture.
+
+    Raises:
+        InputError: it is no picture, or a batch of several.
+    """
 
     def __init__(self, image: ImageLike) -> None:
         if isinstance(image, Tensor | np.ndarray) and image.dtype in (torch.uint8, np.dtype(np.uint8)):
-            # Bytes are not made floats in between: a large picture would take four times the memory.
+            # Bytes are not converted to floats in between: a large picture would take four times the memory.
             pixels = channels_first(pixels_of(image, "picture"), "picture", choose=isinstance(image, Tensor))
             check(len(pixels) == 1, "picture", "one picture", f"a batch of {len(pixels)}; give them one by one")
             super().__init__(to_bytes(pixels[0]))
@@ -96,7 +113,7 @@ class MemoryPicture(ArrayPicture):
 
 
 def to_bytes(image: Tensor) -> NDArray[np.uint8]:
-    """Pixels `(H, W, 3)` of an image `(3, H, W)`, RGB in [0, 1] or bytes already."""
+    """Convert an image `(3, H, W)`, RGB in [0, 1] or bytes, to pixels `(H, W, 3)`, bytes."""
     if image.dtype != torch.uint8:
         check_pixels(image, "image")
         image = image.clamp(0, 1).mul(255).round()
@@ -105,14 +122,14 @@ def to_bytes(image: Tensor) -> NDArray[np.uint8]:
 
 
 class PhotographPicture(LargePicture):
-    """A file that Pillow reads.
+    """An image file that Pillow reads.
 
-    Formats such as JPEG have no windows: the whole is decoded when a window is first needed (three bytes a pixel), and
-    kept. The overview of a JPEG comes before that from its own coarse decoding (`Image.draft`), in a small part of the
-    memory and of the time.
+    Formats such as JPEG cannot be read by windows. The whole picture is decoded when a window is first needed (three
+    bytes per pixel), and kept. A reduced view of a whole JPEG is decoded coarsely before that (`Image.draft`), which
+    takes a small part of the memory and time.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Raises:
         DataError: there is no such file, or it is no picture.
@@ -128,7 +145,7 @@ class PhotographPicture(LargePicture):
             upright = orientation(image) == 1
             self._drafts = image.format == "JPEG" and image.mode in ("RGB", "L")
         if not upright:
-            # Upright it may have another size; its windows are those of the upright picture.
+            # The upright picture may have another size, and windows refer to it.
             self.size = self._whole().shape[1::-1]
 
     def pixels(self, box: Box) -> NDArray[np.uint8]:
@@ -137,7 +154,7 @@ class PhotographPicture(LargePicture):
         return self._whole()[y1:y2, x1:x2]
 
     def read(self, box: Box, reduction: int = 1) -> Tensor:
-        """A window; the whole of a JPEG that was not decoded yet at the coarsest draft that the reduction allows."""
+        """Read a window; the whole of a JPEG that was not decoded yet in the coarsest draft that is allowed."""
         whole = box == (0, 0, *self.size)
         if not (whole and reduction > 1 and self._drafts and self._array is None):
             return super().read(box, reduction)
@@ -151,7 +168,7 @@ class PhotographPicture(LargePicture):
         if self._array is None:
             from PIL import Image
 
-            # By its name Pillow would map a plain TIFF into memory, and mix up its rows where it is to be turned.
+            # Given a path, Pillow would map an uncompressed TIFF into memory, and mix up its rows when turning it.
             with _opening(self.path, "decoded"), self.path.open("rb") as file, Image.open(file) as image:
                 if image.mode in _PLAIN and "transparency" not in image.info:
                     stored = orientation(image)
@@ -163,12 +180,12 @@ class PhotographPicture(LargePicture):
 
 
 class TiffPicture(LargePicture):
-    """A TIFF of bytes, read tile by tile (or strip by strip) through `tifffile`.
+    """A TIFF of bytes, read tile by tile (or strip by strip) by `tifffile`.
 
     Only the tiles that a window touches are decoded, one at a time.
 
     Args:
-        path: of the file; its first page is taken.
+        path: path of the file, whose first page is read.
 
     Raises:
         DataError: `tifffile` is not installed, or the page is not grey or RGB of 8 bits.
@@ -210,7 +227,7 @@ class TiffPicture(LargePicture):
         for number in numbers:
             offset, count = page.dataoffsets[number], page.databytecounts[number]
             if not count:
-                continue  # a tile that the file leaves out is empty
+                continue  # a tile that the file does not hold is black
             self._file.filehandle.seek(offset)
             data = self._file.filehandle.read(count)
             tile = page.decode(data, number, jpegtables=page.jpegtables)[0][0]
@@ -225,9 +242,19 @@ class TiffPicture(LargePicture):
 
 
 def open_large(source: LargePicture | ImageLike) -> LargePicture:
-    """A picture that gives its windows, from any common kind (`semfov.as_image`; `.tif` and `.tiff` tile by tile).
+    """Open a picture to be read by windows.
 
-    Arrays of bytes `(H, W, 3)` and `(H, W)` stay where they are: of a `numpy.memmap` only windows are read.
+    Args:
+        source: a picture of any common kind (`semfov.as_image`), or a `LargePicture`. Arrays of bytes `(H, W, 3)` and
+            `(H, W)` are not copied, and of a `numpy.memmap` only windows are read. Files with the ending `.tif` or
+            `.tiff` are read tile by tile.
+
+    Returns:
+        The picture.
+
+    Raises:
+        InputError: the source is no picture.
+        DataError: the file cannot be read.
 
     >>> open_large(torch.rand(3, 20, 30)).read((10, 5, 30, 15)).shape
     torch.Size([3, 10, 20])
@@ -245,13 +272,13 @@ def open_large(source: LargePicture | ImageLike) -> LargePicture:
 
 
 def _by_rows(shape: tuple[int, ...]) -> bool:
-    """Whether an array of this shape is `(H, W)` or `(H, W, 3)`, and cannot be `(3, H, W)`."""
+    """Tell whether a shape is `(H, W)` or `(H, W, 3)`, and cannot be `(3, H, W)`."""
     return len(shape) == 2 or (len(shape) == 3 and shape[2] == 3 and shape[0] != 3)
 
 
 @contextmanager
 def _opening(path: Path, what: str) -> Iterator[None]:
-    """Tell of a file that cannot be read as a picture, whatever a decoder raises."""
+    """Raise `DataError` where a file cannot be read as a picture, whatever error a decoder raises."""
     check_regular(path, f"image {path}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of damaged metadata and of large files
@@ -261,12 +288,12 @@ def _opening(path: Path, what: str) -> Iterator[None]:
             raise DataError(f"image {path}: no such file") from None
         except SemfovError:
             raise
-        except Exception as error:  # damaged files raise nearly anything in decoders
+        except Exception as error:  # decoders of damaged files raise errors of many kinds
             reason = " ".join(str(error).split()) or type(error).__name__
             raise DataError(f"image {path}: cannot be {what} ({reason}); replace it") from None
 
 
 def _tensor(pixels: NDArray[np.uint8]) -> Tensor:
-    """Bytes `(h, w, 3)` as `(3, h, w)` without a copy where memory may be shared."""
+    """View bytes `(h, w, 3)` as `(3, h, w)`; they are copied only where torch cannot share their memory."""
     shared = pixels.flags.writeable and min(pixels.strides) >= 0
     return torch.from_numpy(pixels if shared else pixels.copy()).permute(2, 0, 1)

@@ -73,7 +73,7 @@ def neighbours(start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[
 
 
 def intersection(x1: Column, y1: Column, x2: Column, y2: Column, first: Index, second: Index) -> Column:
-    """Area that the two boxes of each pair share, `(P,)`.
+    """Compute the area that the two boxes of each pair share.
 
     Args:
         x1: `(N,)`, left edges of the boxes.
@@ -82,6 +82,9 @@ def intersection(x1: Column, y1: Column, x2: Column, y2: Column, first: Index, s
         y2: lower edges.
         first: `(P,)`, index of one box of each pair.
         second: `(P,)`, index of the other one.
+
+    Returns:
+        `(P,)`, areas.
     """
     wide = np.minimum(x2[first], x2[second]) - np.maximum(x1[first], x1[second])
     high = np.minimum(y2[first], y2[second]) - np.maximum(y1[first], y1[second])

@@ -48,11 +48,11 @@ def select(
 def select_several(
     candidates: Candidates, placement: Placement | None, selections: Sequence[Selection], policy: BackgroundPolicy
 ) -> list[Detections]:
-    """`select` with several settings, for less than each by itself costs.
+    """`select` with several settings at once, which share the ranking and the score vectors.
 
     Args:
         candidates: of a detector's head.
-        placement: where each image lies on its canvas; None leaves boxes in canvas pixels.
+        placement: place of each image on its canvas; None leaves boxes in canvas pixels.
         selections: the settings.
         policy: background policy of the score vectors.
 

@@ -20,25 +20,25 @@ def glimpse(
 ) -> Tensor:
     r"""Resample windows of an image to one size.
 
-    Canvas pixel i of a window that starts at a and is s picture pixels wide for each canvas pixel is a mean of picture
-    pixels j with the weights of a triangle as wide as a canvas pixel, but never narrower than a picture pixel (the
-    antialiased bilinear filter of Pillow and torch):
+    A canvas pixel is a weighted mean of picture pixels. The weights form a triangle around it, whose half width is a
+    canvas pixel but never less than a picture pixel. This is the antialiased bilinear filter of Pillow and torch. For
+    canvas pixel i, picture pixels j, a window that starts at a, and s picture pixels per canvas pixel:
 
     .. math:: c_i = \frac{\sum_j t_{ij} I_j}{\sum_j t_{ij}}, \qquad
               t_{ij} = \max\left(0, 1 - \frac{|a + (i + ½) s - (j + ½)|}{\max(s, 1)}\right)
 
-    along x and along y. Pixels beyond the window's border are seen where the triangles of its outer pixels reach them.
-    It is differentiable in the image and in the boxes: in their place and in their size.
+    along x and along y. Triangles of the outer canvas pixels also reach picture pixels beyond the border of the window.
+    The result is differentiable in the image and in the place and size of the windows.
 
     Args:
         image: `(B, C, H, W)`.
         boxes: windows `(B, G, 4)`, or `(B, 4)` for one in each image: `(x1, y1, x2, y2)`, edges between pixels, where 0
-            is the left (top) border of the image. They may reach beyond the image. (Those of Kornia:
+            is the left (top) border of the image. They may reach beyond the image. (Kornia's boxes in this form:
             `kornia.geometry.boxes.Boxes.to_tensor(mode="xyxy")`.)
         size: `(width, height)` of the canvas.
-        padding_mode: what lies beyond the image, as in Kornia: `zeros`, the `border` pixels, or `fill` for
+        padding_mode: pixels beyond the image, as in Kornia: `zeros`, the nearest `border` pixels, or `fill` for
             `fill_value`.
-        fill_value: see there.
+        fill_value: value of the pixels beyond the image for `fill`.
 
     Returns:
         `(B, G, C, height, width)`, or `(B, C, height, width)`.
@@ -81,8 +81,11 @@ def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> 
 
     Args:
         points: `(..., 2)`, pixel centres at integers.
-        magnification: m, canvas pixels for each picture pixel, `(...)`.
+        magnification: m, canvas pixels per picture pixel, `(...)`.
         size: `(w, h)` of the canvas.
+
+    Returns:
+        `(..., 4)`, `(x1, y1, x2, y2)`, edges between pixels.
 
     >>> windows_at(torch.tensor([[9.5, 9.5]]), torch.tensor([2.0]), (10, 20))
     tensor([[ 7.5000,  5.0000, 12.5000, 15.0000]])
@@ -93,12 +96,18 @@ def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> 
 
 
 def ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1.0) -> tuple[float, ...]:
-    """Magnifications one octave apart: from the whole picture up to the last that is not above `finest`.
+    """Magnifications one octave apart, from that of the whole picture to the last one that is not above `finest`.
 
     Args:
-        picture: `(width, height)`.
+        picture: `(width, height)` of the picture.
         size: `(width, height)` of the canvas.
-        finest: canvas pixels for each picture pixel, 1 for native pixels.
+        finest: largest magnification, in canvas pixels per picture pixel; 1 ends at native pixels.
+
+    Returns:
+        The magnifications, in ascending order.
+
+    Raises:
+        InputError: a size or the magnification is not positive.
 
     >>> ladder((2560, 1920), (416, 416))
     (0.1625, 0.325, 0.65)
@@ -113,12 +122,12 @@ def ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1
 
 
 class Glimpse(nn.Module):
-    """A sensor that shows a window of the picture at a magnification, see `glimpse`.
+    """A sensor that shows a window of the picture at a magnification (`glimpse`).
 
     Args:
-        size: `(width, height)` of the canvas, a detector's input.
-        padding_mode: what lies beyond the picture.
-        fill_value: value of `fill`.
+        size: `(width, height)` of the canvas, for example a detector's input.
+        padding_mode: pixels beyond the picture, as for `glimpse`.
+        fill_value: value of the pixels beyond the picture for `fill`.
 
     >>> sensor = Glimpse((32, 32))
     >>> sensor(torch.rand(1, 3, 64, 96), torch.tensor([[[20.0, 20.0]]]), torch.tensor([[0.5]])).shape
@@ -133,7 +142,16 @@ class Glimpse(nn.Module):
         self.fill_value = fill_value
 
     def forward(self, image: Tensor, points: Tensor, magnification: Tensor) -> Tensor:
-        """Views `(B, G, C, h, w)` of images `(B, C, H, W)` at points `(B, G, 2)` and magnifications `(B, G)`."""
+        """Show windows of images.
+
+        Args:
+            image: `(B, C, H, W)`.
+            points: `(B, G, 2)`, centres of the windows in pixels.
+            magnification: `(B, G)`, canvas pixels per picture pixel.
+
+        Returns:
+            `(B, G, C, h, w)`.
+        """
         boxes = windows_at(points, magnification, self.size)
         return glimpse(image, boxes, self.size, padding_mode=self.padding_mode, fill_value=self.fill_value)
 
@@ -143,7 +161,7 @@ class Glimpse(nn.Module):
 
 
 def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: Padding, value: float) -> Tensor:
-    """One window of an image `(C, H, W)`: two products with banded weights, over the pixels that it shows alone."""
+    """One window of an image `(C, H, W)`: two products with banded weights, over the visible pixels only."""
     across, (left, right) = _weights(box[0], box[2], size[0], image.shape[-1], border=padding == "border")
     down, (top, bottom) = _weights(box[1], box[3], size[1], image.shape[-2], border=padding == "border")
     part = image[:, top:bottom, left:right]
@@ -153,7 +171,7 @@ def _window(image: Tensor, box: Tensor, size: tuple[int, int], padding: Padding,
 
 
 def _weights(low: Tensor, high: Tensor, count: int, length: int, *, border: bool) -> tuple[Tensor, tuple[int, int]]:
-    """Weights `(count, n)` of picture pixels in every canvas pixel along one axis, and which n pixels these are."""
+    """Weights `(count, n)` of n picture pixels for each canvas pixel along one axis, and the range of the n pixels."""
     step = (high - low) / count
     reach = step.clamp(min=1.0)
     middle = low + (torch.arange(count).to(low) + 0.5) * step

@@ -65,9 +65,12 @@ def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) ->
 
 
 def _sums(belief: ZoomBelief, level: int) -> Cells:
-    """Sum of the chances of the closer windows, side by side, in each window of a level, `(down, across)`.
+    """Sum the chances of closer windows, side by side, in each window of a level.
 
     Closer windows whose middle was looked at from this level already count as 0.
+
+    Returns:
+        `(down, across)`; where several levels are closer, the largest of their sums.
     """
     lattice, source = belief.lattice, belief.source.numpy()
     down, across = lattice.places(level)[::-1]

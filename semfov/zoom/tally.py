@@ -83,10 +83,13 @@ class Tally:
 
     @torch.no_grad()
     def presence(self, ahead: float) -> float:
-        """Probability that the picture holds the target.
+        """Predict whether the picture holds the target.
 
         Args:
             ahead: value of the best look that is left.
+
+        Returns:
+            The probability.
         """
         odds = self.belief.evidence.anywhere(torch.tensor(self.best), self.case(ahead))
         return float(odds.sigmoid())
