@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -262,8 +263,9 @@ class _Placement:
     """
 
     def __init__(self, frames: Tensor, size: tuple[int, int], like: Tensor) -> None:
-        values = frames.numpy().astype(np.float64 if like.dtype == torch.float64 else np.float32)
-        window, canvas = values[:, :4], values[:, 4:]
+        values = (frames.double() if like.dtype == torch.float64 else frames.float()).numpy()
+        window: NDArray[np.floating] = values[:, :4]
+        canvas: NDArray[np.floating] = values[:, 4:]
         scale = (window[:, 2:] - window[:, :2]) / (canvas[:, 2:] - canvas[:, :2])
         # The border of the picture cuts no object.
         near = np.where(window[:, :2] > 0, canvas[:, :2] + BORDER, -np.inf)

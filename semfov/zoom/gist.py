@@ -82,5 +82,11 @@ def gist(hints: Detections, detections: Detections, lattice: Lattice, action: tu
     sure = detections.confidence[0] >= FOUND
     found[cells(detections.boxes[0, sure].detach()), detections.labels[0, sure].numpy() - 1] = True
     shape = rows, columns
-    size, found = torch.from_numpy(size).view(shape), torch.from_numpy(found).view(*shape, -1)
-    return Gist(level, (column, row), scale, strongest.view(*shape, -1), size, found)
+    return Gist(
+        level,
+        (column, row),
+        scale,
+        strongest.view(*shape, -1),
+        torch.from_numpy(size).view(shape),
+        torch.from_numpy(found).view(*shape, -1),
+    )

@@ -1,6 +1,7 @@
 """Policies of where to look next, and how closely: the value of a look at each window."""
 
 from collections.abc import Callable, Sequence
+from functools import reduce
 
 import numpy as np
 import torch
@@ -84,8 +85,8 @@ def _sums(belief: ZoomBelief, level: int) -> Cells:
         # Windows of the level can reach beyond the picture, where there are no closer windows: zeros.
         table = np.zeros([max((times - 1) * span + n, m) for n, m in ((down, rows), (across, columns))], np.float32)
         np.multiply(chances[:rows, :columns], middle < level, out=table[:rows, :columns])
-        lines = sum(table[span * n : span * n + down] for n in range(times))
-        total = np.maximum(total, sum(lines[:, span * n : span * n + across] for n in range(times)))
+        lines = reduce(np.add, (table[span * n : span * n + down] for n in range(times)))
+        total = np.maximum(total, reduce(np.add, (lines[:, span * n : span * n + across] for n in range(times))))
     return total
 
 
