@@ -104,18 +104,20 @@ class WindowOdds:
             left: `(rows, columns)` of the lattice, share of each cell that is left to see.
         """
         fresh = [_Look(gist) for gist in gists[len(self._looks) :]]
-        changed = [look.box for look in fresh]
+        # A look changes what closer ones start from, and a change in what is left to see concerns looks of all levels.
+        changed = [(look.box, look.gist.level) for look in fresh]
         differs = left != self._left
         if differs.any():
             rows, columns = differs.any(1).nonzero()[0], differs.any(0).nonzero()[0]
-            changed.append((int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1))
+            changed.append(((int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1), -1))
             self._left = left.copy()
         if not changed:
             return
         self._looks += fresh
         self._clear()
         for look in sorted(self._looks, key=lambda look: look.gist.level):
-            if any(_overlap(look.box, box) for box in changed):
+            level = look.gist.level
+            if look.left is None or any(coarser < level and _overlap(look.box, box) for box, coarser in changed):
                 self._predict(look)
             self._write(look)
 
