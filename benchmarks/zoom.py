@@ -1,8 +1,8 @@
-"""What looking at a large picture costs beside the detector: `python -m benchmarks.zoom --weights yolox_nano_416.onnx`.
+"""Cost of a look at a large picture beside the detector: `python -m benchmarks.zoom --weights yolox_nano_416.onnx`.
 
-Mosaics of embedded scenes are searched for a class and looked over for all objects. The detector alone, its boxes
-selected, then sees the same windows again, in the same repetition. What is left of a pass is reading and resampling the
-window, merging boxes and choosing where to look next.
+The agent explores mosaics of embedded scenes, finds all objects of a class in them, and searches them for a class. In
+the same repetition the detector alone, with the selection of its boxes, gets the same canvases. The rest of a pass is
+reading and resampling the window, selecting hints, merging boxes, updating the belief and choosing the next window.
 """
 
 import argparse
@@ -27,7 +27,7 @@ SIZES = {"2560 × 1920 px": (4, 4), "3840 × 2880 px": (6, 6)}
 
 
 def programs(agent: ZoomAgent, columns: int, rows: int) -> dict[str, tuple[Run, Run, int]]:
-    """Every task: the agent's program, the detector's, and their passes."""
+    """For each task: the program of the agent, that of the detector alone, and the number of passes."""
     scenes = EmbeddedScenes(agent.classes[1:], count=16)
     picture = to_bytes(Mosaics(scenes, columns, rows, tile=(640, 480), count=1)[0].image)
     eye, detector = agent.eye, agent.eye.detector
@@ -47,13 +47,14 @@ def programs(agent: ZoomAgent, columns: int, rows: int) -> dict[str, tuple[Run, 
 
     tasks = {
         "explore": lambda: agent.explore(picture, passes=PASSES, worth=0.0),
+        "find all": lambda: agent.find_all(picture, "person", passes=PASSES, worth=0.0),
         "search": lambda: agent.search(picture, "person", passes=PASSES, confirm=1.0, give_up=0.0),
     }
     return {name: (task, alone(path := task()), path.passes) for name, task in tasks.items()}
 
 
 def share(task: Run, detector: Run, seconds: float, clock: Clock) -> tuple[Spread, Spread, Spread]:
-    """Milliseconds of the task and of its detector, and what share of the task is not the detector."""
+    """Milliseconds of a task and of the detector alone, and the share of the task that is not the detector."""
     found = interleaved({"task": task, "detector": detector}, seconds, clock)
     rest = [1 - theirs / ours for ours, theirs in zip(found["task"], found["detector"], strict=True)]
     return Spread.of(found["task"]), Spread.of(found["detector"]), Spread.of(rest)
@@ -61,11 +62,11 @@ def share(task: Run, detector: Run, seconds: float, clock: Clock) -> tuple[Sprea
 
 @torch.inference_mode()
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure all rows and write the table."""
+    """Measure all tasks and write the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.zoom", description=__doc__.splitlines()[0])
     parser.add_argument("--weights", help="ONNX file of YOLOX-nano")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=10.0, help="for each task, at least")
+    parser.add_argument("--seconds", type=float, default=10.0, help="shortest time for each task")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args(arguments)
     use_threads(options.threads)

@@ -57,7 +57,10 @@ class LargePicture(ABC):
             reduction: factor by which a large window may be reduced, a power of two.
 
         Returns:
-            `(3, h, w)` bytes, channels last in memory.
+            `(3, h, w)`, bytes, channels last in memory.
+
+        Raises:
+            InputError: the box is empty or not inside the picture.
         """
         x1, y1, x2, y2 = box
         width, height = self.size
@@ -286,7 +289,7 @@ def _opening(path: Path, what: str) -> Iterator[None]:
             raise DataError(f"image {path}: no such file; check its path") from None
         except SemfovError:
             raise
-        except Exception as error:  # damaged files raise nearly anything in decoders
+        except Exception as error:  # decoders of damaged files raise errors of many kinds
             reason = " ".join(str(error).split()) or type(error).__name__
             raise DataError(f"image {path}: cannot be {what} ({reason}); replace it") from None
 

@@ -1,11 +1,13 @@
 """Selection of a detector's boxes: threshold, non-maximum suppression, and a limit on their number."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
+from semfov.detection.near_duplicates import LEAST, distinct
 from semfov.detection.placement import Placement
 from semfov.detection.scores import BackgroundPolicy, Candidates, score_vectors
 from semfov.errors import check, check_finite, check_number, check_whole, values_known
@@ -52,9 +54,26 @@ def select(
     Returns:
         The selected boxes.
     """
-    return Detections.stack(
-        [_select_one(candidates, image, placement, selection, policy) for image in range(candidates.boxes.shape[0])]
-    )
+    return select_several(candidates, placement, [selection], policy)[0]
+
+
+def select_several(
+    candidates: Candidates, placement: Placement | None, selections: Sequence[Selection], policy: BackgroundPolicy
+) -> list[Detections]:
+    """`select` with several settings at once, which share the ranking and the score vectors.
+
+    Args:
+        candidates: of a detector's head.
+        placement: place of each image on its canvas; None leaves boxes in canvas pixels.
+        selections: the settings.
+        policy: background policy of the score vectors.
+
+    Returns:
+        The detections of each selection.
+    """
+    count = candidates.boxes.shape[0]
+    found = [_select_one(candidates, image, placement, selections, policy) for image in range(count)]
+    return found[0] if count == 1 else [Detections.stack([image[n] for image in found]) for n in range(len(selections))]
 
 
 def _check(image: int, confidence: Tensor, boxes: Tensor) -> None:
@@ -77,44 +96,69 @@ def _select_one(
     candidates: Candidates,
     image: int,
     placement: Placement | None,
-    selection: Selection,
+    selections: Sequence[Selection],
     policy: BackgroundPolicy,
-) -> Detections:
+) -> list[Detections]:
     confidence = candidates.confidence[image]
-    index = (confidence >= selection.threshold).nonzero()[:, 0]
+    index = (confidence >= min(selection.threshold for selection in selections)).nonzero()[:, 0]
     boxes = candidates.boxes[image, index]
     _check(image, confidence, boxes)
     boxes = boxes if placement is None else placement.boxes_to_image(boxes)
-    labels = candidates.classes[image, index].argmax(-1) if selection.per_class else index
-    keep = suppress(boxes, confidence[index], labels, selection)
+    some = any(selection.per_class for selection in selections)
+    labels = candidates.classes[image, index].argmax(-1) if some else index
+    kept = _suppress(boxes, confidence[index], labels, selections)
+    keep = kept[0] if len(kept) == 1 else torch.cat(kept)
     rows = candidates.take(image, index[keep])
     _check_scores(image, rows)
-    scores = score_vectors(rows, policy)
-    # Suppression ranks boxes by objectness times class score; their score vectors may rank them differently.
-    order = scores[:, 1:].detach().amax(-1).argsort(descending=True, stable=True)
-    return Detections(boxes[keep[order]][None], scores[order][None], torch.ones_like(keep, dtype=torch.bool)[None])
+    boxes, scores = boxes[keep], score_vectors(rows, policy)
+    found = []
+    for box, vectors in zip(boxes.split([*map(len, kept)]), scores.split([*map(len, kept)]), strict=True):
+        # Suppression ranks by objectness times class; the shares of a vector can rank otherwise.
+        order = vectors[:, 1:].detach().amax(-1).argsort(descending=True, stable=True)
+        found.append(Detections(box[order][None], vectors[order][None], torch.ones_like(order, dtype=torch.bool)[None]))
+    return found
+
+
+def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:
+    """Indices of the boxes that survive non-maximum suppression, most confident first."""
+    return _suppress(boxes, confidence, labels, [replace(selection, threshold=0.0)])[0]
 
 
 @torch.no_grad()
-def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:
-    """Indices of the boxes that survive non-maximum suppression, most confident first."""
-    from torchvision.ops import batched_nms, nms
-
-    full = ((boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])).nonzero()[:, 0]
-    boxes, confidence, labels = boxes[full], confidence[full], labels[full]
-    if boxes.dtype in (torch.float16, torch.bfloat16):  # too coarse for pixels, and not supported on a CPU
+def _suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selections: Sequence[Selection]) -> list[Tensor]:
+    """Indices of the boxes that are kept by each selection, most confident first."""
+    if boxes.dtype in (torch.float16, torch.bfloat16):  # too coarse for pixels, and not there on a CPU
         boxes, confidence = boxes.float(), confidence.float()
+    ranked, order = confidence.sort(descending=True, stable=True)
+    boxes, labels = boxes[order], labels[order]
+    full = (boxes[:, 2:] > boxes[:, :2]).all(-1)
+    kept = []
+    for selection in selections:
+        chosen = (full & (ranked >= selection.threshold)).nonzero()[:, 0]
+        kept.append(order[_survivors(boxes, ranked, labels, chosen, selection)])
+    return kept
 
-    def survivors(rows: Tensor) -> Tensor:
+
+def _survivors(boxes: Tensor, confidence: Tensor, labels: Tensor, rows: Tensor, selection: Selection) -> Tensor:
+    """Which of some rows survive, of boxes that stand with the most confident first."""
+    strict = selection.iou >= LEAST and not selection.per_class
+    strict = strict and boxes.dtype == torch.float32 and boxes.device.type == "cpu"
+
+    def first(count: int) -> Tensor:
+        from torchvision.ops import batched_nms, nms
+
+        some = rows[:count]
+        if strict:
+            return some[torch.from_numpy(distinct(boxes[some].detach().numpy(), selection.iou))]
         if selection.per_class:
-            return rows[batched_nms(boxes[rows], confidence[rows], labels[rows], selection.iou)]
-        return rows[nms(boxes[rows], confidence[rows], selection.iou)]
+            return some[batched_nms(boxes[some], confidence[some], labels[some], selection.iou)]
+        return some[nms(boxes[some], confidence[some], selection.iou)]
 
-    # Only a more confident box can suppress a box, so the survivors among the first boxes are the first survivors of
-    # all. A part of the boxes is tried first, because time grows with the square of their number.
-    order, first = confidence.argsort(descending=True, stable=True), 2 * selection.limit
-    keep = survivors(order[:first])
-    while len(keep) < selection.limit and first < len(order):
-        first *= 2
-        keep = survivors(order[:first])
-    return full[keep[: selection.limit]]
+    # A box is suppressed by more confident ones alone, so the first survivors are those of the first boxes. Time grows
+    # with the square of their number.
+    count = (2 if strict else 8) * selection.limit
+    keep = first(count)
+    while len(keep) < selection.limit and count < len(rows):
+        count *= 2
+        keep = first(count)
+    return keep[: selection.limit]

@@ -81,7 +81,7 @@ def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> 
 
     Args:
         points: `(..., 2)`, pixel centres at integers.
-        magnification: m, canvas pixels for each picture pixel, `(...)`.
+        magnification: m, canvas pixels per picture pixel, `(...)`.
         size: `(w, h)` of the canvas.
 
     Returns:

@@ -18,18 +18,24 @@ from semfov.zoom.glances import LiveGlances
 from semfov.zoom.search import ZoomPath, find_all, search
 
 MOST = 1_000_000
-"""More passes than any picture has windows worth a look."""
+"""Limit of passes and batches, more than any picture has windows."""
 
 Picture = LargePicture | ImageLike
 
 
 class ZoomAgent(nn.Module):
-    """Looks at a large picture where, and as close as, a pass of the detector pays most.
+    """Search and explore pictures that are larger than the detector's input.
+
+    Each look is a window at a magnification and costs one pass of the detector. The agent looks where it expects to
+    find most, as closely as it takes to find it.
 
     Args:
-        eye: glimpses and detects.
-        evidence: what glances say of closer ones.
-        context: what is beside what, for searches; None goes by the evidence alone.
+        eye: resamples a window and detects in it.
+        evidence: predicts from a look what closer looks will find.
+        context: which classes stand beside each other, used in searches; None leaves it out.
+
+    Raises:
+        InputError: the evidence or the context was made for other classes, or the evidence for another detector.
 
     Example::
 
@@ -51,17 +57,20 @@ class ZoomAgent(nn.Module):
 
     @classmethod
     def recommended(cls, name: str = "yolox-nano", *, finest: float = 1.0, cut: Cut = "keep", **options: Any) -> Self:
-        """The agent with the evidence that is shipped for a detector.
+        """Create the agent with the evidence that is shipped for a detector.
 
         Args:
-            name: of the detector.
-            finest: largest magnification, in canvas pixels for each picture pixel.
-            cut: what becomes of boxes at a window's border (`ZoomEye`).
-            options: of `semfov.load_detector`.
+            name: name of the detector.
+            finest: largest magnification, in canvas pixels per picture pixel.
+            cut: treatment of boxes that the border of a window cuts (`ZoomEye`).
+            **options: options of `semfov.load_detector`.
+
+        Returns:
+            The agent, in evaluation mode and without gradients.
 
         Raises:
             InputError: no evidence is shipped for a detector of this name.
-            DataError: the weights cannot be had, or are damaged.
+            DataError: the weights cannot be downloaded, or they are damaged.
         """
         eye = ZoomEye(load_detector(name, **options), finest=finest, cut=cut)
         evidence = GlimpseEvidence.from_pretrained(eye.detector.name)
@@ -73,7 +82,15 @@ class ZoomAgent(nn.Module):
         return ("background", *self.eye.detector.classes)
 
     def pays(self, picture: Picture) -> bool:
-        """Whether a picture has two octaves or more to zoom in: its longer side is four times the detector's input."""
+        """Tell whether a picture is large enough for windows to pay.
+
+        Args:
+            picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
+
+        Returns:
+            True where there are two octaves or more to zoom in: the longer side of the picture is at least four times
+            that of the detector's input.
+        """
         return self.eye.open(picture).lattice.levels >= 3
 
     def search(
@@ -85,14 +102,19 @@ class ZoomAgent(nn.Module):
         confirm: float | None = None,
         give_up: float | None = None,
     ) -> ZoomPath:
-        """Search for one object of a class, and decide; see `semfov.zoom.search.search`.
+        """Search for one object of a class and decide whether the picture holds one (`semfov.zoom.search.search`).
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
             target: name or index (1..K) of the class.
-            passes: of the detector, at most.
-            confirm: probability that the picture holds the target, from which on it is found (None: the evidence's).
-            give_up: probability that a look shows it, below which none is worth its price (None: the evidence's).
+            passes: largest number of passes of the detector.
+            confirm: the class counts as found when the probability that the picture holds it reaches this value; None
+                takes the threshold of the evidence.
+            give_up: the search ends when no look shows the class with a probability of at least this value; None takes
+                the threshold of the evidence.
+
+        Returns:
+            The looks, the objects of the class, and the decision.
 
         Raises:
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
@@ -116,14 +138,17 @@ class ZoomAgent(nn.Module):
     def find_all(
         self, picture: Picture, target: str | int, *, passes: int = 24, batch: int = 1, worth: float = 0.01
     ) -> ZoomPath:
-        """Find all objects of a class; see `semfov.zoom.search.find_all`.
+        """Find all objects of a class (`semfov.zoom.search.find_all`).
 
         Args:
-            picture: as for `search`.
+            picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
             target: name or index (1..K) of the class.
-            passes: of the detector, at most.
-            batch: glimpses that are chosen jointly and go through the detector together.
-            worth: new objects that a pass must be expected to find.
+            passes: largest number of passes of the detector.
+            batch: number of windows that are chosen jointly and pass the detector together.
+            worth: the exploration ends when no look is expected to find more new objects than this.
+
+        Returns:
+            The looks and the objects of the class.
 
         Raises:
             InputError: the class is unknown (the nearest names are suggested), or an argument does not fit.
@@ -132,7 +157,21 @@ class ZoomAgent(nn.Module):
         return self._find(picture, class_index(target, self.classes[1:], "target"), passes, batch, worth)
 
     def explore(self, picture: Picture, *, passes: int = 24, batch: int = 1, worth: float = 0.01) -> ZoomPath:
-        """Find all objects of all classes; arguments as for `find_all`."""
+        """Find all objects of all classes.
+
+        Args:
+            picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
+            passes: largest number of passes of the detector.
+            batch: number of windows that are chosen jointly and pass the detector together.
+            worth: the exploration ends when no look is expected to find more new objects than this.
+
+        Returns:
+            The looks and the objects.
+
+        Raises:
+            InputError: an argument does not fit.
+            DataError: the file cannot be read.
+        """
         return self._find(picture, None, passes, batch, worth)
 
     def _find(self, picture: Picture, target: int | None, passes: int, batch: int, worth: float) -> ZoomPath:

@@ -1,4 +1,4 @@
-"""Context of windows: what one shows of other classes says something of the class that is searched for."""
+"""Context of windows: other classes in a window tell something about the class that is searched for."""
 
 import torch
 from torch import Tensor
@@ -8,17 +8,20 @@ from semfov.errors import check_number
 
 
 class WindowContext:
-    r"""Log odds that context adds to those of a window w.
+    r"""Log odds that the context of a window w adds to its log odds of showing a class t.
 
     .. math:: c_t(w) = \lambda \sum_j s_j(w) \, r_{tj0}
 
-    with s the strongest hint of each class in the window, and r of `ContextPrior` for things that are next to each
-    other. Tables of `ContextPrior.from_table` tell most here: those that were counted within photographs say where
-    things are in pictures that hold both, and not which pictures hold both.
+    Here s is the strongest hint of each class in the window, and r are the log ratios of `ContextPrior` for objects
+    that are next to each other. Tables of `ContextPrior.from_table` help most. Tables that were counted within
+    photographs tell where objects are in pictures that hold both classes, but not which pictures hold both.
 
     Args:
         prior: the context.
         weight: λ.
+
+    Raises:
+        InputError: the weight is negative or too large.
 
     >>> pairs = torch.zeros(3, 3, 1)
     >>> pairs[1, 2] = 2.0  # cups are beside tables
@@ -32,11 +35,14 @@ class WindowContext:
         self.prior, self.weight = prior, weight
 
     def __call__(self, scores: Tensor, target: int) -> Tensor:
-        """Log odds to add, `(N,)`.
+        """Compute the log odds to add.
 
         Args:
             scores: `(N, K)`, strongest hint of each class in each window.
             target: class 1..K.
+
+        Returns:
+            `(N,)`, one number for each window.
         """
         ratio = self.prior.cooccurrence[target, 1:, 0].to(scores)
         return self.weight * torch.mv(scores, ratio)

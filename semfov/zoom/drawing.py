@@ -9,23 +9,26 @@ from semfov.zoom.objects import Objects
 Box = tuple[float, float, float, float]
 
 WIDTH = 480
-"""Of the drawing, in pixels of the screen."""
+"""Width of the drawing in pixels of the screen."""
 
 MOST = 500
-"""Objects that are drawn: the most certain ones."""
+"""Largest number of objects that are drawn; the most confident ones are."""
 
 
 def path_html(
     title: str, size: tuple[int, int], windows: Sequence[Box], objects: Objects, classes: Sequence[str]
 ) -> str:
-    """What came of it in a line, above a drawing.
+    """Draw windows and objects as HTML, under a line of text.
 
     Args:
-        title: the line.
+        title: the line of text.
         size: `(width, height)` of the picture.
-        windows: that were looked at, `(x1, y1, x2, y2)`, the overview first.
-        objects: that were found.
-        classes: names, background first.
+        windows: the windows that were looked at, `(x1, y1, x2, y2)`, the overview first.
+        objects: the objects that were found.
+        classes: names of the classes, background first.
+
+    Returns:
+        An HTML element.
     """
     width, height = size
     unit = max(width, height) / WIDTH

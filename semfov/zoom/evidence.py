@@ -1,6 +1,6 @@
-"""Learned evidence by magnification: what a look at a window says of closer looks at its parts."""
+"""Learned evidence by magnification: predictions from a look at a window of what closer looks at its parts show."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -17,49 +17,58 @@ from semfov.io.schema import Field, Number, Schema, perceptron
 from semfov.zoom.gist import Gist
 
 STEPS = 3
-"""Octaves between a look and the closer looks that it is taken to say something of."""
+"""Largest number of octaves between a look and the closer looks that are predicted from it."""
 
 _SUMMARY = 3
 _SHAPE, _SHAPE_WIDTH = 7, 24
 _RATE, _RATE_WIDTH = 14, 32
 CASE, _JUDGE_WIDTH = 11, 16
-"""What a search knows of whether its target is in the picture (`semfov.zoom.tally`)."""
+"""Number of facts of a search from which the presence of its target is predicted (`semfov.zoom.tally`)."""
 _FLOOR = 1e-4
 _LARGEST = 1e6
 
 
 class GlimpseEvidence(Pretrained):
-    r"""What a look at a window says of looks at its parts, one to three octaves closer.
+    r"""Predicts from a look at a window what looks at its parts show that are one to three octaves closer.
 
-    Two questions are asked of a part w, for a class t, and one of the whole picture. Small networks answer them, fitted
-    on mosaics of photographs with boxes:
+    It answers two questions about a part w of the window and a class t, and one about the whole picture. Small
+    networks answer them. They are fitted on mosaics of photographs with annotated boxes.
 
-    - does a closer look at w show t, with a score of 0.3 or more? Its log odds go by the strongest hint in w of t and
-      of every other class, for things keep company:
+    - Does a closer look at w show t with a score of 0.3 or more? The log odds depend on the strongest hint of t in w,
+      and on that of every other class, because some classes occur together:
 
       .. math:: \operatorname{logit} P(t \in w) = a_t \phi_t(w) + b_t + f_t(\phi(w)) + g(\phi_t(w), \ldots), \qquad
                 \phi_k(w) = \ln(\max_{x \in w} s_k(x) + \epsilon)
 
-    - how many objects of t does it find that were not found before? Their expected number is a sum over cells, with
-      weights that fall off at the border of w, which cuts what lies there:
+    - How many objects of t does it find that were not found before? The expected number is a sum over cells. Its
+      weights fall off towards the border of w, which cuts objects that lie there:
 
       .. math:: E[n(w)] = \sum_{x \in w} r(x) \lambda(x)
 
-    - does the picture hold t at all, after the looks of a search? What they showed best, :math:`s^*`, is corrected by
-      what else is known of the search, its case c (`semfov.zoom.tally`):
+    - Does the picture hold t at all, after the looks of a search? The highest score of t in any look, :math:`s^*`, is
+      corrected by further facts about the search, its case c (`semfov.zoom.tally`):
 
       .. math:: \operatorname{logit} P(t) = \operatorname{logit} s^* + j(c)
 
-    with f, g, λ and j networks. Class 0 of the second question stands for any class.
+    Here f, g, λ and j are networks. In the second question class 0 stands for any class.
 
     Args:
-        classes: of the detector, background not counted.
-        width: hidden units of the networks.
-        patience: how much more, in expected hits, a window that is not close enough to confirm anything must hold than
-            the best window that is, to be looked at first.
+        classes: number of classes of the detector, without background.
+        width: number of hidden units of f.
+        patience: a coarse window is looked at before the best closer one when the closer windows in it promise this
+            many times as many hits together.
         foresight: share of what still closer looks would find in a window that counts towards its value.
-        thresholds: at which searches decide; None where none were chosen.
+        thresholds: thresholds at which searches decide; None where none were chosen.
         metadata: JSON values kept with the model.
+
+    Raises:
+        InputError: a setting is outside its range.
+
+    >>> evidence = GlimpseEvidence(classes=3, width=8)
+    >>> evidence.presence(torch.rand(5, 3), torch.rand(5, 3), torch.ones(5)).shape
+    torch.Size([5, 3])
+    >>> evidence.taper(8).shape
+    torch.Size([8])
     """
 
     kind: ClassVar[str] = "glimpse-evidence"
@@ -115,7 +124,7 @@ class GlimpseEvidence(Pretrained):
         self.rate = _network(_RATE, _RATE_WIDTH, STEPS)
         self.judge = _network(CASE, _JUDGE_WIDTH, 1)
         with torch.no_grad():
-            # Until it is fitted, the best score is the probability.
+            # Until the network is fitted, the best score is the probability.
             for parameter in self.judge[-1].parameters():
                 parameter.zero_()
         self.prior = nn.Parameter(torch.zeros(classes + 1, 2))
@@ -124,17 +133,18 @@ class GlimpseEvidence(Pretrained):
     def presence(
         self, scores: Tensor, summary: Tensor, steps: Tensor, target: int | None = None, before: Tensor | None = None
     ) -> Tensor:
-        """Log odds that a closer look at a window shows a class with a score of 0.3 or more.
+        """Predict whether a closer look at a window shows a class with a score of 0.3 or more.
 
         Args:
             scores: `(N, K)`, strongest hint of each class in each window (`pool`).
-            summary: `(N, 3)`, of all hints in it (`pool`).
+            summary: `(N, 3)`, summary of all hints in each window (`pool`).
             steps: `(N,)`, octaves between the look and the closer one.
             target: class 1..K; None for all.
-            before: log odds that the look before this one, from farther off, gave; None for a first look.
+            before: log odds that an earlier, coarser look gave for the same windows, in the shape of the result; None
+                for a first look.
 
         Returns:
-            `(N,)`, or `(N, K)` for all classes.
+            Log odds, `(N,)`, or `(N, K)` for all classes.
         """
         hints = features(scores)
         octaves = (steps[:, None] - 1.5).to(hints)
@@ -142,36 +152,33 @@ class GlimpseEvidence(Pretrained):
         inputs = torch.cat([hints, crowd, octaves], -1)
         own, slope, offset = hints, torch.as_tensor(self.slope), torch.as_tensor(self.offset)
         if target is None:
-            company = self.company(inputs)
+            company = _through(self.company, inputs)
         else:
             one = slice(target - 1, target)
             own, slope, offset = own[:, one], slope[one], offset[one]
-            last = self.company[3]
-            assert isinstance(last, nn.Linear)
-            company = F.linear(self.company[:3](inputs), last.weight[one], last.bias[one])
+            company = _through(self.company, inputs, one)
         top = hints.amax(-1, keepdim=True).expand_as(own)
         known = torch.zeros_like(own) if before is None else before.view_as(own) / 3
         first = torch.full_like(own, float(before is not None))
         parts = [own, top, own - top, octaves.expand_as(own), crowd[:, 2:].expand_as(own), known, first]
-        value: Tensor = slope * own + offset + company + self.shape(torch.stack(parts, -1))[..., 0]
+        value: Tensor = slope * own + offset + company + _through(self.shape, torch.stack(parts, -1))[..., 0]
         return value if target is None else value[:, 0]
 
     def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
-        """Expected number of objects centred in each cell that closer looks find, and this one did not.
+        """Predict how many objects centred in each cell closer looks find that this look did not.
 
         Args:
-            look: what was seen.
-            targets: `(T,)`, classes 1..K, or 0 for any.
-            before: `(T, rows, columns)`, logarithm of the rates that the look before this one, from farther off, gave
-                for looks one octave closer than this one; None for a first look.
+            look: the look.
+            targets: `(T,)`, classes 1..K, or 0 for any class.
+            before: `(T, rows, columns)`, logarithms of the rates that an earlier, coarser look gave for looks one
+                octave closer than this one; None for a first look.
 
         Returns:
-            `(T, 3, rows, columns)`, for looks one, two and three octaves closer; logarithms.
+            `(T, 3, rows, columns)`, logarithms of the expected numbers, for looks one, two and three octaves closer.
         """
-        hints = features(look.scores)
-        best = hints.amax(-1)
-        own = _of(hints, best, targets)
-        found = _of(look.found.to(hints), look.found.any(-1).to(hints), targets)
+        strongest = look.scores.amax(-1)
+        best, own = features(strongest), features(_of(look.scores, strongest, targets, strongest))
+        found = _of(look.found, look.found.any(-1), targets, strongest)
         shape = own.shape
 
         def wide(values: Tensor) -> Tensor:
@@ -195,27 +202,37 @@ class GlimpseEvidence(Pretrained):
             torch.full_like(own, -1.0) if before is None else before / 4,
             torch.full_like(own, float(before is not None)),
         ]
-        value: Tensor = self.rate(torch.stack(parts, -1)) + bias[:, None, None, None] - 6
+        value: Tensor = _through(self.rate, torch.stack(parts, -1)) + bias[:, None, None, None] - 6
         return value.clamp(max=3).movedim(-1, 1)
 
     def anywhere(self, best: Tensor, case: Tensor) -> Tensor:
-        """Log odds that the picture holds a class, after the looks of a search, `(...)`.
+        """Predict whether the picture holds a class, after the looks of a search.
 
         Args:
             best: `(...)`, highest score of the class in any look.
-            case: `(..., 11)`, what else is known (`semfov.zoom.tally.Tally.case`).
+            case: `(..., 11)`, further facts about the search (`semfov.zoom.tally.Tally.case`).
+
+        Returns:
+            Log odds, `(...)`.
         """
-        value: Tensor = torch.logit(best, eps=1e-4) + self.judge(case)[..., 0]
+        value: Tensor = torch.logit(best, eps=1e-4) + _through(self.judge, case)[..., 0]
         return value
 
     def taper(self, span: int) -> Tensor:
-        """Weights r of the cells along a side of a window, `(span,)`: what lies at its border is cut."""
+        """Weights r of the cells along a side of a window; objects at its border are cut.
+
+        Args:
+            span: number of cells along the side.
+
+        Returns:
+            `(span,)`, from 0 to 1.
+        """
         cell = torch.arange(span, device=self.border.device)
         ring = torch.minimum(cell, span - 1 - cell) * 8 // span
         return self.border.sigmoid()[ring.clamp(max=3)]
 
     def check_compatible(self, settings: Mapping[str, Any]) -> None:
-        """Raise `InputError` beside another detector than it was fitted for.
+        """Raise `InputError` for another detector than the evidence was fitted for.
 
         Args:
             settings: `ZoomEye.settings()`.
@@ -223,7 +240,7 @@ class GlimpseEvidence(Pretrained):
         check_detector(self.metadata.get("detector", {}), settings["detector"], self.title)
 
     def _record(self) -> dict[str, Any]:
-        """Sizes and what was chosen."""
+        """Sizes and chosen settings, for the file."""
         return {
             "classes": self.classes,
             "width": self.width,
@@ -234,7 +251,7 @@ class GlimpseEvidence(Pretrained):
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """The networks from what was kept."""
+        """The model from its file."""
         model = cls(
             record["classes"],
             record["width"],
@@ -253,11 +270,15 @@ def features(scores: Tensor) -> Tensor:
 
 
 def pool(scores: Tensor, box: tuple[int, int, int, int]) -> tuple[Tensor, Tensor]:
-    """Strongest hint of each class in a window of cells, `(K,)`, and a summary `(3,)` of all hints in it.
+    """Pool the hints in a window of cells.
 
     Args:
-        scores: `(rows, columns, K)`.
-        box: `(x1, y1, x2, y2)` in cells, cut to what there is.
+        scores: `(rows, columns, K)`, strongest hint of each class in each cell.
+        box: `(x1, y1, x2, y2)` in cells. Cells beyond the map are left out.
+
+    Returns:
+        Strongest hint of each class, `(K,)`, and a summary `(3,)` of all cells: the sum of their strongest hints, the
+        share of cells with a hint, and the number of cells with a hint above 0.02.
     """
     x1, y1, x2, y2 = box
     cells = scores[max(y1, 0) : y2, max(x1, 0) : x2].flatten(0, 1)
@@ -265,22 +286,38 @@ def pool(scores: Tensor, box: tuple[int, int, int, int]) -> tuple[Tensor, Tensor
 
 
 def pool_all(scores: Tensor, span: int) -> tuple[Tensor, Tensor]:
-    """`pool` of all windows of `span` × `span` cells that lie in `(rows, columns, K)`, row by row.
+    """Pool the hints in all windows of `span` × `span` cells.
 
-    A side shorter than that is one window.
+    Args:
+        scores: `(rows, columns, K)`. Along a side shorter than `span` there is one window, as long as the side.
+        span: cells along a side of a window.
+
+    Returns:
+        The results of `pool`, `(N, K)` and `(N, 3)`, for the windows row by row.
     """
-    high, wide = (min(span, n) for n in scores.shape[:2])
-    top = _slide(_slide(scores, 0, high), 1, wide)
+    return pool_spans(scores, [span])[0]
+
+
+def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
+    """`pool_all` for windows of several sizes; each size is pooled from the next smaller one."""
     best = scores.amax(-1)
     parts = torch.stack([best, (best > 0).to(best), (best > 0.02).to(best)])
-    area = torch.tensor([1.0, 1 / (high * wide), 1.0])[:, None, None]
-    sums = F.avg_pool2d(parts, (high, wide), 1) * (high * wide) * area
-    return top.flatten(0, 1), sums.flatten(1).mT
+    found: dict[int, tuple[Tensor, Tensor]] = {}
+    top, have = scores, (1, 1)
+    for span in sorted(spans):
+        size = min(span, scores.shape[0]), min(span, scores.shape[1])
+        for axis in (0, 1):
+            top = _slide(top, axis, size[axis], have[axis])
+        have = size
+        area = torch.tensor([1.0, 1 / (size[0] * size[1]), 1.0])[:, None]
+        sums = F.avg_pool2d(parts, size, 1).flatten(1) * (size[0] * size[1]) * area
+        # The caller may write to the rows, so they share no memory.
+        found[span] = top.flatten(0, 1).clone(), sums.T.contiguous()
+    return [found[span] for span in spans]
 
 
-def _slide(values: Tensor, axis: int, width: int) -> Tensor:
-    """Largest of every `width` neighbours along an axis, by windows that double: many times faster than pooling."""
-    have = 1
+def _slide(values: Tensor, axis: int, width: int, have: int = 1) -> Tensor:
+    """Largest of every `width` neighbours along an axis, given the largest of every `have`, by doubling windows."""
     while have < width:
         step = min(have, width - have)
         length = values.shape[axis] - step
@@ -293,9 +330,10 @@ def _summary(best: Tensor) -> Tensor:
     return torch.stack([best.sum(), (best > 0).to(best).mean(), (best > 0.02).to(best).sum()])
 
 
-def _of(values: Tensor, anything: Tensor, targets: Tensor) -> Tensor:
-    """Maps `(T, rows, columns)` of some classes, 0 for any, from `(rows, columns, K)`."""
-    return torch.cat([anything[..., None], values], -1)[..., targets].movedim(-1, 0)
+def _of(values: Tensor, anything: Tensor, targets: Tensor, like: Tensor) -> Tensor:
+    """Maps `(T, rows, columns)` of some classes, 0 for any, from `(rows, columns, K)`, in the dtype of `like`."""
+    maps = values.movedim(-1, 0)[(targets - 1).clamp(min=0)]
+    return torch.where((targets > 0)[:, None, None], maps.to(like), anything.to(like))
 
 
 def _peak(values: Tensor, side: int) -> Tensor:
@@ -304,6 +342,20 @@ def _peak(values: Tensor, side: int) -> Tensor:
 
 def _mean(values: Tensor, side: int) -> Tensor:
     return F.avg_pool2d(values[:, None], side, 1, side // 2)[:, 0]
+
+
+def _through(network: nn.Sequential, values: Tensor, outputs: slice = slice(None)) -> Tensor:
+    """Some of a network's outputs. Networks this small spend most of their time in calls of modules, left out here."""
+    last = len(network) - 1
+    for place, layer in enumerate(network):
+        if isinstance(layer, nn.Linear):
+            kept = outputs if place == last else slice(None)
+            values = F.linear(values, layer.weight[kept], layer.bias[kept])
+        elif isinstance(layer, nn.GELU):
+            values = F.gelu(values)
+        elif layer.training:  # dropout
+            values = layer(values)
+    return values
 
 
 def _network(inputs: int, width: int, outputs: int) -> nn.Sequential:

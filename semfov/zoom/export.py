@@ -1,4 +1,4 @@
-"""A look as one ONNX graph: window, detector, selection and evidence, for robots and cameras.
+"""Export of a look as one ONNX graph: window, detector, selection and evidence, for robots and cameras.
 
 python -m semfov.zoom.export yolox-nano look.onnx
 """
@@ -31,7 +31,7 @@ METADATA_KEY = "semfov.look"
 def export_look(
     eye: ZoomEye, path: str | PathLike[str], evidence: GlimpseEvidence | None = None, *, cells: int = FINEST
 ) -> None:
-    """Write a look of an eye as one ONNX model, which needs neither torch nor semfov to run.
+    """Write a look of an eye as one ONNX model, which runs without torch and without semfov.
 
     Inputs:
 
@@ -40,33 +40,39 @@ def export_look(
 
     Outputs:
 
-    - `boxes` `(L, 4)` in picture pixels and `scores` `(L, K+1)`, background first, most certain first;
-    - `cut` `(L,)`, which boxes the border of the window cuts;
-    - `window` `(4,)`, what of the picture was seen;
-    - with evidence: `rates` `(K+1, 3, c, c)`, logarithms of how many objects of any class (0) and of each class looks
-      one, two and three octaves closer are expected to find in each cell of the window, which this one did not;
-    - with evidence: `odds_1`, `odds_2` and `odds_3`, `(K, p, p)`, log odds that windows so many octaves closer show
-      each class, for the windows that start at each of the first p cells down a column and along a row.
+    - `boxes` `(L, 4)` in picture pixels and `scores` `(L, K+1)`, background first; most confident first;
+    - `cut` `(L,)`, true where the border of the window cuts the box;
+    - `window` `(4,)`, the part of the picture that was seen;
+    - with evidence: `rates` `(K+1, 3, c, c)`, logarithms of the number of further objects of any class (0) and of each
+      class that looks one, two and three octaves closer are expected to find in each cell of the window;
+    - with evidence: `odds_1`, `odds_2` and `odds_3`, `(K, p, p)`, log odds that windows one, two and three octaves
+      closer show each class, for the windows that start at each of the first p cells down a column and along a row.
 
-    Windows are rounded to whole pixels, resampled with antialiasing as bytes, and cut to the picture, as the eye does.
-    (Of windows reduced more than four times the eye first takes means of squares of pixels; the graph does not, and its
-    canvas differs slightly.) A detector that is an ONNX file stays as it is, converted to opset 18, and any other is
-    exported by torch. Boxes that the window's border cuts are kept, whatever the eye's `cut` is.
+    Windows are rounded to whole pixels, resampled as bytes with antialiasing, and cut to the picture, as by the eye.
+    (The eye reads very large windows that are reduced more than four times as means of squares of pixels. The graph
+    does not, and its canvas differs slightly.) A detector that is an ONNX file is converted to opset 18 and otherwise
+    unchanged. Any other detector is exported by torch. Boxes that the border of the window cuts are kept, whatever the
+    setting `cut` of the eye.
 
     Args:
-        eye: whose detector looks.
-        path: where the model goes.
-        evidence: what a look says of closer ones; None leaves it out.
-        cells: c, cells along a side of the window for the evidence: 32, or 16 for windows one octave coarser than the
-            closest.
+        eye: the eye.
+        path: file to write.
+        evidence: predicts what closer looks find; None leaves it out.
+        cells: c, number of cells along a side of the window for the evidence: 32, or 16 for windows one octave coarser
+            than the closest.
 
     Raises:
         InputError: the evidence is for other classes, or the detector cannot be exported.
-        ModuleNotFoundError: the packages onnx and onnxscript are not there.
+        ModuleNotFoundError: the packages onnx and onnxscript are not installed.
         DataError: the file cannot be written.
+
+    Example::
+
+        eye = ZoomEye(semfov.load_detector("yolox-nano"))
+        export_look(eye, "look.onnx", GlimpseEvidence.from_pretrained("yolox-nano"))
     """
     try:
-        import onnxscript  # noqa: F401 (what torch exports with)
+        import onnxscript  # noqa: F401 (torch exports with it)
         from onnx import TensorProto, checker, helper
     except ImportError as error:
         raise ModuleNotFoundError("exporting a look needs two packages: pip install onnx onnxscript") from error
@@ -121,7 +127,7 @@ def export_look(
 
 
 class _Proposing(nn.Module):
-    """Boxes, confidence and score vectors of every candidate of a torch detector."""
+    """Module that returns boxes, confidence and score vectors of every candidate of a torch detector."""
 
     def __init__(self, detector: Detector) -> None:
         super().__init__()
@@ -132,7 +138,7 @@ class _Proposing(nn.Module):
 
 
 class _Decoding(nn.Module):
-    """The same from the outputs of the network of an `OnnxDetector`."""
+    """Module that returns the same from the outputs of the network of an `OnnxDetector`."""
 
     def __init__(self, detector: OnnxDetector, names: list[str]) -> None:
         super().__init__()
@@ -144,7 +150,7 @@ class _Decoding(nn.Module):
 
 
 class _Saying(nn.Module):
-    """What evidence says of a gist."""
+    """Module that returns the predictions of evidence for a gist."""
 
     def __init__(self, evidence: GlimpseEvidence, cells: int) -> None:
         super().__init__()
@@ -183,7 +189,7 @@ def _propose(graph: LookGraph, detector: Detector, canvas: str) -> tuple[str, st
 
 
 def _network(graph: LookGraph, detector: OnnxDetector, canvas: str) -> list[str]:
-    """Outputs of the file of a detector for a canvas."""
+    """Outputs of the network in a detector's file, for a canvas."""
     import onnx
     from onnx import version_converter
 
@@ -203,7 +209,7 @@ def _network(graph: LookGraph, detector: OnnxDetector, canvas: str) -> list[str]
         raise InputError(f"detector: expected a network that takes one image and nothing else, got inputs {told}")
     try:
         model = version_converter.convert_version(model, OPSET)
-    except Exception as error:  # of many kinds, for operators that it cannot convert
+    except Exception as error:  # the converter raises errors of many kinds
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"detector: expected a model that converts to opset {OPSET}, got {reason}") from error
     image = graph.add("Cast", image, to=inputs[0].type.tensor_type.elem_type)
@@ -217,7 +223,7 @@ def _exported(module: nn.Module, *inputs: Tensor) -> Any:
 
     names = [f"x_{number}" for number in range(len(inputs))]
     with warnings.catch_warnings(), torch.no_grad(), tempfile.TemporaryDirectory() as folder:
-        warnings.simplefilter("ignore")  # of the exporter's own doing
+        warnings.simplefilter("ignore")  # from inside the exporter
         path = Path(folder) / "part.onnx"
         torch.onnx.export(
             module.eval().requires_grad_(False),
@@ -241,13 +247,13 @@ def _examples(cells: int, classes: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def main() -> None:
-    """Command line of the export."""
-    parser = argparse.ArgumentParser(prog="python -m semfov.zoom.export", description="a look as one ONNX graph")
+    """Run the command line of the export."""
+    parser = argparse.ArgumentParser(prog="python -m semfov.zoom.export", description="export a look as one ONNX graph")
     parser.add_argument("detector", help="a name, or an ONNX file")
     parser.add_argument("output", type=Path, help="the ONNX file to write")
-    parser.add_argument("--weights", help="file of the detector's weights, where they are not to be downloaded")
-    parser.add_argument("--evidence", help="fitted evidence by magnification, by name or file")
-    parser.add_argument("--cells", type=int, default=FINEST, help="along a side of the window, for the evidence")
+    parser.add_argument("--weights", help="file of the detector's weights, instead of a download")
+    parser.add_argument("--evidence", help="fitted evidence by magnification: a name or a file")
+    parser.add_argument("--cells", type=int, default=FINEST, help="cells along a side of the window, for the evidence")
     options = parser.parse_args()
     detector = load_detector(options.detector, **({} if options.weights is None else {"weights": options.weights}))
     evidence = None if options.evidence is None else GlimpseEvidence.from_pretrained(options.evidence)

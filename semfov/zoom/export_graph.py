@@ -11,7 +11,7 @@ from semfov.zoom.eye import BORDER
 from semfov.zoom.gist import FOUND
 
 OPSET = 18
-"""The first whose `Resize` knows antialiasing."""
+"""The first opset whose `Resize` has antialiasing."""
 
 IR_VERSION = 8
 
@@ -19,10 +19,10 @@ _DOUBLE, _FLOAT, _INT64, _BOOL = 11, 1, 7, 9  # of onnx.TensorProto
 
 
 class LookGraph(Graph):
-    """Nodes of a look.
+    """ONNX nodes of a look.
 
     Args:
-        detector: whose input is the canvas.
+        detector: the detector, whose input is the canvas.
     """
 
     def __init__(self, detector: Detector) -> None:
@@ -31,11 +31,11 @@ class LookGraph(Graph):
         self.fill = float(detector.fill)
 
     def double(self, value: float) -> str:
-        """A constant of double precision, in which windows are computed."""
+        """A constant in double precision, in which windows are computed."""
         return self.constant(torch.tensor(value, dtype=torch.float64))
 
     def append(self, model: Any, prefix: str, inputs: dict[str, str]) -> list[str]:
-        """Add a whole model, whose inputs are named values of this graph; returns its outputs' names."""
+        """Add a whole model, whose inputs are named values of this graph; return the names of its outputs."""
         from onnx import compose, inliner
 
         model = compose.add_prefix(inliner.inline_local_functions(model), prefix)
@@ -48,10 +48,16 @@ class LookGraph(Graph):
         return [output.name for output in model.graph.output]
 
     def window(self, picture: str, fixation: str) -> tuple[str, str, str]:
-        """The canvas `(1, 3, h, w)` of a window of a picture `(H, W, 3)` of bytes, as `ZoomEye` shows it.
+        """Resample a window to the canvas, as `ZoomEye` does.
 
-        Also the window in the picture and on the canvas, `(8,)`, and where the window would start if it were not cut
-        and rounded, with the magnification, `(3,)`; both of double precision.
+        Args:
+            picture: name of the picture `(H, W, 3)`, bytes.
+            fixation: name of the fixation `(3,)`.
+
+        Returns:
+            Names of the canvas `(1, 3, h, w)`; of the window in the picture and on the canvas, `(8,)`; and of the point
+            where the window would start if it were neither cut nor rounded, with the magnification, `(3,)`. The last
+            two are in double precision.
         """
         point = self.add("Cast", fixation, to=_DOUBLE)
         x, y, m = (self.add("Gather", point, self.constant(n)) for n in range(3))
@@ -63,12 +69,12 @@ class LookGraph(Graph):
         part = self.add("Slice", picture, start, self._whole(y2, x2), self.constant([0, 1]))
         pixels = self.add("Cast", self.add("Unsqueeze", part, self.constant([0])), to=_FLOAT)
         pixels = self.add("Transpose", pixels, perm=[0, 3, 1, 2])
-        # One axis after the other, with bytes in between, as Pillow and torch resample bytes.
+        # One axis after the other, rounded to bytes after each, as Pillow and torch resample bytes.
         rows = self._whole(self.add("Sub", y2, y1))
         columns, lines = self._whole(self.add("Sub", u2, u1)), self._whole(self.add("Sub", v2, v1))
         lead = self.constant([1, 3])
         for size in ([lead, rows, columns], [lead, lines, columns]):
-            # Weights beyond the border are left out, as Pillow and torch leave them out.
+            # Weights beyond the border are left out, as by Pillow and torch.
             how: dict[str, Any] = {"mode": "linear", "antialias": 1, "exclude_outside": 1}
             resized = self.add("Resize", pixels, "", "", self.add("Concat", *size, axis=0), **how)
             pixels = self.add("Clip", self.add("Round", resized), self.constant(0.0), self.constant(255.0))
@@ -80,7 +86,7 @@ class LookGraph(Graph):
         return canvas, self._vector(x1, y1, x2, y2, u1, v1, u2, v2), self._vector(left, top, m)
 
     def _axis(self, point: str, m: str, length: str, canvas: int) -> tuple[str, str, str, str, str]:
-        """Along one axis: start of the window, and start and stop of what is shown in the picture and on the canvas."""
+        """Along one axis: start of the window, and start and stop of its visible part in picture and canvas pixels."""
         one, zero, side = self.double(1.0), self.double(0.0), self.double(float(canvas))
         half = self.add("Div", side, self.add("Mul", self.double(2.0), m))
         middle = self.add("Add", point, self.double(0.5))
@@ -95,7 +101,7 @@ class LookGraph(Graph):
         return low, start, stop, first, self.add("Min", last, side)
 
     def selection(self, boxes: str, confidence: str, vectors: str, chosen: Selection) -> tuple[str, str]:
-        """Boxes `(L, 4)` on the canvas and score vectors `(L, K+1)` that are kept of `(1, N, …)`, as `select` does."""
+        """Select candidates `(1, N, …)` as `select` does: canvas boxes `(L, 4)` and score vectors `(L, K+1)`."""
         x1, y1, x2, y2 = self.add("Split", boxes, self.constant([1, 1, 1, 1]), outputs=4, axis=2)
         full = self.add("And", self.add("Greater", x2, x1), self.add("Greater", y2, y1))
         full = self.add("Squeeze", full, self.constant([2]))
@@ -103,7 +109,7 @@ class LookGraph(Graph):
         ranked = self.add("Where", self.add("And", full, sure), confidence, self.constant(0.0))
         apart = boxes
         if chosen.per_class:
-            # Boxes of different classes are moved so far from each other that none overlap.
+            # Boxes of different classes are moved apart, so that they do not overlap.
             classes = self.add("Slice", vectors, self.constant([1]), self.constant([2**31 - 1]), self.constant([2]))
             label = self.add("Cast", self.add("ArgMax", classes, axis=2, keepdims=1), to=_FLOAT)
             apart = self.add("Add", boxes, self.add("Mul", label, self.constant(4.0 * max(self.wide, self.high))))
@@ -125,7 +131,7 @@ class LookGraph(Graph):
         return self.add("Gather", box, order), self.add("Gather", vector, order)
 
     def placed(self, boxes: str, frame: str, picture: str) -> tuple[str, str]:
-        """Boxes `(L, 4)` of the canvas in picture pixels, cut to the window, and which of them its border cuts."""
+        """Map canvas boxes `(L, 4)` to picture pixels, cut to the window; also tell which its border cuts, `(L,)`."""
         window, canvas = self.add("Split", frame, self.constant([4, 4]), outputs=2, axis=0)
         single = [self.add("Cast", each, to=_FLOAT) for each in (window, canvas)]
         (low, high), (first, last) = (self.add("Split", n, self.constant([2, 2]), outputs=2, axis=0) for n in single)
@@ -152,14 +158,18 @@ class LookGraph(Graph):
     def gist(
         self, hints: tuple[str, str], detections: tuple[str, str], start: str, cells: int, classes: int
     ) -> tuple[str, str, str]:
-        """Strongest hint of each class `(c, c, K)`, size `(c, c)` and what is found `(c, c, K)`, as `gist` tells.
+        """Compute the gist of a look, as `semfov.zoom.gist.gist` does.
 
         Args:
-            hints: boxes in picture pixels and score vectors.
+            hints: names of boxes in picture pixels and of score vectors.
             detections: likewise.
-            start: of `window`.
-            cells: c, cells along a side of the window.
+            start: name of the start of the window, from `window`.
+            cells: c, number of cells along a side of the window.
             classes: K.
+
+        Returns:
+            Names of the strongest hint of each class `(c, c, K)`, of the size `(c, c)` and of the classes that are
+            found `(c, c, K)`.
         """
         boxes, vectors = hints
         at, scores = self._cells(boxes, start, cells), self._scores(vectors)
@@ -168,7 +178,7 @@ class LookGraph(Graph):
         best = self._best(vectors)
         alone = self.constant(torch.zeros(cells * cells))
         top = self.add("ScatterElements", alone, at, best, axis=0, reduction="max")
-        # The size is that of the most confident hint of a cell.
+        # The size of a cell is that of its most confident hint.
         leads = self.add("GreaterOrEqual", best, self.add("Gather", top, at))
         corner, opposite = self.add("Split", boxes, self.constant([2, 2]), outputs=2, axis=1)
         extent = self.add("Clip", self.add("Sub", opposite, corner), self.constant(1e-3))
@@ -190,7 +200,7 @@ class LookGraph(Graph):
         return strongest, size, found
 
     def _cells(self, boxes: str, start: str, cells: int) -> str:
-        """Number of the cell in which the middle of each box lies, `(L,)`."""
+        """Index of the cell in which the centre of each box lies, `(L,)`."""
         corner = self.add("Cast", self.add("Slice", start, self.constant([0]), self.constant([2])), to=_FLOAT)
         m = self.add("Cast", self.add("Gather", start, self.constant([2])), to=_FLOAT)
         pitch = self.add("Div", self.constant([self.wide / cells, self.high / cells]), m)
@@ -203,12 +213,12 @@ class LookGraph(Graph):
         return self.add("Cast", self.add("Squeeze", number, self.constant([1])), to=_INT64)
 
     def _strongest(self, start: str, at: str, values: str, classes: int) -> str:
-        """Highest of the rows `(L, K)` of each cell."""
+        """Highest of the rows `(L, K)` in each cell."""
         index = self.add("Expand", self.add("Unsqueeze", at, self.constant([1])), self.constant([1, classes]))
         return self.add("ScatterElements", start, index, values, axis=0, reduction="max")
 
     def _scores(self, vectors: str) -> str:
-        """Scores of the classes alone, `(L, K)`."""
+        """Scores of the classes without background, `(L, K)`."""
         return self.add("Slice", vectors, self.constant([1]), self.constant([2**31 - 1]), self.constant([1]))
 
     def _best(self, vectors: str) -> str:
@@ -216,7 +226,7 @@ class LookGraph(Graph):
         return self.add("ReduceMax", self._scores(vectors), self.constant([1]), keepdims=0)
 
     def _whole(self, *values: str) -> str:
-        """Scalars of double precision as a vector of whole numbers."""
+        """Scalars in double precision as a vector of whole numbers."""
         return self.add("Cast", self._vector(*values), to=_INT64)
 
     def _vector(self, *values: str) -> str:

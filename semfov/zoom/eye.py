@@ -1,10 +1,13 @@
-"""An eye for pictures larger than a detector's input: a look is a choice of where and how close."""
+"""An eye for pictures larger than the detector's input, which looks at windows at a chosen magnification."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -12,8 +15,8 @@ from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, open_large
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
-from semfov.detection.selection import Selection, select
-from semfov.errors import check, check_finite, check_number, check_shape, lookup
+from semfov.detection.selection import Selection, select_several
+from semfov.errors import check, check_number, check_shape, lookup
 from semfov.sensor.glimpse import windows_at
 from semfov.zoom.lattice import Lattice
 
@@ -21,20 +24,25 @@ Cut = Literal["keep", "drop", "background"]
 Limit = tuple[float, float, float, float]
 
 HINTS = Selection(threshold=0.002, iou=0.95, limit=300)
-"""Candidates that are too weak to be detections, but tell where a closer look pays."""
+"""Selection of hints: candidates that are too weak to be detections, but show where a closer look pays."""
 
 _REDUCE = 2  # a window is reduced in the source as long as it keeps this many pixels for each canvas pixel
 BORDER = 2.0
-"""Canvas pixels; a box that comes as near to the window's border is cut by it."""
+"""A box this near to the border of its window, in canvas pixels, counts as cut by it."""
 
 
 @dataclass(frozen=True)
 class ZoomView:
-    """A picture as the eye holds it: nothing is read yet.
+    """A picture that an eye can look at. Opening it reads no pixels.
 
     Attributes:
-        picture: gives its windows.
-        lattice: the cells over it, and the windows of every level.
+        picture: source of the pixels, read by windows.
+        lattice: cells over the picture, and the windows of every level.
+
+    Example::
+
+        view = ZoomEye(load_detector("yolox-nano")).open("harbour.tif")
+        view.picture.size, view.lattice.levels
     """
 
     picture: LargePicture
@@ -43,35 +51,39 @@ class ZoomView:
 
 @dataclass(frozen=True)
 class Seen:
-    """What a few looks show.
+    """The result of several looks.
 
     Attributes:
-        detections: boxes in picture pixels, a batch of F.
-        hints: weak candidates, overlapping ones among them, likewise.
-        windows: `(F, 4)`, what was looked at, cut to the picture.
-        cut: `(F, L)`, which detections the border of their window cuts.
+        detections: a batch of F, boxes in picture pixels.
+        cut: `(F, L)`, boolean, true where the border of the window cuts the box.
+        hints: weak candidates, which may overlap; a batch of F, boxes in picture pixels.
+        windows: `(F, 4)`, the windows in picture pixels, cut to the picture.
     """
 
     detections: Detections
+    cut: Tensor
     hints: Detections
     windows: Tensor
-    cut: Tensor
 
 
 class ZoomEye(nn.Module):
-    """Looks at windows of a picture, each at a magnification and resampled to the detector's input.
+    """Looks at windows of a picture: resamples a window to the detector's input and detects in it.
 
-    A look costs one pass of the detector, whatever the size of the picture. Windows are rounded to whole pixels and
-    resampled by the antialiased filter of `semfov.sensor.glimpse`, from bytes, within their own border.
+    A look costs one pass of the detector, whatever the size of the picture. The borders of windows are rounded to whole
+    pixels. Windows are resampled as bytes by the antialiased filter of `semfov.sensor.glimpse`, from the pixels inside
+    them alone.
 
-    An object that the border of a window cuts shows a part of itself there, and its box is the part's. Such a box can
-    be kept (`keep`), left out (`drop`), or keep its place with the scores of a background (`background`). A border of
-    the picture cuts nothing.
+    Where the border of a window cuts an object, only a part of the object is visible, and its box encloses that part.
+    Such boxes can be kept (`keep`), left out (`drop`), or kept with the scores of background (`background`). The border
+    of the picture cuts no object.
 
     Args:
         detector: any detector.
-        finest: largest magnification, in canvas pixels for each picture pixel; 1 ends at native pixels.
-        cut: what becomes of boxes at a window's border.
+        finest: largest magnification, in canvas pixels per picture pixel; 1 ends at native pixels.
+        cut: treatment of boxes that the border of a window cuts.
+
+    Raises:
+        InputError: a setting is outside its range.
 
     Example::
 
@@ -89,59 +101,87 @@ class ZoomEye(nn.Module):
         self.cut: Cut = lookup(cut, get_args(Cut), "treatment of cut boxes")
 
     def open(self, picture: LargePicture | ImageLike) -> ZoomView:
-        """Hold a picture: a file, another of any common kind (`semfov.as_image`), or a `LargePicture`."""
+        """Open a picture to look at it.
+
+        Args:
+            picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
+
+        Returns:
+            The picture with its lattice.
+        """
         source = open_large(picture)
         return ZoomView(source, Lattice.over(source.size, self.detector.input_size, finest=self.finest))
 
     def look(self, view: ZoomView, fixations: Tensor) -> Detections:
-        """Detections from fixations `(F, 3)`, `(x, y, magnification)`: a batch of F, boxes in picture pixels.
+        """Look at a picture and detect.
 
-        Points of two numbers `(F, 2)` are looked at at the largest magnification.
+        Args:
+            view: the picture, from `open`.
+            fixations: `(F, 3)`, `(x, y, magnification)`: centres of the windows in picture pixels, and canvas pixels
+                per picture pixel. Points `(F, 2)` are looked at with the largest magnification.
+
+        Returns:
+            A batch of F detections, boxes in picture pixels.
         """
         return self.glance(view, fixations).detections
 
     def glance(self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None) -> Seen:
-        """Detections with their hints.
+        """Look at a picture and return weak candidates too.
 
         Args:
-            view: of `open`.
-            fixations: as for `look`.
-            within: box of the picture that each look shows no more than; None for all that fits the canvas.
+            view: the picture, from `open`.
+            fixations: `(F, 3)` or `(F, 2)`, as for `look`.
+            within: for each look the box of the picture that it shows; None shows all that fits the canvas.
+
+        Returns:
+            Detections and hints of each look.
         """
         canvas, frames = self.glimpse(view, fixations, within)
         candidates = self.detector.propose(canvas)
-        policy = self.detector.background
-        detections = select(candidates, None, self.detector.selection, policy)
-        hints = select(candidates, None, HINTS, policy)
-        cut = _at_border(detections, frames, view.picture.size) & detections.mask
-        mapped = self._treat(_to_picture(detections, frames), cut)
-        return Seen(mapped, _to_picture(hints, frames), frames[:, :4], cut)
+        wanted = [self.detector.selection, HINTS]
+        detections, hints = select_several(candidates, None, wanted, self.detector.background)
+        place = _Placement(frames, view.picture.size, detections.boxes)
+        found, cut = self._treat(place.to_picture(detections), place.cut(detections))
+        return Seen(found, cut, place.to_picture(hints), frames[:, :4])
 
     def glimpse(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Canvases `(F, 3, h, w)`, and `(F, 8)`: the window in the picture and the same on the canvas.
+        """Resample windows without detecting in them.
 
-        Arguments as for `glance`.
+        Args:
+            view: the picture, from `open`.
+            fixations: `(F, 3)` or `(F, 2)`, as for `look`.
+            within: for each look the box of the picture that it shows; None shows all that fits the canvas.
+
+        Returns:
+            Canvases `(F, 3, h, w)`, RGB in [0, 1], and frames `(F, 8)`: each window in picture pixels
+            `(x1, y1, x2, y2)`, and its place on the canvas.
+
+        Raises:
+            InputError: a fixation is not finite, or its magnification is not positive.
         """
         if fixations.shape[-1] == 2:
             closest = fixations.new_full((*fixations.shape[:-1], 1), view.lattice.magnifications[-1])
             fixations = torch.cat([fixations, closest], -1)
         check_shape(fixations, "fixations", None, 3)
-        check_finite(fixations, "fixations")
-        check(bool((fixations[:, 2] > 0).all()), "fixations", "positive magnifications", fixations[:, 2].tolist())
+        rows = fixations.tolist()
+        check(all(math.isfinite(n) for row in rows for n in row), "fixations", "finite numbers", rows)
+        check(all(row[2] > 0 for row in rows), "fixations", "positive magnifications", [row[2] for row in rows])
         windows = windows_at(fixations[:, :2].double(), fixations[:, 2].double(), self.detector.input_size)
         limits = [None] * len(fixations) if within is None else within
-        shown = [
-            self._show(view.picture, window, m, limit)
-            for window, m, limit in zip(windows.tolist(), fixations[:, 2].tolist(), limits, strict=True)
+        wide, high = self.detector.input_size
+        canvases = torch.empty(len(fixations), 3, high, wide)
+        frames = [
+            self._show(canvas, view.picture, window, m, limit)
+            for canvas, window, (_, _, m), limit in zip(canvases, windows.tolist(), rows, limits, strict=True)
         ]
-        return torch.stack([canvas for canvas, _ in shown]), torch.tensor([frame for _, frame in shown])
+        return canvases, torch.tensor(frames).view(-1, 8)
 
     def _show(
-        self, picture: LargePicture, window: list[float], magnification: float, limit: Limit | None
-    ) -> tuple[Tensor, list[float]]:
-        """One canvas, and where it lies in the picture."""
+        self, canvas: Tensor, picture: LargePicture, window: list[float], magnification: float, limit: Limit | None
+    ) -> list[float]:
+        """Write one canvas; return its frame (`glimpse`)."""
         wide, high = self.detector.input_size
         low, right = (0.0, 0.0), (float(picture.size[0]), float(picture.size[1]))
         if limit is not None:
@@ -165,64 +205,83 @@ class ZoomEye(nn.Module):
             reduction *= 2
         pixels = picture.read((x1, y1, x2, y2), reduction)[None]
         if pixels.shape[-2:] != (v2 - v1, u2 - u1):
-            # A window whose rows lie apart in memory is resampled half as fast.
+            # torch takes twice as long where the rows of a window are not adjacent in memory.
             pixels = pixels.contiguous(memory_format=torch.channels_last)
             pixels = F.interpolate(pixels, (v2 - v1, u2 - u1), mode="bilinear", antialias=True)
-        shown = pixels[0].to(torch.float32, memory_format=torch.contiguous_format).div_(255)
-        if shown.shape[-2:] == (high, wide):
-            canvas = shown
-        else:
-            canvas = torch.full((3, high, wide), self._fill())
-            canvas[:, v1:v2, u1:u2] = shown
-        return canvas, [float(n) for n in (x1, y1, x2, y2, u1, v1, u2, v2)]
+        if (u1, v1, u2, v2) != (0, 0, wide, high):
+            canvas.fill_(float(self.detector.fill))
+            canvas = canvas[:, v1:v2, u1:u2]
+        canvas.copy_(pixels[0]).div_(255)
+        return [float(n) for n in (x1, y1, x2, y2, u1, v1, u2, v2)]
 
-    def _fill(self) -> float:
-        return float(self.detector.fill)
-
-    def _treat(self, detections: Detections, cut: Tensor) -> Detections:
+    def _treat(self, detections: Detections, cut: Tensor) -> tuple[Detections, Tensor]:
+        """Treat cut boxes as the eye's setting says; also return which of the resulting boxes are cut."""
         if self.cut == "keep" or not bool(cut.any()):
-            return detections
+            return detections, cut
         if self.cut == "drop":
-            kept = [detections[n : n + 1] for n in range(len(cut))]
-            return Detections.stack(
-                [Detections(d.boxes[:, ~c], d.scores[:, ~c], d.mask[:, ~c]) for d, c in zip(kept, cut, strict=True)]
-            )
+            kept = [detections.mask[n] & ~cut[n] for n in range(len(cut))]
+            whole = [
+                Detections(detections.boxes[n : n + 1, keep], detections.scores[n : n + 1, keep], keep[keep][None])
+                for n, keep in enumerate(kept)
+            ]
+            left = Detections.stack(whole)
+            return left, torch.zeros_like(left.mask)
         nothing = torch.zeros_like(detections.scores[..., :1, :])
         nothing[..., 0] = 1
-        return Detections(detections.boxes, torch.where(cut[..., None], nothing, detections.scores), detections.mask)
+        scores = torch.where(cut[..., None], nothing, detections.scores)
+        return Detections(detections.boxes, scores, detections.mask), cut
 
     def forward(self, picture: Tensor, fixations: Tensor) -> Detections:
-        """`look` at an image from fixations."""
+        """Open a picture, look at it and detect.
+
+        Args:
+            picture: `(3, H, W)`, RGB in [0, 1] or bytes.
+            fixations: `(F, 3)` or `(F, 2)`, as for `look`.
+
+        Returns:
+            A batch of F detections, boxes in picture pixels.
+        """
         return self.look(self.open(picture), fixations)
 
     def settings(self) -> dict[str, Any]:
-        """What the detections depend on, for the keys of caches and the metadata of fitted models."""
+        """Settings on which the detections depend, for the keys of caches and the metadata of fitted models.
+
+        Returns:
+            JSON values.
+        """
         sensor = {"glimpse": "antialiased bilinear", "finest": self.finest, "cut": self.cut}
         return {"sensor": sensor, "detector": self.detector.settings()}
 
 
-def _to_picture(detections: Detections, frames: Tensor) -> Detections:
-    """Canvas boxes as boxes in picture pixels, cut to their windows."""
-    window, canvas = frames[:, None, :4].to(detections.boxes), frames[:, None, 4:].to(detections.boxes)
-    scale = (window[..., 2:] - window[..., :2]) / (canvas[..., 2:] - canvas[..., :2])
-    boxes = (detections.boxes - canvas[..., :2].repeat(1, 1, 2)) * scale.repeat(1, 1, 2) + window[..., :2].repeat(
-        1, 1, 2
-    )
-    low, high = window[..., :2].repeat(1, 1, 2), window[..., 2:].repeat(1, 1, 2)
-    boxes = torch.minimum(torch.maximum(boxes, low), high) * detections.mask[..., None]
-    return Detections(boxes, detections.scores, detections.mask)
+class _Placement:
+    """Maps boxes from the canvases of several looks to the picture.
 
+    Args:
+        frames: `(F, 8)`, from `ZoomEye.glimpse`.
+        size: `(width, height)` of the picture.
+        like: boxes that have the dtype and device to compute in.
+    """
 
-def _at_border(detections: Detections, frames: Tensor, size: tuple[int, int]) -> Tensor:
-    """Which boxes touch a border of their window that lies inside the picture, `(F, L)`."""
-    window, canvas = frames[:, None, :4], frames[:, None, 4:].to(detections.boxes)
-    limit = torch.tensor([0.0, 0.0, *size])
-    inside = torch.cat([window[..., :2] > limit[:2], window[..., 2:] < limit[2:]], -1)
-    near = torch.cat(
-        [
-            detections.boxes[..., :2] <= canvas[..., :2] + BORDER,
-            detections.boxes[..., 2:] >= canvas[..., 2:] - BORDER,
-        ],
-        -1,
-    )
-    return (inside & near).any(-1)
+    def __init__(self, frames: Tensor, size: tuple[int, int], like: Tensor) -> None:
+        values = (frames.double() if like.dtype == torch.float64 else frames.float()).numpy()
+        window: NDArray[np.floating] = values[:, :4]
+        canvas: NDArray[np.floating] = values[:, 4:]
+        scale = (window[:, 2:] - window[:, :2]) / (canvas[:, 2:] - canvas[:, :2])
+        # The border of the picture cuts no object.
+        near = np.where(window[:, :2] > 0, canvas[:, :2] + BORDER, -np.inf)
+        far = np.where(window[:, 2:] < size, canvas[:, 2:] - BORDER, np.inf)
+        corners = window[:, :2], window[:, 2:], canvas[:, :2], scale
+        rows = np.stack([*(np.tile(corner, 2) for corner in corners), np.concatenate([near, far], 1)])
+        self._low, self._high, self._first, self._scale, self._border = torch.from_numpy(rows).to(like)[:, :, None]
+
+    def to_picture(self, detections: Detections) -> Detections:
+        """Map canvas boxes to picture pixels and cut them to their windows."""
+        boxes = (detections.boxes - self._first) * self._scale + self._low
+        boxes = boxes.clamp(self._low, self._high) * detections.mask[..., None]
+        return Detections(boxes, detections.scores, detections.mask)
+
+    def cut(self, detections: Detections) -> Tensor:
+        """Tell which boxes touch a border of their window that lies inside the picture, `(F, L)`."""
+        low, high = self._border.split(2, -1)
+        touches = (detections.boxes[..., :2] <= low) | (detections.boxes[..., 2:] >= high)
+        return touches.any(-1) & detections.mask

@@ -1,31 +1,38 @@
-"""What a look at a window says of its cells: the strongest hint of every class in each."""
+"""The gist of a look at a window: the strongest hint of every class in each cell."""
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.detection.detections import Detections
 from semfov.zoom.lattice import Lattice
 
 FINEST = 32
-"""Cells along a side of a gist, at most."""
+"""Largest number of cells along a side of a gist."""
 
 FOUND = 0.1
-"""Score of a detection, from which on its object counts as found."""
+"""Score from which on a detection counts as a found object."""
 
 
 @dataclass(frozen=True)
 class Gist:
-    """A look at a window, cell by cell. Cells are those of the lattice, or squares of them where these are too fine.
+    """A look at a window, cell by cell.
+
+    The cells are those of the lattice. In windows with more than 32 cells along a side, several cells of the lattice
+    form one cell of the gist.
 
     Attributes:
-        level: of the window.
+        level: level of the window.
         first: `(column, row)` of the window's first cell on the lattice.
-        scale: cells of the lattice along a side of a cell of the gist.
-        scores: `(rows, columns, K)`, highest score of each class in a hint whose centre lies in the cell, 0 for none.
-        size: `(rows, columns)`, logarithm (base 2) of the size in canvas pixels of the most confident hint, 0 for none.
-        found: `(rows, columns, K)` boolean, classes of detections whose centre lies in the cell.
+        scale: number of lattice cells along a side of a cell of the gist.
+        scores: `(rows, columns, K)`, highest score of each class among hints whose centre lies in the cell; 0 without
+            hints.
+        size: `(rows, columns)`, logarithm (base 2) of the size in canvas pixels of the most confident hint; 0 without
+            hints.
+        found: `(rows, columns, K)`, boolean, classes of detections whose centre lies in the cell.
     """
 
     level: int
@@ -37,40 +44,49 @@ class Gist:
 
 
 def gist(hints: Detections, detections: Detections, lattice: Lattice, action: tuple[int, int, int]) -> Gist:
-    """The gist of a look at a window of the lattice.
+    """Compute the gist of a look at a window of the lattice.
 
     Args:
-        hints: of the look, a batch of one in picture pixels.
-        detections: of the look, likewise.
-        lattice: of the picture.
-        action: level, column and row of the window.
+        hints: hints of the look, a batch of one without padding, in picture pixels.
+        detections: detections of the look, likewise.
+        lattice: lattice of the picture.
+        action: `(level, column, row)` of the window.
+
+    Returns:
+        The gist.
     """
     level, column, row = action
     span = lattice.span(level)
     scale = max(1, span // FINEST)
     columns = -(-min(span, lattice.columns - column) // scale)
     rows = -(-min(span, lattice.rows - row) // scale)
-    low = torch.tensor([column * lattice.pitch[0], row * lattice.pitch[1]])
-    pitch = torch.tensor(lattice.pitch) * scale
+    low = np.array([column * lattice.pitch[0], row * lattice.pitch[1]], np.float32)
+    pitch = np.array(lattice.pitch, np.float32) * scale
     kinds = hints.scores.shape[-1] - 1
 
-    def cells(boxes: Tensor) -> Tensor:
-        place = (((boxes[:, :2] + boxes[:, 2:]) / 2 - low) / pitch).floor().long()
-        return place[:, 1].clamp(0, rows - 1) * columns + place[:, 0].clamp(0, columns - 1)
+    def cells(boxes: Tensor) -> NDArray[np.int64]:
+        corners = boxes.float().numpy()
+        place = np.floor(((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch).astype(np.int64)
+        return place[:, 1].clip(0, rows - 1) * columns + place[:, 0].clip(0, columns - 1)
 
-    kept = hints.mask[0]
-    boxes, scores = hints.boxes[0, kept], hints.scores[0, kept, 1:].float()
+    boxes, scores = hints.boxes[0].detach(), hints.scores[0, :, 1:].detach().float().contiguous()
     at = cells(boxes)
-    strongest = scores.new_zeros(rows * columns, kinds).scatter_reduce(0, at[:, None].expand(-1, kinds), scores, "amax")
-    size = scores.new_zeros(rows * columns)
-    order = scores.amax(-1).argsort() if len(scores) else at
+    place = torch.from_numpy(at)[:, None].expand(-1, kinds)
+    strongest = scores.new_zeros(rows * columns, kinds).scatter_reduce_(0, place, scores, "amax")
     canvas = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3).log2().mean(-1)
-    canvas = canvas + torch.tensor(lattice.magnifications[level]).log2()
-    # Of several hints in a cell the last that is written stays: the most confident.
-    for place, value in zip(at[order].tolist(), canvas[order].clamp(min=0).tolist(), strict=True):
-        size[place] = value
-    found = torch.zeros(rows * columns, kinds, dtype=torch.bool)
-    sure = detections.mask[0] & (detections.confidence[0] >= FOUND)
-    found[cells(detections.boxes[0, sure]), detections.labels[0, sure] - 1] = True
+    canvas = (canvas + torch.tensor(lattice.magnifications[level]).log2()).clamp(min=0)
+    size, order = np.zeros(rows * columns, np.float32), scores.amax(-1).argsort().numpy()
+    # Of several hints in a cell the one written last remains: the most confident.
+    size[at[order]] = canvas.numpy()[order]
+    found = np.zeros((rows * columns, kinds), np.bool_)
+    sure = detections.confidence[0] >= FOUND
+    found[cells(detections.boxes[0, sure].detach()), detections.labels[0, sure].numpy() - 1] = True
     shape = rows, columns
-    return Gist(level, (column, row), scale, strongest.view(*shape, -1), size.view(shape), found.view(*shape, -1))
+    return Gist(
+        level,
+        (column, row),
+        scale,
+        strongest.view(*shape, -1),
+        torch.from_numpy(size).view(shape),
+        torch.from_numpy(found).view(*shape, -1),
+    )

@@ -1,4 +1,4 @@
-"""Glances: windows of a picture, and what a look at one shows."""
+"""Windows of a picture, and the results of looks at them."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -15,13 +15,14 @@ from semfov.zoom.lattice import Lattice
 
 @dataclass(frozen=True)
 class Window:
-    """Where to look, and how close.
+    """A window of a picture: where to look, and how closely.
 
     Attributes:
         fixation: `(x, y, magnification)`.
-        level: of the lattice; for a window that is not on it, that of the nearest magnification.
-        cells: `(x1, y1, x2, y2)`, cells of the lattice that it shows.
-        within: `(x1, y1, x2, y2)` in picture pixels, to show no more than that; None for all that fits the canvas.
+        level: level of the lattice. A window that is not on the lattice has the level of the nearest magnification.
+        cells: `(x1, y1, x2, y2)`, the cells of the lattice that it shows.
+        within: `(x1, y1, x2, y2)` in picture pixels, the part of the picture that it shows; None for all that fits the
+            canvas.
     """
 
     fixation: tuple[float, float, float]
@@ -32,14 +33,14 @@ class Window:
 
 @dataclass(frozen=True)
 class Glance:
-    """What a look shows.
+    """The result of a look at a window.
 
     Attributes:
-        window: that was looked at.
+        window: the window.
         detections: a batch of one, boxes in picture pixels.
-        cut: `(L,)`, which of them the window's border cuts.
-        show: `(K,)`, highest score of each class.
-        gist: cell by cell, of windows that can be looked at closer; None for the closest ones.
+        cut: `(L,)`, boolean, true where the border of the window cuts the box.
+        show: `(K,)`, highest score of each class in any hint.
+        gist: strongest hints in each cell; None for windows of the last level, which cannot be looked at more closely.
     """
 
     window: Window
@@ -50,15 +51,15 @@ class Glance:
 
 
 def on_lattice(lattice: Lattice, action: tuple[int, int, int]) -> Window:
-    """The window of an action: level, column and row."""
+    """The window of an action `(level, column, row)`."""
     level, column, row = action
-    x, y, magnification = lattice.fixations(torch.tensor(action)).tolist()
+    x, y, magnification = lattice.fixation(level, column, row)
     span = lattice.span(level)
     return Window((x, y, magnification), level, (column, row, column + span, row + span))
 
 
 def around(lattice: Lattice, box: tuple[float, float, float, float]) -> Window:
-    """A window that shows a box of the picture and nothing beyond it, as large as fits the canvas."""
+    """The window that shows a box of the picture and nothing beyond it, as large as the canvas allows."""
     x1, y1, x2, y2 = box
     magnification = min(lattice.canvas[0] / (x2 - x1), lattice.canvas[1] / (y2 - y1))
     level = min(range(lattice.levels), key=lambda k: abs(lattice.magnifications[k] / magnification - 1))
@@ -68,7 +69,7 @@ def around(lattice: Lattice, box: tuple[float, float, float, float]) -> Window:
 
 
 def half_steps(lattice: Lattice) -> Iterator[Window]:
-    """Windows of all levels, half a window apart, those at the far borders among them."""
+    """Yield the windows of all levels that are half a window apart, and those at the right and lower borders."""
     for level in range(lattice.levels):
         half = max(1, lattice.span(level) // 2)
         across, down = lattice.places(level)
@@ -78,44 +79,50 @@ def half_steps(lattice: Lattice) -> Iterator[Window]:
 
 
 class Glances(ABC):
-    """Base of what shows windows of one picture.
+    """Base of sources of looks at one picture: live ones, and stored ones.
 
     Attributes:
-        lattice: of the picture.
+        lattice: the lattice of the picture.
     """
 
     lattice: Lattice
 
     @abstractmethod
     def see(self, windows: Sequence[Window]) -> list[Glance]:
-        """Look at windows, all in one batch where there is an accelerator to use."""
+        """Look at windows, in one batch where that is possible."""
 
 
 class LiveGlances(Glances):
     """Looks of an eye at a picture.
 
     Args:
-        eye: sensor and detector.
-        view: the picture, as the eye holds it.
+        eye: resamples windows and detects in them.
+        view: the picture, from `ZoomEye.open`.
     """
 
     def __init__(self, eye: ZoomEye, view: ZoomView) -> None:
         self.eye, self.view, self.lattice = eye, view, view.lattice
 
     def see(self, windows: Sequence[Window]) -> list[Glance]:
-        """Glimpse and detect."""
+        """Resample the windows and detect in them."""
         fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
         seen = self.eye.glance(self.view, fixations, [window.within for window in windows])
         return [glance(seen, n, window, self.lattice) for n, window in enumerate(windows)]
 
 
 def glance(seen: Seen, number: int, window: Window, lattice: Lattice) -> Glance:
-    """One of the looks of an eye."""
-    hints, detections = seen.hints[number : number + 1], seen.detections[number : number + 1]
-    kept = detections.mask[0]
-    detections = Detections(detections.boxes[:, kept], detections.scores[:, kept], detections.mask[:, kept])
-    scores = (hints.scores[0, :, 1:] * hints.mask[0, :, None]).float()
+    """The result of one of the looks of an eye."""
+    hints, detections = _only(seen.hints, number), _only(seen.detections, number)
+    scores = hints.scores[0, :, 1:].float()
     show = scores.amax(0) if len(scores) else scores.new_zeros(scores.shape[-1])
     whole = window.within is None and window.level < lattice.levels - 1
     told = gist(hints, detections, lattice, (window.level, *window.cells[:2])) if whole else None
-    return Glance(window, detections, seen.cut[number, kept], show, told)
+    return Glance(window, detections, seen.cut[number, : detections.mask.shape[1]], show, told)
+
+
+def _only(looks: Detections, number: int) -> Detections:
+    """Detections of one look, a batch of one without padding."""
+    if len(looks.mask) == 1:
+        return looks
+    kept, one = int(looks.mask[number].sum()), slice(number, number + 1)
+    return Detections(looks.boxes[one, :kept], looks.scores[one, :kept], looks.mask[one, :kept])

@@ -1,8 +1,9 @@
-"""Where and how close an eye can look at a picture: cells of one size, and windows of them one octave apart."""
+"""The windows of a picture that an eye can look at: a grid of cells, and windows of cells one octave apart."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,16 +16,22 @@ CELLS = 8
 
 @dataclass(frozen=True)
 class Lattice:
-    """Cells over a picture, and the windows of every level that lie on them.
+    """A grid of cells over a picture, and the windows of every level that lie on it.
 
-    Level 0 is one window with the whole picture in its upper left corner. A window of level k is half as wide as one of
-    level k - 1, and the closest is `CELLS` cells wide. Windows start at cell borders, at most at the last place where
-    they still lie in the picture (up to a cell).
+    Level 0 has one window, with the whole picture in its upper left corner. A window of level k is half as wide as one
+    of level k - 1. Windows of the last level are `CELLS` cells wide. A window starts at the border of a cell, and it
+    reaches beyond the picture by less than one cell where the picture is large enough.
 
     Attributes:
         size: `(width, height)` of the picture in pixels.
         canvas: `(width, height)` of the detector's input.
-        magnifications: of the levels, canvas pixels for each picture pixel.
+        magnifications: magnification of each level, in canvas pixels per picture pixel.
+
+    >>> lattice = Lattice((800, 600), (400, 400), (0.5, 1.0))
+    >>> lattice.pitch, lattice.columns, lattice.rows
+    ((50.0, 50.0), 16, 12)
+    >>> [lattice.places(level) for level in range(lattice.levels)]
+    [(1, 1), (9, 5)]
     """
 
     size: tuple[int, int]
@@ -33,7 +40,15 @@ class Lattice:
 
     @classmethod
     def over(cls, size: tuple[int, int], canvas: tuple[int, int], *, finest: float = 1.0) -> "Lattice":
-        """The lattice of a picture, up to the last magnification that is not above `finest`.
+        """Create the lattice of a picture, up to the last magnification that is not above `finest`.
+
+        Args:
+            size: `(width, height)` of the picture in pixels.
+            canvas: `(width, height)` of the detector's input.
+            finest: largest magnification, in canvas pixels per picture pixel.
+
+        Returns:
+            The lattice.
 
         >>> lattice = Lattice.over((2560, 1920), (416, 416))
         >>> lattice.levels, lattice.columns, lattice.rows, len(lattice)
@@ -51,46 +66,67 @@ class Lattice:
 
     @property
     def octaves(self) -> Tensor:
-        """By how many octaves the picture is reduced at each level, `(levels,)`; 0 where it is not.
+        """Number of octaves by which the picture is reduced at each level, `(levels,)`; 0 where it is not reduced.
 
         >>> Lattice.over((2560, 1920), (416, 416)).octaves
         tensor([2.6215, 1.6215, 0.6215])
         """
         return -torch.tensor(self.magnifications).log2().clamp(max=0)
 
-    @property
+    @cached_property
     def pitch(self) -> tuple[float, float]:
         """`(width, height)` of a cell in picture pixels."""
         wide, high = self.window(self.levels - 1)
         return wide / CELLS, high / CELLS
 
-    @property
+    @cached_property
     def columns(self) -> int:
-        """Cells in a row."""
+        """Number of cells in a row."""
         return _up(self.size[0] / self.pitch[0])
 
-    @property
+    @cached_property
     def rows(self) -> int:
-        """Cells in a column."""
+        """Number of cells in a column."""
         return _up(self.size[1] / self.pitch[1])
 
     def window(self, level: int) -> tuple[float, float]:
-        """`(width, height)` of a window in picture pixels."""
+        """Size of a window.
+
+        Args:
+            level: its level, from 0.
+
+        Returns:
+            `(width, height)` in picture pixels.
+        """
         magnification = self.magnifications[level]
         return self.canvas[0] / magnification, self.canvas[1] / magnification
 
     def span(self, level: int) -> int:
-        """Cells along a side of a window."""
+        """Number of cells along a side of a window.
+
+        Args:
+            level: its level, from 0.
+
+        Returns:
+            The number of cells.
+        """
         return CELLS << (self.levels - 1 - level)
 
     def places(self, level: int) -> tuple[int, int]:
-        """How many places windows of a level have along a row and down a column."""
+        """Number of places at which a window can start.
+
+        Args:
+            level: its level, from 0.
+
+        Returns:
+            The number of places along a row and down a column.
+        """
         span = self.span(level)
         return max(self.columns - span, 0) + 1, max(self.rows - span, 0) + 1
 
     @cached_property
     def actions(self) -> Tensor:
-        """Every window, `(N, 3)`: level, column and row of its first cell; those of a level row by row."""
+        """All windows, `(N, 3)`: level, column and row of the first cell; the windows of a level row by row."""
         parts = []
         for level in range(self.levels):
             across, down = self.places(level)
@@ -103,24 +139,65 @@ class Lattice:
         return sum(across * down for across, down in map(self.places, range(self.levels)))
 
     def boxes(self, actions: Tensor) -> Tensor:
-        """Windows `(..., 4)` in picture pixels of actions `(..., 3)`; they may reach beyond the picture."""
+        """Windows of actions, which may reach beyond the picture.
+
+        Args:
+            actions: `(..., 3)`: level, column and row of the first cell.
+
+        Returns:
+            `(..., 4)`, `(x1, y1, x2, y2)` in picture pixels.
+        """
         pitch = torch.tensor(self.pitch, dtype=torch.float64)
         low = actions[..., 1:] * pitch
         wide = torch.tensor([self.window(level) for level in range(self.levels)], dtype=torch.float64)
         return torch.cat([low, low + wide[actions[..., 0]]], -1).float()
 
     def fixations(self, actions: Tensor) -> Tensor:
-        """Centres and magnifications `(..., 3)`, `(x, y, m)`, of actions `(..., 3)`."""
+        """Centres and magnifications of actions.
+
+        Args:
+            actions: `(..., 3)`: level, column and row of the first cell.
+
+        Returns:
+            `(..., 3)`, `(x, y, m)` in picture pixels and canvas pixels per picture pixel.
+        """
         boxes = self.boxes(actions).double()
         magnification = torch.tensor(self.magnifications, dtype=torch.float64)[actions[..., 0]]
         return torch.cat([(boxes[..., :2] + boxes[..., 2:]) / 2 - 0.5, magnification[..., None]], -1).float()
 
+    def fixation(self, level: int, column: int, row: int) -> tuple[float, float, float]:
+        """Centre and magnification of one window: a row of `fixations`, computed without tensors.
+
+        Args:
+            level: of the window.
+            column: of its first cell.
+            row: of its first cell.
+
+        Returns:
+            `(x, y, m)`.
+        """
+        x, y = (
+            (float(np.float32(first * pitch)) + float(np.float32(first * pitch + side))) / 2 - 0.5
+            for first, pitch, side in zip((column, row), self.pitch, self.window(level), strict=True)
+        )
+        x, y, magnification = np.array([x, y, self.magnifications[level]], np.float32).tolist()
+        return x, y, magnification
+
     def number(self, level: int, column: int, row: int) -> int:
-        """Place of a window in `actions`."""
+        """Index of a window in `actions`.
+
+        Args:
+            level: of the window.
+            column: of its first cell.
+            row: of its first cell.
+
+        Returns:
+            The index.
+        """
         before = sum(across * down for across, down in map(self.places, range(level)))
         return before + row * self.places(level)[0] + column
 
 
 def _up(ratio: float) -> int:
-    """The next whole number, but for rounding."""
+    """The ratio rounded up, except where only rounding has put it above a whole number."""
     return max(1, -int(-(ratio - 1e-6) // 1))

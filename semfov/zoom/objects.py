@@ -7,19 +7,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from semfov.observation.matching import box_iou
+from semfov.detection.near_duplicates import intersection, neighbours, survivors
 from semfov.zoom.glances import Glance
 
 
 @dataclass(frozen=True)
 class Objects:
-    """Objects, most certain first.
+    """Objects of a picture, most confident first.
 
     Attributes:
-        boxes: `(M, 4)` in picture pixels.
-        scores: `(M,)`, of the class.
+        boxes: `(M, 4)`, `(x1, y1, x2, y2)` in picture pixels.
+        scores: `(M,)`, score of the class.
         labels: `(M,)`, classes 1..K.
-        passes: `(M,)`, number of the look that each comes from, the overview is 0.
+        passes: `(M,)`, number of the look that each box comes from; the overview is 0.
+
+    >>> objects = Objects(torch.zeros(2, 4), torch.tensor([0.9, 0.2]), torch.tensor([1, 3]), torch.tensor([0, 4]))
+    >>> len(objects), len(objects.above(0.5))
+    (2, 1)
     """
 
     boxes: Tensor
@@ -31,7 +35,14 @@ class Objects:
         return len(self.boxes)
 
     def above(self, score: float) -> "Objects":
-        """Those with such a score or more."""
+        """Objects with at least a given score.
+
+        Args:
+            score: the lowest score.
+
+        Returns:
+            The objects.
+        """
         return self[self.scores >= score]
 
     def __getitem__(self, index: Tensor) -> "Objects":
@@ -42,22 +53,31 @@ class Objects:
 def merge(
     glances: Sequence[Glance], target: int | None = None, *, score: float = 0.05, iou: float = 0.5, inside: float = 0.8
 ) -> Objects:
-    """One box for each object that several glances show.
+    """Merge the detections of several looks into one box for each object.
 
-    Of two boxes of one class that are the same object, a box that the border of its window cuts gives way to one that
-    it does not; else the one from the closer look stays, and of one look the one with the higher score. Two boxes are
-    the same object when they overlap by `iou`; from two looks also when one that is cut lies in the other by `inside`
-    of its area.
+    Two boxes of one class are the same object when their intersection over union is at least `iou`. Boxes of two looks
+    are also the same object when the border of its window cuts one of them, and at least `inside` of its area lies in
+    the other. Of two boxes of the same object a whole box is kept rather than a cut one. If both or neither are cut,
+    the box of the closer look is kept, and within a look the box with the higher score.
 
     Args:
-        glances: of one picture.
-        target: class 1..K, by its own score; None for the best class of each box.
-        score: boxes with a lower one are left out.
-        iou: intersection over union.
-        inside: share of the area of a box that is cut.
+        glances: looks at one picture.
+        target: class 1..K, whose score counts for every box; None takes the best class of each box.
+        score: boxes with a lower score are left out.
+        iou: intersection over union from which on two boxes are the same object.
+        inside: share of the area of a cut box from which on it is the same object.
 
     Returns:
-        Objects, most certain first.
+        Objects, most confident first.
+
+    >>> from semfov.detection import Detections
+    >>> from semfov.zoom.glances import Glance, Window
+    >>> def look(magnification, box):
+    ...     found = Detections(torch.tensor([[box]]), torch.tensor([[[0.3, 0.7]]]), torch.tensor([[True]]))
+    ...     window = Window((100.0, 100.0, magnification), 0, (0, 0, 8, 8))
+    ...     return Glance(window, found, torch.tensor([False]), torch.zeros(1), None)
+    >>> merge([look(0.2, [10.0, 10, 50, 50]), look(0.8, [11.0, 12, 51, 50])]).boxes
+    tensor([[11., 12., 51., 50.]])
     """
     boxes, scores, labels, cuts, passes, scale = [], [], [], [], [], []
     for turn, glance in enumerate(glances):
@@ -86,17 +106,19 @@ def merge(
 
 
 def _unlike(box: Tensor, label: Tensor, cut: Tensor, number: Tensor, iou: float, inside: float) -> Tensor:
-    """Which boxes stay when each, in order, drops those after it that are the same object."""
-    if not len(box):
-        return torch.zeros(0, dtype=torch.long)
-    low, high = torch.maximum(box[:, None, :2], box[None, :, :2]), torch.minimum(box[:, None, 2:], box[None, :, 2:])
-    area = (box[:, 2:] - box[:, :2]).prod(-1).clamp(min=1e-6)
-    part = (high - low).clamp(min=0).prod(-1) / area[None]
-    same = (box_iou(box, box) >= iou) | ((part >= inside) & cut[None] & (number[:, None] != number[None]))
-    same &= label[:, None] == label[None]
-    later = same.triu(1).numpy()
-    alive = np.ones(len(box), dtype=bool)
-    for first in range(len(box)):
-        if alive[first]:
-            alive &= ~later[first]
-    return torch.from_numpy(alive).nonzero()[:, 0]
+    """Indices of the boxes that stay when each one, in order, removes later ones that are the same object."""
+    corners, labels, looks = box.numpy(), label.numpy().astype(np.float64), number.numpy()
+    # Classes are moved apart, so that neighbours along x are of one class.
+    shift = labels * (2 * np.abs(corners).max(initial=0) + 1)
+    start, end = corners[:, 0] + shift, corners[:, 2] + shift
+    order = start.argsort(kind="stable")
+    one, other = neighbours(start[order], end[order])
+    one, other = order[one], order[other]
+    first, second = np.minimum(one, other), np.maximum(one, other)
+    x1, y1, x2, y2 = np.ascontiguousarray(corners.T)
+    shared, area = intersection(x1, y1, x2, y2, first, second), (x2 - x1) * (y2 - y1)
+    union = area[first] + area[second] - shared
+    same = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0) >= np.float32(iou)
+    part = shared / np.maximum(area, 1e-6)[second]
+    same |= (part >= np.float32(inside)) & cut.numpy()[second] & (looks[first] != looks[second])
+    return torch.from_numpy(survivors(len(box), first[same], second[same]))

@@ -1,4 +1,4 @@
-"""What looks say of closer ones by the observation model and the miss rates alone, without learned evidence."""
+"""Predictions of closer looks from an observation model and miss rates alone, without learned evidence."""
 
 import torch
 from torch import Tensor
@@ -12,28 +12,28 @@ from semfov.zoom.lattice import Lattice
 
 
 class ObservedRates:
-    r"""Expected finds of closer looks, by an observation model whose levels are magnifications.
+    r"""Expected number of objects that closer looks find, by an observation model whose levels are magnifications.
 
     A cell x whose hints have scores S in a look of octave d holds class t with the calibrated probability
-    :math:`P(t \mid S, d)`; one without hints, by the miss rates m and the shares π of the cells that hold each class,
-    with
+    :math:`P(t \mid S, d)`. For a cell without hints the probability follows from the miss rates m and from the shares π
+    of cells that hold each class:
 
     .. math:: P(t \mid \text{nothing}, d) = \frac{\pi_t \, m_{td}}{\sum_k \pi_k \, m_{kd}}
 
-    (background among the classes). A look of octave d' finds what was not found yet with
+    The sum includes background. A look of octave d' is expected to find this number of new objects:
 
     .. math:: \lambda_{d'}(x) = P(t \in x) \, (1 - m_{td'})
 
-    It stands where `GlimpseEvidence` does in `ZoomBelief` and `find_everything`, for comparison: what the classes and
-    the places of a picture tell of each other is not in it.
+    It can take the place of `GlimpseEvidence` in `ZoomBelief` and `find_everything`, for comparison. It does not use
+    relations between classes or between places of a picture.
 
     Args:
-        model: fitted on mosaics (`python -m train.fit_fom --mosaics N`).
-        lattice: of the picture.
-        foresight: as for `GlimpseEvidence`.
+        model: observation model that was fitted on mosaics (`python -m train.fit_fom --mosaics N`).
+        lattice: lattice of the picture.
+        foresight: share of what still closer looks would find in a window that counts towards its value.
 
     Raises:
-        InputError: the model has no miss rates, or does not know how many cells hold a class.
+        InputError: the model has no miss rates, or no counts of the cells that hold each class.
     """
 
     def __init__(self, model: FovealObservationModel, lattice: Lattice, *, foresight: float = 0.35) -> None:
@@ -45,7 +45,7 @@ class ObservedRates:
 
     @torch.no_grad()
     def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
-        """As `GlimpseEvidence.rates`; what earlier looks said plays no part."""
+        """As `GlimpseEvidence.rates`, but without the rates of earlier looks."""
         octaves = self.lattice.octaves
         here = octaves[look.level]
         scores = look.scores / look.scores.sum(-1, keepdim=True).clamp(min=1)
@@ -53,7 +53,7 @@ class ObservedRates:
         told = self.model.calibrate(seen, here.expand(seen.shape[:-1]))
         unseen = self.share * self.model.miss_likelihood(here)
         held = torch.where((look.scores > 0).any(-1, keepdim=True), told, unseen / unseen.sum())[..., 1:]
-        # An object lies about its centre, where the gist has it.
+        # The gist marks the cell of an object's centre; the object also covers the cells around it.
         known = F.max_pool2d(look.found.float().movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1)
         held = held * (1 - known) * look.scale**2
         rates = torch.zeros(len(targets), STEPS, *look.scores.shape[:2])
@@ -63,5 +63,5 @@ class ObservedRates:
         return (rates + 1e-9).log()
 
     def taper(self, span: int) -> Tensor:
-        """Every cell of a window counts alike, `(span,)`."""
+        """Weights of the cells along a side of a window, `(span,)`: ones."""
         return torch.ones(span)

@@ -1,95 +1,98 @@
-"""Where to look next, and how close: what a pass is worth."""
+"""Policies of where to look next, and how closely: the value of a look at each window."""
 
 from collections.abc import Callable, Sequence
+from functools import reduce
 
+import numpy as np
 import torch
-from torch import Tensor
-from torch.nn import functional as F
 
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.glances import Window, on_lattice
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.sums import Cells
 
 Choice = tuple[Window, float]
-"""A window, and what a look at it is worth."""
+"""A window and the value of a look at it."""
 
 
 def best_find(belief: ZoomBelief, done: set[Window], foresight: float = 0.0) -> Choice | None:
-    """The window in which a pass finds most objects that were not found yet; None where nothing is left.
+    r"""Choose the window in which a look is expected to find most objects that were not found yet.
 
-    .. math:: v(w) = E[n_k(w)] + \\kappa \\, E[n_{k+1}(w)]
+    .. math:: v(w) = E[n_k(w)] + \kappa \, E[n_{k+1}(w)]
 
-    for windows w of all levels k but the first; κ is the `foresight`. The second term counts cells alone that were not
-    looked at from level k yet: a look at the others tells nothing new of where to look closer.
+    for windows w of all levels k but the first. The second term counts only cells that were not looked at from level k
+    yet: a look at the other cells gives no new information about where to look more closely.
+
+    Args:
+        belief: belief about the objects that are looked for.
+        done: windows that were looked at.
+        foresight: κ, share of what looks one octave closer would find that counts.
+
+    Returns:
+        The window and its value; None if nothing is left to find.
     """
     lattice = belief.lattice
     best: Choice | None = None
     for level in range(1, lattice.levels):
-        values = belief.finds(level)
-        if foresight and level + 1 < lattice.levels:
-            values = values + foresight * _deeper(belief, level)
-        best = _better(best, values, level, lattice, done)
+        best = _better(best, belief.value(level, foresight), level, lattice, done)
     return best
 
 
-def _deeper(belief: ZoomBelief, level: int) -> Tensor:
-    """What looks one octave closer would find in each window of a level."""
-    span = belief.lattice.span(level)
-    image = (belief.expected(level + 1) * (belief.source < level))[None, None]
-    wide, high = (max(span - n, 0) for n in (belief.lattice.columns, belief.lattice.rows))
-    line = torch.ones(1, 1, 1, span)
-    return F.conv2d(F.conv2d(F.pad(image, (0, wide, 0, high)), line), line.mT)[0, 0]
-
-
 def best_hit(belief: ZoomBelief, done: set[Window], *, closest: bool = False) -> Choice | None:
-    """The window that most probably shows the target, or one from which it would soon be found; None for none.
+    """Choose the window that most probably shows the target, or one after which the target is soon found.
 
-    A window is worth the probability that it shows the target. If it is not as close as it could be, it is worth the
-    sum of these probabilities over the closer windows in it, divided by `patience`, where that is more.
+    The value of a window is the probability that it shows the target. For windows that can be looked at more closely it
+    is the sum of these probabilities over the closer windows in it, divided by `patience`, if that is larger.
 
     Args:
-        belief: about the target.
+        belief: belief about the target.
         done: windows that were looked at.
-        closest: whether only the closest windows can confirm the target.
+        closest: whether only windows of the last level can confirm the target.
+
+    Returns:
+        The window and its value; None if no window can show the target.
     """
     lattice, patience = belief.lattice, belief.evidence.patience
     best: Choice | None = None
     for level in range(1, lattice.levels):
         last = level == lattice.levels - 1
-        values = torch.zeros(lattice.places(level)[::-1])
-        if last or not closest:
-            values = belief.odds(level).sigmoid()
+        values = belief.chances(level)
+        if closest and not last:
+            values = np.zeros_like(values)
         if not last:
-            deeper = _sums(belief, level)
-            values = torch.maximum(values, deeper / patience)
+            values = np.maximum(values, _sums(belief, level) / np.float32(patience))
         best = _better(best, values, level, lattice, done)
     return best
 
 
-def _sums(belief: ZoomBelief, level: int) -> Tensor:
-    """Sum over the closer windows, side by side, in each window of a level that was not looked at as closely yet."""
-    lattice = belief.lattice
+def _sums(belief: ZoomBelief, level: int) -> Cells:
+    """Sum the chances of closer windows, side by side, in each window of a level.
+
+    Closer windows whose middle was looked at from this level already count as 0.
+
+    Returns:
+        `(down, across)`; where several levels are closer, the largest of their sums.
+    """
+    lattice, source = belief.lattice, belief.source.numpy()
     down, across = lattice.places(level)[::-1]
-    total = torch.zeros(down, across)
+    total = np.zeros((down, across), np.float32)
     for deeper in range(level + 1, lattice.levels):
-        odds = belief.odds(deeper)
+        chances = belief.chances(deeper)
         span, times = lattice.span(deeper), 1 << (deeper - level)
         half = span // 2
-        source = belief.source[half : half + odds.shape[0], half : half + odds.shape[1]]
-        source = F.pad(source[None].float(), (0, odds.shape[1] - source.shape[1], 0, odds.shape[0] - source.shape[0]),
-                       value=torch.inf)[0]  # fmt: skip
-        table = odds.sigmoid() * (source < level)
-        high, wide = ((times - 1) * span + n for n in (down, across))
-        table = F.pad(table, (0, max(wide - table.shape[1], 0), 0, max(high - table.shape[0], 0)))
-        sums = F.conv2d(table[None, None], torch.ones(1, 1, times, times), dilation=span)[0, 0]
-        total = torch.maximum(total, sums[:down, :across])
+        middle = source[half : half + chances.shape[0], half : half + chances.shape[1]]
+        rows, columns = middle.shape
+        # Windows of the level can reach beyond the picture, where there are no closer windows: zeros.
+        table = np.zeros([max((times - 1) * span + n, m) for n, m in ((down, rows), (across, columns))], np.float32)
+        np.multiply(chances[:rows, :columns], middle < level, out=table[:rows, :columns])
+        lines = reduce(np.add, (table[span * n : span * n + down] for n in range(times)))
+        total = np.maximum(total, reduce(np.add, (lines[:, span * n : span * n + across] for n in range(times))))
     return total
 
 
-def _better(best: Choice | None, values: Tensor, level: int, lattice: Lattice, done: set[Window]) -> Choice | None:
-    """The better of a choice and of the windows of a level that were not looked at."""
-    flat = values.flatten()
-    across = values.shape[1]
+def _better(best: Choice | None, values: Cells, level: int, lattice: Lattice, done: set[Window]) -> Choice | None:
+    """The better of a choice and the best window of a level that was not looked at."""
+    flat, across = values.ravel(), values.shape[1]
     for _ in range(len(done) + 1):
         place = int(flat.argmax())
         value = float(flat[place])
@@ -98,13 +101,13 @@ def _better(best: Choice | None, values: Tensor, level: int, lattice: Lattice, d
         window = on_lattice(lattice, (level, place % across, place // across))
         if window not in done:
             return window, value
-        flat = flat.clone()
-        flat[place] = -torch.inf
+        flat = flat.copy()
+        flat[place] = -np.inf
     return best
 
 
 def best_slice(belief: ZoomBelief, slices: Sequence[Window], done: set[Window]) -> Choice | None:
-    """As `best_hit`, where only the given slices can confirm the target, and what is coarser is on the lattice."""
+    """As `best_hit`, but only given slices can confirm the target; coarser windows are those of the lattice."""
     odds = {window: belief.odds_of(window) for window in slices if window not in done}
     if not odds:
         return None
@@ -133,7 +136,7 @@ def _inside(window: Window, other: Window) -> bool:
 
 
 def _coarser(belief: ZoomBelief, window: Window, level: int) -> bool:
-    """Whether the middle of a window was only looked at from farther off than a level."""
+    """Tell whether the middle of a window was only looked at from coarser levels than a given one."""
     x1, y1, x2, y2 = window.cells
     row = min(max((y1 + y2) // 2, 0), belief.lattice.rows - 1)
     column = min(max((x1 + x2) // 2, 0), belief.lattice.columns - 1)
@@ -143,13 +146,16 @@ def _coarser(belief: ZoomBelief, window: Window, level: int) -> bool:
 def jointly(
     choose: Callable[[set[Window]], Choice | None], belief: ZoomBelief, done: set[Window], count: int
 ) -> list[Choice]:
-    """Several windows to look at together, none in another's place: each is chosen as if those before it were seen.
+    """Choose several windows to look at together, each as if the windows before it had been looked at.
 
     Args:
-        choose: the next window, given those that were looked at.
-        belief: what it goes by; as it was, afterwards.
+        choose: policy that returns the next window, given the windows that were looked at.
+        belief: belief that the policy uses. It is changed for the choice and set back afterwards.
         done: windows that were looked at.
-        count: how many, at most.
+        count: largest number of windows.
+
+    Returns:
+        The windows and their values.
     """
     if count == 1:
         choice = choose(done)

@@ -1,4 +1,4 @@
-"""Searching and exploring pictures larger than a detector's input."""
+"""Searching and exploring pictures that are larger than the detector's input."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -20,23 +20,28 @@ from semfov.zoom.policy import Choice, best_find, best_hit, best_slice, jointly
 from semfov.zoom.tally import Tally
 
 DEFAULTS = Thresholds(0.9, 0.005)
-"""For evidence without any."""
+"""Thresholds of searches whose evidence has none."""
 
 
 @dataclass(frozen=True, repr=False)
 class ZoomPath:
-    """The record of a search in, or an exploration of, a large picture.
+    """The record of a search or an exploration of a large picture.
 
     In a notebook it shows the windows that were looked at; `semfov.viz.plot_zoom_path` draws them on the picture.
 
     Attributes:
-        lattice: of the picture.
+        lattice: lattice of the picture.
         classes: names of the classes, background first.
-        target: class that was searched for; None for an exploration.
-        glances: looks in order, the overview first.
-        values: what each was worth when it was chosen; the overview's is infinite.
-        objects: found, merged from all glances.
-        decision: what a search decided; None where everything was to be found.
+        target: class that was searched for; None for all classes.
+        glances: looks in their order, the overview first.
+        values: value of each look when it was chosen; that of the overview is infinite.
+        objects: objects that were found, merged from all looks.
+        decision: decision of a search; None where all objects were to be found.
+
+    >>> nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
+    >>> path = ZoomPath(Lattice.over((2560, 1920), (416, 416)), ("background", "cup"), 1, (), (), nothing)
+    >>> path.describe()
+    '0 × cup in 0 passes'
     """
 
     lattice: Lattice
@@ -49,11 +54,15 @@ class ZoomPath:
 
     @property
     def passes(self) -> int:
-        """Passes of the detector."""
+        """Number of passes of the detector."""
         return len(self.glances)
 
     def describe(self) -> str:
-        """What came of it, in a sentence."""
+        """Summarise the result.
+
+        Returns:
+            A line of text.
+        """
         count = len(self.objects.above(FOUND))
         passes = f"{self.passes} pass{'es' if self.passes != 1 else ''}"
         if self.decision is not None and self.target is not None:
@@ -64,7 +73,14 @@ class ZoomPath:
         return f"{count} × {self.classes[self.target]} in {passes}"
 
     def shown(self, number: int) -> tuple[float, float, float, float]:
-        """What of the picture a look showed, `(x1, y1, x2, y2)` in pixels."""
+        """Part of the picture that a look showed.
+
+        Args:
+            number: number of the look; the overview is 0.
+
+        Returns:
+            `(x1, y1, x2, y2)` in picture pixels.
+        """
         window, (width, height) = self.glances[number].window, self.lattice.size
         if window.within is not None:
             return window.within
@@ -74,7 +90,7 @@ class ZoomPath:
         return max(x - across, 0.0), max(y - down, 0.0), min(x + across, float(width)), min(y + down, float(height))
 
     def __repr__(self) -> str:
-        """What came of it, where it looked, and what it found."""
+        """The result, the windows and the objects."""
         looks = [f"({x:.0f}, {y:.0f}) × {m:.2f}" for x, y, m in (glance.window.fixation for glance in self.glances)]
         path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
         sure = self.objects.above(FOUND)
@@ -93,19 +109,19 @@ class ZoomPath:
         )
 
     def _repr_html_(self) -> str:
-        """Windows, numbered in their order, and objects."""
+        """A drawing of the windows, numbered in their order, and of the objects."""
         windows = [self.shown(number) for number in range(self.passes)]
         return path_html(self.describe(), self.lattice.size, windows, self.objects, self.classes)
 
 
 class Turn(NamedTuple):
-    """A look of a search.
+    """A turn of a search: one look.
 
     Attributes:
-        glance: what it shows.
-        worth: what it was worth when it was chosen.
-        ahead: what the best look that is left is worth now.
-        belief: after it.
+        glance: result of the look.
+        worth: value of the look when it was chosen.
+        ahead: value of the best look that is left after it.
+        belief: belief after it.
     """
 
     glance: Glance
@@ -124,16 +140,19 @@ def look_for(
     closest: bool = False,
     context: WindowContext | None = None,
 ) -> Iterator[Turn]:
-    """Look for one object of a class, glance by glance; ends when a look confirms it, or nothing is left to look at.
+    """Look for one object of a class, look by look, until a look confirms it or nothing is left to look at.
 
     Args:
-        glances: of the picture.
-        evidence: learned, by magnification.
+        glances: source of looks at the picture.
+        evidence: learned evidence by magnification.
         target: class 1..K.
-        confirm: score that confirms it.
-        slices: if given, only looks at these confirm it; else looks at all magnifications do.
-        closest: only looks at the largest magnification confirm it.
-        context: what else is known of what is beside what.
+        confirm: score from which on a look confirms the target.
+        slices: windows that can confirm the target; None lets windows of all magnifications confirm it.
+        closest: whether only windows of the last level can confirm it.
+        context: which classes stand beside each other; None leaves it out.
+
+    Yields:
+        Each turn.
     """
     belief, done = ZoomBelief(glances.lattice, evidence, target, context), set[Window]()
     window, worth = on_lattice(glances.lattice, (0, 0, 0)), float("inf")
@@ -154,17 +173,17 @@ def look_for(
 def find_everything(
     glances: Glances, evidence: Rates, target: int | None = None, *, batch: int = 1, worth: float = 0.0
 ) -> Iterator[tuple[Glance, float]]:
-    """Look for all objects of a class, or of any, glance by glance, until no look is worth its price.
+    """Look for all objects of a class, or of all classes, look by look, until no look promises enough.
 
     Args:
-        glances: of the picture.
-        evidence: learned, by magnification.
-        target: class 1..K; None for any.
-        batch: looks that are chosen, and taken, together.
-        worth: new objects that a look must be expected to find.
+        glances: source of looks at the picture.
+        evidence: learned evidence by magnification.
+        target: class 1..K; None for all classes.
+        batch: number of windows that are chosen jointly and looked at together.
+        worth: the exploration ends when no look is expected to find more new objects than this.
 
     Yields:
-        The glance, and how many new objects it was expected to find.
+        The result of each look, and the number of new objects that it was expected to find.
     """
     belief, done = ZoomBelief(glances.lattice, evidence, target or 0), set[Window]()
     chosen: list[Choice] = [(on_lattice(glances.lattice, (0, 0, 0)), float("inf"))]
@@ -188,21 +207,26 @@ def search(
     give_up: float | None = None,
     context: WindowContext | None = None,
 ) -> ZoomPath:
-    """Search a picture for one object of a class, and decide (`semfov.decision.settle`).
+    """Search a picture for one object of a class and decide whether it is there (`semfov.decision.settle`).
 
-    It is `found` when the picture holds it with a probability of `confirm`, and a detection shows it. When no look is
-    worth `give_up` any more, it is `absent` if the picture rather does not hold it, else `undecided`; so it is, too,
-    when the passes are spent.
+    The target is `found` when the picture holds it with a probability of at least `confirm` and a detection shows it.
+    When the value of every look that is left is below `give_up`, the target is `absent` if its probability is below one
+    half, and the search is `undecided` otherwise. It is also `undecided` when the passes are used up.
 
     Args:
-        glances: of the picture.
-        evidence: learned, by magnification.
-        classes: names, background first.
+        glances: source of looks at the picture.
+        evidence: learned evidence by magnification.
+        classes: names of the classes, background first.
         target: class 1..K.
-        passes: of the detector, at most.
-        confirm: probability that the picture holds the target (None: the evidence's).
-        give_up: probability that a look shows it (None: the evidence's).
-        context: as for `look_for`.
+        passes: largest number of passes of the detector.
+        confirm: probability that the picture holds the target, from which on it is found; None takes the threshold of
+            the evidence.
+        give_up: probability that a look shows the target, below which no look is worth a pass; None takes the threshold
+            of the evidence.
+        context: which classes stand beside each other; None leaves it out.
+
+    Returns:
+        The looks, the objects of the class, and the decision.
     """
     thresholds = (evidence.thresholds or DEFAULTS).changed(confirm, give_up)
     seen: list[Glance] = []
@@ -241,9 +265,19 @@ def find_all(
     batch: int = 1,
     worth: float = 0.01,
 ) -> ZoomPath:
-    """Find all objects of a class, or of any, with so many passes of the detector at most.
+    """Find all objects of a class, or of all classes, with a limited number of passes of the detector.
 
-    Arguments as for `search` and `find_everything`.
+    Args:
+        glances: source of looks at the picture.
+        evidence: learned evidence by magnification.
+        classes: names of the classes, background first.
+        target: class 1..K; None for all classes.
+        passes: largest number of passes of the detector.
+        batch: number of windows that are chosen jointly and looked at together.
+        worth: the exploration ends when no look is expected to find more new objects than this.
+
+    Returns:
+        The looks and the objects.
     """
     seen: list[Glance] = []
     values: list[float] = []

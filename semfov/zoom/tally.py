@@ -1,4 +1,4 @@
-"""What the looks of a search tell, taken together: whether the picture holds the target at all."""
+"""Summary of all looks of a search, from which the presence of the target in the picture is predicted."""
 
 import math
 
@@ -12,14 +12,14 @@ from semfov.zoom.glances import Glance
 
 
 class Tally:
-    """What has been seen of a class in a picture, and what is left to see.
+    """What the looks of a search have shown of the target, and what is left to see.
 
     Args:
-        belief: of the search, which takes account of every look before the tally does.
+        belief: belief of the search; it is updated with each look before the tally is.
 
     Attributes:
-        best: highest score of the class in any look.
-        box: `(4,)`, of the detection that says most of it; None where none does.
+        best: highest score of the target in any look.
+        box: `(4,)`, box of the detection with the highest score of the target; None if there is none.
     """
 
     def __init__(self, belief: ZoomBelief) -> None:
@@ -32,7 +32,7 @@ class Tally:
     box: Tensor | None
 
     def add(self, glance: Glance) -> None:
-        """Count a look."""
+        """Update the summary with the result of a look."""
         target = self.belief.target
         score = float(glance.show[target - 1])
         self.best, self._second = max(self.best, score), max(min(self.best, score), self._second)
@@ -53,19 +53,23 @@ class Tally:
 
     @property
     def looked(self) -> bool:
-        """Whether a detection shows the class, so that there is something to be named as found."""
+        """Whether a detection shows the target, so that a search can name a box as found."""
         return self._found >= FOUND
 
     def case(self, ahead: float) -> Tensor:
-        """What the looks tell of the class, `(11,)`, for `GlimpseEvidence.anywhere`.
+        """Facts about the search for `GlimpseEvidence.anywhere`.
 
-        The highest and the second highest score of a look; the highest of the closest looks, of the overview, and of a
-        detection that is rather of this class than of another; how many looks showed it with a score of 0.1. What
-        another look is worth; how many objects closest looks are expected to find still, and were after the overview;
-        what share of the picture is left to see; and how many looks there were.
+        As features of scores: the highest and the second highest score of the target in a look, the highest in a look
+        of the last level, the score in the overview, the highest of a detection whose best class is the target, and the
+        value of the best look that is left. As logarithms: the number of objects that looks of the last level are still
+        expected to find, and the same after the overview. Then the share of the picture that is left to see. As
+        logarithms: the number of looks with a score of 0.1 or more, and the number of looks.
 
         Args:
-            ahead: what the best look that is left is worth.
+            ahead: value of the best look that is left.
+
+        Returns:
+            `(11,)`.
         """
         scores = [self.best, self._second, self._closest, self._first, self._named, ahead]
         hints = features(torch.tensor(scores, dtype=torch.float32))
@@ -74,11 +78,18 @@ class Tally:
         return torch.cat([hints, torch.tensor([*left, float(self.belief.left.mean()), *counts])])
 
     def _left(self) -> float:
-        """Objects that closest looks are expected to find."""
+        """Number of objects that looks of the last level are expected to find."""
         return float(self.belief.expected(self.belief.lattice.levels - 1).sum())
 
     @torch.no_grad()
     def presence(self, ahead: float) -> float:
-        """Probability that the picture holds the class; arguments as for `case`."""
+        """Predict whether the picture holds the target.
+
+        Args:
+            ahead: value of the best look that is left.
+
+        Returns:
+            The probability.
+        """
         odds = self.belief.evidence.anywhere(torch.tensor(self.best), self.case(ahead))
         return float(odds.sigmoid())

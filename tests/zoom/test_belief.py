@@ -1,5 +1,6 @@
 """Belief and policy: sums against plain loops, what was seen is not looked at again, joint batches."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,6 +12,7 @@ from semfov.zoom.evidence import pool, pool_all
 from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.policy import best_find, best_hit, jointly
+from semfov.zoom.sums import WindowSums
 
 
 @pytest.fixture
@@ -42,6 +44,30 @@ def test_finds_are_tapered_sums(belief, evidence):
             part = cells[row : row + span, column : column + span]
             weight = taper[: part.shape[0], None] * taper[None, : part.shape[1]]
             torch.testing.assert_close(values[row, column], (part * weight).sum())
+
+
+def test_sums_that_are_kept_are_those_computed_anew():
+    generator = np.random.default_rng(0)
+    for span, shape in ((3, (9, 14)), (8, (20, 8)), (16, (5, 40))):
+        weight, cells = generator.random(span, np.float32), generator.random(shape, np.float32)
+        kept = WindowSums(weight, shape)
+        for _ in range(6):
+            padded = np.pad(cells, [(0, max(span - n, 0)) for n in shape])
+            windows = np.lib.stride_tricks.sliding_window_view(padded, (span, span))
+            expected = np.einsum("ijkl,k,l->ij", windows.astype(np.float64), weight, weight)
+            np.testing.assert_allclose(kept(cells), expected, rtol=1e-5)
+            cells, row, column = cells.copy(), generator.integers(shape[0]), generator.integers(shape[1])
+            cells[row : row + 2, column : column + 3] = generator.random()
+
+
+@pytest.mark.parametrize("size", [(4096, 200), (4096, 530), (300, 4096)])
+def test_long_pictures_are_searched(detector, evidence, size):
+    """Windows of some levels are higher than the picture there, and cells of coarse looks reach beyond the last one."""
+    image = torch.rand(3, size[1], size[0], generator=torch.Generator().manual_seed(0)) * 0.6
+    agent = ZoomAgent(ZoomEye(detector), evidence)
+    path = agent.search(image, "red", passes=10, confirm=1.0, give_up=0.0)
+    assert path.passes == 10
+    assert path.lattice.levels > 4
 
 
 def test_pooling_of_all_windows_is_pooling_of_each():

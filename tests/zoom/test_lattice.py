@@ -31,6 +31,14 @@ def test_actions_are_numbered():
         assert lattice.number(*lattice.actions[number].tolist()) == number
 
 
+@given(sizes)
+def test_one_fixation_is_a_row_of_all(size):
+    lattice = Lattice.over(size, (416, 320))
+    some = lattice.actions[:: max(len(lattice) // 20, 1)]
+    fixations = [lattice.fixation(*action) for action in some.tolist()]
+    assert torch.equal(torch.tensor(fixations), lattice.fixations(some))
+
+
 def test_fixations_are_centres_of_boxes():
     lattice = Lattice.over((3840, 2160), (416, 416))
     boxes, fixations = lattice.boxes(lattice.actions), lattice.fixations(lattice.actions)

@@ -1,0 +1,45 @@
+"""Boxes that are nearly the same, found among neighbours, beside torchvision, which compares all boxes."""
+
+import numpy as np
+import pytest
+import torch
+from torchvision.ops import nms
+
+from semfov.detection.near_duplicates import distinct, neighbours
+
+
+def crowd(count, seed, extent=400.0):
+    """Boxes around a few places, so that many are nearly the same; of very different sizes, beyond the border too."""
+    generator = np.random.default_rng(seed)
+    places = generator.uniform(-50, extent, (max(count // 6, 1), 2))
+    sizes = np.exp(generator.uniform(0, 6, (len(places), 2)))
+    chosen = generator.integers(len(places), size=count)
+    shift = generator.normal(0, 0.01, (count, 4)) * sizes[chosen][:, [0, 1, 0, 1]]
+    corner = places[chosen]
+    return (np.concatenate([corner, corner + sizes[chosen]], 1) + shift).astype(np.float32)
+
+
+@pytest.mark.parametrize("iou", [0.9, 0.95, 0.99, 1.0])
+@pytest.mark.parametrize("count", [1, 300])
+def test_survivors_are_those_of_torchvision(count, iou):
+    dropped = 0
+    for seed in range(10):
+        boxes = crowd(count, seed)
+        expected = nms(torch.from_numpy(boxes), torch.arange(count, 0, -1.0), iou)
+        assert distinct(boxes, iou).tolist() == expected.tolist()
+        dropped += count - len(expected)
+    assert (dropped > 0) == (count == 300 and iou < 1)
+
+
+def test_no_boxes_are_no_survivors():
+    assert distinct(np.zeros((0, 4), np.float32), 0.95).tolist() == []
+
+
+def test_neighbours_are_all_intervals_that_meet():
+    generator = np.random.default_rng(0)
+    start = np.sort(generator.uniform(0, 10, 40))
+    end = start + generator.exponential(1.0, 40)
+    expected = {(i, j) for i in range(40) for j in range(i + 1, 40) if start[j] <= end[i]}
+    found = list(zip(*(index.tolist() for index in neighbours(start, end)), strict=True))
+    assert len(found) == len(set(found))
+    assert set(found) == expected
