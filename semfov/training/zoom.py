@@ -1,8 +1,10 @@
 """Fitting evidence by magnification on mosaics of photographs."""
 
+import json
 import logging
 import random
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.data.mosaics import Mosaics
+from semfov.errors import check
 from semfov.experiments.parallel import available_cores, run_tasks
 from semfov.experiments.run import cache_folder
 from semfov.experiments.setup import make_detector, prepare_worker, split_photographs
@@ -19,16 +22,22 @@ from semfov.experiments.zoom import SHOWN
 from semfov.experiments.zoom_store import GlanceStore, open_scene
 from semfov.io.files import inside
 from semfov.training.outputs import training_of, write_outputs
-from semfov.training.zoom_choice import choose, open_all
+from semfov.training.zoom_choice import choose_foresight, choose_patience, open_all
 from semfov.training.zoom_decision import fit_judge, judge_searches, search_mosaics
 from semfov.training.zoom_examples import LookedAt, ZoomExample, example_of, windows_of
-from semfov.training.zoom_settings import FitZoomConfig
+from semfov.training.zoom_settings import FitZoomConfig, Part
+from semfov.training.zoom_survey import SurveyExample, fit_survey, judge_survey
 from semfov.zoom.belief import before_of
-from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
+from semfov.zoom.evidence import GlimpseEvidence, pool
 from semfov.zoom.eye import ZoomEye
+from semfov.zoom.networks import STEPS
+from semfov.zoom.survey import Survey
 
 DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", "tile", "seed")
 """Settings that thresholds and the probability of presence depend on."""
+
+SURVEYING = ("mosaics", "far", "judged", "judged_far", "survey_steps", "tile", "seed")
+"""Settings that the survey depends on."""
 
 _log = logging.getLogger(__name__)
 
@@ -191,7 +200,7 @@ def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
     """Negative log likelihood of what was found in the windows of a mosaic, for some of its classes."""
     shown = torch.stack([look.show for look in example.looks]).amax(0)
     sure, faint = (shown >= SHOWN).nonzero()[:, 0] + 1, ((shown >= 0.02) & (shown < SHOWN)).nonzero()[:, 0] + 1
-    targets = torch.cat([torch.zeros(1).long(), _some(sure, 8), _some(faint, 4)])
+    targets = torch.cat([_some(sure, 8), _some(faint, 4)])
     looks = [look for look in example.looks if look.gist is not None]
     overview, *others = looks
     logs = _logs(model, overview, targets, None)
@@ -257,25 +266,33 @@ def fit_zoom(config: FitZoomConfig) -> None:
     store = make_store(config, eye)
     parts: list[str] = []
     figures = "{}"
+    check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
+    refit: set[Part] = set(config.refit) if config.evidence else {"decision", "survey"}
+    examples = look_at_all(config, eye, mosaics, store) if "survey" in refit else {}
     if config.evidence is None:
-        model, examples = fit_looks(config, eye, mosaics, store)
-        tried = choose(model, eye, mosaics["judged"], mosaics["judged far"], store)
-        text, figures = judge(model, examples)
-        chosen = f"Chosen: foresight {model.foresight:g}, patience {model.patience:g}."
-        parts += [text, chosen, "", *table_of(tried), ""]
+        model = fit_looks(config, eye, mosaics, examples)
+        text, figures = judge(model, examples["judged"])
+        tried = choose_patience(model, eye, mosaics["judged"], store)
+        parts += [text, f"Chosen: patience {model.patience:g}.", "", *table_of(tried), ""]
     else:
         model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
         model.check_compatible(eye.settings())
-    parts += fit_decision(config, model, eye, mosaics, store)
+    if "survey" in refit:
+        told = survey_again(config, model, examples)
+        figures = json.dumps({**json.loads(figures), **told}, indent=1)
+        tried = choose_foresight(model, eye, mosaics["judged"], mosaics["judged far"], store)
+        parts += [*figures_of(told), "", f"Chosen: foresight {model.survey.foresight:g}.", "", *table_of(tried), ""]
+    if "decision" in refit:
+        parts += fit_decision(config, model, eye, mosaics, store)
     path = inside(config.out, f"{eye.detector.name}.safetensors")
     model.save(path)
     write_outputs(config, "\n".join(parts), ("figures.json", figures), path)
 
 
-def fit_looks(
+def look_at_all(
     config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
-) -> tuple[GlimpseEvidence, list[ZoomExample]]:
-    """The model of what looks say of closer ones, and examples that were held out."""
+) -> dict[str, list[ZoomExample]]:
+    """Look at the mosaics to fit on and at those that were held out; returns the results by kind of mosaic."""
     looked = {kind: mosaics[kind] for kind in ("near", "far", "judged")}
     todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
     workers = config.workers or available_cores()
@@ -283,15 +300,35 @@ def fit_looks(
                        unit="mosaic"):  # fmt: skip
         pass
     prepare_worker()
+    return {kind: read_examples(some, store, eye) for kind, some in looked.items()}
+
+
+def fit_looks(
+    config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics], examples: dict[str, list[ZoomExample]]
+) -> GlimpseEvidence:
+    """Fit what looks predict of closer ones, class by class."""
     torch.manual_seed(config.seed)
     random.seed(config.seed)
-    examples = {kind: read_examples(some, store, eye) for kind, some in looked.items()}
     metadata = {**eye.settings(), **training_of(config, mosaics["near"], "judged")}
     model = GlimpseEvidence(len(eye.detector.classes), metadata=metadata)
     known = examples["near"] + examples["far"]
     fit_presence(model, table(known), config.steps)
     fit_rates(model, known, config.steps)
-    return model.eval().requires_grad_(False), examples["judged"]
+    return model.eval().requires_grad_(False)
+
+
+def survey_again(
+    config: FitZoomConfig, model: GlimpseEvidence, examples: dict[str, list[ZoomExample]]
+) -> dict[str, float]:
+    """Fit a new survey, and judge it on mosaics that were held out."""
+    torch.manual_seed(config.seed)
+    random.seed(config.seed)
+    survey = Survey(model.classes, foresight=model.survey.foresight)
+    kinds = {kind: [SurveyExample.of(example) for example in some] for kind, some in examples.items()}
+    fit_survey(survey, kinds["near"] + kinds["far"], config.survey_steps)
+    model.survey = survey.eval().requires_grad_(False)
+    model.metadata["survey"] = {name: getattr(config, name) for name in SURVEYING}
+    return judge_survey(survey, kinds["judged"])
 
 
 def fit_decision(
@@ -332,8 +369,6 @@ def fit_decision(
 @torch.no_grad()
 def judge(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str]:
     """Report on mosaics that were held out, as Markdown and as JSON."""
-    import json
-
     windows = table(examples)
     first, later = (windows.before < 0).nonzero()[:, 0], (windows.before >= 0).nonzero()[:, 0]
     figures: dict[str, float] = {"cross-entropy, overview": float(_presence_loss(model, windows, first))}
@@ -355,5 +390,10 @@ def judge(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str
     losses = torch.stack([rate_loss(model, example) for example in examples])
     figures["rates, mean negative log likelihood"] = float(losses.mean())
     lines = [f"{len(examples)} mosaics of photographs that were held out", ""]
-    lines += ["| what | value |", "|---|---|", *(f"| {name} | {value:.4f} |" for name, value in figures.items()), ""]
+    lines += [*figures_of(figures), ""]
     return "\n".join(lines), json.dumps(figures, indent=1)
+
+
+def figures_of(figures: Mapping[str, float]) -> list[str]:
+    """Figures as a table in Markdown."""
+    return ["| what | value |", "|---|---|", *(f"| {name} | {value:.4f} |" for name, value in figures.items())]

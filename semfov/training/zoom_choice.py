@@ -1,4 +1,4 @@
-"""Choosing how evidence by magnification is gone by, on mosaics that were held out: `foresight` and `patience`."""
+"""Choosing `foresight` and `patience` of evidence by magnification on mosaics that were held out."""
 
 from collections.abc import Sequence
 from itertools import islice
@@ -20,50 +20,61 @@ PATIENCES = (1.5, 1.9, 2.3, 2.8, 3.5)
 
 
 @torch.inference_mode()
-def choose(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, far: Mosaics, store: GlanceStore) -> list[list[str]]:
-    """Set `foresight` to the one by which most is found, and `patience` to the one by which a class is found soonest.
+def choose_foresight(
+    model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, far: Mosaics, store: GlanceStore
+) -> list[list[str]]:
+    """Set the `foresight` of the survey to the one with which most objects are found.
 
-    Found is the mean recall over as many passes as a mosaic has photographs, and one; in kinds of mosaics that differ
-    in how much there is to find, as a share of the most that any foresight finds. Soonest is the mean number of passes
-    until a photograph is looked at that shows the class.
+    The measure is the mean recall over as many passes as a mosaic has photographs, and one. The two kinds of mosaics
+    differ in how much there is to find, so that each recall counts as a share of the highest one of its kind.
 
     Args:
-        model: to set both of.
-        eye: that looks.
+        model: the model; its survey's foresight is set.
+        eye: eye that looks.
         near: mosaics of few photographs.
         far: mosaics of many.
         store: where looks are kept.
 
     Returns:
-        A table of what was tried.
+        A table of the values that were tried.
     """
     kinds = near, far
     opened = [open_all(eye, mosaics, store) for mosaics in kinds]
     objects = [[mosaics.annotation(n) for n in range(len(mosaics))] for mosaics in kinds]
-    rows = [["setting", "value", "recall, near", "recall, far", "passes to the first hit"]]
+    rows = [["foresight", "recall, near", "recall, far"]]
     recalls: dict[float, list[float]] = {}
     for value in tqdm(FORESIGHTS, desc="choosing foresight", unit="value", dynamic_ncols=True):
-        model.foresight = value
+        model.survey.foresight = value
         recalls[value] = [
             mean_recall(model, looks, annotations, len(mosaics.tiles(0)) + 1)
             for looks, annotations, mosaics in zip(opened, objects, kinds, strict=True)
         ]
-        rows.append(["foresight", f"{value:g}", *(f"{recall:.4f}" for recall in recalls[value]), ""])
+        rows.append([f"{value:g}", *(f"{recall:.4f}" for recall in recalls[value])])
         for glances in (*opened[0], *opened[1]):
             glances.save()
     most = [max(*values, 1e-9) for values in zip(*recalls.values(), strict=True)]
     share = {value: sum(r / m for r, m in zip(told, most, strict=True)) for value, told in recalls.items()}
-    model.foresight = max(share, key=share.__getitem__)
-    slots = [[around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened[0])]
+    model.survey.foresight = max(share, key=share.__getitem__)
+    return rows
+
+
+@torch.inference_mode()
+def choose_patience(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, store: GlanceStore) -> list[list[str]]:
+    """Set `patience` to the one with which a class is found soonest.
+
+    The measure is the mean number of passes until a photograph is looked at that shows the class. Arguments and result
+    as for `choose_foresight`.
+    """
+    opened = open_all(eye, near, store)
+    slots = [[around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened)]
     passes: dict[float, float] = {}
     for value in tqdm(PATIENCES, desc="choosing patience", unit="value", dynamic_ncols=True):
         model.patience = value
-        passes[value] = mean_passes(model, opened[0], slots)
-        rows.append(["patience", f"{value:g}", "", "", f"{passes[value]:.3f}"])
-        for glances in opened[0]:
+        passes[value] = mean_passes(model, opened, slots)
+        for glances in opened:
             glances.save()
     model.patience = min(passes, key=passes.__getitem__)
-    return rows
+    return [["patience", "passes to the first hit"], *([f"{value:g}", f"{n:.3f}"] for value, n in passes.items())]
 
 
 def open_all(eye: ZoomEye, mosaics: Mosaics, store: GlanceStore) -> list[StoredGlances]:

@@ -2,10 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.settings import Count, Seed, Settings, Share, Workers
 from semfov.experiments.zoom import Tile
+
+Part = Literal["decision", "survey"]
 
 
 @dataclass(frozen=True)
@@ -26,8 +29,11 @@ class FitZoomConfig(Settings):
         false_alarms: share of absent targets that may be called found, by which the threshold is chosen.
         surest: probability from which on a target counts as found at the latest, however many false alarms that makes.
         lost: share of the targets that may be missed because no look is worth its price any more.
-        evidence: model that was fitted before, to fit anew only when a search decides (None: fit all).
+        evidence: model that was fitted before, to fit anew the parts in `refit` alone (None: fit all).
+        refit: parts of that model: `decision`, when a search decides, and `survey`, how many objects of any class
+            closer looks find.
         steps: of the fits of what looks say of closer ones.
+        survey_steps: steps of the fit of the survey.
         judging: steps of the fit of when a search decides.
         seed: of mosaics and fit.
         out: folder for the model and a report.
@@ -49,7 +55,9 @@ class FitZoomConfig(Settings):
     surest: Share = 0.9
     lost: Share = 0.02
     evidence: Path | None = None
+    refit: tuple[Part, ...] = ("decision",)
     steps: Count = 800
+    survey_steps: Count = 2000
     judging: Count = 300
     seed: Seed = 0
     out: Path = Path("runs/fit_zoom")
