@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.zoom.networks import STEPS
 from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence, pool
 from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.networks import STEPS
 from semfov.zoom.odds import WindowOdds
 from semfov.zoom.sums import Cells, WindowSums
 
@@ -37,8 +37,8 @@ class Rates(Protocol):
 class ZoomBelief:
     """What looks at any window of a picture are expected to show, for one class.
 
-    Each cell is predicted from the closest look at it. The belief keeps five numbers, 24 bytes, for a cell: the level of
-    that look, the number of objects centred in the cell that looks one, two and three octaves closer are expected to
+    Each cell is predicted from the closest look at it. The belief keeps five numbers, 24 bytes, for a cell: the level
+    of that look, the number of objects centred in the cell that looks one, two and three octaves closer are expected to
     find, and the share of the cell that is left to see. Hints of all classes are kept for the windows that were looked
     at, at most 32 × 32 cells of each. A picture of 20,000 × 15,000 px has 49,152 cells: 1.2 MB, and for 80 classes at
     most 0.41 MB for each look. Searches also keep the hints of each look pooled over its windows.
@@ -168,7 +168,7 @@ class ZoomBelief:
         return self._sums[level, tapered]
 
     def odds(self, level: int) -> Tensor:
-        """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf if nothing is known."""
+        """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf if unknown."""
         return torch.from_numpy(self._shown().odds(level).copy())
 
     def chances(self, level: int) -> Cells:

@@ -176,7 +176,12 @@ class GlimpseEvidence(Pretrained):
 
         Returns:
             `(T, 3, rows, columns)`, logarithms of the expected numbers, for looks one, two and three octaves closer.
+
+        Raises:
+            InputError: a target is no class.
         """
+        if not torch.compiler.is_compiling():
+            check(int(targets.min()) >= 1, "targets", "classes from 1 on", targets.tolist())
         best, own = features(look.scores.amax(-1)), features(look.scores.movedim(-1, 0)[targets - 1])
         found = look.found.movedim(-1, 0)[targets - 1].to(own)
         about, bias = self.prior[targets].unbind(-1)

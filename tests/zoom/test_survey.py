@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import poisson_nll_loss
 
+from semfov.errors import InputError
 from semfov.training.zoom_examples import LookedAt, ZoomExample
 from semfov.training.zoom_survey import SurveyExample, Told, fit_survey, judge_survey
 from semfov.zoom import GlimpseEvidence
@@ -74,6 +75,11 @@ def test_explorers_go_by_the_survey_and_searches_by_their_class():
         assert belief.foresight == (0.125 if target == 0 else 0.35)
 
 
+def test_class_rates_are_of_classes():
+    with pytest.raises(InputError, match=r"targets: expected classes from 1 on, got \[0, 2\]"):
+        GlimpseEvidence(CLASSES, 8).rates(gist(), torch.tensor([0, 2]))
+
+
 def test_loss_is_that_of_poisson_counts_window_by_window(survey):
     """Against sums over the cells of each window, one at a time, and PyTorch's own Poisson likelihood."""
     mosaic = example(lambda look, window: sum(window.cells) % 5)
@@ -92,9 +98,7 @@ def test_loss_is_that_of_poisson_counts_window_by_window(survey):
             for x in range(x1, x2):
                 if 0 <= y < logs.shape[1] and 0 <= x < logs.shape[2]:
                     expected = expected + weight[y - y1] * weight[x - x1] * logs[steps - 1, y, x].exp()
-        terms.append(
-            torch.nn.functional.poisson_nll_loss(expected, closer.found.sum().double(), log_input=False, eps=0)
-        )
+        terms.append(poisson_nll_loss(expected, closer.found.sum().double(), log_input=False, eps=0))
     told = Told.of(mosaic, overview, overview.found)
     torch.testing.assert_close(told.loss(survey, logs), torch.stack(terms).mean())
 
