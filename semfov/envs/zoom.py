@@ -339,10 +339,8 @@ class ZoomPolicyAgent:
     def __call__(self, observation: Any = None, info: Any = None) -> Action:
         """Choose the next action; the whole picture again where no other window is expected to show anything."""
         env, belief = self._env, self._env.belief
-        if env.task == "search":
-            choice = best_hit(belief, env.done)
-        else:
-            choice = best_find(belief, env.done, env.scenery.run.evidence.foresight)
+        searching = env.task == "search"
+        choice = best_hit(belief, env.done) if searching else best_find(belief, env.done, belief.foresight)
         return env.action_of(overview(env.glances) if choice is None else choice[0])
 
 

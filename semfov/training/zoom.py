@@ -4,11 +4,13 @@ import json
 import logging
 import random
 from collections import defaultdict
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 
 from semfov.data.mosaics import Mosaics
+from semfov.errors import check
 from semfov.experiments.parallel import available_cores, run_tasks
 from semfov.experiments.run import cache_folder
 from semfov.experiments.setup import make_detector, prepare_worker, split_photographs
@@ -16,17 +18,22 @@ from semfov.experiments.summary import table
 from semfov.experiments.zoom_store import GlanceStore, open_scene
 from semfov.io.files import inside
 from semfov.training.outputs import training_of, write_outputs
-from semfov.training.zoom_choice import choose, open_all
+from semfov.training.zoom_choice import choose_foresight, choose_patience, open_all
 from semfov.training.zoom_decision import fit_judge, judge_searches, search_mosaics
 from semfov.training.zoom_examples import ZoomExample, example_of, windows_of
 from semfov.training.zoom_presence import fit_presence, pair_windows, presence_loss, presence_of
 from semfov.training.zoom_rates import fit_rates, rate_loss
-from semfov.training.zoom_settings import FitZoomConfig
+from semfov.training.zoom_settings import FitZoomConfig, Part
+from semfov.training.zoom_survey import SurveyExample, fit_survey, judge_survey
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import ZoomEye
+from semfov.zoom.survey import Survey
 
 DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", "tile", "seed")
 """Settings that the thresholds and the probability of presence depend on."""
+
+SURVEYING = ("mosaics", "far", "judged", "judged_far", "survey_steps", "tile", "seed")
+"""Settings that the survey depends on."""
 
 _log = logging.getLogger(__name__)
 
@@ -95,35 +102,34 @@ def fit_zoom(config: FitZoomConfig) -> None:
     store = make_store(config, eye)
     parts: list[str] = []
     figures = "{}"
+    check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
+    refit: set[Part] = set(config.refit) if config.evidence else {"decision", "survey"}
+    examples = look_at_all(config, eye, mosaics, store) if "survey" in refit else {}
     if config.evidence is None:
-        model, examples = fit_looks(config, eye, mosaics, store)
-        tried = choose(model, eye, mosaics["judged"], mosaics["judged far"], store)
-        text, figures = judge(model, examples)
-        chosen = f"Settings chosen for the search: foresight {model.foresight:g}, patience {model.patience:g}."
-        parts += [text, chosen, "", *table(tried), ""]
+        model = fit_looks(config, eye, mosaics, examples)
+        text, figures = judge(model, examples["judged"])
+        tried = choose_patience(model, eye, mosaics["judged"], store)
+        parts += [text, f"Patience chosen for the search: {model.patience:g}.", "", *table(tried), ""]
     else:
         model = GlimpseEvidence.from_pretrained(config.evidence).requires_grad_(False)
         model.check_compatible(eye.settings())
-    parts += fit_decision(config, model, eye, mosaics, store)
+    if "survey" in refit:
+        measured = survey_again(config, model, examples)
+        figures = json.dumps({**json.loads(figures), **measured}, indent=1)
+        tried = choose_foresight(model, eye, mosaics["judged"], mosaics["judged far"], store)
+        chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
+        parts += [*figures_of(measured), "", chosen, "", *table(tried), ""]
+    if "decision" in refit:
+        parts += fit_decision(config, model, eye, mosaics, store)
     path = inside(config.out, f"{eye.detector.name}.safetensors")
     model.save(path)
     write_outputs(config, "\n".join(parts), ("figures.json", figures), path)
 
 
-def fit_looks(
+def look_at_all(
     config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
-) -> tuple[GlimpseEvidence, list[ZoomExample]]:
-    """Fit the prediction of closer looks.
-
-    Args:
-        config: the settings.
-        eye: the eye that looks.
-        mosaics: the mosaics (`make_mosaics`).
-        store: store of the looks.
-
-    Returns:
-        The model, without the decisions of searches, and the held-out examples.
-    """
+) -> dict[str, list[ZoomExample]]:
+    """Look at all mosaics to fit on and at the held-out ones; returns the looks by kind of mosaic."""
     looked = {kind: mosaics[kind] for kind in ("near", "far", "judged")}
     todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
     workers = config.workers or available_cores()
@@ -131,15 +137,35 @@ def fit_looks(
                        unit="mosaic"):  # fmt: skip
         pass
     prepare_worker()
+    return {kind: read_examples(some, store, eye) for kind, some in looked.items()}
+
+
+def fit_looks(
+    config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics], examples: dict[str, list[ZoomExample]]
+) -> GlimpseEvidence:
+    """Fit the prediction of closer looks, class by class."""
     torch.manual_seed(config.seed)
     random.seed(config.seed)
-    examples = {kind: read_examples(some, store, eye) for kind, some in looked.items()}
     metadata = {**eye.settings(), **training_of(config, mosaics["near"], "judged")}
     model = GlimpseEvidence(len(eye.detector.classes), metadata=metadata)
     known = examples["near"] + examples["far"]
     fit_presence(model, pair_windows(known), config.steps)
     fit_rates(model, known, config.steps)
-    return model.eval().requires_grad_(False), examples["judged"]
+    return model.eval().requires_grad_(False)
+
+
+def survey_again(
+    config: FitZoomConfig, model: GlimpseEvidence, examples: dict[str, list[ZoomExample]]
+) -> dict[str, float]:
+    """Fit a new survey; returns its measures on held-out mosaics."""
+    torch.manual_seed(config.seed)
+    random.seed(config.seed)
+    survey = Survey(model.classes, foresight=model.survey.foresight)
+    kinds = {kind: [SurveyExample.of(example) for example in some] for kind, some in examples.items()}
+    fit_survey(survey, kinds["near"] + kinds["far"], config.survey_steps)
+    model.survey = survey.eval().requires_grad_(False)
+    model.metadata["survey"] = {name: getattr(config, name) for name in SURVEYING}
+    return judge_survey(survey, kinds["judged"])
 
 
 def fit_decision(
@@ -220,6 +246,10 @@ def judge(model: GlimpseEvidence, examples: list[ZoomExample]) -> tuple[str, str
     losses = torch.stack([rate_loss(model, example) for example in examples])
     figures["rates, mean negative log likelihood"] = float(losses.mean())
     lines = [f"Evaluation on {len(examples)} mosaics of held-out photographs:", ""]
-    rows = [f"| {name} | {value:.4f} |" for name, value in figures.items()]
-    lines += ["| measure | value |", "|---|---|", *rows, ""]
+    lines += [*figures_of(figures), ""]
     return "\n".join(lines), json.dumps(figures, indent=1)
+
+
+def figures_of(figures: Mapping[str, float]) -> list[str]:
+    """Write measures as a table in Markdown."""
+    return ["| measure | value |", "|---|---|", *(f"| {name} | {value:.4f} |" for name, value in figures.items())]

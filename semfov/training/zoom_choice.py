@@ -20,15 +20,16 @@ PATIENCES = (1.5, 1.9, 2.3, 2.8, 3.5)
 
 
 @torch.inference_mode()
-def choose(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, far: Mosaics, store: GlanceStore) -> list[list[str]]:
-    """Set `foresight` to the value with the highest recall, and `patience` to the value that finds a class soonest.
+def choose_foresight(
+    model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, far: Mosaics, store: GlanceStore
+) -> list[list[str]]:
+    """Set the `foresight` of the survey to the one with which most objects are found.
 
     The recall is a mean over passes, from the first to one more than a mosaic has photographs. As the two kinds of
     mosaics differ in difficulty, the recall of each kind is divided by the highest one that any `foresight` reaches.
-    Soonest means the lowest mean number of passes until a look at a photograph that shows the class.
 
     Args:
-        model: the model whose settings are chosen.
+        model: the model; the foresight of its survey is chosen.
         eye: the eye that looks.
         near: mosaics of few photographs.
         far: mosaics of many photographs.
@@ -40,30 +41,48 @@ def choose(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, far: Mosaics, st
     kinds = near, far
     opened = [open_all(eye, mosaics, store) for mosaics in kinds]
     objects = [[mosaics.annotation(n) for n in range(len(mosaics))] for mosaics in kinds]
-    rows = [["setting", "value", "recall, near", "recall, far", "passes to the first hit"]]
+    rows = [["foresight", "recall, near", "recall, far"]]
     recalls: dict[float, list[float]] = {}
     for value in tqdm(FORESIGHTS, desc="choosing foresight", unit="value", dynamic_ncols=True):
-        model.foresight = value
+        model.survey.foresight = value
         recalls[value] = [
             mean_recall(model, looks, annotations, len(mosaics.tiles(0)) + 1)
             for looks, annotations, mosaics in zip(opened, objects, kinds, strict=True)
         ]
-        rows.append(["foresight", f"{value:g}", *(f"{recall:.4f}" for recall in recalls[value]), ""])
+        rows.append([f"{value:g}", *(f"{recall:.4f}" for recall in recalls[value])])
         for glances in (*opened[0], *opened[1]):
             glances.save()
     most = [max(*values, 1e-9) for values in zip(*recalls.values(), strict=True)]
-    share = {value: sum(r / m for r, m in zip(each, most, strict=True)) for value, each in recalls.items()}
-    model.foresight = max(share, key=share.__getitem__)
-    slots = [[around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened[0])]
+    share = {value: sum(r / m for r, m in zip(told, most, strict=True)) for value, told in recalls.items()}
+    model.survey.foresight = max(share, key=share.__getitem__)
+    return rows
+
+
+@torch.inference_mode()
+def choose_patience(model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, store: GlanceStore) -> list[list[str]]:
+    """Set `patience` to the value with which a class is found soonest.
+
+    The measure is the mean number of passes until a look at a photograph that shows the class.
+
+    Args:
+        model: the model; its patience is chosen.
+        eye: the eye that looks.
+        near: mosaics of few photographs.
+        store: store of the looks.
+
+    Returns:
+        A table of the values that were tried.
+    """
+    opened = open_all(eye, near, store)
+    slots = [[around(looks.lattice, tile.slot) for tile in near.tiles(n)] for n, looks in enumerate(opened)]
     passes: dict[float, float] = {}
     for value in tqdm(PATIENCES, desc="choosing patience", unit="value", dynamic_ncols=True):
         model.patience = value
-        passes[value] = mean_passes(model, opened[0], slots)
-        rows.append(["patience", f"{value:g}", "", "", f"{passes[value]:.3f}"])
-        for glances in opened[0]:
+        passes[value] = mean_passes(model, opened, slots)
+        for glances in opened:
             glances.save()
     model.patience = min(passes, key=passes.__getitem__)
-    return rows
+    return [["patience", "passes to the first hit"], *([f"{value:g}", f"{n:.3f}"] for value, n in passes.items())]
 
 
 def open_all(eye: ZoomEye, mosaics: Mosaics, store: GlanceStore) -> list[StoredGlances]:

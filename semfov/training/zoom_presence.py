@@ -9,7 +9,8 @@ from torch.nn import functional as F
 
 from semfov.experiments.zoom import SHOWN
 from semfov.training.zoom_examples import ZoomExample
-from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
+from semfov.zoom.evidence import GlimpseEvidence, pool
+from semfov.zoom.networks import STEPS
 
 
 @dataclass(frozen=True)

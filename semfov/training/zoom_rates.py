@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from semfov.experiments.zoom import SHOWN
 from semfov.training.zoom_examples import LookedAt, ZoomExample
 from semfov.zoom.belief import before_of
-from semfov.zoom.evidence import STEPS, GlimpseEvidence
+from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.networks import STEPS
 
 _log = logging.getLogger(__name__)
 
@@ -41,7 +42,7 @@ def fit_rates(model: GlimpseEvidence, examples: list[ZoomExample], steps: int, b
 def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
     """Compute the negative log likelihood of the numbers of objects found in the windows of a mosaic.
 
-    Only a few classes enter: objects of any class, and random samples of the clearly and of the faintly visible ones.
+    Only a few classes enter: random samples of the clearly and of the faintly visible ones.
 
     Args:
         model: the model.
@@ -52,7 +53,9 @@ def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
     """
     shown = torch.stack([look.show for look in example.looks]).amax(0)
     sure, faint = (shown >= SHOWN).nonzero()[:, 0] + 1, ((shown >= 0.02) & (shown < SHOWN)).nonzero()[:, 0] + 1
-    targets = torch.cat([torch.zeros(1).long(), _some(sure, 8), _some(faint, 4)])
+    targets = torch.cat([_some(sure, 8), _some(faint, 4)])
+    if not len(targets):
+        targets = _some(torch.arange(len(shown)) + 1, 1)
     looks = [look for look in example.looks if look.gist is not None]
     overview, *others = looks
     logs = _log_rates(model, overview, targets, None)
@@ -111,6 +114,6 @@ def _likelihood_loss(
         part = rates[:, steps - 1, max(y1, 0) : y2, max(x1, 0) : x2]
         expected = torch.einsum("tyx,y,x->t", part, weight[: part.shape[1]], weight[: part.shape[2]])
         new = example.labels[closer.found & ~seen]
-        count = torch.stack([(new == t).sum() if t else torch.tensor(len(new)) for t in targets.tolist()])
+        count = (new == targets[:, None]).sum(-1)
         terms.append((expected - count * expected.clamp(min=1e-6).log()).mean())
     return torch.stack(terms).mean() if terms else logs.sum() * 0

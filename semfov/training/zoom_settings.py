@@ -2,10 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.settings import Count, Seed, Settings, Share, Workers
 from semfov.experiments.zoom import Tile
+
+Part = Literal["decision", "survey"]
 
 
 @dataclass(frozen=True)
@@ -27,8 +30,11 @@ class FitZoomConfig(Settings):
         false_alarms: maximum share of absent targets that may be reported as found; it determines the threshold.
         surest: upper limit of that threshold, even if more false alarms result.
         lost: maximum share of the targets that may be missed because the search gives up.
-        evidence: model that was fitted before. If given, only the decisions of searches are fitted (None: fit all).
+        evidence: model that was fitted before. If given, only the parts in `refit` are fitted (None: fit all).
+        refit: parts of that model to fit again: `decision`, the decisions of searches, and `survey`, the number of
+            objects of any class that closer looks find.
         steps: number of training steps for predicting the results of closer looks.
+        survey_steps: number of training steps for the number of objects of any class.
         judging: number of training steps for the decisions of searches.
         seed: seed of the mosaics and the fit.
         out: folder for the model and the report.
@@ -50,7 +56,9 @@ class FitZoomConfig(Settings):
     surest: Share = 0.9
     lost: Share = 0.02
     evidence: Path | None = None
+    refit: tuple[Part, ...] = ("decision",)
     steps: Count = 800
+    survey_steps: Count = 2000
     judging: Count = 300
     seed: Seed = 0
     out: Path = Path("runs/fit_zoom")

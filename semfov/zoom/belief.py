@@ -8,16 +8,17 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from semfov.zoom.context import WindowContext
-from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool
+from semfov.zoom.evidence import GlimpseEvidence, pool
 from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.networks import STEPS
 from semfov.zoom.odds import WindowOdds
 from semfov.zoom.sums import Cells, WindowSums
 
 
 class Rates(Protocol):
-    """Predicts how many objects closer looks find: `GlimpseEvidence`, or `semfov.zoom.observed.ObservedRates`."""
+    """Predicts how many objects closer looks find: `GlimpseEvidence`, `Survey` or `ObservedRates`."""
 
     @property
     def foresight(self) -> float:
@@ -58,7 +59,8 @@ class ZoomBelief:
 
     def __init__(self, lattice: Lattice, evidence: Rates, target: int, context: WindowContext | None = None) -> None:
         self.lattice, self.target, self.context = lattice, target, context
-        self._rates = evidence
+        self._evidence = evidence
+        self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
         shape = lattice.rows, lattice.columns
         self.rate = torch.zeros(STEPS, *shape)
         self.source = torch.full(shape, -1)
@@ -72,8 +74,13 @@ class ZoomBelief:
     @property
     def evidence(self) -> GlimpseEvidence:
         """The learned evidence; only searches ask for it."""
-        assert isinstance(self._rates, GlimpseEvidence), "searches go by learned evidence"
-        return self._rates
+        assert isinstance(self._evidence, GlimpseEvidence), "searches go by learned evidence"
+        return self._evidence
+
+    @property
+    def foresight(self) -> float:
+        """Share of what still closer looks would find in a window that counts towards its value."""
+        return self._rates.foresight
 
     def restore(self, left: Tensor) -> None:
         """Set back what is left to see, to undo `discount`.

@@ -15,16 +15,14 @@ from semfov.io.compatibility import check_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Field, Number, Schema, perceptron
 from semfov.zoom.gist import Gist
-
-STEPS = 3
-"""Largest number of octaves between a look and the closer looks that are predicted from it."""
+from semfov.zoom.networks import STEPS, features, hint_maps, memory_maps, small_network, tapered, through
+from semfov.zoom.survey import SURVEY, Survey, survey_fields
 
 _SUMMARY = 3
 _SHAPE, _SHAPE_WIDTH = 7, 24
 _RATE, _RATE_WIDTH = 14, 32
 CASE, _JUDGE_WIDTH = 11, 16
 """Number of facts of a search from which the presence of its target is predicted (`semfov.zoom.tally`)."""
-_FLOOR = 1e-4
 _LARGEST = 1e6
 
 
@@ -50,7 +48,7 @@ class GlimpseEvidence(Pretrained):
 
       .. math:: \operatorname{logit} P(t) = \operatorname{logit} s^* + j(c)
 
-    Here f, g, λ and j are networks. In the second question class 0 stands for any class.
+    Here f, g, λ and j are networks. Another network predicts how many objects of any class a look finds (`survey`).
 
     Args:
         classes: number of classes of the detector, without background.
@@ -87,6 +85,7 @@ class GlimpseEvidence(Pretrained):
             **perceptron("judge", CASE, _JUDGE_WIDTH),
             "prior": Field(("K+1", 2), low=-1e3, high=1e3),
             "border": Field((4,), low=-1e3, high=1e3),
+            **survey_fields(),
         },
         {
             "classes": Number(size="K"),
@@ -94,6 +93,7 @@ class GlimpseEvidence(Pretrained):
             "patience": Number(above=0, high=_LARGEST),
             "foresight": Number(0, 1),
             "thresholds": THRESHOLDS,
+            "survey": SURVEY,
         },
     )
 
@@ -120,15 +120,16 @@ class GlimpseEvidence(Pretrained):
         self.company = nn.Sequential(
             nn.Linear(classes + _SUMMARY + 1, width), nn.GELU(), nn.Dropout(0.4), nn.Linear(width, classes)
         )
-        self.shape = _network(_SHAPE, _SHAPE_WIDTH, 1)
-        self.rate = _network(_RATE, _RATE_WIDTH, STEPS)
-        self.judge = _network(CASE, _JUDGE_WIDTH, 1)
+        self.shape = small_network(_SHAPE, _SHAPE_WIDTH, 1)
+        self.rate = small_network(_RATE, _RATE_WIDTH, STEPS)
+        self.judge = small_network(CASE, _JUDGE_WIDTH, 1)
         with torch.no_grad():
             # Until the network is fitted, the best score is the probability.
             for parameter in self.judge[-1].parameters():
                 parameter.zero_()
         self.prior = nn.Parameter(torch.zeros(classes + 1, 2))
         self.border = nn.Parameter(torch.tensor([0.0, 1.0, 2.0, 2.0]))
+        self.survey = Survey(classes, foresight=foresight)
 
     def presence(
         self, scores: Tensor, summary: Tensor, steps: Tensor, target: int | None = None, before: Tensor | None = None
@@ -152,16 +153,16 @@ class GlimpseEvidence(Pretrained):
         inputs = torch.cat([hints, crowd, octaves], -1)
         own, slope, offset = hints, torch.as_tensor(self.slope), torch.as_tensor(self.offset)
         if target is None:
-            company = _through(self.company, inputs)
+            company = through(self.company, inputs)
         else:
             one = slice(target - 1, target)
             own, slope, offset = own[:, one], slope[one], offset[one]
-            company = _through(self.company, inputs, one)
+            company = through(self.company, inputs, one)
         top = hints.amax(-1, keepdim=True).expand_as(own)
         known = torch.zeros_like(own) if before is None else before.view_as(own) / 3
         first = torch.full_like(own, float(before is not None))
         parts = [own, top, own - top, octaves.expand_as(own), crowd[:, 2:].expand_as(own), known, first]
-        value: Tensor = slope * own + offset + company + _through(self.shape, torch.stack(parts, -1))[..., 0]
+        value: Tensor = slope * own + offset + company + through(self.shape, torch.stack(parts, -1))[..., 0]
         return value if target is None else value[:, 0]
 
     def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
@@ -169,40 +170,24 @@ class GlimpseEvidence(Pretrained):
 
         Args:
             look: the look.
-            targets: `(T,)`, classes 1..K, or 0 for any class.
+            targets: `(T,)`, classes 1..K; rates for any class are those of `survey`.
             before: `(T, rows, columns)`, logarithms of the rates that an earlier, coarser look gave for looks one
                 octave closer than this one; None for a first look.
 
         Returns:
             `(T, 3, rows, columns)`, logarithms of the expected numbers, for looks one, two and three octaves closer.
+
+        Raises:
+            InputError: a target is no class.
         """
-        strongest = look.scores.amax(-1)
-        best, own = features(strongest), features(_of(look.scores, strongest, targets, strongest))
-        found = _of(look.found, look.found.any(-1), targets, strongest)
-        shape = own.shape
-
-        def wide(values: Tensor) -> Tensor:
-            return values.expand(shape)
-
-        peak, crowd = _peak(own, 3), _mean(best[None], 9)
+        if not torch.compiler.is_compiling():
+            check(int(targets.min()) >= 1, "targets", "classes from 1 on", targets.tolist())
+        best, own = features(look.scores.amax(-1)), features(look.scores.movedim(-1, 0)[targets - 1])
+        found = look.found.movedim(-1, 0)[targets - 1].to(own)
         about, bias = self.prior[targets].unbind(-1)
-        parts = [
-            own,
-            wide(best),
-            peak,
-            _peak(peak, 7),
-            _mean(own, 5),
-            wide(crowd),
-            wide(look.size / 4 - 1),
-            wide((look.size > 0).to(own)),
-            found,
-            _peak(found, 3),
-            wide(own.amax((-1, -2), keepdim=True)),
-            wide(about[:, None, None]),
-            torch.full_like(own, -1.0) if before is None else before / 4,
-            torch.full_like(own, float(before is not None)),
-        ]
-        value: Tensor = _through(self.rate, torch.stack(parts, -1)) + bias[:, None, None, None] - 6
+        usual = about[:, None, None].expand_as(own)
+        parts = [*hint_maps(own, best, found, look.size), usual, *memory_maps(own, before)]
+        value: Tensor = through(self.rate, torch.stack(parts, -1)) + bias[:, None, None, None] - 6
         return value.clamp(max=3).movedim(-1, 1)
 
     def anywhere(self, best: Tensor, case: Tensor) -> Tensor:
@@ -215,7 +200,7 @@ class GlimpseEvidence(Pretrained):
         Returns:
             Log odds, `(...)`.
         """
-        value: Tensor = torch.logit(best, eps=1e-4) + _through(self.judge, case)[..., 0]
+        value: Tensor = torch.logit(best, eps=1e-4) + through(self.judge, case)[..., 0]
         return value
 
     def taper(self, span: int) -> Tensor:
@@ -227,9 +212,7 @@ class GlimpseEvidence(Pretrained):
         Returns:
             `(span,)`, from 0 to 1.
         """
-        cell = torch.arange(span, device=self.border.device)
-        ring = torch.minimum(cell, span - 1 - cell) * 8 // span
-        return self.border.sigmoid()[ring.clamp(max=3)]
+        return tapered(self.border, span)
 
     def check_compatible(self, settings: Mapping[str, Any]) -> None:
         """Raise `InputError` for another detector than the evidence was fitted for.
@@ -247,6 +230,7 @@ class GlimpseEvidence(Pretrained):
             "patience": self.patience,
             "foresight": self.foresight,
             "thresholds": None if self.thresholds is None else asdict(self.thresholds),
+            "survey": {"foresight": self.survey.foresight},
         }
 
     @classmethod
@@ -260,13 +244,9 @@ class GlimpseEvidence(Pretrained):
             thresholds=None if record["thresholds"] is None else Thresholds(**record["thresholds"]),
             metadata=record["metadata"],
         )
+        model.survey.foresight = record["survey"]["foresight"]
         model.load_state_dict(tensors)
         return model
-
-
-def features(scores: Tensor) -> Tensor:
-    """Logarithms of scores, shifted and scaled to about [-1, 1.5]."""
-    return (scores + _FLOOR).log() / 4 + 1.5
 
 
 def pool(scores: Tensor, box: tuple[int, int, int, int]) -> tuple[Tensor, Tensor]:
@@ -328,37 +308,3 @@ def _slide(values: Tensor, axis: int, width: int, have: int = 1) -> Tensor:
 
 def _summary(best: Tensor) -> Tensor:
     return torch.stack([best.sum(), (best > 0).to(best).mean(), (best > 0.02).to(best).sum()])
-
-
-def _of(values: Tensor, anything: Tensor, targets: Tensor, like: Tensor) -> Tensor:
-    """Maps `(T, rows, columns)` of some classes, 0 for any, from `(rows, columns, K)`, in the dtype of `like`."""
-    maps = values.movedim(-1, 0)[(targets - 1).clamp(min=0)]
-    return torch.where((targets > 0)[:, None, None], maps.to(like), anything.to(like))
-
-
-def _peak(values: Tensor, side: int) -> Tensor:
-    return F.max_pool2d(values[:, None], side, 1, side // 2)[:, 0]
-
-
-def _mean(values: Tensor, side: int) -> Tensor:
-    return F.avg_pool2d(values[:, None], side, 1, side // 2)[:, 0]
-
-
-def _through(network: nn.Sequential, values: Tensor, outputs: slice = slice(None)) -> Tensor:
-    """Some of a network's outputs. Networks this small spend most of their time in calls of modules, left out here."""
-    last = len(network) - 1
-    for place, layer in enumerate(network):
-        if isinstance(layer, nn.Linear):
-            kept = outputs if place == last else slice(None)
-            values = F.linear(values, layer.weight[kept], layer.bias[kept])
-        elif isinstance(layer, nn.GELU):
-            values = F.gelu(values)
-        elif layer.training:  # dropout
-            values = layer(values)
-    return values
-
-
-def _network(inputs: int, width: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU(), nn.Linear(width, outputs)
-    )

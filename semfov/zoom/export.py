@@ -20,10 +20,11 @@ from semfov.detection.onnx import OnnxDetector, probe
 from semfov.detection.scores import Candidates, score_vectors
 from semfov.errors import InputError, check
 from semfov.io.files import replacing
-from semfov.zoom.evidence import STEPS, GlimpseEvidence, pool_all
+from semfov.zoom.evidence import GlimpseEvidence, pool_all
 from semfov.zoom.export_graph import IR_VERSION, OPSET, LookGraph
 from semfov.zoom.eye import HINTS, ZoomEye
 from semfov.zoom.gist import FINEST, Gist
+from semfov.zoom.networks import STEPS
 
 METADATA_KEY = "semfov.look"
 
@@ -158,7 +159,8 @@ class _Saying(nn.Module):
 
     def forward(self, strongest: Tensor, size: Tensor, found: Tensor) -> tuple[Tensor, ...]:
         look = Gist(0, (0, 0), 1, strongest, size, found > 0)
-        said = [self.evidence.rates(look, torch.arange(self.evidence.classes + 1))]
+        classes = torch.arange(1, self.evidence.classes + 1)
+        said = [torch.cat([self.evidence.survey.rates(look), self.evidence.rates(look, classes)])]
         for step in range(1, STEPS + 1):
             span = self.cells >> step
             scores, summary = pool_all(strongest, span)

@@ -6,9 +6,9 @@ from torch.nn import functional as F
 
 from semfov.errors import check
 from semfov.observation.foveal import FovealObservationModel
-from semfov.zoom.evidence import STEPS
 from semfov.zoom.gist import Gist
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.networks import STEPS
 
 
 class ObservedRates:

@@ -8,9 +8,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.zoom.evidence import STEPS, pool_all, pool_spans
+from semfov.zoom.evidence import pool_all, pool_spans
 from semfov.zoom.gist import Gist
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.networks import STEPS
 from semfov.zoom.sums import Cells
 
 Box = tuple[int, int, int, int]

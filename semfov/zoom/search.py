@@ -192,7 +192,7 @@ def find_everything(
             done.add(glance.window)
             belief.add(glance)
             yield glance, value
-        chosen = jointly(lambda taken: best_find(belief, taken, evidence.foresight), belief, done, batch)
+        chosen = jointly(lambda taken: best_find(belief, taken, belief.foresight), belief, done, batch)
         chosen = [choice for choice in chosen if choice[1] > worth]
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -26,11 +27,12 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, te
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures("bright"))
     config = FitZoomConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
-        mosaics=1, far=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=96, steps=3,
+        mosaics=1, far=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=96, steps=3, survey_steps=3,
         out=tmp_path / "out", cache=tmp_path / "cache", workers=1,
     )  # fmt: skip
     fit_zoom(config)
-    model = GlimpseEvidence.from_pretrained(tmp_path / "out" / "bright.safetensors")
+    path = tmp_path / "out" / "bright.safetensors"
+    model = GlimpseEvidence.from_pretrained(path)
     model.check_compatible(ZoomEye(textures("bright")).settings())
     assert model.metadata["training"]["steps"] == 3
     figures = json.loads((tmp_path / "out" / "figures.json").read_text())
@@ -38,7 +40,8 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, te
     assert (tmp_path / "out" / "report.md").read_text() in capsys.readouterr().out
     recalls, passes = tried((tmp_path / "out" / "report.md").read_text())
     near, far = (max(*values, 1e-9) for values in zip(*recalls.values(), strict=True))
-    assert model.foresight == max(recalls, key=lambda value: recalls[value][0] / near + recalls[value][1] / far)
+    best = max(recalls, key=lambda value: recalls[value][0] / near + recalls[value][1] / far)
+    assert model.survey.foresight == best
     assert model.patience == min(passes, key=passes.get)
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     # Looks come from the store, and a fit of the same seed is the same.
@@ -46,13 +49,27 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, te
     fit_zoom(config)
     again = GlimpseEvidence.from_pretrained(tmp_path / "out" / "bright.safetensors")
     assert all(torch.equal(before[name], tensor) for name, tensor in again.state_dict().items())
+    # One part is fitted anew, and the others stay.
+    fit_zoom(replace(config, evidence=path, refit=("survey",), seed=1, survey_steps=2, out=tmp_path / "again"))
+    other = GlimpseEvidence.from_pretrained(tmp_path / "again" / "bright.safetensors")
+    changed = {name for name, tensor in other.state_dict().items() if not torch.equal(before[name], tensor)}
+    assert changed
+    assert all(name.startswith("survey.") for name in changed)
 
 
 def tried(report):
-    """Recalls by foresight, and passes by patience, from the table of a report."""
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line.startswith("|")]
-    recalls = {float(row[1]): (float(row[2]), float(row[3])) for row in rows if row[0] == "foresight"}
-    return recalls, {float(row[1]): float(row[4]) for row in rows if row[0] == "patience"}
+    """Recalls by foresight, and passes by patience, from the tables of a report."""
+    tables = {}
+    for line in report.splitlines():
+        cells = [cell.strip() for cell in line.split("|")[1:-1]]
+        if cells and cells[0] in ("foresight", "patience"):
+            rows = tables[cells[0]] = {}
+        elif cells and cells[0].replace(".", "").isdigit():
+            rows[cells[0]] = cells[1:]
+        elif cells and "-" not in cells[0]:
+            rows = {}
+    recalls = {float(value): tuple(map(float, row)) for value, row in tables["foresight"].items()}
+    return recalls, {float(value): float(row[0]) for value, row in tables["patience"].items()}
 
 
 def test_examples_are_the_same_from_a_store(tmp_path, textures):

@@ -1,0 +1,88 @@
+"""Small networks over the hints of a look, and maps that they read."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+STEPS = 3
+"""Largest number of octaves between a look and the closer looks that are predicted from it."""
+
+_FLOOR = 1e-4
+
+
+def features(scores: Tensor) -> Tensor:
+    """Logarithms of scores, shifted and scaled to about [-1, 1.5]."""
+    return (scores + _FLOOR).log() / 4 + 1.5
+
+
+def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor) -> list[Tensor]:
+    """What a look shows about each cell, eleven maps `(T, rows, columns)`.
+
+    Args:
+        own: `(T, rows, columns)`, features of the strongest hint of each target.
+        best: `(rows, columns)`, the same of any class.
+        found: `(T, rows, columns)`, whether a detection of the target is centred in the cell.
+        size: `(rows, columns)`, as in `semfov.zoom.gist.Gist`.
+    """
+
+    def wide(values: Tensor) -> Tensor:
+        return values.expand(own.shape)
+
+    peak = neighbourhood_peak(own, 3)
+    return [
+        own,
+        wide(best),
+        peak,
+        neighbourhood_peak(peak, 7),
+        neighbourhood_mean(own, 5),
+        wide(neighbourhood_mean(best[None], 9)),
+        wide(size / 4 - 1),
+        wide((size > 0).to(own)),
+        found,
+        neighbourhood_peak(found, 3),
+        wide(own.amax((-1, -2), keepdim=True)),
+    ]
+
+
+def memory_maps(own: Tensor, before: Tensor | None) -> list[Tensor]:
+    """What an earlier, coarser look predicted for each cell, and whether there was one, two maps like `own`."""
+    known = torch.full_like(own, -1.0) if before is None else before / 4
+    return [known, torch.full_like(own, float(before is not None))]
+
+
+def tapered(border: Tensor, span: int) -> Tensor:
+    """Weights `(span,)` of the cells along a side of a window, from four learned ones `(4,)` from border to middle."""
+    cell = torch.arange(span, device=border.device)
+    ring = torch.minimum(cell, span - 1 - cell) * 8 // span
+    return border.sigmoid()[ring.clamp(max=3)]
+
+
+def neighbourhood_peak(values: Tensor, side: int) -> Tensor:
+    """Largest value of maps `(T, rows, columns)` in the square about each cell."""
+    return F.max_pool2d(values[:, None], side, 1, side // 2)[:, 0]
+
+
+def neighbourhood_mean(values: Tensor, side: int) -> Tensor:
+    """Mean of maps `(T, rows, columns)` over the square about each cell; what lies beyond the map counts as 0."""
+    return F.avg_pool2d(values[:, None], side, 1, side // 2)[:, 0]
+
+
+def through(network: nn.Sequential, values: Tensor, outputs: slice = slice(None)) -> Tensor:
+    """Some of a network's outputs. Networks this small spend most of their time in calls of modules, left out here."""
+    last = len(network) - 1
+    for place, layer in enumerate(network):
+        if isinstance(layer, nn.Linear):
+            kept = outputs if place == last else slice(None)
+            values = F.linear(values, layer.weight[kept], layer.bias[kept])
+        elif isinstance(layer, nn.GELU):
+            values = F.gelu(values)
+        elif layer.training:  # dropout
+            values = layer(values)
+    return values
+
+
+def small_network(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    """A network of two hidden layers."""
+    return nn.Sequential(
+        nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU(), nn.Linear(width, outputs)
+    )

@@ -1,0 +1,126 @@
+"""How many objects of any class closer looks find: predictions, beliefs that go by them, and their fit."""
+
+import pytest
+import torch
+from torch.nn.functional import poisson_nll_loss
+
+from semfov.errors import InputError
+from semfov.training.zoom_examples import LookedAt, ZoomExample
+from semfov.training.zoom_survey import SurveyExample, Told, fit_survey, judge_survey
+from semfov.zoom import GlimpseEvidence
+from semfov.zoom.belief import ZoomBelief
+from semfov.zoom.gist import Gist
+from semfov.zoom.glances import half_steps, on_lattice
+from semfov.zoom.lattice import Lattice
+from semfov.zoom.survey import Survey
+
+LATTICE = Lattice.over((256, 192), (64, 64))
+CLASSES = 3
+
+
+def gist(level=0, first=(0, 0)):
+    span = LATTICE.span(level)
+    shape = min(span, LATTICE.rows), min(span, LATTICE.columns)
+    scores = torch.rand(*shape, CLASSES) * (torch.rand(*shape, CLASSES) > 0.7)
+    return Gist(level, first, 1, scores, torch.rand(shape) * 4, torch.rand(*shape, CLASSES) > 0.9)
+
+
+@pytest.fixture
+def survey():
+    torch.manual_seed(0)
+    return Survey(CLASSES)
+
+
+def example(rule):
+    """A mosaic in which a closer look finds the objects that `rule` says of its window."""
+    objects = 12
+    looks = [LookedAt(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(objects).bool())]
+    for window in half_steps(LATTICE):
+        if window.level == 0:
+            continue
+        seen = gist(window.level, window.cells[:2]) if window.level < LATTICE.levels - 1 else None
+        looks.append(LookedAt(window, seen, torch.rand(CLASSES), torch.arange(objects) < rule(looks[0].gist, window)))
+    return ZoomExample(LATTICE, torch.randint(1, CLASSES + 1, (objects,)), tuple(looks))
+
+
+def test_classes_tell_the_same_hints_apart(survey):
+    """Rates depend on which class a hint is of, not only on how strong it is."""
+    look = gist()
+    other = Gist(0, (0, 0), 1, look.scores.roll(1, -1), look.size, look.found.roll(1, -1))
+    assert torch.equal(look.scores.amax(-1), other.scores.amax(-1))
+    assert not torch.allclose(survey.rates(look), survey.rates(other))
+
+
+def test_far_cells_do_not_matter(survey):
+    """Beyond the widest neighbourhood a cell matters only through the strongest hint of the look."""
+    look = gist(1, (0, 0))
+    look.scores[0, 0] = 0.9
+    scores = look.scores.clone()
+    scores[-1, -1] = 0.5
+    changed = Gist(1, (0, 0), 1, scores, look.size, look.found)
+    same = survey.rates(look)[0, :, :4, :4]
+    assert look.scores.shape[0] >= 16
+    torch.testing.assert_close(survey.rates(changed)[0, :, :4, :4], same)
+
+
+def test_explorers_go_by_the_survey_and_searches_by_their_class():
+    torch.manual_seed(0)
+    evidence = GlimpseEvidence(CLASSES, 8).eval().requires_grad_(False)
+    evidence.survey.foresight = 0.125
+    glance = LookedAt(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(1).bool())
+    for target, rates in ((0, evidence.survey.rates(glance.gist)), (2, evidence.rates(glance.gist, torch.tensor([2])))):
+        belief = ZoomBelief(LATTICE, evidence, target)
+        belief._spread(glance.gist)
+        torch.testing.assert_close(belief.rate, rates[0].exp()[:, : LATTICE.rows, : LATTICE.columns])
+        assert belief.foresight == (0.125 if target == 0 else 0.35)
+
+
+def test_class_rates_are_of_classes():
+    with pytest.raises(InputError, match=r"targets: expected classes from 1 on, got \[0, 2\]"):
+        GlimpseEvidence(CLASSES, 8).rates(gist(), torch.tensor([0, 2]))
+
+
+def test_loss_is_that_of_poisson_counts_window_by_window(survey):
+    """Against sums over the cells of each window, one at a time, and PyTorch's own Poisson likelihood."""
+    mosaic = example(lambda look, window: sum(window.cells) % 5)
+    overview = mosaic.looks[0]
+    logs = survey.rates(overview.gist)[0].double()
+    survey.double()
+    terms = []
+    for closer in mosaic.looks:
+        steps = closer.window.level
+        if steps == 0:
+            continue
+        x1, y1, x2, y2 = closer.window.cells
+        weight = survey.taper(x2 - x1)
+        expected = torch.zeros((), dtype=torch.float64)
+        for y in range(y1, y2):
+            for x in range(x1, x2):
+                if 0 <= y < logs.shape[1] and 0 <= x < logs.shape[2]:
+                    expected = expected + weight[y - y1] * weight[x - x1] * logs[steps - 1, y, x].exp()
+        terms.append(poisson_nll_loss(expected, closer.found.sum().double(), log_input=False, eps=0))
+    told = Told.of(mosaic, overview, overview.found)
+    torch.testing.assert_close(told.loss(survey, logs), torch.stack(terms).mean())
+
+
+def test_objects_that_were_seen_before_are_not_new():
+    mosaic = example(lambda look, window: 3)
+    overview = mosaic.looks[0]
+    for seen, new in ((0, 3), (2, 1), (12, 0)):
+        counts = Told.of(mosaic, overview, torch.arange(12) < seen).counts
+        assert {int(n) for _, _, numbers in counts.values() for n in numbers} == {new}
+
+
+def test_the_fit_predicts_other_mosaics_better():
+    """Windows hold as many objects as hints of class 2, whatever else they show."""
+    torch.manual_seed(1)
+
+    def rule(look, window):
+        x1, y1, x2, y2 = (max(n, 0) for n in window.cells)
+        return int((look.scores[y1:y2, x1:x2, 1] > 0).sum()) // 4
+
+    examples, held = ([SurveyExample.of(example(rule)) for _ in range(count)] for count in (4, 1))
+    survey = Survey(CLASSES)
+    overview, *_ = before = judge_survey(survey, held)
+    fit_survey(survey, examples, 40, batch=2)
+    assert judge_survey(survey, held)[overview] < before[overview] - 0.2
