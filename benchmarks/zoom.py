@@ -1,8 +1,8 @@
-"""What looking at a large picture costs beside the detector: `python -m benchmarks.zoom --weights yolox_nano_416.onnx`.
+"""Cost of looking at a large picture without the detector: `python -m benchmarks.zoom --weights yolox_nano_416.onnx`.
 
-Mosaics of embedded scenes are searched for a class and looked over for all objects. The detector alone, its boxes
-selected, then sees the same windows again, in the same repetition. What is left of a pass is reading and resampling the
-window, merging boxes and choosing where to look next.
+The agent searches mosaics of embedded scenes for a class, and explores them for all objects. In the same repetition,
+the detector alone, including the selection of boxes, is run on the same windows again. The rest of a pass is reading
+and resampling the window, merging boxes and choosing the next window.
 """
 
 import argparse
@@ -27,7 +27,7 @@ SIZES = {"2560 × 1920 px": (4, 4), "3840 × 2880 px": (6, 6)}
 
 
 def programs(agent: ZoomAgent, columns: int, rows: int) -> dict[str, tuple[Run, Run, int]]:
-    """Every task: the agent's program, the detector's, and their passes."""
+    """For every task, the agent's program, the detector's program, and their number of passes."""
     scenes = EmbeddedScenes(agent.classes[1:], count=16)
     picture = to_bytes(Mosaics(scenes, columns, rows, tile=(640, 480), count=1)[0].image)
     eye, detector = agent.eye, agent.eye.detector
@@ -53,7 +53,7 @@ def programs(agent: ZoomAgent, columns: int, rows: int) -> dict[str, tuple[Run, 
 
 
 def share(task: Run, detector: Run, seconds: float, clock: Clock) -> tuple[Spread, Spread, Spread]:
-    """Milliseconds of the task and of its detector, and what share of the task is not the detector."""
+    """Milliseconds of a task and of its detector, and the share of the task that is not the detector."""
     found = interleaved({"task": task, "detector": detector}, seconds, clock)
     rest = [1 - theirs / ours for ours, theirs in zip(found["task"], found["detector"], strict=True)]
     return Spread.of(found["task"]), Spread.of(found["detector"]), Spread.of(rest)
@@ -64,9 +64,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure all rows and write the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.zoom", description=__doc__.splitlines()[0])
     parser.add_argument("--weights", help="ONNX file of YOLOX-nano")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=10.0, help="for each task, at least")
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--threads", type=int, default=1, help="number of threads")
+    parser.add_argument("--seconds", type=float, default=10.0, help="shortest duration for each task")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
     options = parser.parse_args(arguments)
     use_threads(options.threads)
     clock, times = clock_for(options.threads)

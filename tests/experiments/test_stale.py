@@ -145,7 +145,7 @@ def test_an_emptied_store_is_filled_with_the_same_bits_on_any_number_of_threads(
 
 def test_the_same_policy_twice_is_refused(config):
     for policies in (("random", "random"), ("random", PolicyConfig("random")), ("recommended", "target-evidence")):
-        with pytest.raises(InputError, match=r"^policies: expected each of them once, got '.*' 2 times"):
+        with pytest.raises(InputError, match=r"^policies: expected each policy once, got '.*' 2 times"):
             SearchRun(replace(config, policies=policies))
 
 
