@@ -42,7 +42,7 @@ def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
     """
     records, _ = gather(run)
     if not records:
-        raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
+        raise DataError("data: no scene has a class that may be searched for; raise target_area")
     sums = add_up(records)
     text = summary(records, sums, run)
     files = {"beliefs.md": text, "beliefs.csv": beliefs_csv(sums), "beliefs.json": beliefs_json(sums)}

@@ -220,8 +220,8 @@ def finish(run: SceneRun, title: str) -> None:
     older = parts.by_other_code()
     if todo and older:
         _log.warning(
-            "%s: %d scenes were finished with these settings, but semfov or a library has changed since; they are "
-            "computed anew",
+            "%s: %d scenes were finished with these settings by another version of the code (semfov or a library has "
+            "changed since); they are computed anew",
             run.config.out,
             older,
         )

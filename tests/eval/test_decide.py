@@ -115,7 +115,7 @@ def test_help_and_defaults(capsys):
     assert stopped.value.code == 0
     printed = capsys.readouterr().out
     assert "--belief.target_model" in printed
-    assert "Is it there, where, and how sure" in printed
+    assert "Decide whether a target is present, where, and how surely" in printed
     assert DecideConfig().data == DataConfig()
     assert (DecideConfig().belief, DecideConfig().protocol) == (BeliefConfig(), ProtocolConfig())
     assert callable(search_and_decide)

@@ -62,7 +62,7 @@ def test_a_finished_run_of_other_code_is_told_and_computed_anew(config, monkeypa
     with caplog.at_level(logging.WARNING):
         finish(second, "searching")
     (record,) = caplog.records
-    assert "1 scenes were finished with these settings by other code" in record.getMessage()
+    assert "1 scenes were finished with these settings by another version of the code" in record.getMessage()
     assert second.parts.load(0) is not None
 
 
@@ -170,7 +170,7 @@ def test_a_changed_choice_changes_the_printed_result(tmp_path):
     assert "masked_fill(visited, -torch.inf)" in text
     choice.write_text(text.replace("masked_fill(visited, -torch.inf)", "neg().masked_fill(visited, -torch.inf)"))
     second, told = search(tmp_path / "out")
-    assert "by other code" in told
+    assert "by another version of the code" in told
     assert second != first
     assert search(tmp_path / "fresh")[0] == second
 
