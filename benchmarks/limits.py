@@ -80,8 +80,8 @@ def paths() -> dict[str, Path]:
             lambda: vocus(image),
             4 * (image.numel() + image.numel() // 3),
             "image in, map out",
-            "limited by computation: about 20 Gaussian blurs of up to 65 taps, as matrix products near the processor's "
-            "peak rate",
+            "limited by computation: about 20 Gaussian blurs of up to 65 taps, as matrix products that reach most of "
+            "the processor's peak rate",
         ),
         f"{len(logs)} Dirichlets of {logs.shape[-1]} dimensions": Path(
             lambda: mle(logs), 2 * logs.numel() * logs.element_size(), "mean logarithms in, parameters out", newton

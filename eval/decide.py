@@ -47,7 +47,7 @@ class DecideConfig(Settings):
         data: the scenes to search.
         detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        belief: the belief; `target_model` is the learned evidence.
+        belief: the belief, a grid of class distributions; `target_model` is the learned evidence.
         protocol: the protocol; `shifts` and `seed` are used.
         confirm: the target can count as found when the probability that the image holds it reaches this value (None:
             the model's own threshold).

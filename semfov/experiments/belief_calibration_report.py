@@ -49,7 +49,7 @@ def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
     for name, content in files.items():
         write_text(run.config.out / name, content)
     groups = (
-        f"distance from the closest fixation (1: the longer side of the image), after {judged_after(sums)[-1]} looks"
+        f"distance from the closest fixation, as a fraction of the longer side, after {judged_after(sums)[-1]} looks"
     )
     figure = save_figure(plot_cell_reliability(*curves(sums), groups=groups), run.config.out / "beliefs.png")
     return text, [*(run.config.out / name for name in files), figure]

@@ -39,7 +39,7 @@ class Candidate:
 
     Attributes:
         strategy: observer and policy.
-        saliency: saliency of all cells as seen from each cell, `(X·Y, X·Y)`, or from everywhere alike, `(1, X·Y)`.
+        saliency: saliency of all cells, seen from each cell, `(X·Y, X·Y)`, or the same for all fixations, `(1, X·Y)`.
         weight: weight of the saliency as a prior over the cells (`SaliencyPrior`); None: saliency alone chooses the
             next cell, instead of the policy.
         attention: `(X·Y, K, X·Y)`, attention to every class in every cell, seen from each cell (`TemplateAttention`);
@@ -72,7 +72,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Models:
-    """Fitted models that the policies of a run need; None for a model that no policy needs. Contexts go by name."""
+    """Fitted models that the policies of a run need, contexts by name; None for a model that no policy needs."""
 
     observation: FovealObservationModel | None = None
     evidence: TargetEvidence | None = None

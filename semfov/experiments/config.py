@@ -244,7 +244,7 @@ class SearchConfig(Settings):
         data: the scenes to search.
         detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        belief: the belief.
+        belief: the belief, a grid of class distributions.
         saliency: the saliency baselines.
         protocol: the protocol of the experiment.
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: non-predictive,
@@ -296,7 +296,7 @@ class ExploreConfig(Settings):
         data: the scenes to explore.
         detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        belief: the belief.
+        belief: the belief, a grid of class distributions.
         saliency: the saliency baselines.
         protocol: the protocol of the experiment.
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: kl, scores:

@@ -34,5 +34,5 @@ def percent(count: int, total: int) -> str:
 
 
 def mean(values: Sequence[float], digits: int = 1) -> str:
-    """The mean with so many digits, or a dash where there are no values."""
+    """The mean with `digits` decimal places, or a dash where there are no values."""
     return f"{sum(values) / len(values):.{digits}f}" if values else "-"

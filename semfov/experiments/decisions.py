@@ -34,7 +34,7 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 
 Rule = Callable[[Step, int, Grid], Tensor]
-"""Decides after a step of searches for a class on a grid which of them end, as the numbers of their outcomes."""
+"""Maps a step of searches, their target and their grid to the number of each search's outcome; 0: it goes on."""
 
 AGENT, RANDOM, PUBLISHED, AT_THE_GAZE = (
     "target-evidence",
@@ -84,7 +84,7 @@ class DecisionRun(Run):
 
     def __init__(self, config: DecisionConfig) -> None:
         context = config.belief.context
-        check(context == "none", "belief.context", "none: decisions use the target evidence alone", context)
+        check(context == "none", "belief.context", "none, since decisions use the target evidence alone", context)
         super().__init__(config)
         evidence = self.models.evidence
         assert evidence is not None
@@ -165,7 +165,7 @@ class DecisionRun(Run):
                     steps = search_steps(looks, strategy, target, cell, noise, rule)
                 last, seen = steps[-1], torch.cat([step.cell for step in steps])
                 ended = int(rule(last))
-                # A target that a detection at the gaze shows is where the gaze is.
+                # If a detection at the gaze has ended the search, the target's place is the fixated cell.
                 place = int(last.cell) if judge is at_the_gaze else None
                 shown = [detections[cell] for cell in seen.split(1)]
                 decision = conclude(ended, last.belief, shown, grid, target, place)
@@ -192,7 +192,7 @@ def by_price(price: float) -> Rule:
 
 
 def at_the_gaze(step: Step, target: int, grid: Grid) -> Tensor:
-    """The rule that ends a search when the target is the best class of a detection at the gaze, from `SEEN_FROM` on."""
+    """The rule that ends a search when a detection at the gaze shows the target with a score of `SEEN_FROM` or more."""
     return confirms(step.detections, grid, step.cell, target, SEEN_FROM).long()
 
 

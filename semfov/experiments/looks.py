@@ -13,7 +13,7 @@ from semfov.detection.detections import Detections
 from semfov.eye import Eye
 
 SOURCES = ("semfov.eye", "semfov.detection.load", "semfov.sensor.named", "semfov.data.images", __name__)
-"""The modules that turn an image into detections; their imports belong to them."""
+"""The modules that turn an image into detections; all modules that they import count, too."""
 
 
 @contextmanager

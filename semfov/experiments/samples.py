@@ -172,7 +172,7 @@ class Sampler:
 
     Attributes:
         key: sha256 of everything that the samples depend on.
-        sources: modules that samples depend on; their imports belong to them.
+        sources: modules that samples depend on; all modules that they import count, too.
         coordinates: number of coordinates of a fixation.
     """
 

@@ -45,7 +45,7 @@ class WordsConfig(Settings):
         data: the scenes to search.
         detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        belief: the belief.
+        belief: the belief, a grid of class distributions.
         protocol: the protocol of the experiment.
         policy: the policy to which context is added: `target-evidence`, or a mapping such as `{policy: non-predictive,
             tempering: 0.25, footprint: box_centre}`.

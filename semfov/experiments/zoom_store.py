@@ -20,7 +20,7 @@ from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.lattice import Lattice
 
 SOURCES = (Glances.__module__, load_detector.__module__, "semfov.data.images", "semfov.data.large", __name__)
-"""Modules that turn a large picture into glances; their imports belong to them."""
+"""Modules that turn a large picture into glances; all modules that they import count, too."""
 
 
 class GlanceStore(SceneStore):

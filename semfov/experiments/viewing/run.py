@@ -121,8 +121,8 @@ class ViewingRun(Run):
         for each in people:
             if each.size != size:
                 raise DataError(
-                    f"people: expected fixations in {each.picture} in pixels of a picture of size {size}, the size of "
-                    f"the file, got size {each.size}"
+                    f"people: expected fixations in {each.picture} for a picture size of {size}, as in its file, got "
+                    f"{each.size}; check data.root"
                 )
         return events_of(people, self.raster(index), self.grid(index), self.config.longest)
 
