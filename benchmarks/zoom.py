@@ -1,4 +1,4 @@
-"""Cost of a look at a large picture, apart from the detector: `python -m benchmarks.zoom --weights yolox_nano_416.onnx`.
+"""Cost of looking at a large picture besides detection: `python -m benchmarks.zoom --weights yolox_nano_416.onnx`.
 
 The agent searches mosaics of embedded scenes for a class, and explores them for all objects. In the same repetition,
 the detector alone, including the selection of boxes, is run on the same windows again. The rest of a pass is reading
