@@ -53,7 +53,7 @@ def with_models(config: Config) -> Config:
         elif named:
             why = folder.manifest.parts[missing].why if missing in folder.manifest.parts else "not fitted"
             raise InputError(
-                f"policies: {policy!r} needs the model {missing!r}, which the folder {config.models} lacks ({why})"
+                f"policies: {policy!r} needs the model {missing!r}, which the folder {config.models} lacks: {why}"
             )
     return replace(config, detector=detector, sensor=sensor_of(folder), belief=belief, policies=tuple(chosen))
 
