@@ -1,8 +1,8 @@
-"""Everything measured, beside its peers, in one run: `python -m benchmarks`.
+"""Measure semfov and other implementations (peers) in one run: `python -m benchmarks`.
 
-Every figure is a ratio of times within one repetition of both programs, as median and quartiles over repetitions. With
-one thread, the default, times are the processor's, which other work on the machine changes little; with more, the
-clock's. Results go to `benchmarks/results/NAME.md` and `NAME.json`.
+Results are ratios of the times of two programs within one repetition, as median and quartiles over repetitions. With
+one thread, the default, times are CPU times, which other work on the machine changes little. With more threads, times
+are elapsed times. Results go to `benchmarks/results/NAME.md` and `NAME.json`.
 """
 
 import argparse
@@ -45,10 +45,10 @@ COMPARISONS: tuple[Callable[[], Comparison], ...] = (
 def main() -> None:
     """Measure everything and write the tables."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.splitlines()[0])
-    parser.add_argument("--name", default="cpu", help="of the result files")
-    parser.add_argument("--seconds", type=float, default=4.0, help="for each comparison, at least")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--name", default="cpu", help="name of the result files")
+    parser.add_argument("--seconds", type=float, default=4.0, help="shortest duration of each comparison")
+    parser.add_argument("--threads", type=int, default=1, help="number of threads")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
     options = parser.parse_args()
     use_threads(options.threads)
     clock, times = clock_for(options.threads)
@@ -84,7 +84,7 @@ def report(
     grown: dict[str, tuple[dict[int, Spread], float]],
     found: dict[str, tuple[HotPath, Spread, float]],
 ) -> str:
-    """All tables."""
+    """The report with all tables, as Markdown."""
     rows = [row for each in measured for row in comparison_rows(each)]
     growth = [
         [name, ", ".join(f"{size:,}: {number(s.middle)}" for size, s in sizes.items()), f"{slope:.2f}"]
@@ -99,29 +99,30 @@ def report(
         [
             "# Benchmarks",
             "",
-            "Written by `python -m benchmarks`. Ratios are of times in the same repetition: median (quartiles); above",
-            "1 semfov is faster. Peers that do a part of the work, for the whole would take too long, are scaled up.",
+            "Written by `python -m benchmarks`. Ratios of times are taken within one repetition and given as median",
+            "(quartiles); above 1, semfov is faster. Where the whole work would take a peer too long, it does a part",
+            "of the work, and its time is scaled up.",
             "",
             *(f"- {key}: {value}" for key, value in about.items()),
             f"- copy bandwidth: {bandwidth / 1e9:.1f} GB/s, read and written",
             "",
-            "## Beside peers",
+            "## Comparison with peers",
             "",
             table(["work", "peer", "semfov, ms", "peer, ms", "peer / semfov"], rows),
             "",
             "## Growth",
             "",
-            "Milliseconds by size, and the exponent of the growth between the first and the last.",
+            "Milliseconds by size of the problem, and the exponent of growth between the first and the last size.",
             "",
             table(["series", "size: ms", "exponent"], growth),
             "",
-            "## Distance from the memory's limit",
+            "## Distance from the limit of memory bandwidth",
             "",
-            "Bytes that inputs and results have, each moved once, over the time, as a share of the copy bandwidth.",
+            "The bytes of inputs and results, each moved once, divided by the time, as a share of the copy bandwidth.",
             "",
-            table(["path", "MB", "which are", "ms", "% of copy bandwidth"], hot),
+            table(["path", "MB", "bytes of", "ms", "% of copy bandwidth"], hot),
             "",
-            "What stops them:",
+            "What keeps each path from reaching the copy bandwidth:",
             "",
             *(
                 f"- {name}{' (the slowest)' if name == slowest else ''}: {path.stops}"

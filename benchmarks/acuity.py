@@ -1,12 +1,12 @@
-"""What sensors keep at each distance from the fixation, and what a detector sees through them.
+"""Acuity of sensors by distance from the fixation, and recall of a detector behind them.
 
     python -m benchmarks.acuity                                               # embedded scenes
     python -m benchmarks.acuity --root DIR --annotations FILE --count 60 --detector yolox-nano --weights FILE
 
-The first table has the finest grating that keeps half of its contrast. The second has the round trip: the
-signal-to-noise ratio of what the detector is shown of photographs, beside what it would be shown without a sensor. The
-third has the recall of objects by the distance of their centre from the fixation. Distances and wavelengths are in
-pixels of a picture whose longer side is 640.
+The first table gives the finest grating that keeps half of its contrast. The second gives the round trip: the
+signal-to-noise ratio of the detector's input with the sensor, relative to its input without a sensor. The third gives
+the recall of objects by the distance of their centre from the fixation. Distances and wavelengths are in pixels of a
+picture whose longer side is 640.
 """
 
 import argparse
@@ -36,7 +36,7 @@ SCORE, OVERLAP = 0.1, 0.5
 
 
 def sensors(fovea: float, spacing: float, pooling: float) -> dict[str, Sensor]:
-    """Sensors by their name in tables."""
+    """Sensors by their names in tables."""
     return {
         "none": Foveation(1e9),
         **{name: named_sensor(name) for name in ("published", "published-narrow", "gradual")},
@@ -45,23 +45,24 @@ def sensors(fovea: float, spacing: float, pooling: float) -> dict[str, Sensor]:
 
 
 def contrasts(sensor: Sensor, wavelength: float) -> list[float]:
-    """Share of the contrast of a grating that a sensor keeps between two of `EDGES`."""
+    """Share of a grating's contrast that a sensor keeps, between each two neighbouring `EDGES`."""
     place = torch.arange(2 * EDGES[-1], dtype=torch.float32) - EDGES[-1]
     phase = place * (2 * math.pi / wavelength)
     wave = torch.stack([phase.cos(), phase.sin(), phase.cos()])[:, None].expand(-1, len(place), -1)
-    # Upright waves and lying ones; a third channel is there for the sensor alone.
+    # Vertical and horizontal gratings. The third channel only serves to make an RGB image for the sensor.
     both = torch.stack([wave, wave.mT])
     shown = torch.cat(
         [sensor.look(sensor.open(one[None], torch.ones(2)), torch.full((1, 2), EDGES[-1])) for one in both]
     )
-    # What is weakened alone keeps its phase: so much of it is what was shown times what is.
+    # A grating that is only weakened keeps its phase, so the products of the two quadratures with the view give its
+    # contrast.
     kept = (shown * both)[:, :2].sum(1).mean(0)
     distance = torch.hypot(place[:, None], place)
     return [float(kept[(distance >= low) & (distance < high)].mean()) for low, high in pairwise(EDGES)]
 
 
 def finest(sensor: Sensor) -> list[str]:
-    """Shortest wavelength that keeps half of its contrast, and all longer ones do, between two of `EDGES`."""
+    """Shortest wavelength from which on all gratings keep half of their contrast, between neighbouring `EDGES`."""
     kept = [contrasts(sensor, wavelength) for wavelength in WAVELENGTHS]
     found = []
     for place in range(len(EDGES) - 1):
@@ -90,15 +91,15 @@ def looks(scenes: Scenes, count: int, fixations: int) -> Iterator[tuple[Tensor, 
 
 
 class Tally:
-    """Errors and finds by distance.
+    """Errors and found objects by distance from the fixation.
 
     Attributes:
-        error: sum of squared differences from what is shown without a sensor.
-        pixels: how many values they are of.
-        found: objects that were found.
-        objects: how many there are.
-        seconds: of the processor, in looks.
-        looks: how many there were.
+        error: sum of squared differences between the views with and without the sensor.
+        pixels: number of values in this sum.
+        found: number of objects found.
+        objects: number of objects.
+        seconds: CPU seconds of the sensor.
+        looks: number of looks.
     """
 
     def __init__(self) -> None:
@@ -107,7 +108,7 @@ class Tally:
         self.seconds, self.looks = 0.0, 0
 
     def add(self, eye: Eye, image: Tensor, points: Tensor, boxes: Tensor, labels: Tensor) -> None:
-        """Look at a photograph."""
+        """Look at a photograph from each fixation, and count."""
         edges = torch.tensor(EDGES[1:-1], dtype=torch.float32)
         view, scale = eye.open(image), SIDE / max(image.shape[-2:])
         middle = (boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5
@@ -137,7 +138,7 @@ class Tally:
 
 
 def report(chosen: dict[str, Sensor], detector: Detector, scenes: Scenes, count: int, fixations: int) -> str:
-    """All tables as Markdown."""
+    """The report with all tables, as Markdown."""
     bins = [f"{low}–{high}" for low, high in pairwise(EDGES)]
     acuity = [[name, *finest(sensor)] for name, sensor in chosen.items() if name != "none"]
     tallies = {name: Tally() for name in chosen}
@@ -164,14 +165,14 @@ def report(chosen: dict[str, Sensor], detector: Detector, scenes: Scenes, count:
             table(["", *bins], noise),
             f"Recall (score {SCORE}, IoU {OVERLAP}) by distance of the object from the fixation, in "
             f"{min(count, len(scenes))} photographs with {fixations} fixations each ({sum(objects)} objects: "
-            f"{', '.join(map(str, objects))}); the sensor's milliseconds of a processor for each look:",
+            f"{', '.join(map(str, objects))}); and CPU milliseconds of the sensor per look:",
             table(["", *bins, "all", "ms"], recall),
         ]
     )
 
 
 def draw(image: Tensor, sensor: LogPolar, path: Path) -> None:
-    """A picture `(1, 3, H, W)`, what both sensors show of it, and the cortical image, side by side in a file."""
+    """Draw a picture `(1, 3, H, W)`, its views through both sensors, and its cortical image side by side."""
     from matplotlib.figure import Figure
 
     gaze = torch.tensor([image.shape[-1] * 0.4, image.shape[-2] * 0.5])
@@ -194,18 +195,20 @@ def draw(image: Tensor, sensor: LogPolar, path: Path) -> None:
 
 @torch.inference_mode()
 def main() -> None:
-    """Measure and print."""
+    """Measure, and print the report."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.acuity", description=(__doc__ or "").split("\n", 1)[0])
-    parser.add_argument("--root", type=Path, help="folder of photographs; none takes the embedded scenes")
-    parser.add_argument("--annotations", type=Path, help="their boxes, in COCO's format")
-    parser.add_argument("--count", type=int, default=8, help="photographs")
-    parser.add_argument("--fixations", type=int, default=5, help="in each")
-    parser.add_argument("--detector", default="yolov3-tiny")
-    parser.add_argument("--weights", help="file of the detector's weights, where they are not to be downloaded")
-    parser.add_argument("--fovea", type=float, default=60.0, help="of the log-polar sensor, as for the next two")
-    parser.add_argument("--spacing", type=float, default=1.0)
-    parser.add_argument("--pooling", type=float, default=1.0)
-    parser.add_argument("--picture", type=Path, help="file for a picture of the views")
+    parser.add_argument("--root", type=Path, help="folder of photographs (none: the embedded scenes)")
+    parser.add_argument("--annotations", type=Path, help="annotation file of the photographs, in the COCO format")
+    parser.add_argument("--count", type=int, default=8, help="number of photographs")
+    parser.add_argument("--fixations", type=int, default=5, help="number of fixations in each photograph")
+    parser.add_argument("--detector", default="yolov3-tiny", help="name or file of the detector")
+    parser.add_argument("--weights", help="file of the detector's weights (none: the registered weights)")
+    parser.add_argument("--fovea", type=float, default=60.0, help="eccentricity in pixels at which acuity is halved")
+    parser.add_argument("--spacing", type=float, default=1.0, help="distance of receptors at the fixation, in pixels")
+    parser.add_argument(
+        "--pooling", type=float, default=1.0, help="width of receptive fields, in distances of neighbours"
+    )
+    parser.add_argument("--picture", type=Path, help="file to write for a picture of the views")
     options = parser.parse_args()
     torch.set_num_threads(1)
     detector = load_detector(options.detector, **({} if options.weights is None else {"weights": options.weights}))

@@ -1,6 +1,6 @@
-"""Belief and gaze as one writes them first: loops over cells, and brute force in one tensor.
+"""Peers of belief and gaze: straightforward loops over cells, and brute force with one large tensor.
 
-The published costs of exploration (9.85 s a decision) are those of loops like these.
+The published cost of exploration, 9.85 s per decision, is that of loops like these.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ CLASSES, LEVELS, DETECTIONS, PRIOR = 80, 8, 30, 0.5
 
 
 def kaplan(beta: Array, likelihood: Array) -> Array:
-    """The published rule for one cell."""
+    """Kaplan's rule for one cell, as published."""
     expected = beta @ likelihood
     return beta * (1 + likelihood / expected) / (1 + likelihood.min() / expected)
 
@@ -35,32 +35,32 @@ def divergence(beta: Array) -> float:
 
 
 def divergences(beta: Tensor) -> Tensor:
-    """The same of many cells, by torch's own formula."""
+    """Kullback-Leibler divergences of many cells from the prior, by torch's own formula."""
     prior = Dirichlet(torch.full_like(beta, PRIOR), validate_args=False)
     return kl_divergence(Dirichlet(beta, validate_args=False), prior)
 
 
 def certainty(beta: Array) -> float:
-    """Negative entropy of the mean."""
+    """Negative entropy of the mean of Dir(β)."""
     p = beta / beta.sum()
     return float((p * np.log(p)).sum())
 
 
 def certainties(beta: Tensor) -> Tensor:
-    """The same of many cells."""
+    """Negative entropies of the means of many cells."""
     p = beta / beta.sum(-1, keepdim=True)
     return (p * p.log()).sum(-1)
 
 
-# What the next fixation maximises, summed over the map: of one cell, and of many.
-WORTH: dict[str, tuple[Callable[[Array], float], Callable[[Tensor], Tensor]]] = {
+# The value of a cell that exploration sums over the map and maximises: for one cell, and for many.
+VALUES: dict[str, tuple[Callable[[Array], float], Callable[[Tensor], Tensor]]] = {
     "KL divergence": (divergence, divergences),
     "negative entropy": (certainty, certainties),
 }
 
 
 def make_model(classes: int = CLASSES, levels: int = LEVELS) -> FovealObservationModel:
-    """A model whose scores get flatter with the distance."""
+    """An observation model whose expected scores become flatter with distance."""
     sharp = torch.linspace(8, 0.5, levels)[:, None] * torch.eye(classes + 1)[:, None]
     edges = torch.arange(1, levels) * 50 / 640
     return (
@@ -69,25 +69,25 @@ def make_model(classes: int = CLASSES, levels: int = LEVELS) -> FovealObservatio
 
 
 def make_belief(cells: int, classes: int = CLASSES, batch: int = 1) -> DirichletBelief:
-    """Beliefs after some looks."""
+    """Random beliefs, as they might be after several looks."""
     generator = torch.Generator().manual_seed(0)
     return DirichletBelief(PRIOR + torch.rand(batch, cells, classes + 1, generator=generator).pow(8) * 6)
 
 
 def unvisited(belief: DirichletBelief) -> Tensor:
-    """No cell was fixated yet."""
+    """A mask of visited cells in which no cell is visited."""
     return torch.zeros_like(belief.closest, dtype=torch.bool)
 
 
 def make_look(cells: int, classes: int = CLASSES, batch: int = 1) -> tuple[Tensor, Tensor]:
-    """Likelihoods of detections, and boxes of about a tenth of the cells."""
+    """Random likelihoods of detections, and footprints that each cover about a tenth of the cells."""
     generator = torch.Generator().manual_seed(1)
     likelihood = (3 * torch.randn(batch, DETECTIONS, classes + 1, generator=generator)).softmax(-1)
     return likelihood, torch.rand(batch, DETECTIONS, cells, generator=generator) < 0.1
 
 
 def kaplan_update() -> Comparison:
-    """30 detections into a map of 10 × 10 cells and 81 classes."""
+    """Fusion of 30 detections into a map of 10 × 10 cells and 81 classes."""
     beta, (likelihood, footprint) = make_belief(100).beta, make_look(100)
     cells, scores, covered = beta[0].double().numpy(), likelihood[0].double().numpy(), footprint[0].numpy()
 
@@ -118,7 +118,7 @@ def kaplan_update() -> Comparison:
 
 
 def predictive_search() -> Comparison:
-    """Expected posterior of a target in every cell."""
+    """One decision of predictive search: the expected posterior of a target in every cell."""
     belief, model = make_belief(100), make_model()
     expected, cells = model.expected_scores()[:, 0].double().numpy(), belief.beta[0].double().numpy()
     visited = unvisited(belief)
@@ -141,21 +141,28 @@ def predictive_search() -> Comparison:
 
 
 def exploration(name: str, belief: DirichletBelief | None = None) -> Comparison:
-    """Value of every next fixation; the loop does one fixation of the hundred.
+    """One decision of exploration: the value of every next fixation; the loop evaluates one of the hundred fixations.
 
-    The peers give the published values, which are semfov's and those of the present map together.
+    The peers compute the published values, which equal semfov's plus the value of the present map.
+
+    Args:
+        name: name of the acquisition function.
+        belief: the belief (None: a random one).
+
+    Returns:
+        The comparison of semfov with the loop and with brute force.
     """
     grid, model = Grid(10, 10, (640, 480)), make_model()
     belief = belief or make_belief(len(grid))
     visited, wide = unvisited(belief), belief.beta[0].double()
     kinds = {"KL divergence": acquisition.KLDivergence, "negative entropy": acquisition.NegativeEntropy}
-    value, (worth, worths) = kinds[name](model, grid), WORTH[name]
+    value, (of_cell, of_cells) = kinds[name](model, grid), VALUES[name]
     levels = model.level(grid.cell_distance)
     table, cells = model.expected_scores().double().numpy(), wide.numpy()
 
     def loop(fixations: int = 1) -> list[float]:
         return [
-            sum(worth(kaplan(row, (row / row.sum()) @ table[:, levels[cell, f]])) for cell, row in enumerate(cells))
+            sum(of_cell(kaplan(row, (row / row.sum()) @ table[:, levels[cell, f]])) for cell, row in enumerate(cells))
             for f in range(fixations)
         ]
 
@@ -163,14 +170,14 @@ def exploration(name: str, belief: DirichletBelief | None = None) -> Comparison:
         mean = wide / wide.sum(-1, keepdim=True)
         scores = torch.einsum("xk,knj->xnj", mean, model.expected_scores().double())
         every = scores[torch.arange(len(wide))[:, None], levels]
-        return worths(fusion.kaplan(wide[:, None].expand_as(every), every)).sum(0)
+        return of_cells(fusion.kaplan(wide[:, None].expand_as(every), every)).sum(0)
 
     def ours() -> Tensor:
         return value(belief, visited)
 
     def agree() -> None:
         published = brute()
-        gained = published - worths(wide).sum()
+        gained = published - of_cells(wide).sum()
         precise = value(DirichletBelief(wide[None]), visited)[0]
         torch.testing.assert_close(precise, gained, rtol=0, atol=1e-6)
         torch.testing.assert_close(ours()[0].double(), gained, rtol=1e-3, atol=1e-4)

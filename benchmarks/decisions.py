@@ -1,9 +1,9 @@
-"""Milliseconds of one decision where to look next, beside the published ones: `python -m benchmarks.decisions`.
+"""Time of one decision where to look next, compared with published times: `python -m benchmarks.decisions`.
 
-A decision is for one episode, on a map of 10 x 10 cells and 81 classes, with 8 levels of distance. It begins with a
-belief that is there. It values every cell, draws the random numbers that break ties, and takes the best cell that was
-not visited. Looking, detecting and updating the belief are no part of it; the update has rows of its own. A decision by
-saliency has no belief: it foveates the photograph, models the saliency of the view, and averages that over the cells.
+A decision is made for one episode, on a map of 10 x 10 cells and 81 classes, with 8 levels of distance, from a given
+belief. It evaluates every cell, draws the random numbers that break ties, and takes the best cell not visited yet.
+Looking, detecting and updating the belief are not part of a decision; the update is timed separately. A decision by
+saliency uses no belief: it foveates the photograph, computes the saliency of the view, and averages it over the cells.
 """
 
 import argparse
@@ -35,8 +35,8 @@ from semfov.sensor import named_sensor
 TARGET, LOOKS, TIMES = 5, 3, 10
 KL = "KL divergence, raw"
 
-# Luzio, Bernardino and Moreno (2024), the tables of search and of exploration: computational cost in ms, on another
-# machine. They call raw Kaplan and calibrated modified Kaplan. Their saliency is VOCUS2.
+# Computational cost in ms from the tables of search and of exploration in Luzio, Bernardino and Moreno (2024), measured
+# on another machine. Their "Kaplan" is raw here, their "modified Kaplan" calibrated. Their saliency model is VOCUS2.
 PUBLISHED: dict[str, dict[str, float | None]] = {
     "search": {
         "random": 0.015,
@@ -62,7 +62,7 @@ PUBLISHED: dict[str, dict[str, float | None]] = {
 
 
 def make_seen(grid: Grid, seed: int) -> Detections:
-    """What one look might detect: boxes of up to a tenth of the photograph."""
+    """Random detections of one look, with boxes of up to a tenth of the photograph."""
     generator = torch.Generator().manual_seed(seed)
     size = torch.tensor(photograph().shape[:1:-1])
     corner, extent = torch.rand(2, 1, DETECTIONS, 2, generator=generator) * size
@@ -72,7 +72,7 @@ def make_seen(grid: Grid, seed: int) -> Detections:
 
 
 def believe(observer: observers.Semantic, grid: Grid) -> DirichletBelief:
-    """The belief after some looks."""
+    """The belief after `LOOKS` looks."""
     belief = observer.start(1, grid, torch.zeros(()))
     for seed in range(LOOKS):
         belief = observer(belief, make_seen(grid, seed), grid.centres[seed : seed + 1], grid)
@@ -80,7 +80,7 @@ def believe(observer: observers.Semantic, grid: Grid) -> DirichletBelief:
 
 
 def decide(value: acquisition.AcquisitionFunction, belief: DirichletBelief) -> Run:
-    """One decision."""
+    """A program that makes one decision."""
     visited, generator = unvisited(belief), torch.Generator().manual_seed(0)
     visited[:, :LOOKS] = True
 
@@ -92,7 +92,7 @@ def decide(value: acquisition.AcquisitionFunction, belief: DirichletBelief) -> R
 
 
 def on_the_map(model: FovealObservationModel, maps: dict[str, DirichletBelief], grid: Grid) -> dict[str, Run]:
-    """Decisions that go by a belief."""
+    """Programs of decisions from a belief."""
     kinds = {
         "non-predictive": policies.NonPredictive(),
         "predictive": policies.Predictive(model),
@@ -107,7 +107,7 @@ def on_the_map(model: FovealObservationModel, maps: dict[str, DirichletBelief], 
 
 
 def updates(model: FovealObservationModel, belief: DirichletBelief, grid: Grid) -> dict[str, Run]:
-    """What one look of 30 detections does to a belief."""
+    """Programs of the steps that update a belief with one look of 30 detections."""
     observer, seen, fixation = observers.Semantic(CLASSES + 1), make_seen(grid, LOOKS), torch.tensor([GAZE])
     look, distance = observer.weigh(seen, fixation, grid), grid.box_distance(seen.boxes, fixation)
     return {
@@ -118,7 +118,7 @@ def updates(model: FovealObservationModel, belief: DirichletBelief, grid: Grid) 
 
 
 def on_the_view(grid: Grid) -> tuple[dict[str, Run], dict[str, Run]]:
-    """Decisions that go by the saliency of a foveated view; and what is to be done for them first."""
+    """Programs of decisions by the saliency of a foveated view, and of the preparations for them."""
     image, gaze, sensor = photograph(), torch.tensor(GAZE), named_sensor("published")
     bands, visited = sensor.pyramid(image), torch.zeros(1, len(grid), dtype=torch.bool)
     generator = torch.Generator().manual_seed(0)
@@ -140,14 +140,14 @@ def on_the_view(grid: Grid) -> tuple[dict[str, Run], dict[str, Run]]:
 def main() -> None:
     """Measure all rows and write the tables."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.decisions", description=__doc__.splitlines()[0])
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=30.0, help="for all rows together, at least")
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--threads", type=int, default=2, help="number of threads")
+    parser.add_argument("--seconds", type=float, default=30.0, help="shortest duration of all measurements together")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
     options = parser.parse_args()
     use_threads(options.threads)
     clock, times = clock_for(options.threads)
     about = describe() | {"times": times}
-    # Made outside of inference mode, as a model that is loaded: it keeps its tables then.
+    # Made outside inference mode, like a loaded model, because only then it caches its tables.
     model = make_model()
     with torch.inference_mode():
         spreads, others, peers = measure_all(model, options.seconds / 3, clock)
@@ -165,7 +165,7 @@ def main() -> None:
 def measure_all(
     model: FovealObservationModel, seconds: float, clock: Clock
 ) -> tuple[dict[str, Spread], list[str], Measured]:
-    """Milliseconds of all rows, the names of those that are no decisions, and brute force."""
+    """Milliseconds of all rows, the names of the rows that are not decisions, and the comparison with brute force."""
     grid = Grid(10, 10, (640, 480))
     maps = {
         "raw": believe(observers.Semantic(CLASSES + 1), grid),
@@ -181,7 +181,7 @@ def measure_all(
 
 
 def report(about: dict[str, str], spreads: dict[str, Spread], others: list[str], peers: Measured) -> str:
-    """All tables."""
+    """The report with all tables, as Markdown."""
     sections = []
     for experiment, published in PUBLISHED.items():
         rows = [[name, spread(spreads[name]), number(cost) if cost else ""] for name, cost in published.items()]
@@ -191,29 +191,30 @@ def report(about: dict[str, str], spreads: dict[str, Spread], others: list[str],
         [
             "# Decisions",
             "",
-            "Written by `python -m benchmarks.decisions`. Medians (quartiles) of one run. What goes by a belief is run",
-            f"{TIMES} times in a row, and the mean is one value.",
+            "Written by `python -m benchmarks.decisions`. Medians (quartiles) of one run. Decisions from a belief are",
+            f"run {TIMES} times in a row, and their mean is one value.",
             "",
-            f"A decision is for one episode, {CLASSES + 1} classes on 10 x 10 cells, {LEVELS} levels of distance. It",
-            "begins with a belief that is there. It values every cell, draws the random numbers that break ties, and",
-            "takes the best cell that was not visited. Looking, detecting and updating the belief are no part of it.",
-            "By saliency, it foveates a photograph of 640 x 480 whose pyramid is there, models the saliency of the",
-            "view, and averages it over the cells. Raw is the map by Kaplan's rule, calibrated that by the modified",
-            "rule. Published figures are of another machine: only the peers below were timed beside semfov.",
+            f"A decision is made for one episode, with {CLASSES + 1} classes on 10 x 10 cells and {LEVELS} levels of",
+            "distance, from a given belief. It evaluates every cell, draws the random numbers that break ties, and",
+            "takes the best cell not visited yet. Looking, detecting and updating the belief are not part of a",
+            "decision. A decision by saliency foveates a photograph of 640 x 480 from its given pyramid, computes the",
+            "saliency of the view, and averages it over the cells. Raw: map by Kaplan's rule; calibrated: map by the",
+            "modified rule. Published times are from another machine: only the peers below were timed beside semfov.",
             "",
             *(f"- {key}: {value}" for key, value in about.items()),
             "",
             *sections,
-            "## What decisions need and do not include",
+            "## Work that decisions need but do not include",
             "",
             table(["work", "semfov, ms"], [[name, spread(spreads[name])] for name in others]),
             "",
-            "The foveated view is the exception: it is part of decisions by saliency.",
+            "The foveated view is an exception: it is included in decisions by saliency.",
             "",
             "## Brute force",
             "",
-            "The published sum over the map, of every fixation, by the formula. The loop does one fixation of the",
-            "hundred, and its time is scaled up. It leaves the choice out. Ratios are of times in one repetition.",
+            "The published sum over the map, computed for every fixation by the formula. The loop evaluates one of the",
+            "hundred fixations, and its time is scaled up. It does not choose the next cell. Ratios of times are taken",
+            "within one repetition.",
             "",
             table(["decision", "peer", "semfov, ms", "peer, ms", "peer / semfov"], comparison_rows(peers)),
             "",

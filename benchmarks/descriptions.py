@@ -1,8 +1,8 @@
-"""Whether word vectors know what a description means: `python -m benchmarks.descriptions --embeddings FILE`.
+"""Do word vectors find the class that a description means? `python -m benchmarks.descriptions --embeddings FILE`.
 
-Other names of COCO's classes (`semfov.data.synonyms`) stand for descriptions: of each the class is known. The first
-table has how often the class is among the nearest ones, the second the mean log probability of the right class by the
-temperature of `semfov.data.spread`. Names that share a word with their class, and those that mean several, are left
+Other names of COCO's classes (`semfov.data.synonyms`) serve as descriptions whose class is known. The first table gives
+how often the class is among the nearest ones. The second gives the mean log probability of the right class by the
+temperature of `semfov.data.spread`. Names that share a word with their class and names with several classes are left
 out.
 """
 
@@ -22,7 +22,7 @@ TEMPERATURES = (0.04, 0.06, 0.08, 0.1, 0.15)
 
 
 def cases() -> list[tuple[str, int]]:
-    """Other names, each with the place of its one class."""
+    """Other names, each with the index of its class."""
     pairs = [(other, alike(other, COCO_CLASSES)) for name in COCO_CLASSES for other in names_of(name)]
     return [
         (other, places[0])
@@ -35,7 +35,7 @@ def main() -> None:
     """Measure, and print tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--embeddings", type=Path, required=True, help="word vectors in GloVe's or word2vec's text format"
+        "--embeddings", type=Path, required=True, help="file of word vectors in the text format of GloVe or word2vec"
     )
     path = parser.parse_args().embeddings
     asked = cases()

@@ -19,7 +19,7 @@ from semfov.detection.load import load_detector
 from semfov.detection.selection import suppress
 from semfov.errors import lookup
 
-# COCOeval cuts for itself: it counts at most 100 boxes of each class in an image, at any confidence.
+# COCOeval limits the boxes itself: it counts at most 100 boxes of each class in an image, at any confidence.
 SELECTIONS = {
     "per-class NMS": Selection(threshold=0.001, iou=0.5, limit=10_000, per_class=True),
     "class-agnostic NMS": Selection(threshold=0.001, iou=0.5, limit=10_000),
@@ -27,7 +27,7 @@ SELECTIONS = {
 
 
 def read_image(path: Path) -> Tensor:
-    """A photograph as `(1, 3, H, W)`, RGB in [0, 1], in the orientation in which COCO annotates: as stored."""
+    """A photograph as `(1, 3, H, W)`, RGB in [0, 1], in the stored orientation, to which COCO's annotations refer."""
     import numpy as np
     from PIL import Image
 
@@ -36,9 +36,15 @@ def read_image(path: Path) -> Tensor:
 
 
 def rows_above(candidates: Candidates, threshold: float, *, multilabel: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Row, score (objectness times class) and label from 0 of what one image's candidates score above `threshold`.
+    """The candidates of one image whose score is at least `threshold`.
 
-    Each box counts with its best class; with `multilabel`, with every class.
+    Args:
+        candidates: candidates of one image.
+        threshold: smallest score.
+        multilabel: count each box for every class; false: only for its best class.
+
+    Returns:
+        Row of the candidate, score (objectness times class score) and label from 0, each `(M,)`.
     """
     scores = candidates.classes[0]
     if candidates.objectness is not None:
@@ -54,7 +60,7 @@ def rows_above(candidates: Candidates, threshold: float, *, multilabel: bool) ->
 def detect(
     detector: Detector, image: Tensor, selections: Iterable[Selection], *, multilabel: bool = False
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Boxes, scores and labels of one photograph for each of `selections`."""
+    """Yield boxes, scores and labels of one photograph for each of `selections`."""
     canvas, placement = detector.fit(image)
     candidates = detector.propose(canvas)
     boxes = placement.boxes_to_image(candidates.boxes[0])
@@ -72,7 +78,7 @@ def average_precision(
     *,
     multilabel: bool = False,
 ) -> list[tuple[float, float]]:
-    """AP and AP50 of COCOeval for each of `selections`, over all images of the annotation file."""
+    """AP and AP50 by COCOeval for each of `selections`, over all images of the annotation file."""
     from pycocotools.coco import COCO
 
     with contextlib.redirect_stdout(io.StringIO()):
@@ -105,14 +111,15 @@ def evaluate(truth: Any, result: list[dict[str, Any]]) -> tuple[float, float]:
 
 
 def main() -> None:
+    """Measure, and print the table."""
     parser = argparse.ArgumentParser(description="COCO average precision of a detector, without foveation")
     parser.add_argument("--detector", default="yolov3-tiny", help="name or file, as load_detector takes it")
     parser.add_argument("--weights", help="weights file, for a cfg or instead of the published weights")
     parser.add_argument("--root", type=Path, required=True, help="folder of the photographs")
     parser.add_argument("--annotations", type=Path, required=True, help="COCO annotation file")
-    parser.add_argument("--stride", type=int, help="pad the canvas to a multiple of it; 0: the whole canvas")
-    parser.add_argument("--multilabel", action="store_true", help="let a box count for every class")
-    parser.add_argument("--runtime", help="what computes a Darknet network: auto, torch or onnxruntime")
+    parser.add_argument("--stride", type=int, help="pad the canvas to a multiple of this; 0: to the whole canvas")
+    parser.add_argument("--multilabel", action="store_true", help="count a box for every class")
+    parser.add_argument("--runtime", help="what runs a Darknet network: auto, torch or onnxruntime")
     arguments = parser.parse_args()
     options: dict[str, Any] = {}
     if arguments.weights:

@@ -1,9 +1,9 @@
 """Milliseconds per photograph of a Darknet detector in onnxruntime and in torch, side by side.
 
-For the canvas of the photograph (padded to a multiple of 32 pixels, the default) and the whole square one. `network`
-goes from canvas to every candidate; `detect` adds suppression and score vectors; `all` adds the letterbox before.
-Repetitions are interleaved; a time is the median over them, a ratio, torch over onnxruntime within a repetition, stands
-with its quartiles.
+Two canvases are measured: the photograph's (padded to a multiple of 32 pixels, the default) and the whole square.
+`network` goes from the canvas to all candidates; `detect` adds non-maximum suppression and score vectors; `all` also
+includes the letterbox. Repetitions are interleaved. Times are medians over repetitions. Ratios, torch over onnxruntime
+within a repetition, are given with quartiles.
 
 python -m benchmarks.detector_speed --detector yolov3-tiny --batch 1 4
 """
@@ -26,14 +26,14 @@ RUNTIMES: tuple[Runtime, ...] = ("onnxruntime", "torch")
 
 
 def photograph(width: int, height: int) -> Tensor:
-    """A photograph that scikit-image carries, `(1, 3, height, width)`."""
+    """A photograph that scikit-image ships, `(1, 3, height, width)`."""
     from skimage import data
 
     return resize(torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255, (width, height))
 
 
 def programs(detector: Detector, images: Tensor) -> dict[str, Run]:
-    """What is timed, by its name."""
+    """The programs to time, by name."""
     canvas, placement = detector.fit(images)
     return {
         "network": lambda: detector.propose(canvas),
@@ -44,9 +44,9 @@ def programs(detector: Detector, images: Tensor) -> dict[str, Run]:
 
 @torch.inference_mode()
 def measure(options: argparse.Namespace) -> list[list[str]]:
-    """Rows of the table."""
+    """Measure, and return the rows of the table."""
     torch.set_num_threads(options.threads)
-    torch.empty(31 << 20, dtype=torch.uint8)  # freed, it has the C library keep memory, as in the evaluation's workers
+    torch.empty(31 << 20, dtype=torch.uint8)  # freeing it makes the C library keep memory, as in evaluation workers
     rows = []
     for stride in (32, None):
         loaded = [load_yolo(options.detector, weights=options.weights, stride=stride, runtime=r) for r in RUNTIMES]
@@ -63,14 +63,15 @@ def measure(options: argparse.Namespace) -> list[list[str]]:
 
 
 def main() -> None:
+    """Measure in all processes, and print a table for each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--detector", default="yolov3-tiny", help="yolov3-tiny, yolov3, yolov3-spp, or a cfg")
+    parser.add_argument("--detector", default="yolov3-tiny", help="yolov3-tiny, yolov3, yolov3-spp, or a cfg file")
     parser.add_argument("--weights", help="weights file, for a cfg or instead of the published weights")
     parser.add_argument("--size", type=int, nargs=2, default=[640, 480], help="width and height of the photograph")
-    parser.add_argument("--batch", type=int, nargs="+", default=[1, 4], help="photographs at once")
+    parser.add_argument("--batch", type=int, nargs="+", default=[1, 4], help="batch sizes")
     parser.add_argument("--threads", type=int, default=1, help="threads of each process")
     parser.add_argument("--processes", type=int, default=1, help="processes that measure at the same time")
-    parser.add_argument("--repetitions", type=int, default=25)
+    parser.add_argument("--repetitions", type=int, default=25, help="number of repetitions")
     options = parser.parse_args()
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(options.processes, mp_context=spawn) as pool:

@@ -1,11 +1,11 @@
 """Time to fit 81 x 8 Dirichlets of 81 dimensions, relative to the PyPI package `dirichlet`, in one run.
 
 The data are samples of random Dirichlets that resemble detectors' scores. semfov fits all 648 at once, from their mean
-logs (as `FovealObservationModel.fit` does) and from the samples themselves; the package fits one after another from
-samples, by each of its methods. As that takes long, every repetition times it on a few of them, next to a run of
-semfov on all; a ratio is of times per Dirichlet within one repetition. Figures are medians over repetitions, with
-quartiles. The largest relative difference of the parameters is over the same few; the package stops at a change of
-1e-7 in the log likelihood, not in the parameters.
+logarithms (as `FovealObservationModel.fit` does) and from the samples themselves. The package fits one after the other
+from samples, by each of its methods. Because that takes long, every repetition times the package on a few of them, next
+to a run of semfov on all. Ratios compare times per Dirichlet within one repetition. Values are medians over
+repetitions, with quartiles. The largest relative difference of the parameters is over the same few Dirichlets; the
+package stops when the log likelihood changes by less than 1e-7, whatever the change of the parameters.
 
 python -m benchmarks.dirichlet_mle
 """
@@ -26,7 +26,7 @@ CLASSES, LEVELS, COMPONENTS = 81, 8, 81
 
 
 def draw(samples: int, seed: int) -> Tensor:
-    """Score vectors of random Dirichlets, `(648, samples, 81)`, floored."""
+    """Score vectors drawn from random Dirichlets, `(648, samples, 81)`, with values floored at 1e-6."""
     rng = np.random.default_rng(seed)
     alpha = np.exp(rng.normal(-1.0, 1.0, (CLASSES * LEVELS, COMPONENTS)))
     scores = np.stack([rng.dirichlet(row, samples) for row in alpha])
@@ -34,25 +34,25 @@ def draw(samples: int, seed: int) -> Tensor:
 
 
 def milliseconds(run: Callable[[], object]) -> float:
-    """Time of one run."""
+    """Elapsed milliseconds of one run."""
     start = time.perf_counter()
     run()
     return 1e3 * (time.perf_counter() - start)
 
 
 def spread(values: list[float], digits: int = 1) -> str:
-    """Median and quartiles."""
+    """Median and quartiles, as text."""
     low, middle, high = statistics.quantiles(values, n=4)
     return f"{middle:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def main() -> None:
-    """Measure and print the table."""
+    """Measure, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--samples", type=int, default=100, help="samples of each Dirichlet")
-    parser.add_argument("--repetitions", type=int, default=15)
-    parser.add_argument("--few", type=int, default=4, help="Dirichlets that the package fits in a repetition")
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--samples", type=int, default=100, help="number of samples of each Dirichlet")
+    parser.add_argument("--repetitions", type=int, default=15, help="number of repetitions")
+    parser.add_argument("--few", type=int, default=4, help="number of Dirichlets that the package fits per repetition")
+    parser.add_argument("--threads", type=int, default=2, help="number of threads")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
 
@@ -97,7 +97,7 @@ def main() -> None:
 
 
 def pypi_version() -> str:
-    """Version of the package that is compared with."""
+    """Version of the package `dirichlet`."""
     from importlib.metadata import version
 
     return version("dirichlet")

@@ -1,8 +1,8 @@
-"""Steps of the environments in a second: `python -m benchmarks.environments`.
+"""Steps per second of the environments: `python -m benchmarks.environments`.
 
-Episodes are in embedded scenes whose looks are stored, on 10 x 10 cells. Each step takes a cell at random that was not
-fixated, and every episode that ends is followed by another: all that is counted. Beside it, the agent that looks itself
-makes the same number of steps with the detector in them.
+Episodes run in embedded scenes with stored detections, on 10 x 10 cells. Each step fixates a random cell that was not
+fixated before, and every episode that ends is followed by another; the time of restarts is included. For comparison,
+an agent makes the same number of steps and runs the detector in each.
 """
 
 import argparse
@@ -30,11 +30,11 @@ WORLDS = {
     "exploration, recommended": ("exploration", "recommended", (8, 32)),
     "exploration, Kaplan's rule": ("exploration", "kl-raw", (64, 256)),
 }
-"""The beliefs that environments keep: task, policy, and how many episodes are run side by side."""
+"""Beliefs of the environments: task, policy, and numbers of episodes that run side by side."""
 
 
 def steps(envs: Any, seed: int) -> Run:
-    """A program of some steps of environments side by side."""
+    """A program that makes `STEPS` steps of several environments side by side."""
     random = np.random.default_rng(seed)
     state: dict[str, Any] = {"infos": envs.reset(seed=seed)[1]}
 
@@ -46,13 +46,13 @@ def steps(envs: Any, seed: int) -> Run:
 
 
 def any_free(random: np.random.Generator, masks: NDArray[np.int8]) -> NDArray[np.int64]:
-    """A cell at random of each row that was not fixated."""
+    """For each row, a random cell that was not fixated before."""
     chosen: NDArray[np.int64] = (random.random(masks.shape, dtype=np.float32) * masks).argmax(-1)
     return chosen
 
 
 def alone(env: GazeSearch | GazeExplore, seed: int) -> Run:
-    """A program of some steps of one environment."""
+    """A program that makes `STEPS` steps of one environment."""
     random = np.random.default_rng(seed)
     state: dict[str, Any] = {"info": env.reset(seed=seed)[1]}
 
@@ -67,19 +67,19 @@ def alone(env: GazeSearch | GazeExplore, seed: int) -> Run:
 
 
 def looking(task: str, scenery: Scenery) -> Run:
-    """The recommended agent's own looks, as many as the steps."""
+    """A program in which the recommended agent makes as many looks with the detector."""
     agent = semfov.ActivePerception.recommended()
     image = scenery.image(0)
     if task == "search":
-        # Thresholds that nothing passes: the search goes on.
+        # No probability passes these thresholds, so the search does not end early.
         return lambda: agent.search(image, "person", start=0, shifts=STEPS - 1, confirm=1.0, give_up=0.0)
     return lambda: agent.explore(image, start=0, shifts=STEPS - 1, until=0.0)
 
 
 def programs(task: str, scenery: Scenery, sizes: Sequence[int]) -> dict[str, tuple[Run, int]]:
-    """Every program, and how many episodes it has side by side."""
+    """All programs, each with its number of episodes side by side."""
     kind = GazeSearch if task == "search" else GazeExplore
-    # Restarts come on top of the steps.
+    # Restart in the same step, so that the time of restarts is included and every step counts.
     restarts = AutoresetMode.SAME_STEP
     wide: Callable[..., Any] = partial(GazeVectorEnv, task, scenery=scenery, autoreset_mode=restarts)
     found: dict[str, tuple[Run, int]] = {
@@ -101,12 +101,12 @@ def programs(task: str, scenery: Scenery, sizes: Sequence[int]) -> dict[str, tup
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure all rows and write the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.environments", description=__doc__.splitlines()[0])
-    parser.add_argument("--scenes", type=int, default=8)
-    parser.add_argument("--only", choices=list(WORLDS), nargs="+", default=list(WORLDS))
-    parser.add_argument("--cache", type=Path, help="of what is seen from every cell")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=6.0, help="for each belief, at least")
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--scenes", type=int, default=8, help="number of embedded scenes")
+    parser.add_argument("--only", choices=list(WORLDS), nargs="+", default=list(WORLDS), help="beliefs to measure")
+    parser.add_argument("--cache", type=Path, help="folder of the stored detections from every cell")
+    parser.add_argument("--threads", type=int, default=1, help="number of threads")
+    parser.add_argument("--seconds", type=float, default=6.0, help="shortest duration for each belief")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
     options = parser.parse_args(arguments)
     use_threads(options.threads)
     clock, times = clock_for(options.threads)
@@ -130,10 +130,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         [
             "# Environments",
             "",
-            f"Written by `python -m benchmarks.environments`. Steps a second in {options.scenes} embedded scenes, on",
-            "10 x 10 cells: median and quartiles over repetitions. What is seen from every cell was stored before.",
-            "Episodes that end are followed by others, whose first looks come on top of the steps. One that looks",
-            "itself runs YOLOv3-tiny in every step.",
+            f"Written by `python -m benchmarks.environments`. Steps per second in {options.scenes} embedded scenes, on",
+            "10 x 10 cells: median and quartiles over repetitions. The detections from every cell were stored before.",
+            "Episodes that end are followed by others; the time of their first looks is included, without counting as",
+            "a step. `one that looks itself`: an agent that runs YOLOv3-tiny in every step.",
             "",
             *(f"- {key}: {value}" for key, value in about.items()),
             "",

@@ -1,17 +1,17 @@
-"""Runs that are killed at a random moment and started again: is the result the same to the last bit?
+"""Are the results of runs that are killed at a random moment and restarted the same to the last bit?
 
-A command is started on the embedded scenes, killed (SIGKILL) after a random share of the time that a whole run takes,
-and started again; what it leaves is compared with what a run leaves that nobody disturbs:
+A command is started on the embedded scenes, killed (SIGKILL) after a random share of the duration of a whole run, and
+started again. Its output is compared with that of an undisturbed run:
 
-- `store`: `eval.search` from the first look: what is seen from every cell is kept in a store;
-- `evaluation`: `eval.explore` with its store there, while it runs policies and writes its report;
+- `store`: `eval.search` from the first look on, while it stores the detections from every cell;
+- `evaluation`: `eval.explore` with a complete store, while it runs policies and writes its report;
 - `fit`: `train.fit_fom` from the first look to the fitted model;
 - `workers`: `store` with two worker processes;
-- `reports`: `evaluation` with all its outcomes there, while it writes its report.
+- `reports`: `evaluation` with all outcomes complete, while it writes its report.
 
-After each kill no process of the run may be left. Runs are forked from one process that has imported everything, so
-that kills hit work and not the start of Python. A run that was faster than its kill does not count; the next is given
-another moment.
+After each kill, no process of the run may remain. Runs are forked from one process that has imported everything, so
+that kills hit the work and not the start of Python. A run that ends before its kill does not count; the next run is
+killed at another moment.
 
 python -m benchmarks.faults --kills 50
 """
@@ -54,21 +54,21 @@ _FIT = [
 
 
 def _two(arguments: list[str]) -> list[str]:
-    """The arguments with two workers."""
+    """Add the option for two workers to the arguments."""
     return [*arguments, "--workers", "2"]
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command and what it must leave.
+    """A command and the files that it must write.
 
     Attributes:
-        name: in tables.
-        main: the command.
-        arguments: without folders.
+        name: name in tables.
+        main: function of the command.
+        arguments: arguments without folders.
         results: files of `out` that must be the same to the last bit.
-        stored: whether the store is there already.
-        finished: whether the outcomes are there already, too.
+        stored: whether the store is complete at the start.
+        finished: whether the outcomes are complete at the start, too.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Command:
     finished: bool = False
 
     def run(self, folder: Path) -> None:
-        """Run in this process, in silence; it does not return."""
+        """Run in this process without output, and end the process."""
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, 1)
         os.dup2(null, 2)
@@ -88,7 +88,7 @@ class Command:
         os._exit(self.main(arguments))
 
     def digest(self, folder: Path) -> str:
-        """sha256 over the results, and over what the caches hold."""
+        """The sha256 of the results and of the contents of the caches."""
         digest = hashlib.sha256()
         for name in self.results:
             digest.update((folder / "out" / name).read_bytes())
@@ -111,15 +111,15 @@ COMMANDS = (
 
 @dataclass(frozen=True)
 class Survived:
-    """What came of the kills of a command.
+    """Results of the kills of a command.
 
     Attributes:
-        seconds: of an undisturbed run.
-        spared: runs that ended before their kill.
-        progress: for each kill, files that were there, finished.
-        remains: for each kill, unfinished files that were left behind.
-        identical: kills after which the result is that of the undisturbed run.
-        left: processes of killed runs that were still there ten seconds later.
+        seconds: duration of an undisturbed run.
+        spared: number of runs that ended before their kill.
+        progress: for each kill, number of finished files at that moment.
+        remains: for each kill, number of unfinished files left behind.
+        identical: number of kills after which the restarted run has the same result as the undisturbed run.
+        left: number of processes of killed runs that still existed ten seconds later.
     """
 
     seconds: float
@@ -131,7 +131,7 @@ class Survived:
 
 
 def survive(command: Command, kills: int, seed: int = 0) -> Survived:
-    """Kill and resume a command so often."""
+    """Kill and restart a command `kills` times."""
     fork = multiprocessing.get_context("fork")
     chance = random.Random(seed)
     with tempfile.TemporaryDirectory() as name:
@@ -174,7 +174,7 @@ def survive(command: Command, kills: int, seed: int = 0) -> Survived:
 
 
 def descendants(number: int) -> list[int]:
-    """Processes that a process started, and those that they did (on Linux; elsewhere none are known)."""
+    """All descendants of a process (on Linux; empty on other systems)."""
     found: list[int] = []
     for path in Path("/proc").glob(f"{number}/task/*/children"):
         with suppress(OSError):
@@ -184,7 +184,7 @@ def descendants(number: int) -> list[int]:
 
 
 def still_there(numbers: list[int], seconds: float = 10.0) -> int:
-    """How many of these processes do not end within some time."""
+    """Number of these processes that do not end within some seconds."""
     deadline = time.monotonic() + seconds
     while (alive := [number for number in numbers if _alive(number)]) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -199,31 +199,31 @@ def _alive(number: int) -> bool:
 
 
 def finish(process: "multiprocessing.context.ForkProcess") -> float:
-    """Run a process to its end; returns seconds."""
+    """Run a process to its end; returns its duration in seconds."""
     start = time.perf_counter()
     process.start()
     process.join()
     if process.exitcode != 0:
-        raise RuntimeError(f"a run that nobody disturbed ended with exit code {process.exitcode}")
+        raise RuntimeError(f"expected exit code 0 of an undisturbed run, got {process.exitcode}")
     return time.perf_counter() - start
 
 
 def main() -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=50, help="of each command")
-    parser.add_argument("--only", nargs="+", choices=[c.name for c in COMMANDS], help="these commands; default: all")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--kills", type=int, default=50, help="number of kills of each command")
+    parser.add_argument("--only", nargs="+", choices=[c.name for c in COMMANDS], help="commands to test (default: all)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of the moments of the kills")
+    parser.add_argument("--json", type=Path, help="JSON file to write the results to, too")
     options = parser.parse_args()
-    print("| run | s | kills | finished files then | unfinished | processes left | same bits after |")
+    print("| run | s | kills | finished files | unfinished files | processes left | same bits after restart |")
     print("|---|---|---|---|---|---|---|", flush=True)
     figures = {}
     for command in [c for c in COMMANDS if options.only is None or c.name in options.only]:
-        came = survive(command, options.kills, options.seed)
-        figures[command.name] = came.__dict__
-        files = f"{min(came.progress)} to {max(came.progress)}"
-        cells = [f"{came.seconds:.1f}", options.kills, files, sum(came.remains), came.left, came.identical]
+        result = survive(command, options.kills, options.seed)
+        figures[command.name] = result.__dict__
+        files = f"{min(result.progress)} to {max(result.progress)}"
+        cells = [f"{result.seconds:.1f}", options.kills, files, sum(result.remains), result.left, result.identical]
         print(f"| {command.name} | {' | '.join(map(str, cells))} |", flush=True)
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + "\n")

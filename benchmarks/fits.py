@@ -1,4 +1,4 @@
-"""Maximum-likelihood Dirichlets beside the PyPI package `dirichlet` and scipy's optimiser."""
+"""Comparison of maximum-likelihood fits of Dirichlets with the PyPI package `dirichlet` and scipy's optimiser."""
 
 import dirichlet as pypi
 import numpy as np
@@ -12,7 +12,7 @@ from semfov.observation.dirichlet import mle
 
 
 def dirichlets(samples: int = 100) -> Comparison:
-    """81 × 8 Dirichlets of 81 dimensions from samples; the peers fit one of the 648."""
+    """Fit of 81 × 8 Dirichlets of 81 dimensions from samples; the peers fit one of the 648."""
     scores = draw(samples, seed=0)
     logs = scores[0].log().mean(0).numpy()
 

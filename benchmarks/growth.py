@@ -1,4 +1,4 @@
-"""How costs grow with the size of the problem: the slope of time over size, both in logarithms."""
+"""How costs grow with the size of the problem: the slope of log time over log size."""
 
 import math
 from collections.abc import Callable
@@ -12,13 +12,13 @@ from semfov.belief import fuse
 
 
 def fusing(cells: int = 100, classes: int = 80, batch: int = 1) -> Run:
-    """30 detections into each map."""
+    """A program that fuses 30 detections into each map."""
     beta, look = make_belief(cells, classes, batch).beta, make_look(cells, classes, batch)
     return lambda: fuse(beta, *look)
 
 
 def exploring(side: int = 10, classes: int = 80, levels: int = 8) -> Run:
-    """One decision by KL divergence."""
+    """A program that makes one decision by KL divergence."""
     value = acquisition.KLDivergence(make_model(classes, levels), Grid(side, side, (640, 480)))
     belief = make_belief(side * side, classes)
     visited = unvisited(belief)
@@ -26,7 +26,7 @@ def exploring(side: int = 10, classes: int = 80, levels: int = 8) -> Run:
 
 
 def foveating(side: int = 256, levels: int = 5) -> Run:
-    """One fixation, pyramid included."""
+    """A program that foveates an image for one fixation, including the pyramid."""
     image, gaze = torch.rand(1, 3, side, side), torch.tensor([side / 3, side / 2])
     return lambda: foveate(image, gaze, sigma=side / 6, levels=levels)
 
@@ -44,7 +44,7 @@ SERIES: dict[str, tuple[Callable[[int], Run], tuple[int, ...]]] = {
 
 
 def grow(seconds: float, clock: Clock) -> dict[str, tuple[dict[int, Spread], float]]:
-    """Milliseconds by size, and the slope between the first size and the last, of every series."""
+    """For every series, milliseconds by size and the slope between the first and the last size."""
     grown = {}
     for name, (make, sizes) in SERIES.items():
         times = interleaved({str(size): make(size) for size in sizes}, seconds, clock)

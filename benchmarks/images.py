@@ -1,4 +1,4 @@
-"""Sensor and saliency beside OpenCV and Kornia, for one photograph of 640 × 480."""
+"""Comparison of sensor and saliency with OpenCV and Kornia, for one photograph of 640 × 480."""
 
 from collections.abc import Callable
 
@@ -18,14 +18,14 @@ GAZE, SIGMA = (290.0, 280.0), 100.0
 
 
 def photograph() -> torch.Tensor:
-    """A photograph that scikit-image carries, `(1, 3, 480, 640)`."""
+    """A photograph that scikit-image ships, `(1, 3, 480, 640)`."""
     from skimage import data
 
     return resize(torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255, (640, 480)).clamp(0, 1)
 
 
 def foveation(convention: Convention, *, reuse: bool) -> Comparison:
-    """One fixation; the peers build their pyramid for it, semfov too unless it is reused."""
+    """Foveation for one fixation; peers build their pyramid each time, and so does semfov unless `reuse`."""
     image = photograph()
     pixels, gaze = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy()), torch.tensor(GAZE)
     kinds: dict[Convention, dict[str, Callable[[], Array | torch.Tensor]]] = {
@@ -50,7 +50,7 @@ def foveation(convention: Convention, *, reuse: bool) -> Comparison:
 
 
 def saliency(name: str) -> Comparison:
-    """A saliency map."""
+    """Computation of a saliency map."""
     image = photograph()
     pixels, filters = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy()), gabor_filters()
     model = VOCUS2() if name == "VOCUS2" else IttiKoch()
@@ -59,6 +59,6 @@ def saliency(name: str) -> Comparison:
 
 
 def use_threads(count: int) -> None:
-    """Threads of torch and of OpenCV."""
+    """Set the number of threads of torch and of OpenCV."""
     torch.set_num_threads(count)
     cv2.setNumThreads(count)

@@ -1,22 +1,22 @@
-"""What a fixation costs beside its detection, and whether sensor and detector stand in each other's way.
+"""What a fixation costs in addition to its detection, and whether sensor and detector slow each other down.
 
-Two thread pools work in turn here: torch's in the sensor, onnxruntime's in the detector. First, sensor and detector
-are timed each alone and then alternately; taking turns should cost no more than both alone. It does where the threads
-of onnxruntime spin while they wait, so semfov turns that off; the table has both. Second, whole fixations are timed
-part by part: sensor, detector, belief and policy.
+Two thread pools alternate: torch's in the sensor and onnxruntime's in the detector. First, sensor and detector are
+timed each alone and then alternately; alternating should cost no more than the sum of both alone. It costs more if the
+threads of onnxruntime spin while they wait, so semfov turns spinning off; the table shows both settings. Second, whole
+fixations are timed part by part: sensor, detector, belief and policy.
 
-Repetitions are interleaved, with another order in each; a figure is the median over repetitions, a ratio or share
-stands with its quartiles. The observation model is one that calibrates nothing, at the price of one that does.
+Repetitions are interleaved, each in another order. Times are medians over repetitions; ratios and shares are given with
+quartiles. The observation model changes no score, but costs as much as a fitted one.
 
-A ratio that stays above 1 without spinning comes of memory: glibc hands freed blocks of some MB back to the system, and
-every fixation has to ask for its pages again. `--keep-memory` frees one block of 31 MB at the start, after which glibc
-keeps up to 62 MB.
+If a ratio stays above 1 without spinning, memory is the cause: glibc returns freed blocks of several MB to the system,
+and every fixation has to request its pages again. `--keep-memory` frees one block of 31 MB at the start, after which
+glibc keeps up to 62 MB.
 
 python -m benchmarks.interleave
 python -m benchmarks.interleave --model yolox_nano.onnx
 
-On a machine with other work, `--processor-time` counts what the calling thread computes instead of what passes on the
-clock, for one thread.
+On a machine with other work, `--processor-time` measures the CPU time of the calling thread instead of elapsed time,
+with one thread.
 """
 
 import argparse
@@ -48,14 +48,14 @@ PARTS = ("sensor", "detector", "belief", "policy")
 
 
 def load(path: Path, threads: int, spinning: bool) -> OnnxDetector:
-    """A detector of `threads` threads, which spin while they wait or do not."""
+    """Load a detector with `threads` threads, which spin while they wait if `spinning`."""
     detector = load_onnx(path, threads=threads)
     detector.session = OnnxSession(path, threads=threads, spinning=spinning)
     return detector
 
 
 def taking_turns(eye: Eye, view: View, fixations: Tensor, repetitions: int, clock: Clock) -> dict[str, list[float]]:
-    """Milliseconds per fixation of the sensor alone, of the detector alone and of both in turn, in every repetition."""
+    """Milliseconds per fixation of the sensor alone, of the detector alone and of both in turn, by repetition."""
     gazes = fixations.split(1)
     canvases = [eye.foveated(view, gaze) for gaze in gazes]
     runs: dict[str, Callable[[], object]] = {
@@ -76,7 +76,7 @@ def taking_turns(eye: Eye, view: View, fixations: Tensor, repetitions: int, cloc
 
 
 def in_turn(fixations: int = 10) -> Comparison:
-    """Fixations in which sensor and detector take turns, beside all of the one and then all of the other."""
+    """Fixations in which sensor and detector alternate, compared with all sensor work first and then all detection."""
     image = photograph(640, 480)
     grid = semfov.Grid(COLUMNS, ROWS, (640, 480))
     order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(0))
@@ -104,7 +104,7 @@ def in_turn(fixations: int = 10) -> Comparison:
 
 
 def strategies(classes: Sequence[str]) -> dict[str, Strategy]:
-    """From the cheapest search to exploration."""
+    """Strategies of different cost, from the cheapest search to exploration."""
     model = semfov.FovealObservationModel.identity(classes, EDGES).eval()
     raw, calibrated = (semfov.observers.Semantic(1 + len(classes), observation) for observation in (None, model))
     return {
@@ -117,7 +117,7 @@ def strategies(classes: Sequence[str]) -> dict[str, Strategy]:
 def scanpath(
     eye: Eye, view: View, grid: semfov.Grid, strategy: Strategy, fixations: int, seed: int, clock: Clock
 ) -> list[float]:
-    """Milliseconds per fixation of each of `PARTS` along one scanpath."""
+    """Milliseconds per fixation of each of `PARTS`, over one scanpath."""
     generator = torch.Generator().manual_seed(seed)
     acquisition = strategy.policy(TARGET, grid)
     visited = torch.zeros(1, len(grid), dtype=torch.bool)
@@ -142,7 +142,7 @@ def scanpath(
 
 
 def spread(values: Sequence[float], scale: float = 1.0, digits: int = 2) -> str:
-    """Median and quartiles."""
+    """Median and quartiles, as text."""
     low, middle, high = (
         f"{scale * value:.{digits}f}" for value in statistics.quantiles(values, n=4, method="inclusive")
     )
@@ -150,7 +150,7 @@ def spread(values: Sequence[float], scale: float = 1.0, digits: int = 2) -> str:
 
 
 def report_turns(path: Path, image: Tensor, options: argparse.Namespace, clock: Clock) -> None:
-    """Print sensor and detector alone and in turn."""
+    """Print the times of sensor and detector, each alone and both in turn."""
     grid = semfov.Grid(COLUMNS, ROWS, (image.shape[-1], image.shape[-2]))
     order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(0))
     fixations = grid.centres[order[: options.fixations]]
@@ -168,10 +168,10 @@ def report_turns(path: Path, image: Tensor, options: argparse.Namespace, clock: 
 
 
 def report_parts(path: Path, image: Tensor, options: argparse.Namespace, clock: Clock) -> None:
-    """Print what the parts of a fixation cost."""
+    """Print the times of the parts of a fixation."""
     grid = semfov.Grid(COLUMNS, ROWS, (image.shape[-1], image.shape[-2]))
     opened: dict[int, float] = {}
-    print("\nparts of a fixation, ms; overhead is the share of all but the detector\n")
+    print("\nparts of a fixation, ms; overhead is the share of all parts except the detector\n")
     print("| threads | policy | sensor | detector | belief | policy | overhead, % |")
     print("|---|---|---|---|---|---|---|")
     for threads in options.threads:
@@ -195,18 +195,20 @@ def report_parts(path: Path, image: Tensor, options: argparse.Namespace, clock: 
         opened[threads] = statistics.median(opening)
 
     known = ", ".join(f"{time:.2f} ({threads})" for threads, time in opened.items())
-    print(f"\nletterbox and pyramid, once an image, ms (threads): {known}")
+    print(f"\nletterbox and pyramid, once per image, ms (threads): {known}")
 
 
 def main() -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", type=Path, help="any ONNX file that load_detector takes; default: YOLOv3-tiny")
-    parser.add_argument("--threads", type=int, nargs="+", help="of torch and of onnxruntime; default: 1 and all")
-    parser.add_argument("--repetitions", type=int, default=20)
-    parser.add_argument("--fixations", type=int, default=10, help="in every repetition")
-    parser.add_argument("--keep-memory", action="store_true", help="let the C library keep memory that is freed")
-    parser.add_argument("--processor-time", action="store_true", help="of the calling thread; for one thread")
+    parser.add_argument("--model", type=Path, help="any ONNX file that load_detector accepts (default: YOLOv3-tiny)")
+    parser.add_argument("--threads", type=int, nargs="+", help="threads of torch and onnxruntime (default: 1 and all)")
+    parser.add_argument("--repetitions", type=int, default=20, help="number of repetitions")
+    parser.add_argument("--fixations", type=int, default=10, help="number of fixations in every repetition")
+    parser.add_argument("--keep-memory", action="store_true", help="make the C library keep freed memory")
+    parser.add_argument(
+        "--processor-time", action="store_true", help="measure CPU time of the calling thread; 1 thread"
+    )
     options = parser.parse_args()
     options.threads = options.threads or sorted({1, torch.get_num_threads()})
     clock = time.perf_counter

@@ -1,4 +1,4 @@
-"""What a path must move through memory, and how near to that it comes."""
+"""How many bytes a hot path must move through memory, and how close it comes to the memory bandwidth."""
 
 from dataclasses import dataclass
 
@@ -22,9 +22,9 @@ class Path:
 
     Attributes:
         run: the program.
-        bytes: of its inputs and results, each read or written once.
-        what: they are.
-        stops: what keeps it from moving them at the bandwidth.
+        bytes: number of bytes of its inputs and results, each read or written once.
+        what: description of these bytes.
+        stops: what keeps the path from moving them at the memory bandwidth.
     """
 
     run: Run
@@ -34,7 +34,7 @@ class Path:
 
 
 def paths() -> dict[str, Path]:
-    """Hot paths, the larger ones beyond the caches."""
+    """The hot paths by name; the larger ones exceed the processor's caches."""
     image, gaze = photograph(), torch.tensor(GAZE)
     bands = laplacian_pyramid(image, 5)
     details = sum(band.numel() for band in (*bands.details, bands.base))
@@ -48,12 +48,14 @@ def paths() -> dict[str, Path]:
     episodes = 40
     seen, run = searches(episodes)
     scene = sum(t.numel() * t.element_size() for t in (seen.boxes, seen.scores, seen.mask))
-    # Every look reads and writes an episode's map and reads what is seen from one of the scene's cells.
+    # Every look reads and writes an episode's map, and reads the detections from one of the scene's cells.
     looks = episodes * (SHIFTS + 1)
     moved = looks * (4 * 2 * beta[0].numel() + scene // len(seen.boxes))
-    blurs = "bands of the pyramid are written and read again, in memory that is fresh each time"
-    newton = "Newton's steps, each with digamma and trigamma of every parameter in double precision: it computes"
-    small = "each look is some dozens of operations on small tensors: calls cost more than what they move"
+    blurs = "the bands of the pyramid are written and read again, each time in newly allocated memory"
+    newton = (
+        "limited by computation: Newton's steps, each with digamma and trigamma of every parameter in double precision"
+    )
+    small = "each look takes dozens of operations on small tensors, whose calls cost more than the memory traffic"
     return {
         "foveation, pyramid included": Path(
             lambda: foveate(image, gaze, sigma=SIGMA), 4 * 2 * image.numel(), "image in, view out", blurs
@@ -65,20 +67,21 @@ def paths() -> dict[str, Path]:
             lambda: fuse(beta, likelihood, footprint),
             4 * (2 * beta.numel() + likelihood.numel()) + footprint.numel(),
             "maps in and out, likelihoods, footprints",
-            "detections are fused one after another: the maps go through the processor once for each of them",
+            "detections are fused one after another, and each of them reads and writes the maps once",
         ),
         f"exploration, KL divergence, {batch} maps": Path(
             lambda: value(belief, visited),
             4 * (beta.numel() + visited.numel() + model.alpha.numel()),
             "maps and expected scores in, values out",
-            "every cell is updated as seen at each level and its divergence from the prior taken, "
-            f"ln Γ and ψ of {model.alpha.shape[1] * beta.numel() / 1e6:.1f} million numbers: it computes",
+            "limited by computation: every cell is updated for each level, and its divergence from the prior takes "
+            f"ln Γ and ψ of {model.alpha.shape[1] * beta.numel() / 1e6:.1f} million numbers",
         ),
         "saliency, VOCUS2": Path(
             lambda: vocus(image),
             4 * (image.numel() + image.numel() // 3),
             "image in, map out",
-            "some 20 Gaussian blurs of up to 65 taps, matrix products at most of the processor's rate: it computes",
+            "limited by computation: about 20 Gaussian blurs of up to 65 taps, as matrix products that reach most of "
+            "the processor's peak rate",
         ),
         f"{len(logs)} Dirichlets of {logs.shape[-1]} dimensions": Path(
             lambda: mle(logs), 2 * logs.numel() * logs.element_size(), "mean logarithms in, parameters out", newton
@@ -90,7 +93,7 @@ def paths() -> dict[str, Path]:
 
 
 def limits(bandwidth: float, seconds: float, clock: Clock) -> dict[str, tuple[Path, Spread, float]]:
-    """For each path its milliseconds, and the share of the copy bandwidth at which it moves its bytes."""
+    """For each path, its milliseconds, and the share of the copy bandwidth that it reaches."""
     found = {}
     for name, path in paths().items():
         spread = Spread.of(interleaved({name: path.run}, seconds, clock)[name])

@@ -1,4 +1,4 @@
-"""What figures were measured on."""
+"""Description of the machine on which results were measured."""
 
 import os
 import platform
@@ -14,7 +14,7 @@ PACKAGES = ("torch", "kornia", "numpy", "opencv-python-headless", "scipy", "diri
 
 
 def describe() -> dict[str, str]:
-    """Processor, threads, other work, versions and commit; no name of the machine."""
+    """Processor, threads, load, versions and commit; the machine's name is left out."""
     root = Path(__file__).parents[1]
     commit = subprocess.run(
         ["git", "describe", "--always", "--dirty"], cwd=root, capture_output=True, text=True, check=False
@@ -41,7 +41,7 @@ def processor() -> str:
 
 
 def copy_bandwidth(seconds: float, clock: Clock) -> float:
-    """Bytes a second that a copy between two arrays of 256 MB moves, read and written; the best of all repetitions."""
+    """Bytes per second, read and written, of a copy between two arrays of 256 MB; the best of all repetitions."""
     source = torch.ones(2**26)
     target = torch.empty_like(source)
     times = interleaved({"copy": lambda: target.copy_(source)}, seconds, clock)["copy"]

@@ -1,8 +1,8 @@
-"""Time of the pyramid, the sensor and the blur of saliency by matrices and by Kornia, with gradients and without.
+"""Time of the pyramid, the sensor and the blur of saliency by matrices and by Kornia, with and without gradients.
 
-`semfov.sensor.pyramid` takes Kornia's functions on devices where this does not show its own matrices ahead. Both are
-run here, in one run, whatever it takes. A figure is the ratio of Kornia's time to that of the matrices in the same
-repetition, as median and quartiles: above 1 the matrices are faster. With one thread times are the processor's.
+`semfov.sensor.pyramid` uses Kornia's functions on devices on which this benchmark does not show its own matrices to be
+faster. Here both are run, whatever the device. Ratios divide Kornia's time by the matrices' time in the same
+repetition, as median and quartiles: above 1, the matrices are faster. With one thread, times are CPU times.
 
 python -m benchmarks.pyramid
 """
@@ -22,26 +22,26 @@ from semfov.gaze.saliency.blur import gaussian_blur, gaussian_kernel
 from semfov.sensor import foveate, laplacian_pyramid, pyramid
 
 LEVELS = 4
-# Of VOCUS2: from its centre to its surround.
+# Blur of VOCUS2 from its centre to its surround.
 SIGMA = (6.0**2 - 2.0**2) ** 0.5
-# All halve evenly so often, as Kornia needs.
+# All sizes can be halved `LEVELS` times without remainder, as Kornia needs.
 SHAPES = ((1, 3, 480, 640), (4, 3, 416, 416), (16, 3, 64, 64))
 
 
 def split(image: Tensor) -> Tensor:
-    """Something that depends on every level."""
+    """A number that depends on every level of the pyramid."""
     bands = laplacian_pyramid(image, LEVELS)
     return torch.stack([level.square().sum() for level in (*bands.details, bands.base)]).sum()
 
 
 def view(image: Tensor) -> Tensor:
-    """The sensor, its pyramid included."""
+    """A number that depends on the sensor's view, including its pyramid."""
     gaze = torch.tensor([image.shape[-1] / 3, image.shape[-2] / 2], device=image.device)
     return foveate(image, gaze, sigma=image.shape[-1] / 6, levels=LEVELS).square().sum()
 
 
 def blur(image: Tensor) -> Tensor:
-    """The blur of VOCUS2's surround."""
+    """A number that depends on the blur of VOCUS2's surround."""
     if image.device.type in pyramid._AHEAD:
         blurred = gaussian_blur(image, SIGMA)
     else:
@@ -54,7 +54,7 @@ WORKS: dict[str, Callable[[Tensor], Tensor]] = {"pyramid": split, "sensor": view
 
 
 def run(work: Callable[[Tensor], Tensor], image: Tensor, ahead: Collection[str], gradients: bool) -> Tensor:
-    """The value of `work`, or its gradient, on matrices where the device is among those `ahead`."""
+    """The value or gradient of `work`; by matrices if the device is in `ahead`, else by Kornia."""
     with mock.patch.object(pyramid, "_AHEAD", ahead), torch.inference_mode(not gradients):
         if gradients:
             fresh = image.detach().requires_grad_()
@@ -67,7 +67,7 @@ def run(work: Callable[[Tensor], Tensor], image: Tensor, ahead: Collection[str],
 
 
 def compare(name: str, shape: tuple[int, ...], device: str, gradients: bool) -> Comparison:
-    """Matrices beside Kornia."""
+    """Comparison of matrices with Kornia."""
     work, image = WORKS[name], torch.rand(shape, generator=torch.Generator().manual_seed(0)).to(device)
 
     def ours() -> Tensor:
@@ -86,7 +86,7 @@ def compare(name: str, shape: tuple[int, ...], device: str, gradients: bool) -> 
 
 
 def rows(device: str, seconds: float, clock: Clock) -> list[list[str]]:
-    """One for each work, shape and kind of run."""
+    """Table rows, one for each work, shape and kind of run."""
     comparisons = (
         compare(name, shape, device, gradients) for name in WORKS for shape in SHAPES for gradients in (True, False)
     )
@@ -97,8 +97,8 @@ def main() -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", help="type of the device, `cpu` or `cuda`")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=3.0, help="for each row, at least")
+    parser.add_argument("--threads", type=int, default=1, help="number of threads")
+    parser.add_argument("--seconds", type=float, default=3.0, help="shortest duration for each row")
     options = parser.parse_args()
     use_threads(options.threads)
     on_cpu = options.device == "cpu"

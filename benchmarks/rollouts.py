@@ -1,4 +1,4 @@
-"""The protocol's searches as one batch of tensors, beside the same searches one after another."""
+"""Comparison of searches run as one batch of tensors with the same searches run one after another."""
 
 from collections.abc import Callable
 
@@ -14,14 +14,14 @@ CLASSES, SHIFTS = 80, 30
 
 
 def episode(number: int) -> Episode:
-    """A search for one class after another."""
+    """The search of this number; successive searches have different targets and starts."""
     target = 1 + number % CLASSES
     start = 1 + number % 99
     return Episode(scene=0, target=target, cue=target, repetition=number, start=start, goal=(0,), commonest=False)
 
 
 def searches(episodes: int) -> tuple[Detections, Callable[[int, int], object]]:
-    """What is seen from each cell of a scene, and a program that does so many searches in it, so many at once."""
+    """Detections from each cell of a scene, and a function that runs `count` searches in it, `batch` at a time."""
     generator = torch.Generator().manual_seed(0)
     grid = Grid(10, 10, (640, 480))
     corner = torch.rand(100, 12, 2, generator=generator) * torch.tensor([560.0, 400.0])
@@ -39,7 +39,7 @@ def searches(episodes: int) -> tuple[Detections, Callable[[int, int], object]]:
 
 
 def rollouts(episodes: int = 40) -> Comparison:
-    """Searches of 30 gaze shifts in one scene; alone, a quarter of them."""
+    """Searches of 30 gaze shifts in one scene; the peer runs a quarter of them, one at a time."""
     run = searches(episodes)[1]
 
     def agree() -> None:

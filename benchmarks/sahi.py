@@ -1,12 +1,12 @@
-"""SAHI, which cuts pictures into slices, on the same detector and the same pictures as `eval.zoom`.
+"""Comparison with SAHI, which cuts pictures into slices, on the same detector and pictures as `eval.zoom`.
 
     python -m benchmarks.sahi --mosaics 20
     python -m benchmarks.sahi --data.root DIR --data.annotations FILE --mosaics 0 --target person
 
-SAHI (Akyon, Altinuc and Temizel, 2022) looks at every slice and at the whole picture, and merges what they show by its
-own rules (`GREEDYNMM`, its default, or `NMS`). It has no order and no end before the last slice, so what it gives is
-one point: recall after all of its passes. Beside it are the same slices, merged by `semfov.zoom.merge`, and windows of
-our choice.
+SAHI (Akyon, Altinuc and Temizel, 2022) looks at every slice and at the whole picture, and merges the detections by its
+own rules (`GREEDYNMM`, its default, or `NMS`). It always looks at all slices, so it has a single result: recall after
+all of its passes. It is compared with the same slices, merged by `semfov.zoom.merge`, and with windows that semfov
+chooses.
 """
 
 import sys
@@ -37,19 +37,20 @@ try:
     from sahi.predict import get_sliced_prediction
     from sahi.prediction import ObjectPrediction
 except ImportError as error:
-    # SAHI asks for opencv-python, whose files are those of opencv-python-headless, and runs with the latter.
+    # SAHI depends on opencv-python, which would overwrite the files of opencv-python-headless, but also runs with the
+    # latter.
     raise ModuleNotFoundError(
         "benchmarks.sahi needs SAHI: pip install 'semfov[peers]' && pip install --no-deps sahi"
     ) from error
 
 
 class Slicing(DetectionModel):
-    """A detector as SAHI takes it.
+    """A semfov detector with the interface of SAHI.
 
     Args:
         detector: any detector.
-        target: class 1..K, by its own score as in `merge`; None for the best class of each box.
-        score: boxes with a lower one are left out.
+        target: class 1..K whose own score counts, as in `merge`; None: the best class of each box.
+        score: boxes with a lower score are left out.
     """
 
     def __init__(self, detector: Detector, target: int | None, score: float) -> None:
@@ -58,7 +59,7 @@ class Slicing(DetectionModel):
         super().__init__(model=detector, device="cpu", confidence_threshold=score, category_mapping=names)
 
     def set_model(self, model: Any, **kwargs: Any) -> None:
-        """Take the detector."""
+        """Set the detector."""
         self.model = model
 
     def perform_inference(self, image: NDArray[np.uint8]) -> None:
@@ -74,7 +75,7 @@ class Slicing(DetectionModel):
         full_shape_list: list[list[int | float]] | None = None,
     ) -> None:
         seen: Any = self._original_predictions
-        # One image's may come without the list around it.
+        # For a single image, SAHI may pass the values without the list around them.
         shift, shape = (
             given[0] if given and isinstance(given[0], list) else given
             for given in (shift_amount_list, full_shape_list)
@@ -100,13 +101,13 @@ class Slicing(DetectionModel):
 
 @dataclass
 class Outcome:
-    """What a way of looking found in all pictures.
+    """Result of a way of looking in all pictures.
 
     Attributes:
-        found: objects that were found.
-        objects: how many there are.
-        boxes: that were given for them.
-        passes: of the detector.
+        found: number of objects found.
+        objects: number of objects.
+        boxes: number of boxes reported.
+        passes: number of detector passes.
     """
 
     found: int = 0
@@ -115,7 +116,7 @@ class Outcome:
     passes: int = 0
 
     def add(self, boxes: Tensor, labels: Tensor, annotation: Annotation, passes: int) -> None:
-        """Count a picture: boxes with a score of 0.1, found where they overlap by a half, as `eval.zoom` counts."""
+        """Add a picture's counts; an object is found if a box of its class has an IoU of 0.5, as in `eval.zoom`."""
         hits = (box_iou(boxes, annotation.boxes) >= 0.5) & (labels[:, None] == annotation.labels)
         self.found += int(hits.any(0).sum())
         self.objects += len(annotation.boxes)
@@ -124,7 +125,7 @@ class Outcome:
 
 
 def sliced(run: ZoomRun, index: int, **merging: str) -> tuple[Tensor, Tensor, int]:
-    """Boxes and labels that SAHI gives for a picture, and its passes; by its own defaults unless told otherwise."""
+    """Boxes and labels that SAHI reports for a picture, and its passes; `merging` changes its default rules."""
     config = run.config
     model = Slicing(run.eye.detector, run.target, FOUND)
     picture = (run.scenes[index].image * 255).round().byte().permute(1, 2, 0).numpy()
@@ -144,7 +145,7 @@ def sliced(run: ZoomRun, index: int, **merging: str) -> tuple[Tensor, Tensor, in
 
 
 def compare(config: ZoomConfig) -> None:
-    """Look at every picture in each way, and print the table."""
+    """Look at every picture in all ways, and print the table."""
     run = ZoomRun(config)
     merging = {"SAHI": {}, "SAHI, NMS": {"postprocess_type": "NMS", "postprocess_match_metric": "IOU"}}
     names = "the same slices, merged here", "ours, as many passes", "ours, half as many"

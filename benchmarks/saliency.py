@@ -1,7 +1,7 @@
-"""Milliseconds of both saliency models for one photograph, beside the same models written with OpenCV, in one run.
+"""Milliseconds of both saliency models for one photograph, compared with the same models in OpenCV, in one run.
 
-The OpenCV programs do the same work in the same order, also averaging maps before they are enlarged. Repetitions are
-interleaved; printed are the median, its quartiles and the median of the ratios of neighbouring repetitions.
+The OpenCV programs do the same work in the same order; they, too, average maps before enlarging them. Repetitions are
+interleaved. The table gives median and quartiles of the times, and of their ratios within a repetition.
 
 python -m benchmarks.saliency --size 640 480 --threads 2
 """
@@ -26,7 +26,7 @@ Array = NDArray[Any]
 
 
 def photograph(width: int, height: int) -> Tensor:
-    """A photograph that scikit-image carries, `(1, 3, height, width)`."""
+    """A photograph that scikit-image ships, `(1, 3, height, width)`."""
     from skimage import data
 
     image = torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255
@@ -34,16 +34,18 @@ def photograph(width: int, height: int) -> Tensor:
 
 
 def blur(image: Array, sigma: float) -> Array:
+    """Blur a map by a Gaussian."""
     return cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
 
 
 def stretch(image: Array) -> Array:
+    """Scale a map to the range from 0 to 1; a constant map becomes 0."""
     low, high = image.min(), image.max()
     return (image - low) / (high - low) if high > low else image - low
 
 
 def vocus2_opencv(image: Array, centre: float, surround: float, layers: int = 5, scales: int = 2) -> Array:
-    """VOCUS2 of an image `(H, W, 3)`."""
+    """VOCUS2 saliency of an image `(H, W, 3)`."""
     red, green, blue = cv2.split(image)
     base = cv2.merge([(red + green + blue) / 3, red - green, blue - (red + green) / 2])
     height, width = image.shape[:2]
@@ -65,9 +67,9 @@ def vocus2_opencv(image: Array, centre: float, surround: float, layers: int = 5,
 
 
 def promote(image: Array) -> Array:
-    """Itti's N(.) of one map `(h, w)`."""
+    """The normalisation operator N(.) of Itti, Koch and Niebur for one map `(h, w)`."""
     image = stretch(image)
-    # Of equal neighbours the first counts.
+    # Among equal neighbours only the first counts as a peak.
     earlier = np.array([[1, 1, 1], [1, 0, 0], [0, 0, 0]], np.uint8)
     above, level = cv2.dilate(image, earlier), cv2.dilate(image, np.ascontiguousarray(earlier[::-1, ::-1]))
     peaks = image[(image > above) & (image >= level) & (image > 0.1)]
@@ -76,12 +78,12 @@ def promote(image: Array) -> Array:
 
 
 def total(images: Iterable[Array]) -> Array:
-    """Their sum."""
+    """The sum of images."""
     return reduce(np.add, images)
 
 
 def gabor_filters() -> list[Array]:
-    """Even and odd filters of four orientations."""
+    """Even and odd Gabor filters of four orientations."""
     y, x = np.mgrid[-4:5, -4:5].astype(np.float32)
     filters = []
     for angle in np.deg2rad([0, 45, 90, 135]):
@@ -94,7 +96,7 @@ def gabor_filters() -> list[Array]:
 
 
 def itti_koch_opencv(image: Array, filters: list[Array]) -> Array:
-    """Itti, Koch and Niebur's model of an image `(H, W, 3)`."""
+    """Saliency of an image `(H, W, 3)` by the model of Itti, Koch and Niebur."""
     intensity = image.mean(2)
     visible = intensity > intensity.max() / 10
     gain = visible / np.where(visible, intensity, 1)
@@ -130,7 +132,7 @@ def itti_koch_opencv(image: Array, filters: list[Array]) -> Array:
 def measure(
     ours: Callable[[], object], theirs: Callable[[], object], repetitions: int
 ) -> tuple[list[float], list[float]]:
-    """Milliseconds of both programs, in turn."""
+    """Milliseconds of both programs, run in turn."""
     times: tuple[list[float], list[float]] = ([], [])
     for repetition in range(repetitions + 2):
         for run, record in zip((ours, theirs), times, strict=True):
@@ -142,16 +144,18 @@ def measure(
 
 
 def spread(times: list[float]) -> str:
+    """Median and quartiles, as text."""
     low, middle, high = statistics.quantiles(times, n=4)
     return f"{middle:.1f} ({low:.1f}-{high:.1f})"
 
 
 @torch.inference_mode()
 def main() -> None:
+    """Measure, and print the table."""
     parser = argparse.ArgumentParser(description="milliseconds of the saliency models for one photograph")
     parser.add_argument("--size", type=int, nargs=2, default=[640, 480], help="width and height of the photograph")
     parser.add_argument("--threads", type=int, default=2, help="threads of torch and of OpenCV")
-    parser.add_argument("--repetitions", type=int, default=40)
+    parser.add_argument("--repetitions", type=int, default=40, help="number of repetitions")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(arguments.threads)

@@ -1,8 +1,8 @@
-"""Milliseconds of one decision of the field's searchers, by the size of the grid: `python -m benchmarks.searchers`.
+"""Milliseconds of one decision of searchers from the literature, by size of the grid: `python -m benchmarks.searchers`.
 
-A decision begins with a belief of 81 classes that is there, for one episode. It values every cell and takes the best
-that was not visited. Beside each time stands how often the choice is that of the ideal observer, over beliefs drawn at
-random.
+A decision is made for one episode from a given belief over 81 classes. It evaluates every cell and takes the best cell
+not visited yet. The table also gives how often the choice is the same as that of the ideal observer, over random
+beliefs.
 """
 
 import argparse
@@ -29,20 +29,20 @@ POLICIES = {
 
 
 def searchers(side: int) -> dict[str, acquisition.AcquisitionFunction]:
-    """All searchers on a grid of so many rows and columns."""
+    """All searchers on a grid of `side` × `side` cells."""
     model = FovealObservationModel.from_pretrained(MODEL).requires_grad_(False)
     means, grid = policies.Means(model), Grid(side, side, (640, 480))
     return {name: policies.named_policy(policy, "search", means)(TARGET, grid) for name, policy in POLICIES.items()}
 
 
 def choices(value: acquisition.AcquisitionFunction, cells: int, episodes: int) -> Tensor:
-    """Cells that a searcher would fixate next."""
+    """The cells that a searcher would fixate next, for random beliefs."""
     belief = make_belief(cells, CLASSES, episodes)
     return value(belief, unvisited(belief)).argmax(-1)
 
 
 def decide(value: acquisition.AcquisitionFunction, cells: int) -> Run:
-    """One decision."""
+    """A program that makes one decision."""
     belief = make_belief(cells)
     visited, noise = unvisited(belief), torch.rand(1, cells, generator=torch.Generator().manual_seed(0))
     return lambda: select_fixation(value(belief, visited), visited, noise)
@@ -52,11 +52,13 @@ def decide(value: acquisition.AcquisitionFunction, cells: int) -> Run:
 def main() -> None:
     """Measure all rows and write the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.searchers", description=__doc__.splitlines()[0])
-    parser.add_argument("--sides", type=int, nargs="+", default=[5, 7, 10], help="rows and columns of the grids")
-    parser.add_argument("--episodes", type=int, default=20, help="beliefs over which choices are compared")
-    parser.add_argument("--seconds", type=float, default=10.0, help="for each grid, at least")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument(
+        "--sides", type=int, nargs="+", default=[5, 7, 10], help="numbers of rows (and columns) of grids"
+    )
+    parser.add_argument("--episodes", type=int, default=20, help="number of beliefs for which choices are compared")
+    parser.add_argument("--seconds", type=float, default=10.0, help="shortest duration for each grid")
+    parser.add_argument("--threads", type=int, default=1, help="number of threads")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
     options = parser.parse_args()
     use_threads(options.threads)
     clock, times = clock_for(options.threads)
@@ -74,10 +76,10 @@ def main() -> None:
     head = ["grid", "searcher", "ms a decision", "same choice as the ideal observer"]
     text = "\n".join(
         [
-            "# The field's searchers",
+            "# Searchers from the literature",
             "",
-            "Written by `python -m benchmarks.searchers`. Medians (quartiles); one episode, a belief that is there.",
-            f"The same choice: of {options.episodes} beliefs drawn at random, before the first look.",
+            "Written by `python -m benchmarks.searchers`. Medians (quartiles) for one episode and a given belief. The",
+            f"same choice: share of {options.episodes} random beliefs, before the first look.",
             "",
             *(f"- {key}: {value}" for key, value in about.items()),
             "",

@@ -1,13 +1,13 @@
 """Time of the foveal sensor relative to the same sensor written with OpenCV and with Kornia, in one run.
 
-Peers, each with its pyramid included:
+The peers, each including its pyramid:
 
-- `cv2, plain`: as one writes it in an afternoon: `cv2.pyrDown`, `cv2.pyrUp`, windows and sums in numpy;
-- `cv2, tuned`: every step a fused OpenCV call that writes into memory already there, windows as outer products;
+- `cv2, plain`: a straightforward version with `cv2.pyrDown`, `cv2.pyrUp`, and windows and sums in numpy;
+- `cv2, tuned`: every step is a fused OpenCV call that writes into allocated memory; windows are outer products;
 - `kornia`: `kornia.geometry.transform.pyrdown` and `pyrup`.
 
-A repetition times all of them one after another, so that other work on the machine falls on all alike; a figure is the
-median over repetitions of the ratio of times within one repetition, with its quartiles. Below 1 semfov is faster.
+A repetition times all of them one after another, so that other work on the machine affects all alike. Results are
+ratios of times within one repetition, as median and quartiles over repetitions. Below 1, semfov is faster.
 
 python -m benchmarks.sensor
 """
@@ -54,7 +54,7 @@ def plain(image: np.ndarray, gaze: tuple[float, float], sigma: float) -> np.ndar
 
 
 def tuned(image: np.ndarray, gaze: tuple[float, float], sigma: float) -> np.ndarray:
-    """The same, as fast as OpenCV's calls allow."""
+    """The sensor with OpenCV's pyramid, `(H, W, 3)`, as fast as OpenCV's calls allow."""
     gaussian, bands = [image], []
     for k in range(LEVELS):
         gaussian.append(cv2.pyrDown(gaussian[k]))
@@ -71,7 +71,7 @@ def tuned(image: np.ndarray, gaze: tuple[float, float], sigma: float) -> np.ndar
 
 
 def with_kornia(image: Tensor, gaze: Tensor, sigma: float) -> Tensor:
-    """The sensor with Kornia's pyramid, for sizes that halve evenly."""
+    """The sensor with Kornia's pyramid, for sizes that can be halved `LEVELS` times without remainder."""
     gaussian = [image]
     for _ in range(LEVELS):
         gaussian.append(kornia.pyrdown(gaussian[-1]))
@@ -86,12 +86,12 @@ def with_kornia(image: Tensor, gaze: Tensor, sigma: float) -> Tensor:
 
 
 def planes(view: np.ndarray | Tensor) -> Tensor:
-    """A peer's view in semfov's layout, `(1, 3, H, W)`."""
+    """Convert a peer's view to semfov's layout, `(1, 3, H, W)`."""
     return view if isinstance(view, Tensor) else torch.from_numpy(view).permute(2, 0, 1)[None]
 
 
 def interleaved(runs: dict[str, Callable[[], object]], repetitions: int) -> dict[str, list[float]]:
-    """Milliseconds of every run in every repetition, after a few to warm up."""
+    """Milliseconds of every run in every repetition, after five warm-up repetitions."""
     times: dict[str, list[float]] = {name: [] for name in runs}
     for repetition in range(-5, repetitions):
         for name, run in runs.items():
@@ -103,7 +103,7 @@ def interleaved(runs: dict[str, Callable[[], object]], repetitions: int) -> dict
 
 
 def measure(height: int, width: int, sigma: float, repetitions: int) -> None:
-    """Print the table of one size with the number of threads that is set."""
+    """Measure one size with the current number of threads, and print its table."""
     torch.manual_seed(0)
     image, gaze = torch.rand(1, 3, height, width), torch.tensor([0.45 * width, 0.6 * height])
     array, point = np.ascontiguousarray(image[0].permute(1, 2, 0).numpy()), (gaze[0].item(), gaze[1].item())
@@ -144,7 +144,7 @@ def main() -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sigma", type=float, default=100.0, help="width of the fovea in pixels")
-    parser.add_argument("--repetitions", type=int, default=100)
+    parser.add_argument("--repetitions", type=int, default=100, help="number of repetitions")
     options = parser.parse_args()
     everything = torch.get_num_threads()
     with torch.inference_mode():

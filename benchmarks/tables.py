@@ -1,4 +1,4 @@
-"""Figures as Markdown, and the two files that every run writes."""
+"""Results as Markdown tables, and the two files that every run writes."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -10,17 +10,17 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def number(value: float) -> str:
-    """Three digits."""
+    """A number with three significant digits, or a whole number from 100 on."""
     return f"{value:.3g}" if value < 100 else f"{value:,.0f}"
 
 
 def spread(values: Spread) -> str:
-    """Median and quartiles."""
+    """Median and quartiles, as text."""
     return f"{number(values.middle)} ({number(values.low)} to {number(values.high)})"
 
 
 def comparison_rows(measured: Measured) -> list[list[str]]:
-    """One row for each peer."""
+    """Table rows of a comparison, one for each peer."""
     times = measured.milliseconds
     return [
         [measured.name, peer, number(times["semfov"].middle), number(times[peer].middle), spread(ratio)]
@@ -29,7 +29,7 @@ def comparison_rows(measured: Measured) -> list[list[str]]:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Markdown."""
+    """A Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 

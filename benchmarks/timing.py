@@ -1,4 +1,4 @@
-"""Times of programs that do the same work, side by side."""
+"""Times programs that do the same work, in turn."""
 
 import statistics
 import time
@@ -8,24 +8,24 @@ from dataclasses import dataclass, field
 Run = Callable[[], object]
 
 Clock = Callable[[], float]
-"""Seconds: `time.perf_counter`, or `time.process_time` for programs of one thread, which other work disturbs less."""
+"""Gives seconds: `time.perf_counter`, or, for one thread, `time.process_time`, which other work disturbs less."""
 
 
 def clock_for(threads: int) -> tuple[Clock, str]:
-    """The clock for programs of so many threads, and what it shows."""
+    """The clock for programs with this number of threads, and a description of its times."""
     return (time.process_time, "of the processor") if threads == 1 else (time.perf_counter, "of the clock")
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """semfov beside other programs for the same work.
+    """Comparison of semfov with other programs (peers) for the same work.
 
     Attributes:
-        name: of the work.
+        name: name of the work.
         ours: semfov's program.
-        peers: the others by name.
-        share: part of the work that a peer does where the whole would take too long; its time is divided by this.
-        agree: raises where results differ.
+        peers: the other programs by name.
+        share: share of the work that a peer does if the whole work would take too long; its time is divided by this.
+        agree: raises an error if the results of the programs differ.
     """
 
     name: str
@@ -45,18 +45,18 @@ class Spread:
 
     @classmethod
     def of(cls, values: list[float]) -> "Spread":
-        """Of at least two values."""
+        """Median and quartiles of at least two values."""
         return cls(*statistics.quantiles(values, n=4, method="inclusive"))
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What came of a comparison.
+    """Result of a comparison.
 
     Attributes:
-        name: of the work.
-        milliseconds: of every program, semfov first.
-        ratios: for each peer, its time over semfov's in the same repetition.
+        name: name of the work.
+        milliseconds: times of all programs, semfov first.
+        ratios: for each peer, its time divided by semfov's in the same repetition.
     """
 
     name: str
@@ -67,11 +67,21 @@ class Measured:
 def interleaved(
     runs: Mapping[str, Run], seconds: float, clock: Clock = time.perf_counter, least: int = 5, times: int = 1
 ) -> dict[str, list[float]]:
-    """Milliseconds of every run in every repetition, for about so many seconds; the first, warm-up, is not counted.
+    """Time programs in turn; the first repetition is a warm-up and does not count.
 
-    A repetition runs all of them one after another, starting with another each time: what else the machine does falls
-    on all alike. A run that takes microseconds is slower after another one than after itself: with `times`, each turn
-    is so many runs, and their mean counts.
+    A repetition runs all programs one after another, each repetition beginning with another one, so that other work on
+    the machine affects all alike. A program that takes microseconds is slower after another program than after itself.
+    It can be run several times per turn, and the mean of these runs counts.
+
+    Args:
+        runs: the programs by name.
+        seconds: approximate duration of the whole measurement.
+        clock: the clock.
+        least: smallest number of repetitions.
+        times: number of runs per turn.
+
+    Returns:
+        Milliseconds of every program in every repetition.
     """
     found: dict[str, list[float]] = {name: [] for name in runs}
     names, began, repetition = list(runs), time.perf_counter(), 0
@@ -88,7 +98,7 @@ def interleaved(
 
 
 def measure(comparison: Comparison, seconds: float, clock: Clock, times: int = 1) -> Measured:
-    """Check that the programs agree, and time them (`interleaved`)."""
+    """Check that the programs of a comparison agree, and time them (`interleaved`)."""
     comparison.agree()
     found = interleaved({"semfov": comparison.ours, **comparison.peers}, seconds, clock, times=times)
     for name, share in comparison.share.items():

@@ -65,9 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure all tasks and write the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.zoom", description=__doc__.splitlines()[0])
     parser.add_argument("--weights", help="ONNX file of YOLOX-nano")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=10.0, help="shortest time for each task")
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--threads", type=int, default=1, help="number of threads")
+    parser.add_argument("--seconds", type=float, default=10.0, help="shortest duration for each task")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result files")
     options = parser.parse_args(arguments)
     use_threads(options.threads)
     clock, times = clock_for(options.threads)

@@ -10,7 +10,7 @@ def _leave(*_: object) -> None:
     os._exit(128 + signal.SIGINT)
 
 
-# While `python -m eval.…` looks for its module: Ctrl-C before everything is imported ends it in one line, too.
-# (Nothing can be shared with other packages here: importing semfov is what takes so long.)
+# `python -m eval.…` imports this file first. Ctrl-C during the other imports then ends it with one line, without a
+# traceback. (The handler cannot come from semfov, because the import of semfov is what takes so long.)
 if sys.argv[:1] == ["-m"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, _leave)

@@ -1,15 +1,15 @@
-"""Calibration: `python -m eval.calibration` judges scores, an observation model and beliefs on photographs with boxes.
+"""Measure calibration: `python -m eval.calibration` evaluates scores, an observation model and beliefs on photographs.
 
     python -m eval.calibration --data.root DIR --data.annotations instances.json --out runs/calibration
 
-Without photographs it uses the embedded scenes. Every photograph is fixated at random points and detections are
-matched to the annotated boxes. The table tells, for every level of distance to the fovea, how well raw and calibrated
-scores predict the true class, background included. Judge on photographs that the model was not fitted on.
+Without photographs it uses the embedded scenes. Every photograph is fixated at random points, and detections are
+matched to the annotated boxes. For every level of distance from the fixation, a table gives how well raw and calibrated
+scores predict the true class, background included. Use photographs on which the model was not fitted.
 
-Then every photograph is searched for a class that it holds and for one that it does not hold. Tables and a reliability
-diagram tell how well beliefs say which cells hold the target, by number of looks and by distance of the closest look:
-of raw scores, of calibrated ones as published, tempered, and learned. What is seen from every cell is shared with
-`python -m eval.search`.
+Then every photograph is searched for a class that it holds and for a class that it does not hold. Tables and a
+reliability diagram show how well the belief's probabilities agree with which cells hold the target, by number of looks
+and by distance from the closest fixation. The beliefs use raw scores, calibrated scores as published, tempered scores,
+and learned evidence. Detections from every cell are stored and shared with `python -m eval.search`.
 """
 
 import sys
@@ -46,26 +46,26 @@ from semfov.viz.style import save_figure
 
 @dataclass(frozen=True)
 class CalibrationConfig(Settings):
-    """Judge how well scores, and beliefs in a target, agree with what is there.
+    """Evaluate how well scores, and beliefs about a target, agree with the annotated objects.
 
     Args:
-        data: photographs to judge on, all of them by default.
-        detector: which detector looks through the fovea.
+        data: photographs to evaluate on, by default all of them.
+        detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
         model: fitted observation model, by name or file (None: the one shipped for the detector and growth; for the
-            published belief the one of maximum likelihood, where it is shipped for the sensor).
-        fixations: random fixations in each photograph.
-        iou: overlap from which a detection shows an object.
-        seed: of the fixations, and of the searches.
-        beliefs: whether beliefs are judged too, for which every cell of every photograph is fixated once.
-        grid: `[columns, rows]` of the beliefs.
-        target_model: learned target evidence, by name or file (None: the one shipped for detector and sensor).
-        map_model: learned map, by name or file (None: the one shipped for detector and sensor).
-        target_area: a class whose boxes cover a larger share of the image is not searched for.
+            published belief, the one fitted by maximum likelihood if it is shipped for the sensor).
+        fixations: number of random fixations in each photograph.
+        iou: smallest intersection over union at which a detection matches an object.
+        seed: random seed of the fixations and of the searches.
+        beliefs: evaluate beliefs, too, for which every cell of every photograph is fixated once.
+        grid: `[columns, rows]` of the grid of the beliefs.
+        target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
+        map_model: learned map, by name or file (None: the one shipped for the detector and sensor).
+        target_area: a class is searched for only if its boxes cover at most this share of the image.
         out: folder for the tables and the figures.
-        cache: folder for the labelled detections and for what was seen from every cell (None: `out`, and the user's
-            cache).
-        workers: processes (None: one for each CPU core).
+        cache: folder for the labelled detections and for the stored detections from every cell (None: `out` for the
+            former, the user's cache for the latter).
+        workers: number of processes (None: one per CPU core).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
@@ -86,14 +86,14 @@ class CalibrationConfig(Settings):
 
 
 def judge(config: CalibrationConfig) -> None:
-    """Judge scores, then beliefs."""
+    """Evaluate scores, then beliefs."""
     judge_scores(config)
     if config.beliefs:
         judge_beliefs(config)
 
 
 def judge_scores(config: CalibrationConfig) -> None:
-    """Collect labelled detections and write how well raw and calibrated scores predict their classes."""
+    """Collect labelled detections, and write how well raw and calibrated scores predict their classes."""
     settings = SampleSettings(config.data, config.detector, config.sensor, config.fixations, config.iou, config.seed)
     sampler, samples = collect(settings, (config.cache or config.out) / "samples", config.workers, "looking")
     if rank() > 0:
@@ -111,7 +111,7 @@ def judge_scores(config: CalibrationConfig) -> None:
 
 
 def judge_beliefs(config: CalibrationConfig) -> None:
-    """Search, and write how well beliefs tell which cells hold the target."""
+    """Search, and write how well the probabilities of beliefs agree with which cells hold the target."""
     search = SearchConfig(
         data=replace(config.data, max_target_area=config.target_area),
         detector=config.detector,
@@ -136,7 +136,7 @@ def judge_beliefs(config: CalibrationConfig) -> None:
 def calibration_table(
     model: semfov.FovealObservationModel, predictions: dict[str, torch.Tensor], samples: Samples
 ) -> list[str]:
-    """Figures by level of distance and over all, raw and calibrated in turn."""
+    """Measures of raw and of calibrated scores by level of distance, and over all levels."""
     level = model.level(samples.distance)
     edges = ["0", *(f"{edge:.3f}" for edge in model.edges.tolist()), "…"]
     rows = [["distance", "scores", "detections", "NLL", "Brier", "ECE", "classwise ECE", "accuracy"]]
@@ -150,7 +150,7 @@ def calibration_table(
 
 
 def figures(result: Calibration) -> list[str]:
-    """Figures as the cells of a table row."""
+    """The measures as cells of a table row."""
     return [
         str(result.count),
         *(f"{value:.3f}" for value in (result.nll, result.brier, result.ece)),

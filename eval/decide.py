@@ -1,12 +1,12 @@
-"""Is it there, where, and how sure: `python -m eval.decide` searches for what is there and for what is not.
+"""Decide whether a target is present, where, and how surely: `python -m eval.decide` measures the agent's decisions.
 
     python -m eval.decide --data.root DIR --data.annotations instances.json --out runs/decide
 
-Without photographs it uses the embedded scenes. In every photograph a class that is there and one that is not are
-searched for until the agent decides. The table has the area under the ROC of the last probability, hits at some shares
-of false alarms, and what came of the decisions; beside it the same belief under random gaze, the published belief by
-the same rule and by that of its agent, and one sharp look at the whole photograph. What is seen from every cell is
-shared with `python -m eval.search`.
+Without photographs it uses the embedded scenes. In every photograph the agent searches for a class that is present and
+for a class that is absent, until it decides. The tables give the area under the ROC curve of the final probability, hit
+rates at several false alarm rates, and the decisions. For comparison they have the same belief with random gaze, the
+published belief with the same thresholds and with the rule of the published agent, and one sharp look at the whole
+photograph. Detections from every cell are stored and shared with `python -m eval.search`.
 """
 
 import json
@@ -41,22 +41,26 @@ from semfov.viz.style import save_figure
 
 @dataclass(frozen=True)
 class DecideConfig(Settings):
-    """Searches for what is there and for what is not, each until it decides.
+    """Search for present and for absent classes, each until a decision.
 
     Args:
-        data: which scenes to search.
-        detector: which detector looks through the fovea.
+        data: the scenes to search.
+        detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        belief: the grid of beliefs; `target_model` is the learned evidence.
-        protocol: gaze shifts, seed.
-        confirm: probability that the image holds the target, from which on it counts as found (None: the model's).
-        give_up: probability below which a cell is not worth a look (None: the model's).
-        place: probability that the cell must have that is named (None: the model's).
-        prices: of a look in right decisions; for each, searches that end when looking on is not worth it.
-        out: folder for table and records.
-        cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
-        workers: processes (None: one for each CPU core).
-        models: folder of `train.fit_detector` that names detector, sensor, grid and learned evidence.
+        belief: the belief, a grid of class distributions; `target_model` is the learned evidence.
+        protocol: the protocol; `shifts` and `seed` are used.
+        confirm: the target can count as found when the probability that the image holds it reaches this value (None:
+            the model's own threshold).
+        give_up: a search gives up when, in every cell not fixated yet, the probability of the target is below this
+            value (None: the model's own threshold).
+        place: for a find, the fixated cell must hold the target with at least this probability (None: the model's own
+            threshold).
+        prices: prices of a look in right decisions; for each price there are additional searches, which end when
+            further looks are not worth their price.
+        out: folder for tables, records and the figure.
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        workers: number of processes (None: one per CPU core).
+        models: folder written by `train.fit_detector`, which defines detector, sensor, grid and learned evidence.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -75,7 +79,7 @@ class DecideConfig(Settings):
 
 
 def search_and_decide(config: DecideConfig) -> None:
-    """Run the searches and write their table and records."""
+    """Run the searches, and write their tables, records and ROC curves."""
     settings = {each.name: getattr(config, each.name) for each in fields(config)}
     run = DecisionRun(with_models(DecisionConfig(**settings)))
     finish(run, "deciding")
@@ -88,14 +92,14 @@ def search_and_decide(config: DecideConfig) -> None:
     files = {"decisions.md": text, "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records)}
     for name, content in files.items():
         write_text(config.out / name, content)
-    # Searches that differ in their price alone would only crowd the figure.
+    # Searches that differ only in the price of a look are left out, to keep the figure readable.
     scores, there = probabilities([record for record in records if not record["policy"].startswith("price")])
     picture = save_figure(plot_roc(scores, there), config.out / "roc.png")
     announce(text, [*(config.out / name for name in files), picture])
 
 
 def probabilities(records: Sequence[Record]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-    """What each way to search, and sharp looks, say of presence, `(M,)`, and whether the target is there, `(M,)`."""
+    """Probability or score `(M,)` of presence by way to search, and whether the target is present, `(M,)`."""
     names = list(dict.fromkeys(record["policy"] for record in records))
     groups = {name: [record for record in records if record["policy"] == name] for name in names}
     first = groups[names[0]]
@@ -134,15 +138,16 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
     decided.append(sharp_decisions(groups[names[0]]))
     return "\n".join(
         [
-            f"Is the target there? {len(there)} searches ({sensed}), {int(there.sum())} for a class that is. "
-            "Hits at a share of false alarms in %.",
+            f"Is the target present? {len(there)} searches ({sensed}), {int(there.sum())} of them for a present class. "
+            "Hit rates in % at the given false alarm rates.",
             "",
             *table(rows),
             "",
-            "Decisions in %, and mean looks; the place is right where the target overlaps the cell that is named, in "
-            "all searches that name one. Rows with a price end when looking on is not worth that, in right decisions a "
-            "look, and a detection at the gaze ends a search from a score of 0.5; the others end at thresholds. The "
-            f"sharp look says found from the score that gives it as many hits as {names[0]} has.",
+            "Decisions in %, and mean numbers of looks. `place right`: the target overlaps the reported cell, in % of "
+            "the searches that report one. Searches in rows with a price end when further looks are not worth that "
+            "price, in right decisions per look. In the row with a detection at the gaze, a search ends when such a "
+            "detection has a score of 0.5 or more. All other searches end at thresholds. The threshold of the sharp "
+            f"look's score is chosen so that it has as many hits as {names[0]}.",
             "",
             *table(decided),
             "",
@@ -150,13 +155,13 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
             "",
             *table([["", *LANDINGS], *landings(groups)]),
             "",
-            *worth(groups, prices),
+            *values(groups, prices),
         ]
     )
 
 
 def sharp_decisions(records: Sequence[Record]) -> list[str]:
-    """What one sharp look says, at the score from which it has as many hits as these searches."""
+    """Row of one sharp look, with the threshold of its score chosen for as many hits as these searches have."""
     present = [record for record in records if record["present"]]
     hits = sum(record["outcome"] == "found" for record in present)
     least = sorted((record["sharp"] for record in present), reverse=True)[hits - 1] if hits else float("inf")
@@ -175,7 +180,7 @@ def sharp_decisions(records: Sequence[Record]) -> list[str]:
 
 
 def landings(groups: dict[str, list[Record]]) -> list[list[str]]:
-    """Rows of the table of landings."""
+    """Rows of the table about the first look on the target (`landing`)."""
     landed = {name: [each for each in group if each["landing"] is not None] for name, group in groups.items()}
     return [
         [name, *landing_cells([(each["landing"], each["landing_seen"]) for each in group])]
@@ -183,8 +188,8 @@ def landings(groups: dict[str, list[Record]]) -> list[list[str]]:
     ]
 
 
-def worth(groups: dict[str, list[Record]], prices: Sequence[float]) -> list[str]:
-    """Right decisions less the price of their looks, of searches by thresholds and of those by price."""
+def values(groups: dict[str, list[Record]], prices: Sequence[float]) -> list[str]:
+    """Table of the mean value of a search that ends by thresholds, and of one that ends by the price of looks."""
     if not prices:
         return []
     head = ["price of a look", "by thresholds", "by price"]
@@ -193,7 +198,8 @@ def worth(groups: dict[str, list[Record]], prices: Sequence[float]) -> list[str]
         names = (AGENT, f"price {price:g}")
         rows.append([f"{price:g}", *(f"{utility(groups[name], price):.4f}" for name in names)])
     return [
-        "Mean worth of a search: 1 where the decision is right, less the price of its looks; undecided is not right.",
+        "Mean value of a search: 1 if its decision is right, else 0, minus the price of its looks. An undecided search "
+        "is not right.",
         "",
         *table(rows),
         "",
@@ -201,7 +207,7 @@ def worth(groups: dict[str, list[Record]], prices: Sequence[float]) -> list[str]
 
 
 def utility(records: Sequence[Record], price: float) -> float:
-    """Mean of 1 for each right decision less the price of the looks."""
+    """Mean value of searches: 1 for a right decision, minus the price of the looks."""
     right = [record["outcome"] == ("found" if record["present"] else "absent") for record in records]
     looks = [record["looks"] for record in records]
     return sum(each - price * count for each, count in zip(right, looks, strict=True)) / len(records)

@@ -1,22 +1,21 @@
-"""See what the agent does: `python -m eval.demo PHOTO.jpg --target cup` searches a photograph and draws everything.
+"""See what the agent does: `python -m eval.demo PHOTO.jpg --target cup` searches a photograph and draws the search.
 
     python -m eval.demo                                  # lists the classes that can be searched for
     python -m eval.demo --target cup                     # an embedded scene, no photograph needed
-    python -m eval.demo PHOTO.jpg --target "wine glass"  # your own photograph; a folder or a video will do, too
+    python -m eval.demo PHOTO.jpg --target "wine glass"  # your own photograph, or a folder or a video
     python -m eval.demo PHOTO.jpg --target "something to drink from" --embeddings glove.6B.300d.txt
     python -m eval.demo PHOTO.jpg --explore              # no target: learn what is where
     python -m eval.demo --camera 0 --target cup          # live, from a camera, until Ctrl-C
     python -m eval.demo PHOTO.jpg --target cup --report cup.html
     python -m eval.demo PHOTO.jpg --target cup --models mymodels    # your own detector, after train.fit_detector
 
-It prints what was seen and believed at each fixation, and writes pictures and an animation to the folder `out`: those
-that `--draw` names (`--draw "[scanpath]"`, `--draw "[]"` for none).
-Each picture of a folder is looked at on its own. The frames of a video or a camera are looked at as they come, one gaze
-shift a frame: belief goes on from frame to frame and fades at a rate. A picture that is four times as large as the
-detector's input, or larger, is looked at in windows: the agent chooses where, and how close.
+It prints the detections and the belief at each fixation, and writes pictures and an animation to the folder `out`.
+`--draw` chooses which (`--draw "[scanpath]"`; `--draw "[]"` for none).
+Each picture of a folder is a separate episode. In a video or from a camera, the agent makes one gaze shift per frame;
+the belief is carried from frame to frame and fades at a given rate. In a picture that is at least four times as large
+as the detector's input, the agent looks at windows and chooses their places and magnifications.
 """
 
-import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -28,6 +27,7 @@ import torch
 from torch import Tensor
 
 import semfov
+from eval.demo_text import columns, plain_name, told
 from eval.stream import watch
 from semfov import ActivePerception, Scanpath, viz
 from semfov.data.classes import class_index
@@ -58,33 +58,35 @@ class DemoConfig(Settings):
 
     Args:
         photo: photograph, folder of photographs or video (none: an embedded scene).
-        target: class to search for; none, and no --explore, lists the classes.
-        embeddings: file of word vectors (GloVe's or word2vec's text), by which a target that is no class is spread over
-            the classes that it may mean.
-        explore: look around without a target.
-        camera: look at what the camera of this number shows.
-        agent: `recommended` (learned models, where they are shipped for the detector), `published` (the paper's:
+        target: class to search for; without it and without --explore, the classes are listed.
+        embeddings: file of word vectors (text format of GloVe or word2vec); a target that is not a class of the
+            detector is then spread over the classes closest in meaning.
+        explore: explore the scene, without a target.
+        camera: number of a camera whose frames are looked at.
+        agent: `recommended` (learned models, if they are shipped for the detector), `published` (the paper's:
             calibrated scores, Kaplan's rule, predictive search, Kullback-Leibler exploration) or `raw` (any detector,
-            no model: scores as they are, looks where the target is most probable).
-        detector: name or file, as for `semfov.load_detector`; with `models`, where the detector's file lies now.
-        models: folder of models of your own detector, from `train.fit_detector`; it names detector and sensor.
-        sensor: `gradual` (the recommended agent's), `published` or `published-narrow` (`semfov.sensor.SENSORS`); none
-            takes the agent's own.
+            no model: scores as they are, fixates where the target is most probable).
+        detector: name or file, as for `semfov.load_detector`; with `models`, the new location of the detector's file.
+        models: folder of models for your own detector, from `train.fit_detector`; it defines detector and sensor.
+        sensor: `gradual` (the recommended agent's), `published` or `published-narrow` (`semfov.sensor.SENSORS`; none:
+            the agent's own).
         start: first cell, numbered row by row (none: drawn at random).
-        shifts: most gaze shifts (none: 30 for a search, 20 for an exploration).
-        confirm: probability that the target is there, from which on it counts as found (none: the one chosen when the
-            belief was fitted; for agents without a fitted belief the score of a detection, 0.5).
-        give_up: probability below which a cell is not worth a look (none: the one chosen).
-        price: price of a look in right decisions: a search ends when looking on is not worth it (none: by thresholds).
-        until: price of a look in cells: an exploration ends when none is expected to name so many more right (none: 0.1
-            where the map was learned; 0: never). Of a large picture in objects: when no window is expected to show so
-            many new ones (none: 0.01).
-        seed: of the start, of ties and of the embedded scene.
-        frames: how many frames of a video or camera to look at (none: all of a video, of a camera until Ctrl-C).
-        rate: at which the belief about a video or camera fades from frame to frame (0: never).
-        report: write a page to step through in a browser to this file.
-        draw: what to draw: `scanpath`, `views` (what the eye saw), `belief` (of an exploration: what is where),
-            `belief_bars` and `animation`; `[]` draws nothing.
+        shifts: largest number of gaze shifts (none: 30 for a search, 20 for an exploration).
+        confirm: the target can count as found when the probability of its presence reaches this value (none: the value
+            chosen when the belief was fitted; for agents without a fitted belief, a detection's score of 0.5).
+        give_up: a search gives up when, in every cell not fixated yet, the probability of the target is below this
+            value (none: the value chosen when the belief was fitted).
+        price: price of a look in right decisions: a search ends when further looks are not worth it (none: the search
+            ends by thresholds).
+        until: price of a look in cells: an exploration ends when no look is expected to name this many more cells right
+            (none: 0.1 if the map was learned; 0: never). In a large picture, price in objects: it ends when no window
+            is expected to show this many new objects (none: 0.01).
+        seed: random seed of the start, of ties and of the embedded scene.
+        frames: number of frames of a video or camera to look at (none: the whole video; a camera until Ctrl-C).
+        rate: rate at which the belief about a video or camera fades from frame to frame (0: never).
+        report: HTML file to write: a page in which to step through the episodes.
+        draw: figures to draw: `scanpath`, `views` (the foveated views), `belief` (in an exploration: the map of what is
+            where), `belief_bars` and `animation`; `[]` draws nothing.
         out: folder for pictures and animations.
     """
 
@@ -112,10 +114,10 @@ class DemoConfig(Settings):
 
 
 def demo(config: DemoConfig) -> None:
-    """Look at every picture, print what was done, and draw it."""
+    """Look at every picture, and print and draw the episodes."""
     check(config.target is None or not config.explore, "target", "none with --explore", config.target)
     check(config.photo is None or config.camera is None, "photo", "none with --camera", config.photo)
-    # What can be told of the arguments is told before anything is loaded.
+    # Errors in the arguments are reported, as far as possible, before anything is loaded.
     classes = known_classes(config)
     agent = None if classes is not None else make_agent(config)
     classes = agent.classes[1:] if agent is not None else classes or ()
@@ -173,12 +175,12 @@ def make_agent(config: DemoConfig) -> ActivePerception:
 
 
 def moved(detector: str) -> dict[str, Any]:
-    """Where a detector lies now that a folder of models names, if that is told."""
+    """The new location of the detector of a folder of models, if the settings give one."""
     return {} if detector == DemoConfig().detector else {"detector": detector}
 
 
 def zoom_agent(config: DemoConfig, agent: ActivePerception) -> ZoomAgent | None:
-    """The agent for large pictures, with the same detector; none where no evidence is shipped for it."""
+    """The agent for large pictures, with the same detector; None if no evidence is shipped for the detector."""
     name = agent.eye.detector.name
     if config.agent != "recommended" or not (GlimpseEvidence.shipped / f"{name}.safetensors").is_file():
         return None
@@ -187,7 +189,7 @@ def zoom_agent(config: DemoConfig, agent: ActivePerception) -> ZoomAgent | None:
 
 
 def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig, folder: Path) -> list[Path]:
-    """Search or explore a picture larger than the detector's input, print where it was looked at, and draw that."""
+    """Search or explore a picture larger than the detector's input, and print and draw its windows."""
     passes = 24 if config.shifts is None else config.shifts + 1
     if config.target is None:
         given = {"worth": config.until}
@@ -199,7 +201,7 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig, folder: Path
     print(f"{picture.name}, {width} × {height} px, looked at in windows: {path.describe()}")
     unused = [name for name in ("sensor", "start", "price", "report") if getattr(config, name) is not None]
     if unused:
-        print(f"  not used for a picture of this size: {', '.join(unused)}")
+        print(f"  ignored for a picture of this size: {', '.join(unused)}")
     for number, glance in enumerate(path.glances):
         x, y, magnification = glance.window.fixation
         count = int((glance.detections.confidence >= viz.CONFIDENT).sum())
@@ -209,17 +211,17 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig, folder: Path
 
 
 def chosen(values: dict[str, float | None]) -> dict[str, Any]:
-    """Those that were given."""
+    """The values that were given."""
     return {name: value for name, value in values.items() if value is not None}
 
 
 def known_classes(config: DemoConfig) -> tuple[str, ...] | None:
-    """Classes of the detector, where they are known before it is loaded."""
+    """The detector's classes, if they are known before it is loaded."""
     return check_detector(config.detector) if config.models is None else Manifest.read(config.models).classes
 
 
 def open_live(config: DemoConfig) -> Stream | None:
-    """The video or the camera that the settings name, if they do."""
+    """Open the video or the camera that the settings name; None if they name neither."""
     source = config.camera if config.photo is None else config.photo if is_video(config.photo) else None
     if source is None:
         return None
@@ -238,13 +240,13 @@ def pictures(config: DemoConfig, classes: Sequence[str]) -> Iterator[Picture]:
 
 
 def opened(pictures: Iterator[Picture]) -> Iterator[Picture]:
-    """The same pictures, of which the first is read at once."""
+    """The same pictures; the first is read immediately, so that errors appear early."""
     first = next(pictures)
     return chain([first], pictures)
 
 
 def meant(config: DemoConfig, classes: Sequence[str]) -> dict[str, float]:
-    """The classes that a target may mean, each with a weight, the likeliest first."""
+    """The classes that a target may mean, each with a weight, the most likely first."""
     target = config.target or ""
     try:
         return {classes[class_index(target, classes, "target") - 1]: 1.0}
@@ -255,14 +257,14 @@ def meant(config: DemoConfig, classes: Sequence[str]) -> dict[str, float]:
     found = spread(target, classes, vectors)
     print(f"“{target}” may mean: {', '.join(f'{name} {weight:.2f}' for name, weight in found.items())}")
     if vectors.missing:
-        print(f"  not in {config.embeddings}: {', '.join(vectors.missing)}")
+        print(f"  words without a vector in {config.embeddings}: {', '.join(vectors.missing)}")
     return found
 
 
 def only_likeliest(wanted: dict[str, float]) -> None:
-    """Say where a description is no more than its likeliest class."""
+    """Tell the user if only the most likely class of a description is searched for."""
     if len(wanted) > 1:
-        print(f"videos, cameras and large pictures are searched for one class: {next(iter(wanted))}")
+        print(f"videos, cameras and large pictures are searched only for the most likely class: {next(iter(wanted))}")
 
 
 def look_at(
@@ -281,7 +283,7 @@ def look_at(
 
 
 def start_cell(agent: ActivePerception, picture: Picture, config: DemoConfig) -> int | None:
-    """The first cell: off the target where that is known, else as the agent draws it."""
+    """The first cell: the given one, or a random one off the target if its place is known; None: the agent draws."""
     if config.start is not None or picture.boxes is None:
         return config.start
     grid = semfov.Grid(agent.columns, agent.rows, (picture.image.shape[-1], picture.image.shape[-2]))
@@ -290,59 +292,8 @@ def start_cell(agent: ActivePerception, picture: Picture, config: DemoConfig) ->
     return int(free[torch.randint(len(free), (1,), generator=generator)]) if len(free) else None
 
 
-def told(name: str, scanpath: Scanpath) -> str:
-    """What was done, fixation by fixation, as a table."""
-    if scanpath.target is None:
-        values, what = viz.entropy(scanpath), "entropy (bits)"
-    else:
-        values, what = viz.class_posterior(scanpath), f"p({scanpath.classes[scanpath.target]})"
-    anywhere = None if scanpath.presence is None else scanpath.presence.tolist()
-    head = ["#", "at (column, row)", "seen from there", f"{what} there", "highest", "at"]
-    rows = [[*head, *([] if anywhere is None else ["anywhere"]), "ms"]]
-    for number, (cell, value) in enumerate(zip(scanpath.cells.tolist(), values, strict=True)):
-        best = int(value.argmax())
-        milliseconds = 1000 * sum(scanpath.seconds[number].values())
-        figures = [f"{float(value[cell]):.3f}", f"{float(value[best]):.3f}", place(scanpath, best)]
-        figures += [] if anywhere is None else [f"{anywhere[number]:.3f}"]
-        rows.append([str(number), place(scanpath, cell), seen(scanpath, number), *figures, f"{milliseconds:.0f}"])
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    if scanpath.target is None:
-        lines += ["", "what is where:", *named(scanpath)]
-    return "\n".join([f"{name}: {viz.describe(scanpath)}. {viz.why_it_ended(scanpath)}".rstrip(), *lines, ""])
-
-
-def named(scanpath: Scanpath) -> list[str]:
-    """What the map names at the end, a line for each class: in how many cells, how sure at best, and where that is."""
-    parts: dict[str, list[int]] = {}
-    for label, cells, _ in viz.named_regions(scanpath):
-        parts.setdefault(label, []).extend(cells)
-    lines = []
-    for label, cells in sorted(parts.items(), key=lambda item: -len(item[1])):
-        chance = scanpath.probabilities[-1, cells, scanpath.classes.index(label)]
-        best = cells[int(chance.argmax())]
-        many = f"{len(cells)} cell{'s' if len(cells) != 1 else ''}"
-        lines.append(f"  {label}: {many}, p up to {float(chance.max()):.2f} at {place(scanpath, best)}")
-    return lines or ["  nothing that is more probable than background"]
-
-
-def seen(scanpath: Scanpath, fixation: int, most: int = 3) -> str:
-    """The most confident detections of a look, in words."""
-    detections = scanpath.detections[fixation]
-    pairs = zip(detections.labels[0].tolist(), detections.confidence[0].tolist(), strict=True)
-    sure = [f"{scanpath.classes[label]} {score:.2f}" for label, score in pairs if score >= viz.CONFIDENT]
-    more = f" and {len(sure) - most} more" if len(sure) > most else ""
-    return ", ".join(sure[:most]) + more or "nothing"
-
-
-def place(scanpath: Scanpath, cell: int) -> str:
-    """Column and row of a cell, from 0."""
-    row, column = divmod(cell, scanpath.grid.columns)
-    return f"({column}, {row})"
-
-
 def shown(scanpath: Scanpath, config: DemoConfig) -> list[Tensor]:
-    """What the eye was shown at each fixation, where something that is asked for needs it."""
+    """The foveated view at each fixation; empty if no wanted figure needs it."""
     needed = config.report is not None or {"views", "animation"} & set(config.draw)
     return scanpath.views() if needed else []
 
@@ -350,7 +301,7 @@ def shown(scanpath: Scanpath, config: DemoConfig) -> list[Tensor]:
 def draw(
     folder: Path, scanpath: Scanpath, picture: Picture, views: list[Tensor], wanted: Sequence[Drawn]
 ) -> list[Path]:
-    """Write those figures of an episode that are wanted, and the animation."""
+    """Write the wanted figures and animation of an episode."""
     boxes, searched = picture.boxes, scanpath.target is not None
     figures: dict[str, Callable[[], Any]] = {
         "scanpath": lambda: viz.plot_scanpath(scanpath, boxes=boxes),
@@ -367,23 +318,6 @@ def draw(
         film = film_of(scanpath, views=views, boxes=boxes)
         written += film.save(folder / "animation.gif")
     return written
-
-
-def columns(names: Sequence[str], width: int = 100) -> str:
-    """Names in columns, down first."""
-    wide = max(map(len, names)) + 2
-    across = max(1, width // wide)
-    down = -(-len(names) // across)
-    return "\n".join("".join(name.ljust(wide) for name in names[row::down]).rstrip() for row in range(down))
-
-
-def plain_name(name: str) -> str:
-    """A name that every file system takes.
-
-    >>> plain_name("my cup, frame 3")
-    'my-cup-frame-3'
-    """
-    return re.sub(r"[^\w.]+", "-", name).strip("-.") or "picture"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

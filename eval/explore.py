@@ -4,8 +4,8 @@ Without arguments it explores the embedded scenes, which need no data set. With 
 
     python -m eval.explore --data.root val2017 --data.annotations instances_val2017.json --out runs/explore_val
 
-What is seen from every cell is shared with `python -m eval.search`. A run that was stopped goes on where it was when
-the same command is given again.
+Detections from every cell are stored and shared with `python -m eval.search`. To continue a stopped run, give the same
+command again.
 """
 
 import sys

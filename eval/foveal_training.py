@@ -4,12 +4,13 @@
     python -m eval.foveal_training --tuned runs/finetune_foveal/yolov3-tiny-foveal.onnx \
         --fit.root FIT --fit.annotations fit.json --data.root DIR --data.annotations instances.json
 
-Without photographs both use the embedded scenes, which is only good for trying it out.
+Without photographs both use the embedded scenes, which only serves to try it out.
 
-Four arms: the detector as it is and the one trained on foveal views, each with raw scores and with an observation model
-that is fitted to it here, by the same settings on the same photographs. The tables tell what each took, which objects
-it finds by their distance to the fixation, how far its scores are probabilities, and how soon it finds targets. A run
-that was stopped goes on where it was. Judge on photographs that nothing was fitted or trained on.
+There are four arms: the detector as shipped and the detector trained on foveal views, each with raw scores and with an
+observation model, which is fitted here with the same settings on the same photographs. The tables give the computing
+time of each arm, recall by distance from the fixation, the calibration of the scores, and search performance. To
+continue a stopped run, give the same command again. Evaluate on photographs that were used neither for fitting nor for
+training.
 """
 
 import json
@@ -55,22 +56,22 @@ class FovealTrainingConfig(Settings):
     """Compare calibrating a detector with training it on foveal views.
 
     Args:
-        tuned: the trained detector, of `train.finetune_foveal`.
-        data: photographs to judge on, as for `eval.search`.
-        fit: photographs that observation models are fitted to.
-        detector: the detector as it was before.
-        sensor: the foveal sensor, the one that it was trained behind.
-        fit_fixations: random fixations in each photograph of the fit.
-        fixations: random fixations in each photograph, to measure recall and calibration.
-        rate: false boxes in a look, on average, at which found objects are counted.
-        searched: search only the first so many photographs, for each of which every cell is looked at (None: all).
-        policy: that searches, as for `eval.search`, without `-raw` or `-calibrated`.
-        grid: `[columns, rows]` of the beliefs.
-        protocol: the searches.
-        seed: of the fixations.
-        out: folder for the tables, the models and what was seen.
-        cache: folder for what was seen from every cell, shared with `eval.search` (None: the user's cache).
-        workers: processes (None: one for each CPU core).
+        tuned: the detector trained by `train.finetune_foveal`.
+        data: photographs to evaluate on, as for `eval.search`.
+        fit: photographs on which the observation models are fitted.
+        detector: the detector before the training.
+        sensor: the foveal sensor with which the detector was trained.
+        fit_fixations: number of random fixations in each photograph of the fit.
+        fixations: number of random fixations in each photograph for measuring recall and calibration.
+        rate: mean number of false boxes per look; it sets the score threshold at which recall is measured.
+        searched: search only this many photographs, the first ones (None: all); every cell of these is looked at.
+        policy: search policy, as for `eval.search`, without `-raw` or `-calibrated`.
+        grid: `[columns, rows]` of the grid of the beliefs.
+        protocol: the protocol of the searches.
+        seed: random seed of the fixations.
+        out: folder for the tables, the models and the labelled detections.
+        cache: folder for the stored detections from every cell, shared with `eval.search` (None: the user's cache).
+        workers: number of processes (None: one per CPU core).
     """
 
     tuned: Path = Path("runs/finetune_foveal/yolov3-tiny-foveal.onnx")
@@ -130,7 +131,7 @@ def arms(config: FovealTrainingConfig, name: str, detector: DetectorConfig) -> d
 
 
 def training_minutes(tuned: Path) -> float:
-    """Minutes of processors that looking and training took, as the training told; NaN where it did not."""
+    """CPU minutes of looking and training, as recorded by the training; NaN if there is no such record."""
     try:
         told = json.loads((tuned.parent / "training.json").read_text(encoding="utf-8"))
         return float(told["looking_seconds"] + sum(epoch["seconds"] for epoch in told["epochs"])) / 60
@@ -151,9 +152,9 @@ def report(config: FovealTrainingConfig, found: Mapping[str, Arm], minutes: floa
             "",
             *table(effort(found, minutes)),
             "",
-            f"Objects found and named right (%), at the score that leaves {config.rate:g} false boxes a look, by their "
-            f"distance to the fixation in longer sides ({len(first.recall[1])} photographs, {config.fixations} looks "
-            "at each):",
+            f"Objects found and named right (%), at the score threshold that leaves {config.rate:g} false boxes per "
+            "look, by their distance from the fixation as a fraction of the image's longer side "
+            f"({len(first.recall[1])} photographs, {config.fixations} looks at each):",
             "",
             *table(recall(config, found)),
             "",
@@ -170,7 +171,7 @@ def report(config: FovealTrainingConfig, found: Mapping[str, Arm], minutes: floa
             "",
             *table(performance(found, config.protocol.shifts)),
             "",
-            "Differences in points, paired over photographs:",
+            "Differences in percentage points, paired over photographs:",
             "",
             *table(differences(found, config.protocol.shifts)),
             "",
@@ -179,7 +180,7 @@ def report(config: FovealTrainingConfig, found: Mapping[str, Arm], minutes: floa
 
 
 def effort(found: Mapping[str, Arm], minutes: float) -> list[list[str]]:
-    """Minutes of processors that each arm took."""
+    """CPU minutes that each arm took."""
     rows = [["arm", "training, minutes of a core", "fitting, minutes of a core"]]
     for name, arm in found.items():
         trained = f"{minutes:.1f}" if name.startswith("fine-tuned") else "0"
@@ -194,7 +195,7 @@ def bounds(config: FovealTrainingConfig) -> list[str]:
 
 
 def recall(config: FovealTrainingConfig, found: Mapping[str, Arm]) -> list[list[str]]:
-    """Recall by level and over all, and how many objects there were."""
+    """Recall by level and over all levels, and the numbers of objects."""
     rows = [["arm", *bounds(config), "all"]]
     for name, arm in found.items():
         by_level, whole = arm.recall
@@ -204,13 +205,13 @@ def recall(config: FovealTrainingConfig, found: Mapping[str, Arm]) -> list[list[
 
 
 def share(values: Array) -> str:
-    """Mean and error over the photographs that have a value, in percent."""
+    """Mean and standard error in percent, over the photographs that have a value."""
     known = values[~np.isnan(values)]
     return percent(float(known.mean()), float(standard_error(known))) if len(known) else "-"
 
 
 def calibrations(found: Mapping[str, Arm]) -> list[list[str]]:
-    """Figures of calibration over all detections."""
+    """Measures of calibration over all detections."""
     rows = [["arm", "detections", "of objects (%)", "NLL", "Brier", "ECE", "classwise ECE", "accuracy"]]
     for name, arm in found.items():
         told = calibration(arm.probabilities, arm.labels)
@@ -233,7 +234,7 @@ def surprise(config: FovealTrainingConfig, found: Mapping[str, Arm]) -> list[lis
 
 
 def performance(found: Mapping[str, Arm], last: int) -> list[list[str]]:
-    """Cumulative performance with errors."""
+    """Cumulative performance with standard errors."""
     shifts = [n for n in SHIFTS if n <= last]
     rows = [["arm", *(f"CP@{n}" for n in shifts)]]
     for name, arm in found.items():
@@ -244,7 +245,7 @@ def performance(found: Mapping[str, Arm], last: int) -> list[list[str]]:
 
 
 def differences(found: Mapping[str, Arm], last: int) -> list[list[str]]:
-    """Every arm against calibrating alone, of searches and of recall."""
+    """Differences of every arm from calibration alone, in recall and in search performance."""
     shifts = [n for n in SHIFTS if n <= last]
     rows = [["arm, less calibrated", "recall", *(f"CP@{n}" for n in shifts)]]
     one = found["calibrated"]

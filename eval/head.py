@@ -1,13 +1,14 @@
-"""A head that turns: `python -m eval.head` looks around in scenes that are larger than the field of the eye.
+"""A head that turns: `python -m eval.head` looks around in scenes that are larger than the eye's field of view.
 
     python -m eval.head                                                   # panoramas of embedded scenes
     python -m eval.head --data.root DIR --data.annotations instances.json --scenes 40
     python -m eval.head --data.root DIR --data.annotations instances.json --scene mosaic
-    python -m eval.head --fields '[40, 80]'                                # the head zooms, too
+    python -m eval.head --fields '[40, 80]'                                # the head can zoom, too
 
-Eye and head by the gain that is expected per second, beside a head that scans in raster or in random order, both at
-random, and an eye whose head stays. The tables have what is found by the second and by the pass, and what is known.
-A run that was stopped goes on where it was when the same command is given again.
+Our method moves eye and head by the expected gain per second. It is compared with a head that scans the scene in raster
+order or in random order, with random movements of eye and head, and with an eye whose head does not move. The tables
+give search results by seconds and by passes, and the success rate of explorations. To continue a stopped run, give the
+same command again.
 """
 
 import sys

@@ -1,14 +1,14 @@
-"""Beside people: how soon models find what people search for, and how well they tell where people look.
+"""Compare models with people: how soon they find the same targets, and how well they predict where people look.
 
-Visual search: files of scanpaths, floors, and our policies on those of the pictures that are at hand:
+Visual search: models from files of scanpaths, random baselines, and semfov's policies on the available pictures:
 
     python -m eval.human search --people human_scanpaths --files "[elm.json, nnIBS.json]" --pictures "[val2017]"
 
-Free viewing: exploration policies, saliency, centre bias and random gaze, held against people fixation by fixation:
+Free viewing: exploration policies, saliency, centre bias and random gaze, compared with people fixation by fixation:
 
     python -m eval.human viewing --people fixations.json --data.root images --detector.name yolox-nano
 
-A run that was stopped goes on where it was when the same command is given again.
+To continue a stopped run, give the same command again.
 """
 
 import sys
@@ -28,7 +28,7 @@ from semfov.experiments.viewing.sequences import score_sequences
 
 
 def viewing(config: ViewingConfig) -> None:
-    """Hold policies against people who view pictures freely."""
+    """Compare policies with people who view pictures freely."""
     run = ViewingRun(config)
     finish(run, "following people")
     if rank() == 0:
@@ -48,7 +48,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     if not given or given[0] not in JOBS:
         print(__doc__)
-        print(f"expected {' or '.join(JOBS)}, and `--help` after it for its settings", file=sys.stderr)
+        got = repr(given[0]) if given else "nothing"
+        print(
+            f"expected {' or '.join(JOBS)} as the first argument, got {got}; add --help to see its settings",
+            file=sys.stderr,
+        )
         return 0 if given in (["--help"], ["-h"]) else 2
     job, config = JOBS[given[0]]
     return run_command(job, config, __doc__, given[1:])

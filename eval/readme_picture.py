@@ -1,7 +1,7 @@
-"""Make the picture of the README from a photograph that scikit-image carries: `python -m eval.readme_picture`.
+"""Make the picture of the README from a photograph that scikit-image ships: `python -m eval.readme_picture`.
 
 python -m eval.readme_picture
-python -m eval.readme_picture --zoom --weights yolox_nano_416.onnx    # that of docs/zoom.md, of embedded scenes
+python -m eval.readme_picture --zoom --weights yolox_nano_416.onnx    # the picture of docs/zoom.md, of embedded scenes
 """
 
 import argparse
@@ -25,7 +25,7 @@ TARGET, START = "cup", 99
 
 
 def make_picture(path: Path) -> None:
-    """Search the photograph, and draw what was seen above what was believed, in a small file."""
+    """Search the photograph, and draw the foveated views above the beliefs, in a small file."""
     agent = ActivePerception.recommended("yolov3-tiny")
     with torch.inference_mode():
         scanpath = agent.search(PHOTOGRAPH, TARGET, start=START)
@@ -35,7 +35,7 @@ def make_picture(path: Path) -> None:
 
 
 def make_zoom_picture(path: Path, weights: str | None) -> None:
-    """Find people in a mosaic of embedded scenes, and draw where the eye zoomed in."""
+    """Find people in a mosaic of embedded scenes, and draw the windows that the eye looked at."""
     agent = ZoomAgent.recommended("yolox-nano", weights=weights)
     scenes = EmbeddedScenes(agent.classes[1:], count=16)
     mosaic = Mosaics(scenes, 4, 4, tile=(640, 480), count=1)[0].image
@@ -44,13 +44,13 @@ def make_zoom_picture(path: Path, weights: str | None) -> None:
 
 
 def write(frame: Frame, path: Path) -> None:
-    """Write a picture as a small PNG, whole or not at all."""
+    """Write a picture as a small PNG, atomically."""
     with replacing(path) as temporary:
         in_palette(frame, refine=3).save(temporary, format="PNG", optimize=True)
 
 
 def stacked(frames: list[Frame]) -> Frame:
-    """Frames one below the other, on white."""
+    """Stack frames vertically on a white background."""
     width = max(frame.shape[1] for frame in frames)
     pads = [((0, 0), (0, width - frame.shape[1]), (0, 0)) for frame in frames]
     padded = [np.pad(frame, pad, constant_values=255) for frame, pad in zip(frames, pads, strict=True)]
@@ -60,9 +60,9 @@ def stacked(frames: list[Frame]) -> Frame:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m eval.readme_picture", description=__doc__.splitlines()[0])
-    parser.add_argument("--zoom", action="store_true", help="the picture of docs/zoom.md, with YOLOX-nano")
-    parser.add_argument("--weights", help="ONNX file of YOLOX-nano")
-    parser.add_argument("--out", type=Path, help="file to write (none: where the docs have it)")
+    parser.add_argument("--zoom", action="store_true", help="make the picture of docs/zoom.md, with YOLOX-nano")
+    parser.add_argument("--weights", help="ONNX file of YOLOX-nano (none: the registered weights)")
+    parser.add_argument("--out", type=Path, help="file to write (none: the picture's file in docs/pictures)")
     options = parser.parse_args(arguments)
     path = options.out or PICTURES / ("zoom.png" if options.zoom else "search.png")
     if options.zoom:

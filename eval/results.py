@@ -3,9 +3,10 @@
     python -m eval.results --root val2017 --annotations instances_val2017.json --yolox yolox_nano.onnx
         --fit_root fit --fit_annotations instances_fit.json
 
-Results are measured on the photographs that configs/results_photographs.txt names; settings are chosen on those of the
-fit set. The page's text is docs/results.template.md, in which a line `@@ table` or `@@ experiment table` stands for a
-table. What a detector sees is computed once and shared; a run that was stopped goes on where it was.
+Results are measured on the photographs listed in configs/results_photographs.txt; settings are chosen on the
+photographs of the fit set. The text of the page is docs/results.template.md, in which a line `@@ table` or
+`@@ experiment table` stands for a table. Detections are computed once and shared by all experiments. To continue a
+stopped run, give the same command again.
 """
 
 import sys
@@ -57,14 +58,14 @@ def results(config: ResultsConfig) -> None:
     try:
         template = config.template.read_text(encoding="utf-8")
     except OSError as error:
-        raise DataError(f"{config.template}: cannot be read ({error.strerror})") from None
+        raise DataError(f"template: {config.template} cannot be read ({error.strerror}); check the path") from None
     write_text(config.page, fill(template, runs))
     for path in [config.page, *draw_figures(config.pictures, runs)]:
         print(f"written: {path}")
 
 
 def fill(template: str, runs: Runs) -> str:
-    """The template with every line `@@ …` replaced by the table that it names."""
+    """Replace every line `@@ …` of the template by the table that it names."""
     lines: list[str] = []
     for line in template.splitlines():
         lines += fill_line(line.removeprefix("@@ "), runs) if line.startswith("@@ ") else [line]
@@ -72,7 +73,7 @@ def fill(template: str, runs: Runs) -> str:
 
 
 def fill_line(line: str, runs: Runs) -> list[str]:
-    """The table that a line names: one of the whole page, of a study, or `experiment table`."""
+    """The table that a line names: a table of the whole page, of a study, or of one experiment."""
     if line in STUDIES:
         return study_table(line, runs)
     if line in WHOLE:
@@ -91,7 +92,7 @@ WHOLE: dict[str, Callable[[Runs], list[str]]] = {
     "photographs": photographs,
     "readings": readings,
 }
-"""Tables that draw on several experiments, or on none."""
+"""Tables made from several experiments, or from none."""
 
 EXPLORED = (1, 2, 3, 4, 10, 20)
 
@@ -101,7 +102,7 @@ HANDLERS: dict[type, Callable[[Any], None]] = {
     DecideConfig: search_and_decide,
     CalibrationConfig: judge_beliefs,
 }
-"""What runs an experiment, by the kind of its settings."""
+"""Functions that run an experiment, by the class of its settings."""
 
 TABLES: dict[str, Callable[[Path], list[str]]] = {
     "all": summary,

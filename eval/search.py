@@ -4,9 +4,9 @@ Without arguments it searches the embedded scenes, which need no data set. With 
 
     python -m eval.search --data.root val2017 --data.annotations instances_val2017.json --out runs/val
     python -m eval.search --config configs/paper_search.yaml --data.root ... --data.annotations ...
-    python -m eval.search --models mymodels --data.root ... --data.annotations ...   # of train.fit_detector
+    python -m eval.search --models mymodels --data.root ... --data.annotations ...   # a folder of train.fit_detector
 
-A run that was stopped goes on where it was when the same command is given again.
+To continue a stopped run, give the same command again.
 """
 
 import sys

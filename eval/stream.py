@@ -1,4 +1,4 @@
-"""The demonstration on a video or a camera: what is seen and believed at every frame, printed and drawn into it."""
+"""The demonstration on a video or a camera: prints detections and belief at every frame, and draws them into it."""
 
 import time
 from collections import deque
@@ -10,19 +10,19 @@ from semfov.live import LivePerception, Moment
 from semfov.viz.live import draw_moment, video, video_suffix
 
 UNKNOWN_RATE = 15.0
-"""Frames per second of what is written where the source tells none."""
+"""Frames per second of the written video if the source does not give its own."""
 
 
 def watch(live: LivePerception, stream: Stream, path: Path) -> Path:
-    """Look at every frame, print what is seen and believed, and write a video of it; Ctrl-C ends it in good order.
+    """Look at every frame, print detections and belief, and write a video of them; Ctrl-C ends it in good order.
 
     Args:
-        live: the agent at work.
-        stream: of frames.
-        path: of the video to write, without its suffix.
+        live: the running agent.
+        stream: the frames.
+        path: path of the video to write, without its suffix.
 
     Returns:
-        The video.
+        The path of the video.
     """
     path = path.with_suffix(video_suffix())
     began, looking, shown = time.perf_counter(), 0.0, 0
@@ -41,12 +41,13 @@ def watch(live: LivePerception, stream: Stream, path: Path) -> Path:
         except KeyboardInterrupt:
             print("  stopped")
     whole = time.perf_counter() - began
-    print(f"{shown} frames, {shown / whole:.1f} a second, {shown / max(looking, 1e-9):.1f} without reading and drawing")
+    alone = shown / max(looking, 1e-9)
+    print(f"{shown} frames, {shown / whole:.1f} per second, {alone:.1f} per second without reading and drawing")
     return path
 
 
 def told(moment: Moment, live: LivePerception) -> str:
-    """What is seen and believed at a frame, in a line."""
+    """Detections and belief at a frame, as one line."""
     best = int(moment.probability.argmax())
     row, column = divmod(moment.cell, moment.grid.columns)
     look = f"{moment.number:4d}  at ({column}, {row}): {seen(moment, live)}"
@@ -55,7 +56,7 @@ def told(moment: Moment, live: LivePerception) -> str:
 
 
 def headline(moment: Moment, live: LivePerception) -> str:
-    """What is believed at a frame, in a few words."""
+    """The belief at a frame, in a few words."""
     highest = float(moment.probability.max())
     if moment.target is None:
         return f"p(object) up to {highest:.2f}"
@@ -66,7 +67,7 @@ def headline(moment: Moment, live: LivePerception) -> str:
 
 
 def seen(moment: Moment, live: LivePerception, most: int = 2) -> str:
-    """The most confident detections of a look, in words."""
+    """The most confident detections of a look, as text."""
     detections = moment.detections
     pairs = zip(detections.labels[0].tolist(), detections.confidence[0].tolist(), strict=True)
     sure = [f"{live.classes[label]} {score:.2f}" for label, score in pairs if score >= viz.CONFIDENT]

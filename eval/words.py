@@ -1,12 +1,12 @@
-"""Knowledge from words: `python -m eval.words` searches with and without context, from the same starts.
+"""Context from words: `python -m eval.words` compares searches with and without context, from the same starts.
 
     python -m train.fit_context --embeddings glove.6B.300d.txt --weigh 400 --out runs/glove --name glove …
     python -m eval.words --tables "[runs/glove/glove.safetensors]" --data.root DIR --data.annotations instances.json
 
-The arms: no context, context counted from annotations (the upper reference), context of each table, and of the same
-table with its classes exchanged at random (the control). The tables have how many searches are found after so many gaze
-shifts, and the difference to no context, search by search, with its standard error; then the same of those searches
-alone whose first look misses the target, where context could matter most. In mosaics: `python -m eval.zoom --contexts`.
+The arms are: no context; context counted from annotations (the upper reference); the context of each table; and that of
+the same table with its classes permuted at random (the control). The tables give the share of targets found after n
+gaze shifts, and the paired difference from no context with its standard error. A second table is restricted to searches
+whose first look misses the target, where context could matter most. For mosaics: `python -m eval.zoom --contexts`.
 """
 
 import sys

@@ -1,12 +1,12 @@
-"""Pictures larger than the detector's input: `python -m eval.zoom` compares where to look, and how close.
+"""Pictures larger than the detector's input: `python -m eval.zoom` compares ways to choose place and magnification.
 
     python -m eval.zoom                                                   # mosaics of embedded scenes
     python -m eval.zoom --data.root DIR --data.annotations instances.json --mosaics 100
     python -m eval.zoom --data.root DIR --data.annotations instances.json --mosaics 0 --target person
 
-Slices in raster and in random order, slices ranked by the overview, a quad-tree best first, ours, and an oracle. The
-tables have recall after so many passes of the detector, and for mosaics the passes to the first confirmed hit. A run
-that was stopped goes on where it was when the same command is given again.
+It compares slices in raster order, in random order and ranked by the overview, a best-first quad-tree, our method, and
+an oracle. The tables give recall after n passes of the detector, for mosaics the passes to the first confirmed hit, and
+decisions. To continue a stopped run, give the same command again.
 """
 
 import sys

@@ -1,9 +1,9 @@
-"""Bad input by the thousand: `python -m benchmarks.fuzz --cases 1000`.
+"""Fuzz semfov with thousands of bad inputs: `python -m benchmarks.fuzz --cases 1000`.
 
-A target is a function that draws an input (`hypothesis`), hands it to semfov, and checks what comes back: the
-documented result, compared with something independent of the code (*right*), or one of semfov's own errors, in one
-line that names the thing (*refused by name*); what can be made again may count as missing, which is right, too.
-Anything else is a finding.
+A target is a function that draws an input (`hypothesis`), passes it to semfov, and checks the outcome. Two outcomes are
+allowed: the documented result, checked against something independent of the code (*right*), or one of semfov's own
+errors in one line that names the argument or file (*refused by name*). A stored file that can be computed again may
+also count as missing, which is right, too. Anything else is a finding.
 """
 
 from benchmarks.fuzz.annotations import annotation_files

@@ -12,17 +12,17 @@ from benchmarks.fuzz import TARGETS
 from benchmarks.fuzz.runner import run
 
 CLASSES = {"result": "right", "missing": "right", "InputError": "refused by name", "DataError": "refused by name"}
-"""Classes of outcomes by what targets return; whatever else happens is a finding."""
+"""Classes of outcomes by the values that targets return; anything else is a finding."""
 
 
 def main() -> None:
-    """Run targets and print the table of outcomes."""
+    """Run the targets, and print the table of outcomes."""
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.fuzz", description="hand bad input to semfov; a finding is raised with its input"
+        prog="python -m benchmarks.fuzz", description="pass bad input to semfov; a finding is printed with its input"
     )
-    parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"any of {', '.join(TARGETS)}; default: all")
-    parser.add_argument("--cases", type=int, default=1000, help="inputs for each target")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"any of {', '.join(TARGETS)} (default: all)")
+    parser.add_argument("--cases", type=int, default=1000, help="number of inputs for each target")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of the inputs")
     options = parser.parse_args()
     for name in options.targets:
         if name not in TARGETS:

@@ -1,4 +1,4 @@
-"""COCO files: whole, odd, or with entries of the wrong kind."""
+"""Fuzz COCO annotation files: valid, unusual, or with entries of the wrong kind."""
 
 import copy
 import json
@@ -24,7 +24,7 @@ _JUNK: list[Any] = [
 
 
 def annotation_files(data: st.DataObject) -> str:
-    """`CocoScenes`: the boxes that a plain loop keeps, or `DataError`; wrong entries are never passed over."""
+    """`CocoScenes`: the boxes that a plain loop keeps, or `DataError`; wrong entries are never ignored."""
     document = draw_document(data)
     whole = json.dumps(document)
     damage = choose(data, ("none", "none", "value", "missing", "repeated id", "cut"), "damage")
@@ -81,7 +81,7 @@ def annotation_files(data: st.DataObject) -> str:
 
 
 def draw_document(data: st.DataObject) -> dict[str, Any]:
-    """A valid file: ids with gaps, unknown categories, crowds, boxes without area, outside and beyond the image."""
+    """A valid file with gaps between ids, unknown categories, crowds, and boxes without area or outside the image."""
     rng = draw_rng(data)
     images = rng.choice(1000, data.draw(st.integers(1, 4), label="images"), replace=False).tolist()
     names = [str(name) for name in rng.permutation(CATEGORIES)[: data.draw(st.integers(1, 5), label="categories")]]
@@ -108,7 +108,7 @@ def draw_document(data: st.DataObject) -> dict[str, Any]:
 
 
 def places(document: dict[str, Any]) -> list[tuple[Any, Any]]:
-    """Every value that matters, as its holder and its key."""
+    """All values that matter, each as its container and its key."""
     found: list[tuple[Any, Any]] = [(document, key) for key in document]
     for table in document.values():
         found += [(table, index) for index in range(len(table))]
@@ -117,14 +117,14 @@ def places(document: dict[str, Any]) -> list[tuple[Any, Any]]:
 
 
 def known_categories(document: dict[str, Any]) -> bool:
-    """Whether the detector knows any category."""
+    """Whether the detector knows any of the categories."""
     return any(category["name"] in LABELS for category in document["categories"])
 
 
 def expected(
     document: dict[str, Any], *, min_instances: int, crowd: str, max_target_area: None
 ) -> dict[int, list[list[float]]]:
-    """Rows `[x1, y1, x2, y2, label]` of every image that is kept, by a plain loop."""
+    """Rows `[x1, y1, x2, y2, label]` of every image that should be kept, by a plain loop."""
     names = {category["id"]: category["name"] for category in document["categories"]}
     kept = {}
     for image in sorted(entry["id"] for entry in document["images"]):

@@ -1,4 +1,4 @@
-"""Arguments of the agent, and settings, in and out of their ranges."""
+"""Fuzz arguments of the agent and settings, inside and outside their ranges."""
 
 import dataclasses
 import math
@@ -23,19 +23,19 @@ PICTURES = ("ordinary", "ordinary", "ordinary", "bytes", "255 times", "negative"
 
 
 class Plain(Detector):
-    """Sees one cup wherever it looks."""
+    """A detector that sees one cup in every view."""
 
     def __init__(self) -> None:
         super().__init__("plain", ("cup", "cat"), (32, 32))
 
     def propose(self, canvas: Tensor) -> Candidates:
-        """The same for every canvas."""
+        """Return the same candidates for every canvas."""
         box = canvas.new_tensor([[4.0, 4, 20, 20]]).expand(len(canvas), 1, 4)
         return Candidates(box, canvas.new_tensor([[0.9, 0.1]]).expand(len(canvas), 1, 2), None)
 
 
 def agent_arguments(data: st.DataObject) -> str:
-    """`search` and `explore`: a scanpath of cells in the grid where all values can be, else `InputError` by name."""
+    """`search` and `explore`: a scanpath on the grid if all values are valid, else `InputError` that names one."""
     rng = draw_rng(data)
     kind = choose(data, PICTURES, "image")
     image = picture(kind, rng)
@@ -68,7 +68,7 @@ def agent_arguments(data: st.DataObject) -> str:
 
 
 def picture(kind: str, rng: np.random.Generator) -> Tensor:
-    """A small image, or what is none."""
+    """A small image, or a tensor that is not a valid image."""
     image = torch.from_numpy(rng.random((3, int(rng.integers(8, 40)), int(rng.integers(8, 40))), dtype=np.float32))
     place = tuple(int(rng.integers(size)) for size in image.shape)
     if kind in ("NaN", "infinite"):
@@ -85,7 +85,7 @@ def picture(kind: str, rng: np.random.Generator) -> Tensor:
 
 
 def settings_values(data: st.DataObject) -> str:
-    """Settings of every command: made where a number is in the range that its type tells, else refused by name."""
+    """Settings of the commands: accepted if a number is in the range of its type, else refused by name."""
     kinds = [kind for kind in vars(settings).values() if dataclasses.is_dataclass(kind) and isinstance(kind, type)]
     ranged = [(kind, *field) for kind in kinds for field in fields_of(kind)]
     kind, name, base, allowed, optional = choose(data, ranged, "setting")
@@ -102,7 +102,7 @@ def settings_values(data: st.DataObject) -> str:
         assert not fits, result
         assert str(result).startswith(f"{name}: expected "), result
         return outcome(result)
-    # Words, and mappings, are the command line's to judge.
+    # Words and mappings are checked only on the command line.
     assert fits or (value is None and optional) or word, f"{kind.__name__}.{name}={value!r}"
     return "result"
 

@@ -1,4 +1,4 @@
-"""Detectors that return what no detector should, through the whole chain to the next fixation."""
+"""Fuzz the whole chain to the next fixation with detectors that return invalid or unusual candidates."""
 
 import numpy as np
 import torch
@@ -15,19 +15,19 @@ SCORES = ("ordinary", "zero", "certain", "tiny", "NaN", "negative", "above one")
 
 
 class Odd(Detector):
-    """Returns given candidates for every canvas."""
+    """A detector that returns given candidates for every canvas."""
 
     def __init__(self, candidates: Candidates, selection: Selection) -> None:
         super().__init__("odd", CLASSES, (32, 32), selection=selection)
         self.candidates = candidates
 
     def propose(self, canvas: Tensor) -> Candidates:
-        """The same for every canvas."""
+        """Return the given candidates."""
         return self.candidates
 
 
 def detectors(data: st.DataObject) -> str:
-    """`ActivePerception.search`: beliefs are finite and grow, cells are new and in the grid; or an error."""
+    """`ActivePerception.search`: finite beliefs, and cells in the grid that are never repeated; or an error."""
     rng = draw_rng(data)
     count = choose(data, (0, 1, 3, 40, 10_000), "count")
     boxes, scores = choose(data, BOXES, "boxes"), choose(data, SCORES, "scores")
@@ -54,7 +54,7 @@ def detectors(data: st.DataObject) -> str:
 
 
 def check(path: object, selection: Selection, size: tuple[int, int], cells: int) -> None:
-    """Everything that a scanpath promises."""
+    """Check everything that is documented of a scanpath."""
     assert isinstance(path, Scanpath)
     probabilities = path.probabilities
     assert bool(torch.isfinite(probabilities).all())
@@ -75,7 +75,7 @@ def check(path: object, selection: Selection, size: tuple[int, int], cells: int)
 
 
 def draw_candidates(rng: np.random.Generator, count: int, boxes: str, scores: str, with_objectness: bool) -> Candidates:
-    """Candidates of which some, where it says so, are odd."""
+    """Candidates, of which some have boxes or scores of the given unusual kinds."""
     corner, extent = rng.uniform(0, 28, (count, 2)), rng.uniform(1, 20, (count, 2))
     edges = np.concatenate([corner, corner + extent], -1)
     classes = rng.random((count, len(CLASSES)))
@@ -100,5 +100,5 @@ def draw_candidates(rng: np.random.Generator, count: int, boxes: str, scores: st
 
 
 def choose_share(rng: np.random.Generator) -> float:
-    """Share of the candidates that is odd."""
+    """A random share of candidates to make unusual."""
     return float(rng.choice([0.1, 0.5, 1.0]))

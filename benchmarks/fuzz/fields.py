@@ -1,4 +1,4 @@
-"""Fields of models, with a checksum that is right: what cannot be is refused by name."""
+"""Fuzz the fields of model files with a correct checksum: impossible values are refused by name."""
 
 import copy
 import json
@@ -27,7 +27,7 @@ JUNK: list[Any] = [
 
 
 def model_fields(data: st.DataObject) -> str:
-    """Every model: a tensor or a value of its record is changed; it is refused, or what is loaded is as it was told."""
+    """Every model with a changed tensor or value: it is refused, or the loaded model is exactly what the file says."""
     rng = draw_rng(data)
     make = choose(data, _MODELS, "model")
     model = make()

@@ -1,4 +1,4 @@
-"""Fusion rules: likelihoods and parameters from anywhere on the number line."""
+"""Fuzz fusion rules with likelihoods and parameters of any value."""
 
 import numpy as np
 import torch
@@ -48,7 +48,7 @@ def fusion_rules(data: st.DataObject) -> str:
     torch.testing.assert_close(whole[0, 0], result, rtol=20 * torch.finfo(dtype).eps, atol=torch.finfo(dtype).tiny)
     wide = [tensor.double().numpy().astype(np.longdouble) for tensor in tensors]
     exact = formula(rule, *wide).astype(np.float64)
-    # The product rule keeps parameters above zero by the smallest number there is, before it scales them.
+    # The product rule raises parameters to the smallest positive number before it scales them.
     scale = (1 + beta.sum()) / (beta * likelihood / likelihood.max()).sum()
     least = 10 * torch.finfo(dtype).tiny * max(scale, 1.0)
     np.testing.assert_allclose(result.numpy(), exact, rtol=20 * torch.finfo(dtype).eps, atol=least)
@@ -56,7 +56,7 @@ def fusion_rules(data: st.DataObject) -> str:
 
 
 def formula(rule: str, beta: np.ndarray, likelihood: np.ndarray) -> np.ndarray:
-    """The rules as they are printed."""
+    """The rules as in their published formulas."""
     expected = (beta * likelihood).sum()
     if rule == "kaplan":
         return beta * (1 + likelihood / expected) / (1 + likelihood.min() / expected)
@@ -66,7 +66,7 @@ def formula(rule: str, beta: np.ndarray, likelihood: np.ndarray) -> np.ndarray:
 
 
 def draw_likelihood(rng: np.random.Generator, kind: str, classes: int) -> np.ndarray:
-    """Likelihoods of a kind."""
+    """Random likelihoods of the given kind."""
     values = rng.dirichlet(np.ones(classes)) + 1e-6
     if kind == "sharp":
         values = values**8 + 1e-20
@@ -82,7 +82,7 @@ def draw_likelihood(rng: np.random.Generator, kind: str, classes: int) -> np.nda
 
 
 def draw_beta(rng: np.random.Generator, start: str, classes: int) -> np.ndarray:
-    """Dirichlet parameters of a kind."""
+    """Random Dirichlet parameters of the given kind."""
     values = np.full(classes, 0.5)
     if start == "grown":
         values = rng.gamma(2.0, 5.0, classes) + 0.1

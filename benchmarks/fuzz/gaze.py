@@ -1,4 +1,4 @@
-"""The sensor: images of any shape, fixations anywhere, windows of any width."""
+"""Fuzz the sensor with images of any shape, fixations at any place and windows of any width."""
 
 import math
 
@@ -12,10 +12,16 @@ NUMBERS = (0.0, -1.0, 1e-30, 1e-3, 1.0, 37.5, 1e6, 1e30, math.inf, -math.inf, ma
 
 
 def fixations(data: st.DataObject) -> str:
-    """`foveate`: a finite view of the image's shape that keeps to its range, or `InputError`.
+    """`foveate`: a finite view with the image's shape and in a bounded range, or `InputError`.
 
-    A band is a difference of two averages, so it is at most the image's range r; K bands with weights in [0, 1] then
-    leave the view within K r of the image's values.
+    A band is a difference of two averages, so its values are at most the image's range r. K bands with weights in
+    [0, 1] then keep the view within K r of the image's values.
+
+    Args:
+        data: source of random choices.
+
+    Returns:
+        The kind of the outcome.
     """
     rng = draw_rng(data)
     width = 5000 if data.draw(st.integers(0, 20), label="wide") == 0 else data.draw(st.integers(1, 140), label="width")
@@ -50,7 +56,7 @@ def fixations(data: st.DataObject) -> str:
 
 
 def number(data: st.DataObject, low: float, high: float) -> float:
-    """Mostly from a range, else from anywhere."""
+    """A number, mostly from the range, sometimes any number."""
     ordinary = data.draw(st.integers(0, 9), label="ordinary") > 0
     return data.draw(st.floats(low, high)) if ordinary else choose(data, NUMBERS, "number")
 

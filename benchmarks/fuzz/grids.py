@@ -1,4 +1,4 @@
-"""Boxes on grids: anywhere, of any size, and what is no box."""
+"""Fuzz grids with boxes at any place, of any size, and with invalid boxes."""
 
 import math
 
@@ -13,10 +13,10 @@ RULES = ("overlap", "centre", "box_centre", "soft")
 
 
 def boxes_on_grids(data: st.DataObject) -> str:
-    """`Grid.footprint` and `cell_of`: what a loop over cells finds, or `InputError`."""
+    """`Grid.footprint` and `cell_of`: the same result as a loop over cells, or `InputError`."""
     rng = draw_rng(data)
     columns, rows = (7 - data.draw(st.integers(0, 7), label=side) for side in ("columns", "rows"))
-    # Sizes that the cells divide into binary fractions: borders are then exact in floating point.
+    # With these sizes the borders of cells are binary fractions, which are exact in floating point.
     unit = choose(data, (1, 8, 32, 64, 8, 32, 0), "unit")
     size = (columns * unit, rows * unit)
     grid = attempt(lambda: Grid(columns, rows, size))
@@ -59,7 +59,7 @@ def boxes_on_grids(data: st.DataObject) -> str:
 
 
 def overlaps(box: np.ndarray, cell: int, columns: int, unit: float) -> bool:
-    """Whether box and cell share a positive area."""
+    """Whether the overlap of box and cell has a positive area."""
     left, top = cell % columns * unit, cell // columns * unit
     width = min(box[2], left + unit) - max(box[0], left)
     height = min(box[3], top + unit) - max(box[1], top)

@@ -1,4 +1,4 @@
-"""Image files: many kinds, whole or damaged."""
+"""Fuzz image files of many kinds, valid or damaged."""
 
 import io
 import struct
@@ -34,7 +34,7 @@ _ORIENTATION = 0x0112
 
 
 def image_files(data: st.DataObject) -> str:
-    """`read_image`: pixels as computed by numpy where the file is whole and lossless, else an image or `DataError`."""
+    """`read_image`: the pixels that numpy computes if the file is valid and lossless, else an image or `DataError`."""
     mode = choose(data, KINDS, "mode")
     kind = choose(data, KINDS[mode], "format")
     wide = mode == "L" and kind == "png" and data.draw(st.integers(0, 30), label="wide") == 0
@@ -69,7 +69,7 @@ def image_files(data: st.DataObject) -> str:
 
 
 def picture(mode: str, size: tuple[int, int], rng: np.random.Generator) -> tuple[Any, NDArray[np.float64]]:
-    """A random picture of a Pillow mode, and the RGB values `(H, W, 3)` that it stands for."""
+    """A random picture of a Pillow mode, and the RGB values `(H, W, 3)` that it represents."""
     shape = size[::-1]
     if mode in ("1", "F", "I;16"):
         deep = rng.integers(0, 2**16, shape, dtype=np.uint16)
@@ -95,7 +95,7 @@ def picture(mode: str, size: tuple[int, int], rng: np.random.Generator) -> tuple
 
 
 def encode(image: Any, kind: str, orientation: int, frames: int, rng: np.random.Generator) -> bytes:
-    """The picture as the first of `frames` in a file."""
+    """Encode the picture as the first of `frames` in a file."""
     options: dict[str, Any] = {}
     if orientation != 1:
         exif = Image.Exif()
@@ -110,7 +110,7 @@ def encode(image: Any, kind: str, orientation: int, frames: int, rng: np.random.
 
 
 def damaged(content: bytes, damage: str, kind: str, rng: np.random.Generator) -> bytes:
-    """The file with the damage done."""
+    """The contents of the file after the damage."""
     if damage == "cut":
         return content[: int(rng.integers(1, len(content)))]
     if damage == "bytes":
@@ -129,7 +129,7 @@ def damaged(content: bytes, damage: str, kind: str, rng: np.random.Generator) ->
 
 
 def turned(pixels: NDArray[np.float64], orientation: int) -> NDArray[np.float64]:
-    """`(H, W, 3)` as EXIF orientation 1 to 8 says to show it; other values are passed over."""
+    """Turn pixels `(H, W, 3)` by an EXIF orientation from 1 to 8; other values are ignored."""
     moves = {
         2: lambda p: p[:, ::-1],
         3: lambda p: p[::-1, ::-1],

@@ -1,4 +1,4 @@
-"""Files with models: whole ones come back to the bit, damaged ones are refused."""
+"""Fuzz model files: valid files are read back bit for bit, damaged files are refused."""
 
 import tempfile
 import warnings
@@ -37,7 +37,7 @@ classes=2
 
 
 def model_files(data: st.DataObject) -> str:
-    """Observation models, statistics, target evidence and cached tensors: cut, with bits or bytes changed."""
+    """Observation models, statistics, target evidence and cached tensors: truncated, or with changed bits or bytes."""
     rng = draw_rng(data)
     name = choose(data, _SAVED, "file")
     save, load = _SAVED[name]
@@ -63,7 +63,7 @@ def model_files(data: st.DataObject) -> str:
 
 
 def darknet_files(data: st.DataObject) -> str:
-    """Cfg and weights files of Darknet: a network that runs and is finite, or `DataError`."""
+    """Cfg and weights files of Darknet: a network that runs with finite outputs, or `DataError`."""
     rng = draw_rng(data)
     with tempfile.TemporaryDirectory() as folder:
         cfg, weights = Path(folder, "net.cfg"), Path(folder, "net.weights")
@@ -99,7 +99,7 @@ def darknet_files(data: st.DataObject) -> str:
 
 
 def changed(content: bytes, damage: str, rng: np.random.Generator) -> bytes:
-    """A file with the damage done; never the file that it was."""
+    """The contents of a file after the damage; they always differ from the original."""
     if damage == "cut":
         return content[: int(rng.integers(0, len(content)))]
     if damage == "longer":
@@ -132,7 +132,7 @@ def _statistics() -> DirichletStatistics:
 
 
 def _content(loaded: object) -> str:
-    """Everything that a file says, as text."""
+    """All contents of a loaded file, as text."""
     if isinstance(loaded, tuple):
         statistics, record = loaded
         return f"{statistics.count.tolist()} {statistics.sums.tolist()} {record}"

@@ -1,4 +1,4 @@
-"""The observation model: scores on and off the simplex, distances of every kind."""
+"""Fuzz the observation model with scores on and off the simplex and distances of every kind."""
 
 import math
 
@@ -15,7 +15,7 @@ EDGES = (0.25, 0.5)
 
 
 def observations(data: st.DataObject) -> str:
-    """`calibrate`: Bayes' rule written with `math.lgamma`, or `InputError`; statistics take what is on the simplex."""
+    """`calibrate`: Bayes' rule by `math.lgamma`, or `InputError`; statistics accept only scores on the simplex."""
     rng = draw_rng(data)
     classes = data.draw(st.integers(1, 5), label="classes")
     components, levels = classes + 1, len(EDGES) + 1
@@ -48,7 +48,7 @@ def observations(data: st.DataObject) -> str:
 
 
 def bayes(scores: np.ndarray, alpha: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """Posterior of the classes for scores floored at 1e-6."""
+    """Posterior probabilities of the classes, for scores floored at 1e-6."""
     raised = np.maximum(scores, 1e-6)
     logs = np.log(raised / raised.sum())
     logits = []
@@ -60,7 +60,7 @@ def bayes(scores: np.ndarray, alpha: np.ndarray, prior: np.ndarray) -> np.ndarra
 
 
 def draw_scores(rng: np.random.Generator, kind: str, components: int) -> np.ndarray:
-    """A score vector of a kind."""
+    """A random score vector of the given kind."""
     scores = rng.dirichlet(np.ones(components))
     if kind == "corner":
         scores = np.eye(components)[rng.integers(components)]

@@ -1,4 +1,4 @@
-"""ONNX files: detectors with odd shapes, types and metadata, whole or damaged."""
+"""Fuzz ONNX files: detectors with unusual shapes, types and metadata, valid or damaged."""
 
 import json
 import tempfile
@@ -37,7 +37,7 @@ METADATA: tuple[dict[str, str], ...] = (
 
 
 def onnx_files(data: st.DataObject) -> str:
-    """`load_onnx`: a detector that gives finite boxes and scores of the simplex, or an error that names the fault."""
+    """`load_onnx`: a detector with finite boxes and scores on the simplex, or an error that names the fault."""
     rng = draw_rng(data)
     faults = data.draw(st.sets(st.sampled_from(FAULTS), max_size=2), label="faults")
     shape = [1, 3, 32, 32]
@@ -79,7 +79,7 @@ def onnx_files(data: st.DataObject) -> str:
 
 
 def network(image: list[Any], rank: int, classes: int, kind: int, rng: np.random.Generator) -> onnx.ModelProto:
-    """YOLOv5-style rows that do not depend on the image, cast and cut to the rank and type."""
+    """A network with YOLOv5-style rows that do not depend on the image, converted to the given rank and type."""
     rows = rng.random((1, 6, 5 + classes)).astype(np.float32)
     rows[..., :4] *= 30
     rows = rows.reshape(rows.shape if rank == 3 else {2: (6, -1), 1: (-1,), 0: (-1,)}[rank])

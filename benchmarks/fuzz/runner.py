@@ -1,4 +1,4 @@
-"""Running a target on many generated inputs, and counting what came of them."""
+"""Runs a target on many generated inputs, and counts the outcomes."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -15,12 +15,15 @@ Result = TypeVar("Result")
 
 
 def run(target: Target, cases: int, number: int = 0) -> Counter[str]:
-    """Outcomes of `cases` inputs: how often a result, how often each error.
+    """Run a target, and count its results and errors.
 
     Args:
-        target: raises what is a finding; the smallest input that does is reported.
-        cases: how many.
-        number: seed of the inputs.
+        target: the target; it raises an exception on a finding, and the smallest such input is reported.
+        cases: number of inputs.
+        number: random seed of the inputs.
+
+    Returns:
+        The counts by kind of outcome.
     """
     outcomes: Counter[str] = Counter()
 
@@ -42,7 +45,7 @@ def run(target: Target, cases: int, number: int = 0) -> Counter[str]:
 
 
 def attempt(call: Callable[[], Result]) -> Result | DataError | InputError:
-    """What `call` returns, or the error that semfov raises on purpose, which must say something on one line."""
+    """The result of `call`, or the error that semfov raises on purpose, whose message must be one meaningful line."""
     try:
         return call()
     except (DataError, InputError) as error:
@@ -58,12 +61,12 @@ def failed(result: object) -> bool:
 
 
 def outcome(result: object) -> str:
-    """How an attempt is counted."""
+    """The kind of an attempt's outcome."""
     return type(result).__name__ if failed(result) else "result"
 
 
 def draw_rng(data: st.DataObject) -> np.random.Generator:
-    """A generator for arrays, which hypothesis would draw number by number."""
+    """A random generator for arrays, because hypothesis would draw them number by number."""
     return np.random.default_rng(data.draw(st.integers(0, 2**32 - 1), label="seed"))
 
 

@@ -1,4 +1,4 @@
-"""Saliency: images of any shape, and grids with more cells than pixels."""
+"""Fuzz saliency with images of any shape and grids with more cells than pixels."""
 
 import torch
 from hypothesis import strategies as st
@@ -8,7 +8,7 @@ from semfov.gaze.saliency import cell_saliency, itti_koch_saliency, vocus2_salie
 
 
 def saliency_maps(data: st.DataObject) -> str:
-    """Both models and `cell_saliency`: finite, in [0, 1], flat on a flat image; or `InputError`."""
+    """Both models and `cell_saliency`: finite values in [0, 1], all 0 for a uniform image; or `InputError`."""
     rng = draw_rng(data)
     height, width = data.draw(st.integers(0, 40), label="height"), data.draw(st.integers(0, 70), label="width")
     channels = choose(data, (3, 3, 3, 1), "channels")

@@ -1,4 +1,4 @@
-"""Parts and stores: what can be made again is there whole, or counts as missing."""
+"""Fuzz files of outcomes and of stored detections: they are read back completely, or count as missing."""
 
 import copy
 import json
@@ -24,7 +24,7 @@ LOOK_DAMAGES = ("none", "type", "value", "shape", "missing", "more", "key", "byt
 
 
 def part_files(data: st.DataObject) -> str:
-    """`Parts.load`: the outcomes that were kept, to the last value, or None."""
+    """`Parts.load`: exactly the stored outcomes, or None."""
     rng = draw_rng(data)
     with tempfile.TemporaryDirectory() as folder:
         parts = Parts(Path(folder), "1-2", lambda index: "digest")
@@ -57,7 +57,7 @@ def part_files(data: st.DataObject) -> str:
 
 
 def look_files(data: st.DataObject) -> str:
-    """`DetectionStore.load`: the detections that were kept, to the bit, or None."""
+    """`DetectionStore.load`: the stored detections bit for bit, or None."""
     rng = draw_rng(data)
     with tempfile.TemporaryDirectory() as folder:
         store = DetectionStore(Path(folder), {"detector": "toy"}, 2, 1, 3)

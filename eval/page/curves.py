@@ -1,4 +1,4 @@
-"""Curves of finished runs: per image, paired over images, and by repetition as the paper averages them."""
+"""Curves of finished runs: per image, paired over images, and by repetition, as the paper averages them."""
 
 import json
 from collections import defaultdict
@@ -17,30 +17,30 @@ OBJECTS = "right_without_background"
 
 @cache
 def read_records(folder: Path) -> tuple[Record, ...]:
-    """What a run wrote of every episode."""
+    """Read the records of all episodes of a run."""
     lines = (folder / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
     return tuple(json.loads(line) for line in lines)
 
 
 def records_of(folder: Path, policy: str, *, commonest: bool = False) -> list[Record]:
-    """Records of a policy; of searches for the commonest target of each image alone, as the paper counts."""
+    """Records of a policy; with `commonest`, only searches for each image's commonest target, as in the paper."""
     return [r for r in read_records(folder) if r["policy"] == policy and (r["commonest"] if commonest else True)]
 
 
 def policies_of(folder: Path) -> list[str]:
-    """Policies of a run, in its order."""
+    """The policies of a run in their order."""
     return list(dict.fromkeys(record["policy"] for record in read_records(folder)))
 
 
 def curve_of_record(record: Record, last: int, field: str = "right") -> Array:
-    """Figure of merit of an episode after 0..`last` gaze shifts; `field` is the answer that an exploration counts."""
+    """Measure of an episode after 0..`last` gaze shifts; in explorations, `field` says which answers are counted."""
     if "found_at" in record:
         return cumulative_performance(np.array([record["found_at"]]), last)
     return success_rate(record[field], record["object_cells"])[: last + 1]
 
 
 def per_image(records: list[Record], last: int, field: str = "right") -> Array:
-    """Figure of merit of each image, in order of the images, `(images, last+1)`."""
+    """Measure of each image after 0..`last` gaze shifts, in order of the images, `(images, last+1)`."""
     images: dict[str, list[Array]] = defaultdict(list)
     for record in records:
         images[str(record["scene"])].append(curve_of_record(record, last, field))
@@ -56,13 +56,20 @@ def repetition_error(records: list[Record], last: int, field: str = "right") -> 
 
 
 def difference(one: Array, other: Array) -> tuple[Array, Array]:
-    """Mean difference paired over images, and its standard error, each `(last+1,)`."""
+    """Mean difference, paired over images, and its standard error, each `(last+1,)`."""
     paired = one - other
     return paired.mean(0), standard_error(paired)
 
 
 def behind(mean: Array, error: Array) -> list[int]:
-    """Gaze shifts at which a paired difference is below zero by two standard errors; not at the start.
+    """Gaze shifts, from 1, at which a paired difference is below zero by more than two standard errors.
+
+    Args:
+        mean: mean difference after each gaze shift.
+        error: its standard error.
+
+    Returns:
+        The numbers of the gaze shifts.
 
     >>> behind(np.array([0.0, -0.3, -0.1, 0.2]), np.array([0.0, 0.1, 0.1, 0.1]))
     [1]
@@ -71,7 +78,13 @@ def behind(mean: Array, error: Array) -> list[int]:
 
 
 def spans(numbers: list[int]) -> str:
-    """Numbers as spans.
+    """Write ascending numbers as spans.
+
+    Args:
+        numbers: the numbers.
+
+    Returns:
+        The text.
 
     >>> spans([1, 2, 3, 7, 9, 10])
     '1 to 3, 7, 9 to 10'

@@ -1,4 +1,4 @@
-"""The experiments of the results page: which policies, detectors, sensors and settings."""
+"""The experiments of the results page: their policies, detectors, sensors and settings."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -24,13 +24,13 @@ from semfov.experiments.settings import Count, Settings, Workers
 from semfov.sensor.named import SensorName
 
 DETECTORS = {"nano": "YOLOX-nano", "tiny": "YOLOv3-tiny"}
-"""Detectors of the page, by the names that experiments have."""
+"""Detectors of the page, by their names in experiments."""
 
 FOVEAE: dict[SensorName, str] = {"published": "wide", "published-narrow": "narrow"}
 """Published sensors, in the paper's words."""
 
 CENTRAL = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
-"""Non-predictive search by hand-made settings, from which the learned gaze policy started."""
+"""Non-predictive search with manually chosen settings, from which the learned gaze policy was initialised."""
 
 GUIDED = (
     PolicyConfig("non-predictive", "calibrated", saliency="vocus2"),
@@ -46,7 +46,7 @@ PUBLISHED = (
     "predictive-calibrated",
     "vocus2",
 )
-"""Searches of the paper."""
+"""Search policies of the paper."""
 
 PUBLISHED_EXPLORATION = (
     "random-raw",
@@ -57,7 +57,7 @@ PUBLISHED_EXPLORATION = (
     "two-peaks-calibrated",
     "vocus2-calibrated",
 )
-"""Explorations of the paper."""
+"""Exploration policies of the paper."""
 
 PROPOSED = (
     "random",
@@ -67,7 +67,7 @@ PROPOSED = (
     "vocus2",
     "itti-koch",
 )
-"""What the paper proposes to try next, with its own sensor and observation model."""
+"""Search policies that the paper proposes as future work, with its own sensor and observation model."""
 
 BEYOND = (
     "random",
@@ -78,7 +78,7 @@ BEYOND = (
     PolicyConfig("non-predictive", "calibrated", tempering=0.25, footprint="soft"),
     "target-evidence",
 )
-"""Searches with our own sensor and models."""
+"""Search policies with semfov's own sensor and models."""
 
 BEYOND_EXPLORATION = (
     "random-raw",
@@ -91,7 +91,7 @@ BEYOND_EXPLORATION = (
     "expected-gain-learned",
     "closer-look-learned",
 )
-"""Explorations with our own models."""
+"""Exploration policies with semfov's own models."""
 
 Experiment = RunConfig | DecideConfig | CalibrationConfig
 """Settings of an experiment of the page."""
@@ -117,37 +117,37 @@ SENSITIVITY: dict[str, Changes] = {
     "tempering 0.25": {"belief": {"tempering": 0.25}},
     "closest look": {"belief": {"memory": "closest"}},
 }
-"""Settings that change one thing each; of non-predictive search with raw scores."""
+"""Variations of non-predictive search with raw scores; each changes one setting."""
 
 SENSORS: dict[str, Changes] = {
     f"fovea {sigma} px, growth {growth}": {"sensor": {"sigma": float(sigma), "growth": float(growth)}}
     for sigma in (50, 100, 200)
     for growth in (1, 2)
 }
-"""Sensors."""
+"""Variations of the sensor."""
 
 WEIGHTS: dict[str, Changes] = {
     f"weight {weight:g}": {"saliency": {"weight": weight}} for weight in (0.0, 0.1, 0.3, 1.0, 3.0)
 }
-"""Weights of a saliency map as a prior."""
+"""Variations of the weight of a saliency map as a prior."""
 
 VIEWS: dict[str, Changes] = {
     "foveated view, as published": {"saliency": {"view": "foveated"}},
     "whole photograph, once": {"saliency": {"view": "picture"}},
 }
-"""What the saliency models see."""
+"""Variations of the input of the saliency models."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """Runs on photographs of the fit set that differ in their settings; a row of its table is a setting and a policy.
+    """Runs on photographs of the fit set with different settings; a table row is a setting and a policy.
 
     Attributes:
-        settings: by name, what changes.
-        policies: that are compared.
-        explores: whether scenes are explored, or targets searched for.
-        shifts: that the table shows.
-        model: ending of the observation model's name, where one is named.
+        settings: changes of the settings, by name.
+        policies: policies to compare.
+        explores: whether the runs are explorations; otherwise they are searches.
+        shifts: gaze shifts that the table shows.
+        model: ending of the observation model's name (None: the default model).
     """
 
     settings: dict[str, Changes]
@@ -168,24 +168,27 @@ STUDIES = {
 
 @dataclass(frozen=True)
 class ResultsConfig(Settings):
-    """Which photographs, and where the page goes.
+    """The photographs of the results page, and the files that are written.
 
     Args:
         root: folder of the photographs of COCO val2017.
-        annotations: COCO-format instances file for them.
-        ids: text file with the ids of the photographs that results are measured on.
-        fit_root: folder of photographs that the models were fitted on, for the studies of settings (None: no studies).
-        fit_annotations: COCO-format instances file for them.
-        yolox: ONNX file of YOLOX-nano (None: the published one).
-        limit: only the first so many photographs, for a trial.
-        study: photographs for the studies of settings, which look anew for every sensor and detector setting.
-        only: experiments to run (None: all); the page says of the others what is there from before, or nothing.
+        annotations: their annotation file, in the COCO instances format.
+        ids: text file with the ids of the photographs on which results are measured.
+        fit_root: folder of the photographs on which the models were fitted, for the studies of settings (None: no
+            studies).
+        fit_annotations: their annotation file, in the COCO instances format.
+        yolox: ONNX file of YOLOX-nano (None: the published file).
+        limit: use only this many photographs, the first ones, for a trial.
+        study: number of photographs for the studies of settings, which compute new looks for every setting of sensor
+            and detector.
+        only: names of the experiments to run (None: all); for the others the page shows the results of earlier runs, if
+            there are any.
         page: file to write.
-        template: its text.
-        pictures: folder for the page's figures.
+        template: file with the text of the page.
+        pictures: folder for the figures of the page.
         out: folder for the runs.
-        cache: folder for what the detectors saw (None: the user's cache).
-        workers: processes (None: one for each CPU core).
+        cache: folder for the stored detections (None: the user's cache).
+        workers: number of processes (None: one per CPU core).
     """
 
     root: Path
@@ -220,7 +223,7 @@ def detector(name: str, config: ResultsConfig) -> DetectorConfig:
 
 
 def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
-    """Experiments on the photographs that results are measured on, those of the paper first."""
+    """Experiments on the photographs on which results are measured; the experiments of the paper come first."""
     data = DataConfig(root=config.root, annotations=config.annotations, ids=config.ids, limit=config.limit)
     for name in DETECTORS:
         settings = detector(name, config)
@@ -246,7 +249,7 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
 
 
 def _studies(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:
-    """Experiments on photographs of the fit set, by which settings are chosen."""
+    """Experiments on photographs of the fit set, on which settings are chosen."""
     data = DataConfig(root=config.fit_root, annotations=config.fit_annotations, limit=config.study)
     nano = detector("nano", config)
     few: dict[str, Any] = {"data": data, "detector": nano, "cache": config.cache, "workers": config.workers}

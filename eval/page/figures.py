@@ -12,11 +12,11 @@ from semfov.viz.style import save_figure
 
 @dataclass(frozen=True)
 class PaperFigure:
-    """A figure of the paper: which experiment, and which of its policies.
+    """A figure of the paper.
 
     Attributes:
-        kind: of the experiment.
-        policies: that it compares.
+        kind: kind of the experiment, `search` or `explore`.
+        policies: policies that the figure compares.
     """
 
     kind: str
@@ -37,13 +37,13 @@ FIGURES = {
         "explore", ("kl-raw", "kl-calibrated", "random-raw", "random-calibrated", "vocus2-calibrated")
     ),
 }
-"""By the name of their file."""
+"""The figures by the names of their files."""
 
 LABELS = {"search": "targets found (%)", "explore": "cells with the right class (%)"}
 
 
 def draw_figures(folder: Path, runs: Runs) -> list[Path]:
-    """Draw the figures whose experiments have all run; returns their files."""
+    """Draw the figures whose experiments are all finished; returns their files."""
     from semfov.viz import plot_curve_panels
 
     written = []
@@ -58,7 +58,7 @@ def draw_figures(folder: Path, runs: Runs) -> list[Path]:
 
 
 def panel(folder: Path, figure: PaperFigure) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Curves of a run's policies, and their standard errors over the repetitions, as in the paper."""
+    """Curves of the policies of a run, and their standard errors over the repetitions, as in the paper."""
     last = LAST[figure.kind]
     records = {policy: records_of(folder, policy, commonest=figure.kind == "search") for policy in figure.policies}
     return (

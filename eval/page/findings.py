@@ -1,4 +1,4 @@
-"""For each of the paper's findings, whether it holds here: a figure and a verdict for each detector and fovea."""
+"""Whether the paper's findings hold here: for each finding, numbers and a verdict by detector and fovea."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,10 +21,10 @@ class Finding:
     """A finding of the paper.
 
     Attributes:
-        text: what the paper finds.
-        kind: of the experiment that tells.
-        shown: what the figures are.
-        answer: figures and verdict for the folder of a run.
+        text: the finding.
+        kind: kind of the experiment that tests it.
+        shown: description of the numbers.
+        answer: gives numbers and verdict for the folder of a run.
     """
 
     text: str
@@ -34,10 +34,19 @@ class Finding:
 
 
 def gain(one: str, other: str, shifts: tuple[int, ...], kind: str, *, expected: int = 1) -> Answer:
-    """Paired difference of two policies in points at some gaze shifts, and whether it has the expected sign.
+    """Test whether the paired difference of two policies has the expected sign.
 
-    It holds where every difference has it by two standard errors; where all are within two standard errors of nothing
-    they are level. `expected` 0 asks for just that.
+    A sign holds if the difference is more than two standard errors away from zero; otherwise the policies are level.
+
+    Args:
+        one: the first policy.
+        other: the policy that is subtracted.
+        shifts: gaze shifts at which the policies are compared.
+        kind: kind of the experiment.
+        expected: 1 if the finding is that the first policy is better, 0 if it is that the two are level.
+
+    Returns:
+        A function that gives the differences in percentage points and a verdict.
     """
 
     def answer(folder: Path) -> str:
@@ -50,7 +59,14 @@ def gain(one: str, other: str, shifts: tuple[int, ...], kind: str, *, expected: 
 
 
 def verdict(signs: set[int], expected: int) -> str:
-    """In words, for the signs of differences that are more than two standard errors from nothing.
+    """The verdict on a finding.
+
+    Args:
+        signs: the signs of the differences; 0 for a difference within two standard errors of zero.
+        expected: the sign that the finding claims.
+
+    Returns:
+        The verdict.
 
     >>> verdict({1}, 1), verdict({1, 0}, 1), verdict({0}, 1), verdict({-1}, 1), verdict({-1, 0}, 1), verdict({0}, 0)
     ('holds', 'holds in part', 'level', 'reversed', 'reversed in part', 'holds')
@@ -69,7 +85,7 @@ def verdict(signs: set[int], expected: int) -> str:
 
 
 def overtaken(policy: str, baseline: str, kind: str) -> Answer:
-    """From which gaze shift on a policy is behind its baseline by two standard errors, and where it leads."""
+    """Test whether a policy first leads its baseline and is then overtaken, each by more than two standard errors."""
 
     def answer(folder: Path) -> str:
         mean, error = compare(folder, policy, baseline, kind)
@@ -82,7 +98,7 @@ def overtaken(policy: str, baseline: str, kind: str) -> Answer:
 
 
 def compare(folder: Path, one: str, other: str, kind: str) -> tuple[Array, Array]:
-    """Paired difference of two policies of a run; of searches for all legal targets, for there are most of them."""
+    """Paired difference of two policies of a run; for searches over all legal targets, of which there are most."""
     curves = [per_image(records_of(folder, policy), LAST[kind]) for policy in (one, other)]
     return difference(*curves)
 
@@ -170,7 +186,7 @@ FINDINGS = (
         gain("kl-calibrated", "kl-raw", EXPLORE, "explore", expected=0),
     ),
 )
-"""Findings that curves can tell; costs are measured by `python -m benchmarks.decisions`."""
+"""Findings that can be tested on curves; costs are measured by `python -m benchmarks.decisions`."""
 
 
 def findings(runs: Runs) -> list[str]:

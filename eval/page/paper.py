@@ -1,7 +1,7 @@
-"""Figures that Luzio, Bernardino and Moreno (2024) print: YOLOv3 on 300 photographs of their own choice."""
+"""Results printed by Luzio, Bernardino and Moreno (2024): YOLOv3 on 300 photographs of their own choice."""
 
 SHIFTS = (5, 15, 30)
-"""Gaze shifts at which tables I and II have the cumulative performance."""
+"""Gaze shifts at which tables I and II give the cumulative performance."""
 
 TABLE_I: dict[str, tuple[float, float, float, float]] = {
     "predictive-raw": (61.53, 84.60, 93.10, 0.772),
@@ -17,4 +17,4 @@ TABLE_II: dict[str, tuple[float, float, float, float]] = {
     "predictive-calibrated": (58.83, 84.60, 93.10, 0.820),
     "non-predictive-calibrated": (53.80, 80.90, 93.03, 0.718),
 }
-"""As table I. The paper repeats the raw figures of predictive search at 15 and 30 shifts here."""
+"""Same columns as table I. For predictive search at 15 and 30 shifts, the paper repeats the raw numbers here."""

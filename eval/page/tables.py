@@ -1,4 +1,4 @@
-"""Tables of the results page, from what the runs wrote."""
+"""Tables of the results page, made from the output of the runs."""
 
 from collections.abc import Mapping, Sequence
 from itertools import groupby
@@ -27,16 +27,16 @@ from semfov.metrics.search import random_search
 Runs = dict[str, Experiment]
 
 TOLD = ("summary.md", "decisions.md", "beliefs.md")
-"""Where experiments leave their tables."""
+"""Files with the tables of experiments."""
 
 
 def finished(run: Experiment | None) -> bool:
-    """Whether a run has left its tables."""
+    """Whether a run has written its tables."""
     return run is not None and any((run.out / name).exists() for name in TOLD)
 
 
 def columns(kind: str, runs: Runs) -> dict[str, Path | None]:
-    """Folders of the published experiments of a kind by the head of their column; None where it has not run."""
+    """Folders of the published experiments of a kind, by column heading; None for an experiment that has not run."""
     found = {}
     for name, title in DETECTORS.items():
         for fovea, width in FOVEAE.items():
@@ -46,7 +46,7 @@ def columns(kind: str, runs: Runs) -> dict[str, Path | None]:
 
 
 def beside_paper(published: Mapping[str, tuple[float, ...]], runs: Runs) -> list[str]:
-    """A table of the paper, each of its cells beside ours: the commonest class of each image is the target."""
+    """A table of the paper beside our results; the target is the commonest class of each image."""
     folders = columns("search", runs)
     rows = [["policy", "", "paper", *folders]]
     for policy, figures in published.items():
@@ -74,7 +74,7 @@ def largest_error(folder: Path | None, policy: str) -> str:
 
 
 def readings(runs: Runs) -> list[str]:
-    """What random gaze is expected to find by formula, under both readings of n, for the commonest class."""
+    """Expected performance of random gaze for the commonest class, for both readings of n in the paper."""
     folder = next((folder for folder in columns("search", runs).values() if folder is not None), None)
     rows = [["random gaze, by formula", *(f"CP@{n}" for n in paper.SHIFTS)]]
     rows.append(["paper, measured", *(f"{figure:.2f}" for figure in paper.TABLE_II["random"][:-1])])
@@ -87,7 +87,7 @@ def readings(runs: Runs) -> list[str]:
 
 
 def study_table(title: str, runs: Runs) -> list[str]:
-    """One row for each setting and policy, of the curves over all targets; of explorations by the published measure."""
+    """A row for each setting and policy: curves over all targets, or the published measure for explorations."""
     study = STUDIES[title]
     several = len(study.policies) > 1
     shifts = [str(n) if study.explores else f"CP@{n}" for n in study.shifts]
@@ -107,7 +107,7 @@ def study_table(title: str, runs: Runs) -> list[str]:
 
 
 def summary(folder: Path, section: int | None = None) -> list[str]:
-    """The tables that a run printed, or one of them."""
+    """All tables that a run printed, or one of them."""
     text = (folder / "summary.md").read_text(encoding="utf-8").strip()
     parts = ["**" + part.strip() for part in text.split("\n**")]
     parts[0] = parts[0].removeprefix("**")
@@ -115,19 +115,33 @@ def summary(folder: Path, section: int | None = None) -> list[str]:
 
 
 def told_table(name: str, number: int, folder: Path) -> list[str]:
-    """A table of a file in Markdown, by its number there, without the text around it."""
+    """The table of this number in a Markdown file, without the text around it."""
     lines = (folder / name).read_text(encoding="utf-8").splitlines()
     tables = [list(rows) for is_table, rows in groupby(lines, lambda line: line.startswith("|")) if is_table]
     return tables[number]
 
 
 def paired(folder: Path, baseline: str, shifts: Sequence[int], field: str = "right", *, ending: str = "") -> list[str]:
-    """Differences of every policy whose name ends so to `baseline` over the same images, in points, with errors."""
+    """Table of the differences of policies from a baseline, paired over images, in percentage points.
+
+    Args:
+        folder: folder of the run.
+        baseline: name of the baseline policy.
+        shifts: gaze shifts that the table shows.
+        field: for explorations, the answers that are counted.
+        ending: only policies whose names end with this are compared.
+
+    Returns:
+        The table with standard errors, as lines of Markdown.
+
+    Raises:
+        DataError: the run has no records of the baseline.
+    """
     last = max(shifts)
     names = [policy for policy in policies_of(folder) if policy.endswith(ending)]
     curves = {policy: per_image(records_of(folder, policy), last, field) for policy in names}
     if baseline not in curves:
-        raise DataError(f"{folder}: no policy {baseline!r} to compare with; run the experiment again")
+        raise DataError(f"{folder}: expected records of the policy {baseline!r}, found none; run the experiment again")
     rows = [[f"difference to {baseline}", *(str(n) for n in shifts), "behind by two standard errors at"]]
     for policy, curve in curves.items():
         if policy == baseline:
@@ -144,7 +158,7 @@ def paired_maps(folder: Path, field: str = "right") -> list[str]:
 
 
 def agreement(folder: Path) -> list[str]:
-    """How often predictive and non-predictive search choose the same cell, first and all the way."""
+    """How often predictive and non-predictive search make the same first gaze shift, and need the same number."""
     rows = [["scores", "same first gaze shift", "found after as many shifts"]]
     for mode in ("raw", "calibrated"):
         names = [f"{kind}-{mode}" for kind in ("non-predictive", "predictive")]
@@ -156,10 +170,10 @@ def agreement(folder: Path) -> list[str]:
 
 
 def first_fixations(folder: Path) -> list[str]:
-    """Where explorations look first: share of the first gaze shifts that end in the middle half, or at the border."""
+    """Share of explorations whose first gaze shift ends in the middle half, or at the border."""
     rows = [["policy", "in the middle half of rows and columns", "at the border"]]
     for policy in policies_of(folder):
-        # What one sharp look gives has no fixations.
+        # The reference of one sharp look has no fixations.
         if not records_of(folder, policy)[0]["cells"]:
             continue
         cells = np.array([record["cells"][1] for record in records_of(folder, policy)])
@@ -171,6 +185,13 @@ def first_fixations(folder: Path) -> list[str]:
 def central(cells: NDArray[np.int64], size: int = 10) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which cells of a square grid lie in the middle half of rows and columns, and which at its border.
 
+    Args:
+        cells: numbers of the cells.
+        size: number of columns and of rows.
+
+    Returns:
+        Two boolean arrays, one value for each cell.
+
     >>> central(np.array([0, 33, 55, 22]))
     (array([False,  True,  True, False]), array([ True, False, False, False]))
     """
@@ -181,7 +202,7 @@ def central(cells: NDArray[np.int64], size: int = 10) -> tuple[NDArray[np.bool_]
 
 
 def photographs(runs: Runs) -> list[str]:
-    """What the photographs of the page are: how many, with how many objects, and how many show a person."""
+    """Table of the photographs of the page: their number, their objects and targets, and how many show a person."""
     from semfov.detection.coco_classes import COCO_CLASSES
     from semfov.experiments.setup import make_scenes
 

@@ -1,4 +1,4 @@
-"""Attention by class templates to a whole scene, from everywhere."""
+"""Attention by class templates, computed for a whole scene from the centre of every cell."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from semfov.gaze.templates import ClassTemplates, at_points
 
 
 def attend_all(eye: Eye, templates: ClassTemplates, image: Tensor, grid: Grid) -> Tensor:
-    """Attention to all classes in all cells of `image` `(3, H, W)` from the centre of every cell, `(X·Y, K, X·Y)`."""
+    """Attention to every class in every cell of `image` `(3, H, W)`, seen from each cell's centre: `(X·Y, K, X·Y)`."""
     with one_thread(), torch.inference_mode():
         view, points = eye.open(image[None]), grid.centres.to(image)
         found = []

@@ -1,4 +1,7 @@
-"""How well beliefs in a target agree with where it is, cell by cell, along the same searches."""
+"""Calibration of beliefs: how well each cell's probability of the target agrees with where the target is.
+
+All beliefs are updated with the looks of the same searches.
+"""
 
 from __future__ import annotations
 
@@ -32,22 +35,25 @@ from semfov.gaze.policies import NonPredictive, Task
 from semfov.metrics.calibration import BinarySums
 
 LOOKS = (1, 5, 15)
-"""Looks after which beliefs are judged."""
+"""Numbers of looks after which beliefs are evaluated."""
 
 BANDS = (0.14, 0.24, 0.34)
-"""Edges between bands of eccentricity, in longer sides: in photographs of usual proportions no two of 10 × 10 cells are
-as far apart, so that rounding does not decide."""
+"""Edges between bands of eccentricity, as fractions of the image's longer side.
+
+In photographs of usual proportions no two centres of 10 × 10 cells lie exactly this far apart, so that rounding does
+not decide which band a cell belongs to.
+"""
 
 FIXATED, FARTHEST = "fixated", f"{BANDS[-1]:.2f} - …"
 CELLS = (FIXATED, *(f"{low:.2f} - {high:.2f}" for low, high in pairwise((0, *BANDS))), FARTHEST)
-"""Groups of cells: the fixated ones, then all others by the eccentricity of their closest look."""
+"""Groups of cells: the fixated cells, then all others by their distance from the closest fixation."""
 
 ALL_CLASSES = {
     "raw": PolicyConfig("non-predictive"),
     "published": PolicyConfig("non-predictive", "calibrated"),
     "tempered": PolicyConfig("non-predictive", tempering=0.5),
 }
-"""Beliefs by Kaplan's rule: of raw scores, of calibrated ones, and of raw ones as likelihoods to the power of 1/2."""
+"""Beliefs fused by Kaplan's rule: from raw scores, from calibrated scores, and from raw scores tempered by 0.5."""
 
 LEARNED, MAP = "learned", "learned map"
 
@@ -55,17 +61,17 @@ Model = TypeVar("Model")
 
 
 class BeliefCalibrationRun(Run):
-    """Searches that do not end, one for a class that is there and one for a class that is not, in every scene.
+    """Two searches in every scene, for a present class and for an absent class, that do not stop at the target.
 
-    The gaze goes by the learned evidence for the target, as the agent's does; where none is shipped, by the tempered
-    belief. All beliefs are told the same looks.
+    The learned target evidence guides the gaze, as in the agent. Where no such model is shipped, the tempered belief
+    guides it. All beliefs are updated with the same looks.
 
     Args:
-        config: of the run; its policies have no say.
+        config: settings of the run; its `policies` are ignored.
 
     Attributes:
-        observers: what the beliefs come from, by what tables call them.
-        left_out: beliefs that no model is shipped for, and why.
+        observers: the observer that maintains each belief, by the belief's name in the tables.
+        left_out: for each belief without a shipped model, the reason why it is left out.
     """
 
     task: ClassVar[Task] = "search"
@@ -88,7 +94,7 @@ class BeliefCalibrationRun(Run):
             self.observers[MAP] = LearnedMap(evidence_map)
 
     def _if_shipped(self, name: str, make: Callable[[str | None, Eye], Model], model: str | None) -> Model | None:
-        """The model that is asked for; where none is, the one that is shipped, or None."""
+        """Load the model that the settings name, or else the shipped model; None where none is shipped."""
         try:
             return make(model, self.eye)
         except InputError as error:
@@ -103,11 +109,11 @@ class BeliefCalibrationRun(Run):
 
     @property
     def guide(self) -> str:
-        """The belief that the gaze goes by."""
+        """Name of the belief that guides the gaze."""
         return LEARNED if LEARNED in self.observers else "tempered"
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """Records of both searches of a scene, and the seconds that they took."""
+        """Run both searches of a scene; returns their records, and the seconds that each stage took."""
         protocol, annotation, grid = self.config.protocol, self.scenes.annotation(index), self.grid(index)
         watch = Stopwatch()
         area = self.config.data.max_target_area or 1.0
@@ -146,12 +152,12 @@ class BeliefCalibrationRun(Run):
 
 
 class KnownLooks(Looks):
-    """Looks at one image from the centres of its cells, detected before; each is weighed when it comes.
+    """Precomputed looks at one image from the centres of its cells; likelihoods are computed look by look.
 
     Args:
-        detections: what is seen from every cell, a batch of X·Y.
-        grid: the cells.
-        target: class that is searched for.
+        detections: detections from every cell, a batch of X·Y.
+        grid: the grid over the image.
+        target: the class to search for.
     """
 
     def __init__(self, detections: Detections, grid: Grid, target: int) -> None:
@@ -159,18 +165,21 @@ class KnownLooks(Looks):
         self.like = detections.scores
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
-        """What the store has of the cells; the fixations are their centres."""
+        """The precomputed looks from `cell`; the fixations are the centres of the cells."""
         detections = self.detections[cell]
         return Sight(observer.weigh(detections, fixation, self.grid, self.target), lambda: detections, {})
 
 
 def judge_cells(step: Step, target: int, goal: Tensor) -> Record:
-    """Sums (`BinarySums.record`) over the cells of a search after a step, by group (`CELLS`); none of empty groups.
+    """Sums over the cells of a search after a step, by group of cells.
 
     Args:
-        step: of one search.
-        target: class 1..K.
-        goal: `(X·Y,)` boolean, the cells that it overlaps.
+        step: a step of one search.
+        target: the target's class, 1..K.
+        goal: `(X·Y,)` boolean, the cells that the target overlaps.
+
+    Returns:
+        `BinarySums.record` of every group of `CELLS` that is not empty.
     """
     belief = step.belief
     band = 1 + torch.bucketize(belief.closest[0].double(), torch.tensor(BANDS, dtype=torch.float64))

@@ -1,4 +1,4 @@
-"""What a run that judges beliefs leaves: tables, sums, and a reliability diagram."""
+"""Output of a run that evaluates the calibration of beliefs: tables, sums, and a reliability diagram."""
 
 from __future__ import annotations
 
@@ -29,10 +29,16 @@ HEAD = ("NLL", "Brier", "ECE", "mean probability", "share that hold it")
 
 
 def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
-    """Write tables, sums and figure of a finished run; returns the tables, and the files.
+    """Write the tables, the sums and the figure of a finished run.
+
+    Args:
+        run: the finished run.
+
+    Returns:
+        The tables as Markdown, and the files that were written.
 
     Raises:
-        DataError: nothing could be searched for.
+        DataError: no scene has a class that may be searched for.
     """
     records, _ = gather(run)
     if not records:
@@ -42,13 +48,15 @@ def write_belief_report(run: BeliefCalibrationRun) -> tuple[str, list[Path]]:
     files = {"beliefs.md": text, "beliefs.csv": beliefs_csv(sums), "beliefs.json": beliefs_json(sums)}
     for name, content in files.items():
         write_text(run.config.out / name, content)
-    groups = f"distance of the closest look in longer sides, after {judged_after(sums)[-1]} looks"
+    groups = (
+        f"distance from the closest fixation, as a fraction of the longer side, after {judged_after(sums)[-1]} looks"
+    )
     figure = save_figure(plot_cell_reliability(*curves(sums), groups=groups), run.config.out / "beliefs.png")
     return text, [*(run.config.out / name for name in files), figure]
 
 
 def add_up(records: Iterable[Record]) -> Sums:
-    """Sums over all searches."""
+    """Add up the sums of all searches."""
     sums: Sums = defaultdict(BinarySums.nothing)
     for record in records:
         for belief, told in record["beliefs"].items():
@@ -59,7 +67,7 @@ def add_up(records: Iterable[Record]) -> Sums:
 
 
 def pooled(sums: Sums, belief: str, looks: int) -> BinarySums:
-    """Sums over all cells."""
+    """Sums over all cells, whatever their group."""
     return sum((sums[belief, looks, group] for group in CELLS if (belief, looks, group) in sums), BinarySums.nothing())
 
 
@@ -76,25 +84,27 @@ def summary(records: Sequence[Record], sums: Sums, run: BeliefCalibrationRun) ->
     for group in CELLS:
         told = [(belief, sums[belief, last, group]) for belief in beliefs if (belief, last, group) in sums]
         by_distance += [[group, belief, str(each.count), *figures(each)] for belief, each in told]
-    notes = [f"Left out for want of a fitted model: {name} ({reason})." for name, reason in run.left_out.items()]
+    notes = [
+        f"Left out because no fitted model is shipped: {name} ({reason})." for name, reason in run.left_out.items()
+    ]
     if MAP in beliefs:
         notes.append(
-            f"The {MAP} takes classes to be as frequent as they are in photographs. Here half of the classes are "
-            "there, so it is expected to tell too little."
+            f"The {MAP} assumes that classes are as frequent as they are in photographs. Here half of the target "
+            "classes are present, so its probabilities are expected to be too low."
         )
     every = pooled(sums, beliefs[0], last)
     alone = BinarySums.of(torch.full((every.count,), every.rate), torch.arange(every.count) < every.bins[2].sum())
     return "\n".join(
         [
-            f"Does a cell hold the target? {len(records)} searches ({sensing(run)}), {there} for a class that is there."
-            f" The gaze goes by the {run.guide} belief and does not stop at the target; all beliefs are told the same "
-            f"looks. To tell of all cells alike that {every.rate:.4f} of them hold it would cost an NLL of "
-            f"{alone.nll:.4f} and a Brier score of {alone.brier:.4f}, without an ECE.",
+            f"Does a cell hold the target? {len(records)} searches ({sensing(run)}), {there} of them for a class that "
+            f"is present. The {run.guide} belief guides the gaze, which does not stop at the target; all beliefs are "
+            f"updated with the same looks. A constant prediction of {every.rate:.4f}, the share of cells that hold the "
+            f"target, would have an NLL of {alone.nll:.4f}, a Brier score of {alone.brier:.4f} and an ECE of 0.",
             "",
             *table(by_looks),
             "",
-            f"After {last} looks, by distance of the closest look in longer sides of the image; the fixated cells are "
-            "on their own.",
+            f"After {last} looks, by distance from the closest fixation, as a fraction of the image's longer side; "
+            "fixated cells are a group of their own.",
             "",
             *table(by_distance),
             "",
@@ -108,17 +118,17 @@ def summary(records: Sequence[Record], sums: Sums, run: BeliefCalibrationRun) ->
 
 
 def judged_after(sums: Sums) -> list[int]:
-    """Numbers of looks that there are sums for."""
+    """The numbers of looks for which there are sums."""
     return sorted({looks for _, looks, _ in sums})
 
 
 def figures(sums: BinarySums) -> list[str]:
-    """Figures as the cells of a table row."""
+    """The measures as cells of a table row."""
     return [f"{value:.4f}" for value in (sums.nll, sums.brier, sums.ece, sums.probability, sums.rate)]
 
 
 def landings(records: Sequence[Record]) -> list[list[str]]:
-    """Rows of the table of landings."""
+    """Rows of the table about the first look on the target (`landing`)."""
     landed = [record for record in records if record["seen"] is not None]
     return [
         [belief, *landing_cells([(record["beliefs"][belief]["landing"], record["seen"]) for record in landed])]
@@ -127,7 +137,7 @@ def landings(records: Sequence[Record]) -> list[list[str]]:
 
 
 def beliefs_csv(sums: Sums) -> str:
-    """All figures, a row for each belief, number of looks and group of cells."""
+    """All measures as CSV: a row for each belief, number of looks and group of cells."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(["belief", "looks", "cells", "count", "nll", "brier", "ece", "mean_probability", "rate"])
@@ -138,7 +148,7 @@ def beliefs_csv(sums: Sums) -> str:
 
 
 def beliefs_json(sums: Sums) -> str:
-    """All sums, which add up with those of other photographs (`BinarySums.from_record`)."""
+    """All sums as JSON; the sums of several runs may be added up (`BinarySums.from_record`)."""
     told = [
         {"belief": belief, "looks": looks, "cells": group, **each.record()}
         for belief, looks, group, each in named(sums)
@@ -147,7 +157,7 @@ def beliefs_json(sums: Sums) -> str:
 
 
 def named(sums: Sums) -> Iterator[tuple[str, int, str, BinarySums]]:
-    """Sums with what they are of, those over all cells before those of a group."""
+    """The sums by belief, number of looks and group of cells; the sum over all cells comes before the groups."""
     for belief, looks in dict.fromkeys((belief, looks) for belief, looks, _ in sums):
         yield belief, looks, "all", pooled(sums, belief, looks)
         for group in CELLS:
@@ -156,7 +166,15 @@ def named(sums: Sums) -> Iterator[tuple[str, int, str, BinarySums]]:
 
 
 def curves(sums: Sums) -> tuple[dict[str, dict[str, Tensor]], dict[str, dict[str, float]]]:
-    """What `plot_cell_reliability` draws: bins by number of looks, and errors by group of cells after the last."""
+    """The arguments of `plot_cell_reliability`.
+
+    Args:
+        sums: sums over all searches.
+
+    Returns:
+        The bins of the reliability diagram by number of looks and belief, and the expected calibration error by belief
+        and group of cells after the last look.
+    """
     beliefs, numbers = list(dict.fromkeys(belief for belief, _, _ in sums)), judged_after(sums)
     panels = {
         f"after {looks} looks" if looks > 1 else "after 1 look": {

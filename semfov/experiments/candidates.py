@@ -1,4 +1,4 @@
-"""From a policy's settings to what it observes by and chooses by."""
+"""From the settings of a policy to its observer and its acquisition function."""
 
 from __future__ import annotations
 
@@ -39,11 +39,12 @@ class Candidate:
 
     Attributes:
         strategy: observer and policy.
-        saliency: `(X·Y, X·Y)`, saliency of all cells seen from each cell, or `(1, X·Y)`.
-        weight: of the saliency as a prior over the cells (`SaliencyPrior`); None: saliency takes the policy's place.
-        attention: `(X·Y, K, X·Y)`, to all classes in all cells, seen from each cell (`TemplateAttention`); it takes the
-            policy's place.
-        fovea: width of the fovea in longer sides of the image, by which attention is weighed.
+        saliency: saliency of all cells, seen from each cell, `(X·Y, X·Y)`, or the same for all fixations, `(1, X·Y)`.
+        weight: weight of the saliency as a prior over the cells (`SaliencyPrior`); None: saliency alone chooses the
+            next cell, instead of the policy.
+        attention: `(X·Y, K, X·Y)`, attention to every class in every cell, seen from each cell (`TemplateAttention`);
+            if given, it chooses the next cell instead of the policy.
+        fovea: width of the fovea as a fraction of the image's longer side; attention falls off with it.
     """
 
     strategy: Strategy
@@ -54,7 +55,7 @@ class Candidate:
 
     @property
     def observer(self) -> Observer:
-        """Turns looks into belief."""
+        """The observer, which updates the belief with looks."""
         return self.strategy.observer
 
     def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
@@ -71,7 +72,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Models:
-    """Fitted models that the policies of a run need, contexts by name; None for those that none of them does."""
+    """Fitted models that the policies of a run need, contexts by name; None for a model that no policy needs."""
 
     observation: FovealObservationModel | None = None
     evidence: TargetEvidence | None = None
@@ -82,7 +83,7 @@ class Models:
 
 
 def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
-    """The models that a run needs, checked to belong to its eye."""
+    """Load the models that a run needs, and check that they were fitted for its detector and sensor."""
     check(len(config.policies) > 0, "policies", "at least one policy", "none")
     policies = [resolve(choice, task) for choice in config.policies]
     belief = config.belief
@@ -111,12 +112,12 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
 
 
 def by_evidence(policy: PolicyConfig, task: Task) -> bool:
-    """Whether a policy goes by learned evidence for the target."""
+    """Whether a policy uses the learned target evidence."""
     return policy.policy == TARGET_EVIDENCE or (task == "search" and policy.scores == "learned")
 
 
 def needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) -> bool:
-    """Whether a policy needs an observation model: to predict, to calibrate, or for its miss rates."""
+    """Whether any policy needs an observation model: to predict, to calibrate scores, or for the miss rates."""
     return any(
         policy.scores == "calibrated"
         or _of(policy.misses, belief.misses)
@@ -128,25 +129,34 @@ def needs_observation(policies: Sequence[PolicyConfig], belief: BeliefConfig) ->
 def make_strategy(
     policy: PolicyConfig, task: Task, belief: BeliefConfig, components: int, models: Models, fovea: float
 ) -> Strategy:
-    """Observer and policy of a policy's settings.
+    """Build the observer and the policy that settings describe.
 
     Args:
-        policy: the settings.
-        task: what it is for.
-        belief: settings of the run, for what the policy does not set itself.
-        components: classes, background included.
+        policy: the settings of the policy.
+        task: what the policy is for.
+        belief: the belief settings of the run, used where the policy has none of its own.
+        components: number of classes, background included.
         models: fitted models.
-        fovea: width of the fovea in longer sides of the image.
+        fovea: width of the fovea as a fraction of the image's longer side.
+
+    Returns:
+        The observer and the policy.
+
+    Raises:
+        InputError: a context is asked for with a policy that cannot use one, or a model is missing.
     """
     context = _of(policy.context, belief.context)
     if context == "none":
         return _strategy(policy, task, belief, components, models, fovea)
     if task != "search" or policy.policy not in (TARGET_EVIDENCE, NonPredictive.name):
-        raise InputError(f"context: expected a search by the probability of the target, got policy {policy.policy!r}")
+        raise InputError(
+            "context: expected 'none', or a search with the policy 'target-evidence' or 'non-predictive', got policy "
+            f"{policy.policy!r}"
+        )
     inner = _strategy(policy, task, belief, components, models, fovea)
     prior = _given(models.context.get(_of(policy.context_model, belief.context_model)), "context", "a fitted context")
-    place, company = prior.weights_for("evidence" if inner.observer.by_target else "map")
-    weights = place * (context != "cooccurrence"), company * (context != "place")
+    place, cooccurrence = prior.weights_for("evidence" if inner.observer.by_target else "map")
+    weights = place * (context != "cooccurrence"), cooccurrence * (context != "place")
     return Strategy(Context(inner.observer, prior, weights), inner.policy)
 
 

@@ -19,19 +19,22 @@ from semfov.io.files import discard_unfinished
 
 Config = TypeVar("Config")
 
-_GOES_ON = "the same command goes on where this one stopped"
+_GOES_ON = "give the same command again to continue"
 _SAID: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
 
 def make_parser(
     config: type[Any], description: str | None, positional: tuple[str, str] | None = None
 ) -> ArgumentParser:
-    """A parser with an option for every field of `config`, nested fields dotted, and `--config FILE.yaml`.
+    """Make a parser with an option for every field of `config` and `--config FILE.yaml`; nested fields are dotted.
 
     Args:
         config: dataclass of the settings.
-        description: for `--help`.
-        positional: a path among the fields that is given without its name and may be left out, and its help.
+        description: description for `--help`.
+        positional: name and help of a path field that becomes an optional positional argument.
+
+    Returns:
+        The parser.
     """
     set_parsing_settings(docstring_parse_attribute_docstrings=False)
     parser = ArgumentParser(
@@ -50,7 +53,7 @@ def _formatter() -> Any:
     from jsonargparse import DefaultHelpFormatter
 
     class Formatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
-        """Keeps the line breaks of the description, and tells ranges as people do."""
+        """Keep the line breaks of the description, and print the range of a number in a readable form."""
 
         def _expand_help(self, action: argparse.Action) -> str:
             return re.sub(r"Annotated\[(\w+), ([^]]*)\]", r"\1 \2", super()._expand_help(action))
@@ -68,9 +71,16 @@ def run_command(
 ) -> int:
     """Parse `arguments` into a `config` and call `main` with it.
 
+    Args:
+        main: the function to run.
+        config: dataclass of its settings.
+        description: description for `--help`.
+        arguments: command-line arguments (None: those of the process).
+        positional: name and help of a path field that becomes an optional positional argument.
+
     Returns:
-        0, or 1 after a `SemfovError` (printed in one line), or 130 after Ctrl-C, or 143 after SIGTERM, or 141 where
-        nobody reads the output any more; usage errors exit with 2.
+        The exit code: 0, or 1 after a `SemfovError` (printed in one line), 130 after Ctrl-C, 143 after SIGTERM, or 141
+        if the reader of the output has closed its pipe. Usage errors exit with 2.
     """
     try:
         with _signals():
@@ -85,12 +95,12 @@ def run_command(
         print(f"error: {error}", file=sys.stderr)
         return 1
     except BrokenPipeError:
-        # Whoever read the output, such as `head`, has gone; what is still in the buffer has nowhere to go.
+        # The reader of the output, such as `head`, has closed its end: discard what is still in the buffer.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except KeyboardInterrupt:
-        # CPython remembers an interrupt in a string that `exec` runs, as some packages do when they are imported,
-        # and would end by the signal though it was caught here. The next string that ends well makes it forget.
+        # If the interrupt came while `exec` ran a string, as some packages do when they are imported, CPython remembers
+        # it and would end by the signal although it was caught here. A string that runs to its end resets this.
         exec("")
         print(f"{_SAID[signal.SIGINT]}; {_GOES_ON}", file=sys.stderr)
         return 128 + signal.SIGINT
@@ -101,12 +111,12 @@ def run_command(
 
 
 class _Terminated(BaseException):
-    """Somebody wants this process to end; what is under way is cleared up first."""
+    """SIGTERM was received; unfinished work is cleaned up before the process ends."""
 
 
 @contextmanager
 def _signals() -> Iterator[None]:
-    """SIGINT and SIGTERM end the command in good order, the second time at once."""
+    """Let the first SIGINT or SIGTERM end the command in good order, and the second one at once."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -130,7 +140,7 @@ def _signals() -> Iterator[None]:
 
 
 def _importing(frame: FrameType | None) -> bool:
-    """Whether the command, down from `run_command`, is loading a module."""
+    """Whether a module is being imported somewhere below `run_command` on the call stack."""
     while frame is not None and frame.f_code is not run_command.__code__:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             return True

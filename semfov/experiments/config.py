@@ -1,4 +1,4 @@
-"""Settings of the evaluation, as dataclasses that the command line and YAML files fill in."""
+"""Settings of the evaluation: dataclasses that are filled in from the command line and from YAML files."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,17 +32,18 @@ Scores = Literal["raw", "calibrated", "learned"]
 
 @dataclass(frozen=True)
 class DataConfig(Settings):
-    """Which scenes to search.
+    """The scenes of the experiment.
 
     Args:
-        root: folder of the photographs; None uses the embedded scenes, which need no data set.
-        annotations: COCO-format instances file for the photographs.
-        limit: use only the first so many scenes (None: all of the photographs, 8 embedded scenes).
-        min_instances: leave out photographs with fewer objects (published: 8).
-        ids: text file with the ids of the photographs to take, one a line, before any other selection (None: all).
-        max_target_area: a class whose boxes cover a larger share of the image is not searched for, unless this is null
-            (published: 0.2 for a target object).
-        scene_seed: seed that the embedded scenes are composed by.
+        root: folder of the photographs (None: the embedded scenes, which need no data set).
+        annotations: annotation file of the photographs, in the COCO instances format.
+        limit: use only this many scenes, the first ones (None: all photographs, or 8 embedded scenes).
+        min_instances: leave out photographs with fewer annotated objects than this (published: 8).
+        ids: text file with the ids of the photographs to use, one per line; the other settings select among these
+            (None: all photographs).
+        max_target_area: a class is searched for only if its boxes cover at most this share of the image (published: 0.2
+            for a target object; null: no limit).
+        scene_seed: random seed from which the embedded scenes are composed.
     """
 
     root: Path | None = None
@@ -56,22 +57,24 @@ class DataConfig(Settings):
 
 @dataclass(frozen=True)
 class DetectorConfig(Settings):
-    """Which detector looks through the fovea.
+    """The detector, which is applied to each foveated view.
 
     Args:
         name: `yolov3-tiny`, `yolov3`, `yolov3-spp`, `yolox-nano`, `yolox-tiny`, `yolox-s`, a Darknet cfg file, an
             ONNX model, or `torchvision:<model>`.
-        weights: file with the weights (None: those registered for the name).
-        background: where the background score comes from (`semfov.detection.scores`; None: what suits the network).
-        threshold: boxes with a lower confidence are dropped.
-        iou: class-agnostic non-maximum suppression drops boxes that overlap a better one by more.
-        limit: most boxes kept in a view.
-        stride: pad the view only to a multiple of this (None: to the detector's square input, as Darknet pads it;
-            `auto`: what is fastest, 32 for Darknet's networks).
-        input_size: longer side in pixels at which it works, for Darknet's networks (None: its own, 416).
-        runtime: what computes Darknet's networks: `torch`, `onnxruntime`, or what is faster (`auto`).
-        classes: names of the classes in the order of the scores (None: those that the network comes with, or COCO's).
-        head: of an ONNX model, where it is not recognised (docs/detectors.md).
+        weights: file with the weights (None: the weights registered for the name).
+        background: how the background score is computed (`semfov.detection.scores`; None: the policy that suits the
+            network).
+        threshold: drop boxes whose confidence is lower than this.
+        iou: class-agnostic non-maximum suppression drops a box whose intersection over union with a more confident box
+            is larger than this.
+        limit: keep at most this many boxes per view, the most confident ones.
+        stride: pad the view to a multiple of this number of pixels (None: to the detector's square input, as Darknet
+            pads it; `auto`: whatever is fastest, 32 for Darknet's networks).
+        input_size: longer side in pixels to which a Darknet network's input is resized (None: the network's own, 416).
+        runtime: what runs a Darknet network: `torch`, `onnxruntime`, or the faster of the two (`auto`).
+        classes: names of the classes in the order of the scores (None: the network's own names, or those of COCO).
+        head: output format of an ONNX model whose format is not recognised (docs/detectors.md).
     """
 
     name: str = "yolov3-tiny"
@@ -92,13 +95,15 @@ class SensorConfig(Settings):
     """The foveal sensor.
 
     Args:
-        name: `published` or `published-narrow`, for the wide and the narrow fovea of the paper, or `gradual`, the
-            agent's (`semfov.sensor.SENSORS`).
-        sigma: width of the fovea in pixels of an image whose longer side is `reference` (None: that of the name).
-        growth: how much wider the window of each coarser band is (None: that of the name).
+        name: `published` (the paper's wide fovea), `published-narrow` (the paper's narrow fovea), or `gradual` (the
+            agent's fovea); see `semfov.sensor.SENSORS`.
+        sigma: width of the fovea in pixels of an image whose longer side is `reference` (None: that of the named
+            sensor).
+        growth: factor by which the window of each coarser band is wider than that of the next finer band (None: that of
+            the named sensor).
         levels: number of bands of the Laplacian pyramid.
-        convention: `kornia` or `opencv` pyramid.
-        reference: longer side in pixels that sigma is meant for.
+        convention: whether the pyramid is computed as `kornia` or as `opencv` does it.
+        reference: longer side, in pixels, of the images for which sigma is given.
     """
 
     name: SensorName = "gradual"
@@ -109,36 +114,37 @@ class SensorConfig(Settings):
     reference: Positive = 640.0
 
     def make(self) -> Foveation:
-        """The sensor."""
+        """Build the sensor."""
         given = {"sigma": self.sigma, "growth": self.growth}
         changes = {name: value for name, value in given.items() if value is not None}
         return named_sensor(self.name, levels=self.levels, convention=self.convention, **changes)
 
     @property
     def fovea(self) -> float:
-        """Width of the fovea in longer sides of the image."""
+        """Width of the fovea as a fraction of the image's longer side."""
         return (SENSORS[self.name]["sigma"] if self.sigma is None else self.sigma) / self.reference
 
 
 @dataclass(frozen=True)
 class BeliefConfig(Settings):
-    """The grid of beliefs.
+    """The belief: a grid of cells over the image, with a distribution over the classes in each cell.
 
     Args:
-        columns: cells in a row.
-        rows: cells in a column.
+        columns: number of columns of the grid.
+        rows: number of rows of the grid.
         prior: Dirichlet parameter of every class before the first look.
-        fusion: `kaplan` (published), `product` or `sum`.
+        fusion: rule that updates the belief with a detection: `kaplan` (published), `product` or `sum`.
         footprint: which cells a detection updates: `overlap` (published), `centre`, `box_centre` or `soft`.
         tempering: exponent of the likelihoods (published: 1).
-        memory: fuse `all` looks (published), or keep what the `closest` look at each cell says.
-        misses: take account of cells in which nothing was detected, by the observation model's miss rates.
-        model: fitted observation model, by name or file (None: our own for the detector and growth; published: the
-            detector's name and `-published` or `-published-narrow`).
-        target_model: learned target evidence, by name or file (None: the one shipped for detector and sensor).
-        map_model: learned map, by name or file (None: the one shipped for detector and sensor).
-        context: what is added to the log odds of a target: `none`, its usual `place`, its `cooccurrence` with what was
-            seen, or `both`; for `target-evidence` and `non-predictive`.
+        memory: fuse `all` looks (published), or keep only the evidence of the `closest` look at each cell.
+        misses: also update cells in which nothing was detected, with the miss rates of the observation model.
+        model: fitted observation model, by name or file (None: semfov's own model for the detector and growth; for the
+            published one, give the detector's name followed by `-published` or `-published-narrow`).
+        target_model: learned target evidence, by name or file (None: the one shipped for the detector and sensor).
+        map_model: learned map, by name or file (None: the one shipped for the detector and sensor).
+        context: context that is added to the log odds of the target: `none`, the `place` where the class usually is,
+            its `cooccurrence` with the classes seen so far, or `both`. Only `target-evidence` and `non-predictive` can
+            use context.
         context_model: fitted context, by name or file.
     """
 
@@ -162,10 +168,10 @@ class SaliencyConfig(Settings):
     """The saliency baselines, `vocus2` and `itti-koch`.
 
     Args:
-        view: `foveated`, the saliency of what the sensor shows from each fixation (published), or `picture`, that of
-            the whole photograph, once. Neither depends on the detector.
-        reduction: a cell is as salient as its most salient pixel (`max`) or as the `mean` of its pixels.
-        weight: of a saliency map as a prior over the cells, for policies that have one.
+        view: `foveated` computes the saliency of the foveated view from each fixation (published); `picture` computes
+            the saliency of the whole sharp photograph, once. Neither depends on the detector.
+        reduction: the saliency of a cell is the `max` or the `mean` of that of its pixels.
+        weight: weight of the saliency map as a prior over the cells, for policies that have one.
     """
 
     view: Literal["foveated", "picture"] = "foveated"
@@ -175,19 +181,23 @@ class SaliencyConfig(Settings):
 
 @dataclass(frozen=True)
 class PolicyConfig(Settings):
-    """A policy under comparison: where it looks, and what it believes. What is null is as `belief` has it for the run.
+    """A policy under comparison: how it chooses fixations, and which belief it uses.
+
+    A setting that is null is taken from the `belief` settings of the run.
 
     Args:
-        policy: name of a registered policy (`semfov.gaze.policies`), `saliency`, which goes by a saliency map alone, or
-            `target-evidence`, which goes by learned evidence for the target, or `ivsn`, which goes by class templates.
-        scores: whether scores are likelihoods as they are, `raw`, or go through the observation model, `calibrated`;
-            or the belief is a `learned` one, the map of explorations or the evidence for a target.
+        policy: name of a registered policy (`semfov.gaze.policies`), or `saliency` (fixates the most salient cell),
+            `target-evidence` (uses the learned evidence for the target) or `ivsn` (uses class templates).
+        scores: `raw` uses the detector's scores as likelihoods; `calibrated` passes them through the observation model
+            first; `learned` uses a learned belief, which is the learned map in explorations and the learned target
+            evidence in searches.
         tempering: exponent of the likelihoods.
         footprint: which cells a detection updates: `overlap`, `centre`, `box_centre` or `soft`.
-        memory: fuse `all` looks, or keep what the `closest` look at each cell says.
-        misses: take account of cells in which nothing was detected.
-        saliency: saliency map that it goes by, or has as a prior over the cells: `vocus2` or `itti-koch`.
-        context: what is added to the log odds of a target: `none`, `place`, `cooccurrence` or `both`.
+        memory: fuse `all` looks, or keep only the evidence of the `closest` look at each cell.
+        misses: also update cells in which nothing was detected.
+        saliency: saliency map that `saliency` uses, or that another policy has as a prior over the cells: `vocus2` or
+            `itti-koch`.
+        context: context that is added to the log odds of the target: `none`, `place`, `cooccurrence` or `both`.
         context_model: fitted context, by name or file.
     """
 
@@ -204,17 +214,18 @@ class PolicyConfig(Settings):
 
 @dataclass(frozen=True)
 class ProtocolConfig(Settings):
-    """The experiment.
+    """The protocol of the experiment.
 
     Args:
-        starts: episodes for each image (and target of a search), each from another cell; no search starts on its
-            target.
-        shifts: gaze shifts of an episode.
-        ties: equal cells are chosen at `random`, or the `first` by number.
-        control: `none`; `wrong-class`, the searcher is told another class than the one that counts, drawn at random; or
-            `permuted`, the cells that count are drawn at random, as many as hold the target.
-        seed: seed of starts and tie-breaking (what it promises: docs/guides/evaluation.md).
-        batch: episodes that are run as one tensor (no influence on the result).
+        starts: number of episodes per image (and per target, in searches), each from a different cell; no search starts
+            on its target.
+        shifts: number of gaze shifts per episode.
+        ties: among equally good cells choose one at `random`, or the `first` by number.
+        control: `none`; `wrong-class`: the searcher is given a randomly drawn wrong class, while the true class decides
+            what counts as found; `permuted`: the cells that count as the target are drawn at random, as many as truly
+            hold it.
+        seed: random seed of starts and tie-breaking (docs/guides/evaluation.md says what it reproduces).
+        batch: number of episodes computed together (does not change the result).
     """
 
     starts: Annotated[int, Range(1, 10_000)] = 10
@@ -227,29 +238,30 @@ class ProtocolConfig(Settings):
 
 @dataclass(frozen=True)
 class SearchConfig(Settings):
-    """Visual search: find a target class by moving a fovea, and count the gaze shifts that it takes.
+    """Visual search: find a target class by moving a fovea, and count the gaze shifts that this takes.
 
     Args:
-        data: which scenes to search.
-        detector: which detector looks through the fovea.
+        data: the scenes to search.
+        detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        belief: the grid of beliefs.
+        belief: the belief, a grid of class distributions.
         saliency: the saliency baselines.
-        protocol: the experiment.
+        protocol: the protocol of the experiment.
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: non-predictive,
             scores: calibrated, tempering: 0.25}` (`PolicyConfig`). Presets: `recommended` (target-evidence),
-            `published` (predictive-calibrated), `target-evidence`, `learned`, `ivsn`, `random`, `vocus2`, `itti-koch`,
-            `non-predictive` (also as `maximum-a-posteriori`), `predictive`, `neighbourhood`, `foveal-hit`,
-            `place-information`, `entropy-limit` or `ideal-observer` followed by `-raw` or `-calibrated`; the last four
-            also by `-learned`, with the evidence of `target-evidence`, which is `maximum-a-posteriori-learned`.
+            `published` (predictive-calibrated), `target-evidence`, `learned`, `ivsn`, `random`, `vocus2`, `itti-koch`;
+            and `non-predictive` (also called `maximum-a-posteriori`), `predictive`, `neighbourhood`, `foveal-hit`,
+            `place-information`, `entropy-limit` or `ideal-observer`, each followed by `-raw` or `-calibrated`. The last
+            four also take `-learned`, which uses the same evidence as `target-evidence`;
+            `maximum-a-posteriori-learned` is `target-evidence` itself.
         gaze_model: learned gaze policy of `learned`, by name or file (None: the one shipped for the detector).
         templates: class templates of `ivsn`, by name or file (None: those shipped for the detector).
         out: folder for tables, figures, per-episode records and the manifest.
-        cache: folder for what the detector saw from every cell, shared between runs (None: the user's cache).
-        store: keep what the detector saw on disk; false recomputes it (the result is the same).
-        workers: processes (None: one for each CPU core).
-        scanpaths: draw this many episodes.
-        models: folder of `train.fit_detector` that names detector, sensor, grid and fitted models.
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        store: keep detections on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
+        scanpaths: number of episodes to draw as figures.
+        models: folder written by `train.fit_detector`, which defines detector, sensor, grid and fitted models.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -281,24 +293,24 @@ class ExploreConfig(Settings):
     """Scene exploration: learn what is where by moving a fovea, and count the cells whose class is right.
 
     Args:
-        data: which scenes to explore.
-        detector: which detector looks through the fovea.
+        data: the scenes to explore.
+        detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        belief: the grid of beliefs.
+        belief: the belief, a grid of class distributions.
         saliency: the saliency baselines.
-        protocol: the experiment.
+        protocol: the protocol of the experiment.
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: kl, scores:
             calibrated, memory: closest}` (`PolicyConfig`). Presets: `recommended` (closer-look-learned), `published`
-            (kl-calibrated), and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
+            (kl-calibrated); and `random`, `kl`, `negative-entropy`, `two-peaks`, `surprise`,
             `upper-confidence-bound`, `probability-of-improvement`, `expected-accuracy`, `closer-look`, `objects`,
-            `vocus2` or `itti-koch` followed by `-raw` or `-calibrated`. With a learned map there are `random-learned`,
+            `vocus2` or `itti-koch`, each followed by `-raw` or `-calibrated`. With the learned map: `random-learned`,
             `closer-look-learned`, `objects-learned`, `expected-gain-learned`, `vocus2-learned` and
             `itti-koch-learned`.
         out: folder for tables, figures, per-episode records and the manifest.
-        cache: folder for what was seen from every cell, shared between runs (None: the user's cache).
-        store: keep what was seen on disk; false recomputes it (the result is the same).
-        workers: processes (None: one for each CPU core).
-        models: folder of `train.fit_detector` that names detector, sensor, grid and fitted models.
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        store: keep detections on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
+        models: folder written by `train.fit_detector`, which defines detector, sensor, grid and fitted models.
     """
 
     data: DataConfig = field(default_factory=DataConfig)

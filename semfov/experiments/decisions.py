@@ -1,4 +1,4 @@
-"""Searches for what is there and for what is not, each until it decides."""
+"""Searches for classes that are present and for classes that are absent, each until it reaches a decision."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 
 Rule = Callable[[Step, int, Grid], Tensor]
-"""Which searches for a class on a grid end with a step: numbers of their outcomes."""
+"""Maps a step of searches, their target and their grid to the number of each search's outcome; 0: it goes on."""
 
 AGENT, RANDOM, PUBLISHED, AT_THE_GAZE = (
     "target-evidence",
@@ -42,21 +42,24 @@ AGENT, RANDOM, PUBLISHED, AT_THE_GAZE = (
     "published belief",
     "published belief, a detection at the gaze",
 )
-"""Ways to search: the agent's; its belief, but a gaze at random; and the paper's belief and gaze, by two rules."""
+"""Ways to search: the agent's; the agent's belief with random gaze; and the paper's belief and gaze with two rules."""
 
 SEEN_FROM = 0.5
-"""Score of a detection at the gaze from which on a belief without thresholds has found its target."""
+"""Lowest score of a detection at the gaze that counts as a find where the belief has no thresholds."""
 
 
 @dataclass(frozen=True)
 class DecisionConfig(SearchConfig):
-    """Searches that decide; `policies` are of no account.
+    """Searches that end in a decision. `policies` is ignored.
 
     Args:
-        confirm: probability that the image holds the target, from which on it counts as found (None: the model's).
-        give_up: probability below which a cell is not worth a look (None: the model's).
-        place: probability that the cell must have that is named (None: the model's).
-        prices: of a look, for searches that end by `decide_by_price`, beside those that end by thresholds.
+        confirm: the target can count as found when the probability that the image holds it reaches this value (None:
+            the model's own threshold).
+        give_up: a search gives up when, in every cell not fixated yet, the probability of the target is below this
+            value (None: the model's own threshold).
+        place: for a find, the fixated cell must hold the target with at least this probability (None: the model's own
+            threshold).
+        prices: prices of a look, for additional searches that end by `decide_by_price` instead of by thresholds.
     """
 
     policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
@@ -67,13 +70,13 @@ class DecisionConfig(SearchConfig):
 
 
 class DecisionRun(Run):
-    """Searches by learned target evidence, by the same belief under random gaze, and by the published belief.
+    """Searches with the learned target evidence, with the same belief under random gaze, and with the published belief.
 
-    The published belief (calibrated scores, Kaplan's rule, predictive search) decides at the same thresholds, and once
-    more as its agent does, which has none: it has found its target when a detection at the gaze shows it.
+    The published belief (calibrated scores, Kaplan's rule, predictive search) decides in two ways: by the same
+    thresholds as the others, and, without thresholds, as soon as a detection at the gaze shows the target.
 
     Args:
-        config: of the run.
+        config: settings of the run.
     """
 
     task: ClassVar[Task] = "search"
@@ -81,13 +84,13 @@ class DecisionRun(Run):
 
     def __init__(self, config: DecisionConfig) -> None:
         context = config.belief.context
-        check(context == "none", "belief.context", "none: decisions are by evidence alone", context)
+        check(context == "none", "belief.context", "none, since decisions use the target evidence alone", context)
         super().__init__(config)
         evidence = self.models.evidence
         assert evidence is not None
         chosen = evidence.thresholds or Thresholds(0.9, 0.05)
         self.thresholds = chosen.changed(config.confirm, config.give_up, config.place)
-        # One observer, so that all weigh the looks once.
+        # All share one observer, so that the likelihoods of the looks are computed only once.
         observer = Target(evidence)
         learned, random = Strategy(observer, NonPredictive()), Strategy(observer, Random())
         self.compared: dict[str, tuple[Strategy, Rule]] = {
@@ -106,7 +109,7 @@ class DecisionRun(Run):
         return decide(step, target, self.thresholds)
 
     def _published(self) -> FovealObservationModel | None:
-        """The observation model of the published belief; None where none is shipped, and none is named."""
+        """The observation model of the published belief; None if the settings name none and none is shipped."""
         name = self.config.belief.model
         try:
             return make_observation(name or published_model(self.config.detector, self.config.sensor), self.eye)
@@ -124,7 +127,7 @@ class DecisionRun(Run):
         return hashlib.sha256(json.dumps(what).encode()).hexdigest()
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """Records of all searches of a scene, and the seconds that they took."""
+        """Run all searches of a scene; returns their records, and the seconds that each stage took."""
         protocol, annotation, grid = self.config.protocol, self.scenes.annotation(index), self.grid(index)
         watch = Stopwatch()
         area = self.config.data.max_target_area or 1.0
@@ -162,7 +165,7 @@ class DecisionRun(Run):
                     steps = search_steps(looks, strategy, target, cell, noise, rule)
                 last, seen = steps[-1], torch.cat([step.cell for step in steps])
                 ended = int(rule(last))
-                # What a detection at the gaze shows is where the gaze is.
+                # If a detection at the gaze has ended the search, the target's place is the fixated cell.
                 place = int(last.cell) if judge is at_the_gaze else None
                 shown = [detections[cell] for cell in seen.split(1)]
                 decision = conclude(ended, last.belief, shown, grid, target, place)
@@ -184,24 +187,27 @@ class DecisionRun(Run):
 
 
 def by_price(price: float) -> Rule:
-    """The rule of `decide_by_price`."""
+    """The rule that decides by the price of a look (`decide_by_price`)."""
     return lambda step, target, grid: decide_by_price(step, target, price)
 
 
 def at_the_gaze(step: Step, target: int, grid: Grid) -> Tensor:
-    """Which searches see their target at the gaze: its class is the best of a detection there, of `SEEN_FROM`."""
+    """The rule that ends a search when a detection at the gaze shows the target with a score of `SEEN_FROM` or more."""
     return confirms(step.detections, grid, step.cell, target, SEEN_FROM).long()
 
 
 def sharp_place(seen: Detections, grid: Grid, target: int, goal: Tensor, boxes: Tensor) -> Record | None:
-    """Whether the most confident detection of one look has its middle on the target, and how well its box fits.
+    """Whether the centre of the target's most confident detection lies on the target, and how well its box fits.
 
     Args:
-        seen: what the look shows, a batch of one.
-        grid: the cells.
-        target: class 1..K.
-        goal: `(X·Y,)` boolean, the cells that it overlaps.
-        boxes: `(M, 4)`, the target's.
+        seen: detections of one look, a batch of one.
+        grid: the grid over the image.
+        target: the target's class, 1..K.
+        goal: `(X·Y,)` boolean, the cells that the target overlaps.
+        boxes: `(M, 4)`, the target's annotated boxes.
+
+    Returns:
+        A record with `right` and `overlap`; None if no detection has a score for the target.
     """
     score = seen.scores[0, :, target] * seen.mask[0]
     if not bool((score > 0).any()):
@@ -214,15 +220,18 @@ def sharp_place(seen: Detections, grid: Grid, target: int, goal: Tensor, boxes: 
 def search_steps(
     looks: StoredLooks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
 ) -> list[Step]:
-    """Steps of one search, to its decision or through all looks.
+    """Run one search until it decides or all looks are spent.
 
     Args:
-        looks: at the scene.
-        strategy: how it is gone about.
-        target: class that is searched for.
-        start: `(1,)`, first cell.
-        noise: `(1, N, X·Y)`, for ties, of N looks at most.
-        rule: says by a number above 0 that a step decides, `(1,)`.
+        looks: the looks at the scene.
+        strategy: observer and policy of the search.
+        target: the class to search for.
+        start: `(1,)`, the first cell.
+        noise: `(1, N, X·Y)`, random numbers that break ties in at most N looks.
+        rule: maps a step to a number `(1,)`; a number above 0 ends the search.
+
+    Returns:
+        The steps of the search.
     """
     policy, choice = strategy.policy(target, looks.grid), Greedy(drawn_from(noise))
     ends: Callable[[Step], Tensor] = lambda step: rule(step) > 0  # noqa: E731
@@ -237,14 +246,24 @@ def quarters(image: Tensor) -> list[Tensor]:
 
 
 def overlap(box: Tensor | None, boxes: Tensor) -> float | None:
-    """Largest intersection over union of a box with any of some; None without a box or with none to compare."""
+    """Largest intersection over union of a box with any of `boxes`; None if either is missing."""
     if box is None or not len(boxes):
         return None
     return float(box_iou(box[None], boxes).max())
 
 
 def landing(beliefs: list[Belief], cells: Tensor, goal: Tensor, target: int) -> list[float] | None:
-    """Probability of the target in the cell of the first fixation on it, before and after that look."""
+    """Probability of the target in the first fixated cell that overlaps it, before and after that look.
+
+    Args:
+        beliefs: the belief after each look.
+        cells: the fixated cells in order.
+        goal: `(X·Y,)` boolean, the cells that the target overlaps.
+        target: the target's class, 1..K.
+
+    Returns:
+        The two probabilities; None if no look lands on the target, or if already the first one does.
+    """
     hits = goal[cells].nonzero()[:, 0].tolist()
     if not hits or hits[0] == 0:
         return None
@@ -253,9 +272,19 @@ def landing(beliefs: list[Belief], cells: Tensor, goal: Tensor, target: int) -> 
 
 
 def seen_on_landing(steps: list[Step], path: Tensor, goal: Tensor, target: int, grid: Grid) -> bool | None:
-    """Whether the look that lands on the target sees it: the best class of a detection over the fixated cell is it.
+    """Whether the first look that lands on the target sees it.
 
-    None where no look lands, or the first one is on the target already (`landing`).
+    The look sees the target if the target is the best class of a detection over the fixated cell.
+
+    Args:
+        steps: the steps of the search.
+        path: the fixated cells in order.
+        goal: `(X·Y,)` boolean, the cells that the target overlaps.
+        target: the target's class, 1..K.
+        grid: the grid over the image.
+
+    Returns:
+        Whether it does; None if no look lands on the target, or if already the first one does (as in `landing`).
     """
     hits = goal[path].nonzero()[:, 0].tolist()
     if not hits or hits[0] == 0:
@@ -265,20 +294,23 @@ def seen_on_landing(steps: list[Step], path: Tensor, goal: Tensor, target: int, 
 
 
 LANDINGS = ["landings", "p", "seen", "p, seen", "not seen", "p, not seen"]
-"""Head of `landing_cells`."""
+"""Column headings of `landing_cells`."""
 
 LANDINGS_TOLD = (
-    "Probability of the target in the cell of the first look that lands on it, before and after that look. It is seen "
-    "where the best class of a detection over that cell is the target."
+    "Probability of the target in the first fixated cell that overlaps it (the landing), before and after that look. "
+    "The target counts as seen where it is the best class of a detection over that cell."
 )
-"""What the table of landings is."""
+"""Caption of the table of landings."""
 
 
 def landing_cells(landed: Sequence[tuple[Sequence[float], bool]]) -> list[str]:
-    """Cells of a table's row: how many first looks land, and means before and after; of all, seen, and not seen.
+    """Cells of a table row: number of landings and mean probabilities before and after, of all, seen, and not seen.
 
     Args:
-        landed: for each of them the probabilities before and after (`landing`), and whether the target was seen.
+        landed: for each landing, the probabilities before and after it (`landing`), and whether the target was seen.
+
+    Returns:
+        The cells under the headings `LANDINGS`.
     """
     cells: list[str] = []
     for group in (landed, [each for each in landed if each[1]], [each for each in landed if not each[1]]):

@@ -1,4 +1,4 @@
-"""The protocol of explorations: which episodes there are, and what comes of them."""
+"""The protocol of explorations: the episodes of a scene, and their results."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class Exploration:
 
     Attributes:
         scene: index of the scene in its data set.
-        repetition: which of the starts, from 0.
+        repetition: number of the start, from 0.
         start: cell of the first fixation.
     """
 
@@ -34,14 +34,15 @@ class Exploration:
 
 @dataclass(frozen=True)
 class Progress:
-    """What came of an exploration.
+    """Result of an exploration.
 
     Attributes:
-        cells: fixated cells in order.
-        right: after 0, 1, … gaze shifts, how many of the cells with objects are given the class of one of them: the
-            published measure, where the most probable of all classes is the answer, background among them.
-        right_without_background: the same, where the most probable class but background is the answer.
-        right_everywhere: of all cells, how many are given the class of an object there, or background where none is.
+        cells: the fixated cells in order.
+        right: after 0, 1, … gaze shifts, the number of cells with objects whose answer is the class of one of them. The
+            answer is the most probable class, background included (the published measure).
+        right_without_background: the same, but the answer is the most probable class other than background.
+        right_everywhere: the number of cells, among all, whose answer is the class of an object there, or background
+            where there is no object.
     """
 
     cells: tuple[int, ...]
@@ -51,7 +52,7 @@ class Progress:
 
 
 def explorations_of(scenes: Scenes, index: int, cells: int, protocol: ProtocolConfig) -> list[Exploration]:
-    """All explorations of a scene; starts differ from each other as long as there are enough cells."""
+    """All explorations of a scene; their starts differ as long as there are enough cells."""
     generator = generator_for("start", protocol.seed, scenes.ids[index])
     rounds = -(-protocol.starts // cells)
     order = torch.cat([torch.randperm(cells, generator=generator) for _ in range(rounds)])
@@ -77,14 +78,17 @@ def run_explorations(
     """Run explorations of one scene, `batch` at a time, until their gaze shifts are spent or no cell is left.
 
     Args:
-        episodes: of one and the same scene.
-        candidate: how they explore.
-        detections: what is seen from every cell of the scene, a batch of X·Y.
+        episodes: the explorations, all of the same scene.
+        candidate: the policy under comparison.
+        detections: detections from every cell of the scene, a batch of X·Y.
         grid: the grid over the scene.
         answers: right classes of each cell (`answers_of`).
         noise: `(episodes, shifts+1, X·Y)`, from `explore_noise`.
-        shifts: gaze shifts.
-        batch: episodes in a tensor.
+        shifts: number of gaze shifts.
+        batch: number of episodes computed together.
+
+    Returns:
+        The result of each exploration.
     """
     starts = torch.tensor([episode.start for episode in episodes])
     looks = StoredLooks(detections, grid)
@@ -103,7 +107,7 @@ def run_explorations(
             known = step.belief.class_probabilities()
             visits.append(step.cell)
             counts.append(counts_of(known, answers))
-        # All episodes have made as many shifts, and so all run out of cells at once: nothing changes after that.
+        # All episodes have made the same number of shifts and run out of cells together: nothing changes after that.
         counts += [counts[-1]] * (shifts + 1 - len(counts))
         tables = torch.stack(visits, 1).tolist(), *(torch.stack(each, 1).tolist() for each in zip(*counts, strict=True))
         progress += [Progress(*map(tuple, row)) for row in zip(*tables, strict=True)]

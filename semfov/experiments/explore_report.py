@@ -1,4 +1,4 @@
-"""What an exploration run leaves: the share of cells named right after each gaze shift, counted in three ways."""
+"""Output of an exploration run: the share of rightly named cells after each gaze shift, counted in three ways."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -28,19 +28,19 @@ SHIFTS = (0, 1, 2, 3, 4, 5, 10, 20)
 """Gaze shifts at which tables show the success rate."""
 
 ANSWERS = {
-    "all classes": ("right", "as published: the answer is the most probable of all classes, background among them"),
-    "without background": ("right_without_background", "the answer is the most probable class but background"),
+    "all classes": ("right", "as published: the answer is the most probable class, background included"),
+    "without background": ("right_without_background", "the answer is the most probable class other than background"),
     "whole grid": ("right_everywhere", "all cells count: background is right where there is no object"),
 }
-"""What counts as an answer: the records' field, and in words."""
+"""Ways to count answers: the field of the records, and a description."""
 
 
 def report(run: ExploreRun) -> None:
-    """Write everything that a finished run leaves, and print the tables."""
+    """Write all output of a finished run, and print the tables."""
     records, seconds = collect(run)
     if not records:
         raise DataError("data: no scene has an object; lower data.min_instances or raise data.limit")
-    # What one sharp look gives comes after the policies.
+    # The reference of one sharp look comes after the policies.
     names = dict.fromkeys([*run.policies, *(record["policy"] for record in records)])
     curves = {answer: success(records, list(names), answer) for answer in ANSWERS}
     summary = summary_markdown(curves, run.config.protocol.shifts, sensing(run))
@@ -79,8 +79,8 @@ def summary_markdown(curves: dict[str, dict[str, Curve]], last: int, sensing: st
         first = next(iter(policies.values()))
         lines += [
             f"**{ANSWERS[answer][1]}** ({sensing}; {first.images} images, {first.episodes} explorations per policy; "
-            "% of the cells that are given a right answer after n gaze shifts, of those with objects unless all count, "
-            "± standard error over images)",
+            "percentage of cells with a right answer after n gaze shifts, among the cells with objects unless all "
+            "cells count, ± standard error over images)",
             "",
             *table([head, *curve_rows(policies, shifts)]),
             "",
@@ -89,7 +89,7 @@ def summary_markdown(curves: dict[str, dict[str, Curve]], last: int, sensing: st
 
 
 def draw_curves(run: ExploreRun, curves: dict[str, Curve], answer: str) -> Path:
-    """The success-rate figure."""
+    """Draw the success rate against gaze shifts."""
     from semfov.viz import plot_success_rate
 
     figure = plot_success_rate(

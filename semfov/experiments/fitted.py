@@ -1,4 +1,4 @@
-"""Settings of an experiment from a folder of models."""
+"""Settings of an experiment from a folder of fitted models."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -15,14 +15,20 @@ Config = TypeVar("Config", bound=RunConfig)
 
 
 def with_models(config: Config) -> Config:
-    """The settings with detector, sensor, grid and models of the folder that they name; the same where they name none.
+    """Complete settings with the detector, sensor, grid and models of the folder that `models` names.
 
-    A detector or its weights that are named beside the folder are files that lie elsewhere now. Policies keep their
-    names; `recommended` is what the folder's agent goes by, and of the policies that run where none are named, those
-    that need what the folder has not are left out.
+    If the settings also give a detector or weights, these are the new locations of the folder's files. The preset
+    `recommended` stands for the policy of the folder's agent. Default policies that need a model that the folder lacks
+    are left out.
+
+    Args:
+        config: the settings.
+
+    Returns:
+        The completed settings; `config` itself if it names no folder.
 
     Raises:
-        InputError: a policy that is named needs a model that the folder has not, or a setting is given twice.
+        InputError: a policy given in the settings needs a model that the folder lacks, or a setting is given twice.
         DataError: it is no folder of models, or a file is missing or changed.
     """
     if config.models is None:
@@ -30,7 +36,7 @@ def with_models(config: Config) -> Config:
     folder = ModelFolder(config.models)
     for name in ("model", "target_model", "map_model"):
         given = getattr(config.belief, name)
-        check(given is None, f"belief.{name}", "none beside models, which names it", given)
+        check(given is None, f"belief.{name}", "null, since models defines it", given)
     files = {part: folder.file(part) for part in ("observation", "evidence", "map")}
     names = {"model": "observation", "target_model": "evidence", "map_model": "map"}
     columns, rows = folder.manifest.grid
@@ -46,12 +52,14 @@ def with_models(config: Config) -> Config:
             chosen.append(policy)
         elif named:
             why = folder.manifest.parts[missing].why if missing in folder.manifest.parts else "not fitted"
-            raise InputError(f"policies: {policy!r} needs the part {missing!r}, which {config.models} lacks: {why}")
+            raise InputError(
+                f"policies: {policy!r} needs the model {missing!r}, which the folder {config.models} lacks: {why}"
+            )
     return replace(config, detector=detector, sensor=sensor_of(folder), belief=belief, policies=tuple(chosen))
 
 
 def detector_of(folder: ModelFolder, given: DetectorConfig) -> DetectorConfig:
-    """The settings of a folder's detector; what is given beside it names files that lie elsewhere now."""
+    """The settings of a folder's detector; name and weights in `given` are the new locations of its files."""
     moved = None if given.name == DetectorConfig().name else given.name
     source, options = folder.detector_source(moved, given.weights)
     known = {field.name for field in fields(DetectorConfig)}
@@ -69,7 +77,7 @@ def sensor_of(folder: ModelFolder) -> SensorConfig:
 
 
 def recommended(folder: ModelFolder, config: RunConfig) -> Choice:
-    """The policy that the agent of a folder goes by."""
+    """The policy that the agent of a folder uses."""
     if isinstance(config, ExploreConfig):
         return PolicyConfig("closer-look", "learned") if folder.used("map") else "random-raw"
     if folder.used("evidence"):
@@ -83,7 +91,7 @@ def recommended(folder: ModelFolder, config: RunConfig) -> Choice:
 
 
 def needs(choice: Choice, config: RunConfig) -> list[str]:
-    """Parts that a policy needs."""
+    """Parts of the folder that a policy needs."""
     policy = resolve(choice, "exploration" if isinstance(config, ExploreConfig) else "search")
     if policy.policy == EVIDENCE:
         return ["evidence"]

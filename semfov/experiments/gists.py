@@ -1,4 +1,4 @@
-"""Gists of several looks as tensors for a file: of their cells only those with a hint."""
+"""Gists of several looks as tensors for a file; only cells with a score above 0 are kept."""
 
 from collections.abc import Sequence
 
@@ -11,10 +11,13 @@ from semfov.zoom.glances import Window
 
 
 def gist_fields(kinds: int) -> dict[str, Field]:
-    """What a file of `N` looks holds of their gists.
+    """Names, shapes and ranges of the tensors that hold the gists of `N` looks in a file.
 
     Args:
         kinds: number of classes.
+
+    Returns:
+        The fields by name.
     """
     return {
         "gist.frames": Field(("N", 3), torch.int64, low=0, high=1 << 20),
@@ -27,11 +30,14 @@ def gist_fields(kinds: int) -> dict[str, Field]:
 
 
 def pack_gists(gists: Sequence[Gist | None], kinds: int) -> dict[str, Tensor]:
-    """Gists as tensors, see `gist_fields`; looks without one have no cells.
+    """Pack gists into the tensors of `gist_fields`; a look without a gist has no cells.
 
     Args:
-        gists: of the looks.
+        gists: the gists of the looks.
         kinds: number of classes.
+
+    Returns:
+        The tensors by name.
     """
     frames, counts = torch.zeros(len(gists), 3, dtype=torch.int64), torch.zeros(len(gists), 2, dtype=torch.int64)
     cells, found = [torch.zeros(0, dtype=torch.int32)], [torch.zeros(0, dtype=torch.int32)]
@@ -57,11 +63,14 @@ def pack_gists(gists: Sequence[Gist | None], kinds: int) -> dict[str, Tensor]:
 
 
 def unpack_gists(tensors: dict[str, Tensor], windows: Sequence[Window]) -> list[Gist | None]:
-    """The gists that `pack_gists` made the tensors from.
+    """Unpack the tensors of `pack_gists`.
 
     Args:
-        tensors: see there.
-        windows: that were looked at.
+        tensors: the tensors by name.
+        windows: the windows of the looks.
+
+    Returns:
+        The gists of the looks; None for a look without one.
     """
     full, found = (column.tolist() for column in tensors["gist.counts"].unbind(1))
     parts = (tensors[f"gist.{name}"].split(full) for name in ("cells", "scores", "sizes"))

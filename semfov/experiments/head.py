@@ -1,4 +1,4 @@
-"""An eye in a head that turns: what it finds, and what it comes to know, by the second."""
+"""Experiments with an eye in a head that turns: search and exploration over time."""
 
 from __future__ import annotations
 
@@ -36,39 +36,39 @@ from semfov.io.storage import checksum
 from semfov.metrics.exploration import right_cells
 
 OURS = "ours"
-"""What the others are compared with."""
+"""Name of the method that the others are compared with."""
 
 MOSAIC = 240.0
-"""Degrees that a mosaic of 4 × 4 photographs is wide."""
+"""Width in degrees of a mosaic of 4 × 4 photographs."""
 
 Degrees = Annotated[float, Range(1, 170)]
 
 
 @dataclass(frozen=True)
 class HeadConfig(Settings):
-    """An eye in a head that turns, in scenes larger than its field: search and exploration by seconds and passes.
+    """An eye in a head that turns, in scenes larger than its field of view: search and exploration.
 
     Args:
-        data: photographs; none uses the embedded scenes.
-        detector: which detector looks.
+        data: the photographs from which scenes are composed (without a root: the embedded scenes).
+        detector: the detector, which is applied to each foveated view.
         scene: `panorama`, photographs on a sphere around the viewer, or `mosaic`, photographs side by side in front.
         scenes: number of panoramas or mosaics to compose.
-        targets: classes to search for in each scene, drawn by the seed; 0 leaves searches out.
-        explore: whether scenes are explored, too.
-        fields: fields of view in degrees; several let the head zoom.
-        width: of a scene in pixels: of the 360 degrees of a panorama, or of a mosaic, which is 240 degrees wide.
-        passes: looks of an episode, at most.
-        seconds: of an episode, at most.
-        speeds: of eye and head.
-        dwell: looks from each pose of a head that scans.
-        foresight: share of what a look shows from aside that counts towards a find.
+        targets: number of classes to search for in each scene, drawn at random; 0 leaves out the searches.
+        explore: whether to run explorations, too.
+        fields: fields of view in degrees; with several, the head can zoom.
+        width: width of a scene in pixels: of a panorama's 360 degrees, or of a mosaic, which is 240 degrees wide.
+        passes: largest number of looks in an episode.
+        seconds: longest duration of an episode, in simulated seconds.
+        speeds: speeds of eye and head.
+        dwell: number of looks from each pose of a head that scans the scene in a fixed order.
+        foresight: in searches, weight of what a look reveals away from the gaze, relative to a find at the gaze.
         prior: probability that a cell that was never seen holds the target.
-        unseen: how often the first look at a cell names it right, for explorations.
-        seed: of scenes, targets, starts and ties.
+        unseen: in explorations, assumed probability that the first fixation of a cell names it right.
+        seed: random seed of scenes, targets, starts and tie-breaking.
         out: folder for tables, records and figures.
-        cache: folder for looks, shared between runs (None: the user's cache).
-        store: keep looks on disk; false recomputes them (the result is the same).
-        workers: processes (None: one for each CPU core).
+        cache: folder for the stored looks, shared between runs (None: the user's cache).
+        store: keep looks on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
@@ -94,10 +94,10 @@ class HeadConfig(Settings):
 
 
 class HeadRun(SceneRun):
-    """Everything that a run is made of, built from its settings in each process.
+    """Scenes, eye and models of a run; every process builds its own from the settings.
 
     Attributes:
-        scenes: panoramas or mosaics.
+        scenes: the panoramas or mosaics.
     """
 
     config: HeadConfig
@@ -113,7 +113,7 @@ class HeadRun(SceneRun):
         )
         photographs = make_scenes(config.data, self.eye.detector.classes)
         if not len(photographs):
-            raise DataError("data: no photograph passes the selection; lower data.min_instances or raise data.limit")
+            raise DataError("data: the settings select no photograph; lower data.min_instances or raise data.limit")
         self.scenes: Scenes = (
             Panoramas(photographs, width=config.width, count=config.scenes, seed=config.seed)
             if config.scene == "panorama"
@@ -137,17 +137,17 @@ class HeadRun(SceneRun):
         return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, models])
 
     def world(self, index: int) -> World:
-        """The scene, as a head looks around in it."""
+        """The scene as a world in which the head looks around."""
         image = self.scenes[index].image
         return Panorama(image) if self.config.scene == "panorama" else Flat(image, degree=image.shape[-1] / MOSAIC)
 
     def places(self, index: int) -> Places:
-        """Where its objects are."""
+        """The places of the scene's objects."""
         scenes = self.scenes
         return scenes.regions(index) if isinstance(scenes, Panoramas) else Boxes(scenes.annotation(index).boxes)
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """Records of a scene: searches and an exploration, for every way of moving eye and head."""
+        """Run the searches and the exploration of a scene with every way of moving eye and head; returns records."""
         watch, config = Stopwatch(), self.config
         views = Views(self.world(index), config.fields, fovea=self.fovea)
         store = self.store if config.store else None
@@ -161,11 +161,11 @@ class HeadRun(SceneRun):
                     records += self._explorations(index, views, looks)
                 watch.lap("exploration")
         finally:
-            looks.save()  # of a run that is stopped, too
+            looks.save()  # even when the run is stopped
         return records, watch.seconds
 
     def ways(self, gain: Gain, start: int) -> dict[str, Callable[[int], AcquisitionFunction]]:
-        """Every way of moving eye and head, by its name in tables: who moves by it, after an action."""
+        """Every way of moving eye and head, by its name in the tables: its acquisition function after an action."""
         views, config = gain.views, self.config
         pose = start // views.cells
         order = raster(views, pose)
@@ -181,13 +181,13 @@ class HeadRun(SceneRun):
         }
 
     def start(self, index: int, views: Views, what: int) -> int:
-        """First action of the episodes for a target (0: of an exploration): the middle of a view of the tiling."""
+        """First action of the episodes for a target (0: an exploration): the centre of a random view of the tiling."""
         generator = np.random.Generator(np.random.PCG64([self.config.seed, index, what]))
         poses = [*chain(*views.tiling[0])]
         return int(generator.choice(poses)) * views.cells + views.cells // 2 + 5
 
     def targets(self, index: int) -> list[int]:
-        """Classes to search for in a scene."""
+        """The classes to search for in a scene."""
         generator = np.random.Generator(np.random.PCG64([self.config.seed, index]))
         legal = self.scenes.targets(index)
         return sorted(generator.permutation(legal)[: self.config.targets].tolist())
@@ -241,7 +241,7 @@ class HeadRun(SceneRun):
         for name, acquire in self.ways(gain, start).items():
             seconds, success, objects, actions = list[float](), list[float](), list[float](), list[int]()
             for step in self._steps(views, looks, observer, acquire, start, None, index):
-                # What was never seen has no answer, whatever is usual.
+                # A cell that was never seen gets no answer, even if the prior favours a class.
                 told = step.belief.class_probabilities().masked_fill(step.belief.owner[..., None] < 0, 0.0)
                 right = (right_cells(told, answers)[0] * area).sum() / area.sum()
                 besides = (right_cells(told[..., 1:], answers[:, 1:])[0] * area).sum() / area.sum()
@@ -264,13 +264,13 @@ class HeadRun(SceneRun):
 
 
 def turns(steps: list[HeadStep], views: Views) -> int:
-    """How often the head moved."""
+    """Number of times that the head moved."""
     poses = [step.action // views.cells for step in steps]
     return sum(one != other for one, other in pairwise(poses))
 
 
 def raster(views: Views, pose: int) -> list[int]:
-    """Poses that tile the scene in the order of a scan, from a pose on: row by row, every second one backwards."""
+    """The poses that tile the scene in the order of a scan that begins at `pose`: row by row, alternating direction."""
     rows = next(rows for rows in views.tiling if any(pose in row for row in rows))
     snake = [*chain(*(row if n % 2 == 0 else row[::-1] for n, row in enumerate(rows)))]
     at = snake.index(pose)
@@ -278,10 +278,19 @@ def raster(views: Views, pose: int) -> list[int]:
 
 
 def answers_of(views: Views, places: Places, labels: Tensor, classes: int) -> Tensor:
-    """Which classes are right for each cell of the scene, `(S, K+1)` boolean: those of the objects that overlap it.
+    """Which classes are right for each cell of the scene, those of the objects that overlap it.
 
-    A cell and an object overlap where one holds a point of the other, of a grid all over each; cells that no view shows
-    have no answer.
+    A cell and an object overlap if the object contains the cell's centre, or the cell contains one of the points
+    sampled over the object. Cells that no view shows have no answer.
+
+    Args:
+        views: the views of the scene.
+        places: the places of the objects.
+        labels: `(M,)`, the classes of the objects, 1..K.
+        classes: number of classes K.
+
+    Returns:
+        `(S, K+1)` boolean, for the S cells of the scene.
     """
     world = views.world
     samples = places.samples()

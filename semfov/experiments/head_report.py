@@ -1,4 +1,4 @@
-"""Finishing an experiment with a head that turns, and its tables."""
+"""Runs an experiment with a head that turns to its end, and writes its tables and curves."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Measure = Callable[[Record], float]
 
 
 def head(config: HeadConfig) -> None:
-    """Run all scenes that have no part yet, and write tables, records and curves."""
+    """Run all scenes that are not finished yet, and write tables, records and curves."""
     run = HeadRun(config)
     records = complete(run, "looking around")
     if records is None:
@@ -31,12 +31,12 @@ def head(config: HeadConfig) -> None:
 
 
 def measured(records: list[Record], measure: Measure) -> dict[Any, float]:
-    """Mean of a figure of merit in each scene."""
+    """Mean of a measure over the records of each scene."""
     return by_scene((record["scene"], measure(record)) for record in records)
 
 
 def compared(records: list[Record], others: list[Record], measure: Measure) -> tuple[float, float, float, float]:
-    """Mean over scenes and its standard error, and those of the paired differences to others in the same scenes."""
+    """Mean over scenes with its standard error, then mean difference from `others`, paired by scene, with its error."""
     mine, theirs = measured(records, measure), measured(others, measure)
     values = np.array([*mine.values()])
     apart = np.array([value - theirs[scene] for scene, value in mine.items()])
@@ -45,13 +45,13 @@ def compared(records: list[Record], others: list[Record], measure: Measure) -> t
 
 
 def at(record: Record, seconds: float, what: str) -> float:
-    """A figure of an exploration after so many seconds: that of the last look that was over by then; 0 before any."""
+    """The measure `what` of an exploration after the last look that has ended by `seconds`; 0 before the first."""
     done = sum(second <= seconds for second in record["seconds"])
     return float(record[what][done - 1]) if done else 0.0
 
 
 def budgets(config: HeadConfig) -> list[float]:
-    """Seconds at which the tables tell what was reached."""
+    """The times in seconds for which the tables give results."""
     return sorted({second for second in (2.0, 5.0, 10.0) if second < config.seconds} | {config.seconds})
 
 
@@ -89,9 +89,9 @@ def _searching(searches: dict[str, list[Record]], config: HeadConfig, what: str)
         rows.append(row)
     scenes = len({record["scene"] for record in ours})
     return [
-        f"{len(ours)} searches in {scenes} {what}, until the gaze rests on a cell that a target overlaps. One that "
-        f"does not get there within {limit:g} s and {config.passes} passes counts with these. Means over {what} and "
-        "their standard errors; `less ours`: how much more than ours, paired by scene.",
+        f"{len(ours)} searches in {scenes} {what}, each until the gaze rests on a cell that a target overlaps. A "
+        f"search that does not succeed within {limit:g} s and {config.passes} passes counts with these numbers. Means "
+        f"over {what} ± standard errors; `less ours`: difference from ours, paired by scene.",
         "",
         *table(rows),
         "",
@@ -114,9 +114,9 @@ def _exploring(explorations: dict[str, list[Record]], config: HeadConfig, what: 
         looks, _, *_ = compared(group, ours, lambda r: float(len(r["seconds"])))
         rows.append([*row, percent(mean, error), f"{looks:.1f}"])
     return [
-        f"Explorations of {len(ours)} {what}: share of the cells with objects, by area, whose most probable class of "
-        "all, background included, is an object's there, %. `objects alone`: background left out of the answer, after "
-        f"{last:g} s.",
+        f"Explorations of {len(ours)} {what}: percentage of the cells with objects, weighted by area, whose most "
+        "probable class, background included, is that of an object there. `objects alone`: the same without background "
+        f"as an answer, after {last:g} s.",
         "",
         *table(rows),
         "",
@@ -128,8 +128,8 @@ def _curves(records: list[Record], config: HeadConfig):  # type: ignore[no-untyp
 
     seconds = np.linspace(0, config.seconds, 101)
     wanted: dict[str, tuple[str, Callable[..., float]]] = {
-        "search": ("found, share", lambda r, s=0.0: float(r["found"] and r["seconds"] <= s)),
-        "exploration": ("cells named right, share", lambda r, s: at(r, s, "success")),
+        "search": ("share of targets found", lambda r, s=0.0: float(r["found"] and r["seconds"] <= s)),
+        "exploration": ("share of cells named right", lambda r, s: at(r, s, "success")),
     }
     written = []
     for task, (title, measure) in wanted.items():

@@ -1,4 +1,4 @@
-"""Looks of an eye in a head, computed once and kept on disk."""
+"""Stores the looks of an eye in a head, so that each is computed only once."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,12 +14,12 @@ from semfov.io.schema import Field, Schema
 
 
 class HeadStore(SceneStore):
-    """Detections by action.
+    """Detections by action, on disk.
 
     Args:
-        folder: where the store lies.
-        settings: of the eye, and of the views.
-        classes: of the detector.
+        folder: folder of the store.
+        settings: settings of the eye and of the views.
+        classes: number of the detector's classes.
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, object], classes: int) -> None:
@@ -35,7 +35,7 @@ class HeadStore(SceneStore):
         super().__init__(folder, {"settings": settings}, code, schema)
 
     def load(self, digest: str) -> dict[int, Detections]:
-        """Looks at a scene; none where the store does not have them whole."""
+        """The stored looks at a scene; empty if they are missing or incomplete."""
         tensors = self.read(digest)
         if tensors is None or int(tensors["count"].sum()) != len(tensors["boxes"]):
             return {}
@@ -43,25 +43,25 @@ class HeadStore(SceneStore):
         return {action: _tight(seen[n : n + 1]) for n, action in enumerate(tensors["actions"].tolist())}
 
     def save(self, digest: str, looks: Mapping[int, Detections]) -> None:
-        """Keep the looks at a scene."""
+        """Store the looks at a scene."""
         actions = sorted(looks)
         together = Detections.stack([looks[action] for action in actions])
         self.write(digest, {"actions": torch.tensor(actions), **pack(together)})
 
 
 def _tight(look: Detections) -> Detections:
-    """A batch of one without its padding."""
+    """Remove the padding of a batch of one."""
     mask = look.mask[0]
     return Detections(look.boxes[:, mask], look.scores[:, mask], look.mask[:, mask])
 
 
 class StoredLooksAround:
-    """Looks at one scene, each taken once: from a store, or by an eye that is opened when it is first needed.
+    """Looks at one scene, each computed once: read from a store, or taken by an eye that is opened only when needed.
 
     Args:
-        live: opens the scene.
-        store: where looks are kept; None keeps none.
-        digest: of the scene's pixels.
+        live: opens the scene; returns the function that looks.
+        store: store of the looks; None stores none.
+        digest: digest of the scene's pixels.
     """
 
     def __init__(self, live: Callable[[], Detect], store: HeadStore | None, digest: str) -> None:
@@ -73,7 +73,7 @@ class StoredLooksAround:
     _live: Detect | None
 
     def __call__(self, action: int) -> Detections:
-        """What is seen by an action."""
+        """The detections of an action."""
         if action not in self._known:
             with one_thread(), torch.inference_mode():
                 self._live = self._open() if self._live is None else self._live
@@ -81,7 +81,7 @@ class StoredLooksAround:
         return self._known[action]
 
     def save(self) -> None:
-        """Keep what is new."""
+        """Store the looks at the scene if there are new ones."""
         if self._store is not None and len(self._known) > self._kept:
             self._store.save(self._digest, self._known)
             self._kept = len(self._known)

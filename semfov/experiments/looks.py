@@ -1,4 +1,4 @@
-"""The one way in which a look that is kept is computed: the same bits on any number of threads and processes."""
+"""Computes the looks that are stored, bit for bit the same with any number of threads and processes."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from semfov.detection.detections import Detections
 from semfov.eye import Eye
 
 SOURCES = ("semfov.eye", "semfov.detection.load", "semfov.sensor.named", "semfov.data.images", __name__)
-"""Modules that turn an image into detections, with all that they import."""
+"""The modules that turn an image into detections; all modules that they import count, too."""
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Compute on one thread: sums of several differ in their last bits with the number of threads."""
+    """Compute on one thread, because the last bits of a parallel sum depend on the number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -28,11 +28,19 @@ def one_thread() -> Iterator[None]:
 
 
 def look_from(eye: Eye, image: Tensor, points: Tensor) -> Detections:
-    """Detections in `image` `(3, H, W)` from each of the `points` `(F, 2)`, a batch of F.
+    """Look at an image from each of several fixations.
 
-    Views go through the detector one at a time and on one thread: the bits then depend neither on which views share a
-    batch nor on the machine's processors. The eye must have been made on one thread, too (`setup.make_eye`): a
-    session of onnxruntime keeps the threads that it was opened with.
+    The views pass through the detector one at a time and on one thread. The bits then depend neither on which views
+    share a batch nor on the number of CPU cores. The eye must have been made on one thread, too (`setup.make_eye`):
+    a session of onnxruntime keeps the number of threads that it was opened with.
+
+    Args:
+        eye: the eye.
+        image: `(3, H, W)`.
+        points: `(F, 2)`, the fixations in pixels of the image.
+
+    Returns:
+        The detections from each fixation, a batch of F.
     """
     with one_thread(), torch.inference_mode():
         view = eye.open(image[None])

@@ -1,4 +1,4 @@
-"""Work cut into tasks, shared by processes on this machine and, under torchrun, by machines."""
+"""Runs tasks in several processes on this machine and, under torchrun, on several machines."""
 
 import logging
 import multiprocessing
@@ -29,25 +29,24 @@ def rank() -> int:
 
 
 def world() -> int:
-    """How many processes torchrun started, 1 without torchrun."""
+    """Number of processes that torchrun started, 1 without torchrun."""
     return int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def mine(tasks: Sequence[Task]) -> list[Task]:
-    """This rank's share of the tasks: every `world`-th."""
+    """The tasks of this rank: every `world`-th."""
     return list(tasks[rank() :: world()])
 
 
 def wait_for_others(tasks: Sequence[Task], finished: Callable[[Task], bool], *, seconds: float = 1.0) -> None:
-    """Wait until the tasks of all ranks are finished, however long that takes; nothing without torchrun.
+    """Wait until the tasks of all ranks are finished, however long that takes; without torchrun return at once.
 
-    Ranks see each other's results in the folder that they share, and know each other by nothing else. (torchrun ends
-    all of them when one fails.)
+    The ranks communicate only through the results in their shared folder. (torchrun ends all ranks when one fails.)
 
     Args:
-        tasks: all of them.
-        finished: whether the result of a task is there.
-        seconds: between two looks at the folder.
+        tasks: the tasks of all ranks.
+        finished: whether the result of a task exists.
+        seconds: time between two checks of the folder.
     """
     if world() == 1:
         return
@@ -60,14 +59,17 @@ def wait_for_others(tasks: Sequence[Task], finished: Callable[[Task], bool], *, 
 
 
 def available_cores() -> int:
-    """CPU cores that this process may use."""
+    """Number of CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def processor_seconds() -> float:
-    """Seconds that processors have spent on this process and on those that it started and that have ended.
+    """CPU time in seconds of this process and of its child processes that have ended.
 
-    On a busy machine a clock on the wall tells how busy it is, and this how much there was to do.
+    Elapsed time depends on what else the machine is doing; CPU time measures the work of these processes.
+
+    Returns:
+        User and system time together.
     """
     return sum(os.times()[:4])
 
@@ -82,19 +84,22 @@ def run_tasks(
     title: str,
     unit: str,
 ) -> Iterator[Result]:
-    """Yield `function(task)` for every task, in any order, with a progress bar.
+    """Run `function(task)` for every task, and yield the results in any order, with a progress bar.
 
     Args:
-        function: a module-level function; it reads what `setup` left in its module.
-        tasks: what to do.
-        workers: processes; 1 runs everything here.
+        function: a module-level function; it reads the globals that `setup` has set in its module.
+        tasks: the tasks.
+        workers: number of processes; 1 runs all tasks in this process.
         setup: called once in each process with `settings`, before its first task.
         settings: arguments of `setup`.
         title: label of the progress bar.
-        unit: what a task is called there.
+        unit: name of a task in the progress bar.
+
+    Yields:
+        The results, as tasks finish.
 
     Raises:
-        SemfovError: a process died. Errors of a task are raised as they are; either ends all processes.
+        SemfovError: a process died. An error of a task is raised unchanged. Either error ends all processes.
     """
     if not tasks:
         return
@@ -115,27 +120,28 @@ def run_tasks(
                     yield done.result()
                     bar.update()
             except BaseException as error:
-                # Nobody waits for the tasks under way: what they write is whole or not there.
+                # Running tasks may be killed: their files are written atomically, either completely or not at all.
                 for child in set(multiprocessing.active_children()) - set(before):
                     child.terminate()
                 if not isinstance(error, BrokenProcessPool):
                     raise
                 raise SemfovError(
-                    f"{title}: a worker process died (killed, or out of memory); the same command goes on where this "
-                    "one stopped, with --workers 1 in one process"
+                    f"{title}: a worker process died (killed, or out of memory); run the same command again, and it "
+                    "continues where this one stopped, or add --workers 1 to use a single process"
                 ) from None
 
 
 @contextmanager
 def _deaf_children() -> Iterator[None]:
-    """Processes that are started here never hear of Ctrl-C, which reaches all of a terminal: the first ends the others.
+    """Start processes that ignore Ctrl-C.
 
-    They inherit the mask, and so are deaf from their first moment on, before any code of theirs has run.
+    A terminal sends Ctrl-C to all of its processes, but only the main one may handle it; it then ends the others. The
+    children inherit the blocked signal, and so ignore it even before any of their code has run.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    resource_tracker.ensure_running()  # it would lift the mask when it starts
+    resource_tracker.ensure_running()  # if it started later, it would unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -151,16 +157,16 @@ def _prepare(setup: Callable[..., None], settings: tuple[object, ...]) -> None:
 
 
 def _leave(*_: object) -> None:
-    """End now and leave no unfinished file behind."""
+    """Remove unfinished files and end the process at once."""
     discard_unfinished()
     os._exit(128 + signal.SIGTERM)
 
 
 def _outlive_nobody() -> None:
-    """End this worker when the process that started it does, however that came about."""
+    """End this worker when its parent process ends, for whatever reason."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
         os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(2)  # a long operation may keep the handler from running
+        time.sleep(2)  # a long operation may delay the signal handler
         _leave()

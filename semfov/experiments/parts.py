@@ -1,4 +1,4 @@
-"""Outcomes of finished scenes on disk, so that a killed run goes on where it was."""
+"""Outcomes of finished scenes on disk, so that a killed run continues where it stopped."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from semfov.io.files import check_regular, write_text
 from semfov.io.schema import is_number
 
 Record = dict[str, Any]
-"""What is kept of an episode, as JSON values."""
+"""The stored outcome of an episode, made of JSON values."""
 
 
 class Parts:
     """Outcomes of finished scenes, one file each.
 
     Args:
-        folder: that they lie in; those of another run have another folder in it.
-        key: of the run: of its settings and of its code, with a dash between.
-        digest: sha256 of a scene's image, by its number.
+        folder: folder of the outcomes; each run has its own folder in it.
+        key: key of the run: a digest of its settings and a digest of its code, joined by a dash.
+        digest: sha256 of a scene's image, by the scene's number.
     """
 
     def __init__(self, folder: Path, key: str, digest: Callable[[int], str]) -> None:
@@ -30,11 +30,11 @@ class Parts:
         self.digest = digest
 
     def path(self, index: int) -> Path:
-        """File of a scene."""
+        """Path of a scene's file."""
         return self.folder / f"{index:06d}.json"
 
     def load(self, index: int) -> dict[str, Any] | None:
-        """Outcomes of a scene, or None if they are not there whole."""
+        """The outcomes of a scene; None if they are missing or damaged."""
         path = self.path(index)
         try:
             check_regular(path)
@@ -43,17 +43,17 @@ class Parts:
             whole = part["key"] == self.key and part["sha256"] == self._sha256(index, records, seconds)
             formed = isinstance(records, list) and all(isinstance(record, dict) for record in records)
             formed = formed and isinstance(seconds, dict) and all(map(is_number, seconds.values()))
-        except Exception:  # whatever is wrong with it, it can be made again
+        except Exception:  # whatever is wrong with the file, the scene can be run again
             return None
         return part if whole and formed else None
 
     def save(self, index: int, records: list[Record], seconds: dict[str, float]) -> None:
-        """Keep the outcomes of a scene."""
+        """Store the outcomes of a scene."""
         verified = {"key": self.key, "sha256": self._sha256(index, records, seconds)}
         write_text(self.path(index), json.dumps({**verified, "records": records, "seconds": seconds}))
 
     def by_other_code(self) -> int:
-        """How many scenes were finished with the same settings by code that has changed since."""
+        """Number of scenes that were finished with the same settings by another version of the code."""
         settings = self.key.partition("-")[0]
         folders = self.folder.parent.glob(f"{settings}-*")
         return max((len(list(folder.glob("*.json"))) for folder in folders if folder != self.folder), default=0)

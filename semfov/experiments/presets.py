@@ -1,4 +1,4 @@
-"""Policies by name, and what to call one that has no name."""
+"""Presets: policies by name, and labels for policies without a name."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -18,23 +18,23 @@ IVSN = "ivsn"
 SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
 
 WORDS = {"scores": Scores, "footprint": Footprint, "memory": Memory, "saliency": SaliencyModel, "context": Context}
-"""Settings that are one of a few words."""
+"""Settings with a fixed set of values."""
 
 ALIASES = ("recommended", "published")
-"""Presets that tables call otherwise, beside those of `MAXIMUM_A_POSTERIORI`."""
+"""Presets that have another name in tables, like those of `MAXIMUM_A_POSTERIORI`."""
 
 MAXIMUM_A_POSTERIORI = "maximum-a-posteriori"
-"""What Najemnik and Geisler (2005) call the searcher that fixates where the target is most probable."""
+"""Name of Najemnik and Geisler (2005) for the searcher that fixates where the target is most probable."""
 
 OF_THE_MAP = ("tempering", "footprint", "memory", "misses")
 """Settings of the map of all classes."""
 
 Choice = str | PolicyConfig
-"""A policy as settings have it: the name of a preset, or its settings."""
+"""A policy as given in the settings of a run: the name of a preset, or a `PolicyConfig`."""
 
 
 def known_policies(task: Task) -> list[str]:
-    """Names that `PolicyConfig.policy` may have."""
+    """The values that `PolicyConfig.policy` may have."""
     own = [SALIENCY, TARGET_EVIDENCE, IVSN] if task == "search" else [SALIENCY]
     return [*policy_names(task), *own]
 
@@ -78,6 +78,13 @@ def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig
 def resolve(choice: Choice, task: Task) -> PolicyConfig:
     """The settings of a policy.
 
+    Args:
+        choice: the name of a preset, or settings.
+        task: what the policy is for.
+
+    Returns:
+        The settings.
+
     Raises:
         InputError: there is no such preset, no such policy, or its settings contradict each other.
     """
@@ -85,11 +92,12 @@ def resolve(choice: Choice, task: Task) -> PolicyConfig:
     if isinstance(choice, str):
         if choice[:1] in ("[", "{"):
             settings = ", ".join(field.name for field in fields(PolicyConfig))
-            raise InputError(f"policies: expected names of presets, or mappings with {settings}; got {choice}")
+            raise InputError(f"policies: expected names of presets, or mappings with the keys {settings}; got {choice}")
         return known[lookup(choice, known, "policy")]
     lookup(choice.policy, known_policies(task), "policy")
     if choice.policy == SALIENCY and choice.saliency is None:
-        raise InputError(f"saliency: expected a saliency model for policy 'saliency' ({', '.join(SALIENCY_MODELS)})")
+        models = ", ".join(SALIENCY_MODELS)
+        raise InputError(f"saliency: expected a saliency model ({models}) for policy 'saliency', got none")
     for setting, words in WORDS.items():
         if getattr(choice, setting) is not None:
             lookup(getattr(choice, setting), get_args(words), setting)
@@ -103,12 +111,22 @@ def resolve(choice: Choice, task: Task) -> PolicyConfig:
     if own or (choice.policy in POLICIES and POLICIES[choice.policy].needs_gaze):
         given = next((setting for setting in OF_THE_MAP if getattr(choice, setting) is not None), None)
         if given is not None:
-            raise InputError(f"{given}: expected none, for policy {choice.policy!r} comes with its own belief")
+            raise InputError(
+                f"{given}: expected null, since policy {choice.policy!r} with {choice.scores!r} scores has its own "
+                f"belief, got {getattr(choice, given)!r}"
+            )
     return choice
 
 
 def label(choice: Choice, task: Task) -> str:
-    """What tables call a policy: the preset that is nearest to it, and what differs from that.
+    """The name of a policy in tables: the preset that it is based on, and the settings that differ from it.
+
+    Args:
+        choice: the name of a preset, or settings.
+        task: what the policy is for.
+
+    Returns:
+        The name.
 
     >>> label(PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre"), "search")
     'non-predictive-raw, tempering 0.25, footprint box_centre'
@@ -131,6 +149,6 @@ def label(choice: Choice, task: Task) -> str:
 
 
 def _scored(policy: PolicyConfig, task: Task, scores: Scores) -> bool:
-    """Whether a preset of this policy takes such scores."""
+    """Whether there is a preset of this policy with these scores."""
     saliency = policy.saliency if policy.policy == SALIENCY else None
     return PolicyConfig(policy.policy, scores, saliency=saliency) in presets(task).values()

@@ -1,4 +1,4 @@
-"""Progress of work: a bar for each task, or one bar over the whole of several."""
+"""Progress bars: one for each task, or a single one for several tasks together."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ _whole: ContextVar[Whole | None] = ContextVar("whole", default=None)
 
 
 class Bar(Protocol):
-    """What shows how far a task has come."""
+    """Shows the progress of a task."""
 
     def update(self, n: float = 1) -> object:
-        """So many more units are done."""
+        """Count `n` more units as done."""
 
     def set_postfix(self, **told: object) -> None:
         """Show values beside the bar."""
 
     def close(self) -> None:
-        """The task is over."""
+        """End the task."""
 
 
 class Whole:
-    """One bar over stages that take different times, each of them made of tasks.
+    """One bar for several stages of different duration, each of which consists of tasks.
 
-    While it is open, tasks that `track` or `task_bar` would give a bar of their own move this one.
+    While it is open, `track` and `task_bar` move this bar instead of opening a bar for each task.
 
     Args:
         title: label of the bar.
-        stages: for each stage, in order, about how long each of its tasks takes, by the titles of the tasks; what
-            counts is how these compare. A task of another title moves nothing.
+        stages: for each stage, in order, the approximate durations of its tasks by their titles. Only their ratios
+            matter. A task with another title does not move the bar.
 
     >>> with Whole("all", {"one": {"half": 1, "rest": 1}, "two": {"x": 2}}) as whole:
     ...     with whole.stage("one"):
@@ -55,12 +55,12 @@ class Whole:
 
     @property
     def done(self) -> float:
-        """Share of the whole that is done."""
+        """The share of the work that is done."""
         return self._at / self._total
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Work on a stage; with its end all of it is done, whatever its tasks have told."""
+        """Work on a stage; at its end it counts as done, whatever its tasks have reported."""
         before = 0.0
         for other, tasks in self.stages.items():
             if other == name:
@@ -73,7 +73,7 @@ class Whole:
         self._move(before + sum(self.stages[name].values()))
 
     def task(self, title: str, total: float) -> Bar:
-        """What moves the bar for a task of this title."""
+        """A task with this title, which moves the bar."""
         return _Task(self, self._tasks.pop(title, 0.0) / max(total, 1))
 
     def _move(self, to: float) -> None:
@@ -90,7 +90,7 @@ class Whole:
 
 
 class _Task:
-    """A part of the whole."""
+    """A task that moves the bar of a `Whole`."""
 
     def __init__(self, whole: Whole, step: float) -> None:
         self._whole, self._step = whole, step
@@ -99,20 +99,23 @@ class _Task:
         self._whole._move(self._whole._at + n * self._step)
 
     def set_postfix(self, **told: object) -> None:
-        """Nothing: what a task tells says nothing of the whole."""
+        """Show nothing: values of one task say nothing about the whole."""
 
     def close(self) -> None:
-        """Nothing."""
+        """Do nothing: the bar stays open for other tasks."""
 
 
 def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> Bar:
-    """A bar for a task, or what moves the bar of the whole where one is open.
+    """A bar for a task; if a `Whole` is open, the task moves its bar instead.
 
     Args:
-        total: units of the task.
-        title: what it is called.
-        unit: what a unit is called.
+        total: number of units of the task.
+        title: title of the task.
+        unit: name of a unit.
         hidden: show nothing.
+
+    Returns:
+        The bar.
     """
     whole = _whole.get()
     if whole is not None:
@@ -123,7 +126,7 @@ def task_bar(total: float, title: str, unit: str, *, hidden: bool = False) -> Ba
 
 
 def track(items: Iterable[Item], title: str, unit: str) -> Iterator[Item]:
-    """The items, with a bar that moves as they are taken (`task_bar`)."""
+    """Iterate over items and show a bar that moves with them (`task_bar`)."""
     listed = list(items)
     bar = task_bar(len(listed), title, unit)
     try:

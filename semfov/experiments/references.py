@@ -1,4 +1,4 @@
-"""What a map is held against: one sharp look at the whole picture by the same detector."""
+"""Reference maps for explorations: one sharp look at the whole picture with the same detector."""
 
 from collections.abc import Mapping
 
@@ -11,20 +11,23 @@ from semfov.detection.detections import Detections
 
 FUSED, PAINTED = "one sharp look, fused", "one sharp look, boxes"
 
-# Of 0.2, 0.3 and 0.4 the score that named most cells right, background an answer, on photographs to learn from.
+# Among 0.2, 0.3 and 0.4, the score that named most cells right on the fit set, with background as an answer.
 _SURE = 0.2
 
 
 def sharp_maps(sharp: Detections, grid: Grid) -> Mapping[str, Tensor]:
-    """Maps that one look at the whole picture gives, `(1, X·Y, K+1)`, by the name that tables have for them.
+    """Maps of what is where from one sharp look at the whole picture.
 
-    - fused: scores are likelihoods, fused by Kaplan's rule from a uniform prior, as published.
-    - boxes: every cell that a box overlaps gets its scores, the highest ones where boxes share it; background where
-      none is higher than 0.2.
+    - fused: scores are used as likelihoods and fused by Kaplan's rule from a uniform prior, as published.
+    - boxes: every cell gets the scores of the boxes that overlap it, class by class the highest; its answer is
+      background where no score is higher than 0.2.
 
     Args:
-        sharp: what the detector sees, a batch of one.
-        grid: the cells.
+        sharp: detections in the sharp picture, a batch of one.
+        grid: the grid over the picture.
+
+    Returns:
+        Maps `(1, X·Y, K+1)` by their names in tables.
     """
     observer = Semantic(sharp.scores.shape[-1])
     middle = grid.centres.to(sharp.scores).mean(0, keepdim=True)

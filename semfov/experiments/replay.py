@@ -1,4 +1,4 @@
-"""Recorded episodes once more, with what was seen and believed at each fixation."""
+"""Replays recorded episodes, with the detections and the belief at each fixation."""
 
 from dataclasses import replace
 
@@ -15,15 +15,19 @@ from semfov.scanpath import Scanpath, trace
 
 
 def replay(run: Run, index: int, record: Record) -> Scanpath:
-    """The scanpath of a recorded episode.
+    """Replay a recorded episode.
 
-    A belief about the target alone tells nothing of other classes: the recommended agent's map is kept beside it, or,
-    where none is learned for the eye, one by Kaplan's rule from tempered scores.
+    A belief about the target alone says nothing about other classes. A map of all classes is then maintained beside it:
+    the learned map of the recommended agent or, if none is shipped for the eye, a map by Kaplan's rule from tempered
+    scores.
 
     Args:
-        run: that the record is of.
-        index: of the scene.
-        record: from `episodes.jsonl`.
+        run: the run that made the record.
+        index: index of the scene.
+        record: a record of `episodes.jsonl`.
+
+    Returns:
+        The scanpath.
     """
     grid, candidate = run.grid(index), run.candidate(record["policy"], index)
     cue = record.get("cue")
@@ -43,7 +47,7 @@ def replay(run: Run, index: int, record: Record) -> Scanpath:
     with torch.no_grad():
         scanpath = trace(steps, grid, ("background", *run.scenes.classes), cue, beside)
     found = record.get("found_at", -1) >= 0
-    # How long it takes to read a store is no time of the eye's.
+    # The time to read the store is not the duration of the episode.
     return replace(scanpath, target=record.get("target"), found=found, seconds=())
 
 

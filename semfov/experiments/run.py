@@ -1,4 +1,4 @@
-"""An experiment over scenes, one at a time: what it is made of, and finishing it wherever it was stopped."""
+"""An experiment over scenes, run one scene at a time; a stopped run can be continued."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ _log = logging.getLogger(__name__)
 
 
 class SceneRun(ABC):
-    """An experiment that is made of its settings alone, in any process, and whose scenes are finished one by one.
+    """Base of experiments that any process can build from the settings and that are run scene by scene.
 
     Attributes:
-        config: settings.
-        scenes: in their order.
+        config: the settings.
+        scenes: the scenes in order.
         settings_key: sha256 of all settings, models and scenes that the outcomes depend on.
-        code: sha256 of all code that they depend on.
-        key: of both; parts of another run are never mixed in.
+        code: sha256 of all code that the outcomes depend on.
+        key: short key of both; it keeps the outcomes of different runs apart.
     """
 
     config: Any
     scenes: Scenes
 
     def make_key(self) -> None:
-        """Set the keys from what the run is made of; asked for again where a subclass makes more of it."""
+        """Compute the keys from settings, models and scenes; a subclass that adds models calls this again."""
         self.settings_key, self.code = self._key(), self._code()
         self.key = f"{self.settings_key[:16]}-{self.code[:16]}"
 
@@ -57,12 +57,12 @@ class SceneRun(ABC):
     def _key(self) -> str: ...
 
     def _code(self) -> str:
-        """Of the whole package and the libraries below it."""
+        """Digest of the whole package and of the versions of the libraries that it uses."""
         return digest_of([package_digest(), versions()])
 
     @property
     def parts(self) -> Parts:
-        """Outcomes of finished scenes."""
+        """The outcomes of finished scenes."""
         return Parts(self.config.out / "parts", self.key, self.digest)
 
     def digest(self, index: int) -> str:
@@ -71,15 +71,15 @@ class SceneRun(ABC):
 
     @abstractmethod
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """Records of a scene, and the seconds that they took."""
+        """Run the episodes of a scene; returns their records, and the seconds that each stage took."""
 
 
 class Run(SceneRun):
-    """Everything that a run is made of, built from its settings in each process.
+    """Scenes, eye, models and policies of a run; every process builds its own from the settings.
 
     Attributes:
-        task: what episodes are for.
-        policies: settings of the policies under comparison, by what tables call them.
+        task: the task of the episodes.
+        policies: settings of the policies under comparison, by their names in tables.
     """
 
     task: ClassVar[Task]
@@ -89,13 +89,13 @@ class Run(SceneRun):
         self.config = config
         labels = [label(choice, self.task) for choice in config.policies]
         for name in labels:
-            check(labels.count(name) == 1, "policies", "each of them once", f"{name!r} {labels.count(name)} times")
+            check(labels.count(name) == 1, "policies", "each policy once", f"{name!r} {labels.count(name)} times")
         self.policies = {name: resolve(choice, self.task) for name, choice in zip(labels, config.policies, strict=True)}
         self.check_sources()
         self.eye = make_eye(config.detector, config.sensor)
         self.scenes: Scenes = self.open_scenes()
         if not len(self.scenes):
-            raise DataError("data: no scene passes the selection; lower data.min_instances or raise data.limit")
+            raise DataError("data: the settings select no scene; lower data.min_instances or raise data.limit")
         self.models = load_models(config, self.task, self.eye)
         components, fovea = len(self.scenes.classes) + 1, config.sensor.fovea
         self.strategies = {
@@ -114,15 +114,15 @@ class Run(SceneRun):
         self._digests: dict[int, str] = {}
 
     def check_sources(self) -> None:
-        """Raise an error where what the run looks at, or its detector, is not there, before any of it is loaded."""
+        """Check that the files of the scenes and of the detector exist, before any of them is loaded."""
         check_sources(self.config.data, self.config.detector)
 
     def open_scenes(self) -> Scenes:
-        """The scenes of the run; a subclass may have others."""
+        """Open the scenes of the run; a subclass may open others."""
         return make_scenes(self.config.data, self.eye.detector.classes)
 
     def _code(self) -> str:
-        """Of the whole package and the libraries below it, and of policies that the user registered."""
+        """Digest of the whole package, of the versions of its libraries, and of policies that the user registered."""
         chosen = {policy.policy for policy in self.policies.values()} & POLICIES.keys()
         foreign = [name for name in sorted(chosen) if not POLICIES[name].__module__.startswith("semfov.")]
         return digest_of([package_digest(), versions(), [class_digest(POLICIES[name]) for name in foreign]])
@@ -159,10 +159,10 @@ class Run(SceneRun):
 
     @abstractmethod
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """Records of all episodes of a scene under all policies, and the seconds that they took."""
+        """Run all episodes of a scene with all policies; returns records, and the seconds that each stage took."""
 
     def candidate(self, name: str, index: int) -> Candidate:
-        """The policy that tables call `name`, in a scene."""
+        """The policy of this name in tables, for a scene."""
         policy = self.policies[lookup(name, self.policies, "policy of this run")]
         if policy.policy == IVSN:
             fovea = self.config.sensor.fovea
@@ -177,7 +177,7 @@ class Run(SceneRun):
         return Grid(self.config.belief.columns, self.config.belief.rows, self.scenes.annotation(index).size)
 
     def detections(self, index: int) -> Detections:
-        """What is seen from every cell of a scene, from the store or computed (and kept)."""
+        """Detections from every cell of a scene, read from the store, or computed and stored."""
         digest = self.digest(index)
         seen = self.store.load(digest) if self.config.store else None
         if seen is None:
@@ -187,12 +187,12 @@ class Run(SceneRun):
         return seen
 
     def attention(self, index: int) -> Tensor:
-        """Attention to all classes in the cells of a scene, seen from every cell; computed whenever it is asked for."""
+        """Attention to every class in the cells of a scene, from every cell; computed at each call, never stored."""
         assert self.models.templates is not None
         return attend_all(self.eye, self.models.templates, self.scenes[index].image, self.grid(index))
 
     def saliency(self, name: SaliencyModel, index: int) -> Tensor:
-        """Saliency of the cells of a scene (`saliency_table`), from the store or computed (and kept)."""
+        """Saliency of the cells of a scene (`saliency_table`), read from the store, or computed and stored."""
         digest, store = self.digest(index), self.saliency_stores[name]
         saliency = store.load(digest) if self.config.store else None
         if saliency is None:
@@ -214,14 +214,14 @@ def cache_folder(chosen: Path | None) -> Path:
 
 
 def finish(run: SceneRun, title: str) -> None:
-    """Run all scenes that have no part yet, this rank its share of them, and wait for the other ranks."""
+    """Run this rank's share of the scenes that are not finished yet, and wait for the other ranks."""
     parts = run.parts
     todo = [index for index in mine(range(len(run.scenes))) if parts.load(index) is None]
     older = parts.by_other_code()
     if todo and older:
         _log.warning(
-            "%s: %d scenes were finished with these settings by other code (this package or a library has changed "
-            "since); they are not used, and computed anew",
+            "%s: %d scenes were finished with these settings by another version of the code (semfov or a library has "
+            "changed since); they are computed anew",
             run.config.out,
             older,
         )
@@ -240,7 +240,7 @@ def finish(run: SceneRun, title: str) -> None:
 
 
 def digest_of(what: object) -> str:
-    """sha256 of JSON values."""
+    """The sha256 of a JSON value."""
     return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
 
@@ -248,13 +248,13 @@ _process: dict[str, SceneRun] = {}
 
 
 def prepare_process(make: Callable[[Any], SceneRun], config: Any) -> None:
-    """Build the run once in this process."""
+    """Build the run in this process, once."""
     prepare_worker()
     _process["run"] = make(config)
 
 
 def finish_scene(index: int) -> int:
-    """Run all episodes of a scene and keep their outcomes as a part; returns the scene."""
+    """Run all episodes of a scene and store their outcomes; returns the index of the scene."""
     run = _process["run"]
     records, seconds = run.outcomes(index)
     run.parts.save(index, records, seconds)

@@ -1,4 +1,4 @@
-"""The page of a whole run: its curves, its tables, and some of its episodes to step through."""
+"""The HTML page of a run: curves, tables, and some episodes to step through."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from semfov.report.page import write_page
 from semfov.viz.views import foveated_views
 
 WHERE = ("out", "cache", "workers")
-"""Settings of where and how a run was made, on which nothing on the page depends."""
+"""Settings of folders and processes, which do not change the results and are left out of the page."""
 
 LIMIT = 4_500_000
-"""No further episode is added to a page that is as large as this, in bytes."""
+"""Size of a page in bytes from which no further episode is added."""
 
 
 def write_run_report(
@@ -39,17 +39,20 @@ def write_run_report(
     others: Mapping[str, Array] | None = None,
     episodes: int = 18,
 ) -> Path:
-    """Write `report.html` to the folder of a run, and return its path.
+    """Write `report.html` to the folder of a run.
 
     Args:
         run: the finished run.
-        records: of its episodes.
-        curves: by average and policy.
-        titles: of the averages, in words.
-        label: what the curves show, in percent.
-        shifts: gaze shifts at which the tables show them.
-        others: curves of the first average that no policy made.
-        episodes: at least this many to step through, where the page does not grow too large.
+        records: the records of its episodes.
+        curves: curves by average and policy.
+        titles: descriptions of the averages.
+        label: the quantity that the curves show, in percent.
+        shifts: gaze shifts for which the tables give values.
+        others: reference curves of the first average that belong to no policy.
+        episodes: show at least this many episodes, unless the page grows too large.
+
+    Returns:
+        The path of the page.
     """
     sections = []
     for order, (average, policies) in enumerate(curves.items()):
@@ -74,9 +77,17 @@ def write_run_report(
 
 
 def choose_episodes(records: list[Record], policies: Sequence[str], count: int) -> list[Record]:
-    """Records to show: the same episode under all policies side by side, of as many scenes as `count` allows.
+    """Choose records to show: in each scene the same episode with all policies side by side.
 
-    Of each scene the first start is taken, with the commonest target.
+    The episode of a scene is the one from the first start, in searches for the commonest target.
+
+    Args:
+        records: the records of all episodes.
+        policies: the policies in the order in which they are shown.
+        count: scenes are added until there are at least this many records.
+
+    Returns:
+        The chosen records.
     """
     order = {policy: number for number, policy in enumerate(policies)}
     groups: dict[Any, list[Record]] = defaultdict(list)

@@ -1,4 +1,4 @@
-"""The unit of work of each experiment: one scene, from photograph to outcomes of all policies."""
+"""The two experiments, search and exploration: all policies in one scene, from the photograph to the records."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class SearchRun(Run):
     config: SearchConfig
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """Records of all searches of a scene under all policies, and the seconds that they took."""
+        """Run all searches of a scene with all policies; returns records, and the seconds that each stage took."""
         config, protocol = self.config, self.config.protocol
         episodes = episodes_of(self.scenes, index, config.belief.columns, config.belief.rows, protocol)
         watch = Stopwatch()
@@ -74,7 +74,7 @@ class ExploreRun(Run):
     config: ExploreConfig
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """Records of all explorations of a scene under all policies, and the seconds that they took."""
+        """Run all explorations of a scene with all policies; returns records, and the seconds that each stage took."""
         protocol = self.config.protocol
         watch = Stopwatch()
         records: list[Record] = []

@@ -1,4 +1,4 @@
-"""Saliency of every cell of a scene, from every fixation or once for the whole photograph."""
+"""Stores the saliency of every cell of a scene, from every fixation or once for the whole photograph."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from semfov.sensor import Bands, Foveation
 Model = Callable[[Tensor], Tensor]
 
 SOURCES = ("semfov.gaze.saliency", "semfov.belief.grid", __name__)
-"""Modules that saliency depends on beside those of a look."""
+"""Modules that saliency depends on, in addition to those of a look."""
 
 SALIENCY_MODELS: dict[str, Callable[[], Model]] = {"vocus2": VOCUS2, "itti-koch": IttiKoch}
 
 
 class SaliencyStore(SceneStore):
-    """Saliency of a scene's cells, `(F, X·Y)` with F = X·Y fixations or 1.
+    """Saliency of a scene's cells on disk, `(F, X·Y)` for F = X·Y fixations, or F = 1 for the whole photograph.
 
     Args:
-        folder: where the store lies.
-        name: of the model.
-        saliency: settings of the baselines.
-        sensor: settings of the sensor; what the whole photograph shows does not depend on them.
+        folder: folder of the store.
+        name: name of the saliency model.
+        saliency: settings of the saliency baselines.
+        sensor: settings of the sensor; the saliency of the whole photograph does not depend on them.
         grid: `(columns, rows)`.
     """
 
@@ -53,29 +53,33 @@ class SaliencyStore(SceneStore):
         self.fixations = cells if saliency.view == "foveated" else 1
 
     def load(self, digest: str) -> Tensor | None:
-        """Saliency of a scene, or None if the store does not have it whole."""
+        """The saliency of a scene; None if it is missing or incomplete."""
         tensors = self.read(digest)
         return None if tensors is None or len(tensors["saliency"]) != self.fixations else tensors["saliency"]
 
     def save(self, digest: str, saliency: Tensor) -> None:
-        """Keep the saliency of a scene."""
+        """Store the saliency of a scene."""
         self.write(digest, {"saliency": saliency})
 
 
 def saliency_table(
     name: str, saliency: SaliencyConfig, sensor: Foveation, reference: float, image: Tensor, grid: Grid
 ) -> Tensor:
-    """Saliency of every cell: seen from the centre of every cell `(X·Y, X·Y)`, or of the photograph `(1, X·Y)`.
+    """Saliency of every cell of a photograph.
 
-    No detector has a part in it: the sensor is shown the photograph at the size that its σ is meant for.
+    It does not depend on a detector: the photograph is resized so that its longer side is `reference`, the size for
+    which the sensor's σ is given.
 
     Args:
-        name: of the model.
-        saliency: settings of the baselines.
-        sensor: what the photograph is seen through.
-        reference: longer side in pixels that the sensor's σ is meant for.
+        name: name of the saliency model.
+        saliency: settings of the saliency baselines.
+        sensor: the foveal sensor.
+        reference: longer side in pixels of the images for which the sensor's σ is given.
         image: `(3, H, W)`.
-        grid: the grid over it.
+        grid: the grid over the image.
+
+    Returns:
+        `(X·Y, X·Y)`, a row for the view from the centre of each cell, or `(1, X·Y)` for the whole photograph.
     """
     model = SALIENCY_MODELS[name]()
     with one_thread(), torch.inference_mode():
@@ -87,7 +91,7 @@ def saliency_table(
 
 
 def seen_by(sensor: Foveation, reference: float, image: Tensor, points: Tensor) -> tuple[Bands, Tensor]:
-    """Pyramid of a photograph `(3, H, W)` whose longer side is made `reference`, and `points` `(F, 2)` of it there."""
+    """Pyramid of a photograph `(3, H, W)` resized to a longer side of `reference`, and its `points` `(F, 2)` there."""
     scale = reference / max(image.shape[-2:])
     size = round(image.shape[-1] * scale), round(image.shape[-2] * scale)
     ratio = points.new_tensor(size) / points.new_tensor((image.shape[-1], image.shape[-2]))

@@ -1,4 +1,4 @@
-"""Labelled detections: what the detector scored, how far from the fovea, and what was really there."""
+"""Labelled detections: the detector's scores, the distance from the fixation, and the true class."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class Samples:
     Attributes:
         boxes: `(M, 4)`, in pixels of the image.
         scores: `(M, K+1)`, score vectors.
-        distance: `(M,)`, from the box's centre to the fixation, in longer sides of the image.
-        labels: `(M,)`, true classes, 0 where a detection shows no object.
+        distance: `(M,)`, distance of the box's centre from the fixation, as a fraction of the image's longer side.
+        labels: `(M,)`, true classes, 0 where a detection matches no object.
         look: `(M,)`, the look that a detection belongs to, an index into `scenes` and `fixations`.
-        scenes: `(R,)`, index of the scene that each look was at; a look may have seen nothing.
-        fixations: `(R, 2)`, where each look was fixated; with the magnification `(R, 3)` where windows were looked at.
+        scenes: `(R,)`, index of the scene of each look; a look may have no detections.
+        fixations: `(R, 2)`, the fixation of each look; for glimpses of large pictures `(R, 3)`, with the magnification.
     """
 
     boxes: Tensor
@@ -56,7 +56,7 @@ class Samples:
         return len(self.labels)
 
     def __getitem__(self, index: Tensor) -> Samples:
-        """Some of the detections; the looks stay."""
+        """Select detections; all looks are kept."""
         chosen = {name: getattr(self, name)[index] for name in _DETECTIONS}
         return Samples(**chosen, scenes=self.scenes, fixations=self.fixations)
 
@@ -66,7 +66,7 @@ class Samples:
         return self.scenes[self.look]
 
     def seen(self, looks: slice) -> Detections:
-        """What successive looks saw, a batch of them."""
+        """The detections of successive looks, as a batch."""
         numbers = torch.arange(looks.start, looks.stop + 1)
         bounds = torch.searchsorted(self.look, numbers).tolist()
         return Detections.stack([self._view(slice(a, b)) for a, b in itertools.pairwise(bounds)])
@@ -78,14 +78,17 @@ class Samples:
     @classmethod
     @torch.inference_mode()
     def of(cls, seen: Detections, fixations: Tensor, annotation: Annotation, index: int, iou: float) -> Samples:
-        """Labelled detections of the looks at one scene.
+        """Label the detections of the looks at one scene.
 
         Args:
-            seen: a batch of R looks.
-            fixations: `(R, 2)`, where they were fixated.
-            annotation: what is really there.
-            index: of the scene.
-            iou: overlap from which a detection shows an object.
+            seen: the detections, a batch of R looks.
+            fixations: `(R, 2)`, the fixation of each look.
+            annotation: the scene's annotated objects.
+            index: index of the scene.
+            iou: smallest intersection over union at which a detection matches an object.
+
+        Returns:
+            The labelled detections.
         """
         labels = [
             match(boxes[mask], annotation.boxes, annotation.labels, iou=iou)
@@ -103,7 +106,7 @@ class Samples:
 
     @classmethod
     def join(cls, parts: list[Samples]) -> Samples:
-        """All samples of several sets, in order."""
+        """Concatenate several sets of samples in order."""
         joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in _NAMES}
         counts = torch.tensor([len(part.scenes) for part in parts])
         first = (counts.cumsum(0) - counts).repeat_interleave(torch.tensor([len(part) for part in parts]))
@@ -114,21 +117,21 @@ _DETECTIONS = ("boxes", "scores", "distance", "labels", "look")
 _NAMES = (*_DETECTIONS, "scenes", "fixations")
 
 SOURCES = ("semfov.observation.matching", "semfov.belief.grid", "semfov.experiments.seeds")
-"""Modules that samples depend on beside those of a look."""
+"""Modules that samples depend on, in addition to those of a look."""
 
 
 @dataclass(frozen=True)
 class SampleSettings:
-    """What labelled detections depend on.
+    """Settings that labelled detections depend on.
 
     Attributes:
         data: the photographs.
-        detector: which detector looks through the fovea.
+        detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        fixations: random fixations in each photograph, uniform over its pixels.
-        iou: overlap from which a detection shows an object.
-        seed: of the fixations.
-        shard: photographs in a shard, the unit of work.
+        fixations: number of random fixations in each photograph, uniform over its pixels.
+        iou: smallest intersection over union at which a detection matches an object.
+        seed: random seed of the fixations.
+        shard: number of photographs in a shard, the unit of work.
     """
 
     data: DataConfig
@@ -141,20 +144,21 @@ class SampleSettings:
 
     @classmethod
     def of(cls, config: Any) -> SampleSettings:
-        """Those of a command, whose settings have the same names."""
+        """Take these settings from those of a command, by their names."""
         return cls(**{field.name: getattr(config, field.name) for field in fields(cls)})
 
     def sampler(self) -> Sampler:
-        """What looks."""
+        """The sampler with these settings."""
         return Sampler(self)
 
 
 Cells = Callable[[tuple[int, int], Tensor], tuple[Grid, Tensor, Tensor]]
-"""From an image's size and a fixation: cells to count misses in, how far each is, `(X·Y,)`, and which are shown."""
+"""Maps an image's size and a fixation to a grid for counting misses, to the distance of each cell from the fixation
+`(X·Y,)` (for windows, the octaves of reduction), and to which cells the look shows, `(X·Y,)`."""
 
 
 def cells_of(columns: int, rows: int) -> Cells:
-    """Cells of whole photographs, all of which every look shows, at their distances from the fixation."""
+    """A grid over whole photographs: every look shows all cells, at their distances from the fixation."""
 
     def cells(size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
         grid = Grid(columns, rows, size)
@@ -164,12 +168,12 @@ def cells_of(columns: int, rows: int) -> Cells:
 
 
 class Sampler:
-    """Looks at photographs from random fixations; one shard is a run of successive photographs.
+    """Looks at photographs from random fixations, shard by shard; a shard is a range of successive photographs.
 
     Attributes:
         key: sha256 of everything that the samples depend on.
-        sources: modules that samples depend on, with all that they import.
-        coordinates: of a fixation.
+        sources: modules that samples depend on; all modules that they import count, too.
+        coordinates: number of coordinates of a fixation.
     """
 
     sources: ClassVar[tuple[str, ...]] = SOURCES
@@ -196,36 +200,36 @@ class Sampler:
         )
 
     def make(self) -> tuple[Eye | ZoomEye, Scenes]:
-        """What looks, and at what."""
+        """Make the eye and open the scenes."""
         eye = make_eye(self.settings.detector, self.settings.sensor)
         return eye, make_scenes(self.settings.data, eye.detector.classes)
 
     def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
-        """Where misses are counted (`Cells`)."""
+        """The cells in which misses are counted (`Cells`)."""
         return cells_of(10, 10)(size, fixation)
 
     @property
     def foveal_eye(self) -> Eye:
-        """The eye, where it looks through a fovea."""
+        """The eye, which must be a foveal one."""
         assert isinstance(self.eye, Eye)
         return self.eye
 
     @property
     def shards(self) -> range:
-        """Numbers of the shards."""
+        """The numbers of the shards."""
         return range(-(-len(self.scenes) // self.settings.shard))
 
     def path(self, folder: Path, shard: int) -> Path:
-        """File of a shard."""
+        """Path of a shard's file."""
         return folder / self.key[:16] / f"{shard:06d}.safetensors"
 
     def load(self, folder: Path, shard: int) -> Samples | None:
-        """Samples of a shard, or None if they are not there whole."""
+        """The samples of a shard; None if they are missing or damaged."""
         tensors = read_tensors(self.path(folder, shard), self._shard_key(shard), self._schema)
         return None if tensors is None else Samples(**tensors)
 
     def save(self, folder: Path, shard: int, samples: Samples) -> None:
-        """Keep the samples of a shard."""
+        """Store the samples of a shard."""
         tensors = {name: getattr(samples, name) for name in _NAMES}
         write_tensors(self.path(folder, shard), self._shard_key(shard), tensors)
 
@@ -235,12 +239,12 @@ class Sampler:
         return range(first, min(first + self.settings.shard, len(self.scenes)))
 
     def _shard_key(self, shard: int) -> str:
-        """Of what a shard depends on, the pixels of its photographs among it."""
+        """Digest of everything that a shard depends on, including the pixels of its photographs."""
         digests = [self.scenes.digest(index) for index in self.scenes_of(shard)]
         return hashlib.sha256(json.dumps([self.key, digests]).encode()).hexdigest()
 
     def sample(self, shard: int) -> Samples:
-        """Look at the photographs of a shard."""
+        """Look at the photographs of a shard; returns the labelled detections."""
         return Samples.join([self._look(index) for index in self.scenes_of(shard)])
 
     def _look(self, index: int) -> Samples:
@@ -267,9 +271,21 @@ def _run_shard(shard: int) -> int:
 
 
 def collect(settings: SampleSettings, folder: Path, workers: int | None, title: str) -> tuple[Sampler, Samples]:
-    """Labelled detections of all photographs, in order; finished shards are read back, the others computed.
+    """Collect the labelled detections of all photographs in order; finished shards are read, the others computed.
 
     The result is the same to the last bit for any number of workers and ranks.
+
+    Args:
+        settings: the settings of the samples.
+        folder: folder of the shards.
+        workers: number of processes (None: one per CPU core).
+        title: label of the progress bar.
+
+    Returns:
+        The sampler and the samples.
+
+    Raises:
+        DataError: the file of a shard is missing or damaged.
     """
     sampler = settings.sampler()
     todo = [shard for shard in mine(sampler.shards) if sampler.load(folder, shard) is None]

@@ -1,4 +1,4 @@
-"""The protocol of searches: which episodes there are, and what comes of them."""
+"""The protocol of searches: the episodes of a scene, and their results."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ from semfov.gaze.choice import Greedy, drawn_from
 
 @dataclass(frozen=True)
 class Episode:
-    """One search: a target class in a scene, from a start.
+    """One search for a target class in a scene.
 
     Attributes:
         scene: index of the scene in its data set.
         target: class index, 1..K.
-        cue: class that the searcher is told to look for, the target except in a control.
-        repetition: which of the starts, from 0.
+        cue: class that the searcher is told to look for; it differs from the target only in a control experiment.
+        repetition: number of the start, from 0.
         start: cell of the first fixation.
         goal: cells that an object of the target class overlaps.
-        commonest: whether the target is the scene's class with most instances (the first of them by index).
+        commonest: whether the target is the class with most instances in the scene (of several, the lowest index).
     """
 
     scene: int
@@ -42,7 +42,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of an episode: the fixated cells in order, and the gaze shift that found the target, or -1."""
+    """Result of an episode: the fixated cells in order, and the gaze shift that found the target (-1: none)."""
 
     cells: tuple[int, ...]
     found_at: int
@@ -56,17 +56,20 @@ def episodes_of(
     protocol: ProtocolConfig,
     targets: Sequence[int] | None = None,
 ) -> list[Episode]:
-    """All episodes of one scene: every legal target, `starts` cells that no object of it overlaps.
+    """All episodes of one scene: for every target, `starts` searches from cells that no object of the target overlaps.
 
     Starts differ from each other as long as there are enough cells.
 
     Args:
         scenes: the data set.
-        index: of the scene.
-        columns: cells in a row.
-        rows: cells in a column.
-        protocol: the experiment.
-        targets: classes to search for; None: those that the data set allows.
+        index: index of the scene.
+        columns: number of columns of the grid.
+        rows: number of rows of the grid.
+        protocol: the protocol of the experiment.
+        targets: classes to search for (None: the classes that the data set allows).
+
+    Returns:
+        The episodes.
     """
     annotation = scenes.annotation(index)
     labels, covered = annotation.labels, Grid(columns, rows, annotation.size).footprint(annotation.boxes)
@@ -107,16 +110,19 @@ def choose_classes(
     seed: int,
     absent: int | None = None,
 ) -> list[int]:
-    """Up to so many classes that a photograph holds and that may be searched for, and as many that it does not hold.
+    """Draw target classes for a photograph: some that it holds, and some that it does not hold.
 
     Args:
         scenes: the data set.
-        index: of the scene.
-        annotation: its objects.
-        classes: how many that it holds, at most.
+        index: index of the scene.
+        annotation: the scene's annotated objects.
+        classes: largest number of present classes.
         max_area: classes that cover a larger share of the image are left out.
-        seed: of the choice.
-        absent: how many that it does not hold, at most; None: as many as were chosen of the others.
+        seed: random seed of the choice.
+        absent: largest number of absent classes (None: the number of present classes that were drawn).
+
+    Returns:
+        The present classes, then the absent ones.
     """
     generator = generator_for("classes", seed, scenes.ids[index])
     held = set(annotation.labels.tolist())
@@ -145,13 +151,16 @@ def run_episodes(
     """Run episodes of one scene, `batch` at a time, each until its target is found or its gaze shifts are spent.
 
     Args:
-        episodes: of one and the same scene.
-        candidate: how they search.
-        detections: what is seen from every cell of the scene, a batch of X·Y.
+        episodes: the episodes, all of the same scene.
+        candidate: the policy under comparison.
+        detections: detections from every cell of the scene, a batch of X·Y.
         grid: the grid over the scene.
         noise: `(episodes, shifts+1, X·Y)`, from `tie_noise`.
-        shifts: most gaze shifts.
-        batch: episodes in a tensor.
+        shifts: largest number of gaze shifts.
+        batch: number of episodes computed together.
+
+    Returns:
+        The result of each episode.
     """
     outcomes: list[Outcome] = []
     for first in range(0, len(episodes), batch):
@@ -171,7 +180,7 @@ def _run_batch(
     visits = torch.full((len(episodes), shifts + 1), -1)
     visits[:, 0] = starts
     found_at = torch.where(goals.gather(1, starts[:, None])[:, 0], 0, -1)
-    # A search that starts on its target is over before it has looked.
+    # A search that starts on its target has ended before its first look.
     seeking = (found_at < 0).nonzero()[:, 0]
 
     def acquisition(order: Tensor, cell: Tensor) -> AcquisitionFunction:

@@ -1,4 +1,4 @@
-"""What a search run leaves: cumulative performance as tables and curves, and a few scanpaths."""
+"""Output of a search run: cumulative performance as tables and curves, and a few scanpaths."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ AVERAGES = {
 
 
 def report(run: SearchRun) -> None:
-    """Write everything that a finished run leaves, and print the table."""
+    """Write all output of a finished run, and print the tables."""
     records, seconds = collect(run)
     if not records:
         raise DataError("data: no scene has a class that may be searched for; raise data.max_target_area")
@@ -67,7 +67,7 @@ def report(run: SearchRun) -> None:
 
 
 def performance(records: list[Record], policies: Sequence[str], shifts: int, average: str) -> dict[str, Curve]:
-    """Cumulative performance of each policy, over all targets or the commonest of each image."""
+    """Cumulative performance of each policy, over all targets or over the commonest target of each image."""
     measure = partial(_found, shifts=shifts)
     counted = [record for record in records if record["commonest"] or average == "all targets"]
     return {policy: curve_of((r for r in counted if r["policy"] == policy), measure) for policy in policies}
@@ -78,7 +78,7 @@ def _found(record: Record, shifts: int) -> Array:
 
 
 def expected_random(records: list[Record], shifts: int, cells: int) -> Array:
-    """What random search must give on these targets by the hypergeometric formula, mean over images."""
+    """Expected performance of random search for these targets (hypergeometric formula), mean over images."""
     targets: dict[Any, dict[int, int]] = defaultdict(dict)
     for record in records:
         targets[record["scene"]][record["target"]] = len(record["goal"])
@@ -97,7 +97,8 @@ def summary_markdown(curves: dict[str, dict[str, Curve]], expected: Array, sensi
         first = next(iter(policies.values()))
         lines += [
             f"**{AVERAGES[average]}** ({sensing}; {first.images} images, {first.episodes} searches per policy; "
-            "% found after n gaze shifts, the first fixation not counted, ± standard error over images)",
+            "percentage of targets found after n gaze shifts, not counting the first fixation, ± standard error over "
+            "images)",
             "",
         ]
         rows = curve_rows(policies, shifts)
@@ -108,7 +109,7 @@ def summary_markdown(curves: dict[str, dict[str, Curve]], expected: Array, sensi
 
 
 def draw_curves(run: SearchRun, curves: dict[str, Curve], expected: Array) -> Path:
-    """The cumulative-performance figure."""
+    """Draw the cumulative performance against gaze shifts."""
     from semfov.viz import plot_cumulative_performance
 
     figure = plot_cumulative_performance(
@@ -120,7 +121,7 @@ def draw_curves(run: SearchRun, curves: dict[str, Curve], expected: Array) -> Pa
 
 
 def draw_scanpaths(run: SearchRun, records: list[Record]) -> list[Path]:
-    """Pictures of a few episodes of the last policy, of different scenes, those with a few gaze shifts first."""
+    """Draw a few episodes of the last policy in different scenes, preferring finds after two to six gaze shifts."""
     from semfov.viz import plot_episode
 
     last = [record for record in records if record["policy"] == list(run.policies)[-1]]
@@ -134,7 +135,7 @@ def draw_scanpaths(run: SearchRun, records: list[Record]) -> list[Path]:
         scanpath = replay(run, index, record)
         views = foveated_views(run.eye, scene.image, scanpath.fixations)
         boxes = scene.boxes[scene.labels == record["target"]]
-        # An id is whatever the annotations say; its number tells cleaned ones apart.
+        # An id may be any text. Cleaned ids may coincide, so the scene's number is put before them.
         told = record["scene"] if isinstance(record["scene"], int) else f"{index}-{clean(record['scene'])}"
         path = inside(run.config.out, f"scanpath_{told}_{clean(record['target_name'])}.png")
         paths.append(save_figure(plot_episode(scanpath, scene.image, views, boxes=boxes), path))

@@ -1,4 +1,4 @@
-"""Settings whose ranges are part of their types."""
+"""Settings whose types state their ranges, and the checks of these ranges."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from semfov.io.schema import interval, is_number, shown
 
 @dataclass(frozen=True)
 class Range:
-    """Which numbers a setting may be, in an annotation: `Annotated[int, Range(1, 100)]`.
+    """Range of the values of a setting, in a type annotation: `Annotated[int, Range(1, 100)]`.
 
     Attributes:
-        low: least.
-        high: largest.
-        above: it is larger than this.
+        low: smallest value.
+        high: largest value.
+        above: every value is larger than this.
     """
 
     low: float = -math.inf
@@ -32,50 +32,50 @@ class Range:
         return interval(self.low, self.high, self.above).removeprefix("numbers ")
 
     def holds(self, value: object, *, whole: bool) -> bool:
-        """Whether a value is such a number."""
+        """Whether a value is a number in this range, and a whole one if `whole`."""
         return is_number(value, whole=whole) and self.low <= value <= self.high and value > self.above  # type: ignore[operator]
 
 
 @dataclass(frozen=True)
 class FileName:
-    """Text that a file may be called by, in an annotation."""
+    """Restriction of a text setting to valid file names, in a type annotation."""
 
     def __repr__(self) -> str:
-        return "that a file may be called by"
+        return "that is valid as a file name (letters, digits, space and _ . + -; at most 100 characters)"
 
     def holds(self, value: object, *, whole: bool) -> bool:
-        """Whether a value is such a text."""
+        """Whether a value is a valid file name."""
         return isinstance(value, str) and re.fullmatch(r"\w[\w .+-]{0,99}", value) is not None
 
 
 Name = Annotated[str, FileName()]
 """Name of a model to write."""
 Seed = Annotated[int, Range(0, 2**63 - 1)]
-"""What a generator is seeded with."""
+"""Seed of a random generator."""
 Count = Annotated[int, Range(1, 10**9)]
-"""How many of something, at least one."""
+"""A number of objects, at least one."""
 Whole = Annotated[int, Range(0, 10**9)]
-"""How many of something, or none."""
+"""A number of objects, possibly 0."""
 Share = Annotated[float, Range(0, 1)]
 """A share or a probability."""
 Positive = Annotated[float, Range(above=0, high=10**9)]
 """A number above 0."""
 Weight = Annotated[float, Range(0, 10**9)]
-"""A number from 0."""
+"""A number of 0 or more."""
 Shifts = Annotated[int, Range(0, 10_000)]
-"""Gaze shifts of an episode."""
+"""Number of gaze shifts in an episode."""
 Side = Annotated[int, Range(1, 200)]
-"""Cells in a row or in a column."""
+"""Number of cells in a row or in a column."""
 Workers = Annotated[int, Range(1, 1024)]
-"""Processes."""
+"""Number of processes."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Base of dataclasses of settings: whoever makes one is told of values that cannot be."""
+    """Base of dataclasses of settings; it refuses values that are out of range."""
 
     def __post_init__(self) -> None:
-        """Check all values; see `check_settings`."""
+        """Check all values (`check_settings`)."""
         check_settings(type(self), vars(self), nested=False)
 
 
@@ -83,12 +83,12 @@ _WORDS = {int: "a whole number", float: "a number", str: "a name"}
 
 
 def check_settings(config: type[Any], values: Any, prefix: str = "", *, nested: bool = True) -> None:
-    """Raise `InputError` where a setting is out of the range that its type tells: its dotted name and the range.
+    """Raise `InputError`, with the dotted name and the range, if a setting is out of the range of its type.
 
     Args:
         config: dataclass of the settings.
-        values: by name.
-        prefix: before the names.
+        values: values of the settings by name.
+        prefix: prefix of the names in messages.
         nested: also check settings that are dataclasses themselves.
     """
     hints = _hints(config)  # type: ignore[arg-type]
@@ -124,7 +124,7 @@ def _check(hint: Any, value: Any, name: str) -> None:
         for place, item in enumerate(value):
             _check(options[0 if options[-1] is Ellipsis else place], item, f"{name}[{place}]")
     else:
-        # Words among numbers are checked where they are read.
+        # Where a setting is a number or a word, its words are checked where the setting is used.
         for option in options:
             if is_dataclass(option) and not is_dataclass(value) and hasattr(value, "__dict__"):
                 check_settings(option, vars(value), f"{name}.")  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""From settings to objects: scenes, eye, models."""
+"""Makes scenes, detector, eye and models from settings."""
 
 from __future__ import annotations
 
@@ -30,15 +30,19 @@ from semfov.zoom.eye import ZoomEye
 
 
 def check_sources(data: DataConfig, detector: DetectorConfig) -> None:
-    """Raise an error where photographs, annotations or a detector are not there, before any of them is loaded."""
+    """Raise an error if photographs, annotations or the detector do not exist, before any of them is loaded."""
     check_data(data)
     check_detector(detector.name)
 
 
 def check_data(data: DataConfig) -> None:
-    """Raise an error unless photographs and annotations are there, or neither is asked for."""
+    """Raise an error unless photographs and annotations both exist, or the settings name neither of them."""
     if (data.root is None) != (data.annotations is None):
-        raise InputError("data: expected both data.root and data.annotations, or neither for the embedded scenes")
+        given, missing = ("data.root", "data.annotations") if data.root else ("data.annotations", "data.root")
+        raise InputError(
+            f"data: expected both data.root and data.annotations, or neither for the embedded scenes, got {given} "
+            f"alone; add {missing}"
+        )
     if data.root is not None and not data.root.is_dir():
         raise DataError(f"data.root: no such folder: {data.root}; check the path")
     if data.annotations is not None and not data.annotations.exists():
@@ -46,7 +50,7 @@ def check_data(data: DataConfig) -> None:
 
 
 def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
-    """The scenes to search: photographs where a root is given, else embedded ones."""
+    """The scenes of the settings: photographs if a root is given, else the embedded scenes."""
     check_data(data)
     if data.root is None or data.annotations is None:
         from semfov.data.scenes import EmbeddedScenes
@@ -66,10 +70,18 @@ def make_scenes(data: DataConfig, classes: tuple[str, ...]) -> Scenes:
 
 
 def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) -> tuple[Scenes, Scenes]:
-    """All photographs but every n-th, and these; of embedded scenes two sets.
+    """Split photographs into every n-th one and the others; of the embedded scenes make two sets.
+
+    Args:
+        data: the settings of the photographs.
+        classes: the detector's classes.
+        every: n.
+
+    Returns:
+        The larger part, and every n-th photograph.
 
     Raises:
-        InputError: there are too few to split.
+        InputError: there are too few photographs to split.
     """
     check_data(data)
     if data.root is None or data.annotations is None:
@@ -93,26 +105,29 @@ def split_photographs(data: DataConfig, classes: tuple[str, ...], every: int) ->
 
 
 def read_ids(path: Path) -> list[str]:
-    """Ids of photographs, one a line."""
+    """Read the ids of photographs from a text file with one per line."""
     check_regular(path)
     try:
         return path.read_text(encoding="utf-8").split()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: cannot be read as a list of ids ({error})") from None
+        raise DataError(f"{path}: expected a text file with one id per line; it cannot be read ({error})") from None
 
 
 def make_detector(detector: DetectorConfig) -> Detector:
-    """The detector that the settings name."""
-    # A session of onnxruntime keeps the threads that it is opened with.
+    """Load the detector that the settings name."""
+    # A session of onnxruntime keeps the number of threads that it is opened with.
     with one_thread():
         return load_detector(detector.name, **detector_options(detector))
 
 
 def detector_options(detector: DetectorConfig) -> dict[str, Any]:
-    """Options of `semfov.load_detector` that settings stand for."""
+    """The options of `semfov.load_detector` that correspond to the settings."""
     onnx = detector.name.endswith(".onnx")
     if detector.head is not None and not onnx:
-        raise InputError(f"detector.head: expected none, for {detector.name!r} is no ONNX model of your own")
+        raise InputError(
+            f"detector.head: expected null, since detector.name {detector.name!r} is not an ONNX file, got "
+            f"{detector.head!r}"
+        )
     options: dict[str, Any] = {
         "threshold": detector.threshold,
         "iou": detector.iou,
@@ -131,21 +146,23 @@ def detector_options(detector: DetectorConfig) -> dict[str, Any]:
 
 
 def make_eye(detector: DetectorConfig, sensor: SensorConfig) -> Eye:
-    """The foveal sensor and the detector behind it."""
+    """Make an eye: the foveal sensor, and the detector that sees through it."""
     model = make_detector(detector)
     return Eye(sensor.make(), model, reference=sensor.reference).eval().requires_grad_(False)
 
 
 def fovea_of(eye: Eye) -> Foveation:
-    """The foveal sensor of an eye: fitted models are shipped for no other."""
+    """The foveal sensor of an eye; fitted models exist only for eyes with a foveal sensor."""
     sensor = eye.sensor
     if not isinstance(sensor, Foveation):
-        raise InputError(f"sensor: expected a Foveation, which models are named after, got {type(sensor).__name__}")
+        raise InputError(
+            f"sensor: expected a Foveation, since models are fitted for foveal sensors, got {type(sensor).__name__}"
+        )
     return sensor
 
 
 def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
-    """The observation model of that name, or the one for this eye; checked to belong to detector and class list."""
+    """Load an observation model by name, or the one shipped for the eye; check that it fits detector and classes."""
     own = recommended(eye.detector.name, float(fovea_of(eye).growth))
     model = FovealObservationModel.from_pretrained(name or shipped_model(FovealObservationModel, own, "MODEL"))
     model.check_compatible(eye.settings(), eye.detector.classes)
@@ -153,7 +170,7 @@ def make_observation(name: str | None, eye: Eye) -> FovealObservationModel:
 
 
 def make_zoom_observation(name: str | None, eye: ZoomEye) -> FovealObservationModel | None:
-    """The observation model by magnification of that name, or the one for this eye; None where none is shipped."""
+    """Load an observation model by magnification, by name or the one shipped for the eye; None if none is shipped."""
     own = f"{eye.detector.name}-zoom"
     if name is None and not (FovealObservationModel.shipped / f"{own}.safetensors").is_file():
         return None
@@ -163,14 +180,14 @@ def make_zoom_observation(name: str | None, eye: ZoomEye) -> FovealObservationMo
 
 
 def published_model(detector: DetectorConfig, sensor: SensorConfig) -> str | None:
-    """Observation model of maximum likelihood for detector and sensor; None where none is shipped."""
+    """Name of the observation model fitted by maximum likelihood for detector and sensor; None if none is shipped."""
     name = f"{detector.name}-{sensor.name}"
     shipped = (FovealObservationModel.shipped / f"{name}.safetensors").is_file()
     return name if sensor.name in PUBLISHED_SENSORS and shipped else None
 
 
 def make_target_evidence(name: str | None, eye: Eye) -> TargetEvidence:
-    """The learned evidence for a target of that name, or the one for this eye; checked to belong to it."""
+    """Load learned target evidence by name, or the one shipped for the eye; check that it fits the eye."""
     own = learned_for(eye.detector.name, float(fovea_of(eye).growth))
     model = TargetEvidence.from_pretrained(name or shipped_model(TargetEvidence, own, "MODEL"))
     model.check_compatible(eye.settings())
@@ -178,7 +195,7 @@ def make_target_evidence(name: str | None, eye: Eye) -> TargetEvidence:
 
 
 def make_map_evidence(name: str | None, eye: Eye) -> MapEvidence:
-    """The learned map of that name, or the one for this eye; checked to belong to it."""
+    """Load a learned map by name, or the one shipped for the eye; check that it fits the eye."""
     own = learned_for(eye.detector.name, float(fovea_of(eye).growth))
     model = MapEvidence.from_pretrained(name or shipped_model(MapEvidence, own, "MODEL"))
     model.check_compatible(eye.settings())
@@ -186,35 +203,39 @@ def make_map_evidence(name: str | None, eye: Eye) -> MapEvidence:
 
 
 def make_learned_gaze(name: str | None, eye: Eye) -> LearnedGaze:
-    """The learned gaze policy of that name, or the one for this detector; checked to belong to it."""
+    """Load a learned gaze policy by name, or the one shipped for the detector; check that it fits the eye."""
     gaze = LearnedGaze.from_pretrained(name or eye.detector.name)
     gaze.check_compatible(eye.settings())
     return gaze.requires_grad_(False)
 
 
 def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
-    """The class templates of that name, or those for this detector; checked to belong to it."""
+    """Load class templates by name, or those shipped for the detector; check that they fit the eye."""
     model = ClassTemplates.from_pretrained(name or eye.detector.name)
     model.check_eye(eye.settings(), eye.detector.classes)
     return model
 
 
 def make_context(name: str, eye: Eye | ZoomEye) -> ContextPrior:
-    """The context of searches, checked to know the detector's classes."""
+    """Load a fitted context; check that it knows the detector's classes."""
     prior = ContextPrior.from_pretrained(name)
     prior.check_compatible(eye.detector.classes)
     return prior.requires_grad_(False)
 
 
 def plain(settings: dict[str, Any]) -> Any:
-    """Settings as JSON and YAML have them: paths as text, tuples as lists."""
+    """Convert settings to JSON values: paths become text, tuples become lists."""
     return json.loads(json.dumps(settings, default=str))
 
 
 def prepare_worker() -> None:
-    """One thread a process, so that detections do not depend on how many share the work; and no repeated notices."""
+    """Set one thread per process, so that results do not depend on the number of processes, and silence log messages.
+
+    Only worker processes are silenced: the main process has logged the same messages already.
+    """
     torch.set_num_threads(1)
-    # Freeing one large block raises glibc's threshold for handing memory back, or it would do so after every look.
+    # Freeing one large block raises the size from which glibc returns memory to the system; otherwise it would return
+    # and request memory at every look.
     torch.empty(31 << 20, dtype=torch.uint8)
     if multiprocessing.parent_process() is not None:
         logging.getLogger("semfov").setLevel(logging.ERROR)

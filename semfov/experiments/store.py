@@ -1,7 +1,7 @@
-"""What is seen from every cell of every scene, computed once and kept on disk.
+"""Stores the detections from every cell of every scene, so that they are computed only once.
 
-Scenes are static and the gaze sits on cell centres, so what is seen is a function of (scene, cell). A store remembers
-it under a key of everything that it depends on; it changes how long a run takes and nothing else.
+Scenes are static and the gaze rests on cell centres, so the detections are a function of scene and cell. A store keeps
+them under a key of everything that they depend on. It changes the duration of a run, and never its result.
 """
 
 import hashlib
@@ -24,16 +24,16 @@ from semfov.version import __version__
 
 
 class SceneStore:
-    """A folder of tensors, one file for each scene.
+    """A folder of tensors with one file for each scene.
 
-    Files are written atomically and carry a checksum; one that is damaged, cut short, of another version or not of
-    this store's schema counts as missing and is computed again.
+    Files are written atomically and carry a checksum. A file that is damaged, truncated, of another version or of
+    another schema counts as missing, and its tensors are computed again.
 
     Args:
-        folder: where the store lies; several runs and processes may share it.
+        folder: folder of the store; several runs and processes may share it.
         what: settings that the tensors depend on.
-        code: sha256 of the sources that they depend on.
-        schema: what a file holds.
+        code: sha256 of the source code that the tensors depend on.
+        schema: schema of a file.
     """
 
     def __init__(self, folder: Path, what: Mapping[str, object], code: str, schema: Schema) -> None:
@@ -43,33 +43,33 @@ class SceneStore:
         self.schema = schema
 
     def path(self, digest: str) -> Path:
-        """File for the scene whose image has this sha256."""
+        """Path of the file of the scene whose image has this sha256."""
         return self.folder / f"{digest[:32]}.safetensors"
 
     def read(self, digest: str) -> dict[str, Tensor] | None:
-        """Tensors of a scene, or None if the store does not have them whole."""
+        """Read the tensors of a scene; None if they are missing or damaged."""
         return read_tensors(self.path(digest), self.key, self.schema)
 
     def write(self, digest: str, tensors: Mapping[str, Tensor]) -> None:
-        """Keep the tensors of a scene."""
+        """Write the tensors of a scene."""
         write_tensors(self.path(digest), self.key, tensors)
 
 
 class DetectionStore(SceneStore):
-    """Detections from every cell.
+    """Detections from every cell of a scene, on disk.
 
     Args:
-        folder: where the store lies.
+        folder: folder of the store.
         settings: `Eye.settings()`.
-        columns: cells in a row.
-        rows: cells in a column.
-        components: length of the score vectors; None where it is not known.
+        columns: number of columns of the grid.
+        rows: number of rows of the grid.
+        components: length of the score vectors (None: any length).
     """
 
     def __init__(
         self, folder: Path, settings: Mapping[str, object], columns: int, rows: int, components: int | None = None
     ) -> None:
-        # Where the cells of a picture of odd sizes have their centres stands for how a grid is laid.
+        # The cell centres in a picture of odd size identify the way in which a grid is laid out.
         centres = Grid(columns, rows, (641, 479)).centres.tolist()
         what = {"settings": settings, "grid": [columns, rows], "centres": centres}
         schema = Schema(
@@ -82,19 +82,19 @@ class DetectionStore(SceneStore):
         super().__init__(folder, what, looks_digest(), schema)
 
     def load(self, digest: str) -> Detections | None:
-        """Detections from every cell of a scene, or None if the store does not have them whole."""
+        """The detections from every cell of a scene; None if they are missing or incomplete."""
         tensors = self.read(digest)
         if tensors is None or int(tensors["count"].sum()) != len(tensors["boxes"]):
             return None
         return unpack(tensors)
 
     def save(self, digest: str, detections: Detections) -> None:
-        """Keep the detections of a scene."""
+        """Store the detections of a scene."""
         self.write(digest, pack(detections))
 
 
 def versions() -> dict[str, object]:
-    """Of everything besides this package that numbers depend on."""
+    """Versions of semfov, of its libraries and of the machine, on which numerical results depend."""
     import kornia
     import torchvision
 
@@ -109,16 +109,19 @@ def versions() -> dict[str, object]:
 
 @cache
 def looks_digest(*more: str) -> str:
-    """sha256 over the sources that turn an image into detections: a store never outlives a change of them.
+    """Digest of the source code that turns an image into detections; a store is not reused after a change of it.
 
     Args:
-        more: dotted names of further modules.
+        *more: dotted names of further modules.
+
+    Returns:
+        The sha256.
     """
     return modules_digest(*SOURCES, *more)
 
 
 def pack(detections: Detections) -> dict[str, Tensor]:
-    """Detections without their padding, which is most of a padded batch."""
+    """Convert detections to tensors without padding, which makes up most of a padded batch."""
     mask = detections.mask
     return {
         "boxes": detections.boxes[mask],
@@ -128,7 +131,7 @@ def pack(detections: Detections) -> dict[str, Tensor]:
 
 
 def unpack(tensors: dict[str, Tensor]) -> Detections:
-    """The padded batch that `pack` made the tensors from."""
+    """Convert the tensors of `pack` back to a padded batch."""
     count = tensors["count"]
     mask = torch.arange(int(count.max()) if len(count) else 0) < count[:, None]
     boxes = tensors["boxes"].new_zeros(*mask.shape, 4)

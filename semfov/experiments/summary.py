@@ -1,4 +1,4 @@
-"""What every run leaves: tables, figures, per-episode records and the manifest."""
+"""Output that all runs share: tables, per-episode records and the manifest."""
 
 import csv
 import io
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Curve:
-    """A figure of merit after 0, 1, … gaze shifts: mean, and standard errors over images and over repetitions."""
+    """A measure after 0, 1, … gaze shifts: its mean, and its standard errors over images and over repetitions."""
 
     mean: Array
     over_images: Array
@@ -43,11 +43,14 @@ class Curve:
 
 
 def curve_of(records: Iterable[Record], measure: Callable[[Record], Array]) -> Curve:
-    """Average episodes, those of an image first.
+    """Average episodes: first over the episodes of each image, then over images.
 
     Args:
-        records: of one policy.
-        measure: an episode's figure of merit after 0, 1, … gaze shifts.
+        records: records of one policy.
+        measure: maps an episode's record to its measure after 0, 1, … gaze shifts.
+
+    Returns:
+        The mean curve with its standard errors.
     """
     images: dict[Any, list[Array]] = defaultdict(list)
     repetitions: dict[int, dict[Any, list[Array]]] = defaultdict(lambda: defaultdict(list))
@@ -70,7 +73,7 @@ def curve_of(records: Iterable[Record], measure: Callable[[Record], Array]) -> C
 
 
 def collect(run: Run) -> tuple[list[Record], dict[str, float]]:
-    """Records of all scenes, those of a policy together, and the seconds spent by stage."""
+    """Records of all scenes, sorted by policy, and the seconds that each stage took."""
     records, seconds = gather(run)
     order = {policy: number for number, policy in enumerate(run.policies)}
     records.sort(key=lambda record: order.get(record["policy"], len(order)))
@@ -78,13 +81,27 @@ def collect(run: Run) -> tuple[list[Record], dict[str, float]]:
 
 
 def complete(run: SceneRun, title: str) -> list[Record] | None:
-    """Run all scenes that have no part yet; records of all, or None in a process that leaves the report to another."""
+    """Run all scenes that are not finished yet.
+
+    Args:
+        run: the run.
+        title: label of the progress bar.
+
+    Returns:
+        The records of all scenes; None in a process of torchrun that does not write the report.
+    """
     finish(run, title)
     return gather(run)[0] if rank() == 0 else None
 
 
 def by_scene(values: Iterable[tuple[Any, float]]) -> dict[Any, float]:
-    """Mean of the values of each scene, from pairs of scene and value.
+    """Mean value of each scene, from pairs of scene and value.
+
+    Args:
+        values: the pairs.
+
+    Returns:
+        The mean by scene.
 
     >>> by_scene([(7, 1.0), (7, 2.0), (8, 5.0)])
     {7: 1.5, 8: 5.0}
@@ -96,7 +113,7 @@ def by_scene(values: Iterable[tuple[Any, float]]) -> dict[Any, float]:
 
 
 def gather(run: SceneRun) -> tuple[list[Record], dict[str, float]]:
-    """Records of all scenes in their order, and the seconds spent by stage."""
+    """Records of all scenes in their order, and the seconds that each stage took."""
     records: list[Record] = []
     seconds: dict[str, float] = defaultdict(float)
     for index in range(len(run.scenes)):
@@ -110,7 +127,7 @@ def gather(run: SceneRun) -> tuple[list[Record], dict[str, float]]:
 
 
 def write_summary(out: Path, name: str, text: str, records: list[Record]) -> list[Path]:
-    """Write tables as Markdown, and the records that they are made of; returns their paths."""
+    """Write the tables as Markdown, and the records that they summarise; returns the paths of both files."""
     files = {f"{name}.md": text, "records.jsonl": "".join(json.dumps(record) + "\n" for record in records)}
     for file, content in files.items():
         write_text(out / file, content)
@@ -124,7 +141,7 @@ def write_files(
     records: list[Record],
     seconds: dict[str, float],
 ) -> list[Path]:
-    """Write tables (text by file name), records, settings and manifest; returns their paths."""
+    """Write tables (text by file name), records, settings and manifest; returns the paths of all files."""
     files = {
         **tables,
         "episodes.jsonl": "".join(json.dumps(record) + "\n" for record in records),
@@ -137,7 +154,7 @@ def write_files(
 
 
 def announce(summary: str, written: Iterable[Path]) -> None:
-    """Print the tables and where everything lies."""
+    """Print the tables and the paths of the written files."""
     print(summary)
     print("written:")
     for path in written:
@@ -145,11 +162,14 @@ def announce(summary: str, written: Iterable[Path]) -> None:
 
 
 def curves_csv(curves: dict[str, dict[str, Curve]], head: tuple[str, str]) -> str:
-    """The curves as a table, one row for each average, policy and number of gaze shifts.
+    """The curves as CSV, with one row for each average, policy and number of gaze shifts.
 
     Args:
-        curves: by average and policy.
-        head: what the averages, and what the values are called.
+        curves: curves by average and policy.
+        head: column headings of the averages and of the values.
+
+    Returns:
+        The text of the CSV file.
     """
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
@@ -165,7 +185,7 @@ def curves_csv(curves: dict[str, dict[str, Curve]], head: tuple[str, str]) -> st
 
 
 def curve_rows(curves: dict[str, Curve], shifts: Iterable[int]) -> list[list[str]]:
-    """A row of a table for each policy: its curve at these gaze shifts, in percent, with both standard errors."""
+    """A table row for each policy: its curve at these gaze shifts, in percent, with both standard errors."""
     return [
         [
             name,
@@ -177,16 +197,16 @@ def curve_rows(curves: dict[str, Curve], shifts: Iterable[int]) -> list[list[str
 
 
 LAST_COLUMN = "max. SEM over repetitions"
-"""Head of the last column of `curve_rows`: the largest standard error of the mean over the starts (published)."""
+"""Heading of the last column of `curve_rows`: the largest standard error of the mean over the starts (published)."""
 
 
 def percent(value: float, error: float) -> str:
-    """`12.3 ± 0.4` for a share and its standard error."""
+    """A share and its standard error in percent, such as `12.3 ± 0.4`."""
     return f"{100 * value:.1f} ± {100 * error:.1f}" if np.isfinite(error) else f"{100 * value:.1f}"
 
 
 def table(rows: list[list[str]]) -> list[str]:
-    """A Markdown table, its columns aligned; the first row is the head."""
+    """A Markdown table with aligned columns; the first row holds the headings."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
@@ -195,7 +215,7 @@ def table(rows: list[list[str]]) -> list[str]:
 
 
 def manifest(run: Run, program: str, seconds: dict[str, float]) -> dict[str, object]:
-    """Where the figures come from: versions, commit, checksums, seed, and where the time went."""
+    """Provenance of the results: versions, commit, checksums and seed; and the time that each stage took."""
     return {
         "command": ["python", "-m", program, *sys.argv[1:]],
         "commit": commit(),
@@ -219,7 +239,7 @@ def manifest(run: Run, program: str, seconds: dict[str, float]) -> dict[str, obj
 
 
 def commit() -> str | None:
-    """Commit of the checkout, with `+` where it has changes; None outside a checkout."""
+    """Commit of the git checkout, followed by `+` if it has uncommitted changes; None outside a checkout."""
     folder = Path(__file__).parent
 
     def git(*arguments: str) -> str:
@@ -233,7 +253,7 @@ def commit() -> str | None:
 
 
 def sensing(run: Run) -> str:
-    """Detector, sensor and observation model of a run, for titles."""
+    """Detector, sensor and observation model of a run, as text for titles."""
     sensor, model = run.config.sensor, run.config.belief.model
     spread = fovea_of(run.eye)
     what = f"{run.eye.detector.name}, {sensor.name} fovea (σ {float(spread.sigma):g} px, growth {spread.growth:g})"

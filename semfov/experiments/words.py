@@ -1,4 +1,4 @@
-"""Is it worth knowing what is near what: searches with context from tables, and without, from the same starts."""
+"""Does context help search? Compares searches with and without context, from the same starts."""
 
 from __future__ import annotations
 
@@ -34,30 +34,30 @@ from semfov.io.files import clean, inside, write_text
 from semfov.metrics.search import cumulative_performance
 
 SHIFTS = (1, 3, 5, 10, 30)
-"""Gaze shifts at which the table has the share found."""
+"""Gaze shifts at which the table gives the share of targets found."""
 
 
 @dataclass(frozen=True)
 class WordsConfig(Settings):
-    """Search with no context, with one counted from annotations, and with those of tables, each beside a control.
+    """Search without context, with context counted from annotations, and with context from tables, each with a control.
 
     Args:
-        data: which scenes to search.
-        detector: which detector looks through the fovea.
+        data: the scenes to search.
+        detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        belief: the grid of beliefs.
-        protocol: the experiment.
-        policy: what context is added to: `target-evidence`, or a mapping such as `{policy: non-predictive, tempering:
-            0.25, footprint: box_centre}`.
-        context: what of it is added: `place`, `cooccurrence` or `both`.
-        counted: context counted from annotations, by name or file: the upper reference.
-        tables: contexts of tables, files of `train.fit_context --table` or `--embeddings`.
-        weights: of place and co-occurrence in all arms (none: those that were fitted with each context).
-        permuted: seed of the control, in which the classes of each table are exchanged at random.
-        missed: the first look misses a target of which it shows no such score.
+        belief: the belief, a grid of class distributions.
+        protocol: the protocol of the experiment.
+        policy: the policy to which context is added: `target-evidence`, or a mapping such as `{policy: non-predictive,
+            tempering: 0.25, footprint: box_centre}`.
+        context: which context is added: `place`, `cooccurrence` or `both`.
+        counted: context counted from annotations, by name or file; it serves as the upper reference.
+        tables: contexts from tables, files of `train.fit_context --table` or `--embeddings`.
+        weights: weights of place and co-occurrence in all arms (null: the weights fitted with each context).
+        permuted: random seed of the control, in which the classes of each table are permuted.
+        missed: the first look counts as missing the target if the target's highest score in it is below this.
         out: folder for tables, per-episode records and the manifest.
-        cache: folder for what the detector saw from every cell, shared between runs (None: the user's cache).
-        workers: processes (None: one for each CPU core).
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        workers: number of processes (None: one per CPU core).
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -78,10 +78,10 @@ class WordsConfig(Settings):
 
 
 class WordsRun(SearchRun):
-    """Searches that also keep what the first look shows of the target."""
+    """Searches that also record the target's highest score in the first look."""
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """Records of all searches of a scene, each with the highest score of the target in its first look."""
+        """Run all searches of a scene; each record also holds the target's highest score in the first look."""
         records, seconds = super().outcomes(index)
         if records:
             scores = highest_score(self.detections(index), slice(None))  # type: ignore[arg-type]
@@ -91,7 +91,7 @@ class WordsRun(SearchRun):
 
 
 def words(config: WordsConfig) -> None:
-    """Run all arms, and write and print their differences."""
+    """Run all arms, and write and print their results and differences."""
     check(config.context != "none", "context", "place, cooccurrence or both", config.context)
     arms = arms_of(config)
     settings = {name: getattr(config, name) for name in ("data", "detector", "sensor", "belief", "protocol")}
@@ -119,7 +119,7 @@ def words(config: WordsConfig) -> None:
 
 
 def arms_of(config: WordsConfig) -> dict[str, PolicyConfig]:
-    """What is compared, by its name in the table; what no file has is written to the folder `out`."""
+    """The policies under comparison by their names in the table; changed contexts are written to the folder `out`."""
     base = PolicyConfig(config.policy) if isinstance(config.policy, str) else config.policy
     counted = ContextPrior.from_pretrained(config.counted)
     arms = {"none": base, "counted": _with(base, config, config.counted if config.weights is None else counted)}
@@ -133,11 +133,11 @@ def arms_of(config: WordsConfig) -> dict[str, PolicyConfig]:
 
 
 def _with(base: PolicyConfig, config: WordsConfig, context: str | ContextPrior) -> PolicyConfig:
-    """The policy with a context, from its file; one that has none is written first."""
+    """Add a context to the policy; a context without a file is first written to the folder `out`."""
     if isinstance(context, ContextPrior):
         if config.weights is not None:
             context.weights = dict.fromkeys(context.weights, config.weights)
-        # Its name goes by its content: parts of another are not mistaken for this one's.
+        # The name depends on the content, so that results with another context are never reused.
         path = inside(config.out, f"context-{context.digest()[:16]}.safetensors")
         if rank() == 0 and not path.exists():
             context.save(path)
@@ -146,7 +146,7 @@ def _with(base: PolicyConfig, config: WordsConfig, context: str | ContextPrior) 
 
 
 def told(records: Sequence[Record], arms: Sequence[str], config: WordsConfig) -> list[str]:
-    """Tables of all searches, and of those whose first look misses the target, as lines of Markdown."""
+    """Tables of all searches, and of the searches whose first look misses the target, as lines of Markdown."""
     missed = [record for record in records if record["first_score"] < config.missed]
     lines = []
     for title, group in (("All searches", records), ("Searches whose first look misses the target", missed)):
@@ -168,8 +168,8 @@ def told(records: Sequence[Record], arms: Sequence[str], config: WordsConfig) ->
             rows.append(row)
         searches = len(group) // len(arms)
         lines += [
-            f"{title} ({images} images, {searches} searches an arm; % found after n gaze shifts, mean over images; "
-            "differences of the same searches, ± standard error over images)",
+            f"{title} ({images} images, {searches} searches per arm; percentage of targets found after n gaze shifts, "
+            "mean over images; paired differences of the same searches, ± standard error over images)",
             "",
             *table(rows),
             "",
@@ -178,7 +178,7 @@ def told(records: Sequence[Record], arms: Sequence[str], config: WordsConfig) ->
 
 
 def differences(records: Sequence[Record], arm: str, shifts: int) -> Curve:
-    """Found with an arm less found without context, search by search (`curve_of`)."""
+    """Share found with an arm minus share found without context, paired by search (`curve_of`)."""
     without = {_search(record): record for record in records if record["arm"] == "none"}
     chosen = [record for record in records if record["arm"] == arm]
     return curve_of(chosen, lambda record: found(record, shifts) - found(without[_search(record)], shifts))
@@ -194,5 +194,5 @@ def found(record: Record, shifts: int) -> Array:
 
 
 def signed(value: float, error: float) -> str:
-    """`+1.2 ± 0.4` for a difference of shares and its standard error, in points."""
+    """A difference of shares and its standard error in percentage points, such as `+1.2 ± 0.4`."""
     return f"{100 * value:+.1f}" + (f" ± {100 * error:.1f}" if np.isfinite(error) else "")

@@ -1,4 +1,4 @@
-"""Pictures larger than the detector's input: what is found after so many passes, and where looking first pays."""
+"""Experiments with pictures larger than the detector's input: recall and first hits against detector passes."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ from semfov.zoom.observed import ObservedRates
 from semfov.zoom.search import find_everything, look_for
 
 FREE = "ours, free windows"
-"""The way of looking that contexts are added to."""
+"""Name of the way of looking to which contexts are added."""
 
 UNSEEN = 0.02
-"""Score below which the overview gives no hint of a class."""
+"""The overview gives no hint of a class if its highest score is below this."""
 
 SHOWN = 0.3
-"""Score with which a look confirms a class."""
+"""Smallest score with which a look confirms a class."""
 
 
 Tile = Annotated[int, Range(16, 16_384)]
-"""Side in pixels of a part of a picture."""
+"""Side of a part of a picture in pixels."""
 
 
 Measure = Literal["recall", "hit", "decision"]
@@ -57,35 +57,35 @@ Measure = Literal["recall", "hit", "decision"]
 
 @dataclass(frozen=True)
 class ZoomConfig(Settings):
-    """Large pictures: recall against passes of the detector, and passes to the first confirmed hit.
+    """Large pictures: recall against detector passes, passes to the first confirmed hit, and decisions.
 
     Args:
-        data: photographs; none uses the embedded scenes.
-        detector: which detector looks.
-        mosaics: number of mosaics to compose of the photographs; 0 takes the photographs as they are.
-        columns: photographs in a row of a mosaic.
-        rows: photographs in a column of a mosaic.
-        tile: width of a photograph's slot; three quarters of it is the height.
-        target: class to find all objects of (None: of any class).
-        slice: side in pixels of the slices of photographs; those of mosaics are their photographs.
-        overlap: of neighbouring slices.
-        passes: of the detector, at most.
-        measures: what is measured: `recall` after each pass, passes to the `hit` that a slice of a mosaic shows, and
-            what searches end with, the `decision`.
-        sought: classes that a picture holds, and as many that it does not, to search for until it is decided (with a
-            `target` that alone).
-        cut: what becomes of boxes at a window's border.
+        data: the photographs (without a root: the embedded scenes).
+        detector: the detector.
+        mosaics: number of mosaics to compose from the photographs; 0 uses the photographs as they are.
+        columns: number of photographs in a row of a mosaic.
+        rows: number of photographs in a column of a mosaic.
+        tile: width in pixels of a photograph's slot in a mosaic; the height is three quarters of it.
+        target: class whose objects are to be found (None: objects of any class).
+        slice: side in pixels of the slices of a photograph; a mosaic's slices are its photographs.
+        overlap: overlap of neighbouring slices, as a share of their side.
+        passes: largest number of detector passes.
+        measures: what to measure: `recall` after each pass; passes to the first `hit`, in mosaics, for classes that a
+            slice shows; the `decision` at the end of a search.
+        sought: largest number of classes that a picture holds, and of classes that it does not hold, to search for
+            until a decision (with `target`, only that class is searched for).
+        cut: what to do with boxes at a window's border.
         model: fitted evidence by magnification, by name or file (None: the one shipped for the detector).
         observation: observation model by magnification to compare with, by name or file (None: the one shipped for
             the detector, if there is one).
-        contexts: fitted contexts, by name or file; with each, and with the same for other classes (the control), the
-            passes to the first hit are counted again.
-        context_weight: how much they count (`semfov.zoom.WindowContext`).
-        seed: of mosaics and random orders.
+        contexts: fitted contexts, by name or file; the passes to the first hit are also counted with each context, and
+            with the same context with permuted classes as a control.
+        context_weight: weight of the contexts (`semfov.zoom.WindowContext`).
+        seed: random seed of mosaics and random orders.
         out: folder for tables, records and figures.
-        cache: folder for looks, shared between runs (None: the user's cache).
-        store: keep looks on disk; false recomputes them (the result is the same).
-        workers: processes (None: one for each CPU core).
+        cache: folder for the stored looks, shared between runs (None: the user's cache).
+        store: keep looks on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
     """
 
     data: DataConfig = field(default_factory=lambda: DataConfig(min_instances=0, max_target_area=None))
@@ -113,10 +113,10 @@ class ZoomConfig(Settings):
 
 
 class ZoomRun(SceneRun):
-    """Everything that a run is made of, built from its settings in each process.
+    """Scenes, eye and models of a run; every process builds its own from the settings.
 
     Attributes:
-        scenes: mosaics or photographs.
+        scenes: the mosaics or photographs.
     """
 
     config: ZoomConfig
@@ -130,7 +130,7 @@ class ZoomRun(SceneRun):
         self.observation = make_zoom_observation(config.observation, self.eye)
         photographs = self.open_scenes(detector.classes)
         if not len(photographs):
-            raise DataError("data: no photograph passes the selection; lower data.min_instances or raise data.limit")
+            raise DataError("data: the settings select no photograph; lower data.min_instances or raise data.limit")
         self.scenes: Scenes = photographs
         if config.mosaics:
             size = config.tile, config.tile * 3 // 4
@@ -149,7 +149,7 @@ class ZoomRun(SceneRun):
         self.make_key()
 
     def open_scenes(self, classes: tuple[str, ...]) -> Scenes:
-        """The photographs of the run; a subclass may have others."""
+        """Open the photographs of the run; a subclass may open others."""
         return make_scenes(self.config.data, classes)
 
     def _key(self) -> str:
@@ -164,18 +164,18 @@ class ZoomRun(SceneRun):
         return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, model, observed])
 
     def glances(self, index: int) -> StoredGlances:
-        """Looks at a scene."""
+        """The looks at a scene."""
         return open_scene(self.eye, self.scenes, index, self.store if self.config.store else None)
 
     def slices(self, index: int, lattice: Lattice) -> list[Window]:
-        """What slicing looks at: the photographs of a mosaic, or squares of a picture."""
+        """The slices of a scene: the photographs of a mosaic, or squares of a picture."""
         if isinstance(self.scenes, Mosaics):
             boxes = [tile.slot for tile in self.scenes.tiles(index)]
             return [around(lattice, (float(x1), float(y1), float(x2), float(y2))) for x1, y1, x2, y2 in boxes]
         return slices(lattice, self.config.slice, self.config.overlap)
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """Records of a scene: recall after each pass, and passes to the first hit, for every way of looking."""
+        """Measure all ways of looking at a scene; returns records, and the seconds that each stage took."""
         watch = Stopwatch()
         glances = self.glances(index)
         records: list[Record] = []
@@ -196,7 +196,7 @@ class ZoomRun(SceneRun):
         return records, watch.seconds
 
     def _finding(self, index: int, glances: Glances) -> Iterator[tuple[str, Iterator[Glance]]]:
-        """Every way of looking for all objects, by its name in tables."""
+        """Every way of looking for all objects, with its name in tables."""
         cut = self.slices(index, glances.lattice)
         annotation, target = self.annotation(index), self.target
         yield "slices, raster", raster(glances, cut)
@@ -213,7 +213,7 @@ class ZoomRun(SceneRun):
         yield "oracle", oracle(glances, [*every, *cut], found, self.config.passes)
 
     def _decisions(self, index: int, glances: Glances) -> list[Record]:
-        """Searches for what is there and for what is not."""
+        """Search for classes that are present and for classes that are absent."""
         config, annotation = self.config, self.scenes.annotation(index)
         targets = (
             choose_classes(self.scenes, index, annotation, config.sought, 1.0, config.seed)
@@ -226,7 +226,7 @@ class ZoomRun(SceneRun):
         return [record | {"scene": self.scenes.ids[index]} for record in records]
 
     def annotation(self, index: int) -> Annotation:
-        """Objects that count."""
+        """The objects to be found: of the target class, or all."""
         annotation = self.scenes.annotation(index)
         if self.target is None:
             return annotation
@@ -248,12 +248,12 @@ class ZoomRun(SceneRun):
         }
 
     def _in_context(self, glances: Glances, target: int, context: WindowContext) -> Iterator[Glance]:
-        """Free windows, with context."""
+        """Looks at free windows, chosen with context."""
         for glance, *_ in look_for(glances, self.evidence, target, closest=True, context=context):
             yield glance
 
     def _first_hits(self, index: int, glances: Glances) -> list[Record]:
-        """Passes until a class that a slice shows is first seen in a window as close as a slice."""
+        """Count passes until a class that a slice shows is first seen at a slice's magnification or a higher one."""
         cut = self.slices(index, glances.lattice)
         shown = torch.stack([glance.show for glance in glances.see(cut)]) >= SHOWN
         closest = min(window.level for window in cut)
@@ -291,14 +291,14 @@ class ZoomRun(SceneRun):
 
 
 def without_cut(glance: Glance) -> Glance:
-    """A look without the boxes that the border of its window cuts."""
+    """A look without the boxes that are cut by the border of its window."""
     seen, whole = glance.detections, ~glance.cut
     detections = Detections(seen.boxes[:, whole], seen.scores[:, whole], seen.mask[:, whole])
     return replace(glance, detections=detections, cut=glance.cut[whole])
 
 
 def found_in(looks: Sequence[Glance], annotation: Annotation, target: int | None = None) -> Tensor:
-    """Which objects some looks find, `(M,)`: their merged boxes with a score of 0.1 and an overlap of 0.5."""
+    """Which objects the looks have found, `(M,)`: a merged box has a score of 0.1 or more and an IoU of 0.5 or more."""
     objects = merge(looks, target, score=FOUND)
     if not len(objects):
         return torch.zeros(len(annotation.boxes), dtype=torch.bool)

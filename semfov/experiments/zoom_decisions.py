@@ -1,4 +1,4 @@
-"""Searches of large pictures for what is there and for what is not, each until it decides."""
+"""Searches of large pictures for present and for absent classes, each until it reaches a decision."""
 
 from __future__ import annotations
 
@@ -27,16 +27,20 @@ def decide_all(
     *,
     passes: int,
 ) -> list[Record]:
-    """What searches of a picture decide, beside the highest score of its overview, and of all slices and the overview.
+    """Search a picture until a decision, for each target.
 
     Args:
-        glances: of the picture.
-        evidence: learned, by magnification.
-        classes: names, background first.
+        glances: the looks at the picture.
+        evidence: learned evidence by magnification.
+        classes: names of the classes, background first.
         targets: classes to search for, 1..K.
-        annotation: what is really there.
-        slices: of the picture.
-        passes: of a search, at most.
+        annotation: the annotated objects.
+        slices: the slices of the picture.
+        passes: largest number of passes of a search.
+
+    Returns:
+        A record for each target: the decision and, for comparison, the target's highest score in the overview, and in
+        the overview and all slices.
     """
     shown = torch.stack([glance.show for glance in glances.see(slices)])
     records: list[Record] = []
@@ -65,14 +69,14 @@ def decide_all(
 
 
 def probabilities(records: Sequence[Record]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-    """What tells whether the target is there, `(M,)` each, and whether it is, `(M,)`."""
+    """Scores `(M,)` by name that predict whether the target is present, and whether it is, `(M,)`."""
     names = {"ours": "probability", "the overview, highest score": "overview", "all slices, highest score": "slices"}
     told = {name: torch.tensor([record[key] for record in records]) for name, key in names.items()}
     return told, torch.tensor([record["present"] for record in records])
 
 
 def decision_tables(records: Sequence[Record]) -> list[str]:
-    """How well presence is told, and what was decided, as Markdown."""
+    """Tables of how well scores predict the target's presence, and of the decisions, as Markdown."""
     told, there = probabilities(records)
     passes = {
         "ours": mean([record["passes"] for record in records]),
@@ -92,12 +96,12 @@ def decision_tables(records: Sequence[Record]) -> list[str]:
     found = [r for r in present if r["outcome"] == "found"]
     right = percent(sum((r["overlap"] or 0) >= 0.5 for r in found), len(found))
     return [
-        f"Is it there? {len(records)} searches, {len(present)} for a class that is; hits at a share of false alarms in "
-        "%. Ours is the probability that a search ends with.",
+        f"Is the target present? {len(records)} searches, {len(present)} of them for a present class; hit rates in % "
+        "at the given false alarm rates. `ours` is the probability at the end of a search.",
         "",
         *table(rows),
         "",
-        f"Decisions in %. Of what was found and is there, the box that is named is right (IoU 0.5) in {right} %.",
+        f"Decisions in %. Among the finds of present targets, the reported box is right (IoU 0.5) in {right} %.",
         "",
         *table(decided),
         "",

@@ -1,4 +1,4 @@
-"""Orders in which windows of a picture can be looked at: what is compared with looking where it pays."""
+"""Orders in which to look at the windows of a picture: baselines for the learned choice of windows."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -11,7 +11,7 @@ from semfov.zoom.lattice import Lattice
 
 
 def slices(lattice: Lattice, side: int, overlap: float) -> list[Window]:
-    """Square slices of a picture row by row, the last of a row and of a column moved inside, as SAHI cuts them."""
+    """Square slices of a picture row by row; the last ones are moved inside the picture, as SAHI cuts them."""
     width, height = lattice.size
     step = max(1, int(side * (1 - overlap)))
 
@@ -37,13 +37,16 @@ def shuffled(glances: Glances, windows: Sequence[Window], seed: Sequence[int]) -
 
 
 def ranked(glances: Glances, windows: Sequence[Window], target: int | None, *, most: bool) -> Iterator[Glance]:
-    """The overview, then the windows by its raw scores in them.
+    """The overview, then the windows in descending order of the overview's raw scores in them.
 
     Args:
-        glances: of the picture.
-        windows: to look at.
-        target: class 1..K; None for any.
-        most: by the highest score, else by the sum of all scores.
+        glances: the looks at the picture.
+        windows: windows to look at.
+        target: class 1..K; None: any class.
+        most: rank a window by its highest score; false: by the sum of its scores.
+
+    Yields:
+        The looks in this order.
     """
     first = glances.see([overview(glances)])[0]
     yield first
@@ -53,12 +56,12 @@ def ranked(glances: Glances, windows: Sequence[Window], target: int | None, *, m
 
 
 def quad_tree(glances: Glances, target: int | None, *, most: bool) -> Iterator[Glance]:
-    """Best first: the overview, then always the quarter of a window seen that has the highest raw score in it."""
+    """Best first: the overview, then repeatedly the quarter of a seen window with the highest raw score."""
     lattice = glances.lattice
     first = glances.see([overview(glances)])[0]
     yield first
     frontier = _quarters(lattice, first, target, most)
-    # Quarters at the far borders of the picture are moved inside it, where two can be one.
+    # Quarters at the right and bottom borders are moved inside the picture, where two of them may coincide.
     known = {window for _, window in frontier}
     while frontier:
         frontier.sort(key=lambda entry: (-entry[0], entry[1].level, entry[1].cells))
@@ -89,7 +92,7 @@ def _quarters(lattice: Lattice, glance: Glance, target: int | None, most: bool) 
 
 
 def raw(glance: Glance, window: Window, target: int | None, *, most: bool) -> float:
-    """Highest score, or sum of the scores, that a look with a gist shows in a window."""
+    """Highest score, or sum of the scores, of a look's gist in a window."""
     look = glance.gist
     assert look is not None
     x1, y1, x2, y2 = window.cells
@@ -107,7 +110,7 @@ def raw(glance: Glance, window: Window, target: int | None, *, most: bool) -> fl
 def oracle(
     glances: Glances, windows: Sequence[Window], found: Callable[[Glance], Tensor], most: int
 ) -> Iterator[Glance]:
-    """The overview, then always the window that shows most objects not seen before."""
+    """The overview, then repeatedly the window that shows most of the objects not seen before."""
     first = glances.see([overview(glances)])[0]
     yield first
     seen, looks = found(first), glances.see(windows)

@@ -1,4 +1,4 @@
-"""Finishing an experiment with large pictures, and its tables."""
+"""Runs an experiment with large pictures to its end, and writes its tables and curves."""
 
 from collections import defaultdict
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ from semfov.viz.style import save_figure
 
 
 def zoom(config: ZoomConfig) -> None:
-    """Run all scenes that have no part yet, and write tables, records and curves."""
+    """Run all scenes that are not finished yet, and write tables, records and curves."""
     run = ZoomRun(config)
     records = complete(run, "zooming")
     if records is None:
@@ -35,7 +35,7 @@ def zoom(config: ZoomConfig) -> None:
 
 
 def curve(records: list[Record], passes: int) -> list[float]:
-    """Share of all objects that are found after each pass; a way that ended before keeps what it has."""
+    """Share of all objects found after each pass; if a way of looking ends early, its last share stays."""
     total = sum(record["objects"] for record in records)
     counts = [sum(r["found"][min(n, len(r["found"])) - 1] for r in records) for n in range(1, passes + 1)]
     return [count / max(total, 1) for count in counts]
@@ -57,8 +57,8 @@ def summary(records: list[Record], run: ZoomRun) -> str:
             rows.append([way, f"{mean(counts):.2f}", f"{median(counts):g}", f"{100 * failed:.1f} %"])
         count = len(next(iter(hits.values())))
         lines += [
-            f"Passes to the first confirmed hit, overview included, in {count} searches for a class that one of the "
-            "slices shows with a score of 0.3.",
+            f"Passes to the first confirmed hit, including the overview, in {count} searches for a class that one of "
+            "the slices shows with a score of 0.3 or more.",
             "",
             *table(rows),
             "",
@@ -70,7 +70,7 @@ def summary(records: list[Record], run: ZoomRun) -> str:
 
 
 def recalls(finding: dict[str, list[Record]], run: ZoomRun) -> list[str]:
-    """What every way of looking finds."""
+    """Table of recall for every way of looking."""
     passes = run.config.passes
     at = sorted({n for n in (1, 4, 8, 12, 16, 24) if n <= passes} | {passes})
     pixels = run.eye.detector.input_size[0] * run.eye.detector.input_size[1] / 1e6
@@ -82,8 +82,8 @@ def recalls(finding: dict[str, list[Record]], run: ZoomRun) -> list[str]:
     what = "objects" if run.config.target is None else run.config.target
     objects = sum(record["objects"] for record in next(iter(finding.values())))
     return [
-        f"Recall of {objects} {what} in {len(run.scenes)} pictures after so many passes of the detector, overview "
-        f"included (score 0.1, IoU 0.5); a pass sees {pixels:.3f} million pixels.",
+        f"Recall of {objects} {what} in {len(run.scenes)} pictures after n passes of the detector, including the "
+        f"overview (score 0.1, IoU 0.5); a pass takes {pixels:.3f} million pixels.",
         "",
         *table(rows),
         "",
@@ -91,18 +91,18 @@ def recalls(finding: dict[str, list[Record]], run: ZoomRun) -> list[str]:
 
 
 def _paired(hits: dict[str, list[Record]]) -> list[str]:
-    """What contexts change, search by search, as lines of Markdown; of searches whose overview shows nothing, too."""
+    """Passes saved by contexts in all searches, and where the overview shows no hint, as lines of Markdown."""
     contexts = [way for way in hits if way.startswith("context ")]
     if not contexts:
         return []
-    rows = [["", "passes less than without", "where the overview shows no hint", "searches"]]
+    rows = [["", "passes saved", "where the overview shows no hint", "searches"]]
     for way in contexts:
         pairs = list(zip(hits[FREE], hits[way], strict=True))
         saved = [(a["scene"], a["passes"] - b["passes"]) for a, b in pairs]
         unseen = [each for each, (a, _) in zip(saved, pairs, strict=True) if a["overview"] < UNSEEN]
         rows.append([way, _over_scenes(saved), _over_scenes(unseen), f"{len(saved)}, {len(unseen)}"])
     return [
-        f"The same searches with context and without ({FREE}), mean ± standard error over pictures.",
+        f"The same searches with and without context ({FREE}), mean ± standard error over pictures.",
         "",
         *table(rows),
         "",
@@ -110,7 +110,7 @@ def _paired(hits: dict[str, list[Record]]) -> list[str]:
 
 
 def _over_scenes(values: Iterable[tuple[Any, float]]) -> str:
-    """Mean over scenes, and its standard error."""
+    """Mean over scenes and its standard error."""
     means = np.array([*by_scene(values).values()])
     return f"{means.mean():+.3f} ± {float(standard_error(means)):.3f}" if len(means) else ""
 

@@ -1,4 +1,4 @@
-"""Labelled detections of looks at windows: what the detector scored, at what magnification, and what was there."""
+"""Labelled detections in windows of large pictures: the detector's scores, the magnification, and the true class."""
 
 from __future__ import annotations
 
@@ -22,32 +22,35 @@ from semfov.zoom.eye import ZoomEye
 from semfov.zoom.lattice import Lattice
 
 COLUMNS, ROWS, TILE = 8, 6, (480, 360)
-"""Photographs in a mosaic, and the size of their slots in pixels: whole, it is reduced by more than three octaves."""
+"""Columns and rows of a mosaic, and the size of its slots in pixels.
+
+Such a mosaic is so large that the overview reduces it by more than three octaves.
+"""
 
 
 @dataclass(frozen=True)
 class MosaicSettings(SampleSettings):
-    """What labelled detections of windows depend on.
+    """Settings that labelled detections in windows depend on.
 
     Attributes:
-        mosaics: how many are looked at; `fixations` is the number of windows at each magnification.
-        holdout: every n-th mosaic is made of every n-th photographs, the others of the others.
+        mosaics: number of mosaics; `fixations` is the number of windows at each magnification.
+        holdout: n; every n-th mosaic is composed of every n-th photograph, and the other mosaics of the others.
     """
 
     mosaics: int = 0
     holdout: int = 10
 
     def sampler(self) -> Sampler:
-        """What looks."""
+        """The sampler with these settings."""
         return MosaicSampler(self)
 
 
 class HeldOutMosaics:
-    """Mosaics of which every n-th is made of photographs that no other shows.
+    """Mosaics of which every n-th is composed of photographs that no other mosaic shows.
 
     Args:
-        kept: mosaics of all others.
-        held: every n-th mosaic.
+        kept: source of the other mosaics.
+        held: source of every n-th mosaic.
         every: n.
     """
 
@@ -71,7 +74,7 @@ class HeldOutMosaics:
         return self._of(index).annotation(index)
 
     def targets(self, index: int) -> list[int]:
-        """Classes of a mosaic that may be searched for."""
+        """The classes of a mosaic that may be searched for."""
         return self._of(index).targets(index)
 
     def digest(self, index: int) -> str:
@@ -80,10 +83,10 @@ class HeldOutMosaics:
 
 
 class MosaicSampler(Sampler):
-    """Looks at mosaics in windows of all magnifications, at random places.
+    """Looks at mosaics in windows of all magnifications at random places.
 
-    Distances of its samples are octaves: by how many the picture is reduced in the look (`Lattice.octaves`). Fixations
-    are `(x, y, magnification)`.
+    The distance of a sample is the number of octaves by which the look reduces the picture (`Lattice.octaves`).
+    Fixations are `(x, y, magnification)`.
     """
 
     settings: MosaicSettings
@@ -91,7 +94,7 @@ class MosaicSampler(Sampler):
     coordinates = 3
 
     def make(self) -> tuple[ZoomEye, Scenes]:
-        """The eye, and the mosaics."""
+        """Make the eye and the mosaics."""
         settings = self.settings
         eye = ZoomEye(make_detector(settings.detector)).eval().requires_grad_(False)
         kept, held = split_photographs(settings.data, eye.detector.classes, settings.holdout)
@@ -101,7 +104,7 @@ class MosaicSampler(Sampler):
         return eye, HeldOutMosaics(near, far, settings.holdout)
 
     def cells(self, size: tuple[int, int], fixation: Tensor) -> tuple[Grid, Tensor, Tensor]:
-        """About the lattice's cells, the octaves of a look, and which of the cells it shows."""
+        """The grid of the lattice, the octaves of a look (the same for every cell), and which cells the look shows."""
         lattice = Lattice.over(size, self.eye.detector.input_size)
         grid = Grid(lattice.columns, lattice.rows, size)
         x, y, magnification = fixation.tolist()
@@ -131,7 +134,7 @@ class MosaicSampler(Sampler):
 
 
 def choose_windows(lattice: Lattice, count: int, seed: int, scene: object) -> Tensor:
-    """Windows at random places, so many of each magnification but the first, `(R, 3)`; the first is the overview."""
+    """Draw windows `(R, 3)`: the overview, and `count` windows at random places of every other magnification."""
     generator = generator_for("windows", seed, scene)
     rows = [torch.zeros(1, 3, dtype=torch.long)]
     for level in range(1, lattice.levels):

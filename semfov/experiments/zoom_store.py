@@ -1,4 +1,4 @@
-"""Glances at pictures, computed once and kept on disk."""
+"""Stores the glances at pictures, so that each is computed only once."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,16 +20,16 @@ from semfov.zoom.glances import Glance, Glances, LiveGlances, Window
 from semfov.zoom.lattice import Lattice
 
 SOURCES = (Glances.__module__, load_detector.__module__, "semfov.data.images", "semfov.data.large", __name__)
-"""Modules that turn a large picture into glances, with all that they import."""
+"""Modules that turn a large picture into glances; all modules that they import count, too."""
 
 
 class GlanceStore(SceneStore):
-    """Glances at pictures.
+    """Glances at pictures, on disk.
 
     Args:
-        folder: where the store lies.
+        folder: folder of the store.
         settings: `ZoomEye.settings()`.
-        classes: of the detector.
+        classes: number of the detector's classes.
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, object], classes: int) -> None:
@@ -47,28 +47,28 @@ class GlanceStore(SceneStore):
         super().__init__(folder, {"settings": settings}, modules_digest(*SOURCES), schema)
 
     def load(self, digest: str) -> list[Glance]:
-        """Glances at a picture; none where the store does not have them whole."""
+        """The stored glances at a picture; empty if they are missing or incomplete."""
         tensors = self.read(digest)
         if tensors is None or int(tensors["count"].sum()) != len(tensors["boxes"]):
             return []
         return unpack(tensors)
 
     def save(self, digest: str, glances: Sequence[Glance]) -> None:
-        """Keep the glances at a picture."""
+        """Store the glances at a picture."""
         self.write(digest, pack(glances))
 
 
 class StoredGlances(Glances):
-    """Looks at one picture, each taken once: from a store, or by an eye that is opened when it is first needed.
+    """Looks at one picture, each computed once: read from a store, or taken by an eye that is opened only when needed.
 
-    Looks go through the detector one at a time and on one thread: the bits then depend neither on which looks share a
-    batch nor on the machine's processors.
+    Looks pass through the detector one at a time and on one thread. The bits then depend neither on which looks share a
+    batch nor on the number of CPU cores.
 
     Args:
-        lattice: of the picture.
+        lattice: lattice of the picture.
         live: opens the picture.
-        store: where looks are kept; None keeps none.
-        digest: of the picture's pixels.
+        store: store of the looks; None stores none.
+        digest: digest of the picture's pixels.
     """
 
     def __init__(self, lattice: Lattice, live: Callable[[], Glances], store: GlanceStore | None, digest: str) -> None:
@@ -81,7 +81,7 @@ class StoredGlances(Glances):
     _live: Glances | None
 
     def see(self, windows: Sequence[Window]) -> list[Glance]:
-        """Looks from the store, or new ones."""
+        """The looks at windows, read from the store or computed."""
         for window in windows:
             if window not in self._known:
                 with one_thread(), torch.inference_mode():
@@ -90,14 +90,14 @@ class StoredGlances(Glances):
         return [self._known[window] for window in windows]
 
     def save(self) -> None:
-        """Keep what is new."""
+        """Store the looks at the picture if there are new ones."""
         if self._store is not None and len(self._known) > self._kept:
             self._store.save(self._digest, [*self._known.values()])
             self._kept = len(self._known)
 
 
 def open_scene(eye: ZoomEye, scenes: Scenes, index: int, store: GlanceStore | None) -> StoredGlances:
-    """Looks of an eye at a scene; it is composed, or read, when a look is not in the store."""
+    """Looks of an eye at a scene; the scene's image is composed or read only when a look is not in the store."""
     lattice = Lattice.over(scenes.annotation(index).size, eye.detector.input_size, finest=eye.finest)
 
     def live() -> Glances:
@@ -107,8 +107,8 @@ def open_scene(eye: ZoomEye, scenes: Scenes, index: int, store: GlanceStore | No
 
 
 def pack(glances: Sequence[Glance]) -> dict[str, Tensor]:
-    """Glances as tensors for a file."""
-    # No window ends at 0: four zeros stand for one without a limit.
+    """Convert glances to tensors for a file."""
+    # Four zeros stand for a window without a limit, since no limit ends at 0.
     rows = [
         [*g.window.fixation, *(g.window.within or (0.0, 0.0, 0.0, 0.0)), g.window.level, *g.window.cells]
         for g in glances
@@ -125,7 +125,7 @@ def pack(glances: Sequence[Glance]) -> dict[str, Tensor]:
 
 
 def unpack(tensors: dict[str, Tensor]) -> list[Glance]:
-    """The glances that `pack` made the tensors from."""
+    """Convert the tensors of `pack` back to glances."""
     windows = [_window(row) for row in tensors["windows"].tolist()]
     counts = tensors["count"].tolist()
     parts = (tensors[name].split(counts) for name in ("boxes", "scores", "cut"))

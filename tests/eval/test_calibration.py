@@ -53,8 +53,8 @@ def test_run_leaves_tables_sums_and_figures(finished):
     assert {row["count"] for row in rows if (row["looks"], row["cells"]) == ("15", "fixated")} == {"60"}
     text = (finished / "beliefs.md").read_text()
     assert "4 searches" in text
-    assert "2 for a class that is there" in text
-    assert "half of the classes are there" in text
+    assert "2 of them for a class that is present" in text
+    assert "half of the target classes are present" in text
     by_looks = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|"]
     for row in whole:
         figures = [f"{float(row[name]):.4f}" for name in ("nll", "brier", "ece", "mean_probability", "rate")]
@@ -108,6 +108,6 @@ def test_help_and_defaults(capsys):
     assert stopped.value.code == 0
     printed = capsys.readouterr().out
     assert "--target_model" in printed
-    assert "how well beliefs say which cells hold the target" in printed.replace("\n", " ")
+    assert "how well the belief's probabilities agree with which cells hold the target" in printed.replace("\n", " ")
     assert CalibrationConfig().beliefs
     assert CalibrationConfig().grid == (10, 10)

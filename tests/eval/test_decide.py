@@ -75,7 +75,7 @@ def test_run_leaves_table_and_records(finished):
     assert [row[0] for row in rows] == [*POLICIES, *SHARP, *places, *lands, "price of a look", "0.05"]
     assert (finished / "roc.png").stat().st_size > 1000
     assert "4 searches" in text
-    assert "2 for a class that is" in text
+    assert "2 of them for a present class" in text
     for row in rows[:5]:
         group = [record for record in records if record["policy"] == row[0]]
         score = torch.tensor([record["probability"] for record in group])
@@ -115,7 +115,7 @@ def test_help_and_defaults(capsys):
     assert stopped.value.code == 0
     printed = capsys.readouterr().out
     assert "--belief.target_model" in printed
-    assert "Is it there, where, and how sure" in printed
+    assert "Decide whether a target is present, where, and how surely" in printed
     assert DecideConfig().data == DataConfig()
     assert (DecideConfig().belief, DecideConfig().protocol) == (BeliefConfig(), ProtocolConfig())
     assert callable(search_and_decide)
@@ -149,7 +149,7 @@ def test_the_table_by_hand():
     second = [record("b", each["present"], "undecided", 0.5, 9) for each in first]
     third = [{**each, "policy": "price 0.1"} for each in first]
     text = summary([*first, *second, *third], "sensed", [])
-    assert "6 searches (sensed), 4 for a class that is." in text
+    assert "6 searches (sensed), 4 of them for a present class." in text
     area, other, _, sharp, tiled, a, b, _, look, landed, nowhere, _ = rows_of(text)
     there = torch.tensor([each["present"] for each in first])
     score = torch.tensor([each["probability"] for each in first])

@@ -8,6 +8,7 @@ import torch
 from PIL import Image
 
 import eval.demo as program
+from eval import demo_text
 from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, observers, policies, read_image
 from semfov.belief import MapEvidence
 from semfov.belief.observers import Semantic
@@ -139,7 +140,7 @@ def test_a_large_picture_is_looked_at_in_windows(run, large, zooming, tmp_path):
     )
     assert code == 0
     assert "field.png, 1280 × 960 px, looked at in windows: red: found" in printed.out
-    assert "not used for a picture of this size: start, report" in printed.out
+    assert "ignored for a picture of this size: start, report" in printed.out
     assert "   0  the whole picture × 0.12: 1 detection" in printed.out
     with Image.open(tmp_path / "out" / "zoom.png") as picture:
         picture.verify()
@@ -257,7 +258,7 @@ def test_stages_of_every_look_are_measured(agent, photo):
 def test_what_a_look_took_is_printed(agent, photo):
     picture = Picture("photo", read_image(photo))
     scanpath = program.look_at(agent, picture, program.DemoConfig(explore=True, start=40, shifts=2))
-    lines = program.told("photo", scanpath).splitlines()
+    lines = demo_text.told("photo", scanpath).splitlines()
     assert lines[1].endswith("ms")
     milliseconds = [f"{1000 * sum(look.values()):.0f}" for look in scanpath.seconds]
     assert [line.split()[-1] for line in lines[2 : lines.index("")]] == milliseconds

@@ -123,7 +123,7 @@ def test_fewer_photographs_may_be_searched_than_seen(finished):
     assert main([*arguments, "--searched", "1"]) == 0
     text = (out / "compared" / "foveal_training.md").read_text()
     assert "search (1 photographs" in text
-    assert "fixation in longer sides (2 photographs" in text
+    assert "longer side (2 photographs" in text
 
 
 def test_curves_are_by_photograph():

@@ -130,7 +130,7 @@ def test_searches_of_people_models_floors_and_policies(pictures):
     assert code == 0
     table = rows(out / "summary.csv")
     titles = list(dict.fromkeys(row["table"] for row in table))
-    assert titles == ["all 4 pictures", "the 4 pictures at hand"]
+    assert titles == ["all 4 pictures", "the 4 available pictures"]
     there = {row["row"] for row in table if row["table"] == titles[1]}
     assert there == {"people", "model", "random draws", "centre draws", "random", "non-predictive-raw"}
     paths = read_table(out / "scanpaths" / "non-predictive-raw.csv")

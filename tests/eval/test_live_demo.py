@@ -110,7 +110,7 @@ def test_a_video_and_what_does_not_go_with_it(run, tmp_path):
     assert lines[0] == "red.avi: searching for “red”"
     assert re.match(r"     0  at \(7, 5\): red 0\.9\d +p\(red\) up to 0\.\d\d, most likely at", lines[1])
     assert re.search(r"\d frames/s$", lines[4])
-    assert re.match(r"4 frames, [\d.]+ a second", lines[5])
+    assert re.match(r"4 frames, [\d.]+ per second", lines[5])
     assert len(read(tmp_path / "out" / f"live{video_suffix()}")) == 4
     code, printed = run(path, "--explore")
     assert "red.avi: exploring" in printed.out

@@ -202,7 +202,7 @@ def test_help_and_print_config(capsys):
         alone = re.sub("-(raw|calibrated|learned)$", "", name)
         assert f"`{alone}`" in explained, name
     assert "`-raw`or`-calibrated`" in explained
-    assert "thelastfouralsoby`-learned`" in explained
+    assert "Thelastfouralsotake`-learned`" in explained
     learned = [name for name in presets("search") if name.endswith("-learned")]
     assert learned == [
         "foveal-hit-learned",

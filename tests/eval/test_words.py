@@ -83,8 +83,8 @@ def test_table_has_those_apart_whose_first_look_misses(records, config):
     below = sum(score < middle for score in scores)
     assert 0 < below < len(scores)
     text = "\n".join(told(records, arms, replace(config, missed=middle)))
-    assert f", {len(scores)} searches an arm" in text
-    assert f", {below} searches an arm" in text
+    assert f", {len(scores)} searches per arm" in text
+    assert f", {below} searches per arm" in text
     assert "misses the target: none." in "\n".join(told(records, arms, replace(config, missed=0.0)))
 
 

@@ -150,8 +150,10 @@ def test_a_model_that_is_not_shipped_leaves_its_belief_out(config, run, tmp_path
     text, written = write_belief_report(bare)
     assert all(path.stat().st_size > 200 for path in written)
     for name, title in (("learned", "target evidence"), ("learned map", "map evidence")):
-        assert f"Left out for want of a fitted model: {name} (detector: no model of {title} is shipped for" in text
-    assert "The gaze goes by the tempered belief" in text
+        assert (
+            f"Left out because no fitted model is shipped: {name} (detector: no model of {title} is shipped for" in text
+        )
+    assert "The tempered belief guides the gaze" in text
     with pytest.raises(InputError, match="unknown model of map evidence 'mine'"):
         BeliefCalibrationRun(replace(config, belief=replace(config.belief, map_model="mine")))
 

@@ -233,7 +233,10 @@ def test_context_is_added_where_a_policy_asks_for_it(context):
 
 def test_context_is_refused_where_a_policy_cannot_use_it(context, model):
     for policy, task in (("predictive", "search"), ("random", "search"), ("random", "exploration")):
-        with pytest.raises(InputError, match="context: expected a search by the probability of the target"):
+        with pytest.raises(
+            InputError,
+            match="context: expected 'none', or a search with the policy 'target-evidence' or 'non-predictive'",
+        ):
             strategy(PolicyConfig(policy, context="both"), task, context=context, observation=model)
 
 

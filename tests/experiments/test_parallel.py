@@ -91,8 +91,8 @@ def wait_until(happened, seconds=120):
     ("number", "code", "told"),
     [
         (signal.SIGKILL, -9, None),
-        (signal.SIGTERM, 143, "terminated; the same command goes on where this one stopped"),
-        (signal.SIGINT, 130, "interrupted; the same command goes on where this one stopped"),
+        (signal.SIGTERM, 143, "terminated; give the same command again to continue"),
+        (signal.SIGINT, 130, "interrupted; give the same command again to continue"),
     ],
     ids=["SIGKILL", "SIGTERM", "SIGINT"],
 )

@@ -99,5 +99,5 @@ def test_a_list_of_ids_that_cannot_be_read_is_named(photographs, content):
     if content is not None:
         listed.write_bytes(content)
     data = DataConfig(root=photographs, annotations=photographs / "cups.json", ids=listed)
-    with pytest.raises(DataError, match=r"ids\.txt: cannot be read"):
+    with pytest.raises(DataError, match=r"ids\.txt: expected a text file with one id per line"):
         make_scenes(data, ("cup",))

@@ -62,7 +62,7 @@ def test_a_finished_run_of_other_code_is_told_and_computed_anew(config, monkeypa
     with caplog.at_level(logging.WARNING):
         finish(second, "searching")
     (record,) = caplog.records
-    assert "1 scenes were finished with these settings by other code" in record.getMessage()
+    assert "1 scenes were finished with these settings by another version of the code" in record.getMessage()
     assert second.parts.load(0) is not None
 
 
@@ -145,7 +145,7 @@ def test_an_emptied_store_is_filled_with_the_same_bits_on_any_number_of_threads(
 
 def test_the_same_policy_twice_is_refused(config):
     for policies in (("random", "random"), ("random", PolicyConfig("random")), ("recommended", "target-evidence")):
-        with pytest.raises(InputError, match=r"^policies: expected each of them once, got '.*' 2 times"):
+        with pytest.raises(InputError, match=r"^policies: expected each policy once, got '.*' 2 times"):
             SearchRun(replace(config, policies=policies))
 
 
@@ -170,7 +170,7 @@ def test_a_changed_choice_changes_the_printed_result(tmp_path):
     assert "masked_fill(visited, -torch.inf)" in text
     choice.write_text(text.replace("masked_fill(visited, -torch.inf)", "neg().masked_fill(visited, -torch.inf)"))
     second, told = search(tmp_path / "out")
-    assert "by other code" in told
+    assert "by another version of the code" in told
     assert second != first
     assert search(tmp_path / "fresh")[0] == second
 

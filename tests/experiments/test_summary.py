@@ -98,8 +98,8 @@ def test_exploration_tables_name_the_published_answer_first():
     text = explore_report.summary_markdown(curves, 2, "an eye")
     published, other = text.split("**as published", 1)[1].split("**the answer", 1)
     other, everywhere = other.split("**all cells count", 1)
-    assert "most probable of all classes, background among them" in published
-    assert "most probable class but background" in other
+    assert "most probable class, background included" in published
+    assert "most probable class other than background" in other
     head, _, row = cells_of(published)
     assert head == ["policy", "0", "1", "2", LAST_COLUMN]
     # Means 1/4, 2/4, 3/4; images and repetitions differ by a quarter, so both errors are an eighth.

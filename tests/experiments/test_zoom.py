@@ -88,7 +88,7 @@ def test_measures_can_be_left_out(config, capsys):
 
     zoom_report.zoom(replace(config, measures=("decision",)))
     text = capsys.readouterr().out
-    assert "Is it there?" in text
+    assert "Is the target present?" in text
     assert "Recall" not in text
     assert {json.loads(line)["measure"] for line in (config.out / "records.jsonl").read_text().splitlines()} == {
         "decision"

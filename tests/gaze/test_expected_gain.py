@@ -179,7 +179,7 @@ def test_searches_have_no_learned_map():
 @pytest.mark.parametrize("policy", sorted(LEARNED))
 def test_settings_of_another_belief_are_refused(policy, setting):
     own = LEARNED[policy]
-    with pytest.raises(InputError, match=f"^{next(iter(setting))}: expected none, .*comes with its own belief"):
+    with pytest.raises(InputError, match=f"^{next(iter(setting))}: expected null, .*has its own belief"):
         resolve(PolicyConfig(own.policy, "learned", saliency=own.saliency, **setting), "exploration")
 
 

@@ -331,7 +331,7 @@ def test_settings_of_experiments_from_the_folder(home):
     assert with_models(SearchConfig()) == SearchConfig()
     moved = SearchConfig(models=folder, detector=DetectorConfig(name="elsewhere.onnx"))
     assert with_models(moved).detector.name == "elsewhere.onnx"
-    with pytest.raises(InputError, match=r"belief\.map_model: expected none beside models"):
+    with pytest.raises(InputError, match=r"belief\.map_model: expected null, since models defines it"):
         with_models(SearchConfig(models=folder, belief=SearchConfig().belief.__class__(map_model="x")))
 
 

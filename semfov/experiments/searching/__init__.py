@@ -1,1 +1,1 @@
-"""Searches beside people's: how soon targets are found, and how alike scanpaths are."""
+"""Comparison of searchers with people: how soon they find targets, and how similar their scanpaths are."""

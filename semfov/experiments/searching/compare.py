@@ -1,4 +1,4 @@
-"""Searches of people, of models' files, of floors and of our policies, scored alike."""
+"""Scores the searches of people, of models from files, of random baselines and of policies in the same way."""
 
 from __future__ import annotations
 
@@ -27,10 +27,13 @@ RANDOM, CENTRE = "random draws", "centre draws"
 
 
 def compare(config: PeopleSearchConfig) -> None:
-    """Score all searchers beside people and write what comes of it.
+    """Score all searchers against people and write the report.
+
+    Args:
+        config: the settings.
 
     Raises:
-        DataError: a model's file has no picture that people searched.
+        DataError: the file of a model has no picture that people searched.
     """
     screen = config.screen.width, config.screen.height
     grid = Grid(config.belief.columns, config.belief.rows, screen)
@@ -42,7 +45,7 @@ def compare(config: PeopleSearchConfig) -> None:
     known = {each.picture for each in people}
     for name, searches in searchers.items():
         if not known & {each.picture for each in searches}:
-            raise DataError(f"{name}: expected pictures that people searched, got none of them")
+            raise DataError(f"{name}: expected searches in pictures that people searched, got only other pictures")
     floors = {name: _floor(name, people, grid, config) for name in (RANDOM, CENTRE)}
     policies: dict[str, list[Fixations]] = {}
     run: PeopleSearchRun | None = None
@@ -59,7 +62,7 @@ def compare(config: PeopleSearchConfig) -> None:
         here = set(run.scenes.ids)
         few = {name: [each for each in searches if each.picture in here] for name, searches in every.items()}
         few = {name: searches for name, searches in few.items() if searches}
-        title = f"the {len(here)} pictures at hand"
+        title = f"the {len(here)} available pictures"
         tables[title] = _scored({**few, **policies}, few["people"], grid, config)
     report(config, tables, {**floors, **policies})
 
@@ -73,7 +76,7 @@ def _scored(
 
 
 def _floor(name: str, people: Sequence[Fixations], grid: Grid, config: PeopleSearchConfig) -> list[Fixations]:
-    """A search for each picture's target, by uniform draws or by draws where people look in any picture."""
+    """A search in each picture, by uniform random draws, or by draws from people's fixations in all pictures."""
     density = np.ones(len(grid)) if name == RANDOM else _centre(people, grid)
     trials = [searches[0] for searches in by_picture(people).values()]
     protocol = config.protocol
@@ -82,7 +85,7 @@ def _floor(name: str, people: Sequence[Fixations], grid: Grid, config: PeopleSea
 
 
 def _centre(people: Sequence[Fixations], grid: Grid) -> Array:
-    """How often people fixate each cell after their first fixation, in all pictures; once more than they do."""
+    """How often people fixate each cell after their first fixation in all pictures, plus one."""
     points = np.concatenate([each.points[1:] for each in people])
     counts = torch.bincount(grid.cell_of(torch.from_numpy(points)), minlength=len(grid))
     return np.asarray(counts.double().numpy() + 1)

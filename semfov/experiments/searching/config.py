@@ -19,13 +19,13 @@ from semfov.experiments.settings import Count, Positive, Range, Settings, Worker
 
 @dataclass(frozen=True)
 class ScreenConfig(Settings):
-    """The screen that people sat before, with a picture letterboxed on it.
+    """The screen on which people saw the pictures, with each picture letterboxed on it.
 
     Args:
-        width: in pixels.
-        height: in pixels.
-        degrees: that its width takes of the field of view (COCO-Search18: 54).
-        start: `(x, y)` in pixels, where the first fixation is (of people on COCO-Search18: the mean of theirs).
+        width: width in pixels.
+        height: height in pixels.
+        degrees: width in degrees of visual angle (COCO-Search18: 54).
+        start: `(x, y)` in pixels, the first fixation (default: the mean of people's first fixations in COCO-Search18).
     """
 
     width: Count = 1680
@@ -36,26 +36,28 @@ class ScreenConfig(Settings):
 
 @dataclass(frozen=True)
 class PeopleSearchConfig(Settings):
-    """People, models' files and policies that search for the same targets in the same pictures.
+    """Comparison of people, models and policies that search for the same targets in the same pictures.
 
     Args:
-        people: scanpaths of people: a folder with a JSON file for each (Ruarte et al.'s), or a table (`.csv`).
-        files: scanpaths of models, each a JSON file of that kind or a table; rows are called by the files' names.
-        pictures: folders with some of the pictures; policies search in those that are there.
+        people: scanpaths of people: a folder with one JSON file per person (format of Ruarte et al.), or a table
+            (`.csv`).
+        files: scanpaths of models, each a JSON file in the same format or a table; the file's name is the name of the
+            model in the results.
+        pictures: folders in which the pictures are looked for; policies search in the pictures that are found.
         screen: the screen.
-        detector: which detector looks through the fovea.
+        detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor; it sees the whole screen.
-        belief: the grid over the screen; 32 × 24 are the cells of the models' files.
+        belief: the belief, on a grid over the screen; the default of 32 × 24 cells is the grid of the models' files.
         saliency: the saliency baselines.
-        protocol: `shifts` is after how many gaze shifts a search has failed, and the seed that of the floors.
-        policies: policies that search (`python -m eval.search --help`).
+        protocol: the protocol; a search has failed after `shifts` gaze shifts, and `seed` draws the random baselines.
+        policies: policies to compare (`python -m eval.search --help`).
         gaze_model: learned gaze policy, by name or file.
-        bandwidth: of the clusters of fixations that sequences are spelled by, in screen pixels.
-        bootstrap: samples of pictures that standard errors of TFP-AUC come from.
+        bandwidth: bandwidth, in screen pixels, of the clusters of fixations that make up the letters of a sequence.
+        bootstrap: number of bootstrap samples of the pictures for the standard errors of TFP-AUC.
         out: folder for tables, figures and the manifest.
-        cache: folder for what the detector saw from every cell (None: the user's cache).
-        store: keep that on disk.
-        workers: processes (None: one for each CPU core).
+        cache: folder for the stored detections from every cell (None: the user's cache).
+        store: keep detections on disk.
+        workers: number of processes (None: one per CPU core).
     """
 
     people: Path = Path("human_scanpaths")

@@ -1,4 +1,4 @@
-"""What a comparison of searches leaves: tables, curves, the policies' scanpaths, settings and manifest."""
+"""Output of a comparison of searches: tables, curves, the policies' scanpaths, settings and manifest."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ HEAD = (
 
 
 def report(config: PeopleSearchConfig, tables: Mapping[str, Rows], scanpaths: Mapping[str, list[Fixations]]) -> None:
-    """Write everything and print the tables.
+    """Write all output and print the tables.
 
     Args:
-        config: of the run.
-        tables: by title.
-        scanpaths: of the floors and of our policies, by name.
+        config: the settings of the run.
+        tables: tables by title.
+        scanpaths: scanpaths of the random baselines and of the policies, by name.
     """
     out = config.out
     summary = "\n".join(line for title, rows in tables.items() for line in [f"**{title}**", "", *_table(rows), ""])

@@ -1,4 +1,4 @@
-"""Our policies on the screens that people searched: same first fixation, same cells, same end."""
+"""Policies on the screens that people searched, with the same first fixation, the same cells and the same stop."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from semfov.gaze.policies import Task
 
 
 class PeopleSearchRun(Run):
-    """Searches for people's targets: the unit of work is a screen."""
+    """Searches for the targets of people, one screen after the other."""
 
     task: ClassVar[Task] = "search"
     config: PeopleSearchConfig  # type: ignore[assignment]
@@ -30,11 +30,11 @@ class PeopleSearchRun(Run):
         super().__init__(cast(Any, config))
 
     def check_sources(self) -> None:
-        """Raise an error where the detector is not there; pictures are looked for when people's files are read."""
+        """Check that the detector exists; pictures are looked for after people's files have been read."""
         check_detector(self.config.detector.name)
 
     def open_scenes(self) -> Scenes:
-        """The screens whose pictures are there."""
+        """The screens whose pictures are found."""
         config = self.config
         searches = read_searches(config.people, (config.screen.width, config.screen.height))
         known = {each.picture: each for each in searches}
@@ -42,7 +42,7 @@ class PeopleSearchRun(Run):
         return self.screens
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """A search by each policy."""
+        """Run a search on a screen with each policy; returns records, and the seconds that each stage took."""
         watch, protocol, grid = Stopwatch(), self.config.protocol, self.grid(index)
         detections = self.detections(index)
         watch.lap("look")

@@ -1,4 +1,4 @@
-"""Figures of one searcher beside people, by picture."""
+"""Scores of a searcher against people, by picture."""
 
 from __future__ import annotations
 
@@ -30,20 +30,21 @@ from semfov.metrics.search import cumulative_performance
 Array = NDArray[np.float64]
 
 DIMENSIONS = ("shape", "direction", "length", "position")
-"""Of MultiMatch, those that need no durations."""
+"""The dimensions of MultiMatch that need no fixation durations."""
 
 
 @dataclass(frozen=True)
 class Beside:
-    """A searcher beside people.
+    """Scores of a searcher against people.
 
     Attributes:
-        curve: `(N,)`, share found by the 1st, 2nd, … fixation: a mean over people's means, or over a model's searches.
-        area: under that curve (`performance_area`), and its standard error over pictures.
-        tfp_auc: see `semfov.metrics.scanpath.tfp_auc`, and its standard error by bootstrap over pictures.
-        mismatch: from people's curve over the first seven fixations.
-        ratio: scanpath ratio, over searches that found, and its standard error over pictures.
-        alike: by picture, `(4,)` of MultiMatch, the sequence score and the edit distance to people, `(6,)`.
+        curve: `(N,)`, share of targets found by the 1st, 2nd, … fixation: the mean over people of each person's mean,
+            or the mean over a model's searches.
+        area: area under that curve (`performance_area`), and its standard error over pictures.
+        tfp_auc: `semfov.metrics.scanpath.tfp_auc`, and its standard error by bootstrap over pictures.
+        mismatch: probability mismatch with people's curve over the first seven fixations.
+        ratio: mean scanpath ratio of the successful searches, and its standard error over pictures.
+        alike: by picture `(6,)`: four dimensions of MultiMatch, sequence score, and edit distance to people.
     """
 
     curve: Array
@@ -54,25 +55,25 @@ class Beside:
     alike: Mapping[str, Array]
 
     def mean(self, figure: int) -> tuple[float, float]:
-        """Mean over pictures of a figure of `alike`, and its standard error."""
+        """Mean over pictures of one measure of `alike`, and its standard error."""
         values = np.array([each[figure] for each in self.alike.values()])
         return _mean_and_error(values[np.isfinite(values)])
 
     @property
     def multimatch(self) -> tuple[float, float]:
-        """Mean of MultiMatch's four, and its standard error over pictures."""
+        """Mean of the four dimensions of MultiMatch, and its standard error over pictures."""
         return _mean_and_error(np.array([each[:4].mean() for each in self.alike.values() if np.isfinite(each[0])]))
 
 
 class People:
-    """People's searches, prepared once for all searchers that are laid beside them.
+    """Searches of people, prepared once for the comparison with several searchers.
 
     Args:
-        searches: of all people, in pixels of the screen.
-        grid: cells that scanpaths are compared in.
-        longest: fixations of a search, the first among them.
-        bandwidth: of the clusters that sequences are spelled by, in pixels.
-        bootstrap: samples of pictures.
+        searches: the searches of all people, in pixels of the screen.
+        grid: grid on whose cells scanpaths are compared.
+        longest: largest number of fixations in a search, including the first.
+        bandwidth: bandwidth, in pixels, of the clusters of fixations that make up the letters of a sequence.
+        bootstrap: number of bootstrap samples of the pictures.
     """
 
     def __init__(
@@ -89,7 +90,7 @@ class People:
         self.curve = mean_performance(found, [each.target for each in self.searches], 6)
 
     def score(self, searches: Sequence[Fixations]) -> Beside:
-        """A searcher's figures; people themselves are compared with all others."""
+        """Score a searcher; each person is compared with all other people."""
         found = np.array([shift_found(each, self.longest) for each in searches])
         shifts = self.longest - 1
         curve = mean_performance(found.tolist(), [each.subject for each in searches], shifts)
@@ -121,7 +122,7 @@ class People:
             for mine, word in zip(ours, words, strict=True):
                 path = in_cells(mine, self.grid)
                 for other, cells, letters in zip(self.pictures[name], self.cells[name], self.words[name], strict=True):
-                    # Of two people each pair is counted once.
+                    # Each pair of people is counted only once.
                     if id(mine) in themselves and other.subject <= mine.subject:
                         continue
                     both = shift_found(mine, 10**6) >= 0 and shift_found(other, 10**6) >= 0
@@ -142,11 +143,11 @@ class People:
         return [labels[start:end].tolist() for start, end in zip([0, *ends], ends, strict=False)]
 
     def _error(self, found: NDArray[np.int64], searches: Sequence[Fixations]) -> float:
-        """Standard error of TFP-AUC: pictures are drawn anew with replacement, target by target."""
+        """Standard error of TFP-AUC by bootstrap: pictures are resampled with replacement, target by target."""
         pictures = defaultdict(list)
         for at, each in zip(found.tolist(), searches, strict=True):
             pictures[each.target, each.picture].append(max(0, 7 - at) if at >= 0 else 0)
-        # A search found after n gaze shifts counts in 7 - n of the seven values that are summed.
+        # A search that succeeds after n gaze shifts counts in 7 - n of the seven values that are summed.
         categories = defaultdict(list)
         for (target, _), values in pictures.items():
             categories[target].append((float(np.sum(values)), len(values)))
@@ -160,5 +161,5 @@ class People:
 
 
 def _mean_and_error(values: Array) -> tuple[float, float]:
-    """Mean and standard error, NaN where there are too few values."""
+    """Mean and standard error; NaN if there are too few values."""
     return (float(values.mean()), float(standard_error(values))) if len(values) else (float("nan"), float("nan"))

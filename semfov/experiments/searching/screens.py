@@ -1,4 +1,4 @@
-"""Pictures as people saw them: letterboxed on a grey screen, with the box of what was searched for."""
+"""Pictures as people saw them: letterboxed on a grey screen, with the box of the target."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ from semfov.errors import InputError
 from semfov.io.files import sha256
 
 GREY = 0.5
-"""Of the screen beside the picture."""
+"""Grey value of the screen around the picture."""
 
 
 class Screens:
     """Screens with one picture each, as scenes whose only object is the target (a `Scenes`).
 
     Args:
-        folders: where pictures are looked for, by their name or by COCO's (`semfov.data.fixations.coco_name`).
-        searches: one for each picture, in screen pixels; those whose picture is in no folder are left out, and those
-            for a class that the detector does not know.
-        classes: the detector's.
+        folders: folders in which pictures are looked for, under their own name or under that of COCO
+            (`semfov.data.fixations.coco_name`).
+        searches: one search for each picture, in screen pixels. A search is left out if its picture is in no folder, or
+            if the detector does not know its target class.
+        classes: classes of the detector.
     """
 
     def __init__(self, folders: Sequence[Path], searches: Mapping[str, Fixations], classes: tuple[str, ...]) -> None:

@@ -1,4 +1,4 @@
-"""Scanpaths of searches, brought to cells and cut at the target, as Ruarte et al. (2025) lay them side by side."""
+"""Scanpaths of searches, reduced to cells and cut at the target, as Ruarte et al. (2025) compare them."""
 
 from __future__ import annotations
 
@@ -19,10 +19,18 @@ Array = NDArray[np.float64]
 
 
 def read_searches(path: Path, screen: tuple[int, int], subject: str | None = None) -> list[Fixations]:
-    """Scanpaths of a file, or of all JSON files of a folder, in screen pixels.
+    """Read the scanpaths of a file, or of all JSON files of a folder.
+
+    Args:
+        path: a table (`.csv`), a JSON file in the format of Ruarte et al., or a folder of such JSON files.
+        screen: `(width, height)` of the screen in pixels.
+        subject: name of the searcher (None: the name given in the file).
+
+    Returns:
+        The scanpaths in screen pixels.
 
     Raises:
-        DataError: the folder holds no such file, or a scanpath tells no target or box.
+        DataError: the folder holds no JSON file, or a scanpath has no target or box.
     """
     if path.is_dir():
         files = sorted(path.glob("*.json"))
@@ -35,12 +43,12 @@ def read_searches(path: Path, screen: tuple[int, int], subject: str | None = Non
         found = read_ruarte(path, screen=screen, subject=subject)
     for each in found:
         if each.target is None or each.box is None:
-            raise DataError(f"{path}: {each.picture}: expected a target and its box, for searches are scored by them")
+            raise DataError(f"{path}: {each.picture}: expected a target and its box, by which searches are scored")
     return found
 
 
 def shift_found(search: Fixations, longest: int) -> int:
-    """Gaze shift that found the target, as the file says, else by the box; -1 where none did in so many fixations."""
+    """The gaze shift that found the target, from the file or else from the box; -1 if no fixation of `longest` did."""
     assert search.box is not None
     at = len(search) - 1 if search.found else -1
     if search.found is None:
@@ -49,7 +57,7 @@ def shift_found(search: Fixations, longest: int) -> int:
 
 
 def goal_cells(search: Fixations, grid: Grid) -> tuple[int, int, int, int]:
-    """First and last column, first and last row of the cells that the target's box is in."""
+    """First and last column, and first and last row, of the cells that the target's box overlaps."""
     assert search.box is not None
     step = np.array(search.size) / (grid.columns, grid.rows)
     first = np.floor(np.array(search.box[:2]) / step + 1e-9)
@@ -58,10 +66,17 @@ def goal_cells(search: Fixations, grid: Grid) -> tuple[int, int, int, int]:
 
 
 def in_cells(search: Fixations, grid: Grid) -> Array:
-    """Columns and rows of the cells that were fixated, `(n, 2)`, neighbours merged, up to the target.
+    """The fixated cells of a search, up to the first on the target.
 
-    One fixation after another in the same cell is one (`merge_close`), and what comes after the first in a cell of the
-    target is left out. Coordinates count from the left and the top edge of the screen, as they do it.
+    Successive fixations in the same cell are merged into one (`merge_close`), and all fixations after the first one in
+    a cell of the target are left out. As in Ruarte et al., coordinates count from the left and top edges of the screen.
+
+    Args:
+        search: the scanpath.
+        grid: the grid over the screen.
+
+    Returns:
+        `(n, 2)`, column and row of each cell.
     """
     step = np.array(search.size) / (grid.columns, grid.rows)
     path = merge_close(np.clip(np.floor(search.points / step), 0, (grid.columns - 1, grid.rows - 1)), (1, 1))
@@ -81,16 +96,19 @@ def drawn_searches(
     seed: int,
     name: str,
 ) -> list[Fixations]:
-    """Searches that draw cell after cell, without return, from the same density in every picture.
+    """Random searches that draw cell after cell, without replacement, from the same density in every picture.
 
     Args:
-        searches: one for each picture, for its target.
-        grid: the cells of the screen.
-        start: first fixation.
-        density: `(X·Y,)`, from 0.
-        longest: fixations of a search, the first among them.
-        seed: of the draws.
-        name: of the searcher.
+        searches: one search for each picture, which gives the target.
+        grid: the grid over the screen.
+        start: the first fixation, in pixels of the screen.
+        density: `(X·Y,)`, weights of the cells, 0 or more.
+        longest: largest number of fixations in a search, including the first.
+        seed: random seed of the draws.
+        name: name of the searcher.
+
+    Returns:
+        A search for each picture.
     """
     centres = grid.centres.numpy()
     first = int(grid.cell_of(torch.tensor(start)))

@@ -1,1 +1,1 @@
-"""Free viewing: how well policies, saliency and centre bias foretell where people look next."""
+"""Free viewing: how well policies, saliency and centre bias predict where people look next."""

@@ -20,11 +20,11 @@ from semfov.experiments.settings import Count, Positive, Range, Seed, Settings, 
 
 @dataclass(frozen=True)
 class PicturesConfig(Settings):
-    """Which pictures people saw.
+    """The pictures that people saw.
 
     Args:
-        root: their folder.
-        limit: use only the first so many of them.
+        root: folder of the pictures.
+        limit: use only this many pictures, the first ones.
     """
 
     root: Path = Path()
@@ -33,14 +33,14 @@ class PicturesConfig(Settings):
 
 @dataclass(frozen=True)
 class DensityConfig(Settings):
-    """How maps become densities of the next fixation. Every row of the tables has the same freedom.
+    """How maps are turned into densities of the next fixation; all models have the same kinds of free parameters.
 
     Args:
-        columns: bins of the raster in a row; fixations are looked up in bins.
-        rows: bins in a column.
-        blurs: standard deviations of Gaussian blurs in bins, of which the one that fits best is taken.
-        events: fixations, drawn at random, that weights are fitted on.
-        seed: that they are drawn by.
+        columns: number of columns of the raster; fixations are assigned to its bins.
+        rows: number of rows of the raster.
+        blurs: standard deviations, in bins, of Gaussian blurs; the best-fitting one is used.
+        events: number of randomly drawn fixations on which the weights are fitted.
+        seed: random seed of this draw.
     """
 
     columns: Side = 40
@@ -52,30 +52,31 @@ class DensityConfig(Settings):
 
 @dataclass(frozen=True)
 class ViewingConfig(Settings):
-    """People and policies before the same pictures, without a task.
+    """Comparison of people and policies that view the same pictures without a task.
 
     Args:
-        people: fixations of all people: OSIE's JSON, or a table (`.csv`) as `semfov.data.fixations` reads it.
+        people: fixations of all people: the JSON file of OSIE, or a table (`.csv`) as `semfov.data.fixations` reads it.
         data: the pictures.
-        detector: which detector looks through the fovea.
+        detector: the detector, which is applied to each foveated view.
         sensor: the foveal sensor.
-        belief: the grid that looks are from the cells of, and what policies believe on it.
-        saliency: settings of saliency maps that policies have as priors.
-        protocol: its seed is what scanpaths are drawn by.
-        density: how maps become densities.
-        policies: exploration policies, by preset or settings (`python -m eval.explore --help`). `landing`, on the cells
-            of the raster, is always there beside them.
+        belief: the belief of the policies; looks are taken from the centres of its cells.
+        saliency: settings of the saliency maps that policies have as priors.
+        protocol: the protocol; its seed draws the scanpaths.
+        density: how maps are turned into densities.
+        policies: exploration policies, by preset or settings (`python -m eval.explore --help`). The policy `landing`,
+            on the cells of the raster, is always included.
         models: saliency models.
-        swap: report on the half of the pictures that is fitted on otherwise, and fit on the other.
-        sequences: rows whose scanpaths are drawn and compared with people's.
-        files: scanpaths of other models in these pictures, as tables (`.csv`), compared with people's, too.
-        drawings: pictures in which scanpaths of people and of `landing` are drawn side by side.
-        bandwidth: of the clusters of fixations that sequences are spelled by, in longer sides of the picture.
-        longest: fixations of a scanpath that count.
+        swap: exchange the two halves of the pictures: report on the half that is otherwise used for fitting.
+        sequences: models whose scanpaths are drawn and compared with those of people.
+        files: scanpaths of other models in these pictures, as tables (`.csv`), to compare with those of people.
+        drawings: number of pictures for which scanpaths of people and of `landing` are shown side by side.
+        bandwidth: bandwidth of the clusters of fixations that make up the letters of a sequence, as a fraction of the
+            picture's longer side.
+        longest: number of fixations of a scanpath that are used, the first ones.
         out: folder for tables, figures and the manifest.
-        cache: folder for what the detector saw from every cell, and for maps (None: the user's cache).
-        store: keep looks and maps on disk; false recomputes them.
-        workers: processes (None: one for each CPU core).
+        cache: folder for the stored detections from every cell and for maps (None: the user's cache).
+        store: keep detections and maps on disk; false computes them anew in each run.
+        workers: number of processes (None: one per CPU core).
     """
 
     people: Path = Path("fixations.json")

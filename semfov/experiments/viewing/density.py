@@ -1,4 +1,4 @@
-"""From maps to a density of the next fixation, with the same few weights for every model."""
+"""Turns maps into a density of the next fixation, with the same kinds of weights for every model."""
 
 from __future__ import annotations
 
@@ -14,18 +14,21 @@ from semfov.gaze.habits import standardised as over_cells
 from semfov.gaze.log_linear import fit_log_linear
 
 RIDGE = 1e-3
-"""Of the fit: nothing beside thousands of fixations, but it settles the weight of a map that is the same everywhere."""
+"""Ridge penalty of the fit.
+
+It is negligible against thousands of fixations, but it determines the weight of a map that is constant.
+"""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Of the terms of a density.
+    """Weights of the terms of a density.
 
     Attributes:
         terms: names of the terms.
-        values: `(T,)`.
-        blur: of the maps, in bins.
-        bits: mean log likelihood of the fitted fixations, above a uniform density.
+        values: `(T,)`, their weights.
+        blur: standard deviation of the maps' blur, in bins.
+        bits: mean log likelihood of the fitted fixations in bits, relative to a uniform density.
     """
 
     terms: tuple[str, ...]
@@ -35,7 +38,7 @@ class Weights:
 
 
 def standardised(maps: Tensor) -> Tensor:
-    """Maps `(E, H, W)` with mean 0 and standard deviation 1; 0 where a map is the same everywhere."""
+    """Standardise maps `(E, H, W)` to mean 0 and standard deviation 1; a constant map becomes 0."""
     return over_cells(maps.flatten(-2)).view_as(maps)
 
 
@@ -45,21 +48,27 @@ def log_densities(terms: Sequence[Tensor], weights: Tensor) -> Tensor:
     .. math:: \ln p(u) = \sum_t w_t f_t(u) - \ln \sum_v e^{\sum_t w_t f_t(v)}
 
     Args:
-        terms: maps `(E, H, W)` or `(1, H, W)`.
-        weights: `(T,)`.
+        terms: the T terms, maps `(E, H, W)` or `(1, H, W)`.
+        weights: `(T,)`, their weights.
+
+    Returns:
+        `(E, H, W)`, the log density for each of E fixations.
     """
     total = sum((weight * term for weight, term in zip(weights, terms, strict=True)), torch.zeros(()))
     return total - total.logsumexp((-1, -2), keepdim=True)
 
 
 def fit(names: Sequence[str], terms: Sequence[Tensor], bins: Tensor, blur: float = 0.0) -> Weights:
-    """Weights of the largest likelihood (`semfov.gaze.log_linear`).
+    """Fit the weights of a density by maximum likelihood (`semfov.gaze.log_linear`).
 
     Args:
-        names: of the terms.
+        names: names of the terms.
         terms: maps `(E, H, W)` or `(1, H, W)`.
-        bins: `(E, 2)`, column and row of the fixations.
-        blur: that the maps were blurred by; it is written down.
+        bins: `(E, 2)`, column and row of the bin of each fixation.
+        blur: standard deviation of the blur that was applied to the maps, for the record.
+
+    Returns:
+        The fitted weights.
     """
     check(len(names) == len(terms) > 0, "terms", f"{len(names)} maps, at least one", len(terms))
     height, width = terms[0].shape[-2:]
@@ -71,5 +80,5 @@ def fit(names: Sequence[str], terms: Sequence[Tensor], bins: Tensor, blur: float
 
 
 def at(maps: Tensor, bins: Tensor) -> Tensor:
-    """Values of maps `(E, H, W)` in bins `(E, 2)`, `(E,)`."""
+    """Values `(E,)` of maps `(E, H, W)` in the bins `(E, 2)`."""
     return maps.expand(len(bins), -1, -1)[torch.arange(len(bins)), bins[:, 1], bins[:, 0]]

@@ -1,4 +1,4 @@
-"""What a policy would value after each fixation of a person, had it looked where the person did."""
+"""Values that a policy gives to the cells after each fixation of a person, when it looks where the person looked."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from semfov.gaze.choice import Given
 from semfov.io.schema import Field, Schema
 
 SOURCES = ("semfov.experiments.candidates", "semfov.gaze.policies", "semfov.gaze.saliency", "semfov.episode", __name__)
-"""Modules that the maps depend on beside those of a look."""
+"""Modules that the maps depend on, in addition to those of a look."""
 
 
 class MapStore(SceneStore):
-    """Values of the cells after each fixation of all people, one file for each picture.
+    """Values of the cells after each fixation of all people, in one file for each picture.
 
     Args:
-        folder: where the store lies.
-        what: settings that they depend on.
-        cells: X·Y.
+        folder: folder of the store.
+        what: settings that the values depend on.
+        cells: number of cells X·Y.
     """
 
     def __init__(self, folder: Path, what: Mapping[str, object], cells: int) -> None:
@@ -37,12 +37,12 @@ class MapStore(SceneStore):
 
 
 class FineLooks(Looks):
-    """Looks from the centres of coarse cells that a belief about finer cells is made of.
+    """Looks from the centres of coarse cells, for a belief about finer cells.
 
     Args:
-        detections: what is seen from every coarse cell, a batch of them.
-        grid: the coarse cells.
-        fine: the cells of the belief.
+        detections: detections from every coarse cell, as a batch.
+        grid: the grid of coarse cells.
+        fine: the grid of the belief.
     """
 
     def __init__(self, detections: Detections, grid: Grid, fine: Grid) -> None:
@@ -51,7 +51,7 @@ class FineLooks(Looks):
         self._weighed: tuple[Observer, Look] | None = None
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
-        """What is seen from the coarse cell that each fine cell's centre is in."""
+        """The look from the coarse cell in which the centre of each fine cell lies."""
         if self._weighed is None or self._weighed[0] is not observer:
             centres = self.coarse.centres.to(self.like)
             self._weighed = observer, observer.weigh(self.detections, centres, self.grid)
@@ -60,20 +60,25 @@ class FineLooks(Looks):
 
 
 def follow(looks: Looks, candidates: Mapping[str, Candidate], scanpaths: Sequence[Tensor]) -> dict[str, Tensor]:
-    """Values `(E, X·Y)` of the cells after each fixation but the last of each scanpath, scanpath by scanpath.
+    """Evaluate policies along given scanpaths.
 
-    Where the gaze goes is given, so that policies which observe alike believe alike: one rollout serves all of them.
+    The scanpaths are given, so policies with the same kind of observer have the same belief: one rollout serves them
+    all.
 
     Args:
-        looks: what is seen.
-        candidates: policies by name, whose observers are made alike.
-        scanpaths: for each `(n,)`, cells that are fixated.
+        looks: the looks at the picture.
+        candidates: policies by name; their observers have the same settings.
+        scanpaths: for each scanpath `(n,)`, the fixated cells.
+
+    Returns:
+        For each policy `(E, X·Y)`, the values of the cells after each fixation except the last of each scanpath, one
+        scanpath after the other.
     """
     longest = max(map(len, scanpaths))
     padded = torch.stack([torch.cat([path, path[-1:].expand(longest - len(path))]) for path in scanpaths])
     observer = next(iter(candidates.values())).observer
     if isinstance(observer, Gatherer):
-        # The batch is always that of all people, and so are the bits.
+        # The batch always consists of all people, so the bits of the result never change.
         observer.together = True
     tables: dict[str, list[Tensor]] = {name: [] for name in candidates}
     most = max(longest - 1, 1)

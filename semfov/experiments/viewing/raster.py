@@ -1,4 +1,4 @@
-"""Pictures in equal bins, and what foretells fixations in any picture: the centre, and how far eyes jump."""
+"""Fixations in bins of a raster, and predictors for any picture: centre bias and saccade length."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from semfov.data.fixations import Fixations
 
 @dataclass(frozen=True)
 class Events:
-    """The fixations of one picture that are foretold, each after the one before it in its scanpath.
+    """The fixations of one picture to be predicted: all except the first of each scanpath.
 
     Attributes:
-        bins: `(E, 2)`, column and row of the bin that is fixated.
-        before: `(E, 2)`, of the fixation before.
-        visited: `(E, X·Y)`, 1 for cells of the looks' grid that were fixated before, else 0.
-        number: `(E,)`, gaze shifts before, from 0.
+        bins: `(E, 2)`, column and row of the fixated bin.
+        before: `(E, 2)`, column and row of the bin of the previous fixation.
+        visited: `(E, X·Y)`, 1 for cells of the grid of looks that were fixated before, else 0.
+        number: `(E,)`, number of gaze shifts before, from 0.
         person: `(E,)`, index of the scanpath.
-        cells: for each scanpath `(n,)`, cells of the looks' grid that are fixated.
-        fine: the same in bins.
+        cells: for each scanpath `(n,)`, the fixated cells of the grid of looks.
+        fine: for each scanpath `(n,)`, the fixated bins.
     """
 
     bins: Tensor
@@ -41,13 +41,16 @@ class Events:
 
 
 def events_of(people: Sequence[Fixations], raster: Grid, grid: Grid, longest: int) -> Events:
-    """Events of all people in one picture.
+    """The events of all people in one picture.
 
     Args:
-        people: their fixations, in pixels of the picture; points beside it count to the nearest bin.
+        people: the fixations of each person in pixels of the picture; points outside it belong to the nearest bin.
         raster: the bins.
-        grid: cells that looks are from.
-        longest: fixations of a scanpath that count.
+        grid: the grid of looks.
+        longest: number of fixations of a scanpath that are used, the first ones.
+
+    Returns:
+        The events.
     """
     bins, before, visited, number, person, cells, fine = [], [], [], [], [], [], []
     for index, each in enumerate(people):
@@ -79,11 +82,12 @@ def places(raster: Grid, points: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Habits:
-    """What people do in any picture, as logarithms of densities over bins.
+    """Viewing habits of people in any picture, as log densities over bins.
 
     Attributes:
-        centre: `(H, W)`, of all fixations but the first of each scanpath.
-        jump: `(2H-1, 2W-1)`, of displacements from one fixation to the next; no displacement is in the middle.
+        centre: `(H, W)`, log density of all fixations except the first of each scanpath.
+        jump: `(2H-1, 2W-1)`, log density of displacements from one fixation to the next; the zero displacement is in
+            the middle.
     """
 
     centre: Tensor
@@ -91,7 +95,7 @@ class Habits:
 
     @classmethod
     def of(cls, events: Sequence[Events], columns: int, rows: int, *, blur: float = 1.0, floor: float = 0.05) -> Habits:
-        """Counts, blurred by a Gaussian of so many bins (the centre's twice as wide), and a little everywhere."""
+        """Measure habits: counts, blurred by a Gaussian of `blur` bins (twice as wide for the centre), plus `floor`."""
         bins, before = (torch.cat([getattr(each, name) for each in events]) for name in ("bins", "before"))
         centre, jump = torch.zeros(rows, columns), torch.zeros(2 * rows - 1, 2 * columns - 1)
         one = torch.ones(len(bins))
@@ -101,7 +105,7 @@ class Habits:
         return cls(_log(blurred(centre[None], 2 * blur)[0] + floor), _log(blurred(jump[None], blur)[0] + floor))
 
     def near(self, before: Tensor) -> Tensor:
-        """Log density of the bin after each fixation `(E, 2)`, `(E, H, W)`; in the picture it need not sum to 1."""
+        """Log density `(E, H, W)` of the bin after each fixation `(E, 2)`; within the picture it may not sum to 1."""
         height, width = self.centre.shape
         rows = height - 1 - before[:, 1, None, None] + torch.arange(height)[:, None]
         columns = width - 1 - before[:, 0, None, None] + torch.arange(width)
@@ -109,7 +113,7 @@ class Habits:
 
 
 def blurred(maps: Tensor, sigma: float) -> Tensor:
-    """Maps `(E, H, W)` blurred by a Gaussian of so many bins; at the border they are mirrored."""
+    """Blur maps `(E, H, W)` by a Gaussian of `sigma` bins; they are reflected at the border."""
     if sigma == 0 or not len(maps):
         return maps
     reach = min(int(3 * sigma + 0.5), min(maps.shape[-2:]) - 1)
@@ -117,7 +121,17 @@ def blurred(maps: Tensor, sigma: float) -> Tensor:
 
 
 def enlarged(values: Tensor, grid: Grid, rows: int, columns: int) -> Tensor:
-    """Values `(E, X·Y)` of cells as maps `(E, H, W)`, bilinear between their centres."""
+    """Interpolate values `(E, X·Y)` of cells bilinearly between the cell centres, to maps `(E, H, W)`.
+
+    Args:
+        values: `(E, X·Y)`, values of the cells.
+        grid: the grid of the cells.
+        rows: H.
+        columns: W.
+
+    Returns:
+        The maps.
+    """
     maps = values.reshape(-1, 1, grid.rows, grid.columns)
     if (grid.rows, grid.columns) == (rows, columns):
         return maps[:, 0]

@@ -1,4 +1,4 @@
-"""What a run of free viewing leaves: tables, figures, settings and manifest."""
+"""Output of a run of free viewing: tables, figures, settings and manifest."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ Array = NDArray[np.float64]
 Table = Mapping[tuple[str, str], Scored]
 
 GROUPS = {
-    "alone": "each map alone: its weight (an inverse temperature) and its blur are fitted",
-    "with habits": "to each map are added, with fitted weights, the logarithms of a centre bias and of how far eyes "
-    "jump, and the cells that were visited",
+    "alone": "each map alone; its weight (an inverse temperature) and its blur are fitted",
+    "with habits": "each map plus, with fitted weights, the log densities of a centre bias and of saccade length, and "
+    "the visited cells",
 }
 FLOORS = {"alone": "centre bias", "with habits": "nearby"}
-"""Row without any map, by group."""
+"""Row of the baseline without any map, by group."""
 
 
 def report(run: ViewingRun, scored: Table, sequences: Mapping[str, Array], reported: Half) -> None:
-    """Write everything and print the tables."""
+    """Write all output and print the tables."""
     records, seconds = gather(run)
     summary = summary_markdown(run, scored, sequences)
     tables = {
@@ -49,7 +49,7 @@ def report(run: ViewingRun, scored: Table, sequences: Mapping[str, Array], repor
 
 
 def summary_markdown(run: ViewingRun, scored: Table, sequences: Mapping[str, Array]) -> str:
-    """Tables of both groups, and of sequences."""
+    """The tables of both groups and of sequence scores, as Markdown."""
     pictures = len(next(iter(scored.values())).pictures)
     lines = []
     for group, words in GROUPS.items():
@@ -68,8 +68,8 @@ def summary_markdown(run: ViewingRun, scored: Table, sequences: Mapping[str, Arr
             cells.append(", ".join(f"{value:.2f}" for value in each.weights.values[: len(each.row.maps)].tolist()))
             body.append([name, *cells])
         lines += [
-            f"**{group}** ({sensing(run)}; {pictures} pictures, conditional figures of each fixation but a scanpath's "
-            f"first, ± standard error over pictures; {words})",
+            f"**{group}** ({sensing(run)}; {pictures} pictures, conditional scores of all fixations except the first "
+            f"of each scanpath, ± standard error over pictures; {words})",
             "",
             *table([head, *body]),
             "",
@@ -78,8 +78,9 @@ def summary_markdown(run: ViewingRun, scored: Table, sequences: Mapping[str, Arr
         body = [[name, _figure(values)] for name, values in sorted(sequences.items(), key=lambda item: item[1].mean())]
         count = len(next(iter(sequences.values())))
         lines += [
-            f"**sequences** (scanpaths drawn from the densities with habits, from each person's first fixation and of "
-            f"the same length, beside all other people's; {count} pictures, ± standard error over pictures)",
+            f"**sequences** (scanpaths drawn from the densities with habits, with the first fixation and the length of "
+            f"each person's scanpath, compared with those of all other people; {count} pictures, ± standard error over "
+            "pictures)",
             "",
             *table([["", "sequence score"], *body]),
             "",
@@ -88,7 +89,7 @@ def summary_markdown(run: ViewingRun, scored: Table, sequences: Mapping[str, Arr
 
 
 def summary_csv(scored: Table) -> str:
-    """Every row: figures and standard errors over pictures."""
+    """Means and standard errors over pictures of every row, as CSV."""
     lines = [["row", "group", "figure", "mean", "error", "pictures"]]
     for (name, group), each in scored.items():
         for number, figure in enumerate(FIGURES):
@@ -100,7 +101,7 @@ def summary_csv(scored: Table) -> str:
 
 
 def pictures_csv(run: ViewingRun, scored: Table) -> str:
-    """Every row and picture."""
+    """Scores of every row and picture, as CSV."""
     ids = run.scenes.ids[0 if run.config.swap else 1 :: 2]
     lines = [["picture", "row", "group", *FIGURES]]
     for (name, group), each in scored.items():
@@ -111,7 +112,7 @@ def pictures_csv(run: ViewingRun, scored: Table) -> str:
 
 
 def weights_csv(scored: Table) -> str:
-    """What was fitted, and how likely the fitted half is by it."""
+    """The fitted weights, and the likelihood of the fitted half under them, as CSV."""
     lines = [["row", "group", "term", "weight", "blur", "bits of the fitted half"]]
     for (name, group), each in scored.items():
         weights = each.weights
@@ -121,7 +122,7 @@ def weights_csv(scored: Table) -> str:
 
 
 def sequences_csv(sequences: Mapping[str, Array]) -> str:
-    """Sequence score of each row, by picture."""
+    """Sequence scores of every row and picture, as CSV."""
     lines = [["row", "picture number", "sequence score"]]
     for name, values in sequences.items():
         lines += [[name, str(number), f"{value:.5f}"] for number, value in enumerate(values)]
@@ -129,7 +130,7 @@ def sequences_csv(sequences: Mapping[str, Array]) -> str:
 
 
 def draw_shifts(run: ViewingRun, scored: Table) -> Path:
-    """NSS after each gaze shift, rows with habits."""
+    """Draw NSS after each gaze shift, for rows with habits."""
     from semfov.viz.human import plot_by_shift
 
     shown = [
@@ -153,7 +154,7 @@ def draw_shifts(run: ViewingRun, scored: Table) -> Path:
 
 
 def draw_scanpaths(run: ViewingRun, scored: Table, reported: Half) -> list[Path]:
-    """Scanpaths of four people, of `landing` and of `nearby` over the same pictures."""
+    """Draw scanpaths of four people, of `landing` and of `nearby` in the same pictures."""
     from semfov.viz.human import plot_scanpaths_beside
 
     written = []

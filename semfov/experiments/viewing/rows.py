@@ -1,4 +1,4 @@
-"""Rows of the tables: which maps a density is made of, fitted on one half of the pictures and scored on the other."""
+"""Rows of the tables: models of the next fixation, fitted on one half of the pictures and scored on the other."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from semfov.metrics.scanpath import auc, log_likelihood, nss
 Array = NDArray[np.float64]
 
 HABITS = ("centre bias", "distance", "return")
-"""What foretells fixations in any picture: where it is, how far from the last fixation, and whether it was visited."""
+"""Predictors of fixations in any picture: position, distance from the last fixation, and earlier visits."""
 PEOPLE = "other people"
 """Fixations of all other people in the same picture."""
 
@@ -28,9 +28,9 @@ class Row:
     """One model of the next fixation.
 
     Attributes:
-        name: what tables call it.
-        maps: that it goes by.
-        habits: of `HABITS`, those it goes by besides.
+        name: its name in tables.
+        maps: names of the maps that it uses.
+        habits: the terms of `HABITS` that it also uses.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Row:
 
 
 def rows_of(names: Sequence[str], saliency: Sequence[str]) -> list[Row]:
-    """All rows: floors, every map alone and with habits, saliency and landing together, and people."""
+    """All rows: baselines, every map alone and with habits, saliency combined with landing, and other people."""
     rows = [Row("random"), Row("centre bias", (), HABITS[:1]), Row("nearby", (), HABITS)]
     several = [(f"landing + {name}", ("landing", name)) for name in saliency]
     for name, maps in [*((name, (name,)) for name in names), *several, (PEOPLE, (PEOPLE,))]:
@@ -54,13 +54,13 @@ def rows_of(names: Sequence[str], saliency: Sequence[str]) -> list[Row]:
 
 @dataclass
 class Half:
-    """Events of some pictures, and what is asked of them again and again.
+    """One half of the pictures with its events, and the maps of the models for them.
 
     Attributes:
-        run: that they are of.
+        run: the run.
         pictures: indices of the pictures.
-        events: of each.
-        habits: measured on the half that is fitted.
+        events: events of each picture.
+        habits: habits measured on the half for fitting.
     """
 
     run: ViewingRun
@@ -83,7 +83,7 @@ class Half:
             maps = self.map_of(name, place)
             maps = maps if len(maps) == 1 else maps[chosen]
             smooth = blurred(maps, blur)
-            if name == PEOPLE:  # a density goes in as its logarithm, with a little everywhere
+            if name == PEOPLE:  # a density is used as its logarithm, after a small constant is added
                 smooth = (smooth / smooth.sum((-1, -2), keepdim=True) + 0.1 / (height * width)).log()
             terms.append(standardised(smooth).expand(len(chosen), -1, -1))
         known = {
@@ -95,7 +95,7 @@ class Half:
 
 
 def people_maps(events: Events, rows: int, columns: int) -> Tensor:
-    """For each event, counts of all other people's fixations in bins, `(E, H, W)`; first fixations do not count."""
+    """For each event, counts `(E, H, W)` of all other people's fixations in bins, without first fixations."""
     count = torch.zeros(int(events.person.max()) + 1, rows * columns)
     bins = events.bins[:, 1] * columns + events.bins[:, 0]
     count.index_put_((events.person, bins), torch.ones(len(bins)), accumulate=True)
@@ -104,7 +104,7 @@ def people_maps(events: Events, rows: int, columns: int) -> Tensor:
 
 
 def fit_row(row: Row, half: Half) -> Weights:
-    """Weights, and the blur, that make the fitted half's fixations most likely."""
+    """Fit the weights and the blur of a row by maximum likelihood."""
     density = half.run.config.density
     names = [*row.maps, *row.habits]
     sizes = torch.tensor([len(each) for each in half.events])
@@ -128,7 +128,7 @@ def fit_row(row: Row, half: Half) -> Weights:
 
 
 def score_row(row: Row, weights: Weights, half: Half, place: int) -> Array:
-    """NSS, AUC and bits above a uniform density of each event of a picture, `(E, 3)`."""
+    """NSS, AUC and bits above a uniform density for each event of a picture, `(E, 3)`."""
     events = half.events[place]
     every = torch.arange(len(events))
     height, width = half.habits.centre.shape

@@ -1,4 +1,4 @@
-"""Maps of all policies along all people's scanpaths, picture by picture."""
+"""Computes the maps of all policies along the scanpaths of all people, picture by picture."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ LANDING = "landing"
 
 
 def read_people(path: Path) -> list[Fixations]:
-    """Fixations of all people, from OSIE's JSON or a table."""
+    """Read the fixations of all people from the JSON file of OSIE or from a table."""
     return read_table(path) if path.suffix == ".csv" else read_osie(path)
 
 
 class ViewingRun(Run):
-    """Free viewing: the unit of work is a picture, its outcome the maps that policies have along people's scanpaths."""
+    """Free viewing, one picture after the other: computes the maps of policies along people's scanpaths."""
 
     task: ClassVar[Task] = "exploration"
     config: ViewingConfig  # type: ignore[assignment]
@@ -63,11 +63,11 @@ class ViewingRun(Run):
             self.map_stores[name] = MapStore(cache, {"saliency": name, "raster": self._raster_size}, bins)
 
     def check_sources(self) -> None:
-        """Raise an error where the detector is not there; pictures are looked for when people's files are read."""
+        """Check that the detector exists; pictures are looked for after people's files have been read."""
         check_detector(self.config.detector.name)
 
     def open_scenes(self) -> Scenes:
-        """The pictures that people saw and that are there."""
+        """The pictures that people saw and that are found in the folder."""
         data = self.config.data
         self.people = by_picture(each for each in read_people(self.config.people) if len(each) > 1)
         if data.limit is not None:
@@ -79,7 +79,7 @@ class ViewingRun(Run):
         return [self.config.density.columns, self.config.density.rows]
 
     def _what(self) -> dict[str, object]:
-        """What maps along people's scanpaths depend on, whatever picture and policy."""
+        """Settings that the maps of all pictures and policies depend on."""
         grid = [self.config.belief.columns, self.config.belief.rows]
         fitted = {
             name: None if model is None else checksum(model.state_dict())
@@ -96,7 +96,7 @@ class ViewingRun(Run):
 
     @property
     def names(self) -> list[str]:
-        """What maps there are: of policies, of `landing` and of saliency models."""
+        """Names of all maps: of policies, of `landing` and of saliency models."""
         return list(self.map_stores)
 
     @cached_property
@@ -110,32 +110,42 @@ class ViewingRun(Run):
         return Candidate(Strategy(Landing(len(classes), person), Objects()))
 
     def raster(self, index: int) -> Grid:
-        """Bins of a picture."""
+        """The raster of a picture."""
         density = self.config.density
         return Grid(density.columns, density.rows, self.scenes.annotation(index).size)
 
     def events(self, index: int) -> Events:
-        """Fixations of a picture that are foretold."""
+        """The fixations of a picture that are to be predicted."""
         people = self.people[str(self.scenes.ids[index])]
         size = self.scenes.annotation(index).size
         for each in people:
             if each.size != size:
-                raise DataError(f"people: expected fixations in pixels of {each.picture}, {size}, got {each.size}")
+                raise DataError(
+                    f"people: expected fixations in {each.picture} for a picture size of {size}, as in its file, got "
+                    f"{each.size}; check data.root"
+                )
         return events_of(people, self.raster(index), self.grid(index), self.config.longest)
 
     def candidate(self, name: str, index: int) -> Candidate:
-        """The policy that tables call `name`, in a picture."""
+        """The policy of this name in tables, for a picture."""
         return self.landing if name == LANDING else super().candidate(name, index)
 
     def looks(self, name: str, index: int) -> Looks:
-        """What a policy looks at."""
+        """The looks of a policy at a picture."""
         detections, grid = self.detections(index), self.grid(index)
         return FineLooks(detections, grid, self.raster(index)) if name == LANDING else StoredLooks(detections, grid)
 
     def values(self, name: str, index: int) -> Tensor:
-        """Values `(E, X·Y)` after each fixation of all people, or `(1, bins)` of a saliency map; kept.
+        """Values of the cells of a picture, read from the store, or computed and stored.
 
-        Policies that observe alike are followed together.
+        Policies with the same observer settings are evaluated together.
+
+        Args:
+            name: name of a policy or of a saliency model.
+            index: index of the picture.
+
+        Returns:
+            `(E, X·Y)`, the values after each fixation of all people, or `(1, bins)` for a saliency model.
         """
         digest = self._followed(index)
         kept = self.map_stores[name].read(digest) if self.config.store else None
@@ -157,7 +167,7 @@ class ViewingRun(Run):
         return found[name].float()
 
     def _alike(self, name: str) -> list[str]:
-        """Policies that observe as this one does, itself among them."""
+        """The policies with the same observer settings as this one, including itself."""
         if name == LANDING:
             return [name]
 
@@ -168,13 +178,13 @@ class ViewingRun(Run):
         return [each for each, policy in self.policies.items() if observing(policy) == own]
 
     def maps(self, name: str, index: int) -> Tensor:
-        """The same as maps `(E, H, W)`, or `(1, H, W)`, over the bins."""
+        """The values as maps `(E, H, W)` or `(1, H, W)` over the bins."""
         values, (columns, rows) = self.values(name, index), self._raster_size
         fine = values.shape[-1] == columns * rows
         return enlarged(values, self.raster(index) if fine else self.grid(index), rows, columns)
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """Compute all maps of a picture; how many fixations there are to foretell, and the seconds that it took."""
+        """Compute all maps of a picture; returns its number of events, and the seconds that each stage took."""
         watch = Stopwatch()
         self.detections(index)
         watch.lap("look")

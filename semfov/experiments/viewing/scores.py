@@ -1,4 +1,4 @@
-"""All rows fitted and scored: means over fixations, then over pictures."""
+"""Fits and scores all rows; scores are averaged over fixations, then over pictures."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from semfov.metrics.averages import standard_error
 Array = NDArray[np.float64]
 
 FIGURES = ("NSS", "AUC", "log likelihood")
-"""Conditional figures of each fixation, the last in bits above a uniform density."""
+"""Conditional scores of each fixation; the log likelihood is in bits above a uniform density."""
 
 
 @dataclass(frozen=True)
 class Scored:
-    """A row and what comes of it.
+    """A row with its fitted weights and its scores.
 
     Attributes:
-        row: which.
-        weights: of its terms.
+        row: the row.
+        weights: the fitted weights of its terms.
         pictures: `(P, 3)`, mean of each of `FIGURES` over the fixations of each picture.
-        shifts: `(P, N, 3)`, the same over fixations after 1, 2, … gaze shifts; NaN where a picture has none.
+        shifts: `(P, N, 3)`, the same over the fixations after 1, 2, … gaze shifts; NaN where a picture has none.
     """
 
     row: Row
@@ -39,13 +39,13 @@ class Scored:
     shifts: Array
 
     def difference(self, other: Scored, figure: int = 0) -> tuple[float, float]:
-        """Mean over pictures of how much higher a figure is than another row's, and its standard error."""
+        """Mean difference of a score from that of another row, paired by picture, and its standard error."""
         gap = self.pictures[:, figure] - other.pictures[:, figure]
         return float(gap.mean()), float(standard_error(gap))
 
 
 def halves(run: ViewingRun) -> tuple[Half, Half]:
-    """Every other picture to fit on, and the others to report on; habits are those of the first half."""
+    """Split the pictures alternately into a half for fitting and a half for reporting; habits are from the first."""
     order = list(range(len(run.scenes)))
     check(len(order) >= 2, "data", "at least two pictures, one to fit on and one to report on", len(order))
     fitted, reported = (order[1::2], order[::2]) if run.config.swap else (order[::2], order[1::2])
@@ -57,7 +57,7 @@ def halves(run: ViewingRun) -> tuple[Half, Half]:
 
 
 def score_all(run: ViewingRun, fitted: Half, reported: Half, *, longest: int = 8) -> dict[tuple[str, str], Scored]:
-    """Every row by name and group (`Row.group`)."""
+    """Fit and score every row; results by name and group (`Row.group`)."""
     found = {}
     for row in tqdm(rows_of(run.names, run.config.models), desc="scoring", unit="row"):
         weights = fit_row(row, fitted)

@@ -1,4 +1,4 @@
-"""Scanpaths drawn from a row's densities, spelled by clusters of fixations and laid beside people's."""
+"""Draws scanpaths from the densities of a row, and compares them with people's as sequences of clusters."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ Array = NDArray[np.float64]
 
 
 class Drawn(Choice):
-    """The next fixation drawn from a density over the bins.
+    """Draws the next fixation from a density over the bins.
 
     Args:
-        weights: of the density.
-        habits: of people.
+        weights: weights of the density.
+        habits: habits of people.
         raster: the bins.
-        grid: the cells that looks are from.
-        cells: those that the belief is about.
+        grid: the grid of looks.
+        cells: the grid of the belief.
         start: `(B, 2)`, first fixations.
-        generator: draws.
+        generator: random generator of the draws.
     """
 
     def __init__(
@@ -51,12 +51,12 @@ class Drawn(Choice):
     def __call__(
         self, shift: int, episodes: Tensor, values: Tensor, visited: Tensor, centres: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The centre of the drawn bin, and the cell that it is in."""
+        """Draw a bin; returns its centre, and the cell in which it lies."""
         points = self.draw(enlarged(values, self.cells, self.raster.rows, self.raster.columns))
         return points, self.cells.cell_of(points)
 
     def draw(self, maps: Tensor | None) -> Tensor:
-        """The next points `(B, 2)`, from the row's maps `(B, H, W)` or `(1, H, W)` and the points so far."""
+        """Draw the next points `(B, 2)` from the row's maps `(B, H, W)` or `(1, H, W)` and the points so far."""
         height, width = self.habits.centre.shape
         last, count = self.points[-1], len(self.points[-1])
         seen = torch.zeros(count, len(self.grid))
@@ -81,7 +81,7 @@ class Drawn(Choice):
 
 
 def drawn_scanpaths(scored: Scored, half: Half, place: int) -> list[Array]:
-    """One scanpath for each person of a picture, from the same first fixation and of the same length."""
+    """Draw one scanpath for each person of a picture, with the same first fixation and the same length."""
     run, index = half.run, half.pictures[place]
     people = run.people[str(run.scenes.ids[index])]
     lengths = [min(len(each), run.config.longest) for each in people]
@@ -112,10 +112,17 @@ def drawn_scanpaths(scored: Scored, half: Half, place: int) -> list[Array]:
 
 
 def score_sequences(scored: dict[tuple[str, str], Scored], half: Half) -> dict[str, Array]:
-    """Sequence score of each row that the settings name, and of people, by picture: means over all pairs of people.
+    """Sequence scores of the rows that the settings name, of files and of people, as means over pairs of scanpaths.
 
-    A drawn scanpath is compared with those of all people but the one whose first fixation it has, and one of a file
-    with those of all people. Pictures that a file does not have are left out of its row.
+    A drawn scanpath is compared with those of all people except the person whose first fixation it shares. A scanpath
+    of a file is compared with those of all people. A file's row leaves out pictures that the file does not have.
+
+    Args:
+        scored: the scored rows by name and group.
+        half: the half of the pictures for reporting.
+
+    Returns:
+        The scores of each row by picture.
     """
     run = half.run
     files = {path.stem: by_picture(read_table(path)) for path in run.config.files}

@@ -1,0 +1,80 @@
+"""Texts of the demonstration: episodes as tables, detections in words, and names."""
+
+import re
+from collections.abc import Sequence
+
+from semfov import Scanpath, viz
+
+
+def told(name: str, scanpath: Scanpath) -> str:
+    """The episode, fixation by fixation, as a table."""
+    if scanpath.target is None:
+        values, what = viz.entropy(scanpath), "entropy (bits)"
+    else:
+        values, what = viz.class_posterior(scanpath), f"p({scanpath.classes[scanpath.target]})"
+    anywhere = None if scanpath.presence is None else scanpath.presence.tolist()
+    head = ["#", "at (column, row)", "detections", f"{what} there", "highest", "at"]
+    rows = [[*head, *([] if anywhere is None else ["anywhere"]), "ms"]]
+    for number, (cell, value) in enumerate(zip(scanpath.cells.tolist(), values, strict=True)):
+        best = int(value.argmax())
+        milliseconds = 1000 * sum(scanpath.seconds[number].values())
+        figures = [f"{float(value[cell]):.3f}", f"{float(value[best]):.3f}", place(scanpath, best)]
+        figures += [] if anywhere is None else [f"{anywhere[number]:.3f}"]
+        rows.append([str(number), place(scanpath, cell), seen(scanpath, number), *figures, f"{milliseconds:.0f}"])
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    if scanpath.target is None:
+        lines += ["", "what is where:", *named(scanpath)]
+    return "\n".join([f"{name}: {viz.describe(scanpath)}. {viz.why_it_ended(scanpath)}".rstrip(), *lines, ""])
+
+
+def named(scanpath: Scanpath) -> list[str]:
+    """A line for each class that the final map names: number of cells, highest probability, and its cell."""
+    parts: dict[str, list[int]] = {}
+    for label, cells, _ in viz.named_regions(scanpath):
+        parts.setdefault(label, []).extend(cells)
+    lines = []
+    for label, cells in sorted(parts.items(), key=lambda item: -len(item[1])):
+        chance = scanpath.probabilities[-1, cells, scanpath.classes.index(label)]
+        best = cells[int(chance.argmax())]
+        many = f"{len(cells)} cell{'s' if len(cells) != 1 else ''}"
+        lines.append(f"  {label}: {many}, p up to {float(chance.max()):.2f} at {place(scanpath, best)}")
+    return lines or ["  nothing that is more probable than background"]
+
+
+def seen(scanpath: Scanpath, fixation: int, most: int = 3) -> str:
+    """The most confident detections of a look, as text."""
+    detections = scanpath.detections[fixation]
+    pairs = zip(detections.labels[0].tolist(), detections.confidence[0].tolist(), strict=True)
+    sure = [f"{scanpath.classes[label]} {score:.2f}" for label, score in pairs if score >= viz.CONFIDENT]
+    more = f" and {len(sure) - most} more" if len(sure) > most else ""
+    return ", ".join(sure[:most]) + more or "nothing"
+
+
+def place(scanpath: Scanpath, cell: int) -> str:
+    """Column and row of a cell, from 0."""
+    row, column = divmod(cell, scanpath.grid.columns)
+    return f"({column}, {row})"
+
+
+def columns(names: Sequence[str], width: int = 100) -> str:
+    """Names in columns, in order down each column."""
+    wide = max(map(len, names)) + 2
+    across = max(1, width // wide)
+    down = -(-len(names) // across)
+    return "\n".join("".join(name.ljust(wide) for name in names[row::down]).rstrip() for row in range(down))
+
+
+def plain_name(name: str) -> str:
+    """Make a name valid on every file system.
+
+    Args:
+        name: any text.
+
+    Returns:
+        The name.
+
+    >>> plain_name("my cup, frame 3")
+    'my-cup-frame-3'
+    """
+    return re.sub(r"[^\w.]+", "-", name).strip("-.") or "picture"
