@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, settings
 from semfov.detection.detector import Detector
 from semfov.detection.scores import Candidates
 
+pytest.register_assert_rewrite("tests.base_tester")
 settings.register_profile("semfov", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("semfov")
 

@@ -307,14 +307,6 @@ def test_compiles_to_one_graph(convention, size):
         close(compiled(image, gaze), sensor(image, gaze))
 
 
-def test_module_compiles_to_one_graph():
-    sensor = Foveation(6.0, levels=2, learnable=True)
-    image, gaze = draw(2, 3, 33, 40, dtype=torch.float32), torch.tensor([[4.0, 9.0], [30.0, 2.0]])
-    torch.compiler.reset()
-    compiled = torch.compile(sensor, fullgraph=True, backend="eager")
-    close(compiled(image, gaze).detach(), sensor(image, gaze).detach(), 1e-6)
-
-
 def test_module_is_the_function():
     image, gaze = draw(2, 3, 33, 40), torch.tensor([[4.0, 9.0], [30.0, 2.0]])
     sensor = Foveation(6.0, levels=3, growth=1.0, convention="opencv")
