@@ -20,6 +20,25 @@ settings.register_profile("semfov", deadline=None, derandomize=True, suppress_he
 settings.load_profile("semfov")
 
 
+def pytest_configure() -> None:
+    """Each worker has one thread, as have the processes that it starts: they share the machine's cores."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        torch.set_num_threads(1)
+
+
+RUNS = {"finished", "fitted", "home", "trained", "whole"}
+"""Fixtures that run a command to its end."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Whatever reads the results of a run waits for it."""
+    for item in items:
+        if isinstance(item, pytest.Function) and RUNS & set(item.fixturenames):
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(
     params=["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 )

@@ -51,7 +51,7 @@ def test_an_action_goes_to_the_nearest_window_and_back(size, place, number):
 @pytest.mark.slow
 @pytest.mark.parametrize("task", KINDS)
 def test_gymnasiums_checker_has_nothing_to_say(cache, task):
-    env = gymnasium.make(IDS[task], action="window", mosaics=1, tiles=(3, 2), passes=6, cache=cache, **EVERYTHING)
+    env = gymnasium.make(IDS[task], action="window", mosaics=1, tiles=(2, 1), passes=6, cache=cache, **EVERYTHING)
     assert isinstance(env.unwrapped, KINDS[task])
     check_env(env.unwrapped)
 

@@ -84,11 +84,12 @@ def test_run_leaves_table_and_records(finished):
 
 
 @pytest.mark.weights
-def test_finished_scenes_are_not_searched_again(finished, arguments, tmp_path):
+@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
+def test_finished_scenes_are_not_searched_again(finished, arguments, tmp_path, workers):
     """A run that was stopped goes on; a damaged part is computed again; workers change no bit."""
     out = tmp_path / "out"
     threads = torch.get_num_threads()
-    assert main([*arguments, "--workers", "2", "--out", str(out)]) == 0
+    assert main([*arguments, "--workers", workers, "--out", str(out)]) == 0
     assert records_in(out) == records_in(finished)
     first, second = sorted(out.glob("parts/*/*.json"))
     kept = first.stat().st_mtime_ns

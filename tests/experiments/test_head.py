@@ -62,6 +62,7 @@ def config(request, tmp_path, monkeypatch, textures):
     )
 
 
+@pytest.mark.slow
 def test_the_store_changes_nothing(config):
     fresh = HeadRun(replace(config, store=False)).outcomes(0)[0]
     written = HeadRun(config).outcomes(0)[0]
@@ -70,6 +71,7 @@ def test_the_store_changes_nothing(config):
     assert run.outcomes(0)[0] == written == fresh
 
 
+@pytest.mark.slow
 def test_tables_and_resuming(config, capsys):
     head_report.head(config)
     text = (config.out / "head.md").read_text()

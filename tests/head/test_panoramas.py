@@ -17,6 +17,7 @@ def scenes():
     return EmbeddedScenes(CLASSES, count=5)
 
 
+@pytest.mark.slow
 def test_a_camera_that_looks_at_a_photograph_sees_it_undistorted(scenes):
     panoramas = Panoramas(scenes, width=2048, count=1)
     panorama = panoramas[0].image[None]

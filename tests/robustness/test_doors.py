@@ -210,6 +210,7 @@ def test_what_is_no_picture(kind, folder, agent):
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_batches_go_on_working():
     """Foveation takes batches of any channels and range, keeps gradients, and compiles whole."""
     batch = RGB[None].repeat(2, 1, 1, 1)

@@ -24,9 +24,11 @@ from semfov.zoom.lattice import Lattice
 
 def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, textures):
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures("bright"))
+    monkeypatch.setattr("semfov.training.zoom_choice.FORESIGHTS", (0.1, 0.35))
+    monkeypatch.setattr("semfov.training.zoom_choice.PATIENCES", (1.9, 2.8))
     config = FitZoomConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
-        mosaics=1, far=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=96, steps=3,
+        mosaics=1, far=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=48, steps=3,
         out=tmp_path / "out", cache=tmp_path / "cache", workers=1,
     )  # fmt: skip
     fit_zoom(config)
@@ -82,6 +84,7 @@ def test_settings_have_ranges():
 
 def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys, textures):
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures("bright"))
+    monkeypatch.setattr("semfov.experiments.zoom_samples.TILE", (96, 72))
     config = FitConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
         mosaics=2, fixations=1, levels=4, holdout=2, shard=1, method="newton", name="bright-zoom",
