@@ -85,3 +85,10 @@ def test_the_scan_finds_testers_alone():
         "class TestA(GraphTester): pass\nclass MyTester(TestA): pass\nclass TestB(MyTester): pass\nclass TestC: pass"
     )
     assert names_of_testers(source) == {"TestA", "TestB"}
+
+
+def test_the_page_on_testing_shows_a_whole_tester():
+    root = Path(__file__).parents[1]
+    shown = (root / "docs/testing.md").read_text(encoding="utf-8").partition("```python\n")[2].partition("```")[0]
+    assert "class TestLogPolar(GraphTester):" in shown
+    assert shown in (root / "tests/sensor/test_modules.py").read_text(encoding="utf-8")
