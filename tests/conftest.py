@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
+from semfov.data.scenes import EmbeddedScenes
 from semfov.detection.detector import Detector
 from semfov.detection.scores import Candidates
 
@@ -66,6 +67,22 @@ class Textures(Detector):
 def textures() -> type[Textures]:
     """A detector without weights that sees something everywhere."""
     return Textures
+
+
+@pytest.fixture(scope="module")
+def kept_scenes() -> Iterator[None]:
+    """Embedded scenes are composed once, where mosaics show each of them many times."""
+    compose, kept = EmbeddedScenes._pixels, {}
+
+    def once(scenes: EmbeddedScenes, index: int) -> Any:
+        key = scenes.fingerprint, scenes.ids[index]
+        if key not in kept:
+            kept[key] = compose(scenes, index)
+        return kept[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(EmbeddedScenes, "_pixels", once)
+        yield
 
 
 @pytest.fixture

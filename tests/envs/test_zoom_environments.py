@@ -23,6 +23,8 @@ from semfov.zoom.search import find_everything, look_for
 KINDS = {"search": ZoomSearch, "exploration": ZoomExplore}
 EVERYTHING = {"belief": True, "grid": (6, 4), "glimpse": 32, "render_mode": "rgb_array"}
 
+pytestmark = pytest.mark.usefixtures("kept_scenes")
+
 
 @given(
     size=st.tuples(st.integers(200, 9000), st.integers(200, 9000)),

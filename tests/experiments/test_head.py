@@ -16,6 +16,8 @@ from semfov.experiments import head_report
 from semfov.experiments.head import HeadConfig, HeadRun, answers_of, raster
 from semfov.head.views import Views
 
+pytestmark = pytest.mark.usefixtures("kept_scenes")
+
 
 class Noise:
     """Five pictures of coloured noise with a box each: quick to make."""

@@ -17,6 +17,8 @@ from semfov.experiments.zoom_store import pack, unpack
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.lattice import Lattice
 
+pytestmark = pytest.mark.usefixtures("kept_scenes")
+
 
 @pytest.fixture
 def config(tmp_path, monkeypatch, textures):

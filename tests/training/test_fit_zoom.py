@@ -21,11 +21,12 @@ from semfov.training.zoom_settings import FitZoomConfig
 from semfov.zoom import GlimpseEvidence, ZoomEye
 from semfov.zoom.lattice import Lattice
 
+pytestmark = pytest.mark.usefixtures("kept_scenes")
 
+
+@pytest.mark.slow
 def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, textures):
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures("bright"))
-    monkeypatch.setattr("semfov.training.zoom_choice.FORESIGHTS", (0.1, 0.35))
-    monkeypatch.setattr("semfov.training.zoom_choice.PATIENCES", (1.9, 2.8))
     config = FitZoomConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
         mosaics=1, far=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=48, steps=3,
@@ -82,6 +83,7 @@ def test_settings_have_ranges():
         FitZoomConfig(steps=0)
 
 
+@pytest.mark.slow
 def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys, textures):
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures("bright"))
     monkeypatch.setattr("semfov.experiments.zoom_samples.TILE", (96, 72))
