@@ -5,6 +5,9 @@ STAMP := $(VENV)/.installed
 # The tests of a file stay together: what they share is made once.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
+# Tests are rewritten and start many processes: bytecode that is kept halves the time to collect them.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help setup search test test-all test-quick coverage docs lint types constraints clean
 
