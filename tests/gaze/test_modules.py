@@ -156,6 +156,8 @@ class TestExpectedGain(GraphTester):
 class PolicyTester(AcquisitionTester):
     """What a policy's acquisition function makes of a belief."""
 
+    test_compile = test_export = None  # the function's own tester has them
+
     @staticmethod
     def call(module, beta, closest):
         return module(2, GRID)(DirichletBelief(beta, closest), closest == 0)
@@ -216,6 +218,8 @@ class TestLearned(PolicyTester):
 
 class TestLearnedGaze(PolicyTester):
     """As the policy that it is made for calls it."""
+
+    test_compile, test_export = GraphTester.test_compile, GraphTester.test_export
 
     def make(self):
         return LearnedGaze()
