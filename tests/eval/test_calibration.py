@@ -95,6 +95,7 @@ def test_finished_scenes_are_not_judged_again(finished, arguments, tmp_path, wor
         assert (tmp_path / name).read_bytes() == (finished / name).read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_scores_may_be_judged_alone(arguments, tmp_path, capsys):
     assert main([*arguments, "--beliefs", "false", "--workers", "1", "--out", str(tmp_path)]) == 0

@@ -104,6 +104,7 @@ def test_finished_scenes_are_not_searched_again(finished, arguments, tmp_path, w
     assert part["records"] == records_in(finished)[10:]
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_no_class_to_search_for_is_told(arguments, tmp_path, capsys):
     assert main([*arguments, "--data.max_target_area", "1e-9", "--workers", "1", "--out", str(tmp_path)]) == 1

@@ -128,6 +128,7 @@ def test_the_store_makes_no_difference(pictures, finished):
         assert (pictures / "again" / name).read_text() == (finished / name).read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_searches_of_people_models_floors_and_policies(pictures):
     out, threads = pictures / "search", torch.get_num_threads()

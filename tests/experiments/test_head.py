@@ -97,6 +97,7 @@ def test_tables_and_resuming(config, capsys):
     assert (config.out / "head.md").read_text() == text
 
 
+@pytest.mark.slow
 def test_every_way_starts_alike_and_the_eye_alone_stays(config):
     for task in ("search", "exploration"):
         records = [record for record in HeadRun(config).outcomes(1)[0] if record["task"] == task]

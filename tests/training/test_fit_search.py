@@ -268,6 +268,7 @@ def test_training_is_repeatable_and_leaves_the_caller_alone(examples):
         assert bool(value.isfinite().all()), name
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_training_learns_and_judging_tells(examples):
     """More steps make a lower entropy of cells, on what was trained on."""
