@@ -2,14 +2,21 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# The tests of a file stay together: what they share is made once.
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+# Tests are rewritten and start many processes: bytecode that is kept halves the time to collect them.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup search test test-all test-quick docs lint types constraints clean
+.PHONY: help setup search test test-all test-quick coverage docs lint types constraints clean
 
 help:
 	@echo "make search      set up, fetch the default detector, search the embedded scenes, write tables and pictures"
 	@echo "make test        set up, then lint, types, tests and the site"
-	@echo "make test-all    the same, with the tests that take minutes"
+	@echo "make test-quick  the tests that take no more than a second each"
+	@echo "make test-all    as make test, with the tests that repeat others at length"
+	@echo "make coverage    the tests, and which lines and branches they reach"
 	@echo "make docs        set up, then build the site in build/site"
 	@echo "make constraints write the versions of this environment down as those that are tested"
 	@echo "make clean       remove the environment, the site and run outputs"
@@ -36,13 +43,21 @@ types: $(STAMP)
 
 # tests/docs builds the site.
 test: lint types
-	$(BIN)/python -m pytest -n 2
+	$(PYTEST)
 
 test-all: lint types
-	$(BIN)/python -m pytest -n 2 -m ""
+	$(PYTEST) -m ""
 
 test-quick: $(STAMP)
-	$(BIN)/python -m pytest -n 2 -m "not slow and not long"
+	$(PYTEST) -m "not slow and not long"
+
+# Of the processes that tests start, too.
+coverage: $(STAMP)
+	rm -rf build/coverage && mkdir -p build/coverage
+	$(BIN)/python -m coverage run -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m coverage combine --quiet
+	$(BIN)/python -m coverage html --quiet
+	$(BIN)/python -m coverage report
 
 constraints: $(STAMP)
 	$(BIN)/python .ci/constraints.py

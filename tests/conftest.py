@@ -12,11 +12,32 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
+from semfov.data.scenes import EmbeddedScenes
 from semfov.detection.detector import Detector
 from semfov.detection.scores import Candidates
 
+pytest.register_assert_rewrite("tests.base_tester")
 settings.register_profile("semfov", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("semfov")
+
+
+def pytest_configure() -> None:
+    """Each worker has one thread, as have the processes that it starts: they share the machine's cores."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        torch.set_num_threads(1)
+
+
+RUNS = {"finished", "fitted", "home", "trained", "whole"}
+"""Fixtures that run a command to its end."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Whatever reads the results of a run waits for it."""
+    for item in items:
+        if isinstance(item, pytest.Function) and RUNS & set(item.fixturenames):
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(
@@ -46,6 +67,22 @@ class Textures(Detector):
 def textures() -> type[Textures]:
     """A detector without weights that sees something everywhere."""
     return Textures
+
+
+@pytest.fixture(scope="module")
+def kept_scenes() -> Iterator[None]:
+    """Embedded scenes are composed once, where mosaics show each of them many times."""
+    compose, kept = EmbeddedScenes._pixels, {}
+
+    def once(scenes: EmbeddedScenes, index: int) -> Any:
+        key = scenes.fingerprint, scenes.ids[index]
+        if key not in kept:
+            kept[key] = compose(scenes, index)
+        return kept[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(EmbeddedScenes, "_pixels", once)
+        yield
 
 
 @pytest.fixture

@@ -1,9 +1,7 @@
 """The examples run, and do what they say."""
 
+import importlib
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,16 +11,20 @@ import semfov
 
 pytestmark = [pytest.mark.weights, pytest.mark.slow]
 
-ROOT = Path(__file__).parents[1]
+
+@pytest.fixture
+def run(monkeypatch, capsys, one_thread):
+    """Runs an example and returns what it prints."""
+
+    def call(name, *arguments):
+        monkeypatch.setattr("sys.argv", [name, *map(str, arguments)])
+        importlib.import_module(f"examples.{name}").main()
+        return capsys.readouterr().out
+
+    return call
 
 
-def run(name, *arguments):
-    """What an example prints."""
-    call = [sys.executable, "-m", f"examples.{name}", *map(str, arguments)]
-    return subprocess.run(call, cwd=ROOT, check=True, capture_output=True, text=True).stdout
-
-
-def test_finetuning_raises_the_chance_of_a_hit():
+def test_finetuning_raises_the_chance_of_a_hit(run):
     output = run("finetune_observation", "--scenes", 2, "--starts", 4, "--steps", 12)
     steps = [float(value) for value in re.findall(r"step .*fixation ([\d.]+) %", output)]
     assert len(steps) == 2
@@ -30,7 +32,7 @@ def test_finetuning_raises_the_chance_of_a_hit():
     assert "after training" in output
 
 
-def test_foveating_keeps_what_is_looked_at(tmp_path):
+def test_foveating_keeps_what_is_looked_at(run, tmp_path):
     photo, out = tmp_path / "photo.png", tmp_path / "foveated.png"
     noise = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
     Image.fromarray(noise).save(photo)
@@ -40,7 +42,7 @@ def test_foveating_keeps_what_is_looked_at(tmp_path):
     assert change[:, 130:].mean() > 40
 
 
-def test_searching_draws_the_scanpath(tmp_path):
+def test_searching_draws_the_scanpath(run, tmp_path):
     output = run("search_photograph", "--out", tmp_path / "scanpath.png")
     assert "fixation 0 at (32, 24)" in output
     assert re.search(r"“cup” (found|not there|undecided) after \d+ gaze shifts? \(probability [01]\.\d\d\)", output)
@@ -48,7 +50,7 @@ def test_searching_draws_the_scanpath(tmp_path):
         assert min(picture.size) > 500
 
 
-def test_own_observer_sees_the_score_of_the_target_grow():
+def test_own_observer_sees_the_score_of_the_target_grow(run):
     output = run("own_observer")
     best = [float(value) for value in re.findall(r"best score of a cup so far ([\d.]+)", output)]
     assert best == sorted(best)
@@ -56,7 +58,7 @@ def test_own_observer_sees_the_score_of_the_target_grow():
     assert output.splitlines()[-1] == "found"
 
 
-def test_own_policy_needs_fewer_gaze_shifts():
+def test_own_policy_needs_fewer_gaze_shifts(run):
     output = run("own_policy")
     found = re.findall(r"^([\w-]+): ([\d.]+) gaze shifts on average, (\d+) searches$", output, re.MULTILINE)
     assert [name for name, _, _ in found] == ["non-predictive", "wide-inhibition"]
@@ -64,7 +66,7 @@ def test_own_policy_needs_fewer_gaze_shifts():
     assert found[0][2] == found[1][2] != "0"
 
 
-def test_own_sensor_shows_what_is_too_small_for_the_fovea():
+def test_own_sensor_shows_what_is_too_small_for_the_fovea(run):
     output = run("own_sensor")
     found = re.findall(r"^([\w ]+): (\d+) of (\d+) objects are recognised when they are fixated$", output, re.MULTILINE)
     assert [name for name, _, _ in found] == ["published fovea", "magnifying glass"]
@@ -72,7 +74,7 @@ def test_own_sensor_shows_what_is_too_small_for_the_fovea():
     assert found[0][2] == found[1][2] != "0"
 
 
-def test_own_detector_gets_an_observation_model(tmp_path):
+def test_own_detector_gets_an_observation_model(run, tmp_path):
     output = run("own_onnx_detector", "--scenes", 3, "--looks", 4, "--out", tmp_path / "model.safetensors")
     raw, fitted = (float(value) for value in re.findall(r"likelihood of ([\d.]+) nats", output))
     assert fitted < raw
@@ -81,7 +83,7 @@ def test_own_detector_gets_an_observation_model(tmp_path):
     assert int(np.sum(model.metadata["counts"])) == int(re.search(r"fitted to (\d+)", output)[1])
 
 
-def test_looking_around_turns_the_head_and_draws_it(tmp_path):
+def test_looking_around_turns_the_head_and_draws_it(run, tmp_path):
     output = run("look_around", "--seconds", 6, "--out", tmp_path / "head.png", "--film", tmp_path / "head.gif")
     seconds = [float(value) for value in re.findall(r"([\d.]+) s: head at yaw", output)]
     assert seconds == sorted(seconds)

@@ -98,6 +98,7 @@ def test_exploration_ends_when_no_look_is_worth_its_price(model, image, policy):
     assert 1 in lengths
 
 
+@pytest.mark.slow
 def test_going_by_the_gain_the_chosen_look_has_it(model, image):
     """The values of the last look tell that none is worth it, those of the looks before that one is."""
     agent = agent_of(model, Gain(model))

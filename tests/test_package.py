@@ -1,6 +1,7 @@
 """The package as a whole: what it exports, what importing it costs, which way imports run."""
 
 import ast
+import os
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -101,33 +102,46 @@ def test_import_is_light():
     assert result.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize(
-    ("command", "arguments"),
-    [
-        ("eval.demo", ["--help"]),
-        ("eval.demo", ["--target", "zebr"]),
-        ("eval.demo", ["nosuch.jpg", "--target", "cup"]),
-        ("eval.search", ["--help"]),
-        ("eval.search", ["--workers", "0"]),
-        ("eval.explore", ["--protocol.shifts", "-1"]),
-        ("eval.search", ["--data.root", "nosuch", "--data.annotations", "nosuch.json"]),
-        ("eval.explore", ["--detector.name", "yolo"]),
-        ("train.fit_fom", ["--help"]),
-        ("train.fit_map", ["--steps", "-1"]),
-        ("train.finetune_foveal", ["--help"]),
-        ("eval.foveal_training", ["--help"]),
-    ],
-)
-def test_help_and_mistakes_wait_for_nothing_heavy(command, arguments):
+COMMANDS = [
+    ("eval.demo", ["--help"]),
+    ("eval.demo", ["--target", "zebr"]),
+    ("eval.demo", ["nosuch.jpg", "--target", "cup"]),
+    ("eval.search", ["--help"]),
+    ("eval.search", ["--workers", "0"]),
+    ("eval.explore", ["--protocol.shifts", "-1"]),
+    ("eval.search", ["--data.root", "nosuch", "--data.annotations", "nosuch.json"]),
+    ("eval.explore", ["--detector.name", "yolo"]),
+    ("train.fit_fom", ["--help"]),
+    ("train.fit_map", ["--steps", "-1"]),
+    ("train.finetune_foveal", ["--help"]),
+    ("eval.foveal_training", ["--help"]),
+]
+
+# Each command in a fork of its own: all have imported the package, and nothing of each other.
+EACH = f"""
+import importlib, os, sys
+import semfov
+for number, (command, arguments) in enumerate({COMMANDS}):
+    sys.stdout.flush()
+    if not os.fork():
+        try:
+            code = importlib.import_module(command).main(arguments)
+        except SystemExit as stopped:
+            code = stopped.code
+        print("\\nends", number, code, [m for m in {HEAVY} if m in sys.modules], flush=True)
+        os._exit(0)
+    os.wait()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_help_and_mistakes_wait_for_nothing_heavy():
     """Time is not measured here: it is what is imported that takes it."""
-    code = (
-        f"import sys\nfrom {command} import main\n"
-        f"try:\n    code = main({arguments})\nexcept SystemExit as stopped:\n    code = stopped.code\n"
-        f"print(code, [m for m in {HEAVY} if m in sys.modules])"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    wanted = 0 if "--help" in arguments else 1
-    assert result.stdout.splitlines()[-1] == f"{wanted} []", result.stdout
+    result = subprocess.run([sys.executable, "-c", EACH], capture_output=True, text=True, check=True, cwd=ROOT)
+    ends = [line for line in result.stdout.splitlines() if line.startswith("ends")]
+    wanted = [0 if "--help" in arguments else 1 for _, arguments in COMMANDS]
+    assert ends == [f"ends {number} {code} []" for number, code in enumerate(wanted)], result.stderr
 
 
 def imports(source: str, module: str, *, package: bool = False) -> list[tuple[str, str]]:

@@ -237,5 +237,5 @@ def floor(scores: Tensor, epsilon: float) -> Tensor:
 
 def _check_parameters(alpha: Tensor, argument: str) -> None:
     check_shape(alpha, argument, None)
-    if values_known(alpha):
+    if alpha.numel() and values_known(alpha):
         check(bool((alpha > 0).all()), argument, "positive parameters", alpha.detach().amin().tolist())

@@ -135,6 +135,7 @@ def test_highest_scores_equal_a_loop(random_looks, device):
         assert not none.any()
 
 
+@pytest.mark.slow
 def test_gradients_through_scores_and_boxes(random_looks):
     looks = random_looks(dtype=torch.float64)
 

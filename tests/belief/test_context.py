@@ -53,6 +53,7 @@ def reach(presence, cell, component, edge):
     return best
 
 
+@pytest.mark.slow
 def test_company_equals_the_loop(prior, presence):
     got = prior(presence, GRID, torch.tensor([1, 3]), (0.0, 1.0))
     assert got.dtype == presence.dtype

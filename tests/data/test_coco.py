@@ -208,6 +208,7 @@ places = st.one_of(
 numbers = st.floats(-60, 60) | st.integers(-60, 60) | st.sampled_from([1e308, -1e308, 0])
 
 
+@pytest.mark.slow
 @settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(changes=st.lists(st.tuples(places, json_values | numbers), min_size=1, max_size=3), cut=st.booleans())
 def test_any_file_gives_scenes_or_a_data_error(photographs, tmp_path, coco_dict, changes, cut):
@@ -273,6 +274,7 @@ def test_development_photographs(shared):
         assert all((label in union.targets(index)) == expected for label, expected in legal)
 
 
+@pytest.mark.slow
 def test_program_warns_of_nothing():
     run = subprocess.run(
         [sys.executable, "-W", "error::RuntimeWarning", "-m", "semfov.data.coco", "--help"],

@@ -1,5 +1,6 @@
 """Mosaics: what is where, by seed, and boxes that fit the pixels."""
 
+import pytest
 import torch
 
 from semfov.data import EmbeddedScenes
@@ -12,6 +13,7 @@ def make(**changes):
     return Mosaics(SCENES, **({"columns": 2, "rows": 2, "tile": (320, 256), "count": 3, "seed": 1} | changes))
 
 
+@pytest.mark.slow
 def test_seed_and_number_decide():
     assert torch.equal(make()[1].image, make(count=9)[1].image)
     assert make().fingerprint != make(seed=2).fingerprint

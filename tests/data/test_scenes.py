@@ -116,6 +116,7 @@ def test_photographs_come_in_the_wheels():
     assert all(f"skimage/data/{texture}" in carried for texture in TEXTURES)
 
 
+@pytest.mark.slow
 def test_a_seed_gives_the_same_bits_in_another_process(scenes):
     program = (
         "from semfov.data import EmbeddedScenes\n"

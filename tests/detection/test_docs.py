@@ -21,6 +21,7 @@ def blocks(language):
     return re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_snippets(tiny_weights, make_onnx, tmp_path, monkeypatch):
     from torchvision.models.detection import ssdlite320_mobilenet_v3_large

@@ -94,6 +94,7 @@ def test_what_cannot_be_exported(small, tmp_path, make_onnx):
     assert not (tmp_path / "out.onnx").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_command_line(tiny_weights, tmp_path):
     path = tmp_path / "tiny.onnx"

@@ -16,6 +16,7 @@ def same_threads():
     torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [["--threads", "1", "2"], ["--processor-time", "--keep-memory"]])
 def test_tables(make_onnx, monkeypatch, capsys, options):
     model = make_onnx({"output": np.random.default_rng(0).random((1, 84, 85)).astype(np.float32)})

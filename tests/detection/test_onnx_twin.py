@@ -280,6 +280,7 @@ print(hashlib.sha256(found.boxes.numpy().tobytes() + found.classes.numpy().tobyt
 """
 
 
+@pytest.mark.slow
 def test_processes_that_export_at_once(small_cfg, write_weights, make, tmp_path):
     environment = {**os.environ, "SEMFOV_CACHE": str(tmp_path / "cold"), "PYTHONWARNINGS": "error"}
     call = [sys.executable, "-c", LOOK, str(small_cfg), str(write_weights())]

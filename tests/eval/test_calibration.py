@@ -78,10 +78,11 @@ def test_sums_in_the_file_add_up_to_the_figures(finished):
 
 
 @pytest.mark.weights
-def test_finished_scenes_are_not_judged_again(finished, arguments, tmp_path):
+@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
+def test_finished_scenes_are_not_judged_again(finished, arguments, tmp_path, workers):
     """Workers change no bit; a damaged part is computed again."""
     threads = torch.get_num_threads()
-    assert main([*arguments, "--workers", "2", "--out", str(tmp_path)]) == 0
+    assert main([*arguments, "--workers", workers, "--out", str(tmp_path)]) == 0
     for name in FILES:
         assert (tmp_path / name).read_bytes() == (finished / name).read_bytes()
     first, second = sorted(tmp_path.glob("parts/*/*.json"))
@@ -94,6 +95,7 @@ def test_finished_scenes_are_not_judged_again(finished, arguments, tmp_path):
         assert (tmp_path / name).read_bytes() == (finished / name).read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_scores_may_be_judged_alone(arguments, tmp_path, capsys):
     assert main([*arguments, "--beliefs", "false", "--workers", "1", "--out", str(tmp_path)]) == 0

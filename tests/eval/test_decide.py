@@ -84,11 +84,12 @@ def test_run_leaves_table_and_records(finished):
 
 
 @pytest.mark.weights
-def test_finished_scenes_are_not_searched_again(finished, arguments, tmp_path):
+@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
+def test_finished_scenes_are_not_searched_again(finished, arguments, tmp_path, workers):
     """A run that was stopped goes on; a damaged part is computed again; workers change no bit."""
     out = tmp_path / "out"
     threads = torch.get_num_threads()
-    assert main([*arguments, "--workers", "2", "--out", str(out)]) == 0
+    assert main([*arguments, "--workers", workers, "--out", str(out)]) == 0
     assert records_in(out) == records_in(finished)
     first, second = sorted(out.glob("parts/*/*.json"))
     kept = first.stat().st_mtime_ns
@@ -103,6 +104,7 @@ def test_finished_scenes_are_not_searched_again(finished, arguments, tmp_path):
     assert part["records"] == records_in(finished)[10:]
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_no_class_to_search_for_is_told(arguments, tmp_path, capsys):
     assert main([*arguments, "--data.max_target_area", "1e-9", "--workers", "1", "--out", str(tmp_path)]) == 1

@@ -160,6 +160,7 @@ def test_small_and_large_pictures_of_a_folder(run, photo, large, zooming, tmp_pa
     assert (tmp_path / "out" / "001-my-photo.png" / "scanpath.png").is_file()
 
 
+@pytest.mark.slow
 def test_explore_a_folder(run, photo, tmp_path):
     Image.open(photo).save(photo.with_name("other.png"))
     code, printed = run(photo.parent, "--explore", "--shifts", 2, "--report", tmp_path / "page.html")
@@ -355,6 +356,7 @@ def test_agents_that_come_with_it(agent, task, cup, tmp_path, capsys):
     assert "<!DOCTYPE html>" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_sensors_by_name(usual):
     """The recommended agent's sensor is `gradual`, the published agent's the wide fovea."""

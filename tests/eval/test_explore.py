@@ -132,8 +132,8 @@ def test_run_leaves_everything(finished):
 
 @pytest.mark.parametrize(
     "change",
-    [{"store": False}, {"workers": 2}, {"protocol": ProtocolConfig(starts=2, shifts=4, batch=1)}],
-    ids=["without the stores", "two workers", "small batches"],
+    [{"store": False}, {"protocol": ProtocolConfig(starts=2, shifts=4, batch=1)}],
+    ids=["without the stores", "small batches"],
 )
 def test_same_bits(finished, change, tmp_path):
     again = replace(finished, out=tmp_path / "out", **change)
@@ -192,6 +192,7 @@ def test_saliency_store_knows_what_it_depends_on(finished):
     assert key(view="picture", sensor=other) == key(view="picture")
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_killed_run_resumes_with_the_same_result(finished, tmp_path, kill_when):
     call = [

@@ -104,16 +104,31 @@ def test_figures_are_of_the_half_that_was_not_fitted(finished):
     assert {path.name for path in finished.glob("scanpaths_*.png")} == {"scanpaths_1.png", "scanpaths_3.png"}
 
 
+TABLES = ("summary.csv", "pictures.csv", "weights.csv", "sequences.csv")
+
+
 @pytest.mark.weights
-def test_the_store_makes_no_difference_and_a_second_run_goes_on(pictures, finished):
-    threads = torch.get_num_threads()
-    assert main(viewing(pictures, "again", "--store", "false")) == 0
+def test_a_second_run_goes_on(pictures, finished):
+    before, threads = [(finished / name).read_bytes() for name in TABLES], torch.get_num_threads()
+    part = next(finished.rglob("parts/**/*.json"))
+    kept = part.stat().st_mtime_ns
     assert main(viewing(pictures, "viewing")) == 0
     torch.set_num_threads(threads)
-    for name in ("summary.csv", "pictures.csv", "weights.csv", "sequences.csv"):
+    assert part.stat().st_mtime_ns == kept
+    assert [(finished / name).read_bytes() for name in TABLES] == before
+
+
+@pytest.mark.long
+@pytest.mark.weights
+def test_the_store_makes_no_difference(pictures, finished):
+    threads = torch.get_num_threads()
+    assert main(viewing(pictures, "again", "--store", "false")) == 0
+    torch.set_num_threads(threads)
+    for name in TABLES:
         assert (pictures / "again" / name).read_text() == (finished / name).read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_searches_of_people_models_floors_and_policies(pictures):
     out, threads = pictures / "search", torch.get_num_threads()

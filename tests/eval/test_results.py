@@ -224,6 +224,7 @@ def test_a_study_has_a_row_for_each_setting_and_policy(runs):
     assert len(rows) == 2 + 6 * 2
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_once_their_experiments_have_run(runs, tmp_path):
     assert draw_figures(tmp_path, runs) == []
     for name in ("nano", "tiny"):

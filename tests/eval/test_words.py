@@ -51,6 +51,7 @@ def records(config):
     return [json.loads(line) for line in (config.out / "episodes.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_every_arm_starts_from_the_same_places(records):
     arms = defaultdict(list)
     for record in records:
@@ -63,6 +64,7 @@ def test_every_arm_starts_from_the_same_places(records):
     assert cells["noise"] != cells["noise, permuted"]
 
 
+@pytest.mark.slow
 def test_differences_are_those_of_pairs(records):
     got = differences(records, "noise", 6)
     found = {(r["arm"], r["scene"], r["target"], r["repetition"]): r["found_at"] for r in records}
@@ -76,6 +78,7 @@ def test_differences_are_those_of_pairs(records):
     np.testing.assert_allclose(got.over_images, means.std(0, ddof=1) / np.sqrt(len(means)))
 
 
+@pytest.mark.slow
 def test_table_has_those_apart_whose_first_look_misses(records, config):
     arms = ["none", "counted", "noise", "noise, permuted"]
     scores = sorted(record["first_score"] for record in records if record["arm"] == "none")
@@ -88,6 +91,7 @@ def test_table_has_those_apart_whose_first_look_misses(records, config):
     assert "misses the target: none." in "\n".join(told(records, arms, replace(config, missed=0.0)))
 
 
+@pytest.mark.slow
 def test_the_same_command_goes_on(records, config):
     written = (config.out / "episodes.jsonl").read_bytes()
     words(config)

@@ -79,6 +79,7 @@ def by_hand(run, target, path, detections, grid):
     return told
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_sums_are_those_of_beliefs_followed_by_hand(run):
     assert list(run.observers) == BELIEFS
@@ -138,6 +139,7 @@ def test_sums_are_those_of_beliefs_followed_by_hand(run):
                     assert record["seen"] == (target in best)
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_a_model_that_is_not_shipped_leaves_its_belief_out(config, run, tmp_path, monkeypatch):
     for kind in (TargetEvidence, MapEvidence):

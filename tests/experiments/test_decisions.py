@@ -89,6 +89,7 @@ def test_quarters_cover_the_picture_once():
     assert sorted(value for part in parts for value in part.flatten().tolist()) == list(range(35))
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_searches_by_price_stand_beside_those_by_thresholds(config):
     run = DecisionRun(replace(config, prices=(0.01, 0.2), confirm=0.6))
@@ -109,6 +110,7 @@ def shows(step, grid, target, least=0.5):
     return 0
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_records_are_those_of_searches_by_hand(run):
     outcomes, evidence = set(), run.models.evidence
@@ -168,6 +170,7 @@ def test_records_are_those_of_searches_by_hand(run):
     assert {"found", "absent"} <= outcomes
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_parts_are_of_what_decisions_depend_on(config, run, folder):
     def key(**change):

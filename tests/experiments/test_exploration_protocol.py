@@ -112,6 +112,7 @@ def explore_by_loop(episode, look, model, answers, noise, shifts):
     return tuple(cells), tuple(right), tuple(without)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [2, 100])
 @pytest.mark.parametrize("shifts", [5, 14])
 def test_exploration_equals_a_scalar_twin(look, model, shifts, batch):

@@ -16,6 +16,8 @@ from semfov.experiments import head_report
 from semfov.experiments.head import HeadConfig, HeadRun, answers_of, raster
 from semfov.head.views import Views
 
+pytestmark = pytest.mark.usefixtures("kept_scenes")
+
 
 class Noise:
     """Five pictures of coloured noise with a box each: quick to make."""
@@ -62,6 +64,7 @@ def config(request, tmp_path, monkeypatch, textures):
     )
 
 
+@pytest.mark.slow
 def test_the_store_changes_nothing(config):
     fresh = HeadRun(replace(config, store=False)).outcomes(0)[0]
     written = HeadRun(config).outcomes(0)[0]
@@ -70,6 +73,7 @@ def test_the_store_changes_nothing(config):
     assert run.outcomes(0)[0] == written == fresh
 
 
+@pytest.mark.slow
 def test_tables_and_resuming(config, capsys):
     head_report.head(config)
     text = (config.out / "head.md").read_text()
@@ -93,6 +97,7 @@ def test_tables_and_resuming(config, capsys):
     assert (config.out / "head.md").read_text() == text
 
 
+@pytest.mark.slow
 def test_every_way_starts_alike_and_the_eye_alone_stays(config):
     for task in ("search", "exploration"):
         records = [record for record in HeadRun(config).outcomes(1)[0] if record["task"] == task]

@@ -117,8 +117,10 @@ def test_workers_end_with_the_process_that_started_them(tmp_path, number, code, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("module", ["eval.search", "train.fit_tempering"])
-@pytest.mark.parametrize("seconds", [0.25, 0.8, 1.6, 2.4])
+@pytest.mark.parametrize(
+    ("module", "seconds"),
+    [("eval.search", 0.25), ("eval.search", 0.8), ("eval.search", 1.6), ("train.fit_tempering", 2.4)],
+)
 def test_an_early_interrupt_ends_in_one_line(tmp_path, module, seconds):
     call = [sys.executable, "-m", module, "--out", str(tmp_path), "--workers", "2"]
     with started(call, cwd=ROOT) as process:
@@ -147,6 +149,7 @@ print(sum((folder / str(task)).exists() for task in range(4)))
 """
 
 
+@pytest.mark.slow
 def test_a_rank_waits_for_one_with_much_more_to_do(tmp_path):
     call = [sys.executable, "-c", RANK, str(tmp_path), "2"]
     ranked = [{**ENVIRONMENT, "RANK": str(n), "WORLD_SIZE": "2"} for n in range(2)]
@@ -163,6 +166,7 @@ def test_there_is_nobody_to_wait_for_alone(monkeypatch):
     assert mine(range(7)) == [1, 4]
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_a_reader_that_leaves_is_no_traceback():
     """As `python -m eval.demo | head -0`."""

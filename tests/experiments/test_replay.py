@@ -84,6 +84,7 @@ def steps_of(steps, episode):
             yield step.belief[row], step.values[row][0]
 
 
+@pytest.mark.slow
 def test_a_semantic_search_has_the_beliefs_and_values_that_it_had(run, searched):
     for name in list(run.policies)[: len(SEMANTIC)]:
         records, steps = searched[name]

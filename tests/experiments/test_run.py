@@ -68,6 +68,7 @@ def test_saliency_has_its_weight_beside_a_policy_and_none_alone(config):
     assert none.saliency is None
 
 
+@pytest.mark.slow
 def test_parts_are_of_what_the_outcomes_depend_on(config):
     key = SearchRun(config).key
     for same in (

@@ -51,6 +51,7 @@ def write_search(run, records, **options):
     return curves, page, json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])
 
 
+@pytest.mark.slow
 def test_search(searched):
     run, records = searched
     curves, page, data = write_search(run, records)

@@ -17,6 +17,8 @@ from semfov.experiments.zoom_store import pack, unpack
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.lattice import Lattice
 
+pytestmark = pytest.mark.usefixtures("kept_scenes")
+
 
 @pytest.fixture
 def config(tmp_path, monkeypatch, textures):
@@ -37,6 +39,7 @@ def config(tmp_path, monkeypatch, textures):
     )
 
 
+@pytest.mark.slow
 def test_the_store_changes_nothing(config):
     fresh = ZoomRun(replace(config, store=False)).outcomes(0)[0]
     written = ZoomRun(config).outcomes(0)[0]
@@ -45,6 +48,7 @@ def test_the_store_changes_nothing(config):
     assert run.outcomes(0)[0] == written == fresh
 
 
+@pytest.mark.slow
 def test_tables_and_resuming(config, capsys):
     zoom_report.zoom(config)
     text = (config.out / "zoom.md").read_text()
@@ -69,6 +73,7 @@ def test_tables_and_resuming(config, capsys):
     assert (config.out / "zoom.md").read_text() == text
 
 
+@pytest.mark.slow
 def test_a_damaged_store_is_looked_at_again(config):
     written = ZoomRun(config).outcomes(0)[0]
     store = ZoomRun(config).store
@@ -83,6 +88,7 @@ def test_a_damaged_store_is_looked_at_again(config):
     assert store.load(digest) == []
 
 
+@pytest.mark.slow
 def test_measures_can_be_left_out(config, capsys):
     from dataclasses import replace
 
@@ -170,6 +176,7 @@ def test_slices_are_those_of_sahi():
     assert corners[-1] == (3200, 1520, 3840, 2160)
 
 
+@pytest.mark.slow
 def test_contexts_are_compared_search_by_search(config, tmp_path):
     generator = torch.Generator().manual_seed(1)
     pairs = torch.randn(4, 4, 1, generator=generator)

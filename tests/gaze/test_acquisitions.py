@@ -135,13 +135,6 @@ def test_what_does_not_look_at_the_belief_has_no_gradient(name):
     assert not EVERY[name]()(known, visits()).requires_grad
 
 
-def test_compiles_whole(name):
-    function = EVERY[name]()
-    torch.compiler.reset()
-    compiled = torch.compile(function, fullgraph=True, backend="eager")
-    torch.testing.assert_close(compiled(beliefs(), visits()), function(beliefs(), visits()))
-
-
 def test_dtype_is_that_of_the_belief(name):
     """An observation model in double serves beliefs in single precision."""
     function, known = EVERY[name](), beliefs()

@@ -189,14 +189,6 @@ def test_gradients_reach_the_model(model):
     assert model.log_alpha.grad.abs().sum() > 0
 
 
-@pytest.mark.parametrize("name", ACQUISITIONS)
-def test_compiles_whole(name, model):
-    grid = GRIDS["wide"]
-    acquisition, beta = ACQUISITIONS[name](model, grid), beliefs(grid)
-    compiled = torch.compile(acquisition, fullgraph=True, backend="eager")
-    torch.testing.assert_close(values_of(compiled, beta), values_of(acquisition, beta))
-
-
 def test_small_divergences_survive_float32(model):
     """A belief that is nearly certain changes by next to nothing; the rest must not drown in rounding."""
     grid = GRIDS["wide"]

@@ -23,6 +23,7 @@ def pictures(seed=0, dtype=torch.float32):
     return torch.rand(1, 3, 60, 80, generator=generator, dtype=dtype), torch.rand(1, 3, 20, 30, generator=generator)
 
 
+@pytest.mark.slow
 def test_attention_equals_the_loop_over_torchvisions_layers(ivsn):
     """Layer by layer with torchvision's own network, 14 × 14 places and one."""
     network = vgg16(weights=None).features
@@ -67,6 +68,7 @@ def test_gradients():
     assert torch.autograd.gradcheck(identity, (image.requires_grad_(), target.requires_grad_()))
 
 
+@pytest.mark.slow
 def test_weights_from_a_file(ivsn, tmp_path):
     save_file({f"features.{name}": value for name, value in ivsn.features.state_dict().items()}, tmp_path / "w")
     again = IVSN.vgg16(tmp_path / "w")

@@ -94,9 +94,3 @@ def test_policies_by_name(beta):
 def test_unknown_target(beta, target):
     with pytest.raises(InputError, match="target"):
         values_of(TargetPosterior(target), beta)
-
-
-def test_compiles_whole(beta):
-    for acquisition in (TargetPosterior(2), PredictedTargetPosterior(2, Model(5))):
-        compiled = torch.compile(acquisition, fullgraph=True, backend="eager")
-        torch.testing.assert_close(values_of(compiled, beta), values_of(acquisition, beta))

@@ -11,12 +11,15 @@ from semfov.sensor.perspective import perspective
 
 CLASSES = ("person", "cat", "cup")
 
+pytestmark = pytest.mark.usefixtures("kept_scenes")
+
 
 @pytest.fixture(scope="module")
 def scenes():
     return EmbeddedScenes(CLASSES, count=5)
 
 
+@pytest.mark.slow
 def test_a_camera_that_looks_at_a_photograph_sees_it_undistorted(scenes):
     panoramas = Panoramas(scenes, width=2048, count=1)
     panorama = panoramas[0].image[None]

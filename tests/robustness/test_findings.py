@@ -82,6 +82,7 @@ def test_a_changed_bit_in_a_model_is_noticed(tmp_path):
         FovealObservationModel.from_pretrained(path)
 
 
+@pytest.mark.slow
 def test_a_model_that_does_not_fit_on_the_disk_is_told_of(tmp_path):
     """`safetensors` tells of it by an error of its own; what was there before stays."""
     path = tmp_path / "model.safetensors"

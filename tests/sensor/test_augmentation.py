@@ -129,6 +129,7 @@ def test_behind_a_flip_the_flip_moves_the_boxes():
     torch.testing.assert_close(view, foveate(image.flip(-1), gaze, sigma=6.0))
 
 
+@pytest.mark.slow
 def test_compiles_to_one_graph():
     image = draw(2, 3, 24, 32)
     augment = RandomFoveation((3.0, 30.0), p=1.0)

@@ -39,6 +39,7 @@ def test_plain_loops(twin, convention, growth, size):
         close(result[0], twin.foveate(image[0].numpy(), gaze, sigma, 3, growth, convention))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("growth", [1.0, 2.0])
 def test_plain_loops_on_a_large_image(twin, convention, growth):
@@ -292,6 +293,7 @@ def test_dtype_and_device_follow_the_image(dtype, size, device):
     torch.testing.assert_close(result, expected.to(dtype), rtol=0, atol=2e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("size", [(20, 27), (170, 164)])
 def test_compiles_to_one_graph(convention, size):
@@ -305,14 +307,6 @@ def test_compiles_to_one_graph(convention, size):
     close(compiled(image, gaze), sensor(image, gaze))
     with torch.no_grad():
         close(compiled(image, gaze), sensor(image, gaze))
-
-
-def test_module_compiles_to_one_graph():
-    sensor = Foveation(6.0, levels=2, learnable=True)
-    image, gaze = draw(2, 3, 33, 40, dtype=torch.float32), torch.tensor([[4.0, 9.0], [30.0, 2.0]])
-    torch.compiler.reset()
-    compiled = torch.compile(sensor, fullgraph=True, backend="eager")
-    close(compiled(image, gaze).detach(), sensor(image, gaze).detach(), 1e-6)
 
 
 def test_module_is_the_function():

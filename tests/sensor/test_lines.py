@@ -1,6 +1,7 @@
 """Matrices cut into tiles against the whole matrix."""
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,6 +9,7 @@ from hypothesis import strategies as st
 from semfov.sensor.lines import Taps, banded, separable
 
 
+@pytest.mark.slow
 @given(
     tiles=st.integers(1, 30),
     tile=st.integers(1, 16),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from semfov.errors import InputError
 from semfov.eye import Eye
 from semfov.sensor import LogPolar, from_log_polar, gaussian_pyramid, log_polar
-from tests.robustness.test_reuse import Blobs
+from tests.small import Blobs
 
 
 def draw(*shape, dtype=torch.float64, device=None, seed=0):

@@ -94,6 +94,7 @@ def test_regions_hold_their_samples_and_nothing_beside():
     assert not regions.contain(outside)[0].any()
 
 
+@pytest.mark.slow
 @given(yaws, st.floats(-89, 89))
 def test_boxes_in_a_panorama_hold_the_region_and_touch_it(yaw, pitch):
     """Independent of outlines: which pixels of a panorama lie in the region (a corner can be a tip between them)."""

@@ -140,6 +140,7 @@ def test_nothing_is_asked_twice(server, call):
     assert len(server.requests) == 18
 
 
+@pytest.mark.slow
 def test_a_killed_command_goes_on(server, call):
     server.wait = 0.3
     command = [sys.executable, "-m", "train.ask_language_model", *call]

@@ -102,6 +102,7 @@ def test_the_views_are_gone(trained):
     assert not list((trained / "features").glob("*/*.safetensors"))
 
 
+@pytest.mark.long
 def test_two_workers_give_the_same_bits(trained, tmp_path):
     assert main([*SMALL, "2", "--out", str(tmp_path)]) == 0
     for one, other in zip(weights(tmp_path)[0].items(), weights(trained)[0].items(), strict=True):
@@ -109,7 +110,9 @@ def test_two_workers_give_the_same_bits(trained, tmp_path):
         assert torch.equal(one[1], other[1])
 
 
-@pytest.mark.parametrize("until", ["features/*/*.safetensors", "training.safetensors"])
+@pytest.mark.parametrize(
+    "until", [pytest.param("features/*/*.safetensors", marks=pytest.mark.long), "training.safetensors"]
+)
 def test_killed_training_resumes_with_the_same_bits(trained, tmp_path, kill_when, until):
     call = [sys.executable, "-m", "train.finetune_foveal", *SMALL, "1", "--out", str(tmp_path)]
     kill_when(call, lambda: list(tmp_path.glob(until)), cwd=ROOT)

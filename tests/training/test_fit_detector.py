@@ -129,6 +129,7 @@ def arguments(folder, *more):
     return [str(folder / "colours.onnx"), *data(folder), *SMALL, *paths, *more]
 
 
+@pytest.mark.slow
 def test_the_folder_says_what_it_holds(home):
     manifest = Manifest.read(home / "models")
     assert manifest.classes == CLASSES
@@ -227,6 +228,7 @@ def test_the_same_command_again_fits_nothing(home, monkeypatch, capsys):
     assert f"--models {home / 'models'}" in printed.out
 
 
+@pytest.mark.slow
 def test_a_part_that_is_gone_is_fitted_again_alone(home, tmp_path, monkeypatch):
     """As after a kill: what was finished is read back, the rest is made, and comes out the same."""
     shutil.copytree(home / "models", tmp_path / "models")
@@ -464,6 +466,7 @@ def test_one_bar_over_stages(capsys):
     assert "alone" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_fitting_in_python_is_the_same(home, tmp_path):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

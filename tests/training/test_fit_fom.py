@@ -67,6 +67,7 @@ def test_two_workers_and_larger_shards_give_the_same_bits(fitted, tmp_path):
     assert bits(tmp_path) == bits(fitted)
 
 
+@pytest.mark.long
 def test_two_ranks_give_the_same_bits(fitted, tmp_path):
     launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     call = [*launch, "-m", "train.fit_fom", *SMALL, "1", "--out", str(tmp_path)]
@@ -75,6 +76,7 @@ def test_two_ranks_give_the_same_bits(fitted, tmp_path):
     assert bits(tmp_path) == bits(fitted)
 
 
+@pytest.mark.long
 def test_killed_fit_resumes_with_the_same_bits(fitted, tmp_path, kill_when):
     call = [sys.executable, "-m", "train.fit_fom", *SMALL, "1", "--out", str(tmp_path)]
     kill_when(call, lambda: list(tmp_path.glob("samples/*/*.safetensors")), cwd=ROOT)

@@ -204,6 +204,7 @@ def eye():
     return Eye(Foveation(5.0, levels=3), Textures(), reference=SIDE).requires_grad_(False)
 
 
+@pytest.mark.slow
 def test_training_finds_more(config, eye):
     scenes, metadata = Pictures(12), {}
     learned, losses = train(config, eye, scenes, range(12), metadata)

@@ -148,6 +148,7 @@ def write_viewing(folder, pictures=4, subjects=4):
     return ["--root", str(folder), "--fixations", str(folder / "fixations.json"), "--cache", str(folder / "cache")]
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_a_run_leaves_a_model_and_a_report(tmp_path, capsys):
     threads = torch.get_num_threads()
@@ -172,6 +173,7 @@ def test_a_run_leaves_a_model_and_a_report(tmp_path, capsys):
     assert "did you mean 'kl-raw'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_pictures_of_another_size_are_told(tmp_path, capsys):
     given = write_viewing(tmp_path, pictures=2)

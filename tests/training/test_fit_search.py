@@ -268,6 +268,7 @@ def test_training_is_repeatable_and_leaves_the_caller_alone(examples):
         assert bool(value.isfinite().all()), name
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_training_learns_and_judging_tells(examples):
     """More steps make a lower entropy of cells, on what was trained on."""
@@ -334,12 +335,13 @@ def test_training_leaves_model_report_and_figures(trained):
 @pytest.mark.weights
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
-def test_looks_are_shared_and_the_result_is_the_same(trained, tmp_path):
-    """With what was seen before, by two workers: the same bits; no photograph is looked at again."""
+@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
+def test_looks_are_shared_and_the_result_is_the_same(trained, tmp_path, workers):
+    """With what was seen before, by any number of workers: the same bits; no photograph is looked at again."""
     stored = {path: path.stat().st_mtime_ns for path in (trained / "cache/looks").rglob("*") if path.is_file()}
     assert len([path for path in stored if path.suffix == ".safetensors"]) >= 6
     torch.manual_seed(1)  # what the caller draws elsewhere changes nothing
-    assert main([*SMALL, "--workers", "2", "--out", str(tmp_path), "--cache", str(trained / "cache")]) == 0
+    assert main([*SMALL, "--workers", workers, "--out", str(tmp_path), "--cache", str(trained / "cache")]) == 0
     assert stored == {path: path.stat().st_mtime_ns for path in stored}
     for name in ("yolov3-tiny.safetensors", "judged.json", "report.md"):
         assert (tmp_path / name).read_bytes() == (trained / "out" / name).read_bytes(), name

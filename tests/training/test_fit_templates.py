@@ -70,6 +70,7 @@ def test_objects_are_read_at_their_centres():
         assert float(own @ found) >= float(others[-4])
 
 
+@pytest.mark.slow
 @pytest.mark.weights
 def test_a_run_leaves_templates_that_a_search_goes_by(tmp_path, capsys):
     threads = torch.get_num_threads()

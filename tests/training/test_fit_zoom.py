@@ -22,12 +22,15 @@ from semfov.training.zoom_settings import FitZoomConfig
 from semfov.zoom import GlimpseEvidence, ZoomEye
 from semfov.zoom.lattice import Lattice
 
+pytestmark = pytest.mark.usefixtures("kept_scenes")
 
+
+@pytest.mark.slow
 def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, textures):
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures("bright"))
     config = FitZoomConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
-        mosaics=1, far=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=96, steps=3, survey_steps=3,
+        mosaics=1, far=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=48, steps=3, survey_steps=3,
         out=tmp_path / "out", cache=tmp_path / "cache", workers=1,
     )  # fmt: skip
     fit_zoom(config)
@@ -97,8 +100,10 @@ def test_settings_have_ranges():
         FitZoomConfig(steps=0)
 
 
+@pytest.mark.slow
 def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys, textures):
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures("bright"))
+    monkeypatch.setattr("semfov.experiments.zoom_samples.TILE", (96, 72))
     config = FitConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
         mosaics=2, fixations=1, levels=4, holdout=2, shard=1, method="newton", name="bright-zoom",

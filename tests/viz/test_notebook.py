@@ -20,6 +20,7 @@ print("image/png" in plain, drawn["image/png"][:4] == b"\\x89PNG", drawn["image/
 """
 
 
+@pytest.mark.slow
 def test_a_figure_shows_itself_before_pyplot_is_used():
     """Matplotlib's own figures do not: a notebook learns to show them from pyplot."""
     pytest.importorskip("IPython", reason="needs IPython (pip install semfov[docs])")

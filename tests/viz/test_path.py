@@ -76,6 +76,7 @@ def test_colours_go_with_time():
                                                               axes.collections[-1].get_offsets()[1:]], 1))  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2, 400])
 def test_few_and_very_many_fixations(count):
     """Numbers that there is no room for are left out, never the first and the last."""

@@ -109,6 +109,7 @@ def test_nothing_is_expected_where_the_eye_looked_closest(belief, glances):
     assert (expected[7 : 7 + CELLS, 5 + CELLS : -1] > 0).all()
 
 
+@pytest.mark.slow
 def test_odds_that_are_kept_are_those_computed_anew(belief, glances, evidence):
     """After looks of all levels in any order, and plans that were dropped."""
     lattice, generator = belief.lattice, torch.Generator().manual_seed(5)

@@ -19,6 +19,8 @@ from semfov.zoom.observed import ObservedRates
 
 LATTICE = Lattice.over((1024, 768), (128, 128))
 
+pytestmark = pytest.mark.usefixtures("kept_scenes")
+
 
 def test_octaves_are_logarithms_of_the_magnifications():
     assert LATTICE.octaves.tolist() == pytest.approx([-math.log2(m) for m in LATTICE.magnifications])
@@ -35,6 +37,7 @@ def test_windows_are_of_all_magnifications():
     assert not torch.equal(windows, choose_windows(LATTICE, 5, 1, "scene"))
 
 
+@pytest.mark.slow
 def test_every_nth_mosaic_is_of_other_photographs():
     kept, held = (EmbeddedScenes(("person", "cat"), count=3, seed=seed) for seed in (0, 1))
     both = HeldOutMosaics(*(Mosaics(some, 2, 2, tile=(64, 48), count=6) for some in (kept, held)), every=3)
@@ -49,11 +52,13 @@ def test_every_nth_mosaic_is_of_other_photographs():
 def sampler(detector, monkeypatch):
     detector.classes = ("person", "cat", "cup")
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: detector)
+    monkeypatch.setattr("semfov.experiments.zoom_samples.TILE", (160, 120))
     data = DataConfig(limit=3, min_instances=0, max_target_area=None)
     settings = MosaicSettings(data, DetectorConfig(), SensorConfig(), 2, 0.5, 0, 1, mosaics=2, holdout=2)
     return settings.sampler()
 
 
+@pytest.mark.slow
 def test_samples_are_detections_with_octaves(sampler, tmp_path):
     samples = sampler.sample(0)
     x, y, magnification = samples.fixations[samples.look].unbind(-1)
@@ -69,6 +74,7 @@ def test_samples_are_detections_with_octaves(sampler, tmp_path):
     assert torch.equal(sampler.load(tmp_path, 0).boxes, samples.boxes)
 
 
+@pytest.mark.slow
 def test_misses_are_counted_in_what_a_window_shows(sampler):
     samples, edges = sampler.sample(1), torch.tensor([1.5, 2.5])
     counts = count_misses(sampler.scenes, samples, {1}, edges, sampler.cells)

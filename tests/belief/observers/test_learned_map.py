@@ -320,6 +320,7 @@ def test_the_prior_of_a_class(random_looks, toy_map):
     assert same.tolist() == [False, True, True, False, True]
 
 
+@pytest.mark.slow
 def test_graphs(random_looks, toy_map):
     """One graph, without a break, for the whole of a look; it computes what the eager code does."""
     looks, observer = random_looks(), LearnedMap(toy_map().requires_grad_(False))

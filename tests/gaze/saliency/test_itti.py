@@ -196,12 +196,6 @@ def test_gradients_of_a_uniform_image_are_finite() -> None:
     assert torch.isfinite(image.grad).all()
 
 
-def test_compilation() -> None:
-    model, image = IttiKoch(), torch.rand(1, 3, 66, 70)
-    compiled = torch.compile(model, fullgraph=True, backend="eager")
-    torch.testing.assert_close(compiled(image), model(image), atol=1e-5, rtol=0)
-
-
 def test_bad_input() -> None:
     with pytest.raises(InputError, match="image"):
         IttiKoch()(torch.zeros(1, 4, 8, 8))

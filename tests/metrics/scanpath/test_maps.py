@@ -57,6 +57,7 @@ def picture(pysaliency, maps):
     return Model(caching=False), stimuli, trains, np.array(xs), np.array(ys)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("levels", [None, 4], ids=["distinct", "many ties"])
 def test_all_are_those_of_pysaliency(pysaliency, levels):

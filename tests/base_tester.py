@@ -1,0 +1,188 @@
+"""What every public module must withstand as a part of somebody else's.
+
+A test class derives from a tester, is named after its module (`class TestFoveation(GraphTester)`), and says how the
+module is made (`make`), which tensors it takes (`inputs`) and how it is called with them (`call`, if that is not
+`module(*inputs)`). The rest is inherited. `GraphTester` is for modules that are one graph of differentiable
+operations, `TensorTester` for those whose operations depend on values, `BaseTester` for those that take pictures of
+bytes or scenes. What does not hold for a module is switched off by name, with the reason (`test_no_rows = None`).
+A public module without a tester fails `tests/test_modules.py`.
+"""
+
+import copy
+import io
+import pickle
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+
+class Host(nn.Module):
+    """Somebody else's module: it scales what its part returns by a parameter of its own."""
+
+    def __init__(self, part: nn.Module, call: Any) -> None:
+        super().__init__()
+        self.part = part
+        self.call = call
+        self.gain = nn.Parameter(torch.tensor(2.0))
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return self.gain * self.call(self.part, *inputs)
+
+
+class BaseTester:
+    """A module is used, copied, saved and loaded."""
+
+    def make(self) -> nn.Module:
+        """The module, small; random numbers are seeded."""
+        raise NotImplementedError
+
+    def inputs(self) -> tuple[Any, ...]:
+        """Its inputs, small."""
+        raise NotImplementedError
+
+    @staticmethod
+    def call(module: Any, *inputs: Any) -> Tensor:
+        """One tensor of what the module returns."""
+        return module(*inputs)
+
+    def host(self) -> Host:
+        """The module as a part of another one."""
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            return Host(self.make(), self.call)
+
+    def test_smoke(self) -> None:
+        """It returns numbers, the same ones again, and leaves its inputs alone."""
+        host, inputs = self.host(), self.inputs()
+        assert type(self).__name__.startswith(f"Test{type(host.part).__name__}")
+        given = copy.deepcopy(inputs)
+        result = host(*inputs)
+        assert result.numel() > 0
+        assert not result.isnan().any()
+        assert torch.equal(host(*inputs), result)
+        for now, before in zip(inputs, given, strict=True):
+            assert not isinstance(now, Tensor) or torch.equal(now, before)
+        assert type(host.part).__name__ in repr(host)
+
+    def test_state(self) -> None:
+        """Its parameters and buffers go through a file, which holds all that was changed."""
+        host, other, inputs = self.host(), self.host(), self.inputs()
+        with torch.no_grad():
+            for parameter in host.parameters():
+                parameter.mul_(1.25)
+        file = io.BytesIO()
+        torch.save(host.state_dict(), file)
+        file.seek(0)
+        other.load_state_dict(torch.load(file, weights_only=True))
+        assert torch.equal(host(*inputs), other(*inputs))
+
+    @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda host: pickle.loads(pickle.dumps(host))])
+    def test_copies(self, duplicate: Any) -> None:
+        """A copy does the same and shares no memory."""
+        host, inputs = self.host(), self.inputs()
+        before = host(*inputs)
+        twin = duplicate(host)
+        assert torch.equal(twin(*inputs), before)
+        with torch.no_grad():
+            for tensor in (*twin.parameters(), *twin.buffers()):
+                if tensor.is_floating_point():
+                    tensor.zero_()
+        assert torch.equal(host(*inputs), before)
+
+
+class TensorTester(BaseTester):
+    """A module of tensors follows its user's dtype, device and batches."""
+
+    # Inputs that have an episode in each row.
+    batched: ClassVar[tuple[int, ...]] = (0,)
+    # bfloat16 has 8 bits: a value is off by up to 2^-9, 0.2 %, and by more where values of a kind are subtracted.
+    autocast = 0.02
+
+    def test_shapes(self) -> None:
+        """A row of a batch is what it is alone."""
+        host, inputs = self.host(), self.inputs()
+        rows = len(inputs[self.batched[0]])
+        assert rows > 1, "the inputs of a tester have two rows or more"
+        whole = host(*inputs)
+        for row in range(rows):
+            torch.testing.assert_close(host(*self.rows(row, row + 1)), whole[row : row + 1])
+
+    def test_no_rows(self) -> None:
+        """A batch of nothing gives a batch of nothing."""
+        host = self.host()
+        assert host(*self.rows(0, 0)).shape == (0, *host(*self.inputs()).shape[1:])
+
+    def rows(self, start: int, stop: int) -> tuple[Tensor, ...]:
+        """The inputs with some of their rows."""
+        return tuple(x[start:stop] if n in self.batched else x for n, x in enumerate(self.inputs()))
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_dtypes(self, dtype: torch.dtype) -> None:
+        """Double precision is computed in double precision."""
+        expected = self.host()(*self.inputs())
+        result = self.host().to(dtype)(*(x.to(dtype) if x.is_floating_point() else x for x in self.inputs()))
+        assert result.dtype == dtype
+        torch.testing.assert_close(result.to(expected), expected, rtol=1e-3, atol=1e-4)
+
+    def test_device(self, device: torch.device) -> None:
+        """It runs where its inputs are."""
+        result = self.host().to(device)(*(x.to(device) for x in self.inputs()))
+        assert result.device.type == device.type
+        torch.testing.assert_close(result.cpu(), self.host()(*self.inputs()), rtol=1e-3, atol=1e-4)
+
+    def test_autocast(self) -> None:
+        """It withstands half of the digits."""
+        host, inputs = self.host().requires_grad_(False), self.inputs()
+        expected = host(*inputs)
+        with torch.autocast("cpu", torch.bfloat16):
+            result = host(*inputs)
+        assert bool(torch.isfinite(result).all())
+        scale = float(expected.abs().max().clamp(min=1e-6))
+        assert float((result.float() - expected).abs().max()) <= self.autocast * scale
+
+
+class GraphTester(TensorTester):
+    """A module is one graph of differentiable operations: it is compiled, exported, vectorised and differentiated."""
+
+    # Inputs that it can be differentiated by.
+    differentiable: ClassVar[tuple[int, ...]] = (0,)
+
+    def test_gradcheck(self) -> None:
+        """Derivatives by its inputs and parameters are those of finite differences."""
+        host = self.host().double()
+        inputs = [x.double() if x.is_floating_point() else x for x in self.inputs()]
+        for number in self.differentiable:
+            inputs[number].requires_grad_()
+        names, parameters = zip(*((n, p) for n, p in host.named_parameters() if p.requires_grad), strict=True)
+
+        def result(*values: Tensor) -> Tensor:
+            given = dict(zip(names, values[len(inputs) :], strict=True))
+            return torch.func.functional_call(host, given, values[: len(inputs)])
+
+        assert torch.autograd.gradcheck(result, (*inputs, *parameters), fast_mode=True)
+
+    @pytest.mark.slow
+    def test_compile(self) -> None:
+        """It compiles to one graph."""
+        host, inputs = self.host(), self.inputs()
+        torch.compiler.reset()
+        compiled = torch.compile(host, fullgraph=True, backend="eager")
+        torch.testing.assert_close(compiled(*inputs), host(*inputs), rtol=1e-4, atol=1e-5)
+
+    @pytest.mark.slow
+    def test_export(self) -> None:
+        """`torch.export` takes it."""
+        host, inputs = self.host().requires_grad_(False), self.inputs()
+        program = torch.export.export(host, inputs)
+        torch.testing.assert_close(program.module()(*inputs), host(*inputs), rtol=1e-4, atol=1e-5)
+
+    def test_vmap(self) -> None:
+        """It vectorises over its first input: images, beliefs or scores."""
+        host = self.host().requires_grad_(False)
+        first, *others = self.inputs()
+        many = torch.stack([first, first.flip(-1), first.flip(0)])
+        expected = torch.stack([host(each, *others) for each in many])
+        together = torch.func.vmap(lambda each: host(each, *others))(many)
+        torch.testing.assert_close(together, expected, rtol=1e-4, atol=1e-5)

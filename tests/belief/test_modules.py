@@ -1,0 +1,106 @@
+"""Evidence and observers as parts of others' modules."""
+
+import torch
+
+from semfov.belief.observers import AnyOf, Context, Landing, LearnedMap, Semantic, Target
+from tests.base_tester import GraphTester
+from tests.small import GRID, context, detections, evidence, look, mapping, model, observing, rand
+
+
+class TestContextPrior(GraphTester):
+    def make(self):
+        return context()
+
+    def inputs(self):
+        return (rand(2, len(GRID), 4),)
+
+    @staticmethod
+    def call(module, presence):
+        return module(presence, GRID, 2)
+
+
+class LookTester(GraphTester):
+    """Of a module that takes one look."""
+
+    batched = (0, 1, 2)
+
+    def inputs(self):
+        return look()
+
+
+class TestTargetEvidence(LookTester):
+    def make(self):
+        return evidence()
+
+    @staticmethod
+    def call(module, scores, boxes, fixation):
+        return module(detections(scores, boxes), fixation, GRID, 2)
+
+
+class TestMapEvidence(LookTester):
+    def make(self):
+        return mapping()
+
+    @staticmethod
+    def call(module, scores, boxes, fixation):
+        return module(detections(scores, boxes), fixation, GRID, torch.tensor([1, 2, 3], device=scores.device))
+
+
+class ObserverTester(LookTester):
+    """What an observer believes of class 2 after it was shown the same from two points."""
+
+    @staticmethod
+    def call(module, scores, boxes, fixation):
+        belief, seen = module.start(len(scores), GRID, scores), detections(scores, boxes)
+        for point in (fixation, fixation + 15):
+            belief = module(belief, seen, point, GRID, 2)
+        return belief.probability(2)
+
+
+class TestSemantic(ObserverTester):
+    def make(self):
+        return observing()
+
+
+class TestSemanticOfAllClasses(LookTester):
+    def make(self):
+        return observing()
+
+    @staticmethod
+    def call(module, scores, boxes, fixation):
+        return module(module.start(len(scores), GRID, scores), detections(scores, boxes), fixation, GRID).beta
+
+
+class TestSemanticWithMisses(ObserverTester):
+    def make(self):
+        return Semantic(4, misses=model().requires_grad_(False), memory="closest")
+
+
+class TestTarget(ObserverTester):
+    def make(self):
+        return Target(evidence())
+
+
+class TestContext(ObserverTester):
+    def make(self):
+        return Context(observing(), context())
+
+
+class TestLanding(ObserverTester):
+    def make(self):
+        return Landing(3)
+
+
+class TestLearnedMap(ObserverTester):
+    def make(self):
+        return LearnedMap(mapping())
+
+
+class TestAnyOf(ObserverTester):
+    def make(self):
+        return AnyOf(Target(evidence()), {1: 0.3, 2: 1.0})
+
+
+class TestAnyOfOneMap(ObserverTester):
+    def make(self):
+        return AnyOf(LearnedMap(mapping()), {1: 0.3, 2: 1.0})

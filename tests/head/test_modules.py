@@ -1,0 +1,85 @@
+"""The parts of a head as parts of others' modules."""
+
+from functools import cache
+
+import torch
+
+from semfov import Eye, Foveation
+from semfov.belief.observers import LearnedMap, Target
+from semfov.head import ExploreGain, HeadAgent, Panorama, PerPrice, Scan, SceneObserver, SearchGain, Speeds, Views
+from tests.base_tester import BaseTester
+from tests.small import Blobs, detections, evidence, look, mapping, rand
+
+
+@cache
+def views():
+    """All looks at a small panorama."""
+    return Views(Panorama(rand(3, 60, 120), (64, 48)))
+
+
+class SceneTester(BaseTester):
+    """Of a module that acts in a scene of its own, one episode at a time."""
+
+    def inputs(self):
+        return tuple(each[:1] for each in look()[:2])
+
+    @staticmethod
+    def seen(observer, scores, boxes):
+        """What an observer believes after a look from cell 55 of the first pose."""
+        grid = views().grid
+        return observer(observer.start(1, grid, scores), detections(scores, boxes), grid.centres[55][None], grid, 2)
+
+
+class TestSceneObserver(SceneTester):
+    def make(self):
+        return SceneObserver(Target(evidence()), views())
+
+    @staticmethod
+    def call(module, scores, boxes):
+        return SceneTester.seen(module, scores, boxes).probability(2)
+
+
+class TestSearchGain(SceneTester):
+    def make(self):
+        return SearchGain(views())
+
+    @staticmethod
+    def call(module, scores, boxes):
+        belief = SceneTester.seen(SceneObserver(Target(evidence()), views()), scores, boxes)
+        return module(belief, 0, range(len(views())))
+
+
+class TestExploreGain(SceneTester):
+    def make(self):
+        return ExploreGain(views(), mapping())
+
+    @staticmethod
+    def call(module, scores, boxes):
+        return module(SceneTester.seen(SceneObserver(LearnedMap(module.model), views()), scores, boxes), 0, [0, 1])
+
+
+class TestPerPrice(SceneTester):
+    def make(self):
+        return PerPrice(SearchGain(views()), Speeds(), 55)
+
+    @staticmethod
+    def call(module, scores, boxes):
+        belief = SceneTester.seen(SceneObserver(Target(evidence()), views()), scores, boxes)
+        return module(belief, torch.zeros(1, len(views().grid), dtype=torch.bool))
+
+
+class TestScan(TestPerPrice):
+    def make(self):
+        return Scan(SearchGain(views()), [1, 0], 1, 55)
+
+
+class TestHeadAgent(BaseTester):
+    def make(self):
+        return HeadAgent(Eye(Foveation(20.0), Blobs()), evidence(), mapping()).eval().requires_grad_(False)
+
+    def inputs(self):
+        return (rand(3, 60, 120),)
+
+    @staticmethod
+    def call(module, image):
+        return module.explore(Panorama(image, (64, 48)), passes=2).maps.clone()  # of inference

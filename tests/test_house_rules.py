@@ -1,0 +1,88 @@
+"""Rules that a reader of the library relies on: short files, nobody's private parts, names that are there.
+
+The order of rooms is in `test_package.py`, what may run in `robustness/test_security.py`.
+"""
+
+import ast
+import importlib
+from pathlib import Path
+
+import pytest
+
+import semfov
+from docs.api import MODULES
+
+PACKAGE = Path(semfov.__file__).parent
+ROOT = PACKAGE.parent
+LIBRARY = sorted(PACKAGE.rglob("*.py"))
+SOURCES = LIBRARY + sorted(file for folder in ("eval", "train", "examples") for file in (ROOT / folder).rglob("*.py"))
+LONGEST = 400
+DOCUMENTED = {"os._exit"}
+
+
+def private_parts(source: str) -> list[str]:
+    """Private names of other packages that a module imports or reaches for, such as `torch._C`."""
+    tree = ast.parse(source)
+    found, foreign = [], set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                foreign.add(alias.asname or alias.name.split(".")[0])
+                found += [alias.name] if _is_private(alias.name) else []
+        elif isinstance(node, ast.ImportFrom) and not node.level and node.module:
+            own = node.module.split(".")[0] in ("semfov", "eval", "train", "examples", "__future__")
+            for alias in node.names if not own else ():
+                foreign.add(alias.asname or alias.name)
+                name = f"{node.module}.{alias.name}"
+                found += [name] if _is_private(name) else []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            name = ast.unparse(node)
+            if name.split(".")[0] in foreign and _is_private(node.attr) and name not in DOCUMENTED:
+                found.append(name)
+    return found
+
+
+def _is_private(name: str) -> bool:
+    return any(part.startswith("_") and not part.endswith("__") for part in name.split("."))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import torch\ntorch._C._get_tracing_state()",
+        "from torch._dynamo import allow_in_graph",
+        "import torch._inductor",
+        "from torch.nn import functional as F\nF._verify_batch_size(x)",
+        "from numpy import _core",
+    ],
+)
+def test_the_scan_finds(source):
+    assert private_parts(source)
+
+
+def test_the_scan_leaves_ones_own_alone():
+    assert not private_parts("import torch\nfrom semfov.errors import _to_unit\nself._kept = torch.__version__")
+
+
+def test_nobody_elses_private_parts_are_used():
+    found = {str(file.relative_to(ROOT)): private_parts(file.read_text(encoding="utf-8")) for file in SOURCES}
+    assert {name: parts for name, parts in found.items() if parts} == {}
+
+
+def test_files_of_the_library_are_short():
+    lines = {str(file.relative_to(ROOT)): len(file.read_text(encoding="utf-8").splitlines()) for file in LIBRARY}
+    assert len(lines) > 200
+    assert {name: count for name, count in lines.items() if count > LONGEST} == {}
+
+
+def test_no_file_is_a_drawer():
+    assert not {file.name for file in SOURCES} & {"utils.py", "helpers.py", "misc.py", "common.py"}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_what_a_module_says_is_public_is_there(module):
+    names = getattr(importlib.import_module(module), "__all__", [])
+    assert len(set(names)) == len(names)
+    assert [name for name in names if not hasattr(importlib.import_module(module), name)] == []
+    assert not [name for name in names if _is_private(name)]

@@ -1,0 +1,94 @@
+"""The eye and the agent as parts of others' modules; every public module has its tester."""
+
+import ast
+from inspect import isabstract, isclass
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from docs.api import entries
+from semfov import ActivePerception, Eye, Foveation
+from semfov.gaze import Policy
+from semfov.gaze.acquisition import Static
+from tests.base_tester import TensorTester
+from tests.small import GRID, Blobs, observing, rand
+
+
+class TestEye(TensorTester):
+    batched = (1,)
+    test_no_rows = None  # a detector wants an image
+
+    def make(self):
+        return Eye(Foveation(9.0), Blobs(), reference=64.0)
+
+    def inputs(self):
+        return rand(1, 3, 48, 64), torch.tensor([[20.0, 30.0], [5.0, 6.0]])
+
+    @staticmethod
+    def call(module, image, fixations):
+        return module(image, fixations).scores
+
+
+class InOrder(Policy):
+    """A policy whose choices do not depend on what is seen."""
+
+    def forward(self, target, grid):
+        return Static(rand(len(grid)))
+
+
+class TestActivePerception(TensorTester):
+    """What it believes after it has looked at three given cells."""
+
+    test_shapes = test_no_rows = None  # one picture at a time
+
+    def make(self):
+        strategy = (observing(), InOrder())
+        eye = Eye(Foveation(9.0), Blobs(), reference=64.0)
+        return ActivePerception(eye, strategy, strategy, grid=(GRID.columns, GRID.rows))
+
+    def inputs(self):
+        return (rand(1, 3, 48, 64),)
+
+    @staticmethod
+    def call(module, image):
+        return module.explore(image, start=5, shifts=2).probabilities
+
+
+def names_of_testers(source: str) -> set[str]:
+    """Classes that derive from a tester, or from one that does."""
+    classes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef)]
+    bases = {node.name: {ast.unparse(base).split(".")[-1] for base in node.bases} for node in classes}
+    found = {"BaseTester", "TensorTester", "GraphTester"}
+    for name, above in bases.items():
+        if above & found:
+            found.add(name)
+    return {name for name in found if name.startswith("Test")}
+
+
+def test_every_public_module_has_a_tester():
+    """Also what joins the API reference one day."""
+    files = sorted(Path(__file__).parent.rglob("test_modules.py"))
+    tested = set().union(*(names_of_testers(file.read_text(encoding="utf-8")) for file in files))
+    modules = {
+        name
+        for things in entries().values()
+        for name, thing in things
+        if isclass(thing) and issubclass(thing, nn.Module) and not isabstract(thing)
+    }
+    assert len(modules) > 50
+    assert sorted(modules - {name.removeprefix("Test") for name in tested}) == []
+
+
+def test_the_scan_finds_testers_alone():
+    source = (
+        "class TestA(GraphTester): pass\nclass MyTester(TestA): pass\nclass TestB(MyTester): pass\nclass TestC: pass"
+    )
+    assert names_of_testers(source) == {"TestA", "TestB"}
+
+
+def test_the_page_on_testing_shows_a_whole_tester():
+    root = Path(__file__).parents[1]
+    shown = (root / "docs/testing.md").read_text(encoding="utf-8").partition("```python\n")[2].partition("```")[0]
+    assert "class TestLogPolar(GraphTester):" in shown
+    assert shown in (root / "tests/sensor/test_modules.py").read_text(encoding="utf-8")

@@ -1,0 +1,49 @@
+"""The parts of the zoom as parts of others' modules."""
+
+import torch
+
+from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye
+from tests.base_tester import BaseTester, TensorTester
+from tests.small import Blobs, rand
+
+
+class TestGlimpseEvidence(TensorTester):
+    """What looks one octave closer are likely to show."""
+
+    batched = (0, 1)
+
+    def make(self):
+        return GlimpseEvidence(3, 8).eval()
+
+    def inputs(self):
+        return rand(5, 3), rand(5, 3)
+
+    @staticmethod
+    def call(module, scores, summary):
+        return module.presence(scores, summary, torch.ones(len(scores), dtype=torch.long, device=scores.device))
+
+
+class TestZoomEye(BaseTester):
+    """It takes pictures of bytes, from files too, and keeps them so."""
+
+    def make(self):
+        return ZoomEye(Blobs())
+
+    def inputs(self):
+        return (rand(3, 150, 200) * 255).byte(), torch.tensor([[90.0, 60.0, 1.0], [20.0, 100.0, 0.5]])
+
+    @staticmethod
+    def call(module, picture, fixations):
+        return module(picture, fixations).scores
+
+
+class TestZoomAgent(BaseTester):
+    def make(self):
+        return ZoomAgent(ZoomEye(Blobs()), GlimpseEvidence(3, 8)).eval()
+
+    def inputs(self):
+        return ((rand(3, 300, 400) * 255).byte(),)
+
+    @staticmethod
+    def call(module, picture):
+        return module.explore(picture, passes=3, worth=0.0).objects.boxes
