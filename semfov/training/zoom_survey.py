@@ -43,6 +43,9 @@ class Told:
             example: the mosaic.
             told: the look.
             seen: `(M,)`, objects of the mosaic that were found before.
+
+        Returns:
+            The look with the numbers of new objects.
         """
         look = told.gist
         assert look is not None
@@ -64,14 +67,19 @@ class Told:
         Args:
             survey: predicts them.
             logs: `(3, rows, columns)`, its predictions for the cells of the gist.
+
+        Returns:
+            The mean over the windows, a scalar.
         """
         rates = logs.exp()
         terms = []
         for (steps, span), (rows, columns, new) in self.counts.items():
             weight = survey.taper(span)
             # Windows of an overview may reach beyond the picture.
-            low, high = int(min(rows.min(), 0)), int(max(rows.max() + span - rates.shape[1], 0))
-            left, right = int(min(columns.min(), 0)), int(max(columns.max() + span - rates.shape[2], 0))
+            low, left = min(int(rows.min()), 0), min(int(columns.min()), 0)
+            high, right = (
+                max(int(n.max()) + span - size, 0) for n, size in zip((rows, columns), rates.shape[1:], strict=True)
+            )
             cells = F.pad(rates[None, steps - 1], (-left, right, -low, high))
             sums = F.conv2d(F.conv2d(cells[None], weight[None, None, None]), weight[None, None, :, None])[0, 0]
             expected = sums[rows - low, columns - left]

@@ -16,13 +16,16 @@ def features(scores: Tensor) -> Tensor:
 
 
 def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor) -> list[Tensor]:
-    """What a look shows about each cell, eleven maps `(T, rows, columns)`.
+    """List what a look shows about each cell.
 
     Args:
         own: `(T, rows, columns)`, features of the strongest hint of each target.
         best: `(rows, columns)`, the same of any class.
         found: `(T, rows, columns)`, whether a detection of the target is centred in the cell.
         size: `(rows, columns)`, as in `semfov.zoom.gist.Gist`.
+
+    Returns:
+        Eleven maps `(T, rows, columns)`.
     """
 
     def wide(values: Tensor) -> Tensor:

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.evidence import features
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance
+from semfov.zoom.networks import features
 
 
 class Tally:
