@@ -4,12 +4,13 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup search test test-all test-quick docs lint types constraints clean
+.PHONY: help setup search test test-all test-quick mutation docs lint types constraints clean
 
 help:
 	@echo "make search      set up, fetch the default detector, search the embedded scenes, write tables and pictures"
 	@echo "make test        set up, then lint, types, tests and the site"
 	@echo "make test-all    the same, with the tests that take minutes"
+	@echo "make mutation    set up, then change the library's formulas one by one and list what no test notices (hours)"
 	@echo "make docs        set up, then build the site in build/site"
 	@echo "make constraints write the versions of this environment down as those that are tested"
 	@echo "make clean       remove the environment, the site and run outputs"
@@ -44,8 +45,14 @@ test-all: lint types
 test-quick: $(STAMP)
 	$(BIN)/python -m pytest -n 2 -m "not slow and not long"
 
+# Where graphs are traced, mutants cannot be switched. What has been run is kept in mutants/: call it again to go on.
+mutation: $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[mutation]"
+	TORCHDYNAMO_DISABLE=1 OMP_NUM_THREADS=1 $(BIN)/mutmut run
+	$(BIN)/python -m benchmarks.mutation
+
 constraints: $(STAMP)
 	$(BIN)/python .ci/constraints.py
 
 clean:
-	rm -rf $(VENV) .cache build dist runs
+	rm -rf $(VENV) .cache build dist mutants runs

@@ -1,5 +1,7 @@
 """Figures of merit of telling whether a target is there."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -25,7 +27,7 @@ def area_under_roc(score: Tensor, present: Tensor) -> float:
 
 
 def threshold_for(absent: Tensor, share: float) -> float:
-    """Least threshold that no more than this share of the cases without the target reach.
+    """Least threshold that no more than this share of the cases without the target reach; -inf where all of them may.
 
     Args:
         absent: `(M,)`, scores of cases without the target.
@@ -36,8 +38,10 @@ def threshold_for(absent: Tensor, share: float) -> float:
     """
     check(len(absent) > 0, "absent", "at least one case", "none")
     allowed = int(share * len(absent))
+    if allowed >= len(absent):
+        return -math.inf
     order = absent.double().sort(descending=True).values
-    return float(torch.nextafter(order[min(allowed, len(order) - 1)], torch.tensor(torch.inf, dtype=torch.float64)))
+    return float(torch.nextafter(order[allowed], torch.tensor(torch.inf, dtype=torch.float64)))
 
 
 def hits_at(score: Tensor, present: Tensor, share: float) -> float:

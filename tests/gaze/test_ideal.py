@@ -205,3 +205,19 @@ def test_arguments():
         EntropyLimit(1, FovealObservationModel.identity(["cup"], [0.2]), GRID)
     with pytest.raises(InputError, match="nodes"):
         CorrectLocalisation(1, make_model(), GRID, nodes=3)
+
+
+def test_nodes_are_those_of_the_integral():
+    place, signal = make_belief(batch=3).probability(1), torch.rand(3, 12, 12, dtype=torch.float64) + 0.3
+    place = place / place.sum(-1, keepdim=True)
+    for nodes in (8, 16):
+        got = CorrectLocalisation(1, make_model(), GRID, nodes=nodes).values(place, signal)
+        expected = [
+            [float(correct_localisation(p, d, nodes=nodes)) for d in s] for p, s in zip(place, signal, strict=True)
+        ]
+        torch.testing.assert_close(got, torch.tensor(expected, dtype=torch.float64))
+    usual = CorrectLocalisation(1, make_model(), GRID).values(place, signal)
+    assert torch.equal(usual, CorrectLocalisation(1, make_model(), GRID, nodes=64).values(place, signal))
+    assert not torch.allclose(usual, got, rtol=1e-6)
+    with pytest.raises(InputError, match="nodes: expected 8 or more, got 7"):
+        CorrectLocalisation(1, make_model(), GRID, nodes=7)

@@ -26,7 +26,7 @@ def cell_labels(points: ArrayLike, columns: int, rows: int, size: tuple[float, f
     >>> cell_labels([[0, 0], [99, 0], [99, 99]], 2, 2, (100, 100))
     array([0, 1, 3])
     """
-    inside = (np.asarray(points, dtype=np.float64) + 0.5) / np.asarray(size, dtype=np.float64)
+    inside = (np.asarray(points, dtype=np.float64) + 0.5) / np.asarray(size)
     check(bool(((inside >= 0) & (inside <= 1)).all()), "points", f"points of a picture of {size}", "others")
     column, row = np.minimum(inside * (columns, rows), (columns - 1e-9, rows - 1e-9)).astype(np.int64).T
     return np.asarray(row * columns + column)

@@ -170,3 +170,11 @@ def test_points_belong_to_the_pixel_that_they_are_nearest_to():
 def test_what_cannot_be_is_refused_by_name(call, argument):
     with pytest.raises(InputError, match=f"^{argument}"):
         call()
+
+
+def test_each_map_of_a_batch_is_a_density_of_its_own_in_double_precision():
+    maps = torch.rand(2, 3, *SHAPE, generator=torch.Generator().manual_seed(4))
+    maps[1] *= 100
+    density = log_density(maps, floor=0.2)
+    np.testing.assert_allclose(np.exp(density).sum((-1, -2)), 1, rtol=1e-12)
+    np.testing.assert_array_equal(density, log_density(maps.double(), floor=0.2))

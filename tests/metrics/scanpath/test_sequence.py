@@ -84,3 +84,25 @@ def test_neighbours_merge_while_they_are_closer_than_half_a_window():
 def test_what_cannot_be_is_refused_by_name(call, argument):
     with pytest.raises(InputError, match=f"^{argument}:"):
         call()
+
+
+def test_cells_of_points_in_half_precision():
+    """1025 is a number of half precision and 1025.5 is none."""
+    assert cell_labels(np.array([[1025, 0]], dtype=np.float16), 4096, 1, (4096, 1)).tolist() == [1025]
+
+
+def test_merging_goes_on_to_the_last_fixation_and_starts_anew_after_a_step():
+    np.testing.assert_allclose(merge_close([[0.0, 0.0], [50, 50], [52, 50]], (10, 10)), [[0, 0], [51, 50]])
+    np.testing.assert_allclose(merge_close([[0.0, 0.0], [2, 0]], (10, 10)), [[1, 0]])
+    # Half a window apart is not closer than half a window.
+    np.testing.assert_allclose(merge_close([[0.0, 0.0], [5, 0]], (10, 10)), [[0, 0], [5, 0]])
+    # Bytes do not wrap around.
+    np.testing.assert_allclose(merge_close(np.array([[200, 0], [202, 2]], dtype=np.uint8), (10, 10)), [[201, 1]])
+
+
+@pytest.mark.parametrize("figure", [sequence_score, edit_distance])
+def test_both_words_are_refused_by_their_names(figure):
+    with pytest.raises(InputError, match=r"^ours:"):
+        figure([], [1])
+    with pytest.raises(InputError, match=r"^theirs:"):
+        figure([1], [])
