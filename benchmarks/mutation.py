@@ -64,6 +64,8 @@ class _Words(ast.NodeTransformer):
             node.args[1:] = [ast.Constant("") for _ in node.args[1:]]
         elif name.startswith("check_"):
             node.args[1:2] = [ast.Constant("") for _ in node.args[1:2]]
+        elif name == "lookup":
+            node.args[2:] = [ast.Constant("") for _ in node.args[2:]]
         elif name == "float" and isinstance(node.args[0], ast.Constant):
             node.args[0] = ast.Constant(str(node.args[0].value).lower())
         node.keywords = [each for each in node.keywords if each.arg not in self.left_out]

@@ -106,7 +106,7 @@ def company_of(table: NamedTable, classes: Sequence[str], bands: int) -> tuple[T
         some = ", ".join(table.rows[:5])
         raise InputError(f"classes: expected some that the table knows ({some}, …), got {', '.join(classes[:5])}, …")
     relative = known - known.nanmean(1, keepdim=True) - known.nanmean(0, keepdim=True) + known.nanmean()
-    profile = torch.linspace(1, -1, bands) if bands > 1 else torch.ones(1)
+    profile = torch.linspace(1, -1, bands)
     company = torch.zeros(len(classes) + 1, len(classes) + 1, bands)
     company[1:, 1:] = relative.nan_to_num(0)[..., None] * profile
     return company, missing
@@ -124,6 +124,4 @@ def places_of(table: NamedTable, classes: Sequence[str]) -> Tensor:
 
 def _picked(values: Tensor, names: Sequence[str], classes: Sequence[str]) -> Tensor:
     """Rows for the classes: of the name itself, or the mean of those of its synonyms; NaN where there is none."""
-    nothing = torch.full_like(values[0], torch.nan)
-    found = [alike(name, names) for name in classes]
-    return torch.stack([values[places].nanmean(0) if places else nothing for places in found])
+    return torch.stack([values[alike(name, names)].nanmean(0) for name in classes])

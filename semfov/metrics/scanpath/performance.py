@@ -51,7 +51,7 @@ def mean_performance(found: Sequence[int], groups: Sequence[Hashable], shifts: i
     members: dict[Hashable, list[int]] = {}
     for each, group in zip(found, groups, strict=True):
         members.setdefault(group, []).append(each)
-    curves = [cumulative_performance(np.array(each, dtype=np.int64), shifts) for each in members.values()]
+    curves = [cumulative_performance(np.array(each), shifts) for each in members.values()]
     return np.asarray(np.mean(curves, axis=0))
 
 

@@ -100,3 +100,11 @@ def test_bad_input(inner):
     for target, message in (({}, "several"), ({"cup": 1, 1: 1}, "twice"), ({"cat": 1}, "unknown class")):
         with pytest.raises(InputError, match=message):
             weights_by_class(target, classes)
+
+
+def test_some_episodes_and_classes_that_there_are_not(inner, looks):
+    observer = AnyOf(inner, WEIGHTS)
+    belief = observer.update(observer.start(3, GRID, looks.scores), observer.weigh(looks, FIXATIONS, GRID))
+    assert torch.equal(belief[1:].closest, belief.closest[1:])
+    with pytest.raises(InputError, match=r"^target:"):
+        weights_by_class({99: 1.0}, ("cup", "wine glass"))

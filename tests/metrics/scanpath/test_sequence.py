@@ -1,12 +1,16 @@
 """Scanpaths as words, against alignments by dynamic programming as the field's own code writes them."""
 
+import warnings
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sklearn.cluster import MeanShift
 
 from semfov.errors import InputError
 from semfov.metrics.scanpath import cell_labels, cluster_labels, edit_distance, merge_close, sequence_score
+from semfov.metrics.scanpath.sequence import fitted_clusters
 
 words = st.lists(st.sampled_from(["cup", "fork", "oven", "tv"]), min_size=1, max_size=9)
 
@@ -106,3 +110,24 @@ def test_both_words_are_refused_by_their_names(figure):
         figure([], [1])
     with pytest.raises(InputError, match=r"^theirs:"):
         figure([1], [])
+
+
+def test_letters_of_an_array_are_those_of_a_list():
+    """-1 too, whose hash is not itself."""
+    assert sequence_score(np.array([3, -1, 300_000]), [3, -1, 300_000]) == 1
+    assert edit_distance([3, -1], np.array([3, -1])) == 0
+
+
+def test_clusters_are_those_of_scikit_learn_from_seeds_in_bins():
+    points = np.random.default_rng(0).uniform(0, 500, (40, 2))
+    expected = MeanShift(bandwidth=90, bin_seeding=True).fit(points).predict(points)
+    assert cluster_labels(points, points, bandwidth=90).tolist() == expected.tolist()
+
+
+def test_of_its_warnings_only_that_about_bins_is_silent(monkeypatch):
+    """Where every fixation has a bin of its own."""
+    points = [[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]]
+    assert sorted(cluster_labels(points, points, bandwidth=1).tolist()) == [0, 1, 2]
+    monkeypatch.setattr(MeanShift, "fit", lambda self, points: warnings.warn("another", stacklevel=1))
+    with pytest.warns(UserWarning, match="another"):
+        fitted_clusters(points)
