@@ -1,12 +1,12 @@
-"""Mutation score of each module, and the mutants that no test notices, from what `mutmut run` left in `mutants/`.
+"""Mutation scores by module, and the mutants that no test notices, from what `mutmut run` left in `mutants/`.
 
     make mutation
     python -m benchmarks.mutation semfov.belief.fusion
     mutmut run $(python -m benchmarks.mutation semfov.belief --pending 200)
 
 mutmut changes one operator, number, string or argument at a time and runs the tests that call the function. A mutant is
-killed when a test fails. Mutants that cannot matter are set aside, whether killed or not: those that `_aside`
-recognises, and those that `mutation.toml` lists with the reason.
+killed when a test fails. Mutants that no test can notice are set aside, whether they were killed or not: `_Words`
+recognises some kinds by rule, and `mutation.toml` lists the others with the reason.
 """
 
 import argparse
@@ -28,6 +28,7 @@ EQUIVALENT = Path(__file__).with_name("mutation.toml")
 STATUS = {1: "killed", 3: "killed", 0: "survived", 5: "untested", 33: "untested", None: "not run"}
 # Exit codes of mutants that did not end in time.
 STATUS |= dict.fromkeys((-24, 24, 36, 152, 255), "killed")
+HEAD = ("module", "killed", "survived", "untested", "not run", "aside", "score")
 # Their first argument decides whether there is an error, the others are words of its message.
 CHECKS = ("check", "check_finite", "check_pixels")
 
@@ -36,9 +37,9 @@ class Mutant(NamedTuple):
     """One change of one function.
 
     Attributes:
-        name: mutmut's.
+        name: the name that mutmut gives it.
         function: the function that is changed, with its module.
-        change: the lines that replace others, as `ast.unparse` writes them, joined by a newline.
+        change: the changed lines, as `ast.unparse` writes them, joined by newlines.
         status: `killed`, `survived`, `untested` (no test calls the function), `not run`, or `aside`.
     """
 
@@ -49,10 +50,10 @@ class Mutant(NamedTuple):
 
 
 class _Words(ast.NodeTransformer):
-    """Blanks what no test here is to notice.
+    """Removes the code that no test is meant to notice.
 
-    These are the words of errors; `strict=`, by which `zip` checks itself; the capitals of `float("nan")`; and
-    `device=`, which makes no difference where there is no accelerator.
+    This is the text of error messages, the `strict=` of `zip`, upper and lower case in `float("nan")`, and `device=` on
+    a machine without an accelerator.
     """
 
     left_out = ("strict",) if torch.cuda.is_available() else ("strict", "device")
@@ -76,20 +77,20 @@ class _Words(ast.NodeTransformer):
 
 
 def _functions(tree: ast.Module) -> dict[str, ast.FunctionDef]:
-    """Functions and methods by name; mutmut's names hold that of the class."""
+    """Functions and methods of a module by name; mutmut's names of methods contain the class."""
     bodies = [tree.body, *(node.body for node in tree.body if isinstance(node, ast.ClassDef))]
     return {node.name: node for body in bodies for node in body if isinstance(node, ast.FunctionDef)}
 
 
 def _texts(function: ast.FunctionDef) -> tuple[str, str]:
-    """The function under no name, and the same without the words of errors."""
+    """Source of the function with its name removed, and the same after `_Words`."""
     function.name = "_"
     text = ast.unparse(function)
     return text, ast.unparse(_Words().visit(function))
 
 
 def _change(before: str, after: str) -> str:
-    """Lines of `after` that are not where they are in `before`."""
+    """Lines of `after` between the beginning and the end that it shares with `before`."""
     old, new = before.splitlines(), after.splitlines()
     while old and new and old[0] == new[0]:
         del old[0], new[0]
@@ -99,14 +100,23 @@ def _change(before: str, after: str) -> str:
 
 
 def read(path: Path, equivalent: Mapping[str, Sequence[str]]) -> Iterator[Mutant]:
-    """Mutants of one module, from mutmut's copy of it; `equivalent` has the changes that are set aside by function."""
+    """Read the mutants of one module.
+
+    Args:
+        path: the mutated module in `mutants/`, beside which mutmut keeps its results.
+        equivalent: changes to set aside, by function.
+
+    Yields:
+        Mutants, in mutmut's order.
+    """
     codes = json.loads(path.with_name(path.name + ".meta").read_text(encoding="utf-8"))["exit_code_by_key"]
     functions = _functions(ast.parse(path.read_text(encoding="utf-8")))
     texts = {name: _texts(node) for name, node in functions.items() if "__mutmut_" in name}
     for name, code in codes.items():
         module, _, own = name.rpartition(".")
         stem = own.rpartition("__mutmut_")[0]
-        function = ".".join([module, *stem.removeprefix("x").strip("ǁ_").split("ǁ")])
+        # x_function, or xǁClassǁmethod
+        function = ".".join([module, *stem[2:].split("ǁ")])
         (before, silent), (after, silent_after) = texts[f"{stem}__mutmut_orig"], texts[own]
         change = _change(before, after)
         aside = silent == silent_after or change in equivalent.get(function, ())
@@ -114,21 +124,31 @@ def read(path: Path, equivalent: Mapping[str, Sequence[str]]) -> Iterator[Mutant
 
 
 def score(counts: Mapping[str, int]) -> str:
-    """Killed of those that were run and can matter."""
+    """Share of killed mutants among those that were run and not set aside, in percent."""
     run = counts["killed"] + counts["survived"] + counts["untested"]
     return f"{counts['killed'] / run:.1%}" if run else "–"
 
 
+def listed() -> dict[str, list[str]]:
+    """Changes that `mutation.toml` sets aside, by function."""
+    changes: dict[str, list[str]] = {}
+    for group in tomllib.loads(EQUIVALENT.read_text(encoding="utf-8"))["equivalent"]:
+        for entry in group["changes"]:
+            function, _, change = entry.partition(": ")
+            changes.setdefault(function, []).append(change)
+    return changes
+
+
 def main() -> None:
-    """The command."""
+    """Print the survivors and the table of scores, or names of mutants that have not been run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("modules", nargs="*", help="beginnings of modules' names, all of them if none is given")
-    parser.add_argument("--pending", type=int, metavar="N", help="write only the names of N mutants that are to be run")
-    parser.add_argument("--seed", type=int, default=0, help="of the draw of those")
+    parser.add_argument("modules", nargs="*", help="first part of the modules' names; default: all modules")
+    parser.add_argument(
+        "--pending", type=int, metavar="N", help="print only the names of N mutants that have not been run"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of that draw")
     options = parser.parse_args()
-    equivalent: dict[str, list[str]] = {}
-    for each in tomllib.loads(EQUIVALENT.read_text(encoding="utf-8"))["equivalent"]:
-        equivalent.setdefault(each["function"], []).extend(each["changes"])
+    equivalent = listed()
     modules: dict[str, list[Mutant]] = {}
     for path in sorted(FOLDER.rglob("*.py.meta")):
         source = path.with_suffix("")
@@ -148,9 +168,6 @@ def main() -> None:
         counts = Counter(mutant.status for mutant in mutants)
         rows.append([module, *(str(counts[status]) for status in HEAD[1:-1]), score(counts)])
     print(table(HEAD, rows))
-
-
-HEAD = ("module", "killed", "survived", "untested", "not run", "aside", "score")
 
 
 if __name__ == "__main__":

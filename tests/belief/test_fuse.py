@@ -216,3 +216,17 @@ def test_parameters_that_are_none_are_refused(value):
         with pytest.raises(InputError, match=r"^beta: expected positive, finite"):
             rule(beta, torch.ones(2))
         assert rule(torch.zeros(0, 2), torch.zeros(0, 2)).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        ([0.0, 0.0], "a row of zeros"),
+        ([float("nan"), -1.0], "NaN or infinity"),
+        ([float("inf"), 1.0], "NaN or infinity"),
+        ([-0.1, 1.0], "a negative value"),
+    ],
+)
+def test_an_error_says_what_is_wrong_with_likelihoods(bad, words):
+    with pytest.raises(InputError, match=rf"^likelihood: .*, got {words}$"):
+        fusion.scale_likelihood(torch.tensor([[1.0, 2.0], bad]))

@@ -292,3 +292,9 @@ def test_an_improvement_by_a_margin_is_less_likely(margin, model, monkeypatch):
     got = values_of(ProbabilityOfImprovement(model, grid, margin=margin), beta)
     torch.testing.assert_close(got[0], brute_force("probability of improvement", beta[0], model, grid))
     assert bool((got < values_of(ProbabilityOfImprovement(model, grid), beta)).all())
+
+
+@pytest.mark.parametrize("shape", [(5,), (8,), (1, 9, 5), (9, 5)])
+def test_a_belief_about_other_cells_is_refused_by_name(shape, model):
+    with pytest.raises(InputError, match=r"^beta: expected a tensor of shape \(\.\.\., 8, any\)"):
+        values_of(BayesianSurprise(model, GRIDS["wide"]), torch.ones(shape))
