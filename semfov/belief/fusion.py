@@ -107,7 +107,7 @@ def check_parameters(beta: Tensor) -> None:
 def scale_likelihood(likelihood: Tensor) -> Tensor:
     """Check likelihoods and scale each row to a largest value of 1 (every rule is blind to a common factor)."""
     largest = likelihood.amax(-1, keepdim=True)
-    if likelihood.numel() and values_known(likelihood):
+    if values_known(likelihood) and likelihood.numel():
         # NaN and infinity survive the maximum and the minimum, so two reductions answer everything.
         least = likelihood.detach().amin()
         usable = bool((least >= 0) & ((largest > 0) & (largest < torch.inf)).all())

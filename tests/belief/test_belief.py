@@ -244,3 +244,13 @@ def test_context_fades_with_the_belief_that_it_is_added_to():
         observer.fade(belief.inner, look, 0.25, visited)
     with pytest.raises(InputError, match=r"^look: expected ContextLook"):
         observer.fade(belief, look.inner, 0.25, visited)
+
+
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_one_batch_of_looks_joined_is_itself(kind):
+    observer = OBSERVERS[kind]()
+    look = observer.weigh(looks(), FIXATIONS, GRID, 2)
+    start = observer.start(2, GRID, looks().scores)
+    joined = observer.update(start, type(look).join([look]))
+    for one, other in zip(tensors_of(joined), tensors_of(seen(observer)), strict=True):
+        assert torch.equal(one, other)

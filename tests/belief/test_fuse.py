@@ -230,3 +230,11 @@ def test_parameters_that_are_none_are_refused(value):
 def test_an_error_says_what_is_wrong_with_likelihoods(bad, words):
     with pytest.raises(InputError, match=rf"^likelihood: .*, got {words}$"):
         fusion.scale_likelihood(torch.tensor([[1.0, 2.0], bad]))
+
+
+@pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
+def test_one_detection_in_one_cell(name):
+    beta, likelihood = torch.tensor([[[0.5, 1.5], [1.0, 2.0]]]), torch.tensor([[[0.2, 0.8]]])
+    got = fuse(beta, likelihood, torch.tensor([[[False, True]]]), name)
+    assert torch.equal(got[0, 0], beta[0, 0])
+    torch.testing.assert_close(got[0, 1], getattr(fusion, name)(beta[0, 1], likelihood[0, 0]))

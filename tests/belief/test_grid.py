@@ -176,3 +176,15 @@ def test_grids_have_two_sides_of_1_to_200_cells(grid):
     for bad in (grid[:1], (*grid, 1), (0, grid[1]), (grid[0], 201), (1.5, 2), 7):
         with pytest.raises(InputError, match=r"^grid:"):
             check_cells(bad)
+
+
+def test_points_and_boxes_near_borders_and_outside():
+    grid = Grid(4, 3, (40, 30))
+    inside = [[9.4, 5], [9.6, 5], [29.4, 19.4], [29.6, 19.6]]
+    assert grid.cell_of(torch.tensor(inside)).tolist() == [0, 1, 6, 11]
+    outside = [[-99, -99], [99, -99], [-99, 99], [99, 99], [15, -99], [15, 99], [-99, 15], [99, 15]]
+    assert grid.cell_of(torch.tensor(outside).float()).tolist() == [0, 3, 8, 11, 1, 9, 4, 7]
+    # Edges of boxes are counted from the image's edge: a centre at 9.9 is in the first cell, at 10.1 in the second.
+    boxes = torch.tensor([[8.9, 4, 10.9, 6], [9.1, 4, 11.1, 6], [14, 8.9, 16, 10.9], [14, 9.1, 16, 11.1]])
+    assert grid.footprint(boxes, "box_centre").int().argmax(-1).tolist() == [0, 1, 1, 5]
+    assert (grid.footprint(boxes, "box_centre").sum(-1) == 1).all()

@@ -154,7 +154,9 @@ def test_settings_at_their_limits():
     p, labels = torch.tensor([[0.9, 0.1], [0.4, 0.6], [0.7, 0.3]]), torch.tensor([0, 0, 1])
     # All in one bin: the mean confidence against the share that is right.
     assert calibration(p, labels, bins=1).ece == pytest.approx(abs((0.9 + 0.6 + 0.7) / 3 - 1 / 3))
-    assert calibration(p, labels) == calibration(p, labels, bins=15)
+    many = torch.rand(300, 2, generator=torch.Generator().manual_seed(0)).softmax(1)
+    truth = (torch.arange(300) % 3 == 0).long()
+    assert calibration(many, truth) == calibration(many, truth, bins=15) != calibration(many, truth, bins=16)
     with pytest.raises(InputError, match="bins: expected at least 1, got 0"):
         calibration(p, labels, bins=0)
     with pytest.raises(InputError, match="probabilities: expected a tensor of shape"):

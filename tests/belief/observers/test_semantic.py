@@ -165,3 +165,13 @@ def test_looks_with_fewer_detections_are_joined_to_those_with_more(looks, footpr
         alone = observer.update(start[row : row + 1], part)
         assert torch.equal(together.beta[row], alone.beta[0])
         assert torch.equal(together.closest[row], alone.closest[0])
+
+
+def test_a_belief_keeps_its_precision_whatever_that_of_the_look(looks):
+    observer = Semantic(4, misses=MISSES)
+    look = observer.weigh(looks[:1], FIXATIONS[:1], GRID)
+    for dtype in (torch.float32, torch.float64):
+        said = SemanticLook(look.likelihood.to(dtype), look.footprint, look.distance)
+        for other in (torch.float32, torch.float64):
+            start = observer.start(1, GRID, torch.empty(0, dtype=other))
+            assert observer.update(start, said).beta.dtype == other
