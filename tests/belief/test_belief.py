@@ -212,6 +212,7 @@ def test_parameters_fade_towards_the_prior():
     belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
     faded = observer.fade(belief, look, 0.25, torch.zeros(2, 12, dtype=torch.bool))
     torch.testing.assert_close(faded.beta, 0.75 * torch.full_like(belief.beta, 0.3) + 0.25 * belief.beta)
+    assert observer.fade(belief, look, 1, torch.zeros(2, 12, dtype=torch.bool)) is belief
     torch.testing.assert_close((-6 * faded.closest).exp(), (-6 * belief.closest).exp() / 4)
 
 
@@ -231,7 +232,7 @@ def test_gathered_evidence_fades_towards_that_of_a_look_from_afar_that_shows_not
     assert torch.equal(faded.visited, visited)
 
 
-def test_context_fades_with_the_belief_that_it_is_added_to():
+def test_context_fades_with_the_belief_that_it_is_added_to(monkeypatch):
     observer, visited = context_observer(), torch.zeros(2, 12, dtype=torch.bool)
     belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
     faded = observer.fade(belief, look, 0.25, visited)
@@ -244,6 +245,12 @@ def test_context_fades_with_the_belief_that_it_is_added_to():
         observer.fade(belief.inner, look, 0.25, visited)
     with pytest.raises(InputError, match=r"^look: expected ContextLook"):
         observer.fade(belief, look.inner, 0.25, visited)
+    told = []
+    monkeypatch.setattr(observer.observer, "fade", lambda *given: told.append(given) or belief.inner)
+    observer.fade(belief, look, 0.25, visited)
+    assert [one is other for one, other in zip(told[0], (belief.inner, look.inner, 0.25, visited), strict=True)] == [
+        True
+    ] * 4
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)

@@ -154,9 +154,10 @@ def test_tempering_is_positive(looks):
 def test_looks_with_fewer_detections_are_joined_to_those_with_more(looks, footprint):
     observer = Semantic(4, footprint=footprint, misses=MISSES)
     few = Detections(looks.boxes[1:2, :2], looks.scores[1:2, :2], looks.mask[1:2, :2])
+    many = Detections(looks.boxes.flatten(0, 1)[None], looks.scores.flatten(0, 1)[None], looks.mask.flatten()[None])
     parts = [
         observer.weigh(few, FIXATIONS[1:2], GRID),
-        observer.weigh(looks[2:], FIXATIONS[2:], GRID),
+        observer.weigh(many, FIXATIONS[2:], GRID),
         observer.weigh(Detections.empty(1, 3), FIXATIONS[:1], GRID),
     ]
     start = observer.start(3, GRID, looks.scores)
