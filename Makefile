@@ -9,7 +9,7 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup search test test-all test-quick coverage docs lint types constraints clean
+.PHONY: help setup search test test-all test-quick coverage mutation docs lint types constraints clean
 
 help:
 	@echo "make search      set up, fetch the default detector, search the embedded scenes, write tables and pictures"
@@ -17,6 +17,7 @@ help:
 	@echo "make test-quick  the tests that take no more than a second each"
 	@echo "make test-all    as make test, with the tests that repeat others at length"
 	@echo "make coverage    the tests, and which lines and branches they reach"
+	@echo "make mutation    change the library's formulas one by one, and list the changes that no test notices (hours)"
 	@echo "make docs        set up, then build the site in build/site"
 	@echo "make constraints write the versions of this environment down as those that are tested"
 	@echo "make clean       remove the environment, the site and run outputs"
@@ -59,8 +60,14 @@ coverage: $(STAMP)
 	$(BIN)/python -m coverage html --quiet
 	$(BIN)/python -m coverage report
 
+# Where graphs are traced, mutants cannot be switched. What has been run is kept in mutants/: call it again to go on.
+mutation: $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[mutation]"
+	TORCHDYNAMO_DISABLE=1 OMP_NUM_THREADS=1 $(BIN)/mutmut run
+	$(BIN)/python -m benchmarks.mutation
+
 constraints: $(STAMP)
 	$(BIN)/python .ci/constraints.py
 
 clean:
-	rm -rf $(VENV) .cache build dist runs
+	rm -rf $(VENV) .cache build dist mutants runs

@@ -119,7 +119,7 @@ def cooccurrence_from(table: NamedTable, classes: Sequence[str], bands: int) -> 
         some = ", ".join(table.rows[:5])
         raise InputError(f"classes: expected some that are in the table ({some}, …), got {', '.join(classes[:5])}, …")
     relative = known - known.nanmean(1, keepdim=True) - known.nanmean(0, keepdim=True) + known.nanmean()
-    profile = torch.linspace(1, -1, bands) if bands > 1 else torch.ones(1)
+    profile = torch.linspace(1, -1, bands)
     cooccurrence = torch.zeros(len(classes) + 1, len(classes) + 1, bands)
     cooccurrence[1:, 1:] = relative.nan_to_num(0)[..., None] * profile
     return cooccurrence, missing
@@ -137,6 +137,4 @@ def places_from(table: NamedTable, classes: Sequence[str]) -> Tensor:
 
 def _picked(values: Tensor, names: Sequence[str], classes: Sequence[str]) -> Tensor:
     """Rows for the classes: the row of the name, or the mean of the rows of its synonyms, or NaN."""
-    nothing = torch.full_like(values[0], torch.nan)
-    found = [alike(name, names) for name in classes]
-    return torch.stack([values[places].nanmean(0) if places else nothing for places in found])
+    return torch.stack([values[alike(name, names)].nanmean(0) for name in classes])

@@ -185,10 +185,10 @@ def scale_likelihood(likelihood: Tensor) -> Tensor:
     tensor([0.2500, 1.0000])
     """
     largest = likelihood.amax(-1, keepdim=True)
-    if values_known(likelihood):
+    if values_known(likelihood) and likelihood.numel():
         # NaN and infinity pass through the maximum and the minimum, so two reductions check every condition.
         least = likelihood.detach().amin()
-        usable = bool((least >= 0) & ((largest > 0) & (largest < torch.inf)).all()) if likelihood.numel() else True
+        usable = bool((least >= 0) & ((largest > 0) & (largest < torch.inf)).all())
         check(usable, "likelihood", "finite values, none negative, not all zero", _describe(likelihood))
     return likelihood / largest
 
@@ -236,7 +236,7 @@ def fuse(beta: Tensor, likelihood: Tensor, footprint: Tensor, rule: str = "kapla
     check_parameters(beta)
     soft = footprint.is_floating_point()
     check(soft or footprint.dtype == torch.bool, "footprint", "a boolean or floating-point tensor", footprint.dtype)
-    covered = footprint > 0 if soft else footprint
+    covered = footprint > 0
     if not values_known(beta, likelihood, footprint):
         return _fuse_one_by_one(beta, _scaled(likelihood, covered), footprint, update)
     image, detection, cell = covered.nonzero(as_tuple=True)

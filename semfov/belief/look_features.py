@@ -118,8 +118,7 @@ def nothing_seen(distance: Tensor) -> Tensor:
     """
     none = torch.zeros_like(distance)
     least = _log(none)
-    objectness = 2 * none
-    told = [4 * distance, least, least, objectness, none, none, none, objectness, objectness, none + 1]
+    told = [4 * distance, least, least, none, none, none, none, none, none, none + 1]
     return torch.stack(told, -1)
 
 

@@ -86,4 +86,4 @@ def success_rate(right: Sequence[int], cells: int) -> Array:
     >>> success_rate([1, 3, 4], 4)
     array([0.25, 0.75, 1.  ])
     """
-    return np.asarray(right, dtype=np.float64) / cells
+    return np.asarray(right) / cells

@@ -1,5 +1,7 @@
 """Measures of deciding whether a target is present."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -33,7 +35,7 @@ def area_under_roc(score: Tensor, present: Tensor) -> float:
 
 
 def threshold_for(absent: Tensor, share: float) -> float:
-    """The lowest threshold that keeps the false alarm rate at or below a limit.
+    """The lowest threshold that keeps the false alarm rate at or below a limit; -inf for a limit of 1.
 
     Args:
         absent: `(M,)`, scores of the cases without the target.
@@ -50,8 +52,10 @@ def threshold_for(absent: Tensor, share: float) -> float:
     """
     check(len(absent) > 0, "absent", "at least one case without the target", "none")
     allowed = int(share * len(absent))
+    if allowed >= len(absent):
+        return -math.inf
     order = absent.double().sort(descending=True).values
-    return float(torch.nextafter(order[min(allowed, len(order) - 1)], torch.tensor(torch.inf, dtype=torch.float64)))
+    return float(torch.nextafter(order[allowed], torch.tensor(torch.inf, dtype=torch.float64)))
 
 
 def hits_at(score: Tensor, present: Tensor, share: float) -> float:

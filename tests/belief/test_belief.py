@@ -186,3 +186,78 @@ def test_it_is_public():
     assert semfov.DirichletBelief is DirichletBelief
     assert semfov.Belief is Belief
     assert semfov.observers.Semantic is Semantic
+
+
+def test_some_episodes_take_what_others_believe():
+    before, other = DirichletBelief(rand(4, 3, 2), rand(4, 3)), DirichletBelief(2 * rand(2, 3, 2), 2 * rand(2, 3))
+    after = before.put(torch.tensor([3, 1]), other)
+    for row, source in enumerate([before[0:1], other[1:2], before[2:3], other[0:1]]):
+        assert torch.equal(after.beta[row], source.beta[0])
+        assert torch.equal(after.closest[row], source.closest[0])
+    assert torch.equal(before.beta, rand(4, 3, 2))
+
+
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_what_is_not_faded_is_kept(kind):
+    observer, visited = OBSERVERS[kind](), torch.zeros(2, 12, dtype=torch.bool)
+    belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
+    same = observer.fade(belief, look, 1, visited)
+    for one, other in zip(tensors_of(same), tensors_of(belief), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_parameters_fade_towards_the_prior():
+    """A quarter of what was learned is left; the nearness exp(-6 d) of the closest look is a quarter as great."""
+    observer = Semantic(4, prior=0.3)
+    belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
+    faded = observer.fade(belief, look, 0.25, torch.zeros(2, 12, dtype=torch.bool))
+    torch.testing.assert_close(faded.beta, 0.75 * torch.full_like(belief.beta, 0.3) + 0.25 * belief.beta)
+    assert observer.fade(belief, look, 1, torch.zeros(2, 12, dtype=torch.bool)) is belief
+    torch.testing.assert_close((-6 * faded.closest).exp(), (-6 * belief.closest).exp() / 4)
+
+
+def test_gathered_evidence_fades_towards_that_of_a_look_from_afar_that_shows_nothing():
+    observer, visited = target_observer(), torch.arange(24).reshape(2, 12) % 3 == 0
+    belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
+    faded = observer.fade(belief, look, 0.25, visited)
+    grid = Grid(2, 1, (200, 100))
+    # The second cell's centre is as far from the fixation as the image is wide.
+    nothing = observer.weigh(Detections.empty(1, 80), torch.tensor([[-50.5, 49.5]]).double(), grid, 2).evidence[0, 1]
+    for name in ("nearest", "best"):
+        before, after = getattr(belief, name), getattr(faded, name)
+        torch.testing.assert_close(after, 0.75 * nothing.expand_as(before) + 0.25 * before)
+    for name in ("total", "weight", "score", "looks"):
+        torch.testing.assert_close(getattr(faded, name), getattr(belief, name) / 4)
+    torch.testing.assert_close((-6 * faded.closest).exp(), (-6 * belief.closest).exp() / 4)
+    assert torch.equal(faded.visited, visited)
+
+
+def test_context_fades_with_the_belief_that_it_is_added_to(monkeypatch):
+    observer, visited = context_observer(), torch.zeros(2, 12, dtype=torch.bool)
+    belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
+    faded = observer.fade(belief, look, 0.25, visited)
+    inner = observer.observer.fade(belief.inner, look.inner, 0.25, visited)
+    assert torch.equal(faded.inner.beta, inner.beta)
+    assert torch.equal(faded.closest, inner.closest)
+    torch.testing.assert_close(faded.shown, belief.shown / 4)
+    assert torch.equal(faded.present, belief.present)
+    with pytest.raises(InputError, match=r"^belief: expected ContextBelief"):
+        observer.fade(belief.inner, look, 0.25, visited)
+    with pytest.raises(InputError, match=r"^look: expected ContextLook"):
+        observer.fade(belief, look.inner, 0.25, visited)
+    told = []
+    monkeypatch.setattr(observer.observer, "fade", lambda *given: told.append(given) or belief.inner)
+    observer.fade(belief, look, 0.25, visited)
+    assert [one is other for one, other in zip(told[0], (belief.inner, look.inner, 0.25, visited), strict=True)] == [
+        True
+    ] * 4
+
+
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_one_batch_of_looks_joined_is_itself(kind):
+    observer = OBSERVERS[kind]()
+    look = observer.weigh(looks(), FIXATIONS, GRID, 2)
+    start = observer.start(2, GRID, looks().scores)
+    joined = observer.update(start, type(look).join([look]))
+    for one, other in zip(tensors_of(joined), tensors_of(seen(observer)), strict=True):
+        assert torch.equal(one, other)

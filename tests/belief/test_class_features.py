@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov import Detections, Grid
-from semfov.belief.look_features import FEATURES, class_features, highest_score, look_features
+from semfov.belief.look_features import FEATURES, class_features, highest_score, look_features, nothing_seen
 from semfov.errors import InputError
 
 GRID = Grid(6, 4, (90, 60))
@@ -154,3 +154,9 @@ def test_bad_input(random_looks):
     for target in (0, 5):
         with pytest.raises(InputError, match="target: expected a class from 1 to 4"):
             look_features(looks, FIXATIONS, GRID, target)
+
+
+def test_a_look_without_detections_shows_what_is_said_of_nothing():
+    grid, fixation = Grid(5, 4, (100, 60)), torch.tensor([[12.0, 34.0]])
+    shown = look_features(Detections.empty(1, 3), fixation, grid, 2)
+    assert torch.equal(nothing_seen(grid.distance(fixation)), shown)

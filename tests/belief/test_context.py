@@ -201,3 +201,23 @@ def test_bad_input(prior, looks):
         prior.check_compatible(["cup", "dog", "car"])
     with pytest.raises(InputError, match="edges"):
         ContextPrior(["cup"], torch.zeros(2, 3, 3), torch.zeros(2, 2, 3), [0.3, 0.1])
+
+
+@pytest.mark.parametrize("size", [(60, 100), (100, 60)], ids=["tall", "wide"])
+def test_reaches_are_measured_in_longer_sides(presence, size):
+    """Cell by cell, in pictures of both formats."""
+    grid = Grid(4, 5, size)
+    for edge, got in zip(EDGES, reaches(presence, grid, EDGES), strict=False):
+        for cell in range(20):
+            offset = (grid.centres - grid.centres[cell]).abs().amax(-1) / 100
+            near = presence[:, offset <= edge + 1e-6].amax(1)
+            assert torch.equal(got[:, cell], near)
+
+
+def test_tables_must_be_square(prior):
+    for place in (torch.zeros(4, 2, 3), torch.zeros(3, 2, 2), torch.zeros(2, 2)):
+        with pytest.raises(InputError, match=r"^place:"):
+            ContextPrior(prior.classes, place, prior.cooccurrence, EDGES)
+    for pairs in (torch.zeros(4, 3, 4), torch.zeros(3, 4, 4), torch.zeros(4, 4, 3)):
+        with pytest.raises(InputError, match=r"^cooccurrence:"):
+            ContextPrior(prior.classes, prior.place, pairs, EDGES)

@@ -128,3 +128,64 @@ def test_what_is_no_table_is_told_by_line(path, text, message):
     path.write_bytes(b"\xff\xfe,cup\n")
     with pytest.raises(DataError, match="CSV"):
         read_table(path)
+
+
+def test_a_table_is_written_letter_by_letter(tmp_path):
+    write_table(tmp_path / "t.csv", ["cup"], ["cow", "a, b"], torch.tensor([[0.125, math.nan]]))
+    assert (tmp_path / "t.csv").read_bytes() == b',cow,"a, b"\ncup,0.125,\n'
+
+
+@pytest.mark.parametrize(
+    ("edges", "profile"), [((), [1.0]), ((0.1,), [1.0, -1.0]), ((0.0, 0.1, 0.2), [1, 1 / 3, -1 / 3, -1])]
+)
+def test_company_falls_from_the_nearest_band_to_the_farthest(path, edges, profile):
+    near = ContextPrior.from_table(path, CLASSES, source="s", edges=(0.0, 0.2)).cooccurrence[..., 0]
+    got = ContextPrior.from_table(path, CLASSES, source="s", edges=edges).cooccurrence
+    torch.testing.assert_close(got, near[..., None] * torch.tensor(profile))
+
+
+def test_a_class_is_known_that_is_a_target_or_beside_one(path):
+    path.write_text(",cow\ncup,1\n", encoding="utf-8")
+    prior = ContextPrior.from_table(path, CLASSES, source="s")
+    assert prior.metadata["table"]["missing"] == ["dining table", "zebra"]
+    with pytest.raises(InputError, match=r"knows \(cup, …\), got spoon, zebra, …"):
+        ContextPrior.from_table(path, ["spoon", "zebra"], source="s")
+    path.write_text(",cow\n" + "".join(f"thing {letter},1\n" for letter in "abcdef"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"knows \(thing a, thing b, thing c, thing d, thing e, …\)"):
+        ContextPrior.from_table(path, ["spoon", "zebra"], source="s")
+
+
+def test_places_are_compared_within_each_class(path, tmp_path):
+    heights = tmp_path / "heights.csv"
+    heights.write_text("class,top,bottom\ncow,0,4\ncup,30,10\n", encoding="utf-8")
+    prior = ContextPrior.from_table(path, CLASSES, source="a test", places=heights)
+    assert prior.place[[1, 3], :, 0].tolist() == [[10, -10], [-2, 2]]
+
+
+def test_a_digest_tells_priors_apart(path):
+    prior = ContextPrior.from_table(path, CLASSES, source="a test")
+    tables, settings = (prior.place, prior.cooccurrence), {"weights": prior.weights, "metadata": {"a": 1, "b": 2}}
+    same = ContextPrior(CLASSES, *tables, prior.edges, **settings).digest()
+    turned = {"weights": dict(reversed(prior.weights.items())), "metadata": {"b": 2, "a": 1}}
+    assert ContextPrior(CLASSES, *tables, prior.edges, **turned).digest() == same
+    others = [
+        ContextPrior(CLASSES[::-1], *tables, prior.edges, **settings),
+        ContextPrior(CLASSES, prior.place + 1, prior.cooccurrence, prior.edges, **settings),
+        ContextPrior(CLASSES, prior.place, 2 * prior.cooccurrence, prior.edges, **settings),
+        ContextPrior(CLASSES, *tables, [0.0, 0.1, 0.3], **settings),
+        ContextPrior(CLASSES, *tables, prior.edges, weights={"map": (1, 2)}, metadata=settings["metadata"]),
+        ContextPrior(CLASSES, *tables, prior.edges, weights=prior.weights),
+    ]
+    assert len({same, *(other.digest() for other in others)}) == 1 + len(others)
+
+
+def test_a_control_has_the_weights_of_the_prior_and_one_of_seed_0_unless_told_otherwise(path):
+    prior = ContextPrior.from_table(path, CLASSES, source="a test")
+    assert prior.permuted().digest() == prior.permuted(0).digest()
+    assert prior.permuted().weights == prior.weights
+    with pytest.raises(InputError, match="context prior"):
+        prior.check_compatible(["spoon"])
+
+
+def test_the_prior_that_is_shipped_is_that_of_coco():
+    assert ContextPrior.from_pretrained().digest() == ContextPrior.from_pretrained("coco").digest()

@@ -160,3 +160,81 @@ def test_bad_input():
         fuse(beta, torch.ones(1, 2, 3), torch.ones(1, 2, 4, dtype=torch.bool), "kalman")
     with pytest.raises(InputError, match="prior"):
         Semantic(2, prior=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
+def test_weights_are_exponents_in_any_precision(name, dtype):
+    """Row by row: λ to the power of its weight, scaled to a largest value of 1."""
+    beta, likelihood, footprint = (tensor[0] for tensor in piled(soft=True))
+    expected = beta.clone()
+    for image, detection, cell in footprint.nonzero().tolist():
+        said = (likelihood[image, detection] / likelihood[image, detection].max()) ** footprint[image, detection, cell]
+        expected[image, cell] = getattr(fusion, name)(expected[image, cell], said)
+    got = fuse(beta, likelihood, footprint.to(dtype), name)
+    torch.testing.assert_close(got, expected)
+    rows = torch.func.vmap(lambda b, l, f: fuse(b[None], l[None], f[None], name)[0])(
+        beta, likelihood, footprint.to(dtype)
+    )
+    torch.testing.assert_close(rows, expected)
+
+
+@pytest.mark.parametrize("batched", [0, 1, 2])
+def test_fuse_vectorises_over_one_argument_alone(batched):
+    arguments = piled(soft=True)
+    given = [tensor if number == batched else tensor[0] for number, tensor in enumerate(arguments)]
+    dims = tuple(0 if number == batched else None for number in range(3))
+    together = torch.func.vmap(fuse, in_dims=dims)(*given)
+    for row in range(3):
+        alone = [tensor[row] if number == batched else tensor for number, tensor in enumerate(given)]
+        torch.testing.assert_close(together[row], fuse(*alone))
+
+
+@pytest.mark.parametrize(
+    ("argument", "beta", "likelihood", "footprint"),
+    [
+        ("beta", (4, 3), (2, 3), (2, 4)),
+        ("likelihood", (1, 4, 3), (2, 2, 3), (1, 2, 4)),
+        ("likelihood", (1, 4, 3), (2, 3), (1, 2, 4)),
+        ("footprint", (1, 4, 3), (1, 2, 3), (2, 2, 4)),
+        ("footprint", (1, 4, 3), (1, 2, 3), (1, 3, 4)),
+        ("footprint", (1, 4, 3), (1, 2, 3), (1, 2, 5)),
+        ("footprint", (1, 4, 3), (1, 2, 3), (2, 4)),
+    ],
+)
+def test_shapes_that_do_not_fit_are_refused(argument, beta, likelihood, footprint):
+    with pytest.raises(InputError, match=rf"^{argument}: expected a tensor of shape"):
+        fuse(torch.ones(beta), torch.ones(likelihood), torch.ones(footprint))
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
+def test_parameters_that_are_none_are_refused(value):
+    beta = torch.tensor([[[1.0, 2.0], [value, 1.0]]])
+    with pytest.raises(InputError, match=r"^beta: expected positive, finite Dirichlet parameters"):
+        fuse(beta, torch.ones(1, 1, 2), torch.ones(1, 1, 2))
+    for rule in (fusion.kaplan, fusion.product, fusion.sum):
+        with pytest.raises(InputError, match=r"^beta: expected positive, finite"):
+            rule(beta, torch.ones(2))
+        assert rule(torch.zeros(0, 2), torch.zeros(0, 2)).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        ([0.0, 0.0], "a row of zeros"),
+        ([float("nan"), -1.0], "NaN or infinity"),
+        ([float("inf"), 1.0], "NaN or infinity"),
+        ([-0.1, 1.0], "a negative value"),
+    ],
+)
+def test_an_error_says_what_is_wrong_with_likelihoods(bad, words):
+    with pytest.raises(InputError, match=rf"^likelihood: .*, got {words}$"):
+        fusion.scale_likelihood(torch.tensor([[1.0, 2.0], bad]))
+
+
+@pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
+def test_one_detection_in_one_cell(name):
+    beta, likelihood = torch.tensor([[[0.5, 1.5], [1.0, 2.0]]]), torch.tensor([[[0.2, 0.8]]])
+    got = fuse(beta, likelihood, torch.tensor([[[False, True]]]), name)
+    assert torch.equal(got[0, 0], beta[0, 0])
+    torch.testing.assert_close(got[0, 1], getattr(fusion, name)(beta[0, 1], likelihood[0, 0]))

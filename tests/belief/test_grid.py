@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.belief import Grid
+from semfov.belief.grid import check_cells
 from semfov.errors import InputError
 
 
@@ -122,3 +123,68 @@ def test_distances_are_in_longer_sides():
 def test_bad_input(call):
     with pytest.raises(InputError):
         call()
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 3), (2, 5)])
+def test_what_are_no_boxes_is_refused_by_name(shape):
+    grid, fixation = Grid(3, 2, (30, 20)), torch.zeros(2)
+    for call in (lambda: grid.footprint(torch.zeros(shape)), lambda: grid.box_distance(torch.zeros(shape), fixation)):
+        with pytest.raises(InputError, match=r"^boxes: expected a tensor of shape"):
+            call()
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 1)])
+def test_what_are_no_points_is_refused_by_name(shape):
+    grid, point = Grid(3, 2, (30, 20)), torch.zeros(shape)
+    for name, call in (
+        ("points", lambda: grid.cell_of(point)),
+        ("fixation", lambda: grid.distance(point)),
+        ("fixation", lambda: grid.box_distance(torch.zeros(2, 4), point)),
+    ):
+        with pytest.raises(InputError, match=rf"^{name}: expected a tensor of shape"):
+            call()
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+def test_what_are_no_numbers_is_refused_by_name(number):
+    grid, box, point = Grid(3, 2, (30, 20)), torch.tensor([[1.0, 2.0, 3.0, 4.0]]), torch.tensor([1.0, number])
+    bad = torch.where(box == 3, number, box)
+    for name, call in (
+        ("boxes", lambda: grid.footprint(bad)),
+        ("boxes", lambda: grid.box_distance(bad, torch.zeros(2))),
+        ("fixation", lambda: grid.box_distance(box, point)),
+        ("points", lambda: grid.cell_of(point)),
+    ):
+        with pytest.raises(InputError, match=rf"^{name}: expected finite numbers"):
+            call()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [torch.float32, torch.float64])
+def test_precision_is_that_of_what_is_asked_about(dtype, size):
+    grid, boxes = Grid(3, 2, torch.tensor([31.0, 17.0], dtype=size)), torch.tensor([[1.0, 2, 20, 15]], dtype=dtype)
+    assert grid.footprint(boxes, "soft").dtype == dtype
+    assert grid.distance(boxes[0, :2]).dtype == dtype
+    assert grid.box_distance(boxes, boxes[0, :2]).dtype == dtype
+    assert grid.footprint(boxes).dtype == grid.footprint(boxes, "centre").dtype == torch.bool
+    assert Grid(3, 2, (31, 17)).extent.dtype == torch.get_default_dtype()
+
+
+@pytest.mark.parametrize("grid", [(1, 1), [200, 1], (3, 200)])
+def test_grids_have_two_sides_of_1_to_200_cells(grid):
+    check_cells(grid)
+    for bad in (grid[:1], (*grid, 1), (0, grid[1]), (grid[0], 201), (1.5, 2), 7):
+        with pytest.raises(InputError, match=r"^grid:"):
+            check_cells(bad)
+
+
+def test_points_and_boxes_near_borders_and_outside():
+    grid = Grid(4, 3, (40, 30))
+    inside = [[9.4, 5], [9.6, 5], [29.4, 19.4], [29.6, 19.6]]
+    assert grid.cell_of(torch.tensor(inside)).tolist() == [0, 1, 6, 11]
+    outside = [[-99, -99], [99, -99], [-99, 99], [99, 99], [15, -99], [15, 99], [-99, 15], [99, 15]]
+    assert grid.cell_of(torch.tensor(outside).float()).tolist() == [0, 3, 8, 11, 1, 9, 4, 7]
+    # Edges of boxes are counted from the image's edge: a centre at 9.9 is in the first cell, at 10.1 in the second.
+    boxes = torch.tensor([[8.9, 4, 10.9, 6], [9.1, 4, 11.1, 6], [14, 8.9, 16, 10.9], [14, 9.1, 16, 11.1]])
+    assert grid.footprint(boxes, "box_centre").int().argmax(-1).tolist() == [0, 1, 1, 5]
+    assert (grid.footprint(boxes, "box_centre").sum(-1) == 1).all()

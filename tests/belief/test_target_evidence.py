@@ -529,3 +529,15 @@ def test_bad_input(looks, model):
         Target(model).weigh(looks, FIXATIONS, GRID)
     with pytest.raises(InputError, match="fixation"):
         model(looks, FIXATIONS[:2], GRID, 1)
+
+
+def test_thresholds_are_changed_one_by_one():
+    before = Thresholds(0.8, 0.1, 0.3)
+    assert before.changed() == before
+    assert before.changed(confirm=0.0) == Thresholds(0.0, 0.1, 0.3)
+    assert before.changed(give_up=0.2) == Thresholds(0.8, 0.2, 0.3)
+    assert before.changed(place=0.4) == Thresholds(0.8, 0.1, 0.4)
+
+
+def test_there_are_the_classes_of_coco_unless_told_otherwise():
+    assert TargetEvidence(4, 3).prior.shape == (81,)

@@ -66,3 +66,11 @@ def test_policy_by_name(beta):
     blind.miss_rate = None
     with pytest.raises(InputError, match="miss rates"):
         ExpectedAccuracy(blind, GRID)
+
+
+def test_a_belief_about_one_picture_alone_or_about_other_cells(beta):
+    acquisition = ExpectedAccuracy(Model(), GRID)
+    torch.testing.assert_close(values_of(acquisition, beta[0]), values_of(acquisition, beta)[0])
+    for other in (beta[:, :11], beta[0, 0]):
+        with pytest.raises(InputError, match=r"^beta:"):
+            values_of(acquisition, other)

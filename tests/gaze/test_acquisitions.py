@@ -190,3 +190,11 @@ def test_nothing_of_the_callers_is_changed(name):
     assert torch.equal(known.beta, beliefs().beta)
     assert torch.equal(known.closest, beliefs().closest)
     assert torch.equal(visited, visits())
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if name not in ("LearnedAcquisition", "Static")])
+def test_a_function_in_double_precision_serves_beliefs_in_single_precision(name):
+    """Without changing their precision: what comes out is compared with other values of that belief."""
+    known = beliefs()
+    values = EVERY[name]().double()(DirichletBelief(known.beta.float(), known.closest.float()), visits())
+    assert values.dtype == torch.float32

@@ -197,3 +197,9 @@ def test_strategies_of_learned_maps(model):
         with pytest.raises(InputError, match=r"expected a learned map.*, got none"):
             strategy(name, observation=FovealObservationModel.identity(["a", "b", "c"], [0.2]))
     assert strategy("closer-look-learned", map=model).policy.fovea == 0.15
+
+
+def test_a_grid_in_double_precision_serves_a_belief_in_single_precision(model):
+    belief, visited = belief_of(model)
+    wide = ExpectedGain(model, Grid(5, 4, torch.tensor([50.0, 40.0], dtype=torch.float64)))
+    torch.testing.assert_close(wide(belief, visited), ExpectedGain(model, GRID)(belief, visited))

@@ -258,3 +258,35 @@ def test_bad_arguments(model):
         UpperConfidenceBound(model, grid, kappa=-1.0)
     with pytest.raises(InputError, match="margin"):
         ProbabilityOfImprovement(model, grid, margin=1.0)
+
+
+@pytest.mark.parametrize("kappa", [0.0, 0.5, 3.0])
+def test_the_bound_is_as_many_deviations_above_the_mean_as_told(kappa, model, monkeypatch):
+    def bound(beta):
+        p, total = float(beta.max() / beta.sum()), float(beta.sum())
+        return p + kappa * (p * (1 - p) / (total + 1)) ** 0.5
+
+    monkeypatch.setitem(CHANGES, "upper confidence bound", lambda before, after: bound(after) - bound(before))
+    grid, beta = GRIDS["row"], beliefs(GRIDS["row"], batch=1)
+    got = values_of(UpperConfidenceBound(model, grid, kappa=kappa), beta)
+    torch.testing.assert_close(got[0], brute_force("upper confidence bound", beta[0], model, grid))
+
+
+@pytest.mark.parametrize("margin", [0.01, 0.2])
+def test_an_improvement_by_a_margin_is_less_likely(margin, model, monkeypatch):
+    def improved(before, after):
+        p, total = float(after.max() / after.sum()), float(after.sum())
+        deviation = (p * (1 - p) / (total + 1)) ** 0.5
+        return float(stats.norm.cdf((p - float(before.max() / before.sum()) - margin) / deviation))
+
+    monkeypatch.setitem(CHANGES, "probability of improvement", improved)
+    grid, beta = GRIDS["row"], beliefs(GRIDS["row"], batch=1)
+    got = values_of(ProbabilityOfImprovement(model, grid, margin=margin), beta)
+    torch.testing.assert_close(got[0], brute_force("probability of improvement", beta[0], model, grid))
+    assert bool((got < values_of(ProbabilityOfImprovement(model, grid), beta)).all())
+
+
+@pytest.mark.parametrize("shape", [(5,), (8,), (1, 9, 5), (9, 5)])
+def test_a_belief_about_other_cells_is_refused_by_name(shape, model):
+    with pytest.raises(InputError, match=r"^beta: expected a tensor of shape \(\.\.\., 8, any\)"):
+        values_of(BayesianSurprise(model, GRIDS["wide"]), torch.ones(shape))

@@ -205,3 +205,38 @@ def test_arguments():
         EntropyLimit(1, FovealObservationModel.identity(["cup"], [0.2]), GRID)
     with pytest.raises(InputError, match="nodes"):
         CorrectLocalisation(1, make_model(), GRID, nodes=3)
+
+
+def test_nodes_are_those_of_the_integral():
+    place, signal = make_belief(batch=3).probability(1), torch.rand(3, 12, 12, dtype=torch.float64) + 0.3
+    place = place / place.sum(-1, keepdim=True)
+    for nodes in (8, 16):
+        got = CorrectLocalisation(1, make_model(), GRID, nodes=nodes).values(place, signal)
+        expected = [
+            [float(correct_localisation(p, d, nodes=nodes)) for d in s] for p, s in zip(place, signal, strict=True)
+        ]
+        torch.testing.assert_close(got, torch.tensor(expected, dtype=torch.float64))
+    usual = CorrectLocalisation(1, make_model(), GRID).values(place, signal)
+    assert torch.equal(usual, CorrectLocalisation(1, make_model(), GRID, nodes=64).values(place, signal))
+    assert not torch.allclose(usual, got, rtol=1e-6)
+    with pytest.raises(InputError, match="nodes: expected 8 or more, got 7"):
+        CorrectLocalisation(1, make_model(), GRID, nodes=7)
+
+
+@pytest.mark.parametrize("nodes", [8, 64])
+def test_localisation_is_a_sum_over_equidistant_noise(nodes):
+    """Noise from -5 to 5, each counted by its normal density; 64 of them unless told otherwise."""
+    rng = np.random.default_rng(1)
+    place, signal = rng.dirichlet(np.ones(5)), rng.uniform(0.3, 3, 5)
+    noise = [-5 + 10 * step / (nodes - 1) for step in range(nodes)]
+    total = 0.0
+    for x in range(5):
+        for w in noise:
+            right = 1.0
+            for y in set(range(5)) - {x}:
+                ahead = 2 * log(place[x] / place[y]) + signal[y] ** 2 + signal[x] ** 2 + 2 * signal[x] * w
+                right *= norm.cdf(ahead / (2 * signal[y]))
+            total += place[x] * right * norm.pdf(w) / sum(norm.pdf(noise))
+    told = {} if nodes == 64 else {"nodes": nodes}
+    got = correct_localisation(torch.tensor(place), torch.tensor(signal), **told)
+    assert float(got) == pytest.approx(total, rel=1e-12)

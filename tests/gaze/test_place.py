@@ -79,3 +79,22 @@ def test_policies_need_miss_rates(name, beta):
         named_policy(name, "search", Means(blind))(1, GRID)
     with pytest.raises(InputError, match="observation model"):
         named_policy(name, "search")
+
+
+@pytest.mark.parametrize("kind", [FovealHit, PlaceInformation])
+def test_values_of_several_maps_are_those_of_each(kind):
+    """Maps whose probabilities have other sums, and targets that are seen from one side only."""
+    generator = torch.Generator().manual_seed(1)
+    present = torch.rand(3, 12, generator=generator, dtype=torch.float64) * torch.tensor([0.1, 0.5, 1.0])[:, None]
+    visibility = torch.rand(3, 12, 12, generator=generator, dtype=torch.float64)
+    got = kind(1, Misses(), GRID).values(present, visibility)
+    for row in range(3):
+        p, v = present[row].tolist(), visibility[row].tolist()
+        for f in range(12):
+            if kind is FovealHit:
+                expected = 1 - math.prod(1 - p[x] * v[f][x] for x in range(12))
+            else:
+                q = [value / sum(p) for value in p]
+                missed = [q[x] * (1 - v[f][x]) for x in range(12)]
+                expected = entropy(q) - sum(missed) * entropy([value / sum(missed) for value in missed])
+            assert float(got[row, f]) == pytest.approx(expected)

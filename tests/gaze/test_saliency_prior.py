@@ -7,7 +7,14 @@ import torch
 
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError
 from semfov.gaze import select_fixation
-from semfov.gaze.acquisition import BayesianSurprise, SaliencyPrior, Static, TargetPosterior, TwoPeaks
+from semfov.gaze.acquisition import (
+    AcquisitionFunction,
+    BayesianSurprise,
+    SaliencyPrior,
+    Static,
+    TargetPosterior,
+    TwoPeaks,
+)
 
 GRID = Grid(4, 3, (80, 60))
 
@@ -120,3 +127,13 @@ def test_bad_arguments():
         SaliencyPrior(TargetPosterior(2), SALIENCY * math.nan, weight=0.3)
     with pytest.raises(InputError, match="saliency"):
         values(SaliencyPrior(TargetPosterior(2), SALIENCY[:, :7], weight=0.3))
+
+
+def test_the_acquisition_is_told_which_cells_were_visited():
+    class Unvisited(AcquisitionFunction):
+        def forward(self, belief, visited):
+            return torch.where(visited, 1.0, 2.0).double()
+
+    visited = torch.tensor([[True, False] * 6] * 3)
+    got = SaliencyPrior(Unvisited(), SALIENCY, weight=0.0)(BELIEF, visited)
+    torch.testing.assert_close(got.exp(), torch.where(visited, 1.0, 2.0).double())

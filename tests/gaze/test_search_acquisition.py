@@ -1,5 +1,6 @@
 """Search acquisitions against a loop over cells that simulates the update in full."""
 
+import math
 from functools import partial
 
 import pytest
@@ -94,3 +95,32 @@ def test_policies_by_name(beta):
 def test_unknown_target(beta, target):
     with pytest.raises(InputError, match="target"):
         values_of(TargetPosterior(target), beta)
+
+
+@pytest.mark.parametrize("sigma", [None, 0.4])
+def test_neighbourhood_equals_the_loop(beta, sigma):
+    """Seven tenths of a cell unless told otherwise."""
+    model, told = Model(5), {} if sigma is None else {"sigma": sigma}
+    got = values_of(NeighbourhoodPosterior(3, model, GRID, **told), beta)
+    for episode in range(4):
+        for fixation in range(6):
+            total = 0.0
+            for cell in range(6):
+                down, across = cell // 3 - fixation // 3, cell % 3 - fixation % 3
+                level = int(model.level(GRID.cell_distance[fixation, cell]))
+                belief = beta[episode, cell]
+                scores = sum(p * model.table[k, level] for k, p in enumerate(belief / belief.sum()))
+                after = fusion.kaplan(belief, scores)
+                weight = math.exp(-(down**2 + across**2) / (2 * (sigma or 0.7) ** 2))
+                total += weight * float(after[3] / after.sum())
+            assert float(got[episode, fixation]) == pytest.approx(total, rel=1e-6)
+
+
+def test_neighbourhood_refuses_other_cells_and_no_width(beta):
+    acquisition = NeighbourhoodPosterior(3, Model(5), GRID)
+    torch.testing.assert_close(values_of(acquisition, beta[1]), values_of(acquisition, beta)[1])
+    for other in (beta[:, :5], beta[0, 0]):
+        with pytest.raises(InputError, match=r"^beta:"):
+            values_of(acquisition, other)
+    with pytest.raises(InputError, match=r"^sigma:"):
+        NeighbourhoodPosterior(3, Model(5), GRID, sigma=0.0)

@@ -123,3 +123,19 @@ def test_arguments():
             TemplateAttention(target, make_attention(), GRID)
     with pytest.raises(InputError, match="attention"):
         TemplateAttention(1, make_attention()[:5], GRID)
+
+
+def test_looks_are_weighed_in_the_precision_of_the_attention():
+    """Thousands of equal values have themselves as their mean, to the last digits of double precision."""
+    grid = Grid(30, 20, (300, 200))
+    attention = torch.linspace(1, 2, 600, dtype=torch.float64).expand(600, 1, 600)
+    values = TemplateAttention(1, attention, grid, 0.2)
+    got = values(DirichletBelief(torch.ones(1, 600, 2, dtype=torch.float64)), torch.ones(1, 600, dtype=torch.bool))
+    torch.testing.assert_close(got[0], attention[0, 0], rtol=1e-13, atol=0)
+
+
+def test_attention_must_fit_the_grid_and_the_fovea_have_a_width():
+    with pytest.raises(InputError, match=r"^attention:"):
+        TemplateAttention(1, make_attention()[..., :5], GRID)
+    with pytest.raises(InputError, match=r"^fovea:"):
+        TemplateAttention(1, make_attention(), GRID, 0.0)

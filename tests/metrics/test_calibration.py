@@ -148,3 +148,29 @@ def test_certain_and_wrong_has_finite_sums():
     assert (sums.brier, sums.ece) == (1, 1)
     with pytest.raises(InputError, match="outcome"):
         BinarySums.of(torch.rand(3), torch.ones(2).bool())
+
+
+def test_settings_at_their_limits():
+    p, labels = torch.tensor([[0.9, 0.1], [0.4, 0.6], [0.7, 0.3]]), torch.tensor([0, 0, 1])
+    # All in one bin: the mean confidence against the share that is right.
+    assert calibration(p, labels, bins=1).ece == pytest.approx(abs((0.9 + 0.6 + 0.7) / 3 - 1 / 3))
+    many = torch.rand(300, 2, generator=torch.Generator().manual_seed(0)).softmax(1)
+    truth = (torch.arange(300) % 3 == 0).long()
+    assert calibration(many, truth) == calibration(many, truth, bins=15) != calibration(many, truth, bins=16)
+    with pytest.raises(InputError, match="bins: expected at least 1, got 0"):
+        calibration(p, labels, bins=0)
+    with pytest.raises(InputError, match="probabilities: expected a tensor of shape"):
+        calibration(torch.rand(3), labels)
+    assert calibration(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)).count == 0
+
+
+def test_one_prediction_has_the_error_of_its_confidence():
+    assert float(calibration_error(torch.tensor([0.8]), torch.tensor([False]))) == pytest.approx(0.8)
+    assert float(calibration_error(torch.zeros(0), torch.zeros(0, dtype=torch.bool))) == 0
+
+
+def test_edges_between_bins_are_those_of_double_precision():
+    edges = torch.arange(1, 15, dtype=torch.float64) / 15
+    for p in (edges, torch.nextafter(edges, torch.zeros_like(edges))):
+        assert reliability(p, p > 0.5)[0].tolist() == [1] * 14 + [0]
+    assert reliability(torch.nextafter(edges, torch.ones_like(edges)), edges > 0.5)[0].tolist() == [0] + [1] * 14

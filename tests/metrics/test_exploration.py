@@ -37,3 +37,12 @@ def test_what_is_not_known_is_not_right():
 
 def test_success_rate_by_hand():
     np.testing.assert_allclose(success_rate([0, 1, 3], 4), [0, 0.25, 0.75])
+
+
+def test_answers_have_a_column_for_every_class_of_the_model():
+    """Also where the picture shows none of the last classes."""
+    annotation = Annotation(
+        torch.tensor([[1.0, 1, 5, 5]]), torch.tensor([1]), torch.zeros(1, dtype=torch.bool), (20, 10)
+    )
+    answers = answers_of(annotation, Grid(2, 1, (20, 10)), 5)
+    assert answers.tolist() == [[False, True, False, False, False], [False] * 5]

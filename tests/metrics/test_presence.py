@@ -120,3 +120,14 @@ def test_roc_counts_at_every_threshold(cases):
         assert alarm == pytest.approx((len(told) - sum(told)) / int((~present).sum()))
     assert (alarms[0], hits[0], alarms[-1], hits[-1]) == (0, 0, 1, 1)
     assert np.trapezoid(hits, alarms) == pytest.approx(area_under_roc(score, present))
+
+
+def test_the_next_number_above_a_false_alarm_is_a_hit():
+    score = torch.tensor([0.3, math.nextafter(0.3, 1)], dtype=torch.float64)
+    assert hits_at(score, torch.tensor([False, True]), 0.0) == 1
+
+
+def test_where_every_alarm_may_be_false_every_target_is_told():
+    score = torch.tensor([0.5, 0.7, 0.1], dtype=torch.float64)
+    assert threshold_for(score, 1.0) == -math.inf
+    assert hits_at(score, torch.tensor([False, True, True]), 1.0) == 1

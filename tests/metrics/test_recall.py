@@ -77,3 +77,33 @@ def test_the_least_score_at_which_no_more_are_false(scores, views, rate):
 def test_refuses_no_views():
     with pytest.raises(InputError, match="views: expected at least 1, got 0"):
         score_for(torch.zeros(1), 0)
+
+
+def test_an_overlap_of_one_half_is_enough_and_less_is_not():
+    """An object of 4 × 2, and boxes that share 4 of 8, and 3 of 8, with it."""
+    truth, label, score = torch.tensor([[0.0, 0.0, 4.0, 2.0]]), torch.tensor([1]), torch.tensor([[0.1, 0.9]])
+    for box, expected in (([0.0, 0.0, 2.0, 2.0], 0.9), ([0.0, 0.0, 1.5, 2.0], 0.0)):
+        found, _ = found_objects(torch.tensor([box]), score, truth, label)
+        assert found.tolist() == pytest.approx([expected])
+
+
+@pytest.mark.parametrize(
+    ("argument", "shapes"),
+    [
+        ("scores", ((2, 4), (3, 3), (1, 4), (1,))),
+        ("scores", ((2, 4), (2,), (1, 4), (1,))),
+        ("truth", ((2, 4), (2, 3), (1, 5), (1,))),
+        ("truth", ((2, 4), (2, 3), (2, 4), (1,))),
+        ("truth", ((2, 4), (2, 3), (4,), (4,))),
+    ],
+)
+def test_refuses_shapes_that_do_not_fit(argument, shapes):
+    *tensors, labels = shapes
+    with pytest.raises(InputError, match=f"^{argument}: expected a tensor of shape"):
+        found_objects(*(torch.rand(shape) for shape in tensors), torch.ones(labels, dtype=torch.int64))
+
+
+def test_one_false_box_a_view_unless_told_otherwise():
+    scores = torch.tensor([0.9, 0.7, 0.5, 0.3, 0.1])
+    assert score_for(scores, 1) == pytest.approx(0.7)
+    assert score_for(scores, 3) == pytest.approx(0.3)

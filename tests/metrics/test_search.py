@@ -17,3 +17,9 @@ def test_random_search_equals_simulation():
     simulated = [(hits <= n).mean() for n in range(20)]
     np.testing.assert_allclose(random_search(3, 19, cells=20), simulated, atol=0.015)
     assert random_search(3, 25, cells=20)[-1] == 1
+
+
+def test_random_search_by_hand():
+    """Hundred cells unless told otherwise, one of which the search starts in."""
+    np.testing.assert_allclose(random_search(1, 2), [0, 1 / 99, 2 / 99])
+    np.testing.assert_allclose(random_search(0, 4, cells=5), 0)

@@ -129,8 +129,6 @@ class Landing(Observer):
             x = (centres[:, 0] + 0.5 - ((x1 + x2) / 2)[..., None]) / across[..., None]
             y = (centres[:, 1] + 0.5 - height[..., None]) / down[..., None]
             kernel = (-(x.square() + y.square()) / 2).exp() * (floor / (across * down).sqrt())[..., None]
-            if not boxes.shape[-2]:
-                return centres.new_zeros(*boxes.shape[:-2], len(grid), self.classes)
             strongest = kernel.new_zeros(*kernel.shape[:-2], len(grid), self.classes)
             # One detection at a time: all at once would need memory for detections × cells × classes.
             for place, score in zip(kernel.unbind(-2), scores.unbind(-2), strict=True):

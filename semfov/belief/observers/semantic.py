@@ -56,12 +56,12 @@ class SemanticLook(Look):
         """Concatenate several batches of looks, padded to the largest number of detections."""
         most = max(look.likelihood.shape[-2] for look in looks)
 
-        def filled(values: Tensor, value: float) -> Tensor:
-            return pad(values, (0, 0, 0, most - values.shape[-2]), value=value)
+        def filled(values: Tensor) -> Tensor:
+            return pad(values, (0, 0, 0, most - values.shape[-2]))
 
         return cls(
-            torch.cat([filled(look.likelihood, 1.0) for look in looks]),
-            torch.cat([filled(look.footprint, 0.0) for look in looks]),
+            torch.cat([filled(look.likelihood) for look in looks]),
+            torch.cat([filled(look.footprint) for look in looks]),
             torch.cat([look.distance for look in looks]),
         )
 

@@ -104,7 +104,7 @@ def multimatch(
 
 
 def _aligned(cost: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of the cheapest path through a matrix."""
+    """Rows and columns of the cheapest path through a matrix, from its end to its start."""
     rows, columns = cost.shape
     total = np.full((rows + 1, columns + 1), np.inf)
     total[0, 0] = 0
@@ -117,5 +117,5 @@ def _aligned(cost: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         # `total` has one more row and column in front: its entry (i, j) belongs to the pair (i - 1, j - 1).
         steps = {(i - 1, j - 1): total[i, j], (i - 1, j): total[i, j + 1], (i, j - 1): total[i + 1, j]}
         path.append(min(steps, key=lambda step: steps[step]))
-    first, second = np.array(path[::-1]).T
+    first, second = np.array(path).T
     return first, second

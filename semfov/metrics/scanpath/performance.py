@@ -30,7 +30,7 @@ def found_at(points: ArrayLike, box: ArrayLike) -> int:
     1
     """
     x, y = _points(points).T
-    x1, y1, x2, y2 = np.asarray(box, dtype=np.float64)
+    x1, y1, x2, y2 = np.asarray(box)
     on = (x1 <= x) & (x <= x2) & (y1 <= y) & (y <= y2)
     return int(on.argmax()) if on.any() else -1
 
@@ -60,7 +60,7 @@ def mean_performance(found: Sequence[int], groups: Sequence[Hashable], shifts: i
     members: dict[Hashable, list[int]] = {}
     for each, group in zip(found, groups, strict=True):
         members.setdefault(group, []).append(each)
-    curves = [cumulative_performance(np.array(each, dtype=np.int64), shifts) for each in members.values()]
+    curves = [cumulative_performance(np.array(each), shifts) for each in members.values()]
     return np.asarray(np.mean(curves, axis=0))
 
 
@@ -161,7 +161,7 @@ def scanpath_ratio(points: ArrayLike, box: ArrayLike) -> float:
         return float("nan")
     way = np.linalg.norm(np.diff(path[: last + 1], axis=0), axis=1).sum()
     straight = np.linalg.norm((edges[:2] + edges[2:]) / 2 - path[0])
-    return float(min(straight / way, 1.0)) if way > 0 else float("nan")
+    return float(min(straight / way, 1.0))
 
 
 def _points(points: ArrayLike) -> Array:

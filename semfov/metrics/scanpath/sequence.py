@@ -32,8 +32,8 @@ def cell_labels(points: ArrayLike, columns: int, rows: int, size: tuple[float, f
     >>> cell_labels([[0, 0], [99, 0], [99, 99]], 2, 2, (100, 100))
     array([0, 1, 3])
     """
-    inside = (np.asarray(points, dtype=np.float64) + 0.5) / np.asarray(size, dtype=np.float64)
-    outside = int(((inside < 0) | (inside > 1)).any(-1).sum())
+    inside = (np.asarray(points, dtype=np.float64) + 0.5) / np.asarray(size)
+    outside = int((~((inside >= 0) & (inside <= 1))).any(-1).sum())
     check(outside == 0, "points", f"points inside a picture of {size} pixels", f"{outside} outside it; remove them")
     column, row = np.minimum(inside * (columns, rows), (columns - 1e-9, rows - 1e-9)).astype(np.int64).T
     return np.asarray(row * columns + column)

@@ -26,8 +26,8 @@ def merge_close(points: ArrayLike, size: tuple[float, float]) -> Array:
     array([[1., 0.],
            [9., 9.]])
     """
-    path = [np.asarray(point, dtype=np.float64) for point in np.asarray(points, dtype=np.float64)]
-    half = np.asarray(size, dtype=np.float64) / 2
+    path = list(np.asarray(points, dtype=np.float64))
+    half = np.asarray(size) / 2
     index = 0
     while index < len(path) - 1:
         if (np.abs(path[index] - path[index + 1]) < half).all():

@@ -5,7 +5,7 @@ import torch
 
 from semfov import Detections, Grid
 from semfov.belief import TargetEvidence
-from semfov.belief.observers import AnyOf, Semantic, Target
+from semfov.belief.observers import AnyOf, Landing, Semantic, Target
 from semfov.belief.observers.any_of import weights_by_class
 from semfov.belief.target_evidence import Thresholds
 from semfov.errors import InputError
@@ -100,3 +100,26 @@ def test_bad_input(inner):
     for target, message in (({}, "several"), ({"cup": 1, 1: 1}, "twice"), ({"cat": 1}, "unknown class")):
         with pytest.raises(InputError, match=message):
             weights_by_class(target, classes)
+
+
+def test_some_episodes_and_classes_that_there_are_not(inner, looks):
+    observer = AnyOf(inner, WEIGHTS)
+    belief = observer.update(observer.start(3, GRID, looks.scores), observer.weigh(looks, FIXATIONS, GRID))
+    assert torch.equal(belief[1:].closest, belief.closest[1:])
+    look = observer.weigh(looks, FIXATIONS, GRID)
+    joined = observer.update(observer.start(3, GRID, looks.scores), type(look).join([look]))
+    assert torch.equal(joined.probability(1), belief.probability(1))
+    with pytest.raises(InputError, match=r"^target:"):
+        weights_by_class({99: 1.0}, ("cup", "wine glass"))
+
+
+def test_what_other_observers_made_is_refused_by_name(inner, looks):
+    observer, visited = AnyOf(inner, WEIGHTS), torch.zeros(3, 20, dtype=torch.bool)
+    belief, look = observer.start(3, GRID, looks.scores), observer.weigh(looks, FIXATIONS, GRID)
+    other = Landing(3)
+    strange = other.start(3, GRID, looks.scores), other.weigh(looks, FIXATIONS, GRID)
+    for call in (observer.update, lambda *given: observer.fade(*given, 0.5, visited)):
+        with pytest.raises(InputError, match=r"^belief: expected AnyBelief"):
+            call(strange[0], look)
+        with pytest.raises(InputError, match=r"^look: expected AnyLook"):
+            call(belief, strange[1])

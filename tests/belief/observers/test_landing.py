@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semfov import Detections, Grid
-from semfov.belief.observers import Landing, LandingBelief
+from semfov.belief.observers import Landing, LandingBelief, Semantic
 from semfov.errors import InputError
 from semfov.gaze.acquisition import ObjectEvidence
 from semfov.gaze.policies import Objects
@@ -93,3 +93,44 @@ def test_nothing_seen_is_no_evidence_and_other_beliefs_are_refused():
 def test_settings_that_cannot_be(bad):
     with pytest.raises(InputError, match=next(reversed(bad))):
         Landing(**bad)
+
+
+def test_looks_and_beliefs_keep_their_shapes_and_take_their_parts():
+    grid, seen = Grid(5, 4, (400, 300)), draw()
+    observer, points = Landing(4), torch.tensor([[0.0, 0.0], [399.0, 299.0], [200.0, 10.0]], dtype=torch.float64)
+    start, look = observer.start(3, grid, seen.scores), observer.weigh(seen, points, grid)
+    assert start.evidence.shape == look.evidence.shape == (3, 20, 4)
+    belief = observer.update(start, look)
+    torch.testing.assert_close(belief.class_probabilities()[..., 0], 1 - belief.evidence.amax(-1))
+    assert torch.equal(belief[1:].closest, belief.closest[1:])
+    assert torch.equal(belief[1:].evidence, belief.evidence[1:])
+    joined = type(look).join([look[1:], look[:1]])
+    assert torch.equal(joined.evidence, look.evidence[[1, 2, 0]])
+    assert torch.equal(joined.distance, look.distance[[1, 2, 0]])
+    nothing = Detections(torch.zeros(2, 0, 4), torch.zeros(2, 0, 5), torch.zeros(2, 0).bool())
+    assert observer.weigh(nothing, torch.zeros(2, 2), grid).evidence.shape == (2, 20, 4)
+
+
+def test_evidence_is_computed_in_the_precision_of_the_scores():
+    grid, seen = Grid(5, 4, (400, 300)), draw()
+    look = Landing(4, None, reach=0.013).weigh(seen, torch.zeros(3, 2, dtype=torch.float64), grid)
+    for number in range(3):
+        expected = by_hand(seen, number, grid, 4, None, 0.013)
+        torch.testing.assert_close(look.evidence[number], expected, rtol=1e-12, atol=1e-300)
+    wide = Grid(5, 4, torch.tensor([400.0, 300.0], dtype=torch.float64))
+    single = Detections(seen.boxes.float(), seen.scores.float(), seen.mask)
+    assert Landing(4).weigh(single, torch.zeros(3, 2), wide).evidence.dtype == torch.float32
+
+
+def test_settings_at_their_limits():
+    assert Landing(1, 1, 1).reach == 1
+    for bad in ({"person": 0}, {"reach": 1.01}, {"reach": -0.1}):
+        with pytest.raises(InputError, match=rf"^{next(iter(bad))}:"):
+            Landing(3, **bad)
+
+
+def test_looks_of_other_observers_are_refused():
+    grid, observer, nothing = Grid(2, 2, (40, 40)), Landing(3), Detections.empty(1, 3)
+    belief = observer.start(1, grid, torch.zeros(1))
+    with pytest.raises(InputError, match=r"^look:"):
+        observer.update(belief, Semantic(4).weigh(nothing, torch.zeros(1, 2), grid))

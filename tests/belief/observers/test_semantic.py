@@ -148,3 +148,31 @@ def test_tempering_is_positive(looks):
         likelihoods(looks, FIXATIONS, GRID, tempering=0)
     with pytest.raises(InputError, match="tempering"):
         Semantic(4, tempering=0).weigh(looks, FIXATIONS, GRID)
+
+
+@pytest.mark.parametrize("footprint", ["overlap", "soft"])
+def test_looks_with_fewer_detections_are_joined_to_those_with_more(looks, footprint):
+    observer = Semantic(4, footprint=footprint, misses=MISSES)
+    few = Detections(looks.boxes[1:2, :2], looks.scores[1:2, :2], looks.mask[1:2, :2])
+    many = Detections(looks.boxes.flatten(0, 1)[None], looks.scores.flatten(0, 1)[None], looks.mask.flatten()[None])
+    parts = [
+        observer.weigh(few, FIXATIONS[1:2], GRID),
+        observer.weigh(many, FIXATIONS[2:], GRID),
+        observer.weigh(Detections.empty(1, 3), FIXATIONS[:1], GRID),
+    ]
+    start = observer.start(3, GRID, looks.scores)
+    together = observer.update(start, SemanticLook.join(parts))
+    for row, part in enumerate(parts):
+        alone = observer.update(start[row : row + 1], part)
+        assert torch.equal(together.beta[row], alone.beta[0])
+        assert torch.equal(together.closest[row], alone.closest[0])
+
+
+def test_a_belief_keeps_its_precision_whatever_that_of_the_look(looks):
+    observer = Semantic(4, misses=MISSES)
+    look = observer.weigh(looks[:1], FIXATIONS[:1], GRID)
+    for dtype in (torch.float32, torch.float64):
+        said = SemanticLook(look.likelihood.to(dtype), look.footprint, look.distance)
+        for other in (torch.float32, torch.float64):
+            start = observer.start(1, GRID, torch.empty(0, dtype=other))
+            assert observer.update(start, said).beta.dtype == other

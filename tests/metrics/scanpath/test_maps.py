@@ -171,3 +171,55 @@ def test_points_belong_to_the_pixel_that_they_are_nearest_to():
 def test_what_cannot_be_is_refused_by_name(call, argument):
     with pytest.raises(InputError, match=f"^{argument}"):
         call()
+
+
+def test_each_map_of_a_batch_is_a_density_of_its_own_in_double_precision():
+    maps = torch.rand(2, 3, *SHAPE, generator=torch.Generator().manual_seed(4))
+    maps[1] *= 100
+    density = log_density(maps, floor=0.2)
+    np.testing.assert_allclose(np.exp(density).sum((-1, -2)), 1, rtol=1e-12)
+    np.testing.assert_array_equal(density, log_density(maps.double(), floor=0.2))
+
+
+def test_a_map_without_contrast_beside_one_with():
+    maps = np.stack([np.ones(SHAPE), np.random.default_rng(5).uniform(0, 1, SHAPE)])
+    got = nss(maps, [[3], [4]], [[5], [6]])
+    assert got[0, 0] == 0
+    assert got[1, 0] == pytest.approx((maps[1, 6, 4] - maps[1].mean()) / maps[1].std())
+
+
+def test_figures_are_computed_in_double_precision():
+    maps = torch.rand(SHAPE, generator=torch.Generator().manual_seed(6))
+    assert nss(maps, [3], [4]) == nss(maps.double(), [3], [4])
+    # 1025.5 is no number of half precision.
+    wide = np.arange(2000.0)[None]
+    assert log_likelihood(wide, np.array([1025], np.float16), np.array([0], np.float16)) == log_likelihood(
+        wide, [1025], [0]
+    )
+
+
+@pytest.mark.parametrize(
+    ("call", "argument"),
+    [
+        (lambda: nss(np.ones(5), [1], [0]), "maps"),
+        (lambda: nss(np.ones((0, 5)), [], []), "maps"),
+        (lambda: nss(np.ones(SHAPE), [1, 2], [0]), "x, y"),
+        (lambda: nss(np.ones(SHAPE), [0], [11.5]), "x, y"),
+        (lambda: nss(np.ones(SHAPE), [16.5], [0]), "x, y"),
+        (lambda: auc_judd(np.ones((2, *SHAPE)), [[1], [1]], [[1], [1]]), "saliency"),
+        (lambda: auc_judd(np.ones(SHAPE), [], []), "saliency"),
+        (lambda: auc_shuffled(np.ones(SHAPE), [], [], [1], [1]), "x, other_x"),
+        (lambda: auc_shuffled(np.ones(SHAPE), [1], [1], [], []), "x, other_x"),
+    ],
+)
+def test_what_cannot_be_judged_is_refused_by_name(call, argument):
+    with pytest.raises(InputError, match=rf"^{argument}:"):
+        call()
+
+
+def test_one_fixation_and_one_other_pixel_are_enough():
+    assert auc_judd([[0.0, 1.0]], [1], [0]) == 1
+    # The one threshold lets both pixels through: a straight line from corner to corner.
+    assert auc_judd([[1.0, 0.0]], [1], [0]) == 0.5
+    assert auc_shuffled([[0.0, 1.0]], [1], [0], [0], [0]) == 1
+    assert auc_shuffled([[0.0, 1.0]], [0], [0], [1], [0]) == 0

@@ -48,3 +48,17 @@ def test_what_cannot_be_is_refused_by_name():
         multimatch([[0, 0]] * 3, [0, 1, 2], (10, 10))
     with pytest.raises(InputError, match=r"^durations:"):
         multimatch([[0, 0]] * 3, [[0, 0]] * 3, (10, 10), ([1, 2, 3], [1, 2]))
+
+
+def test_bytes_are_numbers_and_fixations_without_duration_are_alike():
+    path = np.array([[200, 10], [100, 250], [250, 20], [5, 5]], dtype=np.uint8)
+    other = np.array([[10, 200], [255, 0], [30, 30]], dtype=np.uint8)
+    times = np.array([200, 3, 250, 9], dtype=np.uint8), np.array([4, 255, 7], dtype=np.uint8)
+    expected = multimatch(path.tolist(), other.tolist(), (256, 256), tuple(each.tolist() for each in times))
+    assert multimatch(path, other, (256, 256), times) == expected
+    assert multimatch(path, path, (256, 256), ([0] * 4, [0] * 4)).duration == 1
+
+
+def test_the_first_scanpath_is_refused_by_its_name():
+    with pytest.raises(InputError, match=r"^ours:"):
+        multimatch([0, 1, 2], [[0, 0]] * 3, (10, 10))

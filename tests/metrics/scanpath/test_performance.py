@@ -76,3 +76,42 @@ def test_the_straight_way_has_ratio_one_and_a_detour_less():
 def test_what_cannot_be_is_refused_by_name(call, argument):
     with pytest.raises(InputError, match=f"^{argument}:"):
         call()
+
+
+def test_all_four_edges_are_on_the_target():
+    box = (10, 20, 30, 40)
+    for point in ([10, 20], [30, 20], [10, 40], [30, 40]):
+        assert found_at([point], box) == 0
+    for point in ([9.9, 30], [30.1, 30], [20, 19.9], [20, 40.1]):
+        assert found_at([point], box) == -1
+
+
+def test_no_fixation_is_no_scanpath():
+    with pytest.raises(InputError, match=r"^points:"):
+        found_at(np.zeros((0, 2)), (0, 0, 1, 1))
+
+
+def test_the_way_starts_at_the_first_fixation():
+    """From (10, 20) over (10, 50) to (50, 50): 40 and 30 along the sides of a triangle whose third is 50."""
+    assert scanpath_ratio([[10, 20], [10, 50], [50, 50]], (45, 45, 55, 55)) == pytest.approx(50 / 70)
+
+
+def test_pixels_kept_as_bytes_are_numbers():
+    """Their differences and sums do not wrap around at 256."""
+    path, box = np.array([[200, 250], [250, 200]], dtype=np.uint8), np.array([240, 190, 254, 210], dtype=np.uint8)
+    assert scanpath_ratio(path, box) == pytest.approx(min(1, np.hypot(47, 50) / np.hypot(50, 50)))
+    path = np.array([[10, 100], [40, 60], [250, 210]], dtype=np.uint8)
+    box = np.array([240, 200, 252, 220], dtype=np.uint8)
+    assert scanpath_ratio(path, box) == pytest.approx(np.hypot(236, 110) / (50 + np.hypot(210, 150)))
+    found, everyone = np.array([0, 1, 1], dtype=np.uint8), np.array([1, 1, 1], dtype=np.uint8)
+    assert probability_mismatch(found, everyone) == 1
+
+
+def test_a_curve_may_be_of_yes_and_no():
+    """One search, found by the second of three fixations."""
+    assert performance_area(np.array([False, True, True])) == pytest.approx(0.75)
+
+
+def test_seven_fixations_are_summed_unless_told_otherwise():
+    assert tfp_auc([0, 0], ["cup", "fork"]) == 7
+    assert tfp_auc([6, 7], ["cup", "fork"]) == 0.5

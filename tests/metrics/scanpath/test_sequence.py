@@ -1,12 +1,16 @@
 """Scanpaths as words, against alignments by dynamic programming as the field's own code writes them."""
 
+import warnings
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sklearn.cluster import MeanShift
 
 from semfov.errors import InputError
 from semfov.metrics.scanpath import cell_labels, cluster_labels, edit_distance, merge_close, sequence_score
+from semfov.metrics.scanpath.sequence import fitted_clusters
 
 words = st.lists(st.sampled_from(["cup", "fork", "oven", "tv"]), min_size=1, max_size=9)
 
@@ -84,3 +88,46 @@ def test_neighbours_merge_while_they_are_closer_than_half_a_window():
 def test_what_cannot_be_is_refused_by_name(call, argument):
     with pytest.raises(InputError, match=f"^{argument}:"):
         call()
+
+
+def test_cells_of_points_in_half_precision():
+    """1025 is a number of half precision and 1025.5 is none."""
+    assert cell_labels(np.array([[1025, 0]], dtype=np.float16), 4096, 1, (4096, 1)).tolist() == [1025]
+
+
+def test_merging_goes_on_to_the_last_fixation_and_starts_anew_after_a_step():
+    np.testing.assert_allclose(merge_close([[0.0, 0.0], [50, 50], [52, 50]], (10, 10)), [[0, 0], [51, 50]])
+    np.testing.assert_allclose(merge_close([[0.0, 0.0], [2, 0]], (10, 10)), [[1, 0]])
+    # Half a window apart is not closer than half a window.
+    np.testing.assert_allclose(merge_close([[0.0, 0.0], [5, 0]], (10, 10)), [[0, 0], [5, 0]])
+    # Bytes do not wrap around.
+    np.testing.assert_allclose(merge_close(np.array([[200, 0], [202, 2]], dtype=np.uint8), (10, 10)), [[201, 1]])
+
+
+@pytest.mark.parametrize("figure", [sequence_score, edit_distance])
+def test_both_words_are_refused_by_their_names(figure):
+    with pytest.raises(InputError, match=r"^ours:"):
+        figure([], [1])
+    with pytest.raises(InputError, match=r"^theirs:"):
+        figure([1], [])
+
+
+def test_letters_of_an_array_are_those_of_a_list():
+    """-1 too, whose hash is not itself."""
+    assert sequence_score(np.array([3, -1, 300_000]), [3, -1, 300_000]) == 1
+    assert edit_distance([3, -1], np.array([3, -1])) == 0
+
+
+def test_clusters_are_those_of_scikit_learn_from_seeds_in_bins():
+    points = np.random.default_rng(0).uniform(0, 500, (40, 2))
+    expected = MeanShift(bandwidth=90, bin_seeding=True).fit(points).predict(points)
+    assert cluster_labels(points, points, bandwidth=90).tolist() == expected.tolist()
+
+
+def test_of_its_warnings_only_that_about_bins_is_silent(monkeypatch):
+    """Where every fixation has a bin of its own."""
+    points = [[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]]
+    assert sorted(cluster_labels(points, points, bandwidth=1).tolist()) == [0, 1, 2]
+    monkeypatch.setattr(MeanShift, "fit", lambda self, points: warnings.warn("another", stacklevel=1))
+    with pytest.warns(UserWarning, match="another"):
+        fitted_clusters(points)

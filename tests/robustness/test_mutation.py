@@ -1,0 +1,66 @@
+"""What is read of mutation tests: a module as mutmut leaves it, written out by hand."""
+
+import json
+from collections import Counter
+
+import pytest
+
+from benchmarks.mutation import listed, read, score
+
+MODULE = """
+def x_area__mutmut_orig(a: float, b: float) -> float:
+    check(a > 0, "a", "a positive number", a)
+    return a * b
+
+
+def x_area__mutmut_1(a: float, b: float) -> float:
+    check(a >= 0, "a", "a positive number", a)
+    return a * b
+
+
+def x_area__mutmut_2(a: float, b: float) -> float:
+    check(a > 0, "a", None, a)
+    return a * b
+
+
+def x_area__mutmut_3(a: float, b: float) -> float:
+    check(a > 0, "a", "a positive number", a)
+    return a / b
+
+
+class Box:
+    def xǁBoxǁ__len____mutmut_orig(self) -> int:
+        return 2
+
+    def xǁBoxǁ__len____mutmut_1(self) -> int:
+        return 3
+"""
+
+
+@pytest.fixture
+def path(tmp_path):
+    names = ["x_area__mutmut_1", "x_area__mutmut_2", "x_area__mutmut_3", "xǁBoxǁ__len____mutmut_1"]
+    codes = dict(zip((f"shapes.{name}" for name in names), (0, 0, 1, None), strict=True))
+    (tmp_path / "shapes.py").write_text(MODULE, encoding="utf-8")
+    (tmp_path / "shapes.py.meta").write_text(json.dumps({"exit_code_by_key": codes}), encoding="utf-8")
+    return tmp_path / "shapes.py"
+
+
+def test_mutants_have_their_function_their_change_and_their_status(path):
+    weaker = "check(a >= 0, 'a', 'a positive number', a)"
+    first, words, killed, method = read(path, {})
+    assert (first.function, first.change, first.status) == ("shapes.area", weaker, "survived")
+    assert words.status == "aside"
+    assert (killed.change, killed.status) == ("return a / b", "killed")
+    assert (method.function, method.change, method.status) == ("shapes.Box.__len__", "return 3", "not run")
+    assert next(read(path, {"shapes.area": [weaker]})).status == "aside"
+
+
+def test_the_score_counts_what_was_run():
+    assert score(Counter(killed=3, survived=1, aside=9, **{"not run": 5})) == "75.0%"
+    assert score(Counter(killed=1, untested=1)) == "50.0%"
+
+
+def test_every_change_that_is_set_aside_is_of_a_function_of_the_library():
+    assert listed()
+    assert all(function.startswith("semfov.") and all(changes) for function, changes in listed().items())
