@@ -68,7 +68,7 @@ def main() -> None:
                 here = box_iou(seen.boxes[look], scene.boxes[look, None])[:, 0] >= 0.5
                 named += bool((here & seen.mask[look] & (seen.scores[look, :, label] >= 0.5)).any())
             objects += len(scene.labels)
-        print(f"{name}: {named} of {objects} objects are named when they are fixated")
+        print(f"{name}: {named} of {objects} objects are recognised when they are fixated")
 
 
 if __name__ == "__main__":

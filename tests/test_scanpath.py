@@ -296,7 +296,7 @@ def test_other_files_are_refused(scanpath, tmp_path):
     with pytest.raises(DataError, match="without its record"):
         Scanpath.load(path)
     write(path, {"x": torch.zeros(1)}, {"kind": "observation model"})
-    with pytest.raises(DataError, match="expected scanpath"):
+    with pytest.raises(DataError, match="expected a file of kind scanpath"):
         Scanpath.load(path)
     path.write_bytes(b"not a tensor")
     with pytest.raises(DataError, match="not a readable"):

@@ -148,10 +148,10 @@ def test_a_class_is_known_that_is_a_target_or_beside_one(path):
     path.write_text(",cow\ncup,1\n", encoding="utf-8")
     prior = ContextPrior.from_table(path, CLASSES, source="s")
     assert prior.metadata["table"]["missing"] == ["dining table", "zebra"]
-    with pytest.raises(InputError, match=r"knows \(cup, …\), got spoon, zebra, …"):
+    with pytest.raises(InputError, match=r"in the table \(cup, …\), got spoon, zebra, …"):
         ContextPrior.from_table(path, ["spoon", "zebra"], source="s")
     path.write_text(",cow\n" + "".join(f"thing {letter},1\n" for letter in "abcdef"), encoding="utf-8")
-    with pytest.raises(InputError, match=r"knows \(thing a, thing b, thing c, thing d, thing e, …\)"):
+    with pytest.raises(InputError, match=r"in the table \(thing a, thing b, thing c, thing d, thing e, …\)"):
         ContextPrior.from_table(path, ["spoon", "zebra"], source="s")
 
 

@@ -392,7 +392,7 @@ def test_bad_files_are_refused(tmp_path):
     with pytest.raises(DataError, match="not a readable"):
         FovealObservationModel.from_pretrained(path)
     DirichletStatistics((2,), 3).save(path)
-    with pytest.raises(DataError, match="expected foveal-observation-model, got dirichlet-statistics"):
+    with pytest.raises(DataError, match="expected a file of kind foveal-observation-model, got dirichlet-statistics"):
         FovealObservationModel.from_pretrained(path)
 
 

@@ -191,7 +191,7 @@ def test_a_picture_needs_words(tmp_path):
     source = tmp_path / "draws.py"
     source.write_text("# %%\nimport matplotlib.pyplot as plt\nplt.plot([0, 1]);\n", encoding="utf-8")
     notebook = execute(source)
-    with pytest.raises(ValueError, match="no alt text"):
+    with pytest.raises(ValueError, match="expected alt="):
         page(notebook, "draws", tmp_path)
     notebook.cells[0].metadata["alt"] = "a line"
     assert "![a line](draws-0.png)" in page(notebook, "draws", tmp_path)

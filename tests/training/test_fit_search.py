@@ -322,8 +322,8 @@ def test_training_leaves_model_report_and_figures(trained):
     assert [row["looks"] for row in judged] == list(JUDGED)
     report = (trained / "out/report.md").read_text()
     assert "area under ROC" in report
-    assert f"found from {model.thresholds.confirm:.3f}" in report
-    assert f"worth a look from {model.thresholds.give_up:.2f}" in report
+    assert f"presence is at least {model.thresholds.confirm:.3f} and" in report
+    assert f"no other cell has a probability of at least {model.thresholds.give_up:.2f}" in report
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in report.splitlines() if line[:1] == "|"][2:]
     for row, cells in zip(judged, rows, strict=True):
         assert cells[:3] == [str(row["looks"]), f"{100 * row['found']:.1f}", f"{row['cells_nll']:.4f}"]

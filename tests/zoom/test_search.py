@@ -40,10 +40,10 @@ def test_find_all_and_explore(agent, picture):
     assert path.target == 3
     assert (path.objects.labels == 3).all()
     assert len(path.objects.above(0.3))
-    everything = agent.explore(picture, passes=12, batch=3, worth=0.0)
+    everything = agent.explore(picture, passes=24, batch=3, worth=0.0)
     assert set(everything.objects.above(0.3).labels.tolist()) == {1, 3}
     assert everything.target is None
-    assert everything.passes <= 12
+    assert everything.passes <= 24
 
 
 def test_it_ends_where_no_look_is_worth_its_price(agent, picture):
