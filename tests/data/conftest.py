@@ -45,7 +45,7 @@ def coco(boxes=(), categories=("person", "cat", "tv")):
 
 @pytest.fixture
 def make_coco(tmp_path):
-    """Function that writes a COCO file and returns its path: make_coco(boxes, categories=...) or make_coco(data=dict)."""
+    """Function that writes a COCO file and returns its path: make_coco(boxes, categories=...), make_coco(data=dict)."""
 
     def make(boxes=(), *, data=None, **options):
         path = tmp_path / "instances.json"
