@@ -80,7 +80,7 @@ def test_grey_has_three_equal_channels(tmp_path):
     assert np.array_equal(image, np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, -1))
 
 
-def test_bilevel(tmp_path):
+def test_bilevel_images_are_read(tmp_path):
     Image.fromarray(np.array([[0, 255], [255, 0]], np.uint8)).convert("1").save(tmp_path / "a.png")
     assert read_image(tmp_path / "a.png")[1].tolist() == [[0, 1], [1, 0]]
 
@@ -92,7 +92,7 @@ def test_cmyk_jpeg(tmp_path):
     assert read_image(tmp_path / "black.tif").max() == 0
 
 
-def test_palette(tmp_path):
+def test_palette_images_are_read(tmp_path):
     Image.fromarray(PICTURE).quantize(4).save(tmp_path / "a.png")
     assert np.array_equal(bits(read_image(tmp_path / "a.png")), PICTURE)
 
@@ -158,7 +158,7 @@ def test_float_tiff(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["gif", "webp", "png"])
-def test_first_frame_of_an_animation(tmp_path, kind):
+def test_the_first_frame_of_an_animation_is_read(tmp_path, kind):
     frames = [Image.new("RGB", (6, 4), colour) for colour in ("red", "blue", "lime")]
     lossless = {"lossless": True} if kind == "webp" else {}
     frames[0].save(tmp_path / f"a.{kind}", save_all=True, append_images=frames[1:], duration=50, **lossless)

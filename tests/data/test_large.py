@@ -112,7 +112,7 @@ def test_tiles_are_decoded_one_at_a_time(tmp_path):
     assert peak < 4e6
 
 
-def test_errors(tmp_path):
+def test_unreadable_files_and_windows_outside_the_picture_are_refused(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"no picture")
     with pytest.raises(DataError, match="cannot be opened"):
         open_large(tmp_path / "a.jpg")

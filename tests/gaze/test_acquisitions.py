@@ -160,7 +160,7 @@ def test_values_do_not_depend_on_visited_cells(name):
     assert torch.equal(function(beliefs(), visits()), function(beliefs(), ~visits()))
 
 
-def test_a_belief_about_one_target_is_accepted_where_it_is_enough_or_refused(name):
+def test_a_belief_about_one_target_is_refused_if_all_classes_are_needed(name):
     for known in about_one_target():
         function = EVERY[name]()
         if name in OF_ONE_TARGET:

@@ -45,7 +45,7 @@ def test_a_visited_cell_is_never_chosen(seed, astray):
     assert torch.equal(values, before)
 
 
-def test_whole_searches_visit_every_cell_once():
+def test_a_complete_search_visits_every_cell_once():
     choice, visited = Exploratory(noise_from(1), 0.5), torch.zeros(5, 9, dtype=torch.bool)
     for shift in range(9):
         _, cell = choice(shift, torch.arange(5), torch.rand(5, 9), visited, CENTRES)

@@ -150,7 +150,7 @@ def test_saved_habits_load_unchanged(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"columns": 5}, "columns"),
         ({"edges": (0.3, 0.1, 0.6)}, "edges"),
@@ -159,8 +159,8 @@ def test_saved_habits_load_unchanged(tmp_path):
         ({"step": torch.full((4,), torch.nan)}, "step"),
     ],
 )
-def test_invalid_tables_are_refused(changes, told):
-    with pytest.raises(InputError, match=told):
+def test_invalid_tables_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
         make_habits(**changes)
 
 

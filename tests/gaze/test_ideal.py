@@ -117,7 +117,7 @@ def test_without_a_signal_accuracy_is_the_largest_prior():
 
 
 class Sharp:
-    """Sees a target perfectly in the fixated cell, and nothing anywhere else."""
+    """Sees targets perfectly in the fixated cell, and not at all in other cells."""
 
     miss_rate = torch.tensor([[0.5, 1.0], [1e-4, 1.0]], dtype=torch.float64)
     alpha = torch.tensor([[[60.0, 1.0]] * 2, [[1.0, 60.0]] * 2], dtype=torch.float64)
@@ -200,7 +200,7 @@ def test_gradients():
     assert torch.autograd.gradcheck(limit.values, (place, table))
 
 
-def test_arguments():
+def test_invalid_arguments_are_refused():
     with pytest.raises(InputError, match="miss rates"):
         EntropyLimit(1, FovealObservationModel.identity(["cup"], [0.2]), GRID)
     with pytest.raises(InputError, match="nodes"):

@@ -82,7 +82,7 @@ def test_weights_from_a_file(ivsn, tmp_path):
             IVSN.vgg16(tmp_path / name)
 
 
-def test_arguments():
+def test_invalid_arguments_are_refused():
     identity = IVSN(nn.Identity(), nn.Identity(), picture=8, target=1)
     image, target = pictures()
     with pytest.raises(InputError, match="image"):

@@ -70,7 +70,7 @@ def test_fit_converges_when_all_choices_are_equal():
     assert float((weights[0] - weights[1]).exp()) > 1e4
 
 
-def test_arguments():
+def test_invalid_arguments_are_refused():
     phi, chosen, _ = draw()
     with pytest.raises(InputError, match="chosen"):
         fit_log_linear(phi, chosen[:5])

@@ -57,7 +57,7 @@ def make_attention(dtype=torch.float64):
     return torch.randn(12, 3, 12, generator=torch.Generator().manual_seed(3), dtype=torch.float64).to(dtype)
 
 
-def nothing_known(batch, dtype=torch.float64, device="cpu"):
+def uniform_beliefs(batch, dtype=torch.float64, device="cpu"):
     return DirichletBelief(torch.ones(batch, 12, 4, dtype=dtype, device=device))
 
 
@@ -68,7 +68,7 @@ def test_attention_over_several_looks_equals_the_loop(dtype, device):
     target = torch.tensor([3, 1])
     attention = make_attention(dtype)
     value = TemplateAttention(target, attention, GRID, 0.2).to(device)
-    got = value(nothing_known(2, dtype, device), visited.to(device))
+    got = value(uniform_beliefs(2, dtype, device), visited.to(device))
     assert got.dtype == dtype
     for episode in range(2):
         for x in range(12):
@@ -83,18 +83,18 @@ def test_attention_over_several_looks_equals_the_loop(dtype, device):
 def test_after_one_look_attention_is_that_of_the_look():
     visited = torch.zeros(1, 12, dtype=torch.bool)
     visited[0, 5] = True
-    got = TemplateAttention(2, make_attention(), GRID)(nothing_known(1), visited)
+    got = TemplateAttention(2, make_attention(), GRID)(uniform_beliefs(1), visited)
     torch.testing.assert_close(got[0], make_attention()[5, 1])
 
 
 def test_an_episode_does_not_depend_on_the_others():
     visited = torch.rand(5, 12, generator=torch.Generator().manual_seed(0)) < 0.4
     target = torch.tensor([1, 2, 3, 2, 1])
-    together = TemplateAttention(target, make_attention(), GRID)(nothing_known(5), visited)
+    together = TemplateAttention(target, make_attention(), GRID)(uniform_beliefs(5), visited)
     for episode in range(5):
         alone = TemplateAttention(target[episode : episode + 1], make_attention(), GRID)
         part = slice(episode, episode + 1)
-        assert torch.equal(alone(nothing_known(1), visited[part]), together[part])
+        assert torch.equal(alone(uniform_beliefs(1), visited[part]), together[part])
 
 
 def test_saved_templates_load_unchanged(tmp_path):
@@ -113,7 +113,7 @@ def test_saved_templates_load_unchanged(tmp_path):
         ClassTemplates.from_pretrained(tmp_path / "templates.safetensors")
 
 
-def test_arguments():
+def test_invalid_arguments_are_refused():
     with pytest.raises(InputError, match="templates"):
         ClassTemplates(torch.zeros(2, 5), torch.zeros(5), ["a", "b", "c"])
     with pytest.raises(InputError, match="features"):
