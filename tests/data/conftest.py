@@ -29,11 +29,11 @@ def photographs(tmp_path_factory):
 
 
 def coco(boxes=(), categories=("person", "cat", "tv")):
-    """A COCO file as a dict: `boxes` are (image, category name, bbox) or with more keys of the annotation."""
+    """A COCO file as a dict: `boxes` are (image, category name, bbox), and optionally a dict of more keys."""
     return {
         "images": [
             {"id": n, "file_name": f"{n}.png", "width": WIDTH, "height": HEIGHT} for n in (30, 10, 20)
-        ],  # not in order
+        ],  # not sorted
         "categories": [{"id": 7 * i + 3, "name": name} for i, name in enumerate(categories)],
         "annotations": [
             {"id": i, "image_id": image, "category_id": 7 * categories.index(name) + 3, "bbox": list(box)} | extra
@@ -45,7 +45,7 @@ def coco(boxes=(), categories=("person", "cat", "tv")):
 
 @pytest.fixture
 def make_coco(tmp_path):
-    """Writes a COCO file: make_coco(boxes, categories=...) or make_coco(data=dict) gives its path."""
+    """Function that writes a COCO file and returns its path: make_coco(boxes, categories=...), make_coco(data=dict)."""
 
     def make(boxes=(), *, data=None, **options):
         path = tmp_path / "instances.json"
@@ -57,5 +57,5 @@ def make_coco(tmp_path):
 
 @pytest.fixture(scope="session")
 def coco_dict():
-    """`coco` for tests that change the dict before they write it."""
+    """The function `coco`, for tests that change the dict before they write it."""
     return coco

@@ -19,7 +19,7 @@ def test_index_and_digest(make_coco, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_string_ids(make_coco, coco_dict):
+def test_ids_may_be_strings(make_coco, coco_dict):
     data = coco_dict(BOXES)
     for image in data["images"]:
         image["id"] = str(image["id"])
@@ -29,7 +29,7 @@ def test_string_ids(make_coco, coco_dict):
     assert sorted(index.imgs) == ["10", "20", "30"]
 
 
-def test_missing_file(tmp_path):
+def test_a_missing_file_or_a_folder_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"no\.json: no such file; check data\.annotations"):
         read_annotations(tmp_path / "no.json")
     with pytest.raises(DataError, match="expected a file, got a folder"):
@@ -37,7 +37,7 @@ def test_missing_file(tmp_path):
 
 
 @pytest.mark.parametrize("text", [b"", b"{", b"\xff\xfe\x00", b"[" * 100_000, b"1" * 10_000])
-def test_not_json(tmp_path, text):
+def test_a_file_that_is_not_json_is_refused(tmp_path, text):
     (tmp_path / "a.json").write_bytes(text)
     with pytest.raises(DataError, match=r"a\.json: not a JSON file"):
         read_annotations(tmp_path / "a.json")
@@ -79,7 +79,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("where", "value", "message"), FAULTS)
-def test_faults_are_named(make_coco, coco_dict, where, value, message):
+def test_errors_name_the_entry_and_the_field(make_coco, coco_dict, where, value, message):
     data = copy.deepcopy(coco_dict(BOXES))
     entry = data
     for key in where[:-1]:
@@ -92,12 +92,12 @@ def test_faults_are_named(make_coco, coco_dict, where, value, message):
         read_annotations(make_coco(data=data))
 
 
-def test_not_an_object(make_coco):
+def test_a_json_list_is_refused(make_coco):
     with pytest.raises(DataError, match="expected an object with images, annotations and categories, got a list"):
         read_annotations(make_coco(data=[]))
 
 
-def test_long_values_are_shortened(make_coco, coco_dict):
+def test_long_values_are_shortened_in_the_message(make_coco, coco_dict):
     data = coco_dict(BOXES)
     data["images"][0]["width"] = "x" * 10_000
     with pytest.raises(DataError) as caught:
@@ -105,7 +105,7 @@ def test_long_values_are_shortened(make_coco, coco_dict):
     assert len(str(caught.value)) < 300
 
 
-def test_deep_values(make_coco, coco_dict, tmp_path):
+def test_deeply_nested_values_are_refused(make_coco, coco_dict, tmp_path):
     data = coco_dict(BOXES)
     data["images"][0]["width"] = "HERE"
     text = json.dumps(data).replace('"HERE"', "[" * 900 + "]" * 900)

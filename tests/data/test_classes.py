@@ -6,7 +6,7 @@ from semfov.errors import InputError
 
 
 @pytest.mark.parametrize(("old", "new"), ALIASES.items())
-def test_both_spellings_are_one_class(old, new):
+def test_both_spellings_give_the_same_class(old, new):
     assert canonical_name(old) == canonical_name(new) == new
     assert class_index(old, ("person", new)) == class_index(new, ("person", old)) == 2
 
@@ -15,11 +15,11 @@ def test_case_and_spaces_do_not_matter():
     assert canonical_name("  Traffic_Light ") == "traffic light"
 
 
-def test_unknown_names_are_told_with_the_nearest():
+def test_the_error_for_an_unknown_class_suggests_the_nearest_name():
     with pytest.raises(InputError, match="unknown class 'bycicle'; did you mean 'bicycle'"):
         class_index("bycicle", ("person", "bicycle"))
 
 
-def test_one_class_twice_is_refused():
+def test_the_same_class_twice_is_refused():
     with pytest.raises(InputError, match="expected 2 different names"):
         class_indices(("sofa", "couch"))

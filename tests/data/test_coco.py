@@ -15,7 +15,7 @@ from PIL import Image
 from semfov.data import CocoScenes, read_image
 from semfov.errors import DataError, InputError
 
-CLASSES = ("cat", "person", "tvmonitor")  # not in the file's order, and in Darknet's spelling
+CLASSES = ("cat", "person", "tvmonitor")  # in another order than in the file, and with the spelling of Darknet
 BOXES = [
     (20, "cat", (0, 0, 10, 10)),
     (10, "person", (1, 2, 3, 4)),
@@ -59,8 +59,8 @@ def test_iteration_and_index_errors(photographs, make_coco):
         scenes.annotation(3)
 
 
-def test_selection(photographs, make_coco):
-    # 10: 8 boxes, all small; 20: 7 boxes; 30: 8 boxes, but its only class covers too much
+def test_images_are_selected_by_number_of_boxes_and_area(photographs, make_coco):
+    # 10: 8 boxes, one class has small boxes only; 20: 7 boxes; 30: 8 boxes, but its only class covers too much area
     boxes = [(10, "person", (i, 0, 2, 2)) for i in range(7)] + [(10, "tv", (0, 0, 40, 20))]
     boxes += [(20, "person", (i, 0, 2, 2)) for i in range(7)]
     boxes += [(30, "cat", (i, 0, 10, 10)) for i in range(8)]
@@ -84,7 +84,7 @@ def test_selection_does_not_depend_on_the_detector(photographs, make_coco):
     assert scenes.repairs == {"boxes of 'person', which the detector does not know, dropped": 4}
 
 
-def test_repairs_are_counted_and_told_once(photographs, make_coco, caplog):
+def test_repairs_are_counted_and_reported_once(photographs, make_coco, caplog):
     boxes = [
         (10, "cat", (-5, -5, 10, 10)),
         (10, "cat", (35, 25, 10, 10)),
@@ -111,20 +111,20 @@ def test_repairs_are_counted_and_told_once(photographs, make_coco, caplog):
     ]
 
 
-def test_boxes_that_vanish_in_float32_are_dropped(photographs, make_coco):
+def test_boxes_without_area_in_single_precision_are_dropped(photographs, make_coco):
     scenes = CocoScenes(photographs, make_coco([(10, "cat", (30, 20, 1e-9, 5))]), CLASSES, **ALL)
     assert scenes.annotation(0).boxes.shape == (0, 4)
     assert scenes.repairs == {"boxes without area in the image, dropped": 1}
 
 
-def test_no_common_classes(photographs, make_coco):
+def test_annotations_without_a_class_of_the_detector_are_refused(photographs, make_coco):
     with pytest.raises(DataError, match=r"expected some of the detector's 2 classes .* got 'person', 'cat', 'tv'"):
         CocoScenes(photographs, make_coco(BOXES), ("zebra", "cup"))
     with pytest.raises(DataError, match="got none"):
         CocoScenes(photographs, make_coco(categories=()), CLASSES)
 
 
-def test_missing_images(photographs, make_coco, coco_dict):
+def test_a_missing_image_is_an_error_only_if_it_is_used(photographs, make_coco, coco_dict):
     data = coco_dict(BOXES)
     data["images"][0]["file_name"] = "gone.png"
     with pytest.raises(DataError, match=r"gone\.png: no such file \(1 of 3 are missing\); check data\.root"):
@@ -134,7 +134,7 @@ def test_missing_images(photographs, make_coco, coco_dict):
 
 
 @pytest.mark.parametrize("frame", ["upright", "stored"])
-def test_frame_of_a_turned_photograph(tmp_path, make_coco, coco_dict, frame):
+def test_pixels_of_a_rotated_photograph_fit_the_annotated_size(tmp_path, make_coco, coco_dict, frame):
     exif = Image.Exif()
     exif[0x0112] = 6
     pixels = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
@@ -149,7 +149,7 @@ def test_frame_of_a_turned_photograph(tmp_path, make_coco, coco_dict, frame):
     assert np.array_equal((image * 255).round().byte().permute(1, 2, 0).numpy(), expected)
 
 
-def test_size_that_does_not_fit(photographs, make_coco, coco_dict):
+def test_an_image_of_another_size_than_annotated_is_refused(photographs, make_coco, coco_dict):
     data = coco_dict(BOXES)
     data["images"][1]["width"] = 41
     scenes = CocoScenes(photographs, make_coco(data=data), CLASSES, **ALL)
@@ -157,7 +157,7 @@ def test_size_that_does_not_fit(photographs, make_coco, coco_dict):
         scenes[0]
 
 
-def test_fingerprint_tells_what_matters(photographs, make_coco, coco_dict):
+def test_fingerprint_changes_with_annotations_and_settings(photographs, make_coco, coco_dict):
     scenes = CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
     prints = {scenes.fingerprint}
     assert CocoScenes(str(photographs), make_coco(BOXES), list(CLASSES), **ALL).fingerprint in prints
@@ -170,11 +170,11 @@ def test_fingerprint_tells_what_matters(photographs, make_coco, coco_dict):
     assert len({scenes.digest(i) for i in range(3)}) == 3
 
 
-def test_scenes_travel_to_workers(photographs, make_coco):
+def test_scenes_can_be_pickled(photographs, make_coco):
     scenes = CocoScenes(photographs, make_coco(BOXES), CLASSES, **ALL)
-    twin = pickle.loads(pickle.dumps(scenes))
-    assert twin.fingerprint == scenes.fingerprint
-    assert torch.equal(twin[0].boxes, scenes[0].boxes)
+    unpickled = pickle.loads(pickle.dumps(scenes))
+    assert unpickled.fingerprint == scenes.fingerprint
+    assert torch.equal(unpickled[0].boxes, scenes[0].boxes)
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_any_file_gives_scenes_or_a_data_error(photographs, tmp_path, coco_dict,
             else:
                 entry[where[-1]] = value
         except (KeyError, IndexError, TypeError):
-            continue  # an earlier change took the place away
+            continue  # an earlier change removed this entry
     path = tmp_path / "fuzz.json"
     path.write_text(json.dumps(data))
     try:
@@ -269,13 +269,13 @@ def test_development_photographs(shared):
             grid = np.zeros(annotation.size[::-1], dtype=bool)
             for x1, y1, x2, y2 in annotation.boxes[annotation.labels == label].round().int().tolist():
                 grid[y1:y2, x1:x2] = True
-            if abs(grid.mean() - 0.2) > 0.005:  # some boxes are not of whole pixels
+            if abs(grid.mean() - 0.2) > 0.005:  # some boxes do not end at whole pixels
                 legal.append((label, bool(grid.mean() <= 0.2)))
         assert all((label in union.targets(index)) == expected for label, expected in legal)
 
 
 @pytest.mark.slow
-def test_program_warns_of_nothing():
+def test_the_program_gives_no_warnings():
     run = subprocess.run(
         [sys.executable, "-W", "error::RuntimeWarning", "-m", "semfov.data.coco", "--help"],
         capture_output=True,

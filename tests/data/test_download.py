@@ -40,7 +40,7 @@ IMAGES, ANNOTATIONS = ARCHIVES.values()
 
 
 class Server(ThreadingHTTPServer):
-    """Serves FILES; `stop_after` closes each answer early, `ranges` is whether it knows ranges."""
+    """Serves FILES; `stop_after` cuts off each response, and `ranges` tells whether range requests are supported."""
 
     daemon_threads = True
 
@@ -90,7 +90,7 @@ def server():
 
 
 @pytest.fixture
-def dead_address():
+def unreachable_address():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -108,7 +108,7 @@ def tree(root):
 WHOLE = sorted(["annotations/instances_val2017.json", *PICTURES])
 
 
-def test_fetches_verifies_and_unpacks(server, tmp_path):
+def test_archives_are_fetched_verified_and_unpacked(server, tmp_path):
     get(tmp_path / "new" / "coco", server.address)
     root = tmp_path / "new" / "coco"
     assert tree(root) == WHOLE
@@ -116,10 +116,10 @@ def test_fetches_verifies_and_unpacks(server, tmp_path):
     assert all((root / name).read_bytes() == content for name, content in PICTURES.items())
     before = len(server.requests)
     get(root, server.address)
-    assert len(server.requests) == before  # all there
+    assert len(server.requests) == before  # nothing was missing
 
 
-def test_broken_transfers_go_on_where_they_stopped(server, tmp_path):
+def test_interrupted_transfers_continue_where_they_stopped(server, tmp_path):
     server.stop_after = 50_000
     get(tmp_path, server.address, keep=True)
     starts = [start for path, start in server.requests if path == "/zips/val2017.zip"]
@@ -128,7 +128,7 @@ def test_broken_transfers_go_on_where_they_stopped(server, tmp_path):
     assert tree(tmp_path) == sorted([*WHOLE, "val2017.zip", "annotations_trainval2017.zip"])
 
 
-def test_a_later_run_resumes(server, tmp_path):
+def test_a_later_run_resumes_the_transfer(server, tmp_path):
     server.stop_after = 0
     (tmp_path / "val2017.zip.part").write_bytes(FILES["/zips/val2017.zip"][:70_000])
     with pytest.raises(DataError, match=r"failed at 70,000 of [\d,]+ bytes \(the connection closed early\); run again"):
@@ -139,7 +139,7 @@ def test_a_later_run_resumes(server, tmp_path):
     assert server.requests[-1][1] == 70_000
 
 
-def test_server_without_ranges(server, tmp_path):
+def test_a_server_without_range_requests_sends_the_whole_file(server, tmp_path):
     server.ranges = False
     (tmp_path / "val2017.zip.part").write_bytes(b"x" * 70_000)
     assert fetch(IMAGES, tmp_path, address=server.address).read_bytes() == FILES["/zips/val2017.zip"]
@@ -154,27 +154,27 @@ def test_changed_content_is_refused_and_deleted(server, tmp_path):
     assert tree(tmp_path) == []
 
 
-def test_other_size_is_refused(server, tmp_path):
+def test_a_file_of_another_size_is_refused(server, tmp_path):
     server.files["/zips/val2017.zip"] += b"more"
     with pytest.raises(DataError, match=r"expected [\d,]+ bytes, the server has"):
         fetch(IMAGES, tmp_path, address=server.address)
 
 
-def test_server_errors(server, tmp_path):
+def test_a_busy_server_is_asked_again_and_a_missing_file_is_an_error(server, tmp_path):
     with pytest.raises(DataError, match=r"/elsewhere/zips/val2017\.zip: the server answers 404"):
         fetch(IMAGES, tmp_path, address=f"{server.address}/elsewhere")
     server.status = 503
     with pytest.raises(DataError, match="transfer failed at 0"):
         fetch(IMAGES, tmp_path, address=server.address, pause=0)
-    assert len(server.requests) == 4  # a missing file is final, a busy server is asked again
+    assert len(server.requests) == 4  # one request for a missing file, several to a busy server
 
 
-def test_no_network(tmp_path, dead_address):
+def test_without_a_network_the_error_suggests_copying_the_archive(tmp_path, unreachable_address):
     with pytest.raises(DataError, match=r"transfer failed at 0 .* or copy annotations_trainval2017\.zip into"):
-        get(tmp_path, dead_address)
+        get(tmp_path, unreachable_address)
 
 
-def test_a_fetched_archive_waits_for_a_run_that_unpacks_it(server, tmp_path, monkeypatch):
+def test_a_fetched_archive_is_kept_until_it_is_unpacked(server, tmp_path, monkeypatch):
     monkeypatch.setattr(download, "unpack", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         get(tmp_path, server.address)
@@ -188,29 +188,29 @@ def test_a_fetched_archive_waits_for_a_run_that_unpacks_it(server, tmp_path, mon
     assert tree(tmp_path) == WHOLE
 
 
-def test_another_splits_transfer_is_left_alone(server, tmp_path):
+def test_the_partial_download_of_another_split_is_kept(server, tmp_path):
     (tmp_path / ".download").mkdir()
     (tmp_path / ".download/train2017.zip.part").touch()
     get(tmp_path, server.address)
     assert tree(tmp_path) == sorted([".download/train2017.zip.part", *WHOLE])
 
 
-def test_archives_brought_by_hand_are_used_and_left(tmp_path, dead_address):
+def test_archives_copied_by_the_user_are_used_and_kept(tmp_path, unreachable_address):
     for path, data in FILES.items():
         (tmp_path / ARCHIVES[path].name).write_bytes(data)
-    get(tmp_path, dead_address)
+    get(tmp_path, unreachable_address)
     assert tree(tmp_path) == sorted([*WHOLE, "val2017.zip", "annotations_trainval2017.zip"])
 
 
-def test_wrong_archive_brought_by_hand(tmp_path, dead_address):
+def test_a_wrong_archive_copied_by_the_user_is_refused_and_kept(tmp_path, unreachable_address):
     (tmp_path / "annotations_trainval2017.zip").write_bytes(FILES["/annotations/annotations_trainval2017.zip"])
     (tmp_path / "val2017.zip").write_bytes(b"something else")
     with pytest.raises(DataError, match=r"val2017\.zip: expected sha256 .* delete it, and run again"):
-        get(tmp_path, dead_address)
+        get(tmp_path, unreachable_address)
     assert (tmp_path / "val2017.zip").read_bytes() == b"something else"
 
 
-def test_unpacking_goes_on_and_mends(tmp_path):
+def test_unpacking_keeps_complete_files_and_replaces_damaged_ones(tmp_path):
     (tmp_path / "val2017.zip").write_bytes(FILES["/zips/val2017.zip"])
     first, second, _ = PICTURES
     (tmp_path / "val2017").mkdir()
@@ -222,7 +222,7 @@ def test_unpacking_goes_on_and_mends(tmp_path):
     assert (tmp_path / first).stat().st_mtime_ns == before
 
 
-def test_a_missing_picture_is_fetched_again(server, tmp_path):
+def test_a_missing_image_is_fetched_again(server, tmp_path):
     get(tmp_path, server.address)
     (tmp_path / "val2017" / NAMES[1]).unlink()
     get(tmp_path, server.address)
@@ -230,7 +230,7 @@ def test_a_missing_picture_is_fetched_again(server, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["val2017/../../evil", "val2017/..\\evil", "val2017/C:evil"])
-def test_names_that_lead_out_are_refused(tmp_path, name):
+def test_archive_members_outside_the_folder_are_refused(tmp_path, name):
     root = tmp_path / "root"
     (tmp_path / "a.zip").write_bytes(zipped({name: b"evil"}))
     with pytest.raises(DataError, match="unsafe name"):
@@ -238,7 +238,7 @@ def test_names_that_lead_out_are_refused(tmp_path, name):
     assert tree(tmp_path) == ["a.zip"]
 
 
-def test_links_are_refused(tmp_path):
+def test_archive_members_that_are_links_are_refused(tmp_path):
     link = zipfile.ZipInfo("val2017/link")
     link.external_attr = (stat.S_IFLNK | 0o777) << 16
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
@@ -247,7 +247,7 @@ def test_links_are_refused(tmp_path):
         unpack(tmp_path / "a.zip", tmp_path, "val2017/")
 
 
-def test_damaged_and_empty_zip_files(tmp_path):
+def test_damaged_and_empty_zip_files_are_refused(tmp_path):
     (tmp_path / "a.zip").write_bytes(b"no zip")
     with pytest.raises(DataError, match="damaged zip file"):
         unpack(tmp_path / "a.zip", tmp_path, "val2017/")
@@ -256,14 +256,14 @@ def test_damaged_and_empty_zip_files(tmp_path):
         unpack(tmp_path / "b.zip", tmp_path, "val2017/")
 
 
-def test_full_disk(server, tmp_path, monkeypatch):
+def test_too_little_free_space_is_an_error_before_the_download(server, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(download.shutil, "disk_usage", lambda _: usage._replace(free=1000))
     with pytest.raises(DataError, match="free space"):
         get(tmp_path, server.address)
 
 
-def test_disk_that_fills_up(server, tmp_path, monkeypatch):
+def test_a_disk_that_fills_up_is_an_error_and_a_later_run_completes(server, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -275,13 +275,13 @@ def test_disk_that_fills_up(server, tmp_path, monkeypatch):
     assert tree(tmp_path) == WHOLE
 
 
-def test_root_that_is_a_file(tmp_path, dead_address):
+def test_a_root_below_a_file_is_refused(tmp_path, unreachable_address):
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match="cannot be written"):
-        get(tmp_path / "file" / "coco", dead_address)
+        get(tmp_path / "file" / "coco", unreachable_address)
 
 
-def test_program(server, tmp_path, monkeypatch, capsys):
+def test_the_program_downloads_and_reports_errors(server, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(SPLITS, "val2017", IMAGES)
     monkeypatch.setattr(download, "_ANNOTATIONS", ANNOTATIONS)
     assert main(["val2017", "--root", str(tmp_path), "--address", server.address]) == 0
@@ -291,7 +291,7 @@ def test_program(server, tmp_path, monkeypatch, capsys):
     assert re.fullmatch(r"error: .*404.*\n", capsys.readouterr().err)
 
 
-def test_program_interrupted(tmp_path, monkeypatch, capsys):
+def test_an_interrupted_program_says_how_to_resume(tmp_path, monkeypatch, capsys):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 

@@ -1,4 +1,4 @@
-"""Annotations of others name files: only regular ones below the root are read, and none is written elsewhere."""
+"""File names in annotations are not trusted: only regular files below the root are read or written."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from semfov.io.files import check_regular, clean, inside, replacing
 
 @pytest.fixture
 def data(tmp_path):
-    """Writes annotations of one image and opens them."""
+    """The root folder, and a function that writes annotations of one image and opens them."""
     root = tmp_path / "root"
     root.mkdir()
     Image.new("RGB", (40, 30)).save(root / "a.png")
@@ -37,7 +37,7 @@ def data(tmp_path):
     "name",
     ["../outside.png", "sub/../../outside.png", "link.png", "folder/outside.png", "/absolute", "./../outside.png"],
 )
-def test_files_outside_of_the_root_are_refused(data, name):
+def test_files_outside_the_root_are_refused(data, name):
     root, scenes = data
     (root / "link.png").symlink_to(root.parent / "outside.png")
     (root / "folder").symlink_to(root.parent)
@@ -46,7 +46,7 @@ def test_files_outside_of_the_root_are_refused(data, name):
         scenes(absolute if name == "/absolute" else name)
 
 
-def test_links_inside_of_the_root_and_to_the_root_are_followed(data, tmp_path):
+def test_links_inside_the_root_and_to_the_root_are_followed(data, tmp_path):
     root, scenes = data
     (root / "link.png").symlink_to("a.png")
     assert scenes("link.png")[0].size == (40, 30)
@@ -56,7 +56,7 @@ def test_links_inside_of_the_root_and_to_the_root_are_followed(data, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
-def test_what_is_no_regular_file_is_refused_before_it_is_read(data, tmp_path, kind):
+def test_pipes_devices_and_folders_are_refused_before_they_are_read(data, tmp_path, kind):
     root, scenes = data
     path = root / "odd.png"
     if kind == "pipe":
@@ -78,7 +78,7 @@ def test_what_is_no_regular_file_is_refused_before_it_is_read(data, tmp_path, ki
 
 
 @pytest.mark.parametrize("text", ["a\0b", "a\ud800", "a\nb", "\x1b[31m"])
-def test_text_that_cannot_be_written_is_refused_at_once(data, text):
+def test_control_characters_in_annotations_are_refused(data, text):
     _, scenes = data
     for arguments in ({"identity": text}, {"file_name": text}, {"category": text}):
         with pytest.raises(DataError, match=r"expected (id|file_name|name) to have no control characters, got '"):
@@ -86,7 +86,7 @@ def test_text_that_cannot_be_written_is_refused_at_once(data, text):
 
 
 @pytest.mark.parametrize("name", ["../a", "/a", "b/../../a", "", ".", "..", "a\0", "link/a", "x" * 5000])
-def test_no_name_leads_out_of_a_folder(tmp_path, name):
+def test_names_outside_the_folder_are_refused(tmp_path, name):
     folder = tmp_path / "out"
     folder.mkdir()
     (folder / "link").symlink_to(tmp_path)
@@ -96,7 +96,7 @@ def test_no_name_leads_out_of_a_folder(tmp_path, name):
 
 
 @pytest.mark.parametrize("text", ["/../../../x/evil", "..", "", "a" * 1000, "ä/ö", "con\0", "-rf", ".hidden", "a\\b"])
-def test_cleaned_names_are_those_of_files_in_the_folder(tmp_path, text):
+def test_cleaned_names_give_files_in_the_folder(tmp_path, text):
     path = inside(tmp_path, f"{clean(text)}.png")
     assert path.parent == tmp_path
     path.write_text("")

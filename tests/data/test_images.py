@@ -13,7 +13,7 @@ from semfov.data import read_image
 from semfov.data.images import MAX_PIXELS
 from semfov.errors import DataError
 
-# Four colours, one per quadrant, so that any turn or mirroring shows.
+# Four colours, one per quadrant, so that every rotation or mirroring is visible.
 COLOURS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], dtype=np.uint8)
 PICTURE = COLOURS.repeat(8, axis=0).repeat(12, axis=1)  # 16 high, 24 wide
 
@@ -32,7 +32,7 @@ def test_rgb_png_is_exact(tmp_path):
     assert np.array_equal(image.permute(1, 2, 0).numpy(), pixels.astype(np.float32) / 255)
 
 
-# What each EXIF orientation means, by where the standard shows row 0 and column 0 of the stored pixels.
+# Effect of each EXIF orientation: the standard gives the position of row 0 and column 0 of the stored pixels.
 SHOWN = {
     1: lambda a: a,
     2: lambda a: a[:, ::-1],
@@ -47,7 +47,7 @@ SHOWN = {
 
 @pytest.mark.parametrize("kind", ["png", "jpg", "webp", "tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_exif_orientation(tmp_path, orientation, kind):
+def test_photographs_are_rotated_by_exif_orientation(tmp_path, orientation, kind):
     exif = Image.Exif()
     exif[0x0112] = orientation
     path = tmp_path / f"a.{kind}"
@@ -57,19 +57,19 @@ def test_exif_orientation(tmp_path, orientation, kind):
     expected = SHOWN[orientation](PICTURE).astype(int)
     assert shown.shape == expected.shape
     assert abs(shown - expected).max() <= 12
-    if kind != "tif":  # Pillow turns TIFF files itself
+    if kind != "tif":  # Pillow rotates TIFF files itself
         assert abs(bits(read_image(path, oriented=False)).astype(int) - PICTURE).max() <= 12
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 65535])
-def test_unknown_orientation_is_upright(tmp_path, orientation):
+def test_an_unknown_orientation_is_ignored(tmp_path, orientation):
     exif = Image.Exif()
     exif[0x0112] = orientation
     Image.fromarray(PICTURE).save(tmp_path / "a.png", exif=exif)
     assert np.array_equal(bits(read_image(tmp_path / "a.png")), PICTURE)
 
 
-def test_damaged_exif_is_passed_over(tmp_path):
+def test_damaged_exif_data_are_ignored(tmp_path):
     Image.fromarray(PICTURE).save(tmp_path / "a.png", exif=b"Exif\0\0MM\0*\xff\xff\xff\xff\0\1\2")
     assert np.array_equal(bits(read_image(tmp_path / "a.png")), PICTURE)
 
@@ -80,7 +80,7 @@ def test_grey_has_three_equal_channels(tmp_path):
     assert np.array_equal(image, np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, -1))
 
 
-def test_bilevel(tmp_path):
+def test_bilevel_images_are_read(tmp_path):
     Image.fromarray(np.array([[0, 255], [255, 0]], np.uint8)).convert("1").save(tmp_path / "a.png")
     assert read_image(tmp_path / "a.png")[1].tolist() == [[0, 1], [1, 0]]
 
@@ -92,12 +92,12 @@ def test_cmyk_jpeg(tmp_path):
     assert read_image(tmp_path / "black.tif").max() == 0
 
 
-def test_palette(tmp_path):
+def test_palette_images_are_read(tmp_path):
     Image.fromarray(PICTURE).quantize(4).save(tmp_path / "a.png")
     assert np.array_equal(bits(read_image(tmp_path / "a.png")), PICTURE)
 
 
-def test_transparency_lies_on_white(tmp_path):
+def test_transparent_pixels_are_blended_with_white(tmp_path):
     alpha = np.array([[0, 255, 128]], np.uint8)
     colour = np.zeros((1, 3, 3), np.uint8)
     colour[..., 0] = 200
@@ -158,7 +158,7 @@ def test_float_tiff(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["gif", "webp", "png"])
-def test_first_frame_of_an_animation(tmp_path, kind):
+def test_the_first_frame_of_an_animation_is_read(tmp_path, kind):
     frames = [Image.new("RGB", (6, 4), colour) for colour in ("red", "blue", "lime")]
     lossless = {"lossless": True} if kind == "webp" else {}
     frames[0].save(tmp_path / f"a.{kind}", save_all=True, append_images=frames[1:], duration=50, **lossless)
@@ -166,12 +166,12 @@ def test_first_frame_of_an_animation(tmp_path, kind):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 700), (20000, 3)])
-def test_odd_sizes(tmp_path, size):
+def test_images_of_any_size_are_read(tmp_path, size):
     Image.new("RGB", size, "red").save(tmp_path / "a.png")
     assert read_image(tmp_path / "a.png").shape == (3, size[1], size[0])
 
 
-def test_missing_and_wrong_files(tmp_path):
+def test_missing_files_and_other_kinds_of_files_are_refused(tmp_path):
     with pytest.raises(DataError, match=r"no\.jpg: no such file; check its path"):
         read_image(tmp_path / "no.jpg")
     with pytest.raises(DataError, match="expected a file, got a folder"):
@@ -185,7 +185,7 @@ def test_missing_and_wrong_files(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["jpg", "png", "gif", "webp", "tif"])
-def test_truncated(tmp_path, kind):
+def test_truncated_files_are_refused(tmp_path, kind):
     noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
     Image.fromarray(noise).save(tmp_path / f"a.{kind}")
     whole = (tmp_path / f"a.{kind}").read_bytes()
@@ -195,7 +195,7 @@ def test_truncated(tmp_path, kind):
 
 
 @pytest.mark.parametrize("side", [9600, 60000])
-def test_decompression_bomb(tmp_path, side):
+def test_a_decompression_bomb_is_refused(tmp_path, side):
     header = struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
     chunk = b"IHDR" + header
     data = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))

@@ -1,4 +1,4 @@
-"""Pictures read by windows: every source gives the same pixels, within its memory."""
+"""Large pictures read window by window: every source gives the same pixels, with limited memory."""
 
 import os
 import tracemalloc
@@ -50,7 +50,7 @@ def test_grey_has_three_channels(tmp_path):
         assert np.array_equal(open_large(source).pixels((3, 4, 9, 8)), np.repeat(array[4:8, 3:9, None], 3, -1))
 
 
-def test_turned_photographs_stand_upright(tmp_path):
+def test_rotated_photographs_are_read_upright(tmp_path):
     array = pixels()
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -60,7 +60,7 @@ def test_turned_photographs_stand_upright(tmp_path):
     assert np.array_equal(picture.pixels((0, 0, 150, 230)), np.rot90(array, -1))
 
 
-def test_reduced_windows_are_means_of_squares(monkeypatch):
+def test_reduced_windows_are_means_of_square_blocks(monkeypatch):
     monkeypatch.setattr("semfov.data.large._STRIP", 2000)
     array = pixels(128, 192)
     got = ArrayPicture(array).read((0, 0, 192, 128), 4).permute(1, 2, 0).double()
@@ -68,7 +68,7 @@ def test_reduced_windows_are_means_of_squares(monkeypatch):
     assert float((got - expected).abs().max()) <= 0.5 + 1e-9
 
 
-def test_overview_of_a_jpeg_is_drafted(tmp_path):
+def test_a_reduced_jpeg_is_decoded_at_reduced_size(tmp_path):
     smooth = Image.fromarray(pixels(8, 8)).resize((1600, 1200), Image.Resampling.BICUBIC)
     smooth.save(tmp_path / "a.jpg", quality=95)
     picture = PhotographPicture(tmp_path / "a.jpg")
@@ -82,7 +82,7 @@ def test_overview_of_a_jpeg_is_drafted(tmp_path):
     assert float((draft.double() - whole.double()).abs().mean()) < 3
 
 
-def test_windows_of_a_mapped_file_need_no_more_than_themselves(tmp_path):
+def test_windows_of_a_memory_mapped_file_need_little_memory(tmp_path):
     side = 6000
     mapped = np.lib.format.open_memmap(tmp_path / "large.npy", mode="w+", dtype=np.uint8, shape=(side, side, 3))
     mapped[2000:2100, 3000:3100] = 200
@@ -112,7 +112,7 @@ def test_tiles_are_decoded_one_at_a_time(tmp_path):
     assert peak < 4e6
 
 
-def test_errors(tmp_path):
+def test_unreadable_files_and_windows_outside_the_picture_are_refused(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"no picture")
     with pytest.raises(DataError, match="cannot be opened"):
         open_large(tmp_path / "a.jpg")
@@ -133,7 +133,7 @@ def test_errors(tmp_path):
         MemoryPicture(torch.zeros(3, 4, 4)).read((0, 0, 5, 4))
 
 
-def test_files_that_end_early_are_told(tmp_path):
+def test_truncated_files_are_refused(tmp_path):
     tifffile = pytest.importorskip("tifffile")
     Image.fromarray(pixels()).save(tmp_path / "a.jpg")
     tifffile.imwrite(tmp_path / "a.tif", pixels(), tile=(64, 48), photometric="rgb", compression="zlib")
@@ -145,8 +145,8 @@ def test_files_that_end_early_are_told(tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA", "I;16", "1", "P", "CMYK"])
-def test_modes_are_read_as_of_small_pictures(tmp_path, mode):
-    """16 bits keep their range, and what is transparent is white."""
+def test_every_colour_mode_is_read_as_by_read_image(tmp_path, mode):
+    """16-bit values keep their range, and transparent pixels are white."""
     if mode == "I;16":
         image = Image.fromarray(np.linspace(0, 65535, 150 * 230).reshape(150, 230).astype(np.uint16))
     elif mode == "RGBA":

@@ -1,4 +1,4 @@
-"""Mosaics: what is where, by seed, and boxes that fit the pixels."""
+"""Mosaics: layout by seed, and boxes that fit the pixels."""
 
 import pytest
 import torch
@@ -14,21 +14,21 @@ def make(**changes):
 
 
 @pytest.mark.slow
-def test_seed_and_number_decide():
+def test_a_mosaic_depends_only_on_seed_and_index():
     assert torch.equal(make()[1].image, make(count=9)[1].image)
     assert make().fingerprint != make(seed=2).fingerprint
     assert [tile.index for tile in make().tiles(0)] != [tile.index for tile in make(seed=2).tiles(0)]
     assert make().digest(0) == make().digest(0) != make().digest(1)
 
 
-def test_photographs_are_there_once_where_there_are_enough():
+def test_no_photograph_is_repeated_if_there_are_enough():
     for index in range(3):
         numbers = [tile.index for tile in make().tiles(index)]
         assert len(set(numbers)) == 4
     assert sorted(tile.index for tile in make(columns=5, rows=2).tiles(0)) == sorted([*range(5)] * 2)
 
 
-def test_pixels_and_boxes_move_together():
+def test_boxes_move_with_the_pixels_of_their_tile():
     mosaics = make(tile=(640, 500))
     scene = mosaics[0]
     assert scene.size == (1280, 1000)
@@ -45,7 +45,7 @@ def test_pixels_and_boxes_move_together():
     assert start == len(scene.boxes)
 
 
-def test_scaled_boxes_hold_what_the_photographs_do():
+def test_boxes_are_scaled_with_their_photographs():
     mosaics = make()
     annotation = mosaics.annotation(0)
     limit = torch.tensor([640.0, 512, 640, 512])

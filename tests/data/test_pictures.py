@@ -17,7 +17,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_pictures_stand_in_the_order_of_their_names_and_hold_no_objects(folder):
+def test_pictures_are_sorted_by_name_and_have_no_objects(folder):
     pictures = Pictures(folder, ["b.png", "a.png", "b.png"], ("person", "cup"))
     assert pictures.ids == ["a.png", "b.png"]
     assert [pictures[index].image.shape for index in range(2)] == [(3, 6, 9), (3, 6, 8)]
@@ -27,7 +27,7 @@ def test_pictures_stand_in_the_order_of_their_names_and_hold_no_objects(folder):
     assert pictures.targets(0) == []
 
 
-def test_digests_are_of_the_files(folder):
+def test_digests_depend_on_the_content_of_the_files(folder):
     pictures = Pictures(folder, ["a.png", "b.png"], ("person",))
     assert pictures.digest(0) == hashlib.sha256((folder / "a.png").read_bytes()).hexdigest()
     before = pictures.fingerprint
@@ -37,6 +37,6 @@ def test_digests_are_of_the_files(folder):
 
 
 @pytest.mark.parametrize("name", ["missing.png", "../a.png"])
-def test_names_that_lead_nowhere_are_told(folder, name):
+def test_missing_files_and_files_outside_the_folder_are_refused(folder, name):
     with pytest.raises(DataError, match=r"missing\.png|leads out"):
         Pictures(folder, ["a.png", name], ("person",))

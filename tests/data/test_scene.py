@@ -19,7 +19,7 @@ def integer_boxes(draw):
 
 
 @given(integer_boxes())
-def test_coverage_against_a_pixel_grid(case):
+def test_coverage_equals_counts_on_a_pixel_grid(case):
     boxes, (width, height) = case
     grid = np.zeros((height, width), dtype=int)
     for x1, y1, x2, y2 in boxes:
@@ -30,7 +30,7 @@ def test_coverage_against_a_pixel_grid(case):
 
 
 @given(integer_boxes(), st.floats(0.1, 8))
-def test_coverage_does_not_change_with_the_scale(case, factor):
+def test_coverage_does_not_depend_on_the_scale(case, factor):
     boxes, (width, height) = case
     tensor = torch.tensor(boxes, dtype=torch.float64)
     for coverage in ("sum", "union"):
@@ -39,8 +39,10 @@ def test_coverage_does_not_change_with_the_scale(case, factor):
         assert large == pytest.approx(small, abs=1e-9)
 
 
-def test_exactly_the_limit_is_legal():
-    boxes = torch.tensor([[0.0, 0.0, 128.0, 480.0], [0.0, 0.0, 129.0, 480.0]])  # 20 % of 640 x 480, and more
+def test_a_target_that_covers_exactly_the_limit_is_legal():
+    boxes = torch.tensor(
+        [[0.0, 0.0, 128.0, 480.0], [0.0, 0.0, 129.0, 480.0]]
+    )  # exactly 20 % of 640 x 480, and slightly more
     scene = Annotation(boxes, torch.tensor([2, 5]), torch.zeros(2, dtype=torch.bool), (640, 480))
     assert legal_targets(scene, 0.2) == [2]
     assert legal_targets(scene, None) == [2, 5]

@@ -34,7 +34,7 @@ def test_shapes(scenes):
     assert [s.id for s in EmbeddedScenes(CLASSES, count=2)] == [0, 1]
 
 
-def test_patches_neither_overlap_nor_leave_the_scene(scenes):
+def test_patches_do_not_overlap_and_lie_inside_the_scene(scenes):
     for index in range(COUNT):
         taken = np.zeros((480, 640), dtype=int)
         items = scenes.items(index)
@@ -47,7 +47,7 @@ def test_patches_neither_overlap_nor_leave_the_scene(scenes):
         assert taken.max() == 1
 
 
-def test_boxes_lie_in_their_patches_and_name_their_objects(scenes):
+def test_boxes_lie_in_their_patches_and_labels_name_their_objects(scenes):
     for index in range(COUNT):
         annotation = scenes.annotation(index)
         objects = [item for item in scenes.items(index) if item.photograph.label]
@@ -70,7 +70,7 @@ def test_every_object_is_a_legal_target(scenes):
 
 
 def test_mirrored_boxes_follow_the_pixels():
-    """The patch shows the object where its box says: checked on a photograph that is white inside the box only."""
+    """Checked on a photograph that is white only inside the box of its object."""
     photograph = module.Photograph("test", "skimage", "test.png", (10, 20, 110, 80), "cat", (30, 25, 60, 75))
     pixels = np.zeros((100, 120), np.uint8)
     pixels[25:75, 30:60] = 255
@@ -107,7 +107,7 @@ def test_boxes_lie_in_their_crops():
             assert top <= y1 < y2 <= bottom
 
 
-def test_photographs_come_in_the_wheels():
+def test_photographs_are_files_of_the_installed_packages():
     from importlib.metadata import files
 
     carried = {str(f) for name in ("scikit-image", "matplotlib") for f in files(name)}
@@ -117,7 +117,7 @@ def test_photographs_come_in_the_wheels():
 
 
 @pytest.mark.slow
-def test_a_seed_gives_the_same_bits_in_another_process(scenes):
+def test_a_seed_gives_bit_identical_scenes_in_another_process(scenes):
     program = (
         "from semfov.data import EmbeddedScenes\n"
         f"s = EmbeddedScenes({CLASSES!r}, count={COUNT})\n"
@@ -128,12 +128,12 @@ def test_a_seed_gives_the_same_bits_in_another_process(scenes):
     assert torch.equal(scenes[5].image, scenes[5].image)
 
 
-def test_digest_is_of_the_pixels(scenes):
+def test_digest_is_computed_from_the_pixels(scenes):
     pixels = (scenes[2].image * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
     assert scenes.digest(2) == hashlib.sha256(pixels.tobytes()).hexdigest()
 
 
-def test_more_scenes_leave_the_first_as_they_are(scenes):
+def test_the_first_scenes_do_not_depend_on_the_number_of_scenes(scenes):
     few = EmbeddedScenes(CLASSES, count=2)
     assert few.digest(1) == scenes.digest(1)
     assert few.fingerprint != scenes.fingerprint
@@ -141,7 +141,7 @@ def test_more_scenes_leave_the_first_as_they_are(scenes):
     assert len({few.digest(0), few.digest(1), other.digest(0), other.digest(1)}) == 4
 
 
-def test_classes_that_the_detector_lacks_have_no_box():
+def test_objects_of_classes_unknown_to_the_detector_have_no_box():
     scenes = EmbeddedScenes(("dog", "cat"), count=6)
     for index in range(6):
         assert set(scenes.annotation(index).labels.tolist()) <= {2}
@@ -159,7 +159,7 @@ def test_bad_arguments():
         EmbeddedScenes(CLASSES, count=2)[2]
 
 
-def test_missing_packages_and_files(monkeypatch):
+def test_missing_packages_and_files_are_errors(monkeypatch):
     monkeypatch.setitem(module._FOLDERS, "skimage", "elsewhere")
     with pytest.raises(DataError, match=r"expected the photograph .* pip install"):
         EmbeddedScenes(CLASSES)

@@ -1,4 +1,4 @@
-"""Pictures come from files, folders, videos and embedded scenes, and what cannot be read says why."""
+"""Pictures from files, folders, videos and embedded scenes, and the errors for unreadable sources."""
 
 import builtins
 
@@ -15,7 +15,7 @@ SHADES = (20, 90, 160, 230)
 
 @pytest.fixture
 def video(tmp_path):
-    """Eight frames, two of each shade."""
+    """A video of eight frames, two of each shade of blue."""
     cv2 = pytest.importorskip("cv2")
     path = tmp_path / "video.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 5, (64, 48))
@@ -26,7 +26,7 @@ def video(tmp_path):
     return path
 
 
-def test_photograph_and_folder(tmp_path):
+def test_pictures_of_a_file_and_of_a_folder(tmp_path):
     for name in ("b.png", "a.jpg"):
         Image.new("RGB", (8, 6), "red").save(tmp_path / name)
     (tmp_path / "notes.txt").write_text("no picture")
@@ -36,11 +36,11 @@ def test_photograph_and_folder(tmp_path):
     assert [picture.name for picture in open_pictures(tmp_path)] == ["a.jpg", "b.png"]
 
 
-def test_frames_of_a_video_come_one_after_the_other(video):
+def test_frames_of_a_video_are_read_in_order(video):
     stream = open_stream(video)
     taken = list(stream.frames)
     assert (stream.name, stream.rate) == ("video.avi", 5.0)
-    # Blue, which OpenCV puts first, is the last channel here.
+    # Blue is the first channel in OpenCV, and the last one here.
     shades = [float(picture.image[2].mean() * 255) for picture in taken]
     np.testing.assert_allclose(shades, np.repeat(SHADES, 2), atol=6)
     assert all(float(picture.image[0].mean()) < 0.1 for picture in taken)
@@ -49,7 +49,7 @@ def test_frames_of_a_video_come_one_after_the_other(video):
     assert len(list(open_stream(video, 100).frames)) == 8
 
 
-def test_what_cannot_be_read(tmp_path, monkeypatch):
+def test_unreadable_sources_are_errors(tmp_path, monkeypatch):
     with pytest.raises(DataError, match="no such file"):
         list(open_pictures(tmp_path / "none.jpg"))
     with pytest.raises(DataError, match="got none"):
@@ -74,7 +74,7 @@ def test_what_cannot_be_read(tmp_path, monkeypatch):
         open_stream(broken)
 
 
-def test_embedded_scene_holds_the_target():
+def test_an_embedded_scene_contains_the_target():
     picture = embedded_picture(("person", "cup"), "cup", seed=2)
     assert picture.image.shape == (3, 480, 640)
     assert len(picture.boxes) == 1

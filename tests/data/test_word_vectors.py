@@ -1,4 +1,4 @@
-"""Vectors of words: both formats, names of several words, and descriptions spread over classes, against numpy."""
+"""Word vectors against numpy: both file formats, names of several words, and weights of classes for a description."""
 
 import hashlib
 
@@ -28,14 +28,14 @@ def path(request, tmp_path):
     return file
 
 
-def test_only_what_is_asked_for_is_read_and_the_rest_is_named(path):
+def test_only_requested_words_are_read_and_missing_ones_are_listed(path):
     words = WordVectors.read(path, ["Wine_Glass", "dog", "toaster oven"])
     assert set(words.vectors) == {"wine", "glass", "dog"}
     assert words.missing == ("oven", "toaster")
     assert words.digest == hashlib.sha256(path.read_bytes()).hexdigest()
     expected = (VECTORS[1] + VECTORS[2]) / 2
     np.testing.assert_allclose(words.vector("wine glass"), expected, rtol=1e-5)
-    # Of a name that is half known, the half counts.
+    # If only some words of a name are known, their mean is used.
     half = WordVectors.read(path, ["cow shed"])
     np.testing.assert_allclose(half.vector("cow shed"), VECTORS[4], rtol=1e-5)
     assert not words.knows("toaster")
@@ -54,7 +54,7 @@ def test_similarity_is_the_cosine(path):
             assert float(got[row, column]) == pytest.approx(a @ b / np.sqrt((a @ a) * (b @ b)), abs=1e-6)
 
 
-def test_a_word_in_lower_case_goes_before_a_name(tmp_path):
+def test_a_word_in_lower_case_has_priority(tmp_path):
     file = tmp_path / "vectors.txt"
     file.write_text("Turkey 1 0\nturkey 0 1\nTURKEY 1 1\n")
     assert WordVectors.read(file, ["turkey"]).vectors["turkey"].tolist() == [0, 1]
@@ -80,11 +80,11 @@ def test_weights_are_a_softmax_whose_largest_is_one(temperature, seed):
     ("description", "words"),
     [("something to drink from", ["drink"]), ("Fire-Hydrant", ["fire", "hydrant"]), ("one of it", ["one", "of", "it"])],
 )
-def test_little_words_do_not_count_unless_there_are_no_others(description, words):
+def test_function_words_are_ignored_unless_there_are_no_others(description, words):
     assert words_of(description) == words
 
 
-def test_damage_is_told_by_file_and_line(path, tmp_path):
+def test_errors_name_the_file_line_or_argument(path, tmp_path):
     with pytest.raises(DataError, match=r"nothing\.txt"):
         WordVectors.read(tmp_path / "nothing.txt", ["cup"])
     with pytest.raises(InputError, match="zebra"):
@@ -107,7 +107,7 @@ def test_damage_is_told_by_file_and_line(path, tmp_path):
             spread("cup", ["cup"], words, **options)
 
 
-def test_every_class_is_alike_to_itself_alone():
+def test_every_class_name_matches_only_its_own_class():
     for place, name in enumerate(COCO_CLASSES):
         for spelling in (name, name.upper(), name.replace(" ", "_")):
             assert alike(spelling, COCO_CLASSES) == [place]
@@ -116,7 +116,7 @@ def test_every_class_is_alike_to_itself_alone():
     assert alike("spaceship", COCO_CLASSES) == []
 
 
-def test_longer_names_hide_the_shorter_ones_in_them():
+def test_a_longer_name_has_priority_over_a_shorter_one_inside_it():
     text = "1. A hot dog\n2. Wine glasses and forks\n3. People, TVs, a fridge; mugs."
     expected = {"hot dog", "wine glass", "fork", "person", "tv", "refrigerator", "cup"}
     assert named_in(text, COCO_CLASSES) == expected

@@ -31,7 +31,7 @@ def beta():
 
 
 def values_of(acquisition, beta):
-    """Values for a Dirichlet belief with these parameters, when nothing was visited."""
+    """Values for a Dirichlet belief with these parameters, before any cell was visited."""
     return acquisition(DirichletBelief(beta), torch.zeros(beta.shape[:-1], dtype=torch.bool))
 
 
@@ -50,7 +50,7 @@ def test_value_equals_the_loop(beta):
             assert float(got[episode, f]) == pytest.approx(total)
 
 
-def test_nothing_is_gained_where_all_is_known():
+def test_value_is_zero_where_every_cell_is_certain():
     beta = torch.full((1, 12, 3), 1e-6)
     beta[0, :6, 0] = 1000.0
     beta[0, 6:, 2] = 1000.0
@@ -68,7 +68,7 @@ def test_policy_by_name(beta):
         ExpectedAccuracy(blind, GRID)
 
 
-def test_a_belief_about_one_picture_alone_or_about_other_cells(beta):
+def test_an_unbatched_belief_is_accepted_and_another_number_of_cells_is_refused(beta):
     acquisition = ExpectedAccuracy(Model(), GRID)
     torch.testing.assert_close(values_of(acquisition, beta[0]), values_of(acquisition, beta)[0])
     for other in (beta[:, :11], beta[0, 0]):

@@ -1,4 +1,4 @@
-"""What holds for every acquisition function: one signature, rows of a batch, gradients, one graph, which beliefs."""
+"""Properties of every acquisition function: signature, batches, gradients, dtypes, and the beliefs that it accepts."""
 
 import inspect
 
@@ -56,17 +56,17 @@ PRIOR = {
     "SaliencyPrior": lambda: acquisition.SaliencyPrior(acquisition.TargetPosterior(TARGETS), rand(3, 12), weight=0.3)
 }
 EVERY = SEARCH | EXPLORATION | BLIND | PRIOR
-# These need to know no more than where the target may be, or nothing at all.
+# These need only the probabilities of the target, or no belief at all.
 OF_ONE_TARGET = {"TargetPosterior", "FovealHit", "PlaceInformation", "SaliencyPrior", *BLIND}
 
 
 def beliefs():
-    """Three episodes that have looked, each somewhere else."""
+    """Beliefs of three episodes, each after one look at a different cell."""
     return DirichletBelief(0.3 + 4 * rand(3, 12, 4, seed=1) ** 2, GRID.cell_distance[[0, 6, 11]].double())
 
 
-def told_of(present, following, closest):
-    """A belief about one target that says this of it, and anything of the rest."""
+def target_belief(present, following, closest):
+    """A belief about one target with these probabilities; its other fields are random."""
     others, rest = rand(4, 3, 12, seed=7), rand(3, 3, seed=8)
     return TargetBelief(closest, *others, *rest[1:], visits(), present, following, rest[0])
 
@@ -74,7 +74,7 @@ def told_of(present, following, closest):
 def about_one_target():
     present, closest = rand(3, 12), GRID.cell_distance[[0, 6, 11]].double()
     return [
-        told_of(present, present, closest),
+        target_belief(present, present, closest),
         ContextBelief(present, present, closest, beliefs(), rand(3, 12, 4)),
     ]
 
@@ -90,13 +90,13 @@ def name(request):
     return request.param
 
 
-def test_none_is_forgotten():
-    # These have tests of their own: they go by a learned map, by d', by templates, or by all classes but background.
+def test_every_acquisition_function_is_tested():
+    # These have their own tests: they need a learned map, d', templates, or all classes except background.
     own = {"ExpectedGain", "EntropyLimit", "CorrectLocalisation", "TemplateAttention", "ObjectEvidence"}
     assert set(acquisition.__all__) - {"AcquisitionFunction"} == (set(EVERY) - {"LearnedAcquisition"}) | own
 
 
-def test_one_signature(name):
+def test_every_function_takes_belief_and_visited(name):
     function = EVERY[name]()
     assert isinstance(function, acquisition.AcquisitionFunction)
     assert list(inspect.signature(function.forward).parameters) == ["belief", "visited"]
@@ -106,7 +106,7 @@ def test_one_signature(name):
 
 
 def one_row(tensors, row):
-    """An acquisition function that was made for a batch, for one of its episodes."""
+    """Reduce an acquisition function made for a batch to one episode of it."""
     for module in tensors.modules():
         for key, buffer in module.named_buffers(recurse=False):
             if key in ("target", "visibility", "values", "log_prior"):
@@ -114,7 +114,7 @@ def one_row(tensors, row):
     return tensors
 
 
-def test_batches_are_rows(name):
+def test_a_batch_gives_the_values_of_each_episode_alone(name):
     together = EVERY[name]()(beliefs(), visits())
     for row in range(3):
         alone = one_row(EVERY[name](), row)(beliefs()[row : row + 1], visits()[row : row + 1])
@@ -129,14 +129,14 @@ def test_gradients(name):
 
 
 @pytest.mark.parametrize("name", BLIND)
-def test_what_does_not_look_at_the_belief_has_no_gradient(name):
+def test_functions_that_ignore_the_belief_have_no_gradient(name):
     known = beliefs()
     known.beta.requires_grad_()
     assert not EVERY[name]()(known, visits()).requires_grad
 
 
-def test_dtype_is_that_of_the_belief(name):
-    """An observation model in double serves beliefs in single precision."""
+def test_values_have_the_dtype_of_the_belief(name):
+    """An observation model in double precision works with beliefs in single precision."""
     function, known = EVERY[name](), beliefs()
     single = DirichletBelief(known.beta.float(), known.closest.float())
     if name in ("LearnedAcquisition", "Static"):
@@ -148,19 +148,19 @@ def test_dtype_is_that_of_the_belief(name):
 
 @pytest.mark.parametrize("name", [name for name in EVERY if name != "LearnedAcquisition"])
 def test_a_belief_before_the_first_look(name):
-    """Without `closest`, and where nothing was visited; a learned gaze asks for at least one look."""
+    """Without `closest`, and with no visited cell; a learned gaze needs at least one look."""
     values = EVERY[name]()(DirichletBelief(torch.full((3, 12, 4), 0.5)), torch.zeros(3, 12, dtype=torch.bool))
     assert values.shape == (3, 12)
     assert bool(values.isfinite().all())
 
 
 @pytest.mark.parametrize("name", [name for name in EVERY if name != "LearnedAcquisition"])
-def test_inhibition_of_return_is_not_theirs(name):
+def test_values_do_not_depend_on_visited_cells(name):
     function = EVERY[name]()
     assert torch.equal(function(beliefs(), visits()), function(beliefs(), ~visits()))
 
 
-def test_a_belief_about_one_target_is_enough_or_is_refused(name):
+def test_a_belief_about_one_target_is_refused_if_all_classes_are_needed(name):
     for known in about_one_target():
         function = EVERY[name]()
         if name in OF_ONE_TARGET:
@@ -171,20 +171,20 @@ def test_a_belief_about_one_target_is_enough_or_is_refused(name):
 
 
 @pytest.mark.parametrize("name", sorted(OF_ONE_TARGET))
-def test_only_the_probability_of_the_target_counts(name):
-    """A belief about one target and one about all classes that say the same of it."""
+def test_values_depend_only_on_the_probability_of_the_target(name):
+    """A belief about one target and one about all classes, with equal probabilities of the target."""
     known = beliefs()
     present = known.probability(TARGETS)
-    alone = told_of(present, present, known.closest)
+    alone = target_belief(present, present, known.closest)
     torch.testing.assert_close(EVERY[name]()(alone, visits()), EVERY[name]()(known, visits()))
 
 
-def test_searches_look_where_the_target_would_be_if_no_fixated_cell_held_it():
-    alone = told_of(rand(3, 12), rand(3, 12, seed=1), GRID.cell_distance[[0, 6, 11]].double())
+def test_target_posterior_uses_the_probabilities_given_absence_from_visited_cells():
+    alone = target_belief(rand(3, 12), rand(3, 12, seed=1), GRID.cell_distance[[0, 6, 11]].double())
     assert torch.equal(EVERY["TargetPosterior"]()(alone, visits()), alone.following)
 
 
-def test_nothing_of_the_callers_is_changed(name):
+def test_arguments_are_not_modified(name):
     known, visited = beliefs(), visits()
     EVERY[name]()(known, visited)
     assert torch.equal(known.beta, beliefs().beta)
@@ -193,8 +193,8 @@ def test_nothing_of_the_callers_is_changed(name):
 
 
 @pytest.mark.parametrize("name", [name for name in EVERY if name not in ("LearnedAcquisition", "Static")])
-def test_a_function_in_double_precision_serves_beliefs_in_single_precision(name):
-    """Without changing their precision: what comes out is compared with other values of that belief."""
+def test_a_function_in_double_precision_keeps_the_dtype_of_the_belief(name):
+    """Its values are compared with other values of that belief, so they have the same dtype."""
     known = beliefs()
     values = EVERY[name]().double()(DirichletBelief(known.beta.float(), known.closest.float()), visits())
     assert values.dtype == torch.float32

@@ -40,20 +40,20 @@ def test_value_equals_the_loop(belief):
             assert float(got[episode, f]) == pytest.approx(total, rel=1e-5, abs=1e-6)
 
 
-def test_before_the_first_look_any_look_is_closer():
+def test_the_first_fixation_is_at_the_centre():
     belief = DirichletBelief.uniform(1, 12, 5, 0.5, torch.ones(1))
     values = CloserLook(GRID, FOVEA)(belief, torch.zeros(1, 12, dtype=torch.bool))
-    # All unknown, nothing seen: from the centre of the image most is seen.
+    # Every cell is unknown and unseen; most of the image is seen from its centre.
     assert values.argmax().item() in (5, 6)
     torch.testing.assert_close(values, values.flip(-1))
 
 
-def test_nothing_is_gained_where_the_fovea_was():
+def test_value_is_zero_after_every_cell_was_in_the_fovea():
     belief = DirichletBelief(torch.ones(1, 12, 5), torch.full((1, 12), 0.99 * FOVEA))
     assert not CloserLook(GRID, FOVEA)(belief, torch.zeros(1, 12, dtype=torch.bool)).any()
 
 
-def test_nothing_is_gained_where_all_is_known():
+def test_value_is_almost_zero_where_every_cell_is_certain():
     beta = torch.full((1, 12, 5), 1e-9)
     beta[..., 2] = 1.0
     values = CloserLook(GRID, FOVEA)(

@@ -1,4 +1,4 @@
-"""Exploration by a learned map: expected gain against a loop, its policy, and the policies that a map can go with."""
+"""Exploration with a learned map: expected gain against a loop, its policy, and which policies accept a learned map."""
 
 import pytest
 import torch
@@ -28,7 +28,7 @@ def model():
 
 
 def belief_of(model, dtype=torch.float32, device=None):
-    """What three episodes believe after two looks."""
+    """Beliefs of three episodes after two looks."""
     generator = torch.Generator().manual_seed(0)
     corner = torch.rand(3, 4, 2, generator=generator) * 30
     boxes = torch.cat([corner, corner + 3 + torch.rand(3, 4, 2, generator=generator) * 15], -1)
@@ -62,13 +62,13 @@ def test_gain_is_summed_over_all_cells(model, dtype, device):
                 assert nearer == (float(told) != 0)
                 total += float(told)
             assert float(got[episode, fixation]) == pytest.approx(total, abs=1e-4)
-    # Another look from where the gaze has been brings nothing.
+    # A second look at the same cell gains nothing.
     assert not got[visited].any()
     assert bool((got[~visited] != 0).all())
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_gain_of_a_batch_is_that_of_its_episodes(model):
+def test_gain_of_a_batch_equals_the_gain_of_each_episode(model):
     belief, visited = belief_of(model)
     acquisition = ExpectedGain(model, GRID)
     whole = acquisition(belief, visited)
@@ -85,8 +85,8 @@ def test_other_beliefs_are_refused(model):
             acquisition(belief, visited)
 
 
-def test_closer_looks_take_a_learned_map(model):
-    """What is not known of a cell is what its most probable object leaves of all objects."""
+def test_closer_look_accepts_a_learned_map(model):
+    """The uncertainty of a cell is one minus the share of its most probable object among all objects."""
     belief, visited = belief_of(model)
     got = CloserLook(GRID, 0.2)(belief, visited)
     for episode in range(3):
@@ -145,7 +145,7 @@ def test_presets_of_learned_maps():
 
 
 @pytest.mark.parametrize("policy", ["kl", "negative-entropy", "surprise", "two-peaks"])
-def test_policies_that_are_about_dirichlets_are_refused_by_name(policy):
+def test_policies_for_dirichlet_beliefs_refuse_a_learned_map(policy):
     """They need an observation model of the scores, or a Dirichlet belief, and a learned map has neither."""
     if f"{policy}-learned" in presets("exploration"):
         pytest.fail(f"{policy} is about a Dirichlet belief")
@@ -158,14 +158,14 @@ def test_policies_that_are_about_dirichlets_are_refused_by_name(policy):
 
 
 @pytest.mark.parametrize("scores", ["raw", "calibrated"])
-def test_expected_gain_goes_by_a_learned_map_alone(scores):
+def test_expected_gain_accepts_only_a_learned_map(scores):
     with pytest.raises(InputError, match=f"^scores: expected 'learned' for policy 'expected-gain', got '{scores}'"):
         resolve(PolicyConfig("expected-gain", scores), "exploration")
     with pytest.raises(InputError, match="policy"):
         resolve(f"expected-gain-{scores}", "exploration")
 
 
-def test_searches_have_no_learned_map():
+def test_search_policies_refuse_a_learned_map():
     for policy in ("random", "non-predictive", "target-evidence"):
         with pytest.raises(InputError, match=f"^scores: .*'{policy}', got 'learned'"):
             resolve(PolicyConfig(policy, "learned"), "search")
@@ -199,7 +199,7 @@ def test_strategies_of_learned_maps(model):
     assert strategy("closer-look-learned", map=model).policy.fovea == 0.15
 
 
-def test_a_grid_in_double_precision_serves_a_belief_in_single_precision(model):
+def test_a_grid_in_double_precision_works_with_a_belief_in_single_precision(model):
     belief, visited = belief_of(model)
     wide = ExpectedGain(model, Grid(5, 4, torch.tensor([50.0, 40.0], dtype=torch.float64)))
     torch.testing.assert_close(wide(belief, visited), ExpectedGain(model, GRID)(belief, visited))

@@ -32,12 +32,12 @@ GRIDS = {"wide": Grid(4, 2, (64, 30)), "tall": Grid(2, 5, (30, 70)), "row": Grid
 CLASSES = ("cat", "cup", "dog", "hat")
 
 
-# Divergences from the prior are some tens over the map, what a look adds to them a thousandth.
+# Divergences from the prior sum to some tens over the map; one look changes the sum by about a thousandth.
 ROUNDING = {torch.float64: 1e-11, torch.float32: 1e-4}
 
 
 def values_of(acquisition, beta):
-    """Values for a Dirichlet belief with these parameters, when nothing was visited."""
+    """Values for a Dirichlet belief with these parameters, before any cell was visited."""
     return acquisition(DirichletBelief(beta), torch.zeros(beta.shape[:-1], dtype=torch.bool))
 
 
@@ -85,7 +85,7 @@ CHANGES = {
 
 
 def brute_force(name, beta, model, grid):
-    """Values of all fixations for one belief, from the formulas, in (X·Y)² simulated updates."""
+    """Values of all fixations for one belief, by the formulas and (X·Y)² simulated updates."""
     values = []
     for fixation in range(len(grid)):
         changes = []
@@ -126,7 +126,7 @@ def test_equals_brute_force(name, shape, model):
         values = values_of(acquisition, beta.to(dtype))
         assert values.dtype == dtype
         torch.testing.assert_close(values.double(), expected, rtol=tolerance, atol=ROUNDING[dtype])
-        # Inhibition of return leaves both the same choice.
+        # With inhibition of return, both choose the same cell.
         visited = torch.rand(values.shape, generator=generator) < 0.3
         noise = torch.rand(values.shape, generator=generator)
         chosen = select_fixation(values, visited, noise)
@@ -136,8 +136,8 @@ def test_equals_brute_force(name, shape, model):
 
 
 @pytest.mark.parametrize("name", ACQUISITIONS)
-def test_brute_force_has_clear_choices(name, model):
-    """The comparison of choices above is no empty one."""
+def test_the_best_fixation_of_the_brute_force_is_clear(name, model):
+    """The comparison of choices above needs a clear best fixation, and not always the same one."""
     grid = GRIDS["wide"]
     values = values_of(ACQUISITIONS[name](model, grid), beliefs(grid, batch=40))
     best = values.topk(2).values
@@ -146,7 +146,7 @@ def test_brute_force_has_clear_choices(name, model):
 
 
 @pytest.mark.parametrize("name", ACQUISITIONS)
-def test_batches_are_rows(name, model):
+def test_a_batch_gives_the_values_of_each_map_alone(name, model):
     grid = GRIDS["tall"]
     acquisition, beta = ACQUISITIONS[name](model, grid), beliefs(grid, batch=4)
     together = values_of(acquisition, beta)
@@ -156,7 +156,7 @@ def test_batches_are_rows(name, model):
 
 
 @pytest.mark.parametrize("name", ACQUISITIONS)
-def test_a_map_is_valued_to_the_same_bits_in_any_batch(name, model):
+def test_values_are_bit_identical_for_any_batch_size(name, model):
     acquisition = ACQUISITIONS[name](model, GRIDS["row"])
     beta = 0.5 + 3 * torch.rand(7, 3, 5, generator=torch.Generator().manual_seed(5))
     whole = values_of(acquisition, beta)
@@ -189,8 +189,8 @@ def test_gradients_reach_the_model(model):
     assert model.log_alpha.grad.abs().sum() > 0
 
 
-def test_small_divergences_survive_float32(model):
-    """A belief that is nearly certain changes by next to nothing; the rest must not drown in rounding."""
+def test_small_divergences_are_accurate_in_single_precision(model):
+    """A nearly certain belief changes very little; the change must stay larger than rounding errors."""
     grid = GRIDS["wide"]
     beta = (beliefs(grid) * 3000).float().double()
     for name in ("surprise", "negative entropy"):
@@ -199,8 +199,8 @@ def test_small_divergences_survive_float32(model):
         torch.testing.assert_close(single.double(), double, rtol=1e-2, atol=0)
 
 
-def test_an_eye_that_sees_well_nearby_starts_at_the_centre():
-    """With one belief everywhere, the best fixation is where most cells are near."""
+def test_the_first_fixation_is_at_the_centre_for_foveal_vision():
+    """With the same belief in every cell, the best fixation is the one with most cells nearby."""
     near, far = 1 + 8 * torch.eye(3), 1 + 0.2 * torch.eye(3)
     model = FovealObservationModel(torch.stack([near, far], 1), [0.42], ["cup", "cat"]).requires_grad_(False)
     grid = Grid(5, 5, (50, 50))
@@ -209,7 +209,7 @@ def test_an_eye_that_sees_well_nearby_starts_at_the_centre():
         assert values_of(acquisition(model, grid), beta).argmax() == 12
 
 
-def test_nothing_of_the_callers_is_changed(model):
+def test_arguments_are_not_modified(model):
     grid = GRIDS["wide"]
     beta = beliefs(grid)
     kept = beta.clone()
@@ -261,7 +261,7 @@ def test_bad_arguments(model):
 
 
 @pytest.mark.parametrize("kappa", [0.0, 0.5, 3.0])
-def test_the_bound_is_as_many_deviations_above_the_mean_as_told(kappa, model, monkeypatch):
+def test_the_bound_is_kappa_standard_deviations_above_the_mean(kappa, model, monkeypatch):
     def bound(beta):
         p, total = float(beta.max() / beta.sum()), float(beta.sum())
         return p + kappa * (p * (1 - p) / (total + 1)) ** 0.5
@@ -287,6 +287,6 @@ def test_an_improvement_by_a_margin_is_less_likely(margin, model, monkeypatch):
 
 
 @pytest.mark.parametrize("shape", [(5,), (8,), (1, 9, 5), (9, 5)])
-def test_a_belief_about_other_cells_is_refused_by_name(shape, model):
+def test_a_belief_with_another_number_of_cells_is_refused(shape, model):
     with pytest.raises(InputError, match=r"^beta: expected a tensor of shape \(\.\.\., 8, any\)"):
         values_of(BayesianSurprise(model, GRIDS["wide"]), torch.ones(shape))

@@ -1,4 +1,4 @@
-"""Habits of the gaze against loops, against the shares that they should draw, and through the loop of an episode."""
+"""Gaze habits against loops, and frequencies of drawn fixations against probabilities."""
 
 import math
 
@@ -61,7 +61,7 @@ def test_dtypes_and_devices(dtype, device):
 
 
 @given(st.integers(0, 1000), st.floats(0.01, 100), st.floats(-100, 100))
-def test_standardised_does_not_know_the_scale(seed, scale, shift):
+def test_standardised_values_do_not_depend_on_scale_and_offset(seed, scale, shift):
     values = torch.randn(2, 9, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     z = standardised(values)
     torch.testing.assert_close(standardised(scale * values + shift), z, rtol=1e-6, atol=1e-6)
@@ -70,7 +70,7 @@ def test_standardised_does_not_know_the_scale(seed, scale, shift):
 
 
 @pytest.mark.parametrize("level", [0.0, 0.1, -3e7])
-def test_equal_values_say_nothing(level):
+def test_equal_values_are_standardised_to_zero(level):
     assert torch.equal(standardised(torch.full((1, 7), level)), torch.zeros(1, 7))
 
 
@@ -79,17 +79,17 @@ def test_standardised_gradients():
     assert torch.autograd.gradcheck(standardised, (values,))
 
 
-def make_looks():
-    """Nothing is seen from anywhere."""
+def empty_looks():
+    """Looks without any detection."""
     mask = torch.zeros(12, 1, dtype=torch.bool)
     return StoredLooks(Detections(torch.zeros(12, 1, 4), torch.zeros(12, 1, 3), mask), GRID)
 
 
 def walk(choice, episodes, most, values=None):
-    """Cells of episodes that start in the fifth one, `(episodes, most)`."""
+    """Fixated cells of episodes that start at cell 5, `(episodes, most)`."""
     values = torch.linspace(0, 1, 12) if values is None else values
     start = torch.full((episodes,), 5)
-    steps = rollout(make_looks(), Semantic(3), acquisition.Static(values), start, choice, most=most)
+    steps = rollout(empty_looks(), Semantic(3), acquisition.Static(values), start, choice, most=most)
     return torch.stack([step.cell for step in steps], 1)
 
 
@@ -97,7 +97,7 @@ def noise(seed=0):
     return drawn_by(torch.Generator().manual_seed(seed), 12, torch.zeros(()))
 
 
-def test_the_second_fixations_are_drawn_as_they_should():
+def test_second_fixations_follow_the_softmax_of_the_logits():
     habits, count = make_habits(), 20_000
     cells = walk(Habitual(noise(), habits, GRID), count, 2)
     age = torch.full((1, 12), torch.inf)
@@ -107,8 +107,8 @@ def test_the_second_fixations_are_drawn_as_they_should():
     assert bool(((counts - count * share).abs() <= 5 * (count * share * (1 - share)).sqrt() + 1).all())
 
 
-def test_returns_are_drawn_by_their_age():
-    """With nothing else to go by, a cell that was left two fixations ago is as likely as its table says."""
+def test_returns_are_drawn_by_the_number_of_fixations_since():
+    """With only the table of returns, a cell left two fixations ago has the probability given by that table."""
     back, count = torch.tensor([1.0, -1.0, 0.0]), 20_000
     flat = {"pull": 0.0, "place": torch.zeros(12), "step": torch.tensor([-30.0, 0.0, 0.0, 0.0]), "back": back}
     cells = walk(Habitual(noise(1), make_habits(**flat), GRID), count, 4)
@@ -116,18 +116,18 @@ def test_returns_are_drawn_by_their_age():
     first, second = cells[:, 2] == cells[:, 0], (cells[:, 2] != cells[:, 0]) & (cells[:, 3] == cells[:, 0])
     expected = math.e / (math.e + 10)
     assert float(first.double().mean()) == pytest.approx(expected, abs=5 * (0.25 / count) ** 0.5)
-    # Two cells were left then: one before, of weight e, and the start, of weight 1 / e.
+    # Two cells were left by then: the last one, with weight e, and the start, with weight 1 / e.
     expected = (1 - expected) * math.exp(-1) / (math.e + math.exp(-1) + 9)
     assert float(second.double().mean()) == pytest.approx(expected, abs=5 * (0.05 / count) ** 0.5)
 
 
-def test_the_same_numbers_draw_the_same_scanpaths():
+def test_the_same_seed_gives_the_same_scanpaths():
     once, again, other = (walk(Habitual(noise(seed), make_habits(), GRID), 6, 8) for seed in (0, 0, 1))
     assert torch.equal(once, again)
     assert not torch.equal(once, other)
 
 
-def test_with_strong_habits_it_is_a_greedy_searcher():
+def test_habits_with_a_strong_pull_are_a_greedy_searcher():
     values = torch.rand(12, generator=torch.Generator().manual_seed(2))
     never = torch.full((3,), -1e3)
     strict = make_habits(
@@ -136,7 +136,7 @@ def test_with_strong_habits_it_is_a_greedy_searcher():
     assert torch.equal(walk(Habitual(noise(), strict, GRID), 3, 9, values), walk(Greedy(noise()), 3, 9, values))
 
 
-def test_what_is_saved_is_read(tmp_path):
+def test_saved_habits_load_unchanged(tmp_path):
     habits = make_habits()
     habits.metadata["policy"] = "kl-raw"
     habits.save(tmp_path / "habits.safetensors")
@@ -150,7 +150,7 @@ def test_what_is_saved_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"columns": 5}, "columns"),
         ({"edges": (0.3, 0.1, 0.6)}, "edges"),
@@ -159,8 +159,8 @@ def test_what_is_saved_is_read(tmp_path):
         ({"step": torch.full((4,), torch.nan)}, "step"),
     ],
 )
-def test_tables_that_cannot_be_are_refused(changes, told):
-    with pytest.raises(InputError, match=told):
+def test_invalid_tables_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
         make_habits(**changes)
 
 

@@ -1,4 +1,4 @@
-"""Ideal searchers against loops, an adaptive integral, draws, and what Najemnik and Geisler published of them."""
+"""Ideal searchers against loops, an adaptive integral, simulation, and results of Najemnik and Geisler."""
 
 from math import inf, log
 
@@ -20,7 +20,7 @@ GRID = Grid(4, 3, (80, 60))
 
 
 def make_model(dtype=torch.float64):
-    """Two classes at three levels, seen worse and worse."""
+    """Two classes at three levels; recognition gets worse from level to level."""
     generator = torch.Generator().manual_seed(0)
     alpha = 1 + torch.rand(3, 3, 3, generator=generator, dtype=torch.float64)
     alpha += 5 * torch.eye(3)[:, None] * torch.tensor([1.0, 0.4, 0.1])[:, None]
@@ -88,8 +88,8 @@ def test_localisation_equals_the_adaptive_integral(seed):
         assert float(got) == pytest.approx(exact, abs=tolerance)
 
 
-def test_localisation_equals_draws_of_the_answers():
-    """Every cell answers, the posterior is multiplied, and its largest is the answer."""
+def test_localisation_equals_a_simulation_of_responses():
+    """Every cell gives a noisy response; the search answers with the cell of the largest posterior."""
     rng = np.random.default_rng(0)
     place, signal, count = rng.dirichlet(np.full(8, 0.7)), rng.uniform(0.2, 2.5, 8), 400_000
     target = rng.choice(8, count, p=place)
@@ -102,14 +102,14 @@ def test_localisation_equals_draws_of_the_answers():
 
 
 @given(st.integers(0, 10_000), st.integers(2, 12), st.floats(0.1, 3))
-def test_a_look_never_misleads_and_a_better_one_tells_more(seed, cells, scale):
+def test_a_look_never_lowers_accuracy_and_a_stronger_signal_raises_it(seed, cells, scale):
     rng = np.random.default_rng(seed)
     place, signal = torch.tensor(rng.dirichlet(np.ones(cells))), torch.tensor(rng.uniform(0.1, 1, cells)) * scale
     got, better = (float(correct_localisation(place, d, nodes=400)) for d in (signal, 1.5 * signal))
     assert float(place.max()) - 2e-3 <= got <= better + 2e-3 <= 1 + 4e-3
 
 
-def test_what_cannot_be_seen_is_guessed():
+def test_without_a_signal_accuracy_is_the_largest_prior():
     place = torch.tensor([0.2, 0.5, 0.3], dtype=torch.float64)
     assert float(correct_localisation(place, torch.zeros(3, dtype=torch.float64))) == pytest.approx(0.5, abs=1e-6)
     even = torch.full((50,), 0.02, dtype=torch.float64)
@@ -117,7 +117,7 @@ def test_what_cannot_be_seen_is_guessed():
 
 
 class Sharp:
-    """Sees a target perfectly in the fixated cell, and nothing anywhere else."""
+    """Sees targets perfectly in the fixated cell, and not at all in other cells."""
 
     miss_rate = torch.tensor([[0.5, 1.0], [1e-4, 1.0]], dtype=torch.float64)
     alpha = torch.tensor([[[60.0, 1.0]] * 2, [[1.0, 60.0]] * 2], dtype=torch.float64)
@@ -127,8 +127,8 @@ class Sharp:
 
 
 @pytest.mark.parametrize("kind", [EntropyLimit, CorrectLocalisation])
-def test_with_a_fovea_of_one_cell_they_are_the_map_searcher(kind):
-    """Published: a searcher who sees nothing around the fixation does best to fixate the most probable place."""
+def test_with_a_fovea_of_one_cell_they_fixate_the_most_probable_place(kind):
+    """Published: for a searcher who sees only the fixated cell, the most probable place is the best fixation."""
     beta = torch.rand(20, 12, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) + 0.1
     belief = DirichletBelief(beta)
     visited = torch.zeros(20, 12, dtype=torch.bool)
@@ -138,7 +138,7 @@ def test_with_a_fovea_of_one_cell_they_are_the_map_searcher(kind):
         for values in (kind(1, Sharp(), GRID), TargetPosterior(1))
     ]
     agree = float((cells[0] == cells[1]).double().mean())
-    # The ideal searcher does not spend a look on what it would answer anyway, so it may take the second best.
+    # The ideal searcher need not look at the cell that it would answer anyway, so it may take the second best.
     assert agree == 1 if kind is EntropyLimit else agree < 1
     if kind is CorrectLocalisation:
         ranks = TargetPosterior(1)(belief, visited).masked_fill(visited, -inf).argsort(-1, descending=True)
@@ -146,14 +146,14 @@ def test_with_a_fovea_of_one_cell_they_are_the_map_searcher(kind):
 
 
 @pytest.mark.parametrize("kind", [EntropyLimit, CorrectLocalisation])
-def test_with_an_even_prior_they_look_from_the_middle(kind):
+def test_with_a_uniform_prior_the_first_fixation_is_at_the_centre(kind):
     """Published: first fixations of the ideal searcher are central, where most of the display is seen best."""
     grid, belief = Grid(5, 5, (100, 100)), DirichletBelief(torch.ones(1, 25, 3, dtype=torch.float64))
     assert int(kind(1, make_model(), grid)(belief, nothing_visited(belief)).argmax()) == 12
 
 
-def test_the_limit_chooses_much_as_the_ideal_searcher():
-    """Published: entropy limit minimisation is nearly optimal. Its choices lose little of what can be told."""
+def test_entropy_limit_is_nearly_optimal():
+    """Published: entropy limit minimisation is nearly optimal. Its choices lose little of the gain."""
     belief = make_belief(batch=40, seed=7)
     visited = nothing_visited(belief)
     told = CorrectLocalisation(1, make_model(), GRID)(belief, visited)
@@ -186,7 +186,7 @@ def test_an_episode_does_not_depend_on_the_others(kind):
         assert torch.equal(alone, together[part])
 
 
-def test_where_everything_is_known_to_be_elsewhere_values_are_finite():
+def test_values_are_finite_where_the_target_has_probability_zero():
     belief = DirichletBelief(torch.tensor([1.0, 0.0]).repeat(1, 12, 1), torch.zeros(1, 12))
     for kind in (EntropyLimit, CorrectLocalisation):
         assert bool(kind(1, Sharp(), GRID)(belief, nothing_visited(belief)).isfinite().all())
@@ -200,14 +200,14 @@ def test_gradients():
     assert torch.autograd.gradcheck(limit.values, (place, table))
 
 
-def test_arguments():
+def test_invalid_arguments_are_refused():
     with pytest.raises(InputError, match="miss rates"):
         EntropyLimit(1, FovealObservationModel.identity(["cup"], [0.2]), GRID)
     with pytest.raises(InputError, match="nodes"):
         CorrectLocalisation(1, make_model(), GRID, nodes=3)
 
 
-def test_nodes_are_those_of_the_integral():
+def test_values_use_the_given_number_of_integration_nodes():
     place, signal = make_belief(batch=3).probability(1), torch.rand(3, 12, 12, dtype=torch.float64) + 0.3
     place = place / place.sum(-1, keepdim=True)
     for nodes in (8, 16):
@@ -225,7 +225,7 @@ def test_nodes_are_those_of_the_integral():
 
 @pytest.mark.parametrize("nodes", [8, 64])
 def test_localisation_is_a_sum_over_equidistant_noise(nodes):
-    """Noise from -5 to 5, each counted by its normal density; 64 of them unless told otherwise."""
+    """Noise from -5 to 5, each weighted by its normal density; 64 nodes by default."""
     rng = np.random.default_rng(1)
     place, signal = rng.dirichlet(np.ones(5)), rng.uniform(0.3, 3, 5)
     noise = [-5 + 10 * step / (nodes - 1) for step in range(nodes)]

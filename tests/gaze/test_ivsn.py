@@ -1,4 +1,4 @@
-"""IVSN as published over VGG16 with random weights: a loop over places and channels, and the sizes of the paper."""
+"""Published IVSN on VGG16 with random weights: against a loop over places and channels, with the paper's sizes."""
 
 import pytest
 import torch
@@ -25,7 +25,7 @@ def pictures(seed=0, dtype=torch.float32):
 
 @pytest.mark.slow
 def test_attention_equals_the_loop_over_torchvisions_layers(ivsn):
-    """Layer by layer with torchvision's own network, 14 × 14 places and one."""
+    """Layer by layer in torchvision's network: 14 × 14 places for the image and one for the target."""
     network = vgg16(weights=None).features
     network.load_state_dict({**ivsn.features.state_dict()}, strict=True)
     image, target = pictures()
@@ -50,8 +50,8 @@ def test_attention_equals_the_loop_over_torchvisions_layers(ivsn):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_what_is_the_target_draws_attention(dtype, device):
-    """With the identity as network, the place whose colour is the target's is the maximum among equally bright ones."""
+def test_attention_is_largest_at_the_target(dtype, device):
+    """With the identity as network, attention is largest where the colour is that of the target."""
     identity = IVSN(nn.Identity(), nn.Identity(), picture=8, target=1).to(device)
     image = torch.full((1, 3, 8, 8), 0.45, dtype=dtype, device=device)
     image[0, :, 2, 5] = torch.tensor([0.9, 0.1, 0.1], dtype=dtype)
@@ -82,7 +82,7 @@ def test_weights_from_a_file(ivsn, tmp_path):
             IVSN.vgg16(tmp_path / name)
 
 
-def test_arguments():
+def test_invalid_arguments_are_refused():
     identity = IVSN(nn.Identity(), nn.Identity(), picture=8, target=1)
     image, target = pictures()
     with pytest.raises(InputError, match="image"):

@@ -1,4 +1,4 @@
-"""The soft choice of a fixation, and the learned policy: against loops, frequencies and what it starts from."""
+"""The soft choice of a fixation, and the learned policy: against loops, frequencies and its initial policy."""
 
 import math
 
@@ -39,7 +39,7 @@ def test_hard_fixations_are_draws_from_the_softmax():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_straight_through_has_the_centre_and_the_soft_gradient(visited, dtype):
+def test_a_hard_fixation_has_the_gradient_of_the_soft_one(visited, dtype):
     torch.manual_seed(0)
     centres, noise = Grid(COLUMNS, 3, (64, 48)).centres.to(dtype), torch.rand(3, CELLS, dtype=dtype)
     logits = torch.randn(3, CELLS, dtype=dtype, requires_grad=True)
@@ -61,7 +61,7 @@ def test_soft_fixation_gradcheck(visited):
     assert torch.autograd.gradcheck(lambda x: soft_fixation(x, visited, centres, noise, hard=False)[0], logits)
 
 
-def test_cold_soft_fixations_are_hard(visited):
+def test_soft_fixations_at_low_temperature_are_cell_centres(visited):
     torch.manual_seed(0)
     centres, noise = Grid(COLUMNS, 3, (64, 48)).centres, torch.rand(3, CELLS)
     noise[0, 0], noise[1, 1] = 0.0, 1.0  # ends of the range
@@ -99,7 +99,7 @@ def test_features_equal_a_loop(belief, visited):
             assert features[b, x].tolist() == pytest.approx(expected, abs=1e-6)
 
 
-def test_it_starts_as_non_predictive_search(belief, visited):
+def test_a_new_gaze_orders_cells_as_non_predictive_search(belief, visited):
     gaze = LearnedGaze().double()
     target = torch.tensor([1, 4, 2])
     grid = Grid(COLUMNS, 3, (64, 48))
@@ -109,7 +109,7 @@ def test_it_starts_as_non_predictive_search(belief, visited):
     assert torch.equal(values.argsort(), TargetPosterior(target)(belief, visited).argsort())
 
 
-def test_it_knows_no_class_by_its_number(belief, visited):
+def test_values_do_not_depend_on_the_order_of_classes(belief, visited):
     torch.manual_seed(1)
     gaze = LearnedGaze().double()
     torch.nn.init.normal_(gaze.network[-1].weight)
@@ -119,7 +119,7 @@ def test_it_knows_no_class_by_its_number(belief, visited):
     assert not torch.allclose(gaze(belief, visited, 1, COLUMNS), gaze(belief, visited, 3, COLUMNS))
 
 
-def test_all_cells_visited_gives_numbers(belief):
+def test_values_are_finite_when_all_cells_are_visited(belief):
     single = DirichletBelief(belief.beta.float(), belief.closest.float())
     assert LearnedGaze()(single, torch.ones(3, CELLS, dtype=torch.bool), 1, COLUMNS).isfinite().all()
 

@@ -1,4 +1,4 @@
-"""Log-linear choices against scipy's minimiser, closed forms, and choices drawn by known weights."""
+"""Log-linear choice models against scipy's minimiser, closed forms, and choices drawn with known weights."""
 
 import numpy as np
 import pytest
@@ -31,8 +31,8 @@ def test_equals_scipys_minimum(ridge):
     np.testing.assert_allclose(fit_log_linear(phi, chosen, ridge=ridge).numpy(), expected, atol=1e-5)
 
 
-def test_shares_of_alternatives_come_back():
-    """With one weight for each alternative the likeliest probabilities are the shares themselves."""
+def test_probabilities_equal_the_shares_of_alternatives():
+    """With one weight for each alternative, the maximum likelihood probabilities are the shares."""
     chosen = torch.tensor([0] * 50 + [1] * 30 + [2] * 20)
     phi = torch.eye(3).expand(100, 3, 3)
     weights = fit_log_linear(phi, chosen, ridge=1e-9)
@@ -42,7 +42,7 @@ def test_shares_of_alternatives_come_back():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_known_weights_come_back(dtype, device):
+def test_known_weights_are_recovered(dtype, device):
     phi, chosen, weights = draw(count=20_000, dtype=dtype)
     got = fit_log_linear(phi.to(device), chosen.to(device), ridge=1e-6)
     assert got.dtype == torch.float64
@@ -50,12 +50,12 @@ def test_known_weights_come_back(dtype, device):
     torch.testing.assert_close(got.cpu(), weights, rtol=0, atol=0.06)
 
 
-def test_chunks_make_no_difference():
+def test_weights_do_not_depend_on_the_chunk_size():
     phi, chosen, _ = draw()
     torch.testing.assert_close(fit_log_linear(phi, chosen, chunk=7), fit_log_linear(phi, chosen))
 
 
-def test_weights_that_nothing_tells_stay_finite():
+def test_weights_of_uninformative_features_are_zero():
     phi, chosen, _ = draw()
     never = torch.cat([phi, torch.zeros(400, 6, 1, dtype=torch.float64), torch.ones(400, 6, 1)], -1)
     weights = fit_log_linear(never, chosen)
@@ -63,14 +63,14 @@ def test_weights_that_nothing_tells_stay_finite():
     torch.testing.assert_close(weights[:4], fit_log_linear(phi, chosen))
 
 
-def test_choices_that_are_certain_converge():
-    """Without a ridge the weights would be infinite."""
+def test_fit_converges_when_all_choices_are_equal():
+    """Without the ridge penalty the weights would be infinite."""
     phi = torch.eye(2).expand(1000, 2, 2)
     weights = fit_log_linear(phi, torch.zeros(1000, dtype=torch.int64), ridge=1e-3)
     assert float((weights[0] - weights[1]).exp()) > 1e4
 
 
-def test_arguments():
+def test_invalid_arguments_are_refused():
     phi, chosen, _ = draw()
     with pytest.raises(InputError, match="chosen"):
         fit_log_linear(phi, chosen[:5])

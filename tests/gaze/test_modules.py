@@ -1,4 +1,4 @@
-"""Acquisition functions, policies and saliency maps as parts of others' modules."""
+"""Acquisition functions, policies and saliency models as submodules of other modules."""
 
 import torch
 from torch import nn
@@ -13,7 +13,7 @@ from tests.small import GRID, detections, look, mapping, memory, model, rand
 
 
 class AcquisitionTester(GraphTester):
-    """Of a function of a belief and of how close the fovea was to each cell."""
+    """For functions of a belief and of the distance from each cell to the closest fixation."""
 
     batched = (0, 1)
 
@@ -90,7 +90,7 @@ class TestUniform(AcquisitionTester):
 
 
 class LookAheadTester(AcquisitionTester):
-    """Of a function that subtracts values that are nearly equal."""
+    """For functions that subtract nearly equal values."""
 
     autocast = 0.1
 
@@ -154,9 +154,9 @@ class TestExpectedGain(GraphTester):
 
 
 class PolicyTester(AcquisitionTester):
-    """What a policy's acquisition function makes of a belief."""
+    """Values that a policy's acquisition function gives for a belief."""
 
-    test_compile = test_export = None  # the function's own tester has them
+    test_compile = test_export = None  # tested with the acquisition function
 
     @staticmethod
     def call(module, beta, closest):
@@ -217,7 +217,7 @@ class TestLearned(PolicyTester):
 
 
 class TestLearnedGaze(PolicyTester):
-    """As the policy that it is made for calls it."""
+    """Called as by its policy."""
 
     test_compile, test_export = GraphTester.test_compile, GraphTester.test_export
 
@@ -240,7 +240,7 @@ class TestObjects(PolicyTester):
 
 
 class ExplorerTester(PolicyTester):
-    """Of a policy whose function subtracts values that are nearly equal."""
+    """For policies whose function subtracts nearly equal values."""
 
     autocast = 0.1
 
@@ -290,7 +290,7 @@ class TestGain(TestExpectedGain):
 
 
 class TestGazeHabits(TensorTester):
-    """Log probabilities of the next cell, from a cell."""
+    """Log probabilities of the next cell, given the present one."""
 
     batched = (0, 1, 2)
 

@@ -1,4 +1,4 @@
-"""Where something is, against a loop over cells and classes."""
+"""Probability of any object in a cell, against a loop over cells and classes."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Search acquisitions that look beyond the fixated cell, against loops and closed forms."""
+"""Search acquisition functions that also count cells around the fixation, against loops and closed forms."""
 
 import math
 from functools import partial
@@ -24,7 +24,7 @@ class Misses:
 
 
 def values_of(acquisition, beta):
-    """Values for a Dirichlet belief with these parameters, when nothing was visited."""
+    """Values for a Dirichlet belief with these parameters, before any cell was visited."""
     return acquisition(DirichletBelief(beta), torch.zeros(beta.shape[:-1], dtype=torch.bool))
 
 
@@ -51,7 +51,7 @@ def test_foveal_hit_equals_the_loop(beta, target):
 
 
 @pytest.mark.parametrize("target", [1, torch.tensor([2, 1])])
-def test_information_is_the_expected_loss_of_entropy(beta, target):
+def test_information_is_the_expected_reduction_of_entropy(beta, target):
     got = values_of(PlaceInformation(target, Misses(), GRID), beta)
     for episode in range(2):
         p, rates = parts(beta, episode, int(torch.as_tensor(target).expand(2)[episode]))
@@ -82,8 +82,8 @@ def test_policies_need_miss_rates(name, beta):
 
 
 @pytest.mark.parametrize("kind", [FovealHit, PlaceInformation])
-def test_values_of_several_maps_are_those_of_each(kind):
-    """Maps whose probabilities have other sums, and targets that are seen from one side only."""
+def test_values_of_a_batch_equal_a_loop_over_maps(kind):
+    """Probabilities of the maps have different sums, and visibility is not symmetric."""
     generator = torch.Generator().manual_seed(1)
     present = torch.rand(3, 12, generator=generator, dtype=torch.float64) * torch.tensor([0.1, 0.5, 1.0])[:, None]
     visibility = torch.rand(3, 12, 12, generator=generator, dtype=torch.float64)

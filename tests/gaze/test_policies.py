@@ -1,4 +1,4 @@
-"""Policies by name: what they refuse, that they are modules, and that they can be copied and sent elsewhere."""
+"""Policies by name: errors, state as modules, copies and pickling."""
 
 import copy
 import pickle
@@ -16,7 +16,7 @@ GRID = Grid(4, 3, (80, 60))
 
 
 def values_of(acquisition, beta):
-    """Values for a Dirichlet belief with these parameters after a look at the first cell, when nothing was visited."""
+    """Values for a Dirichlet belief with these parameters after a look at the first cell; no cell counts as visited."""
     closest = GRID.cell_distance[0].to(beta).expand(beta.shape[:-1])
     return acquisition(DirichletBelief(beta, closest), torch.zeros(beta.shape[:-1], dtype=torch.bool))
 
@@ -38,7 +38,7 @@ def means(model):
     return Means(model, gaze, everything)
 
 
-def test_names_are_those_of_the_tasks():
+def test_policy_names_of_each_task():
     assert policy_names("search") == [
         "random",
         "non-predictive",
@@ -67,7 +67,7 @@ def test_names_are_those_of_the_tasks():
     )
 
 
-def test_every_policy_is_public_under_its_class():
+def test_every_policy_class_is_public():
     for name, kind in POLICIES.items():
         assert kind.name == name
         assert getattr(policies, kind.__name__) is kind
@@ -75,8 +75,8 @@ def test_every_policy_is_public_under_its_class():
 
 
 @pytest.mark.parametrize("name", POLICIES)
-def test_models_are_parts_of_the_policy(name, means):
-    """As modules they are in its state, and move with it."""
+def test_models_are_submodules_of_the_policy(name, means):
+    """They are in its state dict, and change dtype with it."""
     policy = POLICIES[name].make(means)
     assert isinstance(policy, Policy)
     part = means.model if policy.needs_model else means.gaze if policy.needs_gaze else None
@@ -91,7 +91,7 @@ def test_models_are_parts_of_the_policy(name, means):
     assert bool(moved) == (part is not None)
 
 
-def test_a_policy_of_ones_own_is_named_once_defined():
+def test_a_user_defined_policy_is_registered_under_its_name():
     class Last(Policy):
         name = "last-of-all"
         tasks = ("search",)
@@ -115,7 +115,7 @@ def test_a_policy_of_ones_own_is_named_once_defined():
 
 
 @pytest.mark.parametrize("name", [name for name in policy_names("search") if name != "random"])
-def test_a_copied_or_pickled_search_policy_values_alike(name, means):
+def test_a_copied_or_pickled_search_policy_gives_equal_values(name, means):
     policy = named_policy(name, "search", means)
     beta = torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)) + 0.1
     expected = values_of(policy(1, GRID), beta)
@@ -131,14 +131,14 @@ def test_a_copied_or_pickled_search_policy_values_alike(name, means):
 @pytest.mark.parametrize(
     "name", ["random", "kl", "surprise", "two-peaks", "expected-accuracy", "closer-look", "objects"]
 )
-def test_a_copied_or_pickled_exploration_policy_values_alike(name, means):
+def test_a_copied_or_pickled_exploration_policy_gives_equal_values(name, means):
     policy = named_policy(name, "exploration", means)
     beta = torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)) + 0.1
     for other in (copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))):
         assert torch.equal(values_of(other(None, GRID), beta), values_of(policy(None, GRID), beta))
 
 
-def test_a_missing_model_is_told_at_once():
+def test_a_missing_model_is_an_error_when_the_policy_is_made():
     free = {"random", "non-predictive", "closer-look", "objects"}
     for task in ("search", "exploration"):
         for name in policy_names(task):
@@ -152,7 +152,7 @@ def test_a_missing_model_is_told_at_once():
 
 
 @pytest.mark.parametrize("name", [name for name in policy_names("search") if name != "random"])
-def test_a_missing_target_is_told_by_the_name_of_the_policy(name, means):
+def test_the_error_for_a_missing_target_names_the_policy(name, means):
     with pytest.raises(InputError, match=f"policy '{name}': expected a target"):
         named_policy(name, "search", means)(None, GRID)
 

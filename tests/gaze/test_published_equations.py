@@ -1,8 +1,9 @@
 """The acquisition functions of Luzio, Bernardino and Moreno (2024), against their equations in loops.
 
-Section III-E of the paper, with the labels of its source. For every fixation f' and every cell x the look is simulated:
-the distance of the cells' centres, the expected scores (eq:expected_operator), Kaplan's rule (eq:kaplanrule). Entropy
-and divergence are those of scipy and torch.distributions. Nothing of semfov is called here but what is tested.
+Section III-E of the paper; labels of equations are those of its LaTeX source. For every fixation f' and every cell x
+the look is simulated: the distance of the cells' centres, the expected scores (eq:expected_operator), Kaplan's rule
+(eq:kaplanrule). Entropy and divergence are those of scipy and torch.distributions. Only the functions under test are
+called from semfov.
 """
 
 import math
@@ -28,7 +29,7 @@ def kaplan(beta, likelihood):
 
 
 def posterior(beta):
-    """eq:finalsemanticmap for one draw: β_k / Σ_j β_j."""
+    """eq:finalsemanticmap for one observation: β_k / Σ_j β_j."""
     return beta / beta.sum()
 
 
@@ -51,7 +52,7 @@ def two_peaks(beta):
 
 
 class Paper:
-    """A map, an observation model and a grid, and what the paper makes of them."""
+    """A map, an observation model, a grid, and the quantities that the paper computes from them."""
 
     def __init__(self, shape, components, seed):
         self.columns, self.rows, self.size = shape
@@ -63,7 +64,7 @@ class Paper:
         clarity = np.linspace(6, 0.5, LEVELS)[None, :, None]
         self.alpha = generator.gamma(0.5, size=(components, LEVELS, components)) + 0.05
         self.alpha += clarity * np.eye(components)[:, None]
-        # A map that began as β⁰ = 0.5 and saw a few things; some of its cells saw none.
+        # A map that started at β⁰ = 0.5 and was updated in some cells, not in all.
         self.beta = np.full((self.cells, components), 0.5)
         for cell in range(self.cells):
             for _ in range(generator.integers(0, 4)):
@@ -85,7 +86,7 @@ class Paper:
 
     @cached_property
     def predicted_maps(self):
-        """eq:predbeta: every cell as the look from f is expected to leave it, for every f."""
+        """eq:predbeta: the expected parameters of every cell after a look from f, for every f."""
         expected = [[self.expected_scores(x, level) for level in range(LEVELS)] for x in range(self.cells)]
         maps = []
         for f in range(self.cells):
@@ -98,11 +99,11 @@ class Paper:
         return [posterior(self.beta[x])[target] for x in range(self.cells)]
 
     def predictive(self, target):
-        """eq:peaks_pred, from the map that a look at the cell itself leaves (eq:local_scores)."""
+        """eq:peaks_pred, from the map after a look at the cell itself (eq:local_scores)."""
         return [posterior(after[f])[target] for f, after in enumerate(self.predicted_maps)]
 
     def neighbourhood(self, target, sigma):
-        """The outlook's: the predicted map around f, weighted by distance (the weights are ours)."""
+        """From the paper's outlook: the predicted map around f, weighted by distance (our choice of weights)."""
         values = []
         for f, after in enumerate(self.predicted_maps):
             value = 0.0
@@ -134,7 +135,7 @@ class Paper:
         return FovealObservationModel(torch.from_numpy(self.alpha), self.edges.tolist(), names).requires_grad_(False)
 
     def values(self, function, dtype=torch.float64):
-        """What the library says."""
+        """Values that the library computes."""
         belief = DirichletBelief(torch.from_numpy(self.beta)[None].to(dtype))
         values = function(belief, torch.zeros(1, self.cells, dtype=torch.bool))[0]
         assert values.dtype == dtype
@@ -157,14 +158,14 @@ EXPLORATION = {
     "negative-entropy": lambda paper: paper.total(negentropy),
     "two-peaks": Paper.expected_improvement,
 }
-# What is the same for every fixation may differ: the library takes the present map's divergence and entropy away.
+# A constant over fixations may differ: the library subtracts the divergence or entropy of the present map.
 UP_TO_A_CONSTANT = {"kl", "negative-entropy"}
 # Values of one map differ from fixation to fixation by 0.01 (kl) and by 1e-4 (the others), or more.
 DOUBLE, SINGLE = 1e-9, {"kl": 5e-5, "negative-entropy": 1e-6, "two-peaks": 5e-7}
 
 
-def agree(got, wanted, tolerance, constant=False):
-    """The same values, and the same best fixation (one of several, where they are equally good)."""
+def assert_agree(got, wanted, tolerance, constant=False):
+    """Equal values, and the same best fixation (any of them, if several are equally good)."""
     wanted = np.array(wanted)
     if constant:
         got, wanted = got - got.mean(), wanted - wanted.mean()
@@ -175,8 +176,8 @@ def agree(got, wanted, tolerance, constant=False):
 @pytest.mark.parametrize("name", EXPLORATION)
 def test_exploration(name, paper):
     wanted, function = EXPLORATION[name](paper), named_policy(name, "exploration", Means(paper.model))(None, paper.grid)
-    agree(paper.values(function), wanted, DOUBLE, constant=name in UP_TO_A_CONSTANT)
-    agree(paper.values(function, torch.float32), wanted, SINGLE[name], constant=name in UP_TO_A_CONSTANT)
+    assert_agree(paper.values(function), wanted, DOUBLE, constant=name in UP_TO_A_CONSTANT)
+    assert_agree(paper.values(function, torch.float32), wanted, SINGLE[name], constant=name in UP_TO_A_CONSTANT)
 
 
 @pytest.mark.parametrize("target", [1, 4])
@@ -184,8 +185,8 @@ def test_search(paper, target):
     searches = {"non-predictive": paper.non_predictive(target), "predictive": paper.predictive(target)}
     for name, wanted in searches.items():
         function = named_policy(name, "search", Means(paper.model))(target, paper.grid)
-        agree(paper.values(function), wanted, 1e-12)
-        agree(paper.values(function, torch.float32), wanted, 1e-6)
+        assert_agree(paper.values(function), wanted, 1e-12)
+        assert_agree(paper.values(function, torch.float32), wanted, 1e-6)
 
 
 @pytest.mark.parametrize("sigma", [0.5, 0.7, 3.0])
@@ -193,43 +194,43 @@ def test_neighbourhood(paper, sigma):
     function = acquisition.NeighbourhoodPosterior(2, paper.model, paper.grid, sigma=sigma)
     wanted = paper.neighbourhood(2, sigma)
     # The weights are kept in single precision.
-    agree(paper.values(function), wanted, 1e-6)
-    agree(paper.values(function, torch.float32), wanted, 1e-5)
+    assert_agree(paper.values(function), wanted, 1e-6)
+    assert_agree(paper.values(function, torch.float32), wanted, 1e-5)
 
 
-def test_the_neighbourhood_of_one_cell_is_predictive_search(paper):
-    """With weights that end within the cell; the fixated cell is seen from level 0."""
+def test_a_neighbourhood_of_one_cell_is_predictive_search(paper):
+    """The weights of other cells are almost zero, and the fixated cell is seen at level 0."""
     function = acquisition.NeighbourhoodPosterior(2, paper.model, paper.grid, sigma=0.05)
-    agree(paper.values(function), paper.predictive(2), 1e-12)
+    assert_agree(paper.values(function), paper.predictive(2), 1e-12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXPLORATION)
-def test_the_papers_map(name):
+def test_a_map_of_the_size_in_the_paper(name):
     """10 × 10 cells of 81 classes: a hundred fixations, ten thousand simulated updates."""
     paper = full_size()
     function, wanted = named_policy(name, "exploration", Means(paper.model))(None, paper.grid), EXPLORATION[name](paper)
-    agree(paper.values(function), wanted, DOUBLE, constant=name in UP_TO_A_CONSTANT)
-    agree(paper.values(function, torch.float32), wanted, SINGLE[name], constant=name in UP_TO_A_CONSTANT)
+    assert_agree(paper.values(function), wanted, DOUBLE, constant=name in UP_TO_A_CONSTANT)
+    assert_agree(paper.values(function, torch.float32), wanted, SINGLE[name], constant=name in UP_TO_A_CONSTANT)
 
 
 @pytest.mark.parametrize("prior", [0.1, 0.5, 2.0])
 def test_divergence_from_another_prior(prior):
     paper = Paper(SHAPES["wide"], 5, 3)
     function = named_policy("kl", "exploration", Means(paper.model, prior=prior))(None, paper.grid)
-    agree(paper.values(function), paper.total(lambda beta: divergence(beta, prior)), DOUBLE, constant=True)
+    assert_agree(paper.values(function), paper.total(lambda beta: divergence(beta, prior)), DOUBLE, constant=True)
 
 
 @pytest.mark.parametrize(("name", "metric"), [("kl", divergence), ("negative-entropy", negentropy)])
-def test_the_constant_is_that_of_the_present_map(name, metric, paper):
+def test_the_constant_is_the_value_of_the_present_map(name, metric, paper):
     function = named_policy(name, "exploration", Means(paper.model))(None, paper.grid)
     present = sum(metric(beta) for beta in paper.beta)
     np.testing.assert_allclose(paper.values(function), np.array(paper.total(metric)) - present, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_the_comparisons_are_no_empty_ones(shape):
-    """Cells are seen from several levels, fixations differ in value, and not always the same one is best."""
+def test_the_compared_maps_are_varied(shape):
+    """Cells are seen at several levels, values differ between fixations, and the best one differs between maps."""
     papers = [Paper(SHAPES[shape], 5, seed) for seed in range(12)]
     far = papers[0]
     assert len({sum(far.distance(x, 0) > edge for edge in far.edges) for x in range(far.cells)}) >= 5

@@ -1,4 +1,4 @@
-"""Saliency as a prior over the cells: against a loop, and where it should make no difference."""
+"""Saliency as a prior over cells: against a loop, and cases where it should have no effect."""
 
 import math
 
@@ -59,7 +59,7 @@ def test_value_equals_the_loop(name, weight):
 
 
 @pytest.mark.parametrize("name", ACQUISITIONS)
-def test_without_weight_the_order_is_that_of_the_acquisition(name):
+def test_with_weight_zero_the_order_is_that_of_the_acquisition(name):
     plain, guided = values(ACQUISITIONS[name]()), values(SaliencyPrior(ACQUISITIONS[name](), SALIENCY, weight=0.0))
     torch.testing.assert_close(guided.exp(), plain)
     assert torch.equal(guided.argsort(dim=-1, stable=True), plain.argsort(dim=-1, stable=True))
@@ -67,8 +67,8 @@ def test_without_weight_the_order_is_that_of_the_acquisition(name):
 
 @pytest.mark.parametrize("level", [0.0, 1e-12, 0.4, 1e6])
 @pytest.mark.parametrize("name", ACQUISITIONS)
-def test_saliency_that_is_the_same_everywhere_changes_nothing(name, level):
-    """Not even where there is none at all, as in a picture without contrast."""
+def test_uniform_saliency_changes_nothing(name, level):
+    """Also if it is zero everywhere, as in an image without contrast."""
     flat = torch.full((12,), level, dtype=torch.float64)
     plain, guided = values(ACQUISITIONS[name]()), values(SaliencyPrior(ACQUISITIONS[name](), flat, weight=0.7))
     torch.testing.assert_close(guided - guided.mean(-1, keepdim=True), plain.log() - plain.log().mean(-1, keepdim=True))
@@ -79,8 +79,8 @@ def test_a_large_weight_leaves_the_order_to_saliency():
     assert torch.equal(guided.argsort(-1), SALIENCY.argsort(-1))
 
 
-def test_a_cell_without_saliency_is_not_out():
-    """Its prior is about a thousandth of the most salient cell's."""
+def test_a_cell_with_zero_saliency_can_be_chosen():
+    """Its prior is about a thousandth of that of the most salient cell."""
     saliency = torch.tensor([1.0, 0.0], dtype=torch.float64)
     belief = DirichletBelief(torch.tensor([[[1.0, 1e-6], [1e-6, 1.0]]], dtype=torch.float64))
     guided = SaliencyPrior(TargetPosterior(1), saliency, weight=1.0)(belief, torch.zeros(1, 2, dtype=torch.bool))
@@ -94,14 +94,14 @@ def test_the_unit_of_saliency_does_not_matter():
     torch.testing.assert_close(one, other)
 
 
-def test_one_map_serves_all_episodes():
+def test_one_saliency_map_applies_to_all_episodes():
     one = values(SaliencyPrior(TargetPosterior(2), SALIENCY[1], weight=0.3))
     each = values(SaliencyPrior(TargetPosterior(2), SALIENCY[1].expand(3, 12), weight=0.3))
     assert torch.equal(one, each)
 
 
-def test_worthless_cells_come_last():
-    """A value that is not positive has no logarithm: it counts as next to nothing, and never as NaN."""
+def test_cells_whose_value_is_not_positive_come_last():
+    """Such a value has no logarithm: it counts as a very small positive one, and gives no NaN."""
     worth = torch.tensor([0.5, 0.0, -3.0, 1e-9])
     guided = SaliencyPrior(Static(worth), torch.tensor([0.0, 1.0, 1.0, 1.0]), weight=0.3)
     got = guided(DirichletBelief(torch.ones(1, 4, 2)), torch.zeros(1, 4, dtype=torch.bool))
@@ -110,7 +110,7 @@ def test_worthless_cells_come_last():
     assert got[0, 1] == got[0, 2]
 
 
-def test_choices_are_still_those_of_a_product():
+def test_the_choice_maximises_the_product_of_value_and_saliency():
     """The cell with the largest v s^w, as Torralba and others (2006) multiply them."""
     noise = torch.rand(3, 12, generator=torch.Generator().manual_seed(2))
     chosen = select_fixation(values(SaliencyPrior(TargetPosterior(2), SALIENCY, weight=0.5)), NOWHERE, noise)
@@ -129,7 +129,7 @@ def test_bad_arguments():
         values(SaliencyPrior(TargetPosterior(2), SALIENCY[:, :7], weight=0.3))
 
 
-def test_the_acquisition_is_told_which_cells_were_visited():
+def test_visited_cells_are_passed_to_the_acquisition():
     class Unvisited(AcquisitionFunction):
         def forward(self, belief, visited):
             return torch.where(visited, 1.0, 2.0).double()

@@ -1,4 +1,4 @@
-"""Search acquisitions against a loop over cells that simulates the update in full."""
+"""Search acquisition functions against a loop over cells that simulates every update."""
 
 import math
 from functools import partial
@@ -29,7 +29,7 @@ class Model:
 
 
 def values_of(acquisition, beta):
-    """Values for a Dirichlet belief with these parameters, when nothing was visited."""
+    """Values for a Dirichlet belief with these parameters, before any cell was visited."""
     return acquisition(DirichletBelief(beta), torch.zeros(beta.shape[:-1], dtype=torch.bool))
 
 
@@ -99,7 +99,7 @@ def test_unknown_target(beta, target):
 
 @pytest.mark.parametrize("sigma", [None, 0.4])
 def test_neighbourhood_equals_the_loop(beta, sigma):
-    """Seven tenths of a cell unless told otherwise."""
+    """The default width is 0.7 cells."""
     model, told = Model(5), {} if sigma is None else {"sigma": sigma}
     got = values_of(NeighbourhoodPosterior(3, model, GRID, **told), beta)
     for episode in range(4):
@@ -116,7 +116,7 @@ def test_neighbourhood_equals_the_loop(beta, sigma):
             assert float(got[episode, fixation]) == pytest.approx(total, rel=1e-6)
 
 
-def test_neighbourhood_refuses_other_cells_and_no_width(beta):
+def test_neighbourhood_refuses_another_number_of_cells_and_zero_width(beta):
     acquisition = NeighbourhoodPosterior(3, Model(5), GRID)
     torch.testing.assert_close(values_of(acquisition, beta[1]), values_of(acquisition, beta)[1])
     for other in (beta[:, :5], beta[0, 0]):

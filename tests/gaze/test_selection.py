@@ -1,4 +1,4 @@
-"""The choice of a fixation against a loop, and its tie-breaking against uniformity."""
+"""The choice of a fixation against a loop, and uniform random choice among ties."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ def test_equals_a_loop(cells, seed):
         assert got == (max(tied, key=lambda c: float(noise[row, c])) if free else -1)
 
 
-def test_ties_are_broken_uniformly():
+def test_ties_are_broken_at_random_with_equal_probability():
     torch.manual_seed(0)
     values = torch.tensor([0.2, 0.9, 0.9, 0.1, 0.9]).expand(9000, 5)
     choices = select_fixation(values, torch.zeros(9000, 5, dtype=torch.bool), torch.rand(9000, 5))
@@ -44,7 +44,7 @@ def test_negative_values_and_infinities():
     assert select_fixation(values, torch.zeros(1, 3, dtype=torch.bool), noise).tolist() == [1]
 
 
-def test_compiles_whole():
+def test_compiles_to_one_graph():
     values, noise = torch.rand(4, 9), torch.rand(4, 9)
     visited = torch.rand(4, 9) < 0.5
     compiled = torch.compile(select_fixation, fullgraph=True, backend="eager")

@@ -1,4 +1,4 @@
-"""Class templates and attention over foveal looks, against loops and SciPy."""
+"""Class templates, and attention accumulated over fixations, against loops and SciPy."""
 
 import pytest
 import torch
@@ -40,14 +40,14 @@ def test_gradients():
     assert torch.autograd.gradcheck(model, (features.requires_grad_(),))
 
 
-def test_points_of_the_image_are_found_on_the_canvas():
-    """A canvas that is a ramp over the image: the value at a point is the point."""
+def test_points_of_the_image_are_sampled_on_the_letterboxed_canvas():
+    """The image is a ramp, so the value at a point is its x-coordinate."""
     ramp = torch.linspace(0.5, 79.5, 80).expand(1, 3, 60, 80) / 80
     canvas, placement = letterbox(ramp, (160, 160))
     points = torch.tensor([[10.0, 20.0], [40.5, 30.0], [70.0, 50.0]])
     got = at_points(canvas[:, :1], points, placement, (160, 160))[0, 0]
     torch.testing.assert_close(got, (points[:, 0] + 0.5) / 80, rtol=0, atol=2e-3)
-    # Maps that are coarser than the canvas lie on it all the same.
+    # The same points on a map coarser than the canvas.
     coarse = torch.nn.functional.avg_pool2d(canvas[:, :1], 8)
     torch.testing.assert_close(at_points(coarse, points, placement, (160, 160))[0, 0], got, rtol=0, atol=5e-3)
     assert isinstance(placement, Placement)
@@ -57,18 +57,18 @@ def make_attention(dtype=torch.float64):
     return torch.randn(12, 3, 12, generator=torch.Generator().manual_seed(3), dtype=torch.float64).to(dtype)
 
 
-def nothing_known(batch, dtype=torch.float64, device="cpu"):
+def uniform_beliefs(batch, dtype=torch.float64, device="cpu"):
     return DirichletBelief(torch.ones(batch, 12, 4, dtype=dtype, device=device))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_looks_gather_as_the_loop_has_it(dtype, device):
+def test_attention_over_several_looks_equals_the_loop(dtype, device):
     visited = torch.zeros(2, 12, dtype=torch.bool)
     visited[0, [0, 7, 11]] = visited[1, 4] = True
     target = torch.tensor([3, 1])
     attention = make_attention(dtype)
     value = TemplateAttention(target, attention, GRID, 0.2).to(device)
-    got = value(nothing_known(2, dtype, device), visited.to(device))
+    got = value(uniform_beliefs(2, dtype, device), visited.to(device))
     assert got.dtype == dtype
     for episode in range(2):
         for x in range(12):
@@ -80,24 +80,24 @@ def test_looks_gather_as_the_loop_has_it(dtype, device):
             assert float(got[episode, x]) == pytest.approx(total / weights, rel=1e-4, abs=1e-5)
 
 
-def test_one_look_is_what_it_shows():
+def test_after_one_look_attention_is_that_of_the_look():
     visited = torch.zeros(1, 12, dtype=torch.bool)
     visited[0, 5] = True
-    got = TemplateAttention(2, make_attention(), GRID)(nothing_known(1), visited)
+    got = TemplateAttention(2, make_attention(), GRID)(uniform_beliefs(1), visited)
     torch.testing.assert_close(got[0], make_attention()[5, 1])
 
 
 def test_an_episode_does_not_depend_on_the_others():
     visited = torch.rand(5, 12, generator=torch.Generator().manual_seed(0)) < 0.4
     target = torch.tensor([1, 2, 3, 2, 1])
-    together = TemplateAttention(target, make_attention(), GRID)(nothing_known(5), visited)
+    together = TemplateAttention(target, make_attention(), GRID)(uniform_beliefs(5), visited)
     for episode in range(5):
         alone = TemplateAttention(target[episode : episode + 1], make_attention(), GRID)
         part = slice(episode, episode + 1)
-        assert torch.equal(alone(nothing_known(1), visited[part]), together[part])
+        assert torch.equal(alone(uniform_beliefs(1), visited[part]), together[part])
 
 
-def test_what_is_saved_is_read(tmp_path):
+def test_saved_templates_load_unchanged(tmp_path):
     model = make_templates()
     model.metadata["detector"] = {"name": "yolov3-tiny", "digest": "1"}
     model.save(tmp_path / "templates.safetensors")
@@ -113,7 +113,7 @@ def test_what_is_saved_is_read(tmp_path):
         ClassTemplates.from_pretrained(tmp_path / "templates.safetensors")
 
 
-def test_arguments():
+def test_invalid_arguments_are_refused():
     with pytest.raises(InputError, match="templates"):
         ClassTemplates(torch.zeros(2, 5), torch.zeros(5), ["a", "b", "c"])
     with pytest.raises(InputError, match="features"):
@@ -125,8 +125,8 @@ def test_arguments():
         TemplateAttention(1, make_attention()[:5], GRID)
 
 
-def test_looks_are_weighed_in_the_precision_of_the_attention():
-    """Thousands of equal values have themselves as their mean, to the last digits of double precision."""
+def test_looks_are_weighted_in_the_precision_of_the_attention():
+    """The mean of hundreds of equal values is that value, within rounding of double precision."""
     grid = Grid(30, 20, (300, 200))
     attention = torch.linspace(1, 2, 600, dtype=torch.float64).expand(600, 1, 600)
     values = TemplateAttention(1, attention, grid, 0.2)
@@ -134,7 +134,7 @@ def test_looks_are_weighed_in_the_precision_of_the_attention():
     torch.testing.assert_close(got[0], attention[0, 0], rtol=1e-13, atol=0)
 
 
-def test_attention_must_fit_the_grid_and_the_fovea_have_a_width():
+def test_attention_of_another_grid_and_a_fovea_of_zero_width_are_refused():
     with pytest.raises(InputError, match=r"^attention:"):
         TemplateAttention(1, make_attention()[..., :5], GRID)
     with pytest.raises(InputError, match=r"^fovea:"):

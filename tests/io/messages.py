@@ -42,7 +42,7 @@ PLAIN = {"string": str, "double": float, "int32": int, "uint32": int, "uint8": i
 
 
 class Message:
-    """Base of the stand-ins: fields have defaults, and refuse values of another kind."""
+    """Base class of the stand-ins: fields have defaults, and values of another type are refused."""
 
     FIELDS: ClassVar[dict[str, str]] = {}
 

@@ -1,4 +1,4 @@
-"""Digests of code: what a result depends on changes them, and nothing else does."""
+"""Digests of code change with everything that a result depends on, and with nothing else."""
 
 import sys
 import textwrap
@@ -10,7 +10,7 @@ from semfov.io import code
 
 @pytest.fixture
 def package(tmp_path, monkeypatch):
-    """A package of the user's own, imported; returns how to write and import a module of it."""
+    """Function that writes a module of user code and imports it."""
     monkeypatch.syspath_prepend(str(tmp_path))
 
     def write(name, text):
@@ -41,11 +41,11 @@ class Policy(torch.nn.Module):
 """
 
 
-def test_what_a_class_imports_of_the_users_own_counts(package):
+def test_the_digest_of_a_class_depends_on_imported_user_code(package):
     package("own_helper", HELPER)
     first = code.class_digest(package("own_policy", POLICY).Policy)
     package("own_helper", HELPER.replace("larger", "smaller").replace("Which", "What"))
-    assert code.class_digest(package("own_policy", POLICY).Policy) == first, "comments and docstrings do nothing"
+    assert code.class_digest(package("own_policy", POLICY).Policy) == first, "comments and docstrings do not count"
     package("own_helper", HELPER.replace("a > b", "a < b"))
     assert code.class_digest(package("own_policy", POLICY).Policy) != first
     package("own_helper", HELPER)
@@ -53,18 +53,18 @@ def test_what_a_class_imports_of_the_users_own_counts(package):
     assert code.class_digest(package("own_policy", POLICY.replace("sqrt", "log")).Policy) != first
 
 
-def test_two_classes_of_a_file_differ(package):
+def test_two_classes_in_one_file_have_different_digests(package):
     module = package("own_pair", "class One:\n    pass\nclass Two:\n    pass\n")
     assert code.class_digest(module.One) != code.class_digest(module.Two)
 
 
-def test_a_class_without_a_file_is_known_in_its_process_alone():
+def test_the_digest_of_a_class_without_a_file_is_valid_in_one_process_only():
     typed = type("Typed", (), {"__module__": "__nowhere__"})
     assert code.class_digest(typed) == code.class_digest(typed)
     assert "process" in code.class_digest(typed)
 
 
-def test_a_look_depends_on_what_makes_it_and_not_on_beliefs_or_gaze():
+def test_the_code_of_looks_does_not_include_beliefs_or_gaze():
     from semfov.experiments.looks import SOURCES
 
     files = code.closure(SOURCES, lambda name: name.startswith("semfov."))

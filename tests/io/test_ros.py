@@ -1,4 +1,4 @@
-"""Messages of ROS 2: the dictionaries fill stand-ins of the message classes, and images come back from them."""
+"""Messages of ROS 2: dictionaries fill stand-ins of the message classes, and image messages become pictures."""
 
 import importlib
 import sys
@@ -32,7 +32,7 @@ def seen(request, device):
     return Detections(boxes, scores, torch.tensor([[True, True, False]])).to(device)
 
 
-def test_detections_have_the_shape_of_the_message(seen):
+def test_dictionaries_of_detections_have_the_fields_of_the_message(seen):
     head = {"stamp": {"sec": 3, "nanosec": 250_000_000}, "frame_id": "camera"}
     bbox = {"center": {"position": {"x": 25.0, "y": 50.0}, "theta": 0.0}, "size_x": 30.0, "size_y": 60.0}
     named = [("cat", 0.5), ("cup", 0.25), ("car", 0.125)]
@@ -47,7 +47,7 @@ def test_detections_have_the_shape_of_the_message(seen):
     assert [len(each["results"]) for each in low["detections"]] == [3, 2]
 
 
-def test_messages_are_filled_from_them(seen):
+def test_messages_are_filled_from_dictionaries(seen):
     values = ros.detection_array(seen, CLASSES, stamp=3.25, frame="camera")
     message = ros.fill(ARRAY(), values, DETECTION, HYPOTHESIS)
     got = plain(message)
@@ -55,7 +55,7 @@ def test_messages_are_filled_from_them(seen):
         for result in detection["results"]:
             assert result.pop("pose") == plain(KINDS["geometry_msgs/PoseWithCovariance"]())
     assert got == values
-    # Another message's stamp is taken as it is.
+    # The stamp of another message is used unchanged.
     again = ros.detection_array(seen, CLASSES, stamp=message.header.stamp, frame="camera")
     assert again == values
 
@@ -85,7 +85,7 @@ def image(pixels, encoding, pad=0):
 
 
 @pytest.mark.parametrize("pad", [0, 5])
-def test_images_of_every_encoding_are_the_same_picture(pad):
+def test_images_of_every_encoding_give_the_same_picture(pad):
     rgb = np.random.default_rng(0).integers(0, 256, (4, 6, 3), dtype=np.uint8)
     alpha = np.full((4, 6, 1), 9, dtype=np.uint8)
     forms = {
@@ -123,7 +123,7 @@ def test_bad_input(seen):
 
 
 class Square(Detector):
-    """Detects what is red."""
+    """Detects red pixels."""
 
     def __init__(self):
         super().__init__("square", CLASSES, (64, 64))
@@ -137,7 +137,7 @@ class Square(Detector):
 
 
 class Node:
-    """A stand-in of rclpy's."""
+    """A stand-in for the node class of rclpy."""
 
     def __init__(self, name):
         self.name, self.published, self.subscribed, self.logged = name, {}, {}, []
@@ -159,7 +159,7 @@ class Node:
         return SimpleNamespace(info=self.logged.append)
 
 
-def test_node_publishes_what_it_sees_and_where_to_look_next(monkeypatch):
+def test_the_node_publishes_detections_and_the_next_fixation(monkeypatch):
     def module(name, **members):
         made = ModuleType(name)
         vars(made).update(members)
@@ -193,6 +193,6 @@ def test_node_publishes_what_it_sees_and_where_to_look_next(monkeypatch):
     assert best.results[0].hypothesis.class_id == "cup"
     centre = best.bbox.center.position
     assert (centre.x, centre.y) == pytest.approx((55, 35), abs=6)
-    # The gaze goes to where the target is likely: the second look is at the red square.
+    # The next fixation is where the target is likely: the second look is at the red square.
     assert (gaze[0].point.x, gaze[0].point.y) == pytest.approx((55, 35), abs=12)
     sys.modules.pop("examples.ros_node")

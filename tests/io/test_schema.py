@@ -1,4 +1,4 @@
-"""Models whose fields cannot be are refused by name, whatever their checksum says; whole ones come back to the bit."""
+"""Files of models: errors name invalid fields even if the checksum is right; valid models load bit-identically."""
 
 import json
 
@@ -50,12 +50,12 @@ LOADERS = {name: type(make()) for name, make in MODELS.items()}
 
 
 def parts(model):
-    """Tensors and record as they are written."""
+    """Tensors and record of a model, as written to a file."""
     record = {"kind": model.kind, "version": "0", **model._record(), "metadata": model.metadata}
     return dict(model._tensors()), json.loads(json.dumps(record))
 
 
-def refused(name, tmp_path, tensors, record):
+def message_of_refused_file(name, tmp_path, tensors, record):
     path = tmp_path / "model.safetensors"
     storage.write(path, tensors, record)
     with pytest.raises(DataError) as caught:
@@ -67,7 +67,7 @@ def refused(name, tmp_path, tensors, record):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_whole_models_come_back_to_the_bit(name, tmp_path):
+def test_saved_models_load_bit_identically(name, tmp_path):
     model, path = MODELS[name](), tmp_path / "model.safetensors"
     model.save(path)
     again = LOADERS[name].from_pretrained(path)
@@ -79,57 +79,59 @@ def test_whole_models_come_back_to_the_bit(name, tmp_path):
 
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
-def test_numbers_that_are_none_are_refused(name, value, tmp_path):
+def test_tensors_with_nan_or_infinity_are_refused(name, value, tmp_path):
     for key in parts(MODELS[name]())[0]:
         tensors, record = parts(MODELS[name]())
         spoiled = tensors[key].detach().clone()
         spoiled.view(-1)[-1] = value
-        assert f"{key}: expected finite numbers" in refused(name, tmp_path, {**tensors, key: spoiled}, record)
+        assert f"{key}: expected finite numbers" in message_of_refused_file(
+            name, tmp_path, {**tensors, key: spoiled}, record
+        )
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_tensors_of_another_shape_type_or_none_are_refused(name, tmp_path):
+def test_missing_tensors_and_tensors_of_another_shape_or_type_are_refused(name, tmp_path):
     optional = {key for key, each in LOADERS[name].schema.tensors.items() if each.optional}
     for key in parts(MODELS[name]())[0]:
         tensors, record = parts(MODELS[name]())
         whole = tensors.pop(key).detach()
         if key not in optional:
-            assert f"{key}: expected a tensor, got nothing" in refused(name, tmp_path, tensors, record)
+            assert f"{key}: expected a tensor, got nothing" in message_of_refused_file(name, tmp_path, tensors, record)
         for other in (torch.int64, torch.bool, torch.bfloat16, torch.uint8):
-            assert key in refused(name, tmp_path, {**tensors, key: whole.to(other)}, record)
+            assert key in message_of_refused_file(name, tmp_path, {**tensors, key: whole.to(other)}, record)
         if whole.dtype == torch.float32:
-            assert "type" in refused(name, tmp_path, {**tensors, key: whole.double()}, record)
+            assert "type" in message_of_refused_file(name, tmp_path, {**tensors, key: whole.double()}, record)
         for other in (whole[None], whole.new_zeros(0), whole.repeat(*(2,) * whole.ndim) if whole.ndim else whole[None]):
-            refused(name, tmp_path, {**tensors, key: other.clone()}, record)
+            message_of_refused_file(name, tmp_path, {**tensors, key: other.clone()}, record)
     tensors, record = parts(MODELS[name]())
-    assert "surplus" in refused(name, tmp_path, {**tensors, "surplus": torch.zeros(1)}, record)
+    assert "surplus" in message_of_refused_file(name, tmp_path, {**tensors, "surplus": torch.zeros(1)}, record)
 
 
 JUNK = [None, True, "x", -1, 0.5, 10**400, [], {}, [None], {"a": 1}, [[1, 2], [3, 4]], "\0", ["cup", "cup"], 10**9]
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_records_that_say_something_else_are_refused_or_hold(name, tmp_path):
-    """A value is refused by its name, or what is loaded has it."""
+def test_invalid_values_in_records_are_refused_and_valid_ones_are_loaded(name, tmp_path):
+    """For every field and value: the file is refused, or the loaded model has that value."""
     for key in parts(MODELS[name]())[1]:
         tensors, record = parts(MODELS[name]())
         if key in ("kind", "metadata", "version"):
             continue
         del record[key]
-        missing = storage_result(name, tmp_path, tensors, record)
+        missing = loaded_or_none(name, tmp_path, tensors, record)
         assert missing is None or key == "thresholds"
         for junk in JUNK:
             tensors, record = parts(MODELS[name]())
-            loaded = storage_result(name, tmp_path, tensors, {**record, key: junk})
+            loaded = loaded_or_none(name, tmp_path, tensors, {**record, key: junk})
             if loaded is not None:
                 assert json.loads(json.dumps(loaded._record()))[key] == junk
     tensors, record = parts(MODELS[name]())
-    assert storage_result(name, tmp_path, tensors, {**record, "surplus": 1}) is None
+    assert loaded_or_none(name, tmp_path, tensors, {**record, "surplus": 1}) is None
     for metadata in (None, 1, [], "x", {"detector": 1}, {"sensor": []}, {"detector": "x"}):
-        assert "metadata" in refused(name, tmp_path, tensors, {**record, "metadata": metadata})
+        assert "metadata" in message_of_refused_file(name, tmp_path, tensors, {**record, "metadata": metadata})
 
 
-def storage_result(name, tmp_path, tensors, record):
+def loaded_or_none(name, tmp_path, tensors, record):
     path = tmp_path / "model.safetensors"
     storage.write(path, tensors, record)
     try:
@@ -151,14 +153,16 @@ def storage_result(name, tmp_path, tensors, record):
         ("log_alpha", 500.0, "from -30 to 30"),
     ],
 )
-def test_fields_of_an_observation_model_out_of_range(key, value, told, tmp_path):
+def test_fields_of_an_observation_model_out_of_range_are_refused(key, value, told, tmp_path):
     tensors, record = parts(observation())
-    message = refused("observation", tmp_path, {**tensors, key: torch.full_like(tensors[key], value)}, record)
+    message = message_of_refused_file(
+        "observation", tmp_path, {**tensors, key: torch.full_like(tensors[key], value)}, record
+    )
     assert f"{key}: expected" in message
     assert told in message
 
 
-def test_an_observation_model_is_checked_when_it_is_made_too():
+def test_an_observation_model_is_also_checked_when_it_is_constructed():
     for wrong in ({"tempering": float("nan")}, {"tempering": float("inf")}, {"miss_rate": torch.full((3, 2), 2.0)}):
         with pytest.raises(InputError, match=f"^{next(iter(wrong))}: "):
             FovealObservationModel.identity(CLASSES, [0.2], **wrong)
@@ -173,7 +177,7 @@ def test_the_checksum_is_required(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "NaN", '{"kind": Infinity}', "1", "[]", "null", ""])
-def test_headers_of_every_other_kind_are_refused(tmp_path, text):
+def test_invalid_headers_are_refused(tmp_path, text):
     path = tmp_path / "model.safetensors"
     save_file({"a": torch.zeros(1)}, path, {"semfov": text})
     with pytest.raises(DataError, match=r"model\.safetensors: (not a readable|expected)"):
@@ -181,7 +185,7 @@ def test_headers_of_every_other_kind_are_refused(tmp_path, text):
     assert read_tensors(path, "key") is None
 
 
-def test_deep_metadata_is_refused(tmp_path):
+def test_deeply_nested_metadata_are_refused(tmp_path):
     tensors, record = parts(observation())
     deep = "[" * 5000 + "]" * 5000
     text = json.dumps({**record, "sha256": "0" * 64}).replace('"metadata": {}', f'"metadata": {{"x": {deep}}}')
@@ -230,7 +234,7 @@ def test_cached_tensors_of_another_schema_count_as_missing(tmp_path):
         assert read_tensors(path, "key", schema) is None
 
 
-def test_what_schemas_say_of_single_values():
+def test_schemas_accept_valid_values_and_refuse_invalid_ones():
     sizes = {}
     Array(Text(), "K").check("classes", ["a", "b"], sizes)
     assert sizes == {"K": 2}
@@ -263,7 +267,7 @@ def test_what_schemas_say_of_single_values():
     ],
     ids=["flag", "whole number"],
 )
-def test_values_of_these_kinds(kind, good, bad):
+def test_flags_and_whole_numbers(kind, good, bad):
     for value in good:
         Schema({}, {"x": kind}).check({}, {"x": value})
     for value in bad:
@@ -271,7 +275,7 @@ def test_values_of_these_kinds(kind, good, bad):
             Schema({}, {"x": kind}).check({}, {"x": value})
 
 
-def test_tensors_may_be_of_several_types_where_that_is_said():
+def test_tensors_may_have_different_types_only_in_mixed_fields():
     mixed = {"a": torch.zeros(2), "b": torch.zeros(2, dtype=torch.float64)}
     Schema({name: Field((2,), mixed=True) for name in mixed}).check(mixed)
     Schema({"a": Field((2,), mixed=True), "b": Field((2,))}).check(mixed)
@@ -281,7 +285,7 @@ def test_tensors_may_be_of_several_types_where_that_is_said():
         Schema({"a": Field((2,), mixed=True)}).check({"a": torch.zeros(2, dtype=torch.int64)})
 
 
-def test_numbers_may_be_infinite_where_that_is_said():
+def test_numbers_may_be_infinite_only_where_the_field_allows_it():
     tensor = torch.tensor([-torch.inf, torch.nan])
     Schema({"a": Field((2,), finite=False)}).check({"a": tensor})
     with pytest.raises(InputError, match="finite"):

@@ -1,4 +1,4 @@
-"""An episode and a run that need no detector, with names that try to be markup."""
+"""An episode and a run without a detector, with names that contain HTML markup."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,14 +15,14 @@ from semfov.experiments.summary import Curve
 
 @pytest.fixture
 def hostile() -> str:
-    """A name that would run if it were taken for markup: in an attribute, a text, the title or a script."""
+    """A name that would run as a script if it were not escaped: in an attribute, a text, the title or a script."""
     attack = "<img src=x onerror=\"alert('taken')\"><script>alert('taken')</script>"
     return f"\"'>{attack}</title></script>{attack}<!--<script>"
 
 
 @pytest.fixture
 def scanpath(hostile: str) -> Scanpath:
-    """Three fixations on a 4 × 3 grid; what is believed and seen differs from each to the next."""
+    """Three fixations on a 4 × 3 grid, with different beliefs and detections."""
     generator = torch.Generator().manual_seed(0)
     grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 6, 11])
     scores = torch.rand(3, 2, 4, generator=generator).softmax(-1)
@@ -45,14 +45,14 @@ def scanpath(hostile: str) -> Scanpath:
 
 @pytest.fixture
 def image() -> torch.Tensor:
-    """A picture in the frame of the episode."""
+    """A picture of the size of the frame of the episode."""
     across, down = torch.linspace(0, 1, 80).expand(60, 80), torch.linspace(0, 1, 60)[:, None].expand(60, 80)
     return torch.stack([across, down, 1 - across])
 
 
 @pytest.fixture
 def run_page(scanpath: Scanpath, image: torch.Tensor, hostile: str, tmp_path: Path, monkeypatch) -> Path:
-    """The page of a run of which everything is called that."""
+    """The page of a run in which every name is `hostile`."""
     scene = SimpleNamespace(name=hostile, image=image, boxes=torch.ones(1, 4), labels=torch.tensor([2]))
     run = SimpleNamespace(
         task=hostile,

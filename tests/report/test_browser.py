@@ -1,6 +1,6 @@
 """The page in a real browser: Chromium steps through an episode by keyboard.
 
-The browser is `chromium`, `chromium-browser` or `google-chrome` on the path, or what $CHROMIUM names.
+The browser is `chromium`, `chromium-browser` or `google-chrome` on the path, or the program given by $CHROMIUM.
 """
 
 import os
@@ -46,7 +46,7 @@ def path(scanpath, image, hostile, tmp_path):
 
 @pytest.fixture
 def opened(chromium, path):
-    """The page; nothing may be complained of, asked for or run that is not its own."""
+    """The page, opened; it may give no errors or dialogs, and request nothing from elsewhere."""
     page, told = watched(chromium)
     page.goto(path.as_uri())
     yield page
@@ -55,7 +55,7 @@ def opened(chromium, path):
 
 
 def watched(chromium):
-    """A new page, and what it says: complaints, dialogs, and what it asks of the network."""
+    """A new page, and a list of its console messages, errors, dialogs and network requests."""
     page, told = chromium.new_page(viewport={"width": 1200, "height": 900}), []
 
     def dismiss(dialog):
@@ -73,7 +73,7 @@ PICTURES = ("path", "view", "belief", "entropy", "values")
 
 
 def pictures(page):
-    """What is to be seen; the same drawing may differ in a pixel where the page has moved by part of one."""
+    """Screenshots; equal drawings may differ in a pixel if the page has moved by a fraction of a pixel."""
     return {name: page.locator(f"#{name}").screenshot() for name in PICTURES}
 
 
@@ -81,7 +81,7 @@ def drawings(page):
     return {name: page.locator(f"#{name}").inner_html() for name in PICTURES}
 
 
-def test_slider_moves_by_keyboard(opened):
+def test_the_slider_is_moved_by_arrow_keys(opened):
     before, drawn = pictures(opened), drawings(opened)
     opened.locator("#fixation").focus()
     opened.keyboard.press("ArrowRight")
@@ -92,7 +92,7 @@ def test_slider_moves_by_keyboard(opened):
     assert drawings(opened) == drawn
 
 
-def test_arrow_keys_move_without_focus(opened):
+def test_arrow_keys_work_without_focus_on_the_slider(opened):
     opened.keyboard.press("ArrowRight")
     opened.keyboard.press("ArrowRight")
     opened.keyboard.press("ArrowRight")
@@ -103,7 +103,7 @@ def test_arrow_keys_move_without_focus(opened):
     assert opened.locator("#number").inner_text() == "0 of 2"
 
 
-def test_another_class_changes_the_map(opened, scanpath):
+def test_selecting_another_class_changes_only_the_map(opened, scanpath):
     before, drawn = pictures(opened), drawings(opened)
     opened.locator("#class").select_option(label="cup")
     assert pictures(opened)["belief"] != before["belief"]
@@ -112,7 +112,7 @@ def test_another_class_changes_the_map(opened, scanpath):
 
 
 def test_cells_have_the_colours_of_their_values(opened, scanpath):
-    """On one scale from 0, which is transparent, to 1."""
+    """All maps have one scale from 0, which is transparent, to 1."""
     cells = opened.locator("#belief rect").evaluate_all("all => all.map(cell => cell.getAttribute('fill'))")
     assert len(cells) == 12
     opened.keyboard.press("End")
@@ -131,7 +131,7 @@ def test_cells_have_the_colours_of_their_values(opened, scanpath):
     assert opened.locator("#belief image").evaluate("each => getComputedStyle(each).filter") == "grayscale(1)"
 
 
-def test_head_tells_what_and_how_and_the_outcome_from_the_start(opened, hostile):
+def test_the_head_shows_photograph_settings_and_outcome_at_once(opened, hostile):
     told = dict(
         zip(opened.locator("#about dt").all_inner_texts(), opened.locator("#about dd").all_inner_texts(), strict=True)
     )
@@ -146,7 +146,7 @@ def test_head_tells_what_and_how_and_the_outcome_from_the_start(opened, hostile)
     assert opened.locator("#about dd").first.inner_text() == "another"
 
 
-def test_one_entry_for_each_class(opened, scanpath):
+def test_the_menu_has_one_entry_for_each_class(opened, scanpath):
     entries = opened.locator("#class option").all_inner_texts()
     assert sorted(entries) == sorted(scanpath.classes)
 
@@ -155,7 +155,7 @@ def test_saccades_are_thin_and_fixations_coloured_by_time(opened):
     opened.keyboard.press("End")
     fills = opened.locator("#path circle").evaluate_all("all => all.map(each => each.getAttribute('fill'))")
     assert len(set(fills)) == len(fills) == 3
-    # One unit is a 640th of the width.
+    # One unit is 1/640 of the width.
     widths = opened.locator("#path line").evaluate_all("all => all.map(each => each.getAttribute('stroke-width'))")
     assert max(float(width) for width in widths) <= 3.5 * 80 / 640
 
@@ -163,7 +163,7 @@ def test_saccades_are_thin_and_fixations_coloured_by_time(opened):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", [(1200, 900), (360, 740)], ids=["desktop", "phone"])
 @pytest.mark.parametrize("kind", ["episodes", "run", "notebook"])
-def test_axe_finds_no_violation(chromium, path, run_page, scanpath, kind, size, scheme, tmp_path):
+def test_axe_finds_no_accessibility_violation(chromium, path, run_page, scanpath, kind, size, scheme, tmp_path):
     if kind == "notebook":
         frame = scanpath._repr_html_()
         page_file = tmp_path / "notebook.html"
@@ -180,7 +180,7 @@ def test_axe_finds_no_violation(chromium, path, run_page, scanpath, kind, size, 
     context.close()
 
 
-def test_axe_would_find_a_violation(chromium, path):
+def test_axe_finds_a_label_that_was_removed(chromium, path):
     page = chromium.new_page()
     page.goto(path.as_uri())
     page.evaluate("document.querySelector('label[for=fixation]').remove()")
@@ -189,8 +189,8 @@ def test_axe_would_find_a_violation(chromium, path):
     page.close()
 
 
-def test_page_runs_in_a_frame_and_reaches_nothing_outside(chromium, scanpath, tmp_path):
-    """A notebook's style does not reach in, and the page's program does not reach out."""
+def test_the_page_in_a_frame_is_isolated_from_the_notebook(chromium, scanpath, tmp_path):
+    """Styles of the notebook do not apply to the page, and its program cannot read the notebook."""
     file = tmp_path / "notebook.html"
     style = "<style>* { color: red !important; display: block }</style><p id=outcome>mine</p>"
     file.write_text(f"<!DOCTYPE html>{style}{scanpath._repr_html_()}", "utf-8")
@@ -211,8 +211,8 @@ def test_page_runs_in_a_frame_and_reaches_nothing_outside(chromium, scanpath, tm
     page.close()
 
 
-def test_curves_are_whole_on_a_phone(chromium, run_page):
-    """They fit without scrolling, and their numbers are not too small to read."""
+def test_curves_fit_on_a_phone(chromium, run_page):
+    """They fit without scrolling, and their numbers are large enough to read."""
     context = chromium.new_context(viewport={"width": 360, "height": 740})
     page = context.new_page()
     page.goto(run_page.as_uri())
@@ -237,7 +237,7 @@ def test_curves_are_whole_on_a_phone(chromium, run_page):
     context.close()
 
 
-def test_names_are_shown_and_not_run(opened, hostile):
+def test_names_of_an_episode_are_shown_and_not_run(opened, hostile):
     assert opened.title() == f"search for {hostile}"
     assert hostile in opened.locator("#class option").all_inner_texts()
     assert opened.locator("script").count() == 2
@@ -258,21 +258,21 @@ def test_names_of_a_run_are_shown_and_not_run(chromium, run_page, hostile):
     page.close()
 
 
-def test_names_would_run_if_they_were_not_escaped(chromium, hostile, tmp_path):
-    """Or the tests that they do not would show nothing."""
+def test_names_that_are_not_escaped_run(chromium, hostile, tmp_path):
+    """Without this, the tests above could pass with harmless names."""
     page, told = watched(chromium)
     page.goto(write_page(tmp_path / "page.html", "t", [], Pool(), sections=hostile).as_uri())
     assert told.count("dialog: taken") >= 2
     page.close()
 
 
-def test_another_episode(opened):
+def test_selecting_another_episode_starts_at_its_first_fixation(opened):
     opened.keyboard.press("End")
     opened.locator("#episode").select_option(index=1)
     assert opened.locator("#number").inner_text() == "0 of 2"
 
 
-def test_play_goes_to_the_end(opened):
+def test_the_play_button_runs_to_the_last_fixation(opened):
     opened.locator("#play").click()
     playwright.expect(opened.locator("#play")).to_have_text("Pause")
     playwright.expect(opened.locator("#number")).to_have_text("2 of 2")
@@ -280,8 +280,8 @@ def test_play_goes_to_the_end(opened):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_phone(chromium, path, scheme):
-    """Nothing sticks out sideways, and text stands out from its background by 4.5 to 1 at least."""
+def test_the_page_fits_on_a_phone_and_text_has_enough_contrast(chromium, path, scheme):
+    """Nothing is wider than the screen, and the contrast of text is 4.5 to 1 or more."""
     context = chromium.new_context(viewport={"width": 360, "height": 740}, color_scheme=scheme)
     page = context.new_page()
     page.goto(path.as_uri())
@@ -292,7 +292,7 @@ def test_phone(chromium, path, scheme):
     context.close()
 
 
-# WCAG 2's contrast of every element that holds text itself, by its tag and the start of its text.
+# Contrast by WCAG 2 of every element with text; keys are the tag and the start of the text.
 CONTRAST = """() => {
   const channels = (colour) => (colour.match(/[\\d.]+/g) ?? []).map(Number);
   const light = (rgb) => rgb.slice(0, 3).map((v) => v / 255)

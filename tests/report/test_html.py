@@ -1,4 +1,4 @@
-"""Pages hold what was computed, in one file, and take no name for markup."""
+"""Pages contain the computed results in one file, and names are never interpreted as markup."""
 
 import base64
 import io
@@ -20,7 +20,7 @@ from semfov.viz import why_it_ended
 
 
 class Elements(HTMLParser):
-    """The elements of a page, with their attributes, as a browser finds them."""
+    """The elements of a page with their attributes, as a browser parses them."""
 
     def __init__(self, page):
         super().__init__()
@@ -53,7 +53,7 @@ def decoded(data, *shape):
 
 
 @pytest.mark.parametrize("kind", ["episode", "run"])
-def test_names_are_never_markup(kind, hostile, request):
+def test_names_are_never_interpreted_as_markup(kind, hostile, request):
     if kind == "run":
         page = request.getfixturevalue("run_page").read_text(encoding="utf-8")
     else:
@@ -72,14 +72,14 @@ def test_names_are_never_markup(kind, hostile, request):
     assert "<" not in re.search(r'id="data">(.*?)</script>', page, re.S)[1]
 
 
-def test_a_name_cannot_fill_in_a_place_of_the_template(scanpath, image, tmp_path):
+def test_names_are_not_interpreted_as_placeholders_of_the_template(scanpath, image, tmp_path):
     data = episode_data(scanpath, image, [image] * 3, pool := Pool(), name="{{program}}")
     page = write_page(tmp_path / "page.html", "{{data}}", [data], pool).read_text(encoding="utf-8")
     assert "<title>{{data}}</title>" in page
     assert data_of(page)["episodes"][0]["name"] == "{{program}}"
 
 
-def test_nothing_is_fetched(page):
+def test_the_page_loads_nothing_from_elsewhere(page):
     for tag, attributes in Elements(page).found:
         for name in ("src", "href", "action", "data"):
             assert attributes.get(name, "data:").startswith("data:"), (tag, attributes)
@@ -95,11 +95,11 @@ def test_every_control_has_a_label(page):
     assert all(attributes["id"] in labelled for attributes in controls)
 
 
-def test_beliefs_come_through(page, scanpath):
+def test_the_page_contains_the_beliefs(page, scanpath):
     (episode,) = data_of(page)["episodes"]
     maps = {each["label"]: decoded(each, 3, 12) for each in episode["maps"]}
     first, *_, last = maps
-    # The target's is what the search believed.
+    # The map of the target is the posterior of the search.
     assert (first, last) == (scanpath.classes[2], "background")
     assert len(episode["maps"]) == len(scanpath.classes)
     np.testing.assert_allclose(maps[first], scanpath.posterior, atol=1 / 500)
@@ -111,7 +111,7 @@ def test_beliefs_come_through(page, scanpath):
     np.testing.assert_allclose(decoded(episode["entropy"], 3, 12), entropy, atol=2 / 500)
 
 
-def test_fixations_come_through(page, scanpath, image):
+def test_the_page_contains_fixations_detections_and_pictures(page, scanpath, image):
     data = data_of(page)
     (episode,) = data["episodes"]
     assert [each["cell"] for each in episode["fixations"]] == [0, 6, 11]
@@ -128,7 +128,7 @@ def test_fixations_come_through(page, scanpath, image):
     picture = data["pictures"][episode["image"]]
     pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(picture.split(",")[1]))), dtype=float) / 255
     assert np.abs(pixels - image.permute(1, 2, 0).numpy()).mean() < 0.02
-    assert len(data["pictures"]) == 2  # the three views are one and the same
+    assert len(data["pictures"]) == 2  # the three views are equal
 
 
 def test_an_episode_that_was_not_timed_has_no_times(scanpath, image):
@@ -136,12 +136,12 @@ def test_an_episode_that_was_not_timed_has_no_times(scanpath, image):
     assert [each["seconds"] for each in data["fixations"]] == [None] * 3
 
 
-def test_fewer_classes_on_request(scanpath, image):
+def test_the_number_of_classes_can_be_limited(scanpath, image):
     data = episode_data(replace(scanpath, posterior=None), image, [image] * 3, Pool(), name="few", classes=1)
     assert [each["label"] for each in data["maps"]] == [scanpath.classes[2], "background"]
 
 
-def test_values_that_are_not_finite(scanpath, image, tmp_path):
+def test_values_that_are_not_finite_become_null(scanpath, image, tmp_path):
     values = scanpath.values.clone()
     values[0, 3] = -torch.inf
     data = episode_data(replace(scanpath, values=values), image, [image] * 3, pool := Pool(), name="-inf")
@@ -149,7 +149,7 @@ def test_values_that_are_not_finite(scanpath, image, tmp_path):
     assert data_of(page)["episodes"][0]["fixations"][0]["values"][3] is None
 
 
-def test_curves_are_the_numbers(hostile):
+def test_points_of_curves_follow_the_numbers(hostile):
     text = curves_html({"flat": np.full(3, 0.5), hostile: np.array([0, 0.5, 1.0])}, {"flat": np.full(3, 0.1)}, hostile)
     assert hostile not in text
     lines = re.findall(r'<polyline [^>]*points="([^"]+ [^"]+ [^"]+)"', text)
@@ -160,7 +160,7 @@ def test_curves_are_the_numbers(hostile):
     assert text.count("<polygon") == 1
 
 
-def test_the_legend_of_many_curves_is_sparse(hostile):
+def test_the_legend_of_many_curves_lists_only_some_of_them(hostile):
     curves = {"random": np.zeros(3)} | {f"policy {number}": np.full(3, number / 40) for number in range(30)}
     text = curves_html(curves, {}, hostile)
     entries = re.findall(r"</svg> ([^<]+)</li>", text)
@@ -170,8 +170,8 @@ def test_the_legend_of_many_curves_is_sparse(hostile):
     assert re.findall(r"</svg> ([^<]+)</li>", few) == ["random", "policy 0", "policy 1"]
 
 
-def test_one_entry_for_each_class(scanpath, image):
-    """Whatever the detector calls its classes."""
+def test_classes_of_the_same_name_have_separate_entries(scanpath, image):
+    """A detector may use one name for several classes."""
     twins = replace(scanpath, classes=("background", "N/A", "cup", "N/A"))
     data = episode_data(twins, image, [image] * 3, Pool(), name="twins")
     labels = [each["label"] for each in data["maps"]]
@@ -179,15 +179,15 @@ def test_one_entry_for_each_class(scanpath, image):
     assert sorted(labels) == ["N/A", "N/A (2)", "background", "cup"]
 
 
-def test_without_pictures(scanpath, tmp_path):
+def test_a_page_without_pictures_says_so(scanpath, tmp_path):
     data = episode_data(scanpath, None, None, pool := Pool(), name="in the dark")
     page = write_page(tmp_path / "page.html", "t", [data], pool).read_text(encoding="utf-8")
     assert data_of(page)["pictures"] == []
     assert "not recorded" in page
 
 
-def test_head_of_the_page(scanpath, image, hostile, tmp_path):
-    """It stands there without the program, too."""
+def test_the_head_shows_photograph_settings_and_outcome(scanpath, image, hostile, tmp_path):
+    """It is also shown without JavaScript."""
     settings = {"detector": {"name": hostile}, "sensor": {"sigma": 50.0, "reference": 640.0, "growth": 1.0}}
     decided = replace(scanpath, decision=Decision("found", 0.97, 6), ending="decision")
     data = episode_data(decided, image, [image] * 3, pool := Pool(), name="a.jpg", settings=settings)
@@ -199,8 +199,8 @@ def test_head_of_the_page(scanpath, image, hostile, tmp_path):
     assert page.index("found after") < page.index("<main>")
 
 
-def test_the_outcome_comes_through(scanpath, image):
-    """What was decided, why it ended, and how sure each look made the search."""
+def test_the_page_contains_the_outcome(scanpath, image):
+    """The decision, why the episode ended, and the probability of presence after each look."""
     decision = Decision("found", 0.97, 6, torch.tensor([1.0, 2.0, 30.25, 40.0]))
     presence = torch.tensor([0.25, 0.5, 0.97])
     searched = replace(scanpath, decision=decision, ending="decision", presence=presence)

@@ -1,4 +1,4 @@
-"""A scanpath in a notebook: the page in a frame of its own, bounded in size."""
+"""A scanpath in a notebook: the page is shown in a frame, and its size is limited."""
 
 import html
 import json
@@ -17,7 +17,7 @@ from semfov.scanpath.stimulus import in_bytes
 
 
 class Frame(HTMLParser):
-    """The only element of a cell's output."""
+    """The elements in the output of a cell."""
 
     def __init__(self, text):
         super().__init__()
@@ -28,7 +28,7 @@ class Frame(HTMLParser):
         self.tags.append((tag, dict(attributes)))
 
 
-def kept(scanpath, image):
+def with_photograph(scanpath, image):
     """The scanpath with its photograph."""
     height, width = image.shape[-2:]
     sensor = {"sigma": 20.0, "levels": 2, "growth": 2.0, "convention": "kornia", "reference": 640.0}
@@ -42,8 +42,8 @@ def data_of(page):
     return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)[1])
 
 
-def test_frame_holds_the_page(scanpath, image, hostile):
-    text = kept(scanpath, image)._repr_html_()
+def test_the_frame_contains_the_page(scanpath, image, hostile):
+    text = with_photograph(scanpath, image)._repr_html_()
     ((tag, attributes),) = Frame(text).tags
     assert tag == "iframe"
     assert attributes["sandbox"] == "allow-scripts"
@@ -66,7 +66,7 @@ def test_without_a_photograph_there_are_no_pictures(scanpath):
     assert data["episodes"][0]["detector"] is None
 
 
-def long(looks, columns, classes):
+def scanpath_of(looks, columns, classes):
     grid = Grid(columns, columns, (80, 60))
     cells = torch.arange(looks) % len(grid)
     return Scanpath(
@@ -86,10 +86,10 @@ def long(looks, columns, classes):
     ("looks", "columns", "classes", "size", "shown"),
     [(31, 10, 80, 200, True), (120, 10, 80, 416, True), (31, 40, 80, 200, True), (900, 40, 2, 20, False)],
 )
-def test_size_is_bounded(looks, columns, classes, size, shown):
-    """Finer pictures and more classes where there is room, then coarser ones and fewer, then words."""
+def test_the_size_of_the_output_is_limited(looks, columns, classes, size, shown):
+    """If the output is too large: coarser pictures and fewer classes, then only text."""
     noise = torch.rand(3, size * 3 // 4, size)
-    text = kept(long(looks, columns, classes), noise)._repr_html_()
+    text = with_photograph(scanpath_of(looks, columns, classes), noise)._repr_html_()
     assert len(text.encode()) <= notebook.MOST
     if shown:
         episode = data_of(Frame(text).tags[0][1]["srcdoc"])["episodes"][0]

@@ -1,4 +1,4 @@
-"""The sensor written a second time, in numpy and plain loops, to compare with."""
+"""A second implementation of the sensor, in numpy and plain loops, to compare with."""
 
 from math import exp, floor
 from types import SimpleNamespace
@@ -37,7 +37,7 @@ def resize(line, length):
 
 
 def enlarge_opencv(line, length):
-    """Every second pixel is zero, the zeros beyond the last pixel repeat it: what `cv2.pyrUp` computes."""
+    """As `cv2.pyrUp`: zeros between pixels are filtered, and the last pixel is repeated beyond the border."""
     n = len(line)
     at = lambda i: line[1 if n > 1 else 0] if i < 0 else line[min(i, n - 1)]  # noqa: E731
     even = [(at(i - 1) + 6 * at(i) + at(i + 1)) / 8 for i in range(n)]
@@ -65,7 +65,7 @@ def pyrup(image, size, convention):
 
 
 def foveate(image, gaze, sigma, levels, growth, convention):
-    """`(C, H, W)` around one fixation `(x, y)`, straight from the formula: every band expanded on its own."""
+    """`(C, H, W)` around one fixation `(x, y)`, directly by the formula: every band is expanded separately."""
     pyramid = [image]
     for _ in range(levels):
         pyramid.append(pyrdown(pyramid[-1], convention))
@@ -92,6 +92,6 @@ def foveate(image, gaze, sigma, levels, growth, convention):
 
 
 @pytest.fixture(scope="session")
-def twin():
+def reference_sensor():
     """`pyrdown`, `pyrup` and `foveate` of float64 arrays."""
     return SimpleNamespace(pyrdown=pyrdown, pyrup=pyrup, foveate=foveate)

@@ -1,4 +1,4 @@
-"""Random foveation as Kornia's augmentations behave, and against `foveate`."""
+"""Random foveation against `foveate`, and as one of Kornia's augmentations."""
 
 import copy
 import math
@@ -20,7 +20,7 @@ def draw(*shape, dtype=torch.float32, device=None):
 
 @pytest.mark.parametrize("settings", [{}, {"levels": 3, "growth": 1.0, "convention": "opencv"}])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_foveates_around_what_it_drew(settings, dtype, device):
+def test_view_is_foveated_at_the_drawn_fixations(settings, dtype, device):
     image = draw(3, 3, 40, 56, dtype=dtype, device=device)
     augment = RandomFoveation((5.0, 9.0), p=1.0, **settings)
     view = augment(image)
@@ -35,7 +35,7 @@ def test_foveates_around_what_it_drew(settings, dtype, device):
         torch.testing.assert_close(view[b : b + 1], one, rtol=0, atol=1e-6)
 
 
-def test_draws_are_uniform_over_the_image():
+def test_fixations_and_widths_are_uniformly_distributed():
     augment = RandomFoveation((5.0, 9.0), p=1.0)
     torch.manual_seed(0)
     drawn = augment.forward_parameters(torch.Size([20000, 3, 30, 50]))
@@ -44,12 +44,12 @@ def test_draws_are_uniform_over_the_image():
         (drawn["gaze"][:, 1], -0.5, 29.5),
         (drawn["sigma"], 5.0, 9.0),
     ):
-        # Kolmogorov and Smirnov's distance; it is larger than this for one seed in a million.
+        # The Kolmogorov-Smirnov distance exceeds this bound for one seed in a million.
         share = ((values.double() - low) / (high - low)).sort().values
         assert 0 <= share[0] <= share[-1] <= 1
         distance = (share - (torch.arange(20000) + 0.5) / 20000).abs().max()
         assert distance < 2.7 / math.sqrt(20000)
-    # Fixations and widths have nothing to do with each other.
+    # Fixations and widths are not correlated.
     together = torch.corrcoef(torch.cat([drawn["gaze"], drawn["sigma"][:, None]], 1).T)
     assert (together - torch.eye(3)).abs().max() < 0.04
 
@@ -62,7 +62,7 @@ def test_same_on_batch():
     torch.testing.assert_close(view, view[:1].expand_as(view))
 
 
-def test_parameters_and_seeds_repeat_it():
+def test_equal_parameters_or_seeds_give_equal_views():
     image = draw(4, 3, 24, 32)
     augment = RandomFoveation((3.0, 30.0))
     torch.manual_seed(3)
@@ -74,7 +74,7 @@ def test_parameters_and_seeds_repeat_it():
     assert torch.equal(RandomFoveation((3.0, 30.0))(image), view)
 
 
-def test_probability():
+def test_the_given_share_of_images_is_foveated():
     image = draw(200, 1, 6, 7)
     assert torch.equal(RandomFoveation(1.0, p=0.0)(image), image)
     augment = RandomFoveation(1.0, p=0.3)
@@ -103,7 +103,7 @@ def test_gradients():
     assert torch.autograd.gradcheck(view, (image, gaze, sigma))
 
 
-def test_beside_boxes_masks_and_keypoints(device):
+def test_boxes_masks_and_keypoints_are_not_changed(device):
     image, mask = draw(2, 3, 40, 56, device=device), (draw(2, 1, 40, 56, device=device) > 0.5).float()
     boxes = torch.tensor([[[3.0, 4.0, 20.0, 30.0], [0.0, 0.0, 55.0, 39.0]]], device=device).expand(2, 2, 4)
     points = 30 * draw(2, 5, 2, device=device)
@@ -118,7 +118,7 @@ def test_beside_boxes_masks_and_keypoints(device):
     assert torch.equal(again, view)
 
 
-def test_behind_a_flip_the_flip_moves_the_boxes():
+def test_boxes_are_moved_only_by_a_flip_before_the_foveation():
     image, boxes = draw(2, 3, 40, 56), torch.tensor([[[3.0, 4.0, 20.0, 30.0]]]).expand(2, 1, 4)
     keys = ["input", "bbox_xyxy"]
     both = AugmentationSequential(RandomHorizontalFlip(p=1.0), RandomFoveation(6.0, p=1.0), data_keys=keys)
@@ -140,13 +140,13 @@ def test_compiles_to_one_graph():
     torch.testing.assert_close(compiled(image, params=params), augment(image, params=params))
 
 
-def test_in_a_data_set():
+def test_works_in_a_data_loader():
     augment = RandomFoveation(5.0, p=1.0, keepdim=True)
     loader = DataLoader([(augment(draw(3, 16, 20)), 0)] * 2, batch_size=2)
     assert next(iter(loader))[0].shape == (2, 3, 16, 20)
 
 
-def test_settings_are_shown():
+def test_repr_shows_the_settings():
     text = repr(RandomFoveation((3.0, 30.0), levels=4))
     assert text.startswith("RandomFoveation(sigma=(3.0, 30.0), p=0.5, ")
     assert "levels=4, growth=2.0, convention=kornia" in text
@@ -170,6 +170,6 @@ def test_bad_settings(settings, message):
         RandomFoveation(**{"sigma": 3.0} | settings)
 
 
-def test_no_other_name_is_made_up():
+def test_an_unknown_name_in_the_module_is_an_error():
     with pytest.raises(AttributeError, match="RandomFixation"):
         _ = semfov.sensor.RandomFixation

@@ -24,7 +24,7 @@ def close(a, b, tolerance=1e-12):
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("growth", [1.0, 2.0])
 @pytest.mark.parametrize("size", [(16, 24), (17, 13), (1, 1), (1, 6), (2, 3)])
-def test_plain_loops(twin, convention, growth, size):
+def test_foveation_equals_plain_loops(reference_sensor, convention, growth, size):
     image = draw(1, 2, *size)
     for gaze in ((3.0, 5.5), (-4.0, 30.0)):
         sigma = (4.0, 2.5)
@@ -36,22 +36,22 @@ def test_plain_loops(twin, convention, growth, size):
             growth=growth,
             convention=convention,
         )
-        close(result[0], twin.foveate(image[0].numpy(), gaze, sigma, 3, growth, convention))
+        close(result[0], reference_sensor.foveate(image[0].numpy(), gaze, sigma, 3, growth, convention))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("growth", [1.0, 2.0])
-def test_plain_loops_on_a_large_image(twin, convention, growth):
+def test_foveation_of_a_large_image_equals_plain_loops(reference_sensor, convention, growth):
     image = draw(1, 1, 164, 171)
     gaze, sigma = (100.5, 20.0), (30.0, 30.0)
     result = foveate(image, torch.tensor(gaze), sigma=30.0, growth=growth, convention=convention)
-    close(result[0], twin.foveate(image[0].numpy(), gaze, sigma, 5, growth, convention))
+    close(result[0], reference_sensor.foveate(image[0].numpy(), gaze, sigma, 5, growth, convention))
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @given(size=st.tuples(st.integers(1, 40), st.integers(1, 40)), levels=st.integers(0, 6))
-def test_infinite_sigma_gives_the_image_back(convention, size, levels):
+def test_infinite_sigma_leaves_the_image_unchanged(convention, size, levels):
     image = draw(1, 2, *size, dtype=torch.float32)
     gaze = torch.tensor([3.0, 4.0])
     close(foveate(image, gaze, sigma=math.inf, levels=levels, convention=convention), image, 1e-5)
@@ -60,7 +60,7 @@ def test_infinite_sigma_gives_the_image_back(convention, size, levels):
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("size", [(480, 640), (333, 257), (131, 1), (1, 300)])
 @pytest.mark.parametrize("sigma", [math.inf, 1e7])
-def test_wide_sigma_gives_a_large_image_back(convention, size, sigma, device):
+def test_very_large_sigma_leaves_a_large_image_unchanged(convention, size, sigma, device):
     image = draw(1, 3, *size, dtype=torch.float32, device=device)
     gaze = torch.tensor([[100.0, 50.0]], device=device)
     close(foveate(image, gaze, sigma=sigma, convention=convention), image, 1e-5)
@@ -75,7 +75,7 @@ def test_constant_image_stays_constant(convention, size):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("size", [(20, 27), (170, 164)])
-def test_many_fixations_are_the_loop_over_them(convention, size, device):
+def test_many_fixations_equal_a_loop_over_them(convention, size, device):
     image = draw(2, 3, *size, device=device)
     gaze = 30 * draw(2, 4, 2, device=device)
     many = foveate(image, gaze, sigma=9.0, convention=convention)
@@ -101,14 +101,14 @@ def test_no_fixations_and_no_levels():
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("size", [(20, 27), (170, 164)])
-def test_sigma_of_each_image_and_axis(convention, size):
+def test_sigma_may_differ_between_images_and_axes(convention, size):
     image, gaze = draw(2, 1, *size), 20 * draw(2, 3, 2)
     sigma = torch.tensor([[4.0, 9.0], [7.0, 3.0]])
     result = foveate(image, gaze, sigma=sigma, convention=convention)
     for b in range(2):
         one = foveate(image[b : b + 1], gaze[b : b + 1], sigma=sigma[b : b + 1], convention=convention)
         close(result[b : b + 1], one)
-        # Swapping the axes of everything swaps those of the result.
+        # If the axes of all arguments are swapped, so are those of the result.
         swapped = foveate(
             image[b : b + 1].mT, gaze[b : b + 1].flip(-1), sigma=sigma[b : b + 1].flip(-1), convention=convention
         )
@@ -118,12 +118,12 @@ def test_sigma_of_each_image_and_axis(convention, size):
 
 
 @pytest.mark.parametrize("size", [(20, 27), (170, 164)])
-def test_gaze_far_away_leaves_the_base(size):
+def test_a_fixation_far_outside_shows_only_the_coarsest_level(size):
     image = draw(1, 3, *size, dtype=torch.float32)
     far = foveate(image, torch.tensor([1e6, -1e6]), sigma=5.0)
     assert torch.isfinite(far).all()
     close(far, foveate(image, torch.tensor([-1e30, 1e30]), sigma=5.0), 0)
-    # No window reaches the image, so only the coarsest level is left: a small image of few pixels, enlarged.
+    # No window reaches the image, so only the coarsest level remains: an enlarged image of a few pixels.
     assert far.std() < 0.1 * image.std()
 
 
@@ -136,7 +136,7 @@ def test_sharp_at_the_fixation_and_blurred_away_from_it():
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @given(a=st.floats(-3, 3), b=st.floats(-3, 3), height=st.integers(1, 20), width=st.integers(1, 20))
-def test_linear_in_the_image(convention, a, b, height, width):
+def test_foveation_is_linear_in_the_image(convention, a, b, height, width):
     first, second = draw(1, 2, height, width), draw(1, 2, height, width, seed=1)
     gaze = torch.tensor([width / 3, height / 2])
 
@@ -158,7 +158,7 @@ def test_pyramid_can_be_reused(convention, size):
         for x in (0.0, 7.0, 100.0):
             gaze = torch.tensor([x, 9.0])
             views.append((sensor(bands, gaze), sensor(image, gaze)))
-    # Compared after the last fixation: an earlier view must not be overwritten by a later one.
+    # Compared after the last fixation, because a later view must not overwrite an earlier one.
     for reused, direct in views:
         close(reused, direct, 0)
     for level, then in zip((*bands.details, bands.base), kept, strict=True):
@@ -167,7 +167,7 @@ def test_pyramid_can_be_reused(convention, size):
 
 @pytest.mark.parametrize("levels", [0, 3])
 @pytest.mark.parametrize("size", [(20, 27), (170, 164), (163, 2)])
-def test_nothing_of_the_callers_is_written(levels, size):
+def test_arguments_are_not_modified(levels, size):
     image, gaze, sigma = draw(1, 3, *size), torch.tensor([[5.0, 6.0]]), torch.tensor([[4.0, 5.0]])
     before = [t.clone() for t in (image, gaze, sigma)]
     with torch.no_grad():
@@ -178,7 +178,7 @@ def test_nothing_of_the_callers_is_written(levels, size):
 
 
 @pytest.mark.parametrize("size", [(20, 27), (170, 164)])
-def test_writing_to_a_view_leaves_others_alone(size):
+def test_writing_to_a_view_does_not_change_other_views(size):
     bands = laplacian_pyramid(draw(1, 3, *size), 3)
     gaze = torch.tensor([[[3.0, 4.0], [9.0, 2.0]]])
     with torch.no_grad():
@@ -205,7 +205,7 @@ def test_gradients(convention, size):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("size", [(20, 27), (170, 164), (141, 200)])
-def test_same_with_and_without_gradient(convention, size):
+def test_view_is_equal_with_and_without_gradients(convention, size):
     image, gaze = draw(2, 3, *size), 20 * draw(2, 3, 2)
     recorded = foveate(image.clone().requires_grad_(), gaze, sigma=8.0, convention=convention)
     assert recorded.requires_grad
@@ -218,7 +218,7 @@ def test_same_with_and_without_gradient(convention, size):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_gradients_in_single_precision(convention):
-    # Single and double precision take different ways through the pyramid.
+    # Single and double precision use different code for the pyramid.
     gradients = []
     for dtype in (torch.float32, torch.float64):
         image = draw(2, 3, 150, 132).to(dtype).requires_grad_()
@@ -230,7 +230,7 @@ def test_gradients_in_single_precision(convention):
         close(single, double, 1e-5)
 
 
-def test_gradient_after_inference():
+def test_gradients_are_finite_after_inference_mode():
     image = draw(1, 1, 135, 142, dtype=torch.float32)
     gaze = torch.tensor([30.0, 40.0], requires_grad=True)
     with torch.inference_mode():
@@ -242,14 +242,14 @@ def test_gradient_after_inference():
 
 
 @pytest.mark.parametrize("sigma", [1e-30, 1e-3, 1e30, math.inf])
-def test_extreme_windows(sigma):
+def test_views_and_gradients_are_finite_for_extreme_sigma(sigma):
     image = draw(1, 1, 20, 27, dtype=torch.float32).requires_grad_()
     gaze = torch.tensor([[[5.0, 6.0], [1e30, -1e30]]], requires_grad=True)
     result = foveate(image, gaze, sigma=sigma)
     result.sum().backward()
     assert torch.isfinite(result).all()
     assert torch.isfinite(image.grad).all()
-    # Beyond that a distance in widths has no number of its own any more.
+    # For smaller sigma, distances in units of sigma overflow.
     assert sigma < 1e-3 or torch.isfinite(gaze.grad).all()
 
 
@@ -309,7 +309,7 @@ def test_compiles_to_one_graph(convention, size):
         close(compiled(image, gaze), sensor(image, gaze))
 
 
-def test_module_is_the_function():
+def test_module_equals_the_function():
     image, gaze = draw(2, 3, 33, 40), torch.tensor([[4.0, 9.0], [30.0, 2.0]])
     sensor = Foveation(6.0, levels=3, growth=1.0, convention="opencv")
     expected = foveate(image, gaze, sigma=6.0, levels=3, growth=1.0, convention="opencv")

@@ -17,7 +17,7 @@ def picture(height=47, width=61, channels=3, dtype=torch.float64, seed=0):
 
 
 @pytest.mark.parametrize("size", [(61, 47), (30, 23), (17, 9), (90, 80), (1, 1)])
-def test_whole_picture_is_torchs_antialiased_resize_away_from_its_border(device, size):
+def test_the_whole_image_equals_antialiased_resizing_by_torch_inside_the_border(device, size):
     image = picture().to(device)
     boxes = torch.tensor([[0.0, 0.0, 61.0, 47.0]], dtype=image.dtype, device=device)
     expected = F.interpolate(image, size[::-1], mode="bilinear", antialias=True)
@@ -30,18 +30,18 @@ def test_whole_picture_is_torchs_antialiased_resize_away_from_its_border(device,
 
 @pytest.mark.parametrize("box", [(10.0, 8.0, 40.0, 32.0), (10.25, 8.5, 43.75, 29.125), (20.5, 20.5, 30.0, 26.0)])
 @pytest.mark.parametrize("size", [(12, 9), (40, 33)])
-def test_windows_are_those_of_pillow(box, size):
+def test_windows_equal_those_of_pillow(box, size):
     grey = np.random.default_rng(0).random((47, 61), dtype=np.float32)
     expected = np.asarray(Image.fromarray(grey).resize(size, Image.Resampling.BILINEAR, box=box))
     got = glimpse(torch.from_numpy(grey)[None, None], torch.tensor([box]), size)[0, 0]
     torch.testing.assert_close(got, torch.from_numpy(expected.copy()), rtol=1e-5, atol=1e-5)
 
 
-def test_enlarged_windows_are_those_of_kornia():
+def test_enlarged_windows_equal_those_of_kornia():
     from kornia.geometry.transform import crop_and_resize
 
     image = picture()
-    # Kornia's corners are pixel centres of the first and the last canvas pixel.
+    # In Kornia, corners are the centres of the first and last pixel of the canvas.
     corners = torch.tensor([[[12.0, 10.0], [24.0, 10.0], [24.0, 19.0], [12.0, 19.0]]], dtype=image.dtype)
     expected = crop_and_resize(image, corners, (19, 25))
     step = 0.5
@@ -50,7 +50,7 @@ def test_enlarged_windows_are_those_of_kornia():
 
 
 @pytest.mark.parametrize("padding", ["zeros", "border"])
-def test_beyond_the_border_it_is_kornias_padding(padding):
+def test_padding_beyond_the_border_equals_that_of_kornia(padding):
     from kornia.geometry.transform import warp_affine
 
     image = picture()
@@ -60,13 +60,13 @@ def test_beyond_the_border_it_is_kornias_padding(padding):
     torch.testing.assert_close(glimpse(image, box, (70, 60), padding_mode=padding), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_fill_is_seen_beyond_the_border():
+def test_the_fill_value_is_used_beyond_the_border():
     view = glimpse(picture(), torch.tensor([[-200.0, -200, -100, -100]]).double(), (8, 8), padding_mode="fill",
                    fill_value=0.4)  # fmt: skip
     torch.testing.assert_close(view, torch.full_like(view, 0.4))
 
 
-def test_many_windows_are_each_alone():
+def test_many_windows_equal_a_loop_over_windows():
     image = torch.cat([picture(seed=1), picture(seed=2)])
     boxes = torch.tensor([[[0.0, 0, 30, 20], [5, 5, 50, 40], [-9, 3, 12, 70]]] * 2).double()
     boxes[1] += 1.5
@@ -77,7 +77,7 @@ def test_many_windows_are_each_alone():
             torch.testing.assert_close(together[b, g], glimpse(image[b : b + 1], boxes[b, g][None], (16, 12))[0])
 
 
-def test_fine_stripes_vanish_instead_of_aliasing():
+def test_fine_stripes_do_not_alias():
     stripes = (torch.arange(256) % 2).double().expand(1, 1, 256, 256)
     view = glimpse(stripes, torch.tensor([[0.0, 0, 256, 256]]).double(), (29, 29), padding_mode="border")
     assert float((view[..., 1:-1, 1:-1] - 0.5).abs().max()) < 0.02
@@ -85,7 +85,7 @@ def test_fine_stripes_vanish_instead_of_aliasing():
     assert float((aliased[..., 1:-1, 1:-1] - 0.5).abs().max()) > 0.3
 
 
-def test_gradients_in_image_place_and_magnification():
+def test_gradients_in_image_position_and_magnification():
     image = picture(12, 14, 1).requires_grad_()
     points = torch.tensor([[[5.13, 4.37], [8.71, 6.29]]], dtype=torch.float64, requires_grad=True)
     magnification = torch.tensor([[0.73, 1.61]], dtype=torch.float64, requires_grad=True)
@@ -100,7 +100,7 @@ def test_dtype_follows_the_image(device):
         assert view.device.type == device.type
 
 
-def test_windows_at_and_ladder():
+def test_windows_and_ladder_of_magnifications():
     box = windows_at(torch.tensor([99.5, 49.5]), torch.tensor(0.5), (416, 208))
     assert box.tolist() == [100 - 416, 50 - 208, 100 + 416, 50 + 208]
     steps = ladder((20000, 15000), (416, 416))

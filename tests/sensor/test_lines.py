@@ -1,4 +1,4 @@
-"""Matrices cut into tiles against the whole matrix."""
+"""Banded matrices split into tiles, against the full matrix."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from semfov.sensor.lines import Taps, banded, separable
     alike=st.booleans(),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_tiles_are_the_whole_matrix(tiles, tile, shift, reach, rest, fewer, alike, seed):
+def test_tiles_give_the_product_with_the_full_matrix(tiles, tile, shift, reach, rest, fewer, alike, seed):
     generator = np.random.default_rng(seed)
     count, taps = 161 + tiles * shift + 2 * reach + rest, 3
     length = -(-count // shift) * tile - min(fewer, tile - 1)
@@ -49,11 +49,11 @@ def test_tiles_are_the_whole_matrix(tiles, tile, shift, reach, rest, fewer, alik
     torch.testing.assert_close(recorded.detach(), expected)
 
 
-def test_long_lines_are_cut():
+def test_only_long_lines_are_split_into_tiles():
     index = torch.arange(400)[:, None]
     taps = Taps(index, torch.ones(400, 1, dtype=torch.float64))
     lines = banded(taps, 400, 8, 8, 1, torch.float32, torch.device("cpu"))
     assert lines.middle is not None
     assert lines.middle.shape == (48, 8, 10)
-    assert lines.middle.stride(0) == 0, "tiles that are alike share their matrix"
+    assert lines.middle.stride(0) == 0, "equal tiles share one matrix"
     assert banded(Taps(index[:100], taps.weight[:100]), 100, 8, 8, 1, torch.float32, torch.device("cpu")).middle is None

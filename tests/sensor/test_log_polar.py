@@ -30,7 +30,7 @@ def cubic(t):
 
 
 def read(plane, x, y):
-    """A plane between its pixels, whose border goes on."""
+    """Interpolate a plane between its pixels; beyond the border its pixels are repeated."""
     height, width = plane.shape
     total = 0.0
     for j in range(math.floor(y) - 1, math.floor(y) + 3):
@@ -40,9 +40,9 @@ def read(plane, x, y):
 
 
 def cortical_twin(levels, gaze, a, spacing, pooling, rings, wedges):
-    """`(M, N)` of a pyramid `[(h, w), ...]`, one receptor at a time."""
+    """Cortical image `(M, N)` of a pyramid `[(h, w), ...]`, one receptor at a time."""
     (height, width), result = levels[0].shape, np.zeros((rings, wedges))
-    # The pyramid ends where no receptor within the diagonal needs more.
+    # The pyramid has no more levels than receptors within the diagonal need.
     top = math.ceil(max(math.log2(pooling * spacing * (1 + math.hypot(width, height) / a)), 0))
     for i in range(rings):
         radius = a * (math.exp((i + 0.5) * spacing / a) - 1)
@@ -60,18 +60,18 @@ def cortical_twin(levels, gaze, a, spacing, pooling, rings, wedges):
 
 @pytest.mark.parametrize("pooling", [1.0, 0.6])
 @pytest.mark.parametrize("size", [(16, 24), (17, 13), (1, 1), (1, 6)])
-def test_receptors_one_at_a_time(twin, size, pooling):
+def test_the_cortical_image_equals_a_loop_over_receptors(reference_sensor, size, pooling):
     image, gaze = draw(1, 1, *size), (3.2, 5.5)
     point = torch.tensor(gaze, dtype=torch.float64)
     seen = log_polar(image, point, fovea=3.0, spacing=0.8, pooling=pooling)[0, 0]
     levels = [image[0].numpy()]
     for _ in range(4):
-        levels.append(twin.pyrdown(levels[-1], "kornia"))
+        levels.append(reference_sensor.pyrdown(levels[-1], "kornia"))
     planes = [level[0] for level in levels]
     close(seen, cortical_twin(planes, gaze, 3.0, 0.8, pooling, *seen.shape), 1e-9)
 
 
-def test_back_projection_one_pixel_at_a_time():
+def test_back_projection_equals_a_loop_over_pixels():
     a, spacing, gaze, size = 3.0, 0.8, (4.0, 2.3), (9, 7)
     image = draw(1, 1, *size[::-1])
     point = torch.tensor(gaze, dtype=torch.float64)
@@ -98,14 +98,14 @@ def test_back_projection_one_pixel_at_a_time():
             assert float(view[y, x]) == pytest.approx(expected, abs=1e-9)
 
 
-def test_turning_the_image_turns_the_wedges():
+def test_rotating_the_image_shifts_the_wedges():
     image, middle = draw(1, 3, 41, 41), torch.tensor([20.0, 20.0])
     seen = log_polar(image, middle, fovea=6.0)
     quarter = seen.shape[-1] // 4
-    turned = log_polar(image.rot90(-1, (-2, -1)), middle, fovea=6.0)  # clockwise, as wedges run
+    turned = log_polar(image.rot90(-1, (-2, -1)), middle, fovea=6.0)  # clockwise, in the order of the wedges
     close(turned, seen.roll(quarter, -1), 1e-9)
     views = LogPolar(6.0)(torch.cat([image, image.rot90(-1, (-2, -1))]), middle)
-    # The fixated pixel itself lies in no direction, and is given that of the x-axis.
+    # The fixated pixel has no direction; the code uses that of the x-axis.
     views[..., 20, 20] = 0
     close(views[1], views[0].rot90(-1, (-2, -1)), 1e-9)
 
@@ -116,7 +116,7 @@ def test_turning_the_image_turns_the_wedges():
     fovea=st.floats(1, 100),
     spacing=st.floats(0.5, 3),
 )
-def test_a_constant_stays_constant(size, gaze, fovea, spacing):
+def test_constant_image_stays_constant(size, gaze, fovea, spacing):
     image = torch.full((1, 2, *size), 0.3, dtype=torch.float64)
     sensor = LogPolar(fovea, spacing)
     seen = sensor.cortical(image, torch.tensor(gaze))
@@ -125,23 +125,23 @@ def test_a_constant_stays_constant(size, gaze, fovea, spacing):
 
 
 @given(a=st.floats(-3, 3), b=st.floats(-3, 3), height=st.integers(1, 20), width=st.integers(1, 20))
-def test_linear_in_the_image(a, b, height, width):
+def test_the_sensor_is_linear_in_the_image(a, b, height, width):
     first, second = draw(1, 2, height, width), draw(1, 2, height, width, seed=1)
     gaze, sensor = torch.tensor([width / 3, height / 2]), LogPolar(4.0)
     close(sensor(a * first + b * second, gaze), a * sensor(first, gaze) + b * sensor(second, gaze), 1e-10)
 
 
 def contrast(wavelength, fovea, size=801):
-    """What is left of a grating's contrast at each eccentricity along the x-axis, `(size // 2,)`."""
+    """Remaining contrast of a grating at each eccentricity along the x-axis, `(size // 2,)`."""
     phase = torch.arange(size, dtype=torch.float64) * (2 * math.pi / wavelength)
     waves = torch.stack([phase.cos(), phase.sin()])[None, :, None].expand(1, 2, 65, size)
     shown = LogPolar(fovea)(waves, torch.tensor([size // 2, 32.0]))[0, :, 32]
-    # A wave that is weakened alone keeps its phase: so much of it is what was shown times what is.
+    # Only the amplitude of a wave changes, not its phase, so its product with the input is the amplitude.
     return (shown * waves[0, :, 32]).sum(0)[size // 2 :]
 
 
-def test_acuity_falls_off_as_the_formula_says():
-    """Receptors twice as far apart show half as fine a grating: where 1 + r / a has doubled."""
+def test_acuity_falls_off_with_eccentricity_by_the_formula():
+    """Where 1 + r / a doubles, so do the distances of receptors and the wavelength that they resolve."""
     fovea = 40.0
     half = {}
     for wavelength in (8, 16, 32):
@@ -152,13 +152,13 @@ def test_acuity_falls_off_as_the_formula_says():
     assert spread[32] / spread[16] == pytest.approx(2, rel=0.1)
 
 
-def test_nothing_is_lost_at_the_fixation():
+def test_contrast_is_kept_at_the_fixation():
     assert float(contrast(4, 40.0)[:8].min()) > 0.75
     assert float(contrast(8, 40.0)[:8].min()) > 0.9
 
 
-def test_receptors_pool_what_is_finer_than_they_are():
-    """A board of single pixels is grey to the periphery, and not some of its pixels."""
+def test_receptors_average_details_finer_than_their_spacing():
+    """A checkerboard of single pixels looks grey in the periphery: no single pixels are sampled."""
     place = torch.arange(256)
     board = ((place[:, None] + place) % 2).double()[None, None]
     seen = log_polar(board, torch.tensor([3.3, 3.7]), fovea=10.0)[0, 0]
@@ -198,7 +198,7 @@ def test_a_fixation_on_a_pixel_has_a_gradient():
 
 
 @pytest.mark.parametrize("far", [1e4, 1e30])
-def test_a_fixation_far_away_sees_a_blur(far):
+def test_a_fixation_far_outside_sees_a_blurred_image(far):
     image = draw(1, 3, 60, 80, dtype=torch.float32).requires_grad_()
     gaze = torch.tensor([far, -far], requires_grad=True)
     view = LogPolar(8.0)(image, gaze)
@@ -207,7 +207,7 @@ def test_a_fixation_far_away_sees_a_blur(far):
     assert view.std() < 0.1 * image.std()
 
 
-def test_many_fixations_are_the_loop_over_them(device):
+def test_many_fixations_equal_a_loop_over_them(device):
     image, gaze, sensor = draw(2, 3, 20, 27, device=device), 30 * draw(2, 4, 2, device=device), LogPolar(6.0)
     many, seen = sensor(image, gaze), sensor.cortical(image, gaze)
     assert many.shape == (2, 4, 3, 20, 27)
@@ -228,7 +228,7 @@ def test_dtype_and_device_follow_the_image(dtype, device):
     torch.testing.assert_close(result, expected.to(dtype), rtol=0, atol=2e-4 if dtype == torch.float32 else 1e-12)
 
 
-def test_module_is_the_functions():
+def test_module_equals_the_functions():
     image, gaze = draw(2, 3, 33, 40), torch.tensor([[4.0, 9.0], [30.0, 2.0]])
     sensor = LogPolar(6.0, 0.8, 0.9)
     seen = log_polar(image, gaze, fovea=6.0, spacing=0.8, pooling=0.9)
@@ -239,8 +239,8 @@ def test_module_is_the_functions():
 
 
 @pytest.mark.parametrize("stretch", [False, True])
-def test_an_eye_shows_what_the_sensor_shows_of_the_picture(stretch):
-    """At the detector's resolution, whatever that is, and stretched or not."""
+def test_the_view_of_an_eye_equals_the_sensor_on_the_full_image(stretch):
+    """At the resolution of the detector, with and without stretching of the image."""
     detector = Blobs()
     detector.stretch = stretch
     eye, sensor = Eye(LogPolar(8.0), detector, reference=256.0), LogPolar(8.0)
@@ -284,7 +284,7 @@ def test_bad_input(arguments, message):
         log_polar(**arguments)
 
 
-def test_a_cortical_image_of_another_retina():
+def test_a_cortical_image_of_another_retina_is_refused():
     seen = log_polar(IMAGE, torch.tensor([4.0, 4.0]), fovea=3.0)
     with pytest.raises(InputError, match="cortical: expected a tensor of shape"):
         from_log_polar(seen, torch.tensor([4.0, 4.0]), (8, 8), fovea=4.0)

@@ -1,4 +1,4 @@
-"""Sensors as parts of others' modules."""
+"""Sensors as submodules of other modules."""
 
 import torch
 
@@ -6,7 +6,7 @@ from semfov.sensor import Foveation, Glimpse, LogPolar, Perspective, RandomFovea
 from tests.base_tester import GraphTester, TensorTester
 from tests.small import rand
 
-# Not on a pixel's centre, where bilinear interpolation has no derivative.
+# Fixations off the centres of pixels, where bilinear interpolation has no derivative.
 GAZES = torch.tensor([[20.3, 30.1], [45.7, 9.4]])
 
 
@@ -62,7 +62,7 @@ class TestGlimpse(TensorTester):
 
 
 class TestRandomFoveation(TensorTester):
-    """At places that were drawn before."""
+    """At fixations that were drawn before."""
 
     batched = (0, 1, 2)
 

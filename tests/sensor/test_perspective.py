@@ -15,7 +15,7 @@ from semfov.sensor.sphere import Camera, panorama_directions
 
 
 def remapped(panorama, yaw, pitch, field, size):
-    """A view by OpenCV and SciPy alone, of a panorama `(H, W, 3)`."""
+    """A view of a panorama `(H, W, 3)`, computed by OpenCV and SciPy only."""
     high, wide = panorama.shape[:2]
     focal = size[0] / 2 / math.tan(math.radians(field / 2))
     u, v = np.meshgrid(np.arange(size[0]) + 0.5 - size[0] / 2, np.arange(size[1]) + 0.5 - size[1] / 2)
@@ -24,7 +24,7 @@ def remapped(panorama, yaw, pitch, field, size):
     longitude, latitude = np.arctan2(x, z), np.arctan2(-y, np.hypot(x, z))
     column = (longitude / (2 * np.pi) + 0.5) * wide - 0.5
     row = (0.5 - latitude / np.pi) * high - 0.5
-    # Two rows more, those beyond the poles, and the border wraps along x.
+    # Add a row beyond each pole, and wrap the border along x.
     turned = np.roll(panorama, wide // 2, 1)
     whole = np.concatenate([turned[:1], panorama, turned[-1:]])
     whole = np.concatenate([whole[:, -1:], whole, whole[:, :1]], 1)
@@ -33,8 +33,8 @@ def remapped(panorama, yaw, pitch, field, size):
 
 
 @pytest.mark.parametrize("pose", [(0, 0, 60), (179, 10, 90), (-77, 88, 50), (400, -90, 100), (12.3, 45.6, 20)])
-def test_bilinear_views_are_those_of_opencv(pose):
-    # Smooth, for OpenCV rounds places to a 32nd of a pixel.
+def test_bilinear_views_equal_those_of_opencv(pose):
+    # The image is smooth, because OpenCV rounds coordinates to 1/32 of a pixel.
     directions = panorama_directions(
         torch.stack(torch.meshgrid(torch.arange(128.0), torch.arange(64.0), indexing="xy"), -1), (128, 64)
     )
@@ -47,8 +47,8 @@ def test_bilinear_views_are_those_of_opencv(pose):
 
 
 @pytest.mark.parametrize("pose", [(180.0, 0.0, 60.0), (33.0, 90.0, 80.0), (-10.0, -90.0, 80.0), (170.0, 70.0, 100.0)])
-def test_views_are_exact_at_the_poles_and_across_the_seam(pose, device):
-    """The panorama shows a smooth function of direction; so do its views, wherever they look."""
+def test_views_are_accurate_at_the_poles_and_across_the_seam(pose, device):
+    """The panorama is a smooth function of direction; views show that function in every direction."""
     wide, high = 720, 360
     grid = torch.stack(torch.meshgrid(torch.arange(wide), torch.arange(high), indexing="xy"), -1).double()
 
@@ -79,7 +79,7 @@ def test_gradients_in_the_panorama():
     assert gradcheck(lambda p: perspective(p, pose, (4, 3)), (panorama,))
 
 
-def test_no_gradient_is_lost_at_a_pole():
+def test_gradients_are_finite_and_not_zero_at_a_pole():
     panorama = torch.rand(1, 3, 32, 64)
     pose = torch.tensor([[30.0, 90.0, 60.0]], requires_grad=True)
     perspective(panorama, pose, (9, 9)).square().sum().backward()
@@ -88,7 +88,7 @@ def test_no_gradient_is_lost_at_a_pole():
 
 
 def test_shrinking_does_not_alias():
-    """Stripes finer than the pixels of the view are seen as their mean; without smoothing they are not."""
+    """Stripes finer than the pixels of the view look grey with antialiasing, and not without it."""
     panorama = (torch.arange(2048) % 2).float().expand(1, 1, 1024, 2048)
     pose = torch.tensor([[0.0, 0.0, 90.0]])
     smooth = perspective(panorama, pose, (64, 48))
@@ -96,7 +96,7 @@ def test_shrinking_does_not_alias():
     assert (perspective(panorama, pose, (64, 48), antialias=False) - 0.5).abs().max() > 0.4
 
 
-def test_rows_are_means_by_brute_force():
+def test_rows_are_averaged_as_by_a_brute_force():
     torch.manual_seed(1)
     panorama = torch.rand(2, 8, 16, dtype=torch.float64)
     found = even_rows(panorama)
@@ -110,7 +110,7 @@ def test_rows_are_means_by_brute_force():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_module_batches_and_keeps_the_type(dtype, device):
+def test_the_module_accepts_batches_and_keeps_the_dtype(dtype, device):
     panorama = torch.rand(2, 3, 16, 32, dtype=dtype, device=device)
     poses = torch.tensor([[0.0, 0, 60], [90, 30, 40]], device=device).expand(2, 2, 3)
     views = Perspective((8, 6))(panorama, poses)
@@ -119,6 +119,6 @@ def test_the_module_batches_and_keeps_the_type(dtype, device):
     torch.testing.assert_close(views[1, 1], perspective(panorama[1:], poses[1:, 1], (8, 6))[0])
 
 
-def test_odd_widths_are_refused():
+def test_panoramas_of_odd_width_are_refused():
     with pytest.raises(InputError, match="panorama: expected an even number of columns"):
         perspective(torch.rand(1, 3, 8, 15), torch.zeros(1, 3) + 60, (4, 4))

@@ -12,7 +12,7 @@ from semfov.sensor import laplacian_pyramid, pyramid, pyrdown, pyrup
 
 CONVENTIONS = ("kornia", "opencv")
 SIZES = [(1, 1), (1, 2), (2, 1), (2, 2), (1, 9), (3, 3), (4, 4), (5, 4), (6, 7), (13, 8), (37, 50), (64, 64)]
-# Beyond 160 pixels another algorithm takes over.
+# Another algorithm is used for more than 160 pixels.
 LARGE = [(162, 163), (163, 162), (161, 3), (2, 200), (1, 301), (256, 160), (178, 204), (481, 639)]
 sizes = st.tuples(st.integers(1, 24), st.integers(1, 24))
 
@@ -27,20 +27,20 @@ def close(a, b, tolerance=2e-6):
 
 
 @pytest.mark.parametrize("size", [s for s in SIZES + LARGE if min(s) >= 3])
-def test_kornia_pyrdown(size, device):
+def test_pyrdown_equals_kornia(size, device):
     image = draw(2, 3, *size, dtype=torch.float32, device=device)
     close(pyrdown(image), kornia.pyrdown(image))
 
 
 @pytest.mark.parametrize("size", [s for s in SIZES + LARGE if min(s) >= 2])
-def test_kornia_pyrup(size, device):
+def test_pyrup_equals_kornia(size, device):
     image = draw(2, 3, *size, dtype=torch.float32, device=device)
     close(pyrup(image, (2 * size[0], 2 * size[1])), kornia.pyrup(image))
 
 
 @pytest.fixture
-def in_kornia(monkeypatch):
-    """Let Kornia compute what it defines on every device, as it does on accelerators."""
+def kornia_everywhere(monkeypatch):
+    """Use Kornia's functions on every device, as on accelerators."""
     monkeypatch.setattr(pyramid, "_AHEAD", frozenset())
 
 
@@ -51,7 +51,7 @@ def levels_of(image, levels=4):
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-10)])
 @pytest.mark.parametrize("size", [*SIZES, *LARGE, (480, 640)])
-def test_computed_by_kornia_or_not(monkeypatch, dtype, tolerance, size, device):
+def test_pyramids_by_kornia_and_by_matrices_are_equal(monkeypatch, dtype, tolerance, size, device):
     image = draw(2, 3, *size, dtype=dtype, device=device)
     results = []
     for ahead in (frozenset(), frozenset({device.type})):
@@ -63,14 +63,14 @@ def test_computed_by_kornia_or_not(monkeypatch, dtype, tolerance, size, device):
 
 
 @pytest.mark.parametrize("requires_grad", [False, True])
-def test_kornia_runs_where_it_may(monkeypatch, requires_grad):
+def test_kornia_is_called_only_where_it_can_be_used(monkeypatch, requires_grad):
     called = []
     for name in ("pyrdown", "pyrup"):
         function = getattr(kornia, name)
         monkeypatch.setattr(kornia, name, lambda image, f=function, n=name: called.append(n) or f(image))
     image = draw(1, 3, 32, 48).requires_grad_(requires_grad)
     levels_of(image)
-    assert called == [], "on a CPU ours is faster, with gradients too"
+    assert called == [], "on a CPU our code is faster, with gradients too"
     monkeypatch.setattr(pyramid, "_AHEAD", frozenset())
     levels_of(image)
     assert called == ["pyrdown", "pyrup"] * 4
@@ -87,14 +87,14 @@ def test_kornia_runs_where_it_may(monkeypatch, requires_grad):
     assert called == []
 
 
-@pytest.mark.usefixtures("in_kornia")
+@pytest.mark.usefixtures("kornia_everywhere")
 @pytest.mark.parametrize("size", [(6, 5), (12, 7)])
 def test_gradients_by_kornia(size):
     image = draw(1, 2, *size).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: levels_of(x, 2), image)
 
 
-@pytest.mark.usefixtures("in_kornia")
+@pytest.mark.usefixtures("kornia_everywhere")
 def test_gradients_of_the_sensor_by_kornia():
     image = draw(1, 2, 8, 12).requires_grad_()
     gaze = (4 * draw(1, 3, 2)).requires_grad_()
@@ -103,7 +103,7 @@ def test_gradients_of_the_sensor_by_kornia():
     assert torch.autograd.gradcheck(sensor, (image, gaze, sigma))
 
 
-@pytest.mark.usefixtures("in_kornia")
+@pytest.mark.usefixtures("kornia_everywhere")
 @pytest.mark.parametrize("requires_grad", [False, True])
 def test_compiles_to_one_graph_by_kornia(requires_grad):
     image, gaze = draw(1, 2, 40, 36).requires_grad_(requires_grad), 20 * draw(1, 3, 2)
@@ -116,7 +116,7 @@ def test_compiles_to_one_graph_by_kornia(requires_grad):
     close(compiled(image, gaze), sensor(image, gaze), 1e-12)
 
 
-@pytest.mark.usefixtures("in_kornia")
+@pytest.mark.usefixtures("kornia_everywhere")
 def test_strided_images_empty_batches_and_vmap_by_kornia():
     image = draw(2, 3, 20, 24)
     expected = levels_of(image, 2)
@@ -129,7 +129,7 @@ def test_strided_images_empty_batches_and_vmap_by_kornia():
 
 
 @pytest.mark.parametrize("levels", [1, 3, 5])
-def test_kornia_gaussian_pyramid_is_sum_of_bands(levels):
+def test_sums_of_bands_equal_the_gaussian_pyramid_of_kornia(levels):
     image = draw(1, 3, 160, 224)
     bands = laplacian_pyramid(image, levels)
     expected = kornia.build_pyramid(image, levels + 1)
@@ -139,7 +139,7 @@ def test_kornia_gaussian_pyramid_is_sum_of_bands(levels):
 
 
 @pytest.mark.parametrize("size", SIZES + LARGE)
-def test_opencv_pyrdown(size, device):
+def test_pyrdown_equals_opencv(size, device):
     image = draw(1, 3, *size, dtype=torch.float32, device=device)
     expected = [cv2.pyrDown(plane) for plane in image[0].cpu().numpy()]
     close(pyrdown(image, "opencv")[0], np.stack(expected))
@@ -147,7 +147,7 @@ def test_opencv_pyrdown(size, device):
 
 @pytest.mark.parametrize("size", SIZES + LARGE)
 @pytest.mark.parametrize("shorter", [(0, 0), (1, 0), (0, 1), (1, 1)])
-def test_opencv_pyrup(size, shorter, device):
+def test_pyrup_equals_opencv(size, shorter, device):
     height, width = (2 * n - s for n, s in zip(size, shorter, strict=True))
     image = draw(1, 3, *size, dtype=torch.float32, device=device)
     expected = [cv2.pyrUp(plane, dstsize=(width, height)) for plane in image[0].cpu().numpy()]
@@ -156,14 +156,14 @@ def test_opencv_pyrup(size, shorter, device):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @given(size=sizes, wider=st.tuples(st.booleans(), st.booleans()))
-def test_plain_loops(twin, convention, size, wider):
+def test_pyramid_equals_plain_loops(reference_sensor, convention, size, wider):
     image = draw(1, 2, *size)
-    close(pyrdown(image, convention)[0], twin.pyrdown(image[0].numpy(), convention), 1e-12)
+    close(pyrdown(image, convention)[0], reference_sensor.pyrdown(image[0].numpy(), convention), 1e-12)
     if convention == "kornia":
         target = tuple(2 * n + w for n, w in zip(size, wider, strict=True))
     else:
         target = tuple(2 * n - w for n, w in zip(size, wider, strict=True))
-    close(pyrup(image, target, convention)[0], twin.pyrup(image[0].numpy(), target, convention), 1e-12)
+    close(pyrup(image, target, convention)[0], reference_sensor.pyrup(image[0].numpy(), target, convention), 1e-12)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
@@ -209,8 +209,8 @@ def test_sizes_of_the_bands(convention, levels):
     assert len(bands.details) == levels
 
 
-def test_places_of_pixels_are_where_their_weight_lies():
-    # A ramp is reproduced away from the borders by every level, so it tells where the pixels lie.
+def test_positions_of_pixels_in_every_level():
+    # Away from the borders every level reproduces a ramp, so its values are the positions of the pixels.
     ramp = torch.arange(256, dtype=torch.float64).expand(1, 1, 160, 256)
     for convention in CONVENTIONS:
         bands = laplacian_pyramid(ramp, 4, convention)
@@ -232,7 +232,7 @@ def test_gradients(convention, size):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("size", [(163, 172), (172, 164)])
-def test_with_and_without_gradient_agree(convention, size):
+def test_pyramid_is_equal_with_and_without_gradients(convention, size):
     image = draw(1, 2, *size)
     recorded = laplacian_pyramid(image.clone().requires_grad_(), 3, convention)
     with torch.no_grad():
@@ -242,7 +242,7 @@ def test_with_and_without_gradient_agree(convention, size):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_strided_images(convention):
+def test_images_in_any_memory_layout(convention):
     image = draw(2, 3, 164, 170)
     expected = laplacian_pyramid(image, 3, convention)
     for same in (image.contiguous(memory_format=torch.channels_last), image.mT.contiguous().mT):
@@ -253,7 +253,7 @@ def test_strided_images(convention):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("size", [(20, 30), (180, 164), (161, 170)])
-def test_image_stays_as_it_was(convention, size):
+def test_image_and_earlier_pyramids_are_not_modified(convention, size):
     image = draw(1, 3, *size)
     before = image.clone()
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Directions, pixels of cameras and of panoramas: against SciPy's rotations, closed forms, and there and back."""
+"""Directions, pixels of cameras and of panoramas: against SciPy's rotations and closed forms, and round trips."""
 
 import math
 
@@ -22,13 +22,13 @@ def camera(yaw, pitch, field, size=(41, 31), dtype=torch.float64):
 
 
 @given(yaws, pitches)
-def test_a_camera_turns_as_in_scipy(yaw, pitch):
+def test_rotation_of_a_camera_equals_scipy(yaw, pitch):
     expected = Rotation.from_euler("YX", [yaw, pitch], degrees=True).as_matrix()
     np.testing.assert_allclose(camera(yaw, pitch, 60).rotation, expected, atol=1e-12)
 
 
 @given(yaws, pitches, fields)
-def test_pixels_and_directions_there_and_back(yaw, pitch, field):
+def test_pixels_of_a_camera_to_directions_and_back(yaw, pitch, field):
     points = torch.rand(50, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 30
     seen = camera(yaw, pitch, field)
     directions = seen.directions(points)
@@ -38,7 +38,7 @@ def test_pixels_and_directions_there_and_back(yaw, pitch, field):
     assert inside.all()
 
 
-def test_panorama_pixels_and_directions_there_and_back(device):
+def test_pixels_of_a_panorama_to_directions_and_back(device):
     size = 64, 32
     y, x = torch.meshgrid(torch.arange(32.0), torch.arange(64.0), indexing="ij")
     points = torch.stack([x, y], -1).double().to(device)
@@ -47,7 +47,7 @@ def test_panorama_pixels_and_directions_there_and_back(device):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_directions_of_a_panorama_are_latitude_and_longitude(dtype):
-    """A quarter turn to the right is +x, the top +up, and the seam is behind."""
+    """+x is 90° to the right, -y is up, and the seam is behind the camera."""
     points = torch.tensor([[511.5, 255.5], [767.5, 255.5], [255.5, 255.5], [-0.5, 255.5], [100, -0.5]], dtype=dtype)
     expected = [[0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, 0, -1], [0, -1, 0]]
     directions = panorama_directions(points, (1024, 512))
@@ -55,8 +55,8 @@ def test_directions_of_a_panorama_are_latitude_and_longitude(dtype):
     np.testing.assert_allclose(directions, expected, atol=1e-6)
 
 
-def test_a_camera_sees_straight_ahead_in_its_middle():
-    """Closed form: the middle of a view looks along yaw and pitch, its edge half a field of view beside."""
+def test_the_centre_of_a_view_has_the_direction_of_yaw_and_pitch():
+    """The angle between the centre and the middle of an edge is half the field of view."""
     seen = camera(30, 20, 80, (101, 51))
     middle = seen.directions(torch.tensor([[50.0, 25.0]], dtype=torch.float64))[0]
     lat, lon = math.radians(20), math.radians(30)
@@ -67,7 +67,7 @@ def test_a_camera_sees_straight_ahead_in_its_middle():
 
 
 @given(pitches, pitches)
-def test_angles_are_those_of_scipy(one, other):
+def test_angles_between_directions_equal_scipy(one, other):
     a, b = (Rotation.from_euler("X", angle, degrees=True) for angle in (one, other))
     ahead = np.array([0.0, 0.0, 1.0])
     expected = math.degrees((a.inv() * b).magnitude())
@@ -75,13 +75,13 @@ def test_angles_are_those_of_scipy(one, other):
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_what_is_behind_has_no_pixel():
+def test_directions_behind_the_camera_have_no_pixel():
     points, inside = camera(0, 0, 60).points(torch.tensor([[0.0, 0, -1], [1, 0, 0]], dtype=torch.float64))
     assert not inside.any()
     assert points.isinf().all()
 
 
-def test_regions_hold_their_samples_and_nothing_beside():
+def test_regions_contain_their_samples_and_no_points_outside():
     pose = torch.tensor([[179.0, 85.0, 60.0], [0.0, 0.0, 60.0]])
     boxes = torch.tensor([[10.0, 5, 30, 20], [0, 0, 41, 31]])
     regions = Regions(Camera(pose, (41, 31)), boxes)
@@ -96,8 +96,8 @@ def test_regions_hold_their_samples_and_nothing_beside():
 
 @pytest.mark.slow
 @given(yaws, st.floats(-89, 89))
-def test_boxes_in_a_panorama_hold_the_region_and_touch_it(yaw, pitch):
-    """Independent of outlines: which pixels of a panorama lie in the region (a corner can be a tip between them)."""
+def test_boxes_in_a_panorama_fit_the_region_tightly(yaw, pitch):
+    """Checked with all panorama pixels in the region, without its outline (a corner can lie between pixels)."""
     size = 360, 180
     pose = torch.tensor([[yaw, pitch, 70.0]], dtype=torch.float64)
     regions = Regions(Camera(pose, (40, 30)), torch.tensor([[4.0, 3, 33, 27]], dtype=torch.float64))
@@ -116,6 +116,6 @@ def test_boxes_in_a_panorama_hold_the_region_and_touch_it(yaw, pitch):
     assert along.max() >= x2 - x1 - 4 or x2 - x1 == 360
 
 
-def test_a_field_of_half_a_turn_is_refused():
+def test_a_field_of_view_of_180_degrees_is_refused():
     with pytest.raises(InputError, match="field: expected degrees between 0 and 180"):
         camera(0, 0, 180)

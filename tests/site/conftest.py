@@ -1,4 +1,4 @@
-"""The site, built once for all workers of a run."""
+"""The documentation site, built once for all workers of a test run."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="session")
 def can_run() -> bool:
-    """Whether the default detector's weights can be had, which the tutorials need."""
+    """Whether the weights of the default detector, which the tutorials need, are available."""
     try:
         fetch("yolov3-tiny")
     except semfov.DataError:
@@ -25,7 +25,7 @@ def can_run() -> bool:
 
 @pytest.fixture(scope="session")
 def site(can_run: bool, tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
-    """The folder of the built site; tutorials are executed where their detector can be had."""
+    """The folder of the built site; tutorials are executed if their detector is available."""
     folder = tmp_path_factory.getbasetemp()
     shared = folder.parent if hasattr(request.config, "workerinput") else folder
     said = shared / "site.txt"

@@ -18,7 +18,7 @@ def sections(text):
 
 
 def explained(block):
-    """Names that a section explains: those at its own indentation."""
+    """Names that a section explains: those at its lowest indentation."""
     lines = [line for line in block.splitlines() if line.strip()]
     indent = min((len(line) - len(line.lstrip()) for line in lines), default=0)
     heads = [line.split(":")[0] for line in lines if len(line) - len(line.lstrip()) == indent]
@@ -31,7 +31,7 @@ def arguments(function):
 
 
 def raised(function):
-    """Names of the errors that a function raises itself."""
+    """Names of errors raised in the code of a function."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     errors = [node.exc for node in ast.walk(tree) if isinstance(node, ast.Raise) and node.exc]
     names = {ast.unparse(error.func if isinstance(error, ast.Call) else error).split(".")[-1] for error in errors}
@@ -47,7 +47,7 @@ def check_function(function, text):
 
 
 def methods(cls):
-    """Public methods that a class defines, without those that a base of the package explains."""
+    """Public methods that a class defines, except those documented in a base class of the package."""
     for name, thing in vars(cls).items():
         function = inspect.unwrap(getattr(thing, "__func__", thing)) if callable(thing) or name in vars(cls) else thing
         bases = [base for base in cls.__mro__[1:] if base.__module__.startswith("semfov")]
@@ -58,14 +58,14 @@ def methods(cls):
 
 
 @pytest.mark.parametrize("thing", [place for place in PLACES if inspect.isfunction(place.values[0])])
-def test_functions(thing):
+def test_docstrings_of_functions_are_complete(thing):
     text = inspect.getdoc(thing)
     check_function(thing, text)
     assert ">>>" in text or "Example" in text
 
 
 @pytest.mark.parametrize("thing", [place for place in PLACES if inspect.isclass(place.values[0])])
-def test_classes(thing):
+def test_docstrings_of_classes_are_complete(thing):
     text = inspect.getdoc(thing)
     if not issubclass(thing, BaseException):
         assert ">>>" in text or "Example" in text

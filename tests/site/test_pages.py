@@ -1,4 +1,4 @@
-"""What pages are made of: names that lead on, docstrings, formulas, links between files."""
+"""Contents of pages: links of names, docstrings, formulas, links between files."""
 
 import doctest
 import xml.etree.ElementTree as etree
@@ -36,22 +36,22 @@ def names():
         ("semfov.__version__", None),
     ],
 )
-def test_names_lead_to_their_home(names, name, there):
+def test_names_link_to_the_page_of_their_definition(names, name, there):
     assert names.place(name) == there
 
 
 @pytest.mark.parametrize("name", ["semfov.MissModel", "semfov.sensor.fovea", "semfov.Foveation.close"])
-def test_names_that_do_not_exist_are_told(names, name):
+def test_names_that_do_not_exist_are_refused(names, name):
     with pytest.raises(LookupError, match="does not exist"):
         names.link(f"see `{name}`")
 
 
-def test_code_and_links_are_left_alone(names):
+def test_names_in_links_double_backticks_and_plain_text_are_not_linked(names):
     text = "[`Foveation`](x.md), ``Foveation`` and Foveation"
     assert names.link(text) == text
 
 
-def test_names_inside_are_gathered(names):
+def test_names_of_internal_functions_are_collected(names):
     inside = set()
     text = names.link("`semfov.training.evidence.objective`", inside)
     assert text == "[`semfov.training.evidence.objective`][semfov.training.evidence.objective]"
@@ -105,7 +105,7 @@ blur(1)
     )
 
 
-def test_bare_names_lead_to_neighbours_but_not_to_arguments(names):
+def test_short_names_link_to_the_same_module_but_not_if_they_are_arguments(names):
     module = "semfov.observation.dirichlet"
     assert docstring("see `entropy`", names, module) == "see [`entropy`][semfov.observation.dirichlet.entropy]"
     assert docstring("see `entropy`", names, module, {"entropy"}) == "see `entropy`"
@@ -132,33 +132,33 @@ def test_mathml_has_the_structure_of_the_formula():
         (r"\ln\Gamma(x)", 1),
     ],
 )
-def test_functions_stand_apart_as_in_tex(formula, spaces):
+def test_spaces_around_functions_are_those_of_tex(formula, spaces):
     assert len(etree.fromstring(mathml(formula, block=False)).findall(f".//{SPACE}mspace")) == spaces
 
 
-def test_a_command_that_has_no_mathml_is_told():
+def test_a_command_without_mathml_is_refused():
     with pytest.raises(ValueError, match="foo"):
         mathml(r"\foo{a}", block=False)
 
 
 @pytest.mark.parametrize("text", ["`$x$`", "it costs $5", "$HOME and $PATH", r"\$x\$"])
-def test_dollars_that_are_none_of_a_formula(text):
+def test_dollar_signs_outside_formulas_are_left_unchanged(text):
     assert "<math" not in markdown.markdown(text, extensions=["docs.site.formulas"])
 
 
-def test_formulas_stand_in_tables():
+def test_formulas_in_tables_are_converted():
     html = markdown.markdown("| a | b |\n|---|---|\n| $x_i$ | c |", extensions=["docs.site.formulas", "tables"])
     assert "<td><math" in html
 
 
-def test_a_link_to_what_is_not_there_is_told(tmp_path):
+def test_a_link_to_a_missing_page_is_refused(tmp_path):
     stage = Stage(tmp_path)
     stage.page("[here](nowhere.md)", "docs/method.md")
     with pytest.raises(LookupError, match=r"docs/method\.md links to nowhere\.md"):
         stage.finish()
 
 
-def test_links_lead_to_where_files_are_on_the_site(tmp_path):
+def test_links_are_rewritten_to_the_paths_on_the_site(tmp_path):
     moved = Stage(tmp_path).page(
         "[a](../../examples/own_policy.py) [b](gaze.md#x) [c](https://d.org)", "docs/guides/belief.md"
     )
@@ -168,7 +168,7 @@ def test_links_lead_to_where_files_are_on_the_site(tmp_path):
 
 
 @pytest.mark.parametrize("module", [docs.api, docs.site.formulas, docs.site.stage], ids=lambda module: module.__name__)
-def test_examples_of_the_tools(module):
+def test_docstring_examples_of_the_documentation_tools_pass(module):
     failed, tried = doctest.testmod(module)
     assert failed == 0
     assert tried > 0
@@ -179,7 +179,7 @@ def test_there_are_five_tutorials():
 
 
 @pytest.mark.slow
-def test_a_tutorial_that_warns_is_told(tmp_path):
+def test_a_tutorial_with_a_warning_is_refused(tmp_path):
     source = tmp_path / "warns.py"
     source.write_text("# %%\nimport warnings\nwarnings.warn('beware')\n", encoding="utf-8")
     with pytest.raises(ValueError, match="beware"):
@@ -187,7 +187,7 @@ def test_a_tutorial_that_warns_is_told(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_picture_needs_words(tmp_path):
+def test_a_picture_without_alt_text_is_refused(tmp_path):
     source = tmp_path / "draws.py"
     source.write_text("# %%\nimport matplotlib.pyplot as plt\nplt.plot([0, 1]);\n", encoding="utf-8")
     notebook = execute(source)
@@ -197,7 +197,7 @@ def test_a_picture_needs_words(tmp_path):
     assert "![a line](draws-0.png)" in page(notebook, "draws", tmp_path)
 
 
-def test_sources_of_tutorials_are_without_outputs():
+def test_sources_of_tutorials_start_with_a_title():
     for source in SOURCES:
         cells = read(source).cells
         assert cells[0].cell_type == "markdown"

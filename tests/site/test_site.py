@@ -1,4 +1,4 @@
-"""The site as it was built: whole, linked, and nothing in it comes from a network."""
+"""The built site: complete, with working links, and without anything loaded from a network."""
 
 import json
 import os
@@ -33,7 +33,7 @@ LOADS = {
 
 
 class Page(HTMLParser):
-    """What a page loads, its text, and the code in it by whether a link leads on from it."""
+    """What a page loads, its text, and the code in it with a flag that tells whether it is linked."""
 
     def __init__(self, path):
         super().__init__()
@@ -87,7 +87,7 @@ def test_no_style_loads_a_font_from_a_network(site):
     )
 
 
-def test_every_public_name_has_its_place(site):
+def test_every_public_name_is_in_the_index_of_the_site(site):
     packed = (site / "objects.inv").read_bytes().split(b"\n", 4)[4]
     known = {line.split(" ")[0] for line in zlib.decompress(packed).decode().splitlines()}
     wanted = {place(module, name, thing) for module, things in entries().items() for name, thing in things}
@@ -100,13 +100,13 @@ def test_the_navigation_names_every_page_of_the_reference(site):
     assert [module for module in entries() if f'href="./api/{module}.html"' not in home] == []
 
 
-def test_equations_lead_to_code(site):
+def test_names_of_code_on_the_method_page_are_linked(site):
     code = [found for found in Page(site / "method.html").code if found[0].startswith("semfov.")]
     assert len(code) > 100
     assert [name for name, linked in code if not linked] == []
 
 
-def test_formulas_are_drawn_and_no_markup_is_left(site):
+def test_formulas_are_converted_and_no_markup_is_left(site):
     drawn = 0
     for path in (site / "api").glob("*.html"):
         drawn += path.read_text(encoding="utf-8").count("<math")
@@ -115,7 +115,7 @@ def test_formulas_are_drawn_and_no_markup_is_left(site):
     assert drawn > 100
 
 
-def test_examples_are_code_and_no_quotation(site):
+def test_examples_are_not_shown_as_quotations(site):
     assert [
         path.name for path in (site / "api").glob("*.html") if "<blockquote" in path.read_text(encoding="utf-8")
     ] == []
@@ -123,7 +123,7 @@ def test_examples_are_code_and_no_quotation(site):
 
 @pytest.mark.weights
 @pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.stem)
-def test_tutorials_have_pictures_worth_looking_at(site, can_run, source):
+def test_tutorials_have_pictures_with_content_and_alt_text(site, can_run, source):
     if not can_run:
         pytest.skip("the default detector's weights are missing")
     page = Page(site / "tutorials" / f"{source.stem}.html")
@@ -142,7 +142,7 @@ def test_tutorials_have_pictures_worth_looking_at(site, can_run, source):
 
 @pytest.fixture
 def address(site):
-    """The site on a server of this machine: its search needs one."""
+    """Address of the site on a local server, which its search needs."""
     handler = partial(Quiet, directory=str(site))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         thread = threading.Thread(target=server.serve_forever)
@@ -153,7 +153,7 @@ def address(site):
 
 
 class Quiet(SimpleHTTPRequestHandler):
-    """A server that says nothing."""
+    """A request handler that prints no log."""
 
     def log_message(self, *_):
         pass
@@ -161,7 +161,7 @@ class Quiet(SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def opened():
-    """A page of a browser, and what it asks for."""
+    """A page of a browser, and the list of addresses that it requests."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install playwright)")
     if CHROMIUM is None:
         pytest.skip("needs Chromium (apt-get install chromium, or set $CHROMIUM)")
@@ -169,13 +169,13 @@ def opened():
     with playwright.sync_playwright() as program:
         browser = program.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_page()
-        page.set_default_timeout(120_000)  # a busy machine is no mistake of the page's
+        page.set_default_timeout(120_000)  # on a busy machine the page may be slow
         page.on("request", lambda request: asked.append(request.url))
         yield page, asked
         browser.close()
 
 
-def test_a_browser_draws_formulas_and_asks_for_nothing(site, opened):
+def test_a_browser_draws_formulas_and_requests_nothing_else(site, opened):
     page, asked = opened
     page.goto((site / "api" / "semfov.sensor.html").as_uri())
     fraction = page.locator("math mfrac").first.bounding_box()
@@ -184,11 +184,11 @@ def test_a_browser_draws_formulas_and_asks_for_nothing(site, opened):
     assert [address for address in asked if not address.startswith(("file:", "data:", "blob:"))] == []
 
 
-def test_the_search_finds_and_asks_for_nothing_elsewhere(address, opened):
+def test_the_search_works_and_requests_nothing_from_elsewhere(address, opened):
     page, asked = opened
     page.goto(f"{address}/index.html")
     box = page.locator("input[placeholder]:visible").first
-    for _ in range(60):  # until the program of the page listens
+    for _ in range(60):  # until the program of the page reacts to keys
         page.keyboard.press("Control+k")
         page.wait_for_timeout(1000)
         if box.is_visible():

@@ -1,4 +1,4 @@
-"""Animations hold every frame, and play it as long as asked."""
+"""Animations contain every frame, for the requested time."""
 
 import base64
 import re
@@ -20,7 +20,7 @@ from semfov.viz.fixation import FixationFigure
 
 @pytest.fixture(params=["search", "exploration"])
 def searched(request):
-    """Three fixations, the photograph and three views of it."""
+    """A scanpath of three fixations, the photograph, and a view for each fixation."""
     generator = torch.Generator().manual_seed(0)
     grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 6, 11])
     scores = torch.tensor([[0.1, 0.8, 0.1], [0.3, 0.1, 0.6]])
@@ -46,7 +46,7 @@ def frames():
     return [np.full((31, 41, 3), shade, np.uint8) for shade in (0, 100, 200)]
 
 
-def test_gif(frames, tmp_path):
+def test_a_gif_contains_all_frames_and_durations(frames, tmp_path):
     save_animation(frames, tmp_path / "a.gif", seconds=0.5, hold=1.5)
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 3
@@ -57,35 +57,35 @@ def test_gif(frames, tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
-def test_mp4(frames, tmp_path):
+def test_an_mp4_contains_all_frames_and_durations(frames, tmp_path):
     _, path = save_animation(frames, tmp_path / "a.gif", seconds=0.5, hold=1.5)
     command = ["ffmpeg", "-loglevel", "error", "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     pixels = np.frombuffer(subprocess.run(command, capture_output=True, check=True).stdout, np.uint8)
     shown = pixels.reshape(-1, 32, 42, 3)[:, 10, 10, 0]
-    assert len(shown) == pytest.approx(30, abs=5)  # three seconds of ten frames
+    assert len(shown) == pytest.approx(30, abs=5)  # three seconds with ten frames each
     np.testing.assert_allclose([shown[2], shown[7], shown[-2]], [0, 100, 200], atol=6)
 
 
-def test_without_ffmpeg(frames, tmp_path, monkeypatch):
+def test_without_ffmpeg_only_a_gif_is_written(frames, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: None)
     assert save_animation(frames, tmp_path / "a.gif") == [tmp_path / "a.gif"]
 
 
-def test_frames_are_the_figures_drawn_one_by_one(searched):
-    """One figure makes them all, yet each is what `plot_fixation` draws."""
+def test_frames_equal_figures_drawn_one_by_one(searched):
+    """All frames are drawn with one figure, but each equals the figure of `plot_fixation`."""
     scanpath, image, views = searched
     frames = episode_frames(scanpath, image, views)
     assert len(frames) == len(scanpath)
     for fixation, (frame, view) in enumerate(zip(frames, views, strict=True)):
         (alone,) = render([plot_fixation(scanpath, fixation, image, view)])
         assert frame.shape == alone.shape
-        # The layout of a figure that is drawn on its own is done once more, and may move by part of a pixel.
+        # The layout of a separate figure is computed again, and may be shifted by a fraction of a pixel.
         off = np.abs(frame.astype(int) - alone) > 48
         assert off.mean() < 2e-3, fixation
     assert all((a != b).mean() > 1e-3 for a, b in pairwise(frames))
 
 
-def test_frames_do_not_depend_on_those_before(searched):
+def test_frames_do_not_depend_on_earlier_frames(searched):
     scanpath, image, views = searched
     figure = FixationFigure(scanpath, image, views[0])
     (last,) = render([figure.show(2, views[2])])
@@ -95,7 +95,7 @@ def test_frames_do_not_depend_on_those_before(searched):
     np.testing.assert_array_equal(last, again)
 
 
-def test_film(searched, tmp_path):
+def test_a_film_is_shown_in_notebooks_as_the_gif_that_it_writes(searched, tmp_path):
     scanpath, image, views = searched
     film = animate(scanpath, image=image, views=views, seconds=0.5, hold=1)
     assert len(film) == 3
@@ -109,7 +109,7 @@ def test_film(searched, tmp_path):
             assert read.info["duration"] == (500, 500, 1500)[number]
             shown = np.asarray(read.convert("RGB")).astype(int)
             assert (shown[0] == 255).all()
-            # The photograph is noise, which needs more colours than there are.
+            # The photograph is noise, which has more colours than a GIF.
             assert np.abs(shown - frame).mean() < 9
     for bad in ({"seconds": 0.0}, {"hold": -1.0}):
         with pytest.raises(InputError, match=next(iter(bad))):
@@ -117,12 +117,12 @@ def test_film(searched, tmp_path):
 
 
 def test_frames_share_their_colours(searched):
-    """What stands still does not flicker."""
+    """Parts that do not change must not flicker."""
     first, *others = in_one_palette(episode_frames(*searched))
     assert all(frame.getpalette() == first.getpalette() for frame in others)
 
 
-def test_render_is_the_figure():
+def test_render_gives_the_pixels_of_the_figure():
     figure = Figure(figsize=(1, 0.5), facecolor="#336699")
     (frame,) = render([figure], dpi=100)
     assert frame.shape == (50, 100, 3)

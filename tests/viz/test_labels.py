@@ -1,4 +1,4 @@
-"""Labels of boxes cover neither each other nor what is to be kept free."""
+"""Labels of boxes do not cover each other, nor areas that must stay free."""
 
 from itertools import combinations
 
@@ -16,7 +16,7 @@ def apart(a, b):
 
 
 @given(boxes, st.tuples(number, number))
-def test_labels_are_apart(corners, point):
+def test_labels_do_not_overlap(corners, point):
     framed = [(min(a, c), min(b, d), max(a, c), max(b, d)) for a, b, c, d in corners]
     gaze = (point[0], point[1], point[0] + 5, point[1] + 5)
     labels = place_labels(framed, [(20, 6)] * len(framed), (100, 100), [gaze])
@@ -25,7 +25,7 @@ def test_labels_are_apart(corners, point):
     assert all(abs(x2 - x1 - 20) < 1e-9 and abs(y2 - y1 - 6) < 1e-9 for x1, y1, x2, y2 in labels)
 
 
-def test_a_lone_label_lies_in_the_corner_of_its_box():
+def test_a_single_label_is_placed_in_the_corner_of_its_box():
     assert place_labels([(10, 20, 60, 70)], [(20, 6)], (100, 100)) == [(10, 20, 30, 26)]
 
 

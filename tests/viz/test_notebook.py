@@ -1,4 +1,4 @@
-"""A figure as the last value of a notebook's cell."""
+"""A figure as the last value of a notebook cell."""
 
 import subprocess
 import sys
@@ -21,8 +21,8 @@ print("image/png" in plain, drawn["image/png"][:4] == b"\\x89PNG", drawn["image/
 
 
 @pytest.mark.slow
-def test_a_figure_shows_itself_before_pyplot_is_used():
-    """Matplotlib's own figures do not: a notebook learns to show them from pyplot."""
+def test_a_figure_is_displayed_before_pyplot_is_imported():
+    """Plain Matplotlib figures are not: notebooks can display them only after pyplot is imported."""
     pytest.importorskip("IPython", reason="needs IPython (pip install semfov[docs])")
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False", "True", "1"]

@@ -1,4 +1,4 @@
-"""The path of the gaze: numbers can be read, and colours tell the time."""
+"""Figures of scanpaths: numbers are readable, and colours show the time."""
 
 from itertools import combinations
 
@@ -36,7 +36,7 @@ def drawn(scanpath):
 
 
 def crowded(columns, rows, near):
-    """31 fixations anywhere, or all in the cells around one."""
+    """Cells of 31 fixations, anywhere in the image or close together."""
     generator = torch.Generator().manual_seed(columns)
     if near:
         return (torch.arange(31) % 6 + 3) + columns * (torch.arange(31) // 6 + 3)
@@ -45,14 +45,14 @@ def crowded(columns, rows, near):
 
 @pytest.mark.parametrize("near", [False, True])
 @pytest.mark.parametrize(("columns", "rows"), [(10, 10), (20, 20), (40, 30)])
-def test_numbers_of_thirty_shifts_do_not_hide_each_other(columns, rows, near):
+def test_numbers_of_thirty_gaze_shifts_do_not_overlap(columns, rows, near):
     scanpath = scanpath_of(crowded(columns, rows, near), columns, rows)
     axes = drawn(scanpath)
     numbers = [int(text.get_text()) for text in axes.texts]
     assert sorted(numbers) == list(range(31))
     boxes = [text.get_bbox_patch().get_window_extent() for text in axes.texts]
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
-    # Each number is on its own fixation, or on none.
+    # No number covers another fixation.
     where = axes.transData.transform((scanpath.fixations + 0.5).numpy())
     for number, box in zip(numbers, boxes, strict=True):
         inside = [n for n, (x, y) in enumerate(where) if box.x0 < x < box.x1 and box.y0 < y < box.y1]
@@ -62,7 +62,7 @@ def test_numbers_of_thirty_shifts_do_not_hide_each_other(columns, rows, near):
         np.testing.assert_allclose([text.xyann for text in axes.texts], scanpath.fixations + 0.5, atol=1e-3)
 
 
-def test_colours_go_with_time():
+def test_colours_show_the_time_of_fixations():
     from matplotlib import colormaps
 
     axes = drawn(scanpath_of(torch.arange(0, 90, 9), 10, 10))
@@ -78,8 +78,8 @@ def test_colours_go_with_time():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2, 400])
-def test_few_and_very_many_fixations(count):
-    """Numbers that there is no room for are left out, never the first and the last."""
+def test_numbers_of_few_and_of_very_many_fixations_do_not_overlap(count):
+    """Numbers without enough space are left out, but never the first and the last."""
     axes = drawn(scanpath_of(torch.randperm(1600, generator=torch.Generator().manual_seed(0))[:count], 40, 40))
     numbers = {int(text.get_text()) for text in axes.texts}
     assert {0, count - 1} <= numbers
@@ -95,7 +95,7 @@ def apart(a, b):
 
 
 @given(st.lists(st.tuples(number, number), min_size=1, max_size=14))
-def test_placed_numbers_are_apart_and_in_the_frame(points):
+def test_placed_numbers_do_not_overlap_and_stay_in_the_frame(points):
     placed = place_numbers(points, [(9, 6)] * len(points), (100, 100), 30)
     assert len(placed) == len(points)
     assert placed[0] is not None
@@ -112,7 +112,7 @@ def test_placed_numbers_are_apart_and_in_the_frame(points):
 
 
 @given(st.lists(st.lists(st.tuples(number, number), min_size=1, max_size=4), max_size=9))
-def test_labels_that_have_a_choice_are_apart(candidates):
+def test_labels_with_several_candidate_positions_do_not_overlap(candidates):
     placed = place_within(candidates, [(20, 6)] * len(candidates), (100, 100))
     assert all(apart(a, b) for a, b in combinations(placed, 2))
     if candidates:

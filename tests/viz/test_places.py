@@ -1,4 +1,4 @@
-"""Every picture can be drawn in axes of the caller's, and written as pixels, PDF and SVG."""
+"""Every figure can be drawn into given axes, and written as PNG, PDF and SVG."""
 
 import inspect
 import re
@@ -41,7 +41,7 @@ def scanpath():
 
 
 def calls(scanpath):
-    """For each function its arguments, and how many axes it takes (0: a figure)."""
+    """Arguments and options of each function, and the number of axes or the parameter that it draws into."""
     image = torch.rand(3, 60, 80)
     views = [image] * 3
     p = torch.rand(500, 1)
@@ -69,8 +69,8 @@ NAMES = [name for name in viz.__all__ if name.startswith("plot_") and name != "p
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_drawn_in_the_callers_axes(name, scanpath):
-    """What is in them is what is in a figure of the function's own, and nothing else is drawn to."""
+def test_figures_are_drawn_into_given_axes(name, scanpath):
+    """Their content equals that of a new figure, and other axes stay empty."""
     function, (arguments, options, place) = getattr(viz, name), calls(scanpath)[name]
     mine = Figure(figsize=(12, 8), layout="constrained")
     left, right = mine.subfigures(1, 2, width_ratios=[1, 3])
@@ -98,12 +98,12 @@ def test_drawn_in_the_callers_axes(name, scanpath):
             function(*arguments, **options, axes=given[:-1])
 
 
-def test_every_function_says_where_it_draws():
+def test_every_function_has_a_parameter_for_axes_or_a_figure():
     for name in [*NAMES, "plot_zoom_path"]:
         assert {"ax", "axes", "figure"} & set(inspect.signature(getattr(viz, name)).parameters), name
 
 
-def test_pdf_holds_its_fonts_and_text(scanpath, tmp_path):
+def test_a_pdf_contains_its_fonts_and_text(scanpath, tmp_path):
     figure = viz.plot_scanpath(scanpath, torch.rand(3, 60, 80))
     path = viz.save_figure(figure, tmp_path / "a.pdf")
     (page,) = pypdf.PdfReader(path).pages
@@ -113,14 +113,14 @@ def test_pdf_holds_its_fonts_and_text(scanpath, tmp_path):
     fonts = [font.get_object() for font in page["/Resources"]["/Font"].get_object().values()]
     assert fonts
     for font in fonts:
-        # TrueType inside of a composite font: what publishers take.
+        # TrueType inside a composite font, as publishers require.
         assert font["/Subtype"] == "/Type0"
         (inner,) = [each.get_object() for each in font["/DescendantFonts"]]
         assert "/FontFile2" in inner["/FontDescriptor"].get_object()
-    assert len(page.images) == 1  # the photograph alone is made of pixels
+    assert len(page.images) == 1  # only the photograph is a pixel image
 
 
-def test_svg_holds_its_text_as_outlines(scanpath, tmp_path):
+def test_an_svg_contains_its_text_as_outlines(scanpath, tmp_path):
     figure = viz.plot_cumulative_performance(CURVES)
     root = ET.parse(viz.save_figure(figure, tmp_path / "a.svg")).getroot()
     tags = [element.tag.rpartition("}")[2] for element in root.iter()]
@@ -131,13 +131,13 @@ def test_svg_holds_its_text_as_outlines(scanpath, tmp_path):
     assert "targets found (%)" in re.sub(r"<!-- (.*?) -->", r"\1", text)
 
 
-def test_png_is_as_fine_as_asked_for(tmp_path):
+def test_a_png_has_the_requested_resolution(tmp_path):
     figure = viz.plot_cumulative_performance(CURVES)
     with Image.open(viz.save_figure(figure, tmp_path / "a.png", dpi=50)) as picture:
         assert picture.size == (310, 200)
 
 
-def test_a_figure_that_cannot_be_written_leaves_what_was_there(tmp_path):
+def test_a_failed_write_leaves_existing_files_unchanged(tmp_path):
     path = tmp_path / "a.png"
     path.write_bytes(b"before")
     with pytest.raises(ValueError, match="nonsense"):
@@ -149,7 +149,7 @@ def test_a_figure_that_cannot_be_written_leaves_what_was_there(tmp_path):
     assert path.read_bytes() == b"before"
 
 
-def test_the_callers_settings_stay(scanpath, tmp_path):
+def test_settings_of_matplotlib_are_not_changed(scanpath, tmp_path):
     import matplotlib as mpl
 
     before = dict(mpl.rcParams)

@@ -1,4 +1,4 @@
-"""The figure of hits against false alarms."""
+"""The figure of hit rates against false-alarm rates."""
 
 import numpy as np
 import torch
@@ -7,7 +7,7 @@ from semfov.metrics.presence import area_under_roc, roc
 from semfov.viz.presence import plot_roc
 
 
-def test_curves_are_those_of_the_scores():
+def test_curves_and_areas_equal_those_of_the_scores():
     generator = torch.Generator().manual_seed(0)
     present = torch.rand(40, generator=generator) < 0.5
     scores = {"one": torch.rand(40, generator=generator) + present, "other": torch.rand(40, generator=generator)}

@@ -1,4 +1,4 @@
-"""What a map names: regions against scipy, marginal probabilities, and the figure."""
+"""Semantic maps: named regions against scipy, marginal probabilities, and the figure."""
 
 import math
 import warnings
@@ -17,7 +17,7 @@ CLASSES = ("background", "cat", "cup", "dog")
 
 
 def scanpath_of(probabilities, columns, classes=CLASSES):
-    """An exploration whose map was `(n, X·Y, K+1)`."""
+    """The scanpath of an exploration with maps `(n, X·Y, K+1)`."""
     looks, cells = probabilities.shape[:2]
     grid = Grid(columns, cells // columns, (10 * columns, 10 * (cells // columns)))
     order = torch.arange(looks)
@@ -46,7 +46,7 @@ def labelled(table):
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (6, 7), (12, 10)], ids=str)
 @pytest.mark.parametrize("classes", [1, 2, 4])
-def test_regions_are_those_of_scipy(shape, classes):
+def test_regions_equal_those_of_scipy(shape, classes):
     for seed in range(6):
         table = torch.randint(classes + 1, shape, generator=torch.Generator().manual_seed(seed))
         found = regions(table)
@@ -55,7 +55,7 @@ def test_regions_are_those_of_scipy(shape, classes):
         assert sorted(cell for cells in found for cell in cells) == table.flatten().nonzero()[:, 0].tolist()
 
 
-def test_regions_of_nothing_and_of_everything():
+def test_regions_of_empty_and_uniform_tables():
     assert regions(torch.zeros(3, 4, dtype=torch.long)) == []
     assert regions(torch.full((3, 4), 2)) == [list(range(12))]
     snake = torch.tensor([[1, 1, 1], [0, 0, 1], [1, 1, 1], [1, 0, 0], [1, 1, 1]])
@@ -65,7 +65,7 @@ def test_regions_of_nothing_and_of_everything():
 @pytest.mark.parametrize("count", [2, 4, 12])
 @pytest.mark.parametrize("marginal", [True, False])
 def test_named_regions_equal_a_loop(count, marginal):
-    """An object that is more probable than background, and than the lesser of a half and thrice an even share."""
+    """Objects more probable than background, and than 1/2 or 3 / (number of classes), whichever is smaller."""
     classes = ("background", *(f"class {number}" for number in range(1, count)))
     for seed in range(5):
         generator = torch.Generator().manual_seed(seed)
@@ -90,7 +90,7 @@ def test_named_regions_equal_a_loop(count, marginal):
 
 
 def marginal_map():
-    """A cup on a table of cats: cells that hold two, cells that hold nothing; 6 × 4 cells after 3 looks."""
+    """A cat with a cup in the same cells, a dog, and cells without objects; 6 × 4 cells, 3 looks."""
     probabilities = torch.full((3, 24, 4), 0.02)
     probabilities[..., 0] = 0.9
     probabilities[-1, 7:11, 0] = 0.05
@@ -118,7 +118,7 @@ def test_figure_of_marginal_probabilities():
 
 
 def test_borders_go_around_regions():
-    """Their length is that of the sides between cells of different labels, and of the frame, counted on the table."""
+    """The number of lines equals the number of cell sides between the region and other cells or the frame."""
     table = torch.randint(3, (6, 7), generator=torch.Generator().manual_seed(0))
     grid = Grid(7, 6, (70, 60))
     padded = np.pad(table.numpy(), 1, constant_values=-1)
@@ -131,14 +131,14 @@ def test_borders_go_around_regions():
         assert len(lines) == expected
         for (x1, y1), (x2, y2) in lines:
             assert abs(x2 - x1) + abs(y2 - y1) == pytest.approx(10)
-            # Beside the middle of a side lie a cell of the region and one that is not.
+            # One side of each line is a cell of the region, the other one is not.
             x, y = (x1 + x2) / 20, (y1 + y2) / 20
             off = (0.5, 0) if x1 == x2 else (0, 0.5)
             pair = [padded[math.floor(y + s * off[1]) + 1, math.floor(x + s * off[0]) + 1] for s in (-1, 1)]
             assert len({int(each) for each in pair}) == 2
 
 
-def test_names_of_many_regions_do_not_hide_each_other():
+def test_names_of_many_regions_do_not_overlap():
     generator = torch.Generator().manual_seed(0)
     probabilities = torch.rand(1, 100, 4, generator=generator).pow(4)
     figure = plot_semantic_map(scanpath_of(probabilities, 10, ("background", "fire hydrant", "dining table", "cup")))
@@ -148,7 +148,7 @@ def test_names_of_many_regions_do_not_hide_each_other():
     assert not any(a.overlaps(b) for n, a in enumerate(extents) for b in extents[n + 1 :])
 
 
-def test_entropy_of_marginal_probabilities_is_that_of_their_shares():
+def test_entropy_is_that_of_normalised_probabilities():
     scanpath = marginal_map()
     got = entropy(scanpath)
     assert got.shape == (3, 24)
@@ -160,8 +160,8 @@ def test_entropy_of_marginal_probabilities_is_that_of_their_shares():
     assert float(got.max()) <= 2
 
 
-def test_demo_tells_what_is_where():
-    """A line for each class: all its cells, its highest probability and where that is."""
+def test_the_demo_lists_classes_and_their_cells():
+    """One line for each class: its number of cells, its highest probability and the cell of that."""
     lines = demo.told("picture", marginal_map()).splitlines()
     start = lines.index("what is where:")
     assert lines[start + 1 : start + 3] == [
@@ -170,7 +170,7 @@ def test_demo_tells_what_is_where():
     ]
 
 
-def test_demo_tells_that_nothing_is_there():
+def test_the_demo_reports_an_empty_map():
     empty = torch.tensor([0.9, 0.3, 0.2, 0.1]).expand(2, 24, -1)
     told = demo.told("picture", scanpath_of(empty, 6))
     assert told.rstrip().endswith("what is where:\n  nothing that is more probable than background")

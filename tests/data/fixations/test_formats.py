@@ -1,4 +1,4 @@
-"""Files of fixations: what is written is read back, and what is wrong is named by file, record and field."""
+"""Files of fixations: written records are read back, and errors name file, record and field."""
 
 import json
 
@@ -30,7 +30,7 @@ def record(picture="a.jpg", subject="1", points=((1.5, 2.25), (3.0, 4.0)), **mor
     return Fixations(picture, subject, np.array(points, dtype=np.float64), (800, 600), **more)
 
 
-def same(a, b):
+def assert_equal_records(a, b):
     assert (a.picture, a.subject, a.size, a.target, a.found) == (b.picture, b.subject, b.size, b.target, b.found)
     np.testing.assert_allclose(a.points, b.points)
     assert (a.durations is None) == (b.durations is None)
@@ -59,30 +59,30 @@ FULL = {
     ],
     ids=["ruarte", "cocosearch", "table"],
 )
-def test_searches_come_back_as_they_went(tmp_path, write, read, more):
+def test_written_searches_are_read_back(tmp_path, write, read, more):
     records = [record(**more), record('b, with "comma".jpg', **more)]
     write(tmp_path / "file", records)
     for before, after in zip(records, read(tmp_path / "file"), strict=True):
-        same(before, after)
+        assert_equal_records(before, after)
 
 
-def test_free_viewing_comes_back_as_it_went(tmp_path):
+def test_written_free_viewing_records_are_read_back(tmp_path):
     records = [record("a.jpg", "1", durations=np.array([1.0, 2.0])), record("a.jpg", "2"), record("b.jpg", "1")]
     write_osie(tmp_path / "file", records)
     for before, after in zip(records, read_osie(tmp_path / "file"), strict=True):
-        same(before, after)
+        assert_equal_records(before, after)
     with pytest.raises(InputError, match="one size"):
         write_osie(tmp_path / "file", [records[0], records[0].resized((8, 6))])
 
 
 @given(st.lists(st.tuples(numbers, numbers), min_size=1, max_size=8))
-def test_any_points_survive_the_table(tmp_path_factory, points):
+def test_any_points_are_read_back_from_a_table(tmp_path_factory, points):
     path = tmp_path_factory.mktemp("table") / "t.csv"
     write_table(path, [record(points=points)])
     np.testing.assert_array_equal(read_table(path)[0].points, points)
 
 
-def test_a_table_of_pandas_is_read(tmp_path):
+def test_a_table_written_by_pandas_is_read(tmp_path):
     frame = pandas.DataFrame(
         {"picture": ["a"] * 2 + ["b"], "subject": [1, 1, 1], "x": [0.0, 1, 2], "y": [0, 1, 2.5]}
     ).assign(width=8, height=6)
@@ -97,13 +97,13 @@ def trial(**changes):
     return {**fields, **changes}
 
 
-def test_durations_beyond_the_target_are_left_out(tmp_path):
-    """Of a scanpath that was cut at its target, X is cut and T is not."""
+def test_durations_after_the_last_fixation_are_left_out(tmp_path):
+    """In scanpaths that were cut at their target, X is cut and T is not."""
     (tmp_path / "s.json").write_text(json.dumps({"a.jpg": trial()}))
     assert read_ruarte(tmp_path / "s.json")[0].durations.tolist() == [100, 200]
 
 
-def test_cells_have_their_last_row_and_column_in_the_box(tmp_path):
+def test_boxes_in_cells_include_their_last_row_and_column(tmp_path):
     cells = trial(X=[15], Y=[11], image_width=32, image_height=24, receptive_width=1, receptive_height=1)
     cells |= {"target_bbox": [12, 25, 21, 28], "target_object": "bottle", "target_found": False}
     (tmp_path / "s.json").write_text(json.dumps({"a.jpg": cells}))
@@ -148,7 +148,7 @@ def test_errors_name_file_record_and_field(tmp_path, changes, said):
         ("picture,subject,x,y,width,height,found\na,1,2,3,8,6,maybe\n", read_table, "line 2, found"),
     ],
 )
-def test_files_that_hold_something_else(tmp_path, content, read, said):
+def test_files_of_another_format_are_refused(tmp_path, content, read, said):
     (tmp_path / "f").write_text(content)
     with pytest.raises(DataError, match=rf"{tmp_path.name}/f: .*{said}"):
         read(tmp_path / "f")
@@ -159,12 +159,12 @@ def test_a_missing_file_is_named(tmp_path):
         read_table(tmp_path / "nothing.csv")
 
 
-def test_one_person_looks_at_a_picture_once_in_ruartes_file(tmp_path):
+def test_two_records_of_one_picture_in_a_ruarte_file_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"several for a\.jpg"):
         write_ruarte(tmp_path / "s.json", [record(), record()])
 
 
-def test_pictures_are_in_the_order_of_their_names():
+def test_pictures_are_sorted_by_name():
     assert list(by_picture([record("b"), record("a"), record("b", "2")])) == ["a", "b"]
     with pytest.raises(InputError, match="name"):
         coco_name("dog.jpg")
@@ -175,19 +175,19 @@ def test_pictures_are_in_the_order_of_their_names():
     [{"points": ()}, {"points": ((np.nan, 1.0),)}, {"durations": np.ones(3)}],
     ids=["none", "NaN", "durations"],
 )
-def test_records_that_cannot_be(broken):
+def test_invalid_records_are_refused(broken):
     with pytest.raises(InputError):
         record(**broken)
 
 
-def test_inside_is_up_to_the_pixels_edges():
+def test_points_count_as_inside_up_to_the_edges_of_pixels():
     assert record(points=[(-0.5, 0), (799.49, 599.49), (799.5, 0), (0, -0.51)]).inside.tolist() == [
         True, True, False, False,
     ]  # fmt: skip
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_fixation_trains_of_pysaliency(monkeypatch):
+def test_fixation_trains_of_pysaliency_are_converted_both_ways(monkeypatch):
     import importlib.util
     import sys
     from types import SimpleNamespace
@@ -200,7 +200,7 @@ def test_fixation_trains_of_pysaliency(monkeypatch):
         monkeypatch.setitem(sys.modules, "pkg_resources", SimpleNamespace(resource_string=None, resource_listdir=None))
     records = [record("a.jpg", "0"), record("b.jpg", "1", points=[(7.0, 8.0)], durations=np.array([200.0]))]
     trains = to_pysaliency(records, ["b.jpg", "a.jpg"])
-    # The pixel that pysaliency looks a fixation up in is the one whose centre is nearest.
+    # In pysaliency, the pixel of a fixation is the one with the nearest centre.
     assert list(zip(trains.x_int.tolist(), trains.y_int.tolist(), trains.n.tolist(), strict=True)) == [
         (2, 2, 1), (3, 4, 1), (7, 8, 0),
     ]  # fmt: skip
@@ -213,7 +213,7 @@ def test_fixation_trains_of_pysaliency(monkeypatch):
 
 
 @pytest.mark.parametrize("target", [None, 1])
-def test_an_agents_scanpath_is_a_record_like_peoples(tmp_path, target):
+def test_the_scanpath_of_a_model_is_converted_to_a_record(tmp_path, target):
     import torch
 
     from semfov import Grid, Scanpath
@@ -236,4 +236,4 @@ def test_an_agents_scanpath_is_a_record_like_peoples(tmp_path, target):
     assert (fixations.size, fixations.subject) == ((80, 60), "semfov")
     assert (fixations.target, fixations.found) == ((None, None) if target is None else ("cup", True))
     write_table(tmp_path / "t.csv", [fixations])
-    same(fixations, read_table(tmp_path / "t.csv")[0])
+    assert_equal_records(fixations, read_table(tmp_path / "t.csv")[0])

@@ -1,4 +1,4 @@
-"""From screens to pictures: on pictures whose mapping is known, and against the other way round."""
+"""Coordinates on screens and in pictures: known mappings, and round trips."""
 
 import json
 from collections import defaultdict
@@ -27,11 +27,11 @@ def test_a_letterboxed_picture_fits_and_is_centred(width, height, across, down):
     np.testing.assert_allclose(placed.box_to_picture(placed.box_to_screen((1, 2, 3, 4))), (1, 2, 3, 4), atol=1e-6)
 
 
-def test_by_hand():
-    # 640 × 480 on 1680 × 1050 is 1400 × 1050, 140 from the left.
+def test_letterbox_equals_values_computed_by_hand():
+    # 640 × 480 on a screen of 1680 × 1050 becomes 1400 × 1050, with an offset of 140 from the left.
     placed = Letterbox((1680, 1050), (640, 480))
     assert placed.box_to_screen((0, 0, 640, 480)) == (140, 0, 1540, 1050)
-    # 480 × 640 is 787.5 × 1050.
+    # 480 × 640 becomes 787.5 × 1050.
     assert Letterbox((1680, 1050), (480, 640)).offset == (446.25, 0)
 
 
@@ -40,14 +40,14 @@ def test_resizing_keeps_centres_of_cells_and_edges():
     np.testing.assert_allclose(resized_points(np.array([[0.0, 23.0]]), (32, 24), (1680, 1050)), [[25.75, 1027.625]])
 
 
-def test_sizes_that_cannot_be():
+def test_a_size_of_zero_is_refused():
     with pytest.raises(InputError, match=r"^picture:"):
         Letterbox((1680, 1050), (0, 5))
 
 
 @pytest.mark.shared
-def test_boxes_of_cocosearch_land_on_those_of_coco(shared):
-    """Nine pictures are in both sets, and COCO knows nothing of the screen: its boxes check the mapping."""
+def test_boxes_of_cocosearch_mapped_to_pictures_match_those_of_coco(shared):
+    """Nine pictures are in both data sets. Boxes of COCO do not depend on the screen, so they check the mapping."""
     sizes, boxes = {}, defaultdict(list)
     for name in ("eval300", "fit"):
         data = json.loads((shared / f"coco/annotations/instances_{name}.json").read_text())
@@ -66,12 +66,12 @@ def test_boxes_of_cocosearch_land_on_those_of_coco(shared):
     for each in seen.values():
         candidates = np.array(boxes[each.picture, each.target])
         off = np.abs(candidates - each.box).max(1).min()
-        # Boxes of the pictures are whole pixels of a reduced picture; those of the screen whole screen pixels.
+        # Boxes of one data set are rounded to pixels of a reduced picture, those of the other to screen pixels.
         assert off < 2.5, (each.picture, off)
 
 
 @pytest.mark.shared
-def test_models_in_cells_and_people_in_pixels_tell_of_the_same_target(shared):
+def test_target_boxes_in_cells_of_models_match_those_in_pixels_of_people(shared):
     folder = shared / "human/cocosearch18"
     people = {each.picture: each for each in read_ruarte(folder / "human_scanpaths/subj01_scanpaths.json")}
     models = read_ruarte(folder / "predicted/nnIBS.json", screen=(1680, 1050))

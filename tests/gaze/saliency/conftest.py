@@ -19,7 +19,7 @@ def tolerance(dtype: torch.dtype) -> float:
 
 @pytest.fixture
 def photograph() -> np.ndarray:
-    """Part of a photograph with odd sides, `(97, 131, 3)` in [0, 1]."""
+    """Part of a photograph, with an odd height and width, `(97, 131, 3)` in [0, 1]."""
     from skimage import data
 
     return data.astronaut()[40 : 40 + 2 * 97 : 2, 150 : 150 + 2 * 131 : 2] / 255

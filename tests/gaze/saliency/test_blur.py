@@ -14,7 +14,7 @@ from semfov.gaze.saliency.blur import enlarge, gaussian_blur, gaussian_kernel
 
 
 @given(st.integers(1, 150), st.integers(1, 150), st.floats(0.3, 9.0), st.sampled_from([torch.float32, torch.float64]))
-def test_blur_is_opencvs(height: int, width: int, sigma: float, dtype: torch.dtype) -> None:
+def test_blur_equals_opencv(height: int, width: int, sigma: float, dtype: torch.dtype) -> None:
     image = np.random.default_rng(height * width).random((height, width, 3))
     expected = cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE).reshape(image.shape)
     tensor = torch.from_numpy(image).permute(2, 0, 1)[None].to(dtype)
@@ -27,7 +27,7 @@ def test_blur_is_opencvs(height: int, width: int, sigma: float, dtype: torch.dty
     np.testing.assert_allclose(halved.numpy(), sampled.reshape(*size[::-1], 3), atol=2e-6)
 
 
-def test_blur_is_scipys_and_kornias(dtype: torch.dtype) -> None:
+def test_blur_equals_scipy_and_kornia(dtype: torch.dtype) -> None:
     image = torch.rand(2, 3, 70, 140, dtype=dtype)
     blurred = gaussian_blur(image, 2.0)
     scipy = ndimage.gaussian_filter(image.double().numpy(), (0, 0, 2.0, 2.0), mode="nearest", radius=8)
@@ -37,13 +37,13 @@ def test_blur_is_scipys_and_kornias(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 2**1.5, 5.0, 8.0])
-def test_kernel_is_opencvs(sigma: float) -> None:
+def test_kernel_equals_opencv(sigma: float) -> None:
     kernel = gaussian_kernel(sigma).numpy()
     np.testing.assert_allclose(kernel, cv2.getGaussianKernel(len(kernel), sigma)[:, 0], atol=1e-15)
 
 
 @given(st.integers(1, 60), st.integers(1, 60), st.integers(0, 70), st.integers(0, 70))
-def test_enlargement_is_opencvs(height: int, width: int, taller: int, wider: int) -> None:
+def test_enlargement_equals_opencv(height: int, width: int, taller: int, wider: int) -> None:
     image = np.random.default_rng(height * width).random((height, width))
     size = (height + taller, width + wider)
     expected = cv2.resize(image, size[::-1], interpolation=cv2.INTER_CUBIC)
@@ -52,7 +52,7 @@ def test_enlargement_is_opencvs(height: int, width: int, taller: int, wider: int
 
 @pytest.mark.parametrize("size", [(200, 333), (481, 170), (24, 640)])
 @pytest.mark.parametrize("halve", [False, True])
-def test_blur_in_tiles_is_opencvs(size: tuple[int, int], halve: bool, dtype: torch.dtype) -> None:
+def test_blur_in_tiles_equals_opencv(size: tuple[int, int], halve: bool, dtype: torch.dtype) -> None:
     image = torch.rand(2, 3, *size, dtype=dtype)
     blurred = gaussian_blur(image, 5.5, halve=halve)
     for plane, made in zip(image.flatten(0, 1), blurred.flatten(0, 1), strict=True):
@@ -77,17 +77,21 @@ def test_blur_in_tiles_compiles_and_vectorises() -> None:
 
 
 @pytest.mark.parametrize(("size", "length"), [((200, 170), (90, 61)), ((190, 40), (63, 41)), ((300, 200), (450, 199))])
-def test_other_sizes_are_opencvs(size: tuple[int, int], length: tuple[int, int], dtype: torch.dtype) -> None:
+def test_resizing_to_other_sizes_equals_opencv(
+    size: tuple[int, int], length: tuple[int, int], dtype: torch.dtype
+) -> None:
     image = torch.rand(size, dtype=dtype)
     expected = cv2.resize(image.double().numpy(), length[::-1], interpolation=cv2.INTER_CUBIC)
-    # OpenCV's weights are in single precision.
+    # The weights in OpenCV are in single precision.
     np.testing.assert_allclose(enlarge(image, length).numpy(), expected, atol=2e-5)
 
 
 @pytest.mark.parametrize(
     ("size", "factors"), [((60, 90), (2, 4)), ((30, 21), (16, 8)), ((100, 61), (3, 7)), ((80, 170), (3, 1))]
 )
-def test_enlargement_in_tiles_is_opencvs(size: tuple[int, int], factors: tuple[int, int], dtype: torch.dtype) -> None:
+def test_enlargement_in_tiles_equals_opencv(
+    size: tuple[int, int], factors: tuple[int, int], dtype: torch.dtype
+) -> None:
     image = torch.rand(size, dtype=dtype)
     height, width = size[0] * factors[0], size[1] * factors[1]
     expected = cv2.resize(image.double().numpy(), (width, height), interpolation=cv2.INTER_CUBIC)
@@ -96,7 +100,7 @@ def test_enlargement_in_tiles_is_opencvs(size: tuple[int, int], factors: tuple[i
     np.testing.assert_allclose(graded.numpy(), expected, atol=1e-5)
 
 
-def test_matrices_made_in_inference_mode_carry_gradients() -> None:
+def test_gradients_flow_through_matrices_made_in_inference_mode() -> None:
     image = torch.rand(1, 1, 21, 23)
     with torch.inference_mode():
         enlarge(gaussian_blur(image, 1.2345), (41, 47))

@@ -12,9 +12,9 @@ from semfov.gaze.saliency import cell_saliency
 
 
 @given(st.integers(1, 23), st.integers(1, 23), st.integers(1, 8), st.integers(1, 8))
-def test_mean_and_max_are_the_brute_forces(height: int, width: int, columns: int, rows: int) -> None:
+def test_mean_and_max_equal_a_brute_force(height: int, width: int, columns: int, rows: int) -> None:
     saliency = np.random.default_rng(height + 100 * width).random((2, height, width))
-    # Every pixel as rows x columns pieces: then every cell has height x width whole pieces.
+    # Split every pixel into rows x columns pieces: then every cell consists of height x width whole pieces.
     pieces = saliency.repeat(rows, 1).repeat(columns, 2)
     cells = pieces.reshape(2, rows, height, columns, width).transpose(0, 1, 3, 2, 4).reshape(2, rows * columns, -1)
     for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 2e-6)):
@@ -24,7 +24,7 @@ def test_mean_and_max_are_the_brute_forces(height: int, width: int, columns: int
         np.testing.assert_allclose(largest.numpy(), cells.max(-1), atol=tolerance)
 
 
-def test_cells_are_the_grids() -> None:
+def test_cells_are_those_of_the_grid() -> None:
     saliency = torch.zeros(1, 47, 61)
     saliency[0, 33, 50] = 1.0
     expected = Grid(7, 5, (61, 47)).cell_of(torch.tensor([50.0, 33.0]))
@@ -32,7 +32,7 @@ def test_cells_are_the_grids() -> None:
         assert cell_saliency(saliency, 7, 5, reduction).argmax() == expected
 
 
-def test_the_most_salient_open_cell_holds_the_most_salient_pixel_left() -> None:
+def test_the_most_salient_unvisited_cell_holds_the_most_salient_pixel_left() -> None:
     """Luzio, Bernardino and Moreno (2024, section IV-B): after each fixation the pixels of its cell are nullified."""
     saliency = torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(0)) + 0.1
     left, visited = saliency[0].clone(), torch.zeros(20, dtype=torch.bool)
@@ -45,7 +45,7 @@ def test_the_most_salient_open_cell_holds_the_most_salient_pixel_left() -> None:
         left[row * 6 : row * 6 + 6, column * 10 : column * 10 + 10] = 0
 
 
-def test_mean_keeps_the_mass(device: torch.device) -> None:
+def test_mean_over_cells_is_the_mean_over_pixels(device: torch.device) -> None:
     saliency = torch.rand(3, 31, 50, dtype=torch.float64, device=device)
     torch.testing.assert_close(cell_saliency(saliency, 8, 7).mean(-1), saliency.mean((-2, -1)))
 
@@ -73,6 +73,6 @@ def test_bad_input(shape: tuple[int, ...], columns: int, rows: int, reduction: s
         cell_saliency(torch.zeros(shape), columns, rows, reduction)
 
 
-def test_whole_numbers_are_refused() -> None:
+def test_integer_maps_are_refused() -> None:
     with pytest.raises(InputError, match="saliency"):
         cell_saliency(torch.zeros(1, 4, 4, dtype=torch.long), 2, 2)

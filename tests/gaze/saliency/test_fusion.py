@@ -10,7 +10,7 @@ from semfov.gaze.saliency.conspicuity import fuse, rescale
 
 
 @pytest.mark.parametrize("fusion", ["mean", "max"])
-def test_fusion_is_opencvs(fusion: str, dtype: torch.dtype, tolerance: float) -> None:
+def test_fusion_equals_opencv(fusion: str, dtype: torch.dtype, tolerance: float) -> None:
     sizes = [(24, 37), (12, 18), (6, 9), (3, 4)]
     maps = [torch.rand(2, 6, *size, dtype=dtype) for size in sizes]
     fused = fuse(maps, sizes[0], fusion)

@@ -1,4 +1,4 @@
-"""The model of Itti, Koch and Niebur (1998) against its steps written with OpenCV and loops."""
+"""The model of Itti, Koch and Niebur (1998) against its steps in OpenCV and loops."""
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from semfov.gaze.saliency.itti import (
 
 
 def numpy_promote(image: np.ndarray) -> np.ndarray:
-    """N(.) of one map, looking for peaks pixel by pixel."""
+    """N(.) of one map, with a search for peaks pixel by pixel."""
     low, high = image.min(), image.max()
     if high - low < 1e-5:
         return np.zeros_like(image)
@@ -39,7 +39,7 @@ def numpy_promote(image: np.ndarray) -> np.ndarray:
 
 
 def opencv_gabor(angle: float, phase: float) -> np.ndarray:
-    """OpenCV turns the other way, and its phase is added to the wave."""
+    """OpenCV's kernel is rotated by 180°, and its phase is added to that of the wave."""
     kernel = cv2.getGaborKernel((9, 9), 7 / 3, np.deg2rad(angle), 7.0, 1.0, phase)[::-1, ::-1]
     kernel = kernel - kernel.mean()
     return kernel / np.abs(kernel).sum()
@@ -85,18 +85,18 @@ def opencv_itti_koch(image: np.ndarray) -> np.ndarray:
     return (saliency - saliency.min()) / (saliency.max() - saliency.min())
 
 
-def test_saliency_is_opencvs(photograph: np.ndarray, dtype: torch.dtype) -> None:
-    # Noise breaks up even areas: which of their pixels is a peak hangs on how a processor rounds.
+def test_saliency_equals_the_steps_in_opencv(photograph: np.ndarray, dtype: torch.dtype) -> None:
+    # Noise removes uniform areas, where rounding decides which pixel is a peak.
     picture = 0.2 + 0.5 * photograph + 0.3 * np.random.default_rng(0).random(photograph.shape)
     saliency = IttiKoch()(torch.from_numpy(picture).permute(2, 0, 1)[None].to(dtype))
     assert saliency.dtype == dtype
-    # In single precision a peak may still come or go.
+    # In single precision a peak may still appear or vanish.
     atol = 1e-6 if dtype == torch.float64 else 5e-4
     np.testing.assert_allclose(saliency[0].numpy(), opencv_itti_koch(picture), atol=atol)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (48, 64), (97, 131)])
-def test_pyramid_is_opencvs(size: tuple[int, int], dtype: torch.dtype, tolerance: float) -> None:
+def test_pyramid_equals_opencv(size: tuple[int, int], dtype: torch.dtype, tolerance: float) -> None:
     image = np.random.default_rng(1).random((*size, 3))
     levels = gaussian_pyramid(torch.from_numpy(image).permute(2, 0, 1)[None].to(dtype), 8)
     assert len(levels) == 9
@@ -105,28 +105,28 @@ def test_pyramid_is_opencvs(size: tuple[int, int], dtype: torch.dtype, tolerance
         image = cv2.pyrDown(image).reshape((image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2, 3)
 
 
-def test_gabor_kernels_are_opencvs() -> None:
+def test_gabor_kernels_equal_opencv() -> None:
     kernels = gabor_kernels().unflatten(0, (4, 2))
     for angle, pair in zip((0, 45, 90, 135), kernels, strict=True):
         for phase, kernel in zip((0, np.pi / 2), pair, strict=True):
             np.testing.assert_allclose(kernel.numpy(), opencv_gabor(angle, phase), atol=1e-12)
 
 
-def test_orientation_energy_is_opencvs(dtype: torch.dtype, tolerance: float) -> None:
+def test_orientation_energy_equals_opencv(dtype: torch.dtype, tolerance: float) -> None:
     image = np.random.default_rng(2).random((19, 26))
     energy = orientation_energy(torch.from_numpy(image)[None, None].to(dtype))
     for angle, answer in zip((0, 45, 90, 135), energy[0], strict=True):
         np.testing.assert_allclose(answer.numpy(), opencv_energy(image, angle), atol=tolerance)
 
 
-def test_bars_answer_at_their_orientation() -> None:
+def test_energy_of_a_grating_is_largest_at_its_orientation() -> None:
     y, x = torch.meshgrid(torch.arange(40.0), torch.arange(40.0), indexing="ij")
     for index, angle in enumerate(torch.tensor([0.0, 45.0, 90.0, 135.0]).deg2rad()):
         waves = torch.cos(2 * torch.pi / 7 * (x * angle.cos() + y * angle.sin()))
         assert orientation_energy(waves[None, None])[0, :, 20, 20].argmax() == index
 
 
-def test_across_scales_is_opencvs(dtype: torch.dtype, tolerance: float) -> None:
+def test_difference_across_scales_equals_opencv(dtype: torch.dtype, tolerance: float) -> None:
     rng = np.random.default_rng(3)
     centre, surround = rng.random((31, 44)), rng.random((4, 6))
     difference = across_scales(*(torch.from_numpy(each)[None, None].to(dtype) for each in (centre, surround)))
@@ -135,8 +135,8 @@ def test_across_scales_is_opencvs(dtype: torch.dtype, tolerance: float) -> None:
 
 
 @pytest.mark.parametrize("steps", [3, 10, 1000])
-def test_promotion_is_the_loops(steps: int, dtype: torch.dtype, tolerance: float) -> None:
-    # Few steps make plateaus: of equal neighbours only the first may count.
+def test_promotion_equals_a_loop(steps: int, dtype: torch.dtype, tolerance: float) -> None:
+    # With few grey levels there are plateaus: of equal neighbours only the first counts as a peak.
     maps = torch.randint(steps, (2, 3, 9, 11)).to(dtype)
     promoted = promote(maps)
     for image, result in zip(maps.flatten(0, 1), promoted.flatten(0, 1), strict=True):
@@ -167,18 +167,18 @@ def test_any_size_and_uniform_images(size: tuple[int, int], dtype: torch.dtype, 
         assert itti_koch_saliency(uniform).abs().max() == 0
 
 
-def test_batch_is_a_loop(dtype: torch.dtype, device: torch.device) -> None:
+def test_a_batch_equals_a_loop_over_images(dtype: torch.dtype, device: torch.device) -> None:
     images = torch.rand(3, 3, 80, 101, dtype=dtype, device=device)
     images[1] *= 0.2
     loop = torch.cat([itti_koch_saliency(image[None]) for image in images])
-    # In single precision a peak may come or go.
+    # In single precision a peak may appear or vanish.
     atol = 1e-6 if dtype == torch.float64 else 5e-4
     torch.testing.assert_close(itti_koch_saliency(images), loop, atol=atol, rtol=0)
 
 
-def test_red_pops_out(pop_out: torch.Tensor) -> None:
+def test_saliency_is_largest_at_the_red_square(pop_out: torch.Tensor) -> None:
     row, column = divmod(int(itti_koch_saliency(pop_out).argmax()), 320)
-    # A pixel of the map is 16 of the image.
+    # One pixel of the map is 16 pixels of the image wide.
     assert 92 <= row < 124
     assert 172 <= column < 204
 
@@ -205,5 +205,5 @@ def test_bad_input() -> None:
         orientation_energy(torch.zeros(1, 3, 8, 8))
 
 
-def test_settings_are_shown() -> None:
+def test_repr_shows_the_settings() -> None:
     assert repr(IttiKoch()) == "IttiKoch(normalise=True)"

@@ -23,7 +23,7 @@ def test_opponent_colours(dtype: torch.dtype) -> None:
 
 def test_double_opponency(dtype: torch.dtype) -> None:
     image = torch.rand(2, 3, 6, 5, dtype=dtype) ** 3
-    image[1] *= 0.1  # the threshold is each image's own
+    image[1] *= 0.1  # the threshold is computed for each image
     for single, result in zip(image, double_opponency(image), strict=True):
         brightest = max(sum(pixel.tolist()) / 3 for pixel in single.flatten(1).T)
         for pixel, got in zip(single.flatten(1).T, result.flatten(1).T, strict=True):
@@ -36,19 +36,19 @@ def test_double_opponency(dtype: torch.dtype) -> None:
 
 def test_lab(dtype: torch.dtype) -> None:
     pixels = np.random.default_rng(0).random((20, 30, 3))
-    # Black, white and dark greys, where the formula has another branch.
+    # Black, white and dark greys, where another branch of the formula applies.
     pixels[0, :4] = np.array([0.0, 1.0, 0.001, 0.02])[:, None]
     channels = lab_colours(torch.from_numpy(pixels).permute(2, 0, 1)[None].to(dtype))
     assert channels.dtype == dtype
     result = channels[0].permute(1, 2, 0).numpy()
     np.testing.assert_allclose(result, color.rgb2lab(pixels) / (100, 255, 255), atol=2e-6)
-    # The program of VOCUS2's authors has OpenCV's bytes, with an offset.
+    # The program of VOCUS2's authors uses OpenCV's 8-bit values, with an offset.
     coded = cv2.cvtColor((255 * pixels).round().astype(np.uint8), cv2.COLOR_RGB2Lab) / 255
     np.testing.assert_allclose(result + np.array([0, 128, 128]) / 255, coded, atol=0.01)
 
 
 @pytest.mark.parametrize("level", [0.0, 1e-30, 0.3, 1.0])
-def test_grey_has_no_colour(level: float, dtype: torch.dtype) -> None:
+def test_colour_channels_of_grey_are_zero(level: float, dtype: torch.dtype) -> None:
     image = torch.full((1, 3, 4, 4), level, dtype=dtype)
     for channels in (opponent_colours(image), double_opponency(image)):
         assert torch.isfinite(channels).all()
@@ -60,7 +60,7 @@ def test_hue_does_not_depend_on_intensity() -> None:
     torch.testing.assert_close(double_opponency(image)[:, 1:], double_opponency(0.1 * image)[:, 1:])
 
 
-def test_anchor_leaves_differences() -> None:
+def test_anchor_subtracts_the_first_pixel_of_every_channel() -> None:
     channels = torch.rand(2, 3, 4, 5, dtype=torch.float64)
     shifted = channels - anchor(channels)
     torch.testing.assert_close(shifted, channels[..., :1, :1].expand_as(channels))

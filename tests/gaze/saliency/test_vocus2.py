@@ -20,7 +20,7 @@ def blur(image: np.ndarray, sigma: float) -> np.ndarray:
 def opencv_pyramids(
     channel: np.ndarray, centre: float, surround: float, layers: int, scales: int
 ) -> list[list[tuple[np.ndarray, np.ndarray]]]:
-    """Centres and surrounds of one channel; the scale that starts the next layer is computed in full and sampled."""
+    """Centres and surrounds of one channel; the first scale of the next layer is blurred at full size, then sampled."""
     pyramids = []
     image = blur(channel, centre)
     for layer in range(min(layers, int(np.log2(min(channel.shape))) + 1)):
@@ -64,7 +64,7 @@ def opencv_vocus2(
 
 @pytest.mark.parametrize(("centre", "surround"), [(2.0, 6.0), (3.0, 13.0)])
 @pytest.mark.parametrize("scales", [1, 2, 3])
-def test_pyramids_are_opencvs(centre: float, surround: float, scales: int, dtype: torch.dtype) -> None:
+def test_pyramids_equal_opencv(centre: float, surround: float, scales: int, dtype: torch.dtype) -> None:
     channels = np.random.default_rng(scales).random((41, 75, 3))
     tensor = torch.from_numpy(channels).permute(2, 0, 1)[None].to(dtype)
     pyramids = twin_pyramids(tensor, centre, surround, layers=5, scales=scales)
@@ -87,7 +87,7 @@ def test_contrasts(dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("fusion", ["mean", "max"])
 @pytest.mark.parametrize(("centre", "surround", "scales"), [(2.0, 6.0, 2), (3.0, 13.0, 2), (2.0, 6.0, 3)])
-def test_saliency_is_opencvs(
+def test_saliency_equals_the_steps_in_opencv(
     photograph: np.ndarray, fusion: str, centre: float, surround: float, scales: int, dtype: torch.dtype
 ) -> None:
     image = torch.from_numpy(photograph).permute(2, 0, 1)[None].to(dtype)
@@ -97,7 +97,7 @@ def test_saliency_is_opencvs(
     np.testing.assert_allclose(saliency[0].numpy(), expected, atol=2e-5)
 
 
-def test_saliency_in_lab_is_that_of_scikit_images_lab(photograph: np.ndarray) -> None:
+def test_saliency_in_lab_equals_that_of_lab_channels_by_scikit_image(photograph: np.ndarray) -> None:
     lab = color.rgb2lab(photograph) / (100, 255, 255)
     expected = opencv_vocus2(np.moveaxis(lab, -1, 0), 2.0, 6.0, 2, "mean")
     saliency = VOCUS2(color_space="lab")(torch.from_numpy(photograph).permute(2, 0, 1)[None])
@@ -119,7 +119,7 @@ def test_any_size_and_uniform_images(
         assert vocus2_saliency(uniform, fusion=fusion, color_space=color_space).abs().max() == 0
 
 
-def test_batch_is_a_loop(dtype: torch.dtype, device: torch.device) -> None:
+def test_a_batch_equals_a_loop_over_images(dtype: torch.dtype, device: torch.device) -> None:
     images = torch.rand(3, 3, 40, 52, dtype=dtype, device=device)
     images[1] *= 0.2
     for fusion in ("mean", "max"):
@@ -128,7 +128,7 @@ def test_batch_is_a_loop(dtype: torch.dtype, device: torch.device) -> None:
         torch.testing.assert_close(model(images), loop, atol=1e-5, rtol=0)
 
 
-def test_red_pops_out(pop_out: torch.Tensor) -> None:
+def test_saliency_is_largest_at_the_red_square(pop_out: torch.Tensor) -> None:
     for model in (VOCUS2(), VOCUS2(3.0, 13.0), VOCUS2(fusion="max")):
         row, column = divmod(int(model(pop_out).argmax()), 320)
         assert 100 <= row < 116
@@ -150,7 +150,7 @@ def test_gradients(fusion: str, normalise: bool, color_space: str) -> None:
     assert torch.autograd.gradcheck(model, image)
 
 
-def test_nothing_is_written_in_place_and_views_are_welcome() -> None:
+def test_the_image_is_not_modified_and_may_be_a_view() -> None:
     picture = torch.rand(20, 24, 3)
     image = picture.permute(2, 0, 1)[None]
     before = picture.clone()
@@ -193,6 +193,6 @@ def test_bad_image() -> None:
         twin_pyramids(torch.zeros(1, 3, 0, 8))
 
 
-def test_settings_are_shown() -> None:
+def test_repr_shows_the_settings() -> None:
     expected = "VOCUS2(centre_sigma=3, surround_sigma=13, layers=5, scales=2, fusion='mean', color_space='opponent')"
     assert repr(VOCUS2(3, 13)) == expected
