@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Told:
+class CountedLook:
     """A look, and how many new objects each of the closer looks inside it found.
 
     Attributes:
@@ -36,18 +36,18 @@ class Told:
     counts: dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]]
 
     @classmethod
-    def of(cls, example: ZoomExample, told: LookedAt, seen: Tensor) -> "Told":
+    def of(cls, example: ZoomExample, looked: LookedAt, seen: Tensor) -> "CountedLook":
         """Compare a look with all closer looks inside it.
 
         Args:
             example: the mosaic.
-            told: the look.
+            looked: the look.
             seen: `(M,)`, objects of the mosaic that were found before.
 
         Returns:
             The look with the numbers of new objects.
         """
-        look = told.gist
+        look = looked.gist
         assert look is not None
         high, wide = look.scores.shape[:2]
         found = defaultdict(list)
@@ -96,28 +96,28 @@ class SurveyExample:
         closer: looks that were closer, and can be followed by closer ones.
     """
 
-    overview: Told
-    closer: tuple[Told, ...]
+    overview: CountedLook
+    closer: tuple[CountedLook, ...]
 
     @classmethod
     def of(cls, example: ZoomExample) -> "SurveyExample":
         """Prepare a mosaic for the fit."""
         overview, *others = (look for look in example.looks if look.gist is not None)
         first = overview.found
-        closer = (Told.of(example, look, first | look.found) for look in others)
-        return cls(Told.of(example, overview, first), tuple(closer))
+        closer = (CountedLook.of(example, look, first | look.found) for look in others)
+        return cls(CountedLook.of(example, overview, first), tuple(closer))
 
-    def losses(self, survey: Survey, closer: Sequence[Told]) -> list[Tensor]:
+    def losses(self, survey: Survey, closer: Sequence[CountedLook]) -> list[Tensor]:
         """Losses of the overview and of closer looks, whose predictions build on those of the overview."""
         logs = survey.rates(self.overview.gist)[0]
         found = [self.overview.loss(survey, logs)]
         cells = _spread(self.overview.gist, logs.detach())
-        for told in closer:
-            look = told.gist
+        for counted in closer:
+            look = counted.gist
             rows, columns = (n * look.scale for n in look.scores.shape[:2])
             part = cells[:, look.first[1] : look.first[1] + rows, look.first[0] : look.first[0] + columns]
             before = before_of(part, torch.zeros(part.shape[1:], dtype=torch.long), look)
-            found.append(told.loss(survey, survey.rates(look, before=before[None])[0]))
+            found.append(counted.loss(survey, survey.rates(look, before=before[None])[0]))
         return found
 
 

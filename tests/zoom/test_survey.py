@@ -6,7 +6,7 @@ from torch.nn.functional import poisson_nll_loss
 
 from semfov.errors import InputError
 from semfov.training.zoom_examples import LookedAt, ZoomExample
-from semfov.training.zoom_survey import SurveyExample, Told, fit_survey, judge_survey
+from semfov.training.zoom_survey import SurveyExample, CountedLook, fit_survey, judge_survey
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.gist import Gist
@@ -99,15 +99,15 @@ def test_loss_is_that_of_poisson_counts_window_by_window(survey):
                 if 0 <= y < logs.shape[1] and 0 <= x < logs.shape[2]:
                     expected = expected + weight[y - y1] * weight[x - x1] * logs[steps - 1, y, x].exp()
         terms.append(poisson_nll_loss(expected, closer.found.sum().double(), log_input=False, eps=0))
-    told = Told.of(mosaic, overview, overview.found)
-    torch.testing.assert_close(told.loss(survey, logs), torch.stack(terms).mean())
+    counted = CountedLook.of(mosaic, overview, overview.found)
+    torch.testing.assert_close(counted.loss(survey, logs), torch.stack(terms).mean())
 
 
 def test_objects_that_were_seen_before_are_not_new():
     mosaic = example(lambda look, window: 3)
     overview = mosaic.looks[0]
     for seen, new in ((0, 3), (2, 1), (12, 0)):
-        counts = Told.of(mosaic, overview, torch.arange(12) < seen).counts
+        counts = CountedLook.of(mosaic, overview, torch.arange(12) < seen).counts
         assert {int(n) for _, _, numbers in counts.values() for n in numbers} == {new}
 
 
