@@ -47,7 +47,7 @@ def test_every_public_name_has_a_docstring():
 
 
 def test_the_reference_contains_no_addresses_or_local_paths():
-    """Neither memory addresses of objects nor the path of the checkout."""
+    """It contains neither memory addresses of objects nor the path of the checkout."""
     text = "\n".join(pages().values())
     assert not re.search(r"0x[0-9a-f]{6}| at 0x", text)
     assert str(DOCS.parent) not in text

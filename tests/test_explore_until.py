@@ -100,7 +100,7 @@ def test_exploration_ends_when_no_look_is_worth_its_price(model, image, policy):
 
 @pytest.mark.slow
 def test_the_gain_policy_ends_when_its_largest_value_is_below_the_price(model, image):
-    """After the last look every gain is below the price; after every earlier look one is not."""
+    """After the last look every gain is below the price; after every earlier look at least one is not."""
     agent = agent_of(model, Gain(model))
     scanpath = agent.explore(image, start=7, shifts=19, until=0.25)
     assert scanpath.ending == "price"

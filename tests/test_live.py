@@ -173,7 +173,7 @@ def test_the_belief_follows_a_moving_target_and_old_evidence_fades():
     still = agent_with(Semantic(3)).live("green", rate=0, seed=1)
     for x, _ in frames:
         kept = still.step(scene(x))
-    assert kept.probability[left].max() > 0.7, "without a rate nothing is forgotten"
+    assert kept.probability[left].max() > 0.7, "at rate 0 nothing is forgotten"
     # Each frame is fixated at the cell chosen after the frame before.
     for (_, before), (_, after) in pairwise(frames):
         assert after.cell == before.next_cell

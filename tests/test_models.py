@@ -22,7 +22,7 @@ GAZE = sorted(semfov.gaze.LearnedGaze.shipped.glob("*.safetensors"))
 
 
 @pytest.mark.parametrize("path", OBSERVATION, ids=lambda path: path.stem)
-def test_observation_model(path):
+def test_shipped_observation_models(path):
     model = semfov.FovealObservationModel.from_pretrained(path.stem)
     assert path.stat().st_size < 1_100_000
     assert len(model.classes) == 80
@@ -48,7 +48,7 @@ def check_name(model, path):
 
 
 @pytest.mark.parametrize("path", TARGET, ids=lambda path: path.stem)
-def test_target_evidence(path):
+def test_shipped_models_of_target_evidence(path):
     model = semfov.TargetEvidence.from_pretrained(path.stem)
     assert path.stat().st_size < 100_000
     check_name(model, path)
@@ -67,7 +67,7 @@ def test_target_evidence(path):
 
 
 @pytest.mark.parametrize("path", MAPS, ids=lambda path: path.stem)
-def test_map_evidence(path):
+def test_shipped_models_of_map_evidence(path):
     model = semfov.MapEvidence.from_pretrained(path.stem)
     assert path.stat().st_size < 100_000
     check_name(model, path)
@@ -88,7 +88,7 @@ def test_map_evidence(path):
 
 
 @pytest.mark.parametrize("path", sorted(ContextPrior.shipped.glob("*.safetensors")), ids=lambda path: path.stem)
-def test_context(path):
+def test_shipped_context_priors(path):
     prior = ContextPrior.from_pretrained(path.stem)
     assert path.stat().st_size < 100_000
     assert set(prior.weights) == {"evidence", "map"}
@@ -104,7 +104,7 @@ def test_context(path):
     assert "/" not in text.replace("://", "")
 
 
-def test_learned_gaze():
+def test_shipped_learned_gaze():
     assert [path.stem for path in GAZE] == ["yolov3-tiny"]
     gaze = semfov.gaze.LearnedGaze.from_pretrained("yolov3-tiny")
     assert GAZE[0].stat().st_size < 20_000
@@ -121,7 +121,7 @@ def test_learned_gaze():
             assert gaze(DirichletBelief(beta, closest), visited, 7, 10).argmax() == cell
 
 
-def test_class_templates():
+def test_shipped_class_templates():
     paths = sorted(semfov.gaze.ClassTemplates.shipped.glob("*.safetensors"))
     assert [path.stem for path in paths] == ["yolov3-tiny"]
     model = semfov.gaze.ClassTemplates.from_pretrained("yolov3-tiny")
@@ -135,7 +135,7 @@ def test_class_templates():
     assert torch.equal(model(average)[..., 0, 0].argmax(-1), torch.arange(80))
 
 
-def test_gaze_habits():
+def test_shipped_gaze_habits():
     paths = sorted(semfov.gaze.GazeHabits.shipped.glob("*.safetensors"))
     assert [path.stem for path in paths] == ["osie-vocus2"]
     habits = semfov.gaze.GazeHabits.from_pretrained("osie-vocus2")
@@ -154,7 +154,7 @@ def test_gaze_habits():
 
 
 @pytest.mark.parametrize("path", ZOOM, ids=lambda path: path.stem)
-def test_glimpse_evidence(path):
+def test_shipped_models_of_glimpse_evidence(path):
     model = GlimpseEvidence.from_pretrained(path.stem)
     assert path.stat().st_size < 100_000
     assert model.metadata["detector"]["name"] == path.stem

@@ -42,7 +42,7 @@ def test_links_lead_somewhere():
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
-def test_pictures_are_small():
+def test_images_are_small():
     for link in re.findall(r"!\[[^]]+\]\(([^)]+)\)", README):
         assert (ROOT / link).stat().st_size < 300_000
         with Image.open(ROOT / link) as picture:
@@ -173,8 +173,8 @@ def run_in_new_process(words, folder, cache):
 
 
 def written_files(printed, folder):
-    """The files that a command lists as written_files, after checking that they exist."""
-    names = [line.strip() for line in printed.partition("written_files:\n")[2].partition("\n\n")[0].splitlines()]
+    """The files that a command lists as written, after checking that they exist."""
+    names = [line.strip() for line in printed.partition("written:\n")[2].partition("\n\n")[0].splitlines()]
     assert names
     assert [name for name in names if not (folder / name).is_file()] == []
     return names

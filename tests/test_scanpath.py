@@ -119,7 +119,7 @@ def test_a_scanpath_without_a_photograph_has_no_views_or_pictures(scanpath):
             call()
 
 
-def test_repr_is_three_lines(scanpath):
+def test_repr_has_three_lines(scanpath):
     first, second, third = repr(scanpath).splitlines()
     assert first.startswith("Scanpath: ")
     assert f"{scanpath.shifts} gaze shifts" in first

@@ -69,7 +69,7 @@ def draw(figure):
     return figure
 
 
-def test_curves_and_bands():
+def test_plot_shows_curves_and_error_bands():
     curves = {"random": np.linspace(0, 0.8, 31), "predictive": np.linspace(0, 0.9, 31)}
     figure = draw(plot_cumulative_performance(curves, {"random": np.full(31, 0.02)}))
     axes = figure.axes[0]

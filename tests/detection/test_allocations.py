@@ -137,7 +137,7 @@ def test_weights_outside_the_folder_of_the_model_are_refused(tmp_path):
         {"noise": "x" * 2**21},
     ],
 )
-def test_metadata_is_bounded(tmp_path, metadata):
+def test_invalid_or_excessive_metadata_is_refused_in_one_line(tmp_path, metadata):
     reshape = helper.make_node("Reshape", ["image", "shape"], ["out"])
     shape = constant("shape", np.array([1, 384, 8]))
     outputs = [("out", TensorProto.FLOAT, [1, 384, 8])]
@@ -148,7 +148,7 @@ def test_metadata_is_bounded(tmp_path, metadata):
     assert len(str(caught.value)) < 1000
 
 
-def test_an_ordinary_model_still_loads(tmp_path):
+def test_an_ordinary_network_is_accepted(tmp_path):
     with torch.random.fork_rng(devices=[]):
         network = Darknet(parse_cfg(NET + HEAD))
     assert [tuple(each.shape) for each in network(torch.zeros(1, 3, 32, 32))] == [(1, 7, 32, 32)]

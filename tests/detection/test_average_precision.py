@@ -1,4 +1,4 @@
-"""COCO figures of detectors on the development photographs equal those of independent implementations."""
+"""COCO figures of detectors on the development photographs match those of independent implementations."""
 
 from pathlib import Path
 

@@ -214,7 +214,7 @@ def test_images_without_detections_give_empty_tensors(detector):
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
-def test_uniform_images(detector, value):
+def test_uniform_images_give_valid_detections(detector, value):
     images = torch.full((1, 3, 48, 64), value)
     assert_valid(detector, detector(images), images)
 
@@ -260,7 +260,7 @@ def test_a_batch_equals_a_loop(detector):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1), (17, 31), (200, 301), (512, 64)])
-def test_any_image_size(detector, size):
+def test_images_may_have_any_size(detector, size):
     images = photographs(1, *size)
     assert_valid(detector, detector(images), images)
 
@@ -317,7 +317,7 @@ def test_settings_are_json_and_differ_between_detectors(detector):
 
 
 @pytest.mark.parametrize("policy", ["residual", "normalised", "uniform", "none"])
-def test_every_background_policy(detector, policy):
+def test_detectors_accept_every_background_policy(detector, policy):
     detector.background = policy
     images = photographs(1, 45, 64)
     found = detector(images)

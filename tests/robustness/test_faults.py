@@ -48,7 +48,7 @@ def result_files(out: Path) -> list[bytes]:
 def wait_for(found: Callable[[], Any]) -> Any:
     deadline = time.monotonic() + 300
     while not (found_value := found()):
-        assert time.monotonic() < deadline, "nothing happened"
+        assert time.monotonic() < deadline, "the condition was not met within 300 s"
         time.sleep(0.005)
     return found_value
 

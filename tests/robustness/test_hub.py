@@ -32,7 +32,7 @@ def test_entry_points_are_listed_and_have_docstrings():
         assert importlib.util.find_spec(package) is not None
 
 
-def test_parts_without_weights():
+def test_sensor_and_observation_model_load_without_detector_weights():
     sensor = load("foveation", sigma=20.0, levels=3)
     image = torch.rand(1, 3, 40, 40)
     expected = semfov.foveate(image, torch.tensor([8.0, 9.0]), sigma=20.0, levels=3)
