@@ -1,10 +1,11 @@
-"""What every public module must withstand as a part of somebody else's.
+"""Tests that every public module must pass when it is a part of a user's own module.
 
-A test class derives from a tester, is named after its module (`class TestFoveation(GraphTester)`), and says how the
-module is made (`make`), which tensors it takes (`inputs`) and how it is called with them (`call`, if that is not
-`module(*inputs)`). The rest is inherited. `GraphTester` is for modules that are one graph of differentiable
-operations, `TensorTester` for those whose operations depend on values, `BaseTester` for those that take pictures of
-bytes or scenes. What does not hold for a module is switched off by name, with the reason (`test_no_rows = None`).
+A test class derives from a tester, is named after its module (`class TestFoveation(GraphTester)`), and defines how
+the module is made (`make`), which tensors it takes (`inputs`) and how it is called with them (`call`, if that is not
+`module(*inputs)`). It inherits the tests. `GraphTester` is for modules that are one graph of differentiable
+operations, `TensorTester` for modules whose operations depend on values, `BaseTester` for modules that take images of
+bytes or scenes. A test that does not apply to a module is switched off by name, with the reason
+(`test_no_rows = None`).
 A public module without a tester fails `tests/test_modules.py`.
 """
 
@@ -19,7 +20,7 @@ from torch import Tensor, nn
 
 
 class Host(nn.Module):
-    """Somebody else's module: it scales what its part returns by a parameter of its own."""
+    """A user's module: it multiplies the output of its part by a parameter."""
 
     def __init__(self, part: nn.Module, call: Any) -> None:
         super().__init__()
@@ -32,19 +33,19 @@ class Host(nn.Module):
 
 
 class BaseTester:
-    """A module is used, copied, saved and loaded."""
+    """Tests of any module: it runs, and it can be saved, loaded and copied."""
 
     def make(self) -> nn.Module:
-        """The module, small; random numbers are seeded."""
+        """A small instance of the module, made from seeded random numbers."""
         raise NotImplementedError
 
     def inputs(self) -> tuple[Any, ...]:
-        """Its inputs, small."""
+        """Small inputs of the module."""
         raise NotImplementedError
 
     @staticmethod
     def call(module: Any, *inputs: Any) -> Tensor:
-        """One tensor of what the module returns."""
+        """Call the module and return one tensor of its output."""
         return module(*inputs)
 
     def host(self) -> Host:
@@ -54,7 +55,7 @@ class BaseTester:
             return Host(self.make(), self.call)
 
     def test_smoke(self) -> None:
-        """It returns numbers, the same ones again, and leaves its inputs alone."""
+        """It returns numbers, returns the same numbers again, and does not change its inputs."""
         host, inputs = self.host(), self.inputs()
         assert type(self).__name__.startswith(f"Test{type(host.part).__name__}")
         given = copy.deepcopy(inputs)
@@ -67,7 +68,7 @@ class BaseTester:
         assert type(host.part).__name__ in repr(host)
 
     def test_state(self) -> None:
-        """Its parameters and buffers go through a file, which holds all that was changed."""
+        """Its parameters and buffers can be saved and loaded, and the file holds all changed values."""
         host, other, inputs = self.host(), self.host(), self.inputs()
         with torch.no_grad():
             for parameter in host.parameters():
@@ -80,7 +81,7 @@ class BaseTester:
 
     @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda host: pickle.loads(pickle.dumps(host))])
     def test_copies(self, duplicate: Any) -> None:
-        """A copy does the same and shares no memory."""
+        """A copy gives the same output and shares no memory with the original."""
         host, inputs = self.host(), self.inputs()
         before = host(*inputs)
         twin = duplicate(host)
@@ -93,47 +94,48 @@ class BaseTester:
 
 
 class TensorTester(BaseTester):
-    """A module of tensors follows its user's dtype, device and batches."""
+    """Tests of modules that take tensors: batches, dtypes and devices."""
 
-    # Inputs that have an episode in each row.
+    # Indices of the inputs whose first dimension is the batch.
     batched: ClassVar[tuple[int, ...]] = (0,)
-    # bfloat16 has 8 bits: a value is off by up to 2^-9, 0.2 %, and by more where values of a kind are subtracted.
+    # bfloat16 has 8 significant bits: rounding errors are up to 2^-9 (0.2 %), and larger where similar values are
+    # subtracted.
     autocast = 0.02
 
     def test_shapes(self) -> None:
-        """A row of a batch is what it is alone."""
+        """A row gives the same output in a batch and alone."""
         host, inputs = self.host(), self.inputs()
         rows = len(inputs[self.batched[0]])
-        assert rows > 1, "the inputs of a tester have two rows or more"
+        assert rows > 1, "the inputs of a tester must have at least two rows"
         whole = host(*inputs)
         for row in range(rows):
             torch.testing.assert_close(host(*self.rows(row, row + 1)), whole[row : row + 1])
 
     def test_no_rows(self) -> None:
-        """A batch of nothing gives a batch of nothing."""
+        """An empty batch gives an empty batch."""
         host = self.host()
         assert host(*self.rows(0, 0)).shape == (0, *host(*self.inputs()).shape[1:])
 
     def rows(self, start: int, stop: int) -> tuple[Tensor, ...]:
-        """The inputs with some of their rows."""
+        """The inputs, with the given rows of each batched one."""
         return tuple(x[start:stop] if n in self.batched else x for n, x in enumerate(self.inputs()))
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_dtypes(self, dtype: torch.dtype) -> None:
-        """Double precision is computed in double precision."""
+        """The output has the dtype of the module and its inputs."""
         expected = self.host()(*self.inputs())
         result = self.host().to(dtype)(*(x.to(dtype) if x.is_floating_point() else x for x in self.inputs()))
         assert result.dtype == dtype
         torch.testing.assert_close(result.to(expected), expected, rtol=1e-3, atol=1e-4)
 
     def test_device(self, device: torch.device) -> None:
-        """It runs where its inputs are."""
+        """It runs on the device of its inputs."""
         result = self.host().to(device)(*(x.to(device) for x in self.inputs()))
         assert result.device.type == device.type
         torch.testing.assert_close(result.cpu(), self.host()(*self.inputs()), rtol=1e-3, atol=1e-4)
 
     def test_autocast(self) -> None:
-        """It withstands half of the digits."""
+        """It tolerates automatic mixed precision (bfloat16)."""
         host, inputs = self.host().requires_grad_(False), self.inputs()
         expected = host(*inputs)
         with torch.autocast("cpu", torch.bfloat16):
@@ -144,13 +146,13 @@ class TensorTester(BaseTester):
 
 
 class GraphTester(TensorTester):
-    """A module is one graph of differentiable operations: it is compiled, exported, vectorised and differentiated."""
+    """Tests of modules that are one graph of differentiable operations: gradients, compiling, export and `vmap`."""
 
-    # Inputs that it can be differentiated by.
+    # Indices of the inputs with respect to which it is differentiable.
     differentiable: ClassVar[tuple[int, ...]] = (0,)
 
     def test_gradcheck(self) -> None:
-        """Derivatives by its inputs and parameters are those of finite differences."""
+        """Gradients with respect to inputs and parameters equal finite differences."""
         host = self.host().double()
         inputs = [x.double() if x.is_floating_point() else x for x in self.inputs()]
         for number in self.differentiable:
@@ -165,7 +167,7 @@ class GraphTester(TensorTester):
 
     @pytest.mark.slow
     def test_compile(self) -> None:
-        """It compiles to one graph."""
+        """It compiles to a single graph."""
         host, inputs = self.host(), self.inputs()
         torch.compiler.reset()
         compiled = torch.compile(host, fullgraph=True, backend="eager")
@@ -173,13 +175,13 @@ class GraphTester(TensorTester):
 
     @pytest.mark.slow
     def test_export(self) -> None:
-        """`torch.export` takes it."""
+        """`torch.export` can export it."""
         host, inputs = self.host().requires_grad_(False), self.inputs()
         program = torch.export.export(host, inputs)
         torch.testing.assert_close(program.module()(*inputs), host(*inputs), rtol=1e-4, atol=1e-5)
 
     def test_vmap(self) -> None:
-        """It vectorises over its first input: images, beliefs or scores."""
+        """`vmap` can vectorise it over its first input: images, beliefs or scores."""
         host = self.host().requires_grad_(False)
         first, *others = self.inputs()
         many = torch.stack([first, first.flip(-1), first.flip(0)])

@@ -1,4 +1,4 @@
-"""What all tests share: devices, the development photographs, kills, and a hypothesis profile without a stopwatch."""
+"""Fixtures of all tests: devices, photographs, killing commands, and a hypothesis profile without deadlines."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ settings.load_profile("semfov")
 
 
 def pytest_configure() -> None:
-    """Each worker has one thread, as have the processes that it starts: they share the machine's cores."""
+    """Give each worker and the processes that it starts one thread, as all workers share the cores."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         os.environ.setdefault("OMP_NUM_THREADS", "1")
         torch.set_num_threads(1)
@@ -34,7 +34,7 @@ RUNS = {"finished", "fitted", "home", "trained", "whole"}
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whatever reads the results of a run waits for it."""
+    """Mark tests as slow if they use a fixture that runs a whole command."""
     for item in items:
         if isinstance(item, pytest.Function) and RUNS & set(item.fixturenames):
             item.add_marker(pytest.mark.slow)
@@ -44,7 +44,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     params=["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 )
 def device(request: pytest.FixtureRequest) -> torch.device:
-    """Every device that this machine has."""
+    """Each device of this machine."""
     return torch.device(request.param)
 
 
@@ -65,13 +65,13 @@ class Textures(Detector):
 
 @pytest.fixture
 def textures() -> type[Textures]:
-    """A detector without weights that sees something everywhere."""
+    """A detector without weights that detects something everywhere."""
     return Textures
 
 
 @pytest.fixture(scope="module")
 def kept_scenes() -> Iterator[None]:
-    """Embedded scenes are composed once, where mosaics show each of them many times."""
+    """Compose each embedded scene only once, as mosaics use each scene many times."""
     compose, kept = EmbeddedScenes._pixels, {}
 
     def once(scenes: EmbeddedScenes, index: int) -> Any:
@@ -87,7 +87,7 @@ def kept_scenes() -> Iterator[None]:
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
-    """One thread, which repeats itself to the bit; the number before is put back at the end."""
+    """Use one thread, so that results are reproducible to the bit; restore the number of threads afterwards."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -96,9 +96,9 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture
 def kill_when() -> Iterator[Callable[..., None]]:
-    """Start a command and kill it (SIGKILL) once something has happened.
+    """Start a command and kill it (SIGKILL) as soon as a condition is met.
 
-    The test fails where nothing was killed: the command ended before, or what was waited for did not come in time.
+    The test fails if the command ended before it could be killed, or if the condition was not met in time.
     """
     started: list[subprocess.Popen[bytes]] = []
 
@@ -110,7 +110,7 @@ def kill_when() -> Iterator[Callable[..., None]]:
             if process.poll() is not None:
                 pytest.fail(f"nothing to kill: the command ended with exit code {process.returncode}")
             if time.monotonic() > deadline:
-                pytest.fail(f"nothing was killed: what was waited for did not come within {seconds} s")
+                pytest.fail(f"nothing was killed: the condition was not met within {seconds} s")
             time.sleep(0.01)
         process.kill()
         if process.wait() != -signal.SIGKILL:
@@ -124,7 +124,7 @@ def kill_when() -> Iterator[Callable[..., None]]:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """Folder of the development photographs and models."""
+    """The folder of the development photographs and models."""
     folder = Path(os.environ.get("SEMFOV_SHARED", Path(__file__).parents[2] / "shared"))
     if not (folder / "coco").is_dir():
         pytest.skip(f"no development data in {folder} (set SEMFOV_SHARED)")

@@ -1,4 +1,4 @@
-"""Small models, beliefs, looks and pictures of random numbers, the same ones every time."""
+"""Small models, beliefs, looks and images, made from seeded random numbers."""
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ GRID = Grid(4, 3, (64, 48))
 
 
 def rand(*shape: int) -> Tensor:
-    """Uniform numbers in [0, 1), which depend on the shape alone."""
+    """Uniform random numbers in [0, 1) that depend only on the shape."""
     return torch.rand(shape, generator=torch.Generator().manual_seed(sum(shape)))
 
 
@@ -24,26 +24,26 @@ def model() -> FovealObservationModel:
 
 
 def evidence() -> TargetEvidence:
-    """Target evidence as it is before training."""
+    """An untrained model of target evidence."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return TargetEvidence(4, 4).eval()
 
 
 def mapping() -> MapEvidence:
-    """Map evidence as it is before training."""
+    """An untrained model of map evidence."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return MapEvidence(4, 4, components=4).eval()
 
 
 def observing() -> Semantic:
-    """The paper's observer with an observation model that is not trained."""
+    """The observer of the paper with an untrained observation model."""
     return Semantic(4, model().requires_grad_(False))
 
 
 def context(**weights: tuple[float, float]) -> ContextPrior:
-    """Which classes stand near which, at random; weights are for a map unless others are given."""
+    """A random context prior (which classes occur near each other); its weights are for a map unless given."""
     return ContextPrior(CLASSES, rand(4, 3, 3), rand(4, 4, 3), [0.2, 0.4], weights=weights or {"map": (0.5, 0.2)})
 
 
@@ -53,13 +53,13 @@ def beliefs() -> Tensor:
 
 
 def memory() -> tuple[Tensor, Tensor]:
-    """Two beliefs, and how close the fovea was to each cell after looks at cells 2 and 7, `(2, 12)`."""
+    """Two beliefs, and the distance of the fovea from each cell after looks at cells 2 and 7, `(2, 12)`."""
     closest = torch.minimum(*GRID.cell_distance[[2, 7]]).expand(2, -1).clone()
     return beliefs(), closest
 
 
 def look() -> tuple[Tensor, Tensor, Tensor]:
-    """Scores `(2, 2, 4)`, boxes `(2, 2, 4)` and fixations `(2, 2)` of one look in each of two pictures."""
+    """Scores `(2, 2, 4)`, boxes `(2, 2, 4)` and fixations `(2, 2)` of one look at each of two images."""
     boxes = torch.tensor([[[4.0, 4, 30, 30], [20, 10, 60, 40]], [[8.0, 20, 40, 44], [30, 2, 62, 20]]])
     return rand(2, 2, 4).softmax(-1), boxes, torch.tensor([[20.0, 20.0], [41.0, 13.0]])
 
@@ -70,7 +70,7 @@ def detections(scores: Tensor, boxes: Tensor) -> Detections:
 
 
 class Blobs(Detector):
-    """As many detections as there are quarters of the canvas, scored by a linear layer from their mean colour."""
+    """Detects each quarter of the canvas; a linear layer computes the scores from the mean colour."""
 
     def __init__(self) -> None:
         super().__init__("blobs", CLASSES, (64, 48), selection=Selection(threshold=0.0, iou=1.0))

@@ -21,7 +21,7 @@ SIZE = (160, 120)
 
 
 class Squares(Detector):
-    """Detects the bounding box of what is red (class 1) and what is green (class 2); its score is how saturated."""
+    """Detects the bounding boxes of red (class 1) and green (class 2) pixels; the score is their saturation."""
 
     def __init__(self) -> None:
         super().__init__("squares", ("red", "green"), SIZE)
@@ -70,7 +70,7 @@ def test_search_goes_to_the_target(agent, image):
     assert len(set(scanpath.cells.tolist())) == len(scanpath)
 
 
-def test_search_for_any_of_several_finds_the_one_that_is_there(agent, image):
+def test_search_for_any_of_several_classes_finds_the_one_that_is_present(agent, image):
     image[:, 8:28, 8:28] = 0.4  # nothing red is left
     scanpath = agent.search(image, {"red": 1.0, "green": 0.8}, start=0)
     assert scanpath.found
@@ -79,11 +79,11 @@ def test_search_for_any_of_several_finds_the_one_that_is_there(agent, image):
     assert corner == pytest.approx([130, 100, 140, 110], abs=6)
     alone = agent.search(image, "green", start=0)
     assert torch.equal(agent.search(image, {"green": 1.0}, start=0).cells, alone.cells)
-    # A class that is hardly meant confirms nothing.
+    # A detection of a class with a low weight does not confirm the target.
     assert not agent.search(image, {"red": 1.0, "green": 0.1}, start=0, shifts=6).found
 
 
-def test_policies_that_look_ahead_search_for_one_class(image):
+def test_predictive_policies_search_for_one_class_only(image):
     model = FovealObservationModel.identity(["red", "green"], [0.2])
     ahead = ActivePerception(squares_eye(), (Semantic(3), Predictive(model)), (Semantic(3), Random()), grid=(8, 6))
     with pytest.raises(InputError, match="one class for policy 'predictive'"):
@@ -100,8 +100,8 @@ def test_boxes_decide_what_is_found(agent, image):
 
 
 @pytest.mark.parametrize("mapper", [{}, {"prior": 0.25, "fusion": "sum"}], ids=["same", "other"])
-def test_beliefs_are_those_of_the_exploring_observer(image, mapper):
-    """It keeps the map of all classes in searches too, and the posterior is that of the searching observer."""
+def test_search_keeps_the_beliefs_of_both_observers(image, mapper):
+    """The map of all classes is that of the exploring observer, the posterior that of the searching observer."""
     agent = ActivePerception(
         squares_eye(), (Semantic(3), NonPredictive()), (Semantic(3, **mapper), Random()), grid=(8, 6)
     )
@@ -119,8 +119,8 @@ def test_beliefs_are_those_of_the_exploring_observer(image, mapper):
         torch.testing.assert_close(sought.probability(2)[0], scanpath.posterior[number])
 
 
-def test_one_observer_for_both_tasks_looks_once(image):
-    """Where both tasks share an observer, the map is the belief that the search goes by."""
+def test_an_observer_shared_by_both_tasks_has_one_belief(image):
+    """If both tasks share an observer, the map and the posterior of a search are one belief."""
     shared = Semantic(3)
     agent = ActivePerception(squares_eye(), (shared, NonPredictive()), (shared, Random()), grid=(8, 6))
     apart = ActivePerception(squares_eye(), (shared, NonPredictive()), (Semantic(3), Random()), grid=(8, 6))
@@ -132,12 +132,12 @@ def test_one_observer_for_both_tasks_looks_once(image):
 
 def toy_context():
     generator = torch.Generator().manual_seed(0)
-    place, company = torch.randn(3, 3, 3, generator=generator), torch.randn(3, 3, 2, generator=generator)
-    return ContextPrior(["red", "green"], place, company, [0.2], weights={"evidence": (0.5, 0.25)})
+    place, cooccurrence = torch.randn(3, 3, 3, generator=generator), torch.randn(3, 3, 2, generator=generator)
+    return ContextPrior(["red", "green"], place, cooccurrence, [0.2], weights={"evidence": (0.5, 0.25)})
 
 
-def test_what_was_learned_moves_with_the_agent(image):
-    """Models of observers and policies are modules of the agent: state, dtype, gradients and copies have them."""
+def test_learned_models_are_submodules_of_the_agent(image):
+    """State, dtype, gradients and copies of the agent include the models of its observers and policies."""
     misses = FovealObservationModel.identity(["red", "green"], [0.2], miss_rate=torch.full((3, 2), 0.5))
     evidence, expected = TargetEvidence(4, 4), FovealObservationModel.identity(["red", "green"], [0.3])
     search = Context(Target(evidence), toy_context()), NonPredictive()
@@ -174,15 +174,15 @@ def test_what_was_learned_moves_with_the_agent(image):
     with torch.no_grad():
         next(other.searching.observer.observer.model.parameters()).add_(1)
     assert torch.equal(agent.search(image.double(), "green", start=0, shifts=2).posterior, scanpath.posterior)
-    # Neither observer nor policy have learned anything here; a state of another agent is loaded into this one.
+    # This agent has no learned models; the state of another agent is loaded into this one.
     plain = ActivePerception(squares_eye(), (Semantic(3), NonPredictive()), (Semantic(3), Random()))
     assert all(name.startswith("eye.") for name in plain.state_dict())
     other.load_state_dict(agent.state_dict())
     assert torch.equal(other.search(image.double(), "green", start=0, shifts=2).posterior, scanpath.posterior)
 
 
-def test_a_model_of_two_parts_is_one_parameter(image):
-    """The model that calibrates and the one that predicts are the same, and stay it in a copy."""
+def test_a_model_shared_by_observer_and_policy_is_stored_once(image):
+    """Observer and policy use the same model, and so do the observer and policy of a copy."""
     model = FovealObservationModel.identity(["red", "green"], [0.2])
     observer = Semantic(3, model)
     agent = ActivePerception(squares_eye(), (observer, Predictive(model)), (observer, KL(model)), grid=(8, 6))
@@ -227,7 +227,7 @@ def test_search_ends_when_every_cell_was_visited(image):
 
 @pytest.fixture
 def explorer():
-    """An agent that calibrates what it sees and looks where it expects to learn most."""
+    """An agent that calibrates its detections and looks where it expects the largest information gain."""
     clarity = torch.tensor([4.0, 1.0, 0.2])
     alpha = 1 + torch.eye(3)[:, None] * clarity[:, None]
     model = FovealObservationModel(alpha, [0.2, 0.4], ["red", "green"]).requires_grad_(False).eval()
@@ -235,13 +235,13 @@ def explorer():
     return ActivePerception(squares_eye(), (observer, NonPredictive()), (observer, KL(model)), grid=(8, 6))
 
 
-def test_exploration_makes_all_its_gaze_shifts(explorer, image):
+def test_exploration_makes_the_given_number_of_gaze_shifts(explorer, image):
     scanpath = explorer.explore(image, start=0, shifts=6)
     assert scanpath.shifts == 6
     assert scanpath.target is None
     assert not scanpath.found
     assert len(set(scanpath.cells.tolist())) == 7
-    # Each fixation is the best that was left after the looks before.
+    # Each fixation has the highest value among the cells that were not yet visited.
     for number in range(6):
         left = scanpath.values[number].clone()
         assert left.max() > left.min() * 1.01
@@ -262,7 +262,7 @@ def test_exploration_ends_when_every_cell_was_visited(image):
     assert not torch.equal(first, second)
 
 
-def test_an_agent_that_calibrates_may_see_nothing(explorer, image):
+def test_an_agent_that_calibrates_accepts_looks_without_detections(explorer, image):
     scanpath = explorer.explore(torch.full_like(image, 0.4), start=3, shifts=2)
     torch.testing.assert_close(scanpath.probabilities, torch.full_like(scanpath.probabilities, 1 / 3))
 
@@ -291,7 +291,7 @@ def test_class_names_are_suggested(agent, image):
         agent.search(image, 1, start=48)
 
 
-def test_confirmation_needs_place_class_and_score():
+def test_confirmation_needs_cell_class_and_score():
     grid = Grid(8, 6, SIZE)
     boxes = torch.tensor([[[10.0, 10, 19, 19]]])
     sure = Detections(boxes, torch.tensor([[[0.1, 0.8, 0.1]]]), torch.tensor([[True]]))
@@ -310,7 +310,7 @@ def test_confirmation_needs_place_class_and_score():
     assert not confirmed(padded, 0, 0.5)
 
 
-def test_confirmation_of_a_batch_is_that_of_each_look():
+def test_confirmation_of_a_batch_equals_that_of_each_look():
     grid, generator = Grid(4, 3, SIZE), torch.Generator().manual_seed(0)
     corner = torch.rand(40, 3, 2, generator=generator) * 100
     boxes = torch.cat([corner, corner + 5 + torch.rand(40, 3, 2, generator=generator) * 40], -1)
@@ -331,7 +331,7 @@ def test_confirmation_of_a_batch_is_that_of_each_look():
 
 
 def test_view_is_foveated_at_the_resolution_of_the_detector(image):
-    """A photograph of twice the size, its fovea scaled with it, gives the same view."""
+    """A photograph of twice the size gives the same view, as the fovea is scaled with it."""
     eye = Eye(Foveation(30.0), Squares(), reference=160.0)
     large = image.repeat_interleave(2, -1).repeat_interleave(2, -2)
     small_view = eye.foveated(eye.open(image[None]), torch.tensor([[39.5, 19.5]]))
@@ -343,10 +343,10 @@ def test_view_is_foveated_at_the_resolution_of_the_detector(image):
 
 
 @pytest.mark.parametrize("growth", [1.0, 2.0])
-def test_view_shows_what_the_sensor_shows_of_a_reference_image(growth):
-    """Blurring the photograph and shrinking it is the same as shrinking it and blurring with matched bands."""
+def test_view_equals_the_reduced_output_of_the_sensor(growth):
+    """Blurring a photograph before reducing it equals reducing it and then blurring with matched bands."""
     generator = torch.Generator().manual_seed(0)
-    # Detail at all scales, as photographs have it.
+    # Detail at all scales, as in photographs.
     picture = torch.zeros(1, 3, 480, 640)
     for n in (2, 4, 8, 16, 32):
         coarse = torch.rand(1, 3, 480 // n, 640 // n, generator=generator)
@@ -359,12 +359,12 @@ def test_view_shows_what_the_sensor_shows_of_a_reference_image(growth):
     scaled = foveate(view.state.bands, view.placement.points_to_canvas(gaze)[None], sigma=15.0, growth=growth)[0]
     error, other = ((each - shown).square().mean().sqrt() for each in (got, scaled))
     assert error < 0.02
-    # With growth 1 both are one picture, and may differ by a rounding.
+    # With growth 1 both views are the same up to rounding.
     assert error <= other * (1 + 1e-4)
     assert growth == 1 or error < other / 2
 
 
 @pytest.mark.parametrize("grid", [(0, 5), (5, -1), (5, 1.5), (5,), (5, 5, 5), (201, 1)])
-def test_a_grid_that_cannot_be_is_refused(grid):
+def test_invalid_grids_are_refused(grid):
     with pytest.raises(InputError, match=r"^grid: expected"):
         ActivePerception(squares_eye(), (Semantic(3), Random()), (Semantic(3), Random()), grid=grid)

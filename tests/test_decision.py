@@ -1,4 +1,4 @@
-"""What searches decide: by beliefs made by hand, against a loop, and by agents whose observers follow a script."""
+"""Decisions of searches: on constructed beliefs, against a loop, and of agents whose observers follow a script."""
 
 import math
 from dataclasses import dataclass, replace
@@ -36,7 +36,7 @@ AT = Thresholds(0.8, 0.1)
 
 @dataclass(frozen=True)
 class Known(Belief):
-    """A belief that says what it was told to."""
+    """A belief with given probabilities."""
 
     present: torch.Tensor
     anywhere: torch.Tensor
@@ -53,14 +53,14 @@ class Known(Belief):
 
 
 class Guided(Known):
-    """A belief that sees no chance elsewhere once it has looked."""
+    """A belief whose chance of a hit is a tenth of the probability in each cell."""
 
     def chance(self, target):
         return self.present / 10
 
 
 def step(cells, visited, presence=0.5):
-    """Searches at these probabilities, with these cells visited."""
+    """Steps of searches with the given probabilities and visited cells."""
     cells = torch.tensor(cells)
     seen = torch.zeros(cells.shape, dtype=torch.bool)
     for row, places in enumerate(visited):
@@ -73,28 +73,28 @@ def number(cells, visited, presence, thresholds=AT):
     return int(decide(step([cells], [visited], presence), 1, thresholds)[0])
 
 
-def test_outcomes():
+def test_names_of_outcomes():
     assert OUTCOMES == ("undecided", "found", "absent", "undecided")
 
 
-def test_found_only_where_the_gaze_has_been():
+def test_the_target_is_found_only_in_cells_that_were_fixated():
     assert number([0.2, 0.9, 0.3], [1], 0.9) == 1
     assert number([0.2, 0.9, 0.3], [0], 0.9) == 0
     assert number([0.2, 0.9, 0.3], [0, 2], 0.9) == 0
     assert number([0.2, 0.9, 0.3], [0, 1, 2], 0.9) == 1
-    # Another cell that was fixated, and is nearly as probable, will do.
+    # A fixated cell that is nearly as probable as the best cell is enough.
     assert number([0.2, 0.9, 0.85], [2], 0.9) == 1
     assert number([0.2, 0.9, 0.8], [2], 0.9) == 0
-    # How probable the cell is does not matter, as long as none is more so.
+    # The probability of the cell does not matter as long as no other cell is more probable.
     assert number([0.2, 0.4, 0.3], [1], 0.9) == 1
 
 
-def test_found_only_where_the_place_is_known():
+def test_the_target_is_found_only_if_its_cell_is_probable_enough():
     assert number([0.2, 0.6, 0.3], [1], 0.9, Thresholds(0.8, 0.1, 0.6)) == 1
     assert number([0.2, 0.599, 0.3], [1], 0.9, Thresholds(0.8, 0.1, 0.6)) == 0
-    # Nothing is left to look at: rather there, but it is not known where.
+    # No cell is left to look at: the target is probably present, but its cell is not known.
     assert number([0.2, 0.5, 0.05], [0, 1], 0.9, Thresholds(0.8, 0.1, 0.6)) == 3
-    # The best cell that was fixated is not far behind the best one, and high enough itself.
+    # The best fixated cell is nearly as probable as the best cell, and above the threshold.
     assert number([0.2, 0.62, 0.65], [1], 0.9, Thresholds(0.8, 0.1, 0.6)) == 1
     assert number([0.2, 0.59, 0.65], [1], 0.9, Thresholds(0.8, 0.1, 0.6)) == 0
 
@@ -105,25 +105,25 @@ def test_thresholds_change_one_at_a_time():
     assert AT.changed(None, 0.0, 0.5) == Thresholds(0.8, 0.0, 0.5)
 
 
-def test_found_from_the_threshold_on():
+def test_the_target_is_found_at_the_threshold_and_above():
     assert number([0.2, 0.8, 0.3], [1], 0.75, Thresholds(0.75, 0.1)) == 1
     assert number([0.2, 0.99, 0.3], [1], 0.799) == 0
     assert number([0.2, 0.1, 0.3], [2], 0.0, Thresholds(0.0, 0.0)) == 1
     assert number([0.2, 0.999, 0.3], [1], 0.999, Thresholds(1.0, 0.0)) == 0
 
 
-def test_gives_up_where_no_cell_is_worth_a_look():
+def test_search_gives_up_if_no_cell_reaches_the_threshold():
     assert number([0.7, 0.05, 0.09], [0], 0.4) == 2
     assert number([0.7, 0.05, 0.09], [0], 0.5) == number([0.7, 0.05, 0.09], [0], 0.79) == 3
-    # A cell that is left, and worth it.
+    # An unvisited cell is probable enough.
     assert number([0.7, 0.05, 0.2], [0], 0.1) == 0
-    # What counts is the chance if no fixated cell holds the target.
+    # The chance of a cell is what counts: its probability given that no fixated cell holds the target.
     stated = step([[0.7, 0.3, 0.2]], [[0]], 0.1)
     assert int(decide(stated, 1, AT)) == 0
     stated.belief = Guided(*(getattr(stated.belief, name) for name in ("present", "anywhere", "closest")))
     assert int(decide(stated, 1, AT)) == 2
     assert number([0.05, 0.05, 0.05], [], 0.49) == 2
-    # Never, at a price of nothing, not even where every cell was visited.
+    # With threshold 0 the search never gives up, not even after every cell was visited.
     assert number([0.0, 0.0, 0.0], [0, 1, 2], 0.0, Thresholds(0.8, 0.0)) == 0
     assert number([0.7, 0.7, 0.7], [0, 1, 2], 0.3) == 2
 
@@ -133,7 +133,7 @@ def test_finding_comes_before_giving_up():
     assert number([0.95, 0.01, 0.01], [1], 0.9, Thresholds(0.8, 0.96)) == 3
 
 
-def test_a_belief_that_tells_no_presence_goes_by_its_most_probable_cell():
+def test_presence_defaults_to_the_probability_of_the_most_probable_cell():
     beta = torch.tensor([[[1.0, 1.5], [8.0, 0.2], [9.0, 0.1]], [[3.0, 1.0], [8.0, 0.2], [9.0, 0.1]]])
     belief = DirichletBelief(beta)
     torch.testing.assert_close(belief.presence(1), torch.tensor([0.6, 0.25]))
@@ -158,7 +158,7 @@ def batches(draw):
 
 
 @given(batches())
-def test_a_batch_is_decided_as_a_loop_does(batch):
+def test_decisions_of_a_batch_equal_a_loop(batch):
     cells, visited, presence, thresholds = batch
     confirm, give_up, place = thresholds.confirm, thresholds.give_up, thresholds.place
     stated = SimpleNamespace(
@@ -209,7 +209,7 @@ def test_best_box_equals_a_loop(seed):
                 assert torch.equal(got, expected)
 
 
-def test_best_box_of_nothing():
+def test_best_box_without_overlapping_detections_is_none():
     grid = Grid(4, 3, SIZE)
     assert best_box([], grid, 0, 1) is None
     assert best_box([Detections.empty(1, 3)], grid, 0, 1) is None
@@ -220,7 +220,7 @@ def test_best_box_of_nothing():
 
 
 class Square(Detector):
-    """Detects the bounding box of what is red (class 1), sure of it; class 2 is never seen."""
+    """Detects the bounding box of red pixels (class 1) with a high score, and never class 2."""
 
     def __init__(self) -> None:
         super().__init__("square", ("red", "green"), SIZE)
@@ -235,7 +235,7 @@ class Square(Detector):
 
 @dataclass(frozen=True)
 class Nothing(Look):
-    """A look that says nothing; its number is counted by the belief."""
+    """A look without information; the observer counts the looks."""
 
     count: int
 
@@ -248,7 +248,7 @@ class Nothing(Look):
 
 
 class Scripted(Observer):
-    """Believes, look by look, what it was told to: `(probabilities of 12 cells, presence)`; the last is kept."""
+    """Returns scripted beliefs, one per look: `(probabilities of 12 cells, presence)`; the last one is repeated."""
 
     by_target = True
 
@@ -274,7 +274,7 @@ class Scripted(Observer):
 
 
 def cells(**at):
-    """Probabilities of 12 cells: 0.2, except where told otherwise."""
+    """Probabilities of 12 cells: 0.2 unless given."""
     return [at.get(f"c{cell}", at.get("rest", 0.2)) for cell in range(12)]
 
 
@@ -291,7 +291,7 @@ def agent(observer):
     return ActivePerception(eye, (observer, NonPredictive()), (Semantic(3), Random()), grid=(4, 3)).eval()
 
 
-def test_a_search_that_finds(image):
+def test_search_ends_when_the_target_is_found(image):
     script = [(cells(c5=0.4), 0.9), (cells(c11=0.9), 0.9), (cells(c11=0.95), 0.97)]
     scanpath = agent(Scripted(*script)).search(image, "red", start=0)
     assert scanpath.cells.tolist() == [0, 5, 11]
@@ -305,18 +305,18 @@ def test_a_search_that_finds(image):
     assert describe(scanpath) == "“red” found after 2 gaze shifts (probability 0.97)"
 
 
-def test_what_is_found_may_be_elsewhere_than_the_gaze(image):
-    """The most probable cell was fixated before; the look that settles it may be another, and so may the box."""
+def test_the_target_may_be_found_in_another_cell_than_the_last_fixation(image):
+    """The most probable cell was fixated earlier than the last look, and the box may lie in another cell."""
     script = [(cells(c3=0.5), 0.3), (cells(c7=0.7), 0.9), (cells(c3=0.7), 0.9)]
     scanpath = agent(Scripted(*script)).search(image, "red", start=0)
     assert scanpath.cells.tolist() == [0, 3, 7]
-    # A box was seen in the last cell alone.
+    # The only box lies in the last cell of the grid.
     assert (scanpath.decision.outcome, scanpath.decision.cell) == ("found", 11)
     assert scanpath.decision.box is not None
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_place_equals_a_loop(seed):
+def test_cell_and_box_of_the_decision_equal_a_loop(seed):
     grid, looks = Grid(4, 3, SIZE), random_looks(3, 4, seed)
     parts = [looks[row : row + 1] for row in range(3)]
     known = torch.rand(1, 12, generator=torch.Generator().manual_seed(seed))
@@ -337,14 +337,14 @@ def test_the_place_equals_a_loop(seed):
     assert decision.probability == 0.75
     assert conclude(1, belief, parts, grid, 2, cell=5).cell == 5
     assert conclude(2, belief, parts, grid, 2) == Decision("absent", 0.75)
-    # Where nothing was detected the belief alone tells.
+    # Without detections the belief alone decides.
     nothing = [Detections.empty(1, 3)]
     assert conclude(1, belief, nothing, grid, 2) == Decision("found", 0.75, int(known.argmax()))
     assert strength(nothing[0], grid, 2).tolist() == [0.0] * 12
 
 
-def worth_of_looks(cells, visited, presence, price):
-    """Value of deciding now, and the best value of deciding after m more looks, by following every course of them."""
+def value_of_looks(cells, visited, presence, price):
+    """Value of deciding now, and the best value of deciding after m more looks, by enumerating all courses."""
     left = sorted((p for p, seen in zip(cells, visited, strict=True) if not seen), reverse=True)
     total, best = sum(cells), -1.0
     for most in range(1, len(left) + 1):
@@ -352,7 +352,7 @@ def worth_of_looks(cells, visited, presence, price):
         for p in left[:most]:
             paid += price
             met = presence * p / total
-            # It is met with this look: right, for what has been paid.
+            # This look finds the target: a right decision, minus the price paid so far.
             value += met * (1 - paid)
             unmet -= met
         here = unmet - (1 - presence)
@@ -366,13 +366,13 @@ def worth_of_looks(cells, visited, presence, price):
     st.floats(0.01, 0.99),
     st.floats(0.0001, 0.3),
 )
-def test_the_price_of_looks_equals_following_every_course(cells, presence, price):
+def test_decision_by_price_equals_enumerating_all_courses_of_the_search(cells, presence, price):
     known, visited = (list(column) for column in zip(*cells, strict=True))
     stated = SimpleNamespace(
         belief=Known(torch.tensor([known]).double(), torch.tensor([presence]).double(), torch.zeros(())),
         visited=torch.tensor([visited]),
     )
-    now, later = worth_of_looks(known, visited, presence, price)
+    now, later = value_of_looks(known, visited, presence, price)
     outcome = int(decide_by_price(stated, 1, price))
     if later > now + 1e-5:
         assert outcome == 0
@@ -380,18 +380,18 @@ def test_the_price_of_looks_equals_following_every_course(cells, presence, price
         assert outcome == (1 if presence >= 0.5 else 2)
 
 
-def test_looks_that_are_free_go_on_and_dear_ones_do_not():
+def test_search_goes_on_if_looks_are_cheap_and_ends_if_they_are_expensive():
     stated = step([[0.4, 0.3, 0.2]], [[0]], 0.6)
     assert int(decide_by_price(stated, 1, 1e-4)) == 0
     assert int(decide_by_price(stated, 1, 0.9)) == 1
-    # Where every cell was fixated nothing is left to pay for.
+    # After every cell was fixated no look is left to pay for.
     assert int(decide_by_price(step([[0.4, 0.3]], [[0, 1]], 0.4), 1, 1e-4)) == 2
     for price in (-0.1, float("nan"), float("inf")):
         with pytest.raises(InputError, match="price: expected 0 or more"):
             decide_by_price(stated, 1, price)
 
 
-def test_a_search_may_end_by_price(image):
+def test_a_search_can_end_by_price(image):
     script = [(cells(c5=0.9), 0.6), (cells(c5=0.99), 0.97)]
     assert agent(Scripted(*script)).search(image, "red", start=0, price=0.02).cells.tolist() == [0, 5]
     assert agent(Scripted(*script)).search(image, "red", start=0, price=0.9).decision.outcome == "found"
@@ -406,7 +406,7 @@ def test_a_search_may_end_by_price(image):
 @pytest.mark.parametrize(
     ("presence", "outcome", "words"), [(0.2, "absent", "not there"), (0.7, "undecided", "undecided")]
 )
-def test_a_search_that_gives_up(image, presence, outcome, words):
+def test_search_gives_up_and_describes_the_outcome(image, presence, outcome, words):
     script = [(cells(c5=0.4), 0.3), (cells(rest=0.04, c5=0.6), presence)]
     scanpath = agent(Scripted(*script)).search(image, "red", start=0)
     assert scanpath.cells.tolist() == [0, 5]
@@ -415,21 +415,21 @@ def test_a_search_that_gives_up(image, presence, outcome, words):
     assert describe(scanpath) == f"“red” {words} after 1 gaze shift (probability {presence:.2f})"
 
 
-def test_a_search_that_runs_out_of_shifts(image):
+def test_search_without_shifts_left_is_undecided(image):
     scanpath = agent(Scripted((cells(), 0.1))).search(image, "red", start=0, shifts=4)
     assert scanpath.shifts == 4
     assert scanpath.decision == Decision("undecided", pytest.approx(0.1))
     assert describe(scanpath) == "“red” undecided after 4 gaze shifts (probability 0.10)"
 
 
-def test_a_search_that_runs_out_of_cells(image):
-    """Where every cell was visited, none is left that is worth a look."""
+def test_search_without_cells_left_decides_absent(image):
+    """After every cell was visited, no cell is left to look at."""
     scanpath = agent(Scripted((cells(), 0.1))).search(image, "red", start=0, shifts=40)
     assert sorted(scanpath.cells.tolist()) == list(range(12))
     assert scanpath.decision.outcome == "absent"
 
 
-def test_a_search_decides_with_its_last_shift(image):
+def test_search_decides_after_its_last_shift(image):
     script = [(cells(c5=0.4), 0.3), (cells(c5=0.9), 0.9)]
     scanpath = agent(Scripted(*script)).search(image, "red", start=0, shifts=1)
     assert scanpath.decision.outcome == "found"
@@ -437,19 +437,19 @@ def test_a_search_decides_with_its_last_shift(image):
     assert (scanpath.decision.outcome, scanpath.shifts) == ("found", 0)
 
 
-def test_thresholds_may_be_given(image):
+def test_search_takes_thresholds_as_arguments(image):
     script = [(cells(c5=0.4), 0.3), (cells(c5=0.6), 0.6)]
     searcher = agent(Scripted(*script))
     assert searcher.search(image, "red", start=0, confirm=0.6 - 1e-6).decision.outcome == "found"
     assert searcher.search(image, "red", start=0, confirm=0.61, shifts=3).decision.outcome == "undecided"
     ended = searcher.search(image, "red", start=0, give_up=0.41)
     assert (ended.decision.outcome, ended.shifts) == ("absent", 0)
-    # Either alone leaves the other as it was chosen.
+    # Giving one threshold does not change the other.
     assert searcher.search(image, "red", start=0, give_up=0.3, shifts=1).decision.outcome == "undecided"
     assert searcher.search(image, "red", start=0, confirm=0.5, shifts=1).decision.outcome == "found"
 
 
-def test_with_boxes_nothing_is_decided(image):
+def test_search_with_annotated_boxes_makes_no_decision(image):
     script = [(cells(c5=0.95), 0.9), (cells(c5=0.95), 0.9), (cells(c6=0.95), 0.9)]
     boxes = torch.tensor([[85.0, 45, 90, 50]])
     scanpath = agent(Scripted(*script)).search(image, "red", start=0, boxes=boxes, shifts=1)
@@ -463,14 +463,14 @@ def test_with_boxes_nothing_is_decided(image):
     assert describe(scanpath) == "“red” found after 2 gaze shifts"
 
 
-def test_an_exploration_decides_nothing(image):
+def test_exploration_makes_no_decision(image):
     scanpath = agent(Scripted((cells(), 0.5))).explore(image, start=0, shifts=1)
     assert scanpath.decision is None
     assert describe(scanpath) == "explored with 1 gaze shift"
 
 
-def test_without_thresholds_a_detection_decides(image):
-    """Beliefs of Kaplan's rule: the fixated cell, and the score of a detection that overlaps it."""
+def test_without_thresholds_a_detection_confirms_the_target(image):
+    """With Kaplan's rule the score of a detection that overlaps the fixated cell confirms the target."""
     searcher = agent(Semantic(3))
     scanpath = searcher.search(image, "red", start=0)
     assert scanpath.found
@@ -481,7 +481,7 @@ def test_without_thresholds_a_detection_decides(image):
     assert not goal[scanpath.cells[:-1]].any()
     assert scanpath.decision.probability == pytest.approx(float(scanpath.posterior[-1].max()))
     assert torch.equal(scanpath.decision.box, scanpath.detections[-1].boxes[0, 0])
-    # They never give up, and a score that no detection has finds nothing.
+    # Such a search never gives up, and finds nothing if no detection reaches the score.
     for options in ({"confirm": 0.95}, {"confirm": 0.95, "give_up": 1.0}):
         never = searcher.search(image, "red", start=0, shifts=40, **options)
         assert len(never) == 12
@@ -489,7 +489,7 @@ def test_without_thresholds_a_detection_decides(image):
     assert searcher.search(image, "green", start=0, shifts=3).decision.outcome == "undecided"
 
 
-def test_context_decides_by_the_thresholds_of_the_other_observer(image):
+def test_context_uses_the_thresholds_of_the_observer_that_it_wraps(image):
     nothing = ContextPrior(
         ["red", "green"], torch.zeros(3, 3, 3), torch.zeros(3, 3, 2), [0.2], weights={"evidence": (1.0, 1.0)}
     )
@@ -504,20 +504,20 @@ def test_context_decides_by_the_thresholds_of_the_other_observer(image):
 
 @pytest.mark.parametrize("observer", [Scripted((cells(), 0.5)), Semantic(3)], ids=["thresholds", "none"])
 @pytest.mark.parametrize("given", [{"confirm": 50}, {"give_up": -1}, {"confirm": float("nan")}], ids=str)
-def test_what_is_no_probability_is_refused_by_name(image, observer, given):
+def test_thresholds_that_are_not_probabilities_are_refused_by_name(image, observer, given):
     (name,) = given
     with pytest.raises(InputError, match=f"^{name}: expected a probability"):
         agent(observer).search(image, "red", **given)
 
 
-def test_goal_cells_are_those_that_boxes_overlap():
+def test_goal_cells_are_the_cells_that_boxes_overlap():
     grid = Grid(4, 2, (80, 40))
     assert goal_cells([[0, 0, 20, 20], [61, 21, 80, 40]], grid, torch.zeros(())).nonzero()[:, 0].tolist() == [0, 7]
-    for wrong, told in (
+    for wrong, message in (
         ([[20, 0, 0, 20]], "x1 < x2"),
         ([0.0, 0, 20, 20], "shape"),
         (torch.rand(2, 5), "shape"),
         ([[0, 0, math.inf, 5]], "finite"),
     ):
-        with pytest.raises(InputError, match=f"boxes: .*{told}"):
+        with pytest.raises(InputError, match=f"boxes: .*{message}"):
             goal_cells(wrong, grid, torch.zeros(()))

@@ -1,4 +1,4 @@
-"""Sdist and wheel, built without a network and installed where nothing else of this checkout can be seen."""
+"""Sdist and wheel: both are built without a network, and the wheel is installed outside the checkout."""
 
 import os
 import subprocess
@@ -52,7 +52,7 @@ def run(*call, cwd, **environment):
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """Sdist of the checkout, and the wheel that is made from it, in a folder."""
+    """A folder with the sdist of the checkout and the wheel that is built from it."""
     folder = tmp_path_factory.mktemp("dist")
     run(sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", folder, cwd=ROOT)
     (sdist,) = folder.glob("*.tar.gz")
@@ -73,30 +73,30 @@ def names_in(built, kind):
 
 
 def tracked(folder):
-    """Files of the package that are no by-products."""
+    """Source and data files of the package, without generated files."""
     files = [path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
     return {path.relative_to(ROOT).as_posix() for path in files if path.suffix in {".py", *DATA}}
 
 
-def test_the_wheel_has_the_package_and_all_its_data_and_nothing_else(built):
+def test_the_wheel_contains_exactly_the_package_and_its_data(built):
     names = {name for name in names_in(built, "*.whl") if ".dist-info/" not in name}
     assert names == tracked(PACKAGE)
     assert sum(name.endswith(".safetensors") for name in names) > 15
 
 
-def test_the_wheel_carries_its_licence(built):
+def test_the_wheel_contains_the_licence(built):
     assert any(name.endswith("licenses/LICENSE") for name in names_in(built, "*.whl"))
 
 
-def test_the_sdist_has_what_the_tests_need(built):
+def test_the_sdist_contains_the_files_that_the_tests_need(built):
     names = names_in(built, "*.tar.gz")
     assert {"pyproject.toml", "LICENSE", "README.md", "CHANGELOG.md", "constraints.txt", "Makefile"} <= names
     assert {"tests/conftest.py", "eval/search.py", "train/fit_fom.py", "docs/api.py", "mkdocs.yml"} <= names
     assert not [name for name in names if name.startswith((".venv/", "build/", "runs/", ".git/"))]
 
 
-def test_the_wheel_works_in_an_environment_of_its_own(built, tmp_path):
-    """Dependencies are those of this environment, by a path that does not run what else it would add to the search."""
+def test_the_wheel_works_in_a_separate_environment(built, tmp_path):
+    """A path file adds the dependencies of this environment, but not its editable install of the checkout."""
     home = tmp_path / "environment"
     venv.create(home, with_pip=False, symlinks=os.name != "nt")
     python = home / "bin" / "python"

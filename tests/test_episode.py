@@ -1,4 +1,4 @@
-"""The loop of active perception against a loop in scalars; live and stored looks, gradients, replay and timing."""
+"""Rollouts against a loop over scalars; live and stored looks, gradients, replay and timing."""
 
 import math
 from functools import partial
@@ -26,7 +26,7 @@ CELLS = len(GRID)
 TARGETS = torch.tensor([1, 3, 1, 2, 3])
 START = torch.tensor([0, 4, 2, 2, 5])
 BATCH = len(START)
-# Where each episode ends: one where it starts, one never.
+# The cell where each episode ends: one episode ends where it starts, and one never ends.
 GOAL = torch.tensor([3, 4, 0, -1, 1])
 
 
@@ -38,7 +38,7 @@ NOISE = rand(BATCH, CELLS + 1, CELLS, seed=9)
 
 
 def stored(classes=3, most=4, dtype=torch.float64):
-    """What is seen from every cell, some of it padding; from one of them nothing."""
+    """Detections from every cell, partly padding; from one cell there are none."""
     corner = rand(CELLS, most, 2) * 50
     boxes = torch.cat([corner, corner + 4 + 30 * rand(CELLS, most, 2, seed=1)], -1)
     scores = (3 * rand(CELLS, most, classes + 1, seed=2)).softmax(-1)
@@ -54,8 +54,8 @@ def evidence():
 
 def context(classes=3):
     names = [f"class {number}" for number in range(1, classes + 1)]
-    place, company = rand(classes + 1, 3, 3), rand(classes + 1, classes + 1, 2)
-    return ContextPrior(names, place, company, [0.3], weights={"evidence": (0.5, 0.25), "map": (1.0, 2.0)})
+    place, cooccurrence = rand(classes + 1, 3, 3), rand(classes + 1, classes + 1, 2)
+    return ContextPrior(names, place, cooccurrence, [0.3], weights={"evidence": (0.5, 0.25), "map": (1.0, 2.0)})
 
 
 def reached(step):
@@ -67,7 +67,7 @@ def by_target(episodes, cell):
 
 
 def records(steps):
-    """What every episode did, step by step."""
+    """The records of every episode, step by step."""
     episodes = [[] for _ in range(BATCH)]
     for number, step in enumerate(steps):
         assert step.shift == number
@@ -90,7 +90,7 @@ def records(steps):
 
 
 class SemanticLoop:
-    """The published belief of one episode, in floats; options of `Semantic` that the loop knows."""
+    """The published belief update of one episode in Python floats, with the option `tempering` of `Semantic`."""
 
     def __init__(self, seen, target, tempering=1.0):
         self.seen, self.target, self.tempering = seen, target, tempering
@@ -118,7 +118,7 @@ class SemanticLoop:
 
 
 class TargetLoop:
-    """Evidence for the target: that of the closest look at each cell, the strongest, and the mean of all."""
+    """Evidence for the target in each cell: of the closest look, of the strongest one, and the mean of all looks."""
 
     def __init__(self, seen, target, model):
         self.seen, self.target, self.model = seen, target, model
@@ -128,13 +128,13 @@ class TargetLoop:
 
     def look(self, at):
         fixation = GRID.centres[at : at + 1].double()
-        said = self.model(self.seen[at : at + 1], fixation, GRID, self.target)[0].tolist()
+        look_odds = self.model(self.seen[at : at + 1], fixation, GRID, self.target)[0].tolist()
         for cell in range(CELLS):
             distance = away(cell, at)
             if distance < self.closest[cell]:
-                self.closest[cell], self.nearest[cell] = distance, said[cell]
-            self.best[cell] = max(self.best[cell], said[cell])
-            self.total[cell] += math.exp(-6 * distance) * said[cell]
+                self.closest[cell], self.nearest[cell] = distance, look_odds[cell]
+            self.best[cell] = max(self.best[cell], look_odds[cell])
+            self.total[cell] += math.exp(-6 * distance) * look_odds[cell]
             self.weight[cell] += math.exp(-6 * distance)
         for detection in range(int(self.seen.count[at])):
             self.score = max(self.score, float(self.seen.scores[at, detection, self.target]))
@@ -159,12 +159,12 @@ class TargetLoop:
 
 
 def away(cell, other):
-    """Distance between the centres of two cells, in longer sides."""
+    """Distance between the centres of two cells, relative to the longer side of the image."""
     return math.hypot(cell % 3 - other % 3, cell // 3 - other // 3) / 3
 
 
 def scalar_episode(loop, episode, most, values_of=None):
-    """Looks, update and choice of one episode, by hand; every entry as `records` has it."""
+    """Looks, updates and choices of one episode as a plain loop, in the format of `records`."""
     visited, path, at = [], [], int(START[episode])
     while True:
         loop.look(at)
@@ -204,7 +204,7 @@ def check_against_loop(observer, make_loop, acquisition, most, values_of=None):
                 assert step["next"] == chosen
                 assert torch.equal(step["next point"], GRID.centres[chosen].double())
     if most > 2:
-        assert len(lengths) > 1  # They do end at different times.
+        assert len(lengths) > 1  # The episodes end at different times.
 
 
 MOST = [1, 3, CELLS, 50]
@@ -212,7 +212,7 @@ MOST = [1, 3, CELLS, 50]
 
 @pytest.mark.parametrize("most", MOST)
 @pytest.mark.parametrize("tempering", [1.0, 0.25])
-def test_searches_by_a_map_equal_the_scalar_loop(most, tempering):
+def test_searches_with_a_semantic_map_equal_the_scalar_loop(most, tempering):
     observer = Semantic(4, tempering=tempering)
     check_against_loop(observer, partial(SemanticLoop, tempering=tempering), by_target, most)
 
@@ -225,7 +225,7 @@ def test_searches_for_several_targets_equal_the_scalar_loop(most):
 
 @pytest.mark.parametrize("most", MOST)
 @pytest.mark.parametrize("values", [[0.0] * CELLS, [0.3, 0.9, 0.9, 0.1, 0.9, 0.3]], ids=["all tied", "some tied"])
-def test_ties_go_to_each_episodes_own_noise(most, values):
+def test_ties_are_broken_by_the_noise_of_each_episode(most, values):
     acquisition = Static(torch.tensor(values, dtype=torch.float64))
     check_against_loop(Semantic(4), SemanticLoop, acquisition, most, values)
 
@@ -247,7 +247,7 @@ def test_without_episodes_or_looks_there_is_no_step():
 
 
 def test_a_step_marks_visits_and_fuses():
-    """Of a look at a box in one corner; what was believed before is left as it was."""
+    """A look sees a box in one corner; the update does not change the belief before it."""
     boxes = torch.tensor([[[61.0, 31, 89, 59]]]).expand(CELLS, 1, 4)
     seen = Detections(boxes, torch.tensor([[[0.1, 0.8, 0.1]]]).expand(CELLS, 1, 3), torch.ones(CELLS, 1).bool())
     steps = rollout(
@@ -262,7 +262,7 @@ def test_a_step_marks_visits_and_fuses():
     assert present[1][5] > present[0][5]
 
 
-def test_the_acquisition_is_made_for_the_episodes_that_go_on():
+def test_the_acquisition_is_made_for_the_episodes_that_are_not_over():
     asked = []
 
     def acquire(episodes, cell):
@@ -276,7 +276,7 @@ def test_the_acquisition_is_made_for_the_episodes_that_go_on():
     assert len({len(step.episodes) for step in steps}) > 1
 
 
-def test_choices_are_asked_for_the_shift_and_the_episodes():
+def test_choices_get_the_number_of_the_shift_and_the_episodes():
     asked = []
 
     class Noted(Greedy):
@@ -292,7 +292,7 @@ def test_choices_are_asked_for_the_shift_and_the_episodes():
     ]
 
 
-def test_stored_looks_are_weighed_once_for_each_target():
+def test_stored_looks_are_weighed_only_once_per_target():
     class Counted(Semantic):
         weighed = 0
 
@@ -314,10 +314,10 @@ def test_stored_looks_are_weighed_once_for_each_target():
     assert mapper.weighed == 1
     assert seeker.asked == (1, 2, 3)
     list(rollout(looks, mapper, by_target, START, Greedy(drawn_from(NOISE)), most=2))
-    assert mapper.weighed == 2  # Those of one observer are kept.
+    assert mapper.weighed == 2  # Only the looks of the last observer are kept.
 
 
-def test_an_observer_that_goes_by_the_target_is_told_of_a_lack_of_one():
+def test_an_observer_of_targets_without_a_target_is_refused():
     looks = LiveLooks(*live(), GRID)
     steps = rollout(looks, Target(evidence()), Uniform(), START, Greedy(drawn_from(NOISE)), most=2)
     with pytest.raises(InputError, match="target: expected a class to search for"):
@@ -325,7 +325,7 @@ def test_an_observer_that_goes_by_the_target_is_told_of_a_lack_of_one():
 
 
 class Quarters(Detector):
-    """A box in each quarter of the canvas, scored by its mean colour; dull quarters show nothing."""
+    """Detects each quarter of the canvas, scored by its brightest colour; dark quarters give no detection."""
 
     def __init__(self):
         super().__init__("quarters", ("red", "green", "blue"), (96, 64), selection=Selection(threshold=0.3, iou=1.0))
@@ -347,10 +347,10 @@ def live():
 
 @pytest.mark.parametrize("kind", ["map", "target", "context"])
 @pytest.mark.parametrize("target", [1, 3])
-def test_live_and_stored_looks_give_one_scanpath(kind, target):
+def test_live_and_stored_looks_give_the_same_scanpath(kind, target):
     eye, view = live()
     seen = eye.look(view, GRID.centres)
-    assert len(set(seen.count.tolist())) > 1  # It hangs on the fixation what is seen.
+    assert len(set(seen.count.tolist())) > 1  # The number of detections depends on the fixation.
     mapper = Semantic(4, tempering=0.5)
     observer = {"map": mapper, "target": Target(evidence()), "context": Context(mapper, context())}[kind]
     run = partial(
@@ -372,10 +372,10 @@ def test_live_and_stored_looks_give_one_scanpath(kind, target):
             torch.testing.assert_close(mine.scores[row][mine.mask[row]], theirs.scores[row][theirs.mask[row]])
 
 
-def tensors_of(thing):
+def tensors_of(instance):
     found = []
-    for name in thing.__dataclass_fields__:
-        part = getattr(thing, name)
+    for name in instance.__dataclass_fields__:
+        part = getattr(instance, name)
         found += [part] if isinstance(part, torch.Tensor) else tensors_of(part)
     return found
 
@@ -407,14 +407,14 @@ STRATEGIES = {
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
-def test_a_batch_of_episodes_is_each_episode_to_the_bit(name):
+def test_an_episode_in_a_batch_equals_the_episode_alone_to_the_bit(name):
     observer, policy = STRATEGIES[name]()
     seen = stored(20, 7, torch.float32)
     targets = torch.tensor([1, 17, 1, 20, 17])
     noise = NOISE.float()
 
     def run(episodes):
-        """Steps of some of the episodes, as if there were no others."""
+        """Steps of the given episodes, without the other ones."""
 
         def reached_too(step):
             return step.cell == GOAL[episodes][step.episodes]
@@ -435,11 +435,11 @@ def test_a_batch_of_episodes_is_each_episode_to_the_bit(name):
                 assert torch.equal(mine[0], theirs[row])
 
 
-# Differentiable from the choice of a fixation to what is seen there.
+# Detections that are differentiable with respect to the fixation.
 
 
 class Smooth(Looks):
-    """Scores that change smoothly with the point of fixation, of two boxes."""
+    """Looks at two boxes whose scores are smooth functions of the fixation point."""
 
     def __init__(self):
         self.grid, self.like = GRID, torch.empty(0, dtype=torch.float64)
@@ -457,7 +457,7 @@ class Smooth(Looks):
 
 
 class Biased(AcquisitionFunction):
-    """Log odds of a class, and a parameter for every cell."""
+    """An acquisition function: the log odds of a class plus a parameter for every cell."""
 
     def __init__(self, bias):
         super().__init__()
@@ -475,13 +475,13 @@ def relaxed_steps(bias, hard, most, window=None):
     return list(rollout(Smooth(), Semantic(3), Biased(bias), START[:2], relaxed(hard), most=most, window=window))
 
 
-def test_soft_choices_pass_the_gradient_of_all_looks():
+def test_soft_choices_pass_gradients_through_all_looks():
     def believed(bias):
         return [step.belief.probability(1) for step in relaxed_steps(bias, hard=False, most=4)]
 
     bias = rand(CELLS, seed=5).requires_grad_()
     assert torch.autograd.gradcheck(lambda given: torch.stack(believed(given)), bias)
-    # The first look comes before any choice; every later one is reached.
+    # The first look comes before any choice; the gradient reaches every later look.
     for shift, present in enumerate(believed(bias)):
         assert present.requires_grad == (shift > 0)
         if shift:
@@ -489,13 +489,13 @@ def test_soft_choices_pass_the_gradient_of_all_looks():
             assert gradient.abs().max() > 1e-6
 
 
-def test_hard_choices_are_centres_with_the_gradient_of_the_soft_point():
+def test_hard_choices_are_cell_centres_with_the_gradient_of_the_soft_point():
     bias = rand(CELLS, seed=5).requires_grad_()
     first, second = relaxed_steps(bias, hard=True, most=2)
     assert torch.equal(second.fixation.detach(), GRID.centres[second.cell].double())
     assert torch.equal(first.next_cell, second.cell)
     (got,) = torch.autograd.grad(second.belief.probability(1).square().sum(), bias)
-    # By hand: how the loss changes with the fixation, through how the soft point changes with the parameters.
+    # The chain rule: from the loss to the fixation, and from the soft point to the parameters.
     observer, point = Semantic(3), GRID.centres[second.cell].double().requires_grad_()
     after = observer(first.belief.detach(), Smooth().seen(point), point, GRID)
     (slope,) = torch.autograd.grad(after.probability(1).square().sum(), point)
@@ -508,22 +508,22 @@ def test_hard_choices_are_centres_with_the_gradient_of_the_soft_point():
 
 @pytest.mark.parametrize("hard", [True, False])
 @pytest.mark.parametrize(("window", "reached_at"), [(None, "-++++"), (1, "-----"), (2, "-+-+-"), (3, "-++-+")])
-def test_a_window_cuts_the_gradient_and_nothing_else(window, reached_at, hard):
+def test_a_window_truncates_the_gradient_and_changes_no_value(window, reached_at, hard):
     bias = rand(CELLS, seed=5).requires_grad_()
     whole, steps = (relaxed_steps(bias, hard, 5, each) for each in (None, window))
     assert "".join("-+"[step.belief.beta.requires_grad] for step in steps) == reached_at
-    assert all(step.next_fixation.requires_grad for step in steps)  # Within its step a choice keeps its gradient.
+    assert all(step.next_fixation.requires_grad for step in steps)  # The gradient of a choice within its step is kept.
     for one, other in zip(whole, steps, strict=True):
         for name in ("cell", "fixation", "visited", "values", "next_fixation"):
             assert torch.equal(getattr(one, name), getattr(other, name)), name
         assert torch.equal(one.belief.beta, other.belief.beta)
 
 
-def test_gradients_after_the_border_of_a_window_are_those_of_a_fresh_start():
+def test_gradients_after_the_border_of_a_window_treat_the_state_as_constant():
     bias = rand(CELLS, seed=5).requires_grad_()
     steps = relaxed_steps(bias, hard=False, most=4, window=2)
     (got,) = torch.autograd.grad(steps[3].belief.probability(1).square().sum(), bias)
-    # By hand from the border between the second look and the third, whose belief and point are constants.
+    # The same steps from the border between the second look and the third; belief and point are constants there.
     observer, before, point = Semantic(3), steps[1].belief.detach(), steps[1].next_fixation.detach()
     third = observer(before, Smooth().seen(point), point, GRID)
     assert torch.equal(third.beta, steps[2].belief.beta)
@@ -537,7 +537,7 @@ def test_gradients_after_the_border_of_a_window_are_those_of_a_fresh_start():
     assert not torch.allclose(got, whole, rtol=1e-3)
 
 
-def test_a_soft_point_is_in_the_cell_that_it_lies_in():
+def test_the_cell_of_a_soft_point_is_the_cell_that_contains_it():
     for step in relaxed_steps(rand(CELLS, seed=5), hard=False, most=4):
         assert torch.equal(step.next_cell, GRID.cell_of(step.next_fixation))
         assert not any(bool((GRID.centres == point.float()).all(-1).any()) for point in step.next_fixation)
@@ -562,8 +562,8 @@ def test_a_recorded_scanpath_is_replayed_to_the_bit(kind):
             assert torch.equal(mine, theirs)
 
 
-def test_given_cells_are_fixated_again_and_the_last_one_stays():
-    """A scanpath may come back to a cell; after its end there is no other place to go to."""
+def test_a_given_scanpath_may_revisit_cells_and_repeats_its_last_cell():
+    """A given scanpath may return to a cell; after its end the gaze stays at the last cell."""
     cells = torch.tensor([[0, 3, 0], [4, 4, 1]])
     looks = StoredLooks(stored(), GRID)
     steps = list(rollout(looks, Semantic(4), Uniform(), cells[:, 0], Given(cells), most=5))
@@ -571,7 +571,7 @@ def test_given_cells_are_fixated_again_and_the_last_one_stays():
     assert steps[-1].visited.sum(-1).tolist() == [2, 2]
 
 
-def test_noise_drawn_as_needed_repeats_with_its_seed():
+def test_noise_drawn_at_each_shift_is_reproducible_by_its_seed():
     looks = StoredLooks(stored(), GRID)
 
     def cells(seed):
@@ -582,7 +582,7 @@ def test_noise_drawn_as_needed_repeats_with_its_seed():
     assert not torch.equal(cells(3), cells(4))
 
 
-def test_a_choice_of_ones_own():
+def test_rollout_takes_a_custom_choice():
     class First(Choice):
         """The first cell that was not visited."""
 
@@ -594,8 +594,8 @@ def test_a_choice_of_ones_own():
     assert [int(step.cell) for step in steps] == [4, 0, 1, 2, 3, 5]
 
 
-def test_every_stage_of_a_cycle_is_timed_and_nothing_else(monkeypatch):
-    """By a clock that runs only while a stage works."""
+def test_only_the_stages_of_a_cycle_are_timed(monkeypatch):
+    """The clock of this test advances only while a stage runs."""
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr("semfov.episode.stopwatch.time", SimpleNamespace(perf_counter=lambda: clock.now))
 
@@ -617,14 +617,14 @@ def test_every_stage_of_a_cycle_is_timed_and_nothing_else(monkeypatch):
     eye.detector.detect = taking(2, eye.detector.detect)
     for step in rollout(LiveLooks(eye, view, GRID), observer, acquire, START, choice, most=3):
         assert step.seconds == spent
-        clock.now += 1000.0  # What the caller does with a step is no part of it.
-    # In a store there is nothing to foveate and to detect, and all is weighed at the first look.
+        clock.now += 1000.0  # Time that the caller spends between steps does not count.
+    # Stored looks are not foveated or detected again, and the first look weighs them all.
     rows = [step.seconds for step in rollout(StoredLooks(seen, GRID), observer, acquire, START, choice, most=3)]
     rest = {stage: spent[stage] for stage in STAGES[2:]}
     assert rows == [rest, rest | {"weigh": 0.0}, rest | {"weigh": 0.0}]
 
 
-def test_stages_take_time():
+def test_every_stage_takes_a_positive_time():
     eye, view = live()
     for step in rollout(LiveLooks(eye, view, GRID), Semantic(4), Uniform(), START, Greedy(drawn_from(NOISE)), most=2):
         assert tuple(step.seconds) == STAGES
@@ -633,8 +633,8 @@ def test_stages_take_time():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", ["map", "target"])
-def test_beliefs_are_where_the_looks_are(kind, dtype, device):
-    """On the device and in the dtype of what is seen."""
+def test_beliefs_have_the_device_and_dtype_of_the_looks(kind, dtype, device):
+    """Beliefs, values and fixations follow the detections."""
     seen = stored(dtype=dtype)
     seen = Detections(seen.boxes.to(device), seen.scores.to(device), seen.mask.to(device))
     model = evidence().to(device, dtype)
@@ -647,5 +647,5 @@ def test_beliefs_are_where_the_looks_are(kind, dtype, device):
             assert tensor.device.type == device.type
 
 
-def test_it_is_public():
+def test_rollout_is_public():
     assert semfov.rollout is rollout

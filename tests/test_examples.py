@@ -1,4 +1,4 @@
-"""The examples run, and do what they say."""
+"""The examples run and show the effects that they describe."""
 
 import importlib
 import re
@@ -32,7 +32,7 @@ def test_finetuning_raises_the_chance_of_a_hit(run):
     assert "after training" in output
 
 
-def test_foveating_keeps_what_is_looked_at(run, tmp_path):
+def test_foveating_keeps_the_fixated_region_sharp(run, tmp_path):
     photo, out = tmp_path / "photo.png", tmp_path / "foveated.png"
     noise = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
     Image.fromarray(noise).save(photo)
@@ -50,7 +50,7 @@ def test_searching_draws_the_scanpath(run, tmp_path):
         assert min(picture.size) > 500
 
 
-def test_own_observer_sees_the_score_of_the_target_grow(run):
+def test_own_observer_raises_the_score_of_the_target(run):
     output = run("own_observer")
     best = [float(value) for value in re.findall(r"best score of a cup so far ([\d.]+)", output)]
     assert best == sorted(best)
@@ -66,7 +66,7 @@ def test_own_policy_needs_fewer_gaze_shifts(run):
     assert found[0][2] == found[1][2] != "0"
 
 
-def test_own_sensor_shows_what_is_too_small_for_the_fovea(run):
+def test_own_sensor_recognises_objects_too_small_for_the_published_fovea(run):
     output = run("own_sensor")
     found = re.findall(r"^([\w ]+): (\d+) of (\d+) objects are recognised when they are fixated$", output, re.MULTILINE)
     assert [name for name, _, _ in found] == ["published fovea", "magnifying glass"]

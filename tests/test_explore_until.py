@@ -18,7 +18,7 @@ SIZE = (160, 120)
 
 
 class Square(Detector):
-    """Detects the bounding box of what is red; its score is how saturated it is."""
+    """Detects the bounding box of red pixels; the score is their saturation."""
 
     def __init__(self) -> None:
         super().__init__("square", ("red", "green"), SIZE)
@@ -41,7 +41,7 @@ def image():
 
 @pytest.fixture
 def model():
-    """Evidence at random; a look gains 0.1 of a cell wherever it comes nearer."""
+    """Random evidence; a look gains 0.1 of a cell for every cell that it is nearest to so far."""
     generator = torch.Generator().manual_seed(2)
     model = MapEvidence(4, 4, components=3).requires_grad_(False).eval()
     for parameter in model.parameters():
@@ -56,8 +56,8 @@ def agent_of(model, policy=None, grid=(5, 4)):
     return ActivePerception(eye, (Semantic(3), NonPredictive()), (observer, policy or Closer(0.25)), grid=grid)
 
 
-def worths(model, scanpath):
-    """After every look the most cells that another one is expected to gain, loop by loop."""
+def largest_gains(model, scanpath):
+    """The largest expected gain of a further look, in cells, after every look; computed by loops."""
     grid, answer = scanpath.grid, []
     for number in range(len(scanpath)):
         before = scanpath.cells[: number + 1].tolist()
@@ -80,12 +80,12 @@ def test_exploration_ends_when_no_look_is_worth_its_price(model, image, policy):
     whole = agent.explore(image, start=0, shifts=12, until=0, seed=1)
     assert len(whole) == 13
     assert whole.ending == "shifts"
-    expected = worths(model, whole)
+    expected = largest_gains(model, whole)
     assert max(expected) > 4 * min(expected)
     lengths = set()
     for price in (0.15, 0.25, 0.35, 0.55, 0.85, 5.0):
         part = agent.explore(image, start=0, shifts=12, until=price, seed=1)
-        last = next((number for number, worth in enumerate(expected) if worth < price), None)
+        last = next((number for number, value in enumerate(expected) if value < price), None)
         assert part.ending == ("shifts" if last is None else "price")
         assert len(part) == (13 if last is None else last + 1)
         assert torch.equal(part.cells, whole.cells[: len(part)])
@@ -99,8 +99,8 @@ def test_exploration_ends_when_no_look_is_worth_its_price(model, image, policy):
 
 
 @pytest.mark.slow
-def test_going_by_the_gain_the_chosen_look_has_it(model, image):
-    """The values of the last look tell that none is worth it, those of the looks before that one is."""
+def test_the_gain_policy_ends_when_its_largest_value_is_below_the_price(model, image):
+    """After the last look every gain is below the price; after every earlier look at least one is not."""
     agent = agent_of(model, Gain(model))
     scanpath = agent.explore(image, start=7, shifts=19, until=0.25)
     assert scanpath.ending == "price"
@@ -108,10 +108,10 @@ def test_going_by_the_gain_the_chosen_look_has_it(model, image):
         left = values.clone()
         left[scanpath.cells[: number + 1]] = -math.inf
         assert (float(left.max()) < 0.25) == (number == len(scanpath) - 1)
-        assert float(left.max()) == pytest.approx(worths(model, scanpath)[number], abs=1e-5)
+        assert float(left.max()) == pytest.approx(largest_gains(model, scanpath)[number], abs=1e-5)
 
 
-def test_a_price_of_none_is_the_default(model, image):
+def test_until_none_means_the_default_price(model, image):
     agent = agent_of(model)
     model.worth[-1].bias.fill_(PRICE / 3.5)
     free, default, same = (agent.explore(image, start=0, shifts=19, until=until, seed=3) for until in (0, None, PRICE))
@@ -122,7 +122,7 @@ def test_a_price_of_none_is_the_default(model, image):
 
 
 @pytest.mark.parametrize("gain", [0.0, -1.0])
-def test_a_price_of_nothing_never_ends_it(model, image, gain):
+def test_price_zero_never_ends_an_exploration(model, image, gain):
     model.worth[-1].bias.fill_(gain)
     agent = agent_of(model)
     assert agent.explore(image, start=0, shifts=3, until=0).ending == "shifts"
@@ -132,19 +132,19 @@ def test_a_price_of_nothing_never_ends_it(model, image, gain):
 
 
 @pytest.mark.parametrize("until", [0, 1e-6])
-def test_all_cells_were_fixated(model, image, until):
-    """That is why it ends, whatever a look costs: each of them was worth it."""
+def test_exploration_with_a_low_price_ends_after_all_cells(model, image, until):
+    """The gain of every look exceeds the price, so the exploration ends after the last cell."""
     scanpath = agent_of(model, grid=(3, 2)).explore(image, shifts=30, until=until)
     assert sorted(scanpath.cells.tolist()) == list(range(6))
     assert scanpath.ending == "cells"
 
 
-def test_exploration_of_no_shift(model, image):
+def test_exploration_without_gaze_shifts(model, image):
     assert agent_of(model).explore(image, start=0, shifts=0, until=0.1).ending == "shifts"
     assert agent_of(model).explore(image, start=0, shifts=0, until=1e3).ending == "price"
 
 
-def test_map_of_a_search_is_the_learned_one(model, image):
+def test_the_map_of_a_search_is_the_learned_map(model, image):
     agent = agent_of(model)
     scanpath = agent.search(image, "green", start=3, shifts=3)
     grid, observer = Grid(5, 4, SIZE), LearnedMap(model)
@@ -155,7 +155,7 @@ def test_map_of_a_search_is_the_learned_one(model, image):
     assert scanpath.ending == "shifts"
 
 
-def test_only_a_learned_map_tells_what_a_look_will_bring(image):
+def test_until_needs_an_agent_with_a_learned_map(image):
     eye = Eye(Foveation(40.0), Square(), reference=160.0)
     agent = ActivePerception(eye, (Semantic(3), NonPredictive()), (Semantic(3), Random()), grid=(5, 4))
     with pytest.raises(InputError, match=r"^until: expected None for an agent without a learned map"):
@@ -165,6 +165,6 @@ def test_only_a_learned_map_tells_what_a_look_will_bring(image):
 
 
 @pytest.mark.parametrize("until", [-0.1, math.inf, math.nan, "0.1", True, [0.1], 10**400])
-def test_prices_that_make_no_sense_are_refused(model, image, until):
+def test_invalid_prices_are_refused(model, image, until):
     with pytest.raises(InputError, match="until: expected 0 or more cells"):
         agent_of(model).explore(image, until=until)

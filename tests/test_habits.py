@@ -1,4 +1,4 @@
-"""What keeps the project in order agrees with itself: versions, pins, checks before a commit and on the server."""
+"""Consistency of the project's setup: versions, pinned dependencies, and checks before a commit and on the server."""
 
 import re
 import runpy
@@ -26,7 +26,7 @@ def read(path):
 
 
 def required(*extras):
-    """Requirements of the package and of some extras, with those of the extras that these name."""
+    """Requirements of the package and of the given extras, including extras that refer to other extras."""
     texts = [*PROJECT["dependencies"], *(text for extra in extras for text in PROJECT["optional-dependencies"][extra])]
     for requirement in map(Requirement, texts):
         if requirement.name == PROJECT["name"]:
@@ -35,7 +35,7 @@ def required(*extras):
             yield requirement
 
 
-def test_the_version_is_written_once_and_cited_right():
+def test_citation_and_changelog_have_the_version_of_the_package():
     assert PROJECT["dynamic"] == ["version"]
     assert read("CITATION.cff")["version"] == semfov.__version__
     released = re.findall(r"^## (\d+\.\d+\.\d+), (\d{4}-\d\d-\d\d)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
@@ -45,11 +45,11 @@ def test_the_version_is_written_once_and_cited_right():
 @pytest.mark.parametrize(
     "requirement", sorted({str(each): each for each in required("dev")}.values(), key=str), ids=str
 )
-def test_what_the_tests_need_is_pinned_to_a_version_that_users_may_have(requirement):
+def test_pins_of_the_tests_are_within_the_bounds_for_users(requirement):
     assert PINS[canonicalize_name(requirement.name)] in requirement.specifier
 
 
-def test_setup_takes_the_pins():
+def test_make_setup_installs_the_pinned_versions():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert '--constraint constraints.txt --editable ".[dev]"' in makefile
     assert "$(STAMP): pyproject.toml constraints.txt" in makefile
@@ -64,14 +64,14 @@ def test_the_oldest_versions_are_the_lower_bounds():
     )
 
 
-def test_what_is_checked_before_a_commit_is_checked_by_make_test():
+def test_checks_before_a_commit_are_part_of_make_test():
     hooks = [hook for repo in read(".pre-commit-config.yaml")["repos"] for hook in repo["hooks"]]
     targets = [hook["entry"].removeprefix("make ") for hook in hooks]
     assert {"lint", "types"} <= set(targets) <= MAKE
     assert re.search(r"^test: lint types$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
 
 
-def test_the_workflows_run_what_is_there():
+def test_the_commands_of_the_workflows_exist():
     jobs = {
         name: job for path in ("test", "docs") for name, job in read(f".github/workflows/{path}.yml")["jobs"].items()
     }
@@ -82,7 +82,7 @@ def test_the_workflows_run_what_is_there():
     assert jobs["tested"]["strategy"]["matrix"]["os"] == ["ubuntu-latest", "macos-latest"]
 
 
-def test_the_workflows_have_the_oldest_python_and_a_newer_one():
+def test_the_workflows_test_the_oldest_python_and_a_newer_one():
     supported = SpecifierSet(PROJECT["requires-python"])
     text = (ROOT / ".github/workflows/test.yml").read_text(encoding="utf-8")
     versions = re.findall(r'python-version: "([\d.]+)"', text)
@@ -90,7 +90,7 @@ def test_the_workflows_have_the_oldest_python_and_a_newer_one():
     assert f">={min(versions)}" == PROJECT["requires-python"] != f">={max(versions)}"
 
 
-def test_templates_can_be_read():
+def test_issue_templates_are_valid():
     for path in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml"):
         form = read(path.relative_to(ROOT))
         assert path.stem == "config" or {"name", "description", "body"} <= set(form)

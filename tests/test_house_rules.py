@@ -1,6 +1,6 @@
-"""Rules that a reader of the library relies on: short files, nobody's private parts, names that are there.
+"""Rules for the source code: short files, no private names of other packages, and valid `__all__` lists.
 
-The order of rooms is in `test_package.py`, what may run in `robustness/test_security.py`.
+The import order of subpackages is checked in `test_package.py`, code execution in `robustness/test_security.py`.
 """
 
 import ast
@@ -16,12 +16,12 @@ PACKAGE = Path(semfov.__file__).parent
 ROOT = PACKAGE.parent
 LIBRARY = sorted(PACKAGE.rglob("*.py"))
 SOURCES = LIBRARY + sorted(file for folder in ("eval", "train", "examples") for file in (ROOT / folder).rglob("*.py"))
-LONGEST = 400
+MOST_LINES = 400
 DOCUMENTED = {"os._exit"}
 
 
-def private_parts(source: str) -> list[str]:
-    """Private names of other packages that a module imports or reaches for, such as `torch._C`."""
+def private_names(source: str) -> list[str]:
+    """Private names of other packages that a module imports or accesses, such as `torch._C`."""
     tree = ast.parse(source)
     found, foreign = [], set()
     for node in ast.walk(tree):
@@ -57,31 +57,31 @@ def _is_private(name: str) -> bool:
         "from numpy import _core",
     ],
 )
-def test_the_scan_finds(source):
-    assert private_parts(source)
+def test_the_scan_finds_private_names_of_other_packages(source):
+    assert private_names(source)
 
 
-def test_the_scan_leaves_ones_own_alone():
-    assert not private_parts("import torch\nfrom semfov.errors import _to_unit\nself._kept = torch.__version__")
+def test_the_scan_ignores_private_names_of_this_package():
+    assert not private_names("import torch\nfrom semfov.errors import _to_unit\nself._kept = torch.__version__")
 
 
-def test_nobody_elses_private_parts_are_used():
-    found = {str(file.relative_to(ROOT)): private_parts(file.read_text(encoding="utf-8")) for file in SOURCES}
+def test_no_private_names_of_other_packages_are_used():
+    found = {str(file.relative_to(ROOT)): private_names(file.read_text(encoding="utf-8")) for file in SOURCES}
     assert {name: parts for name, parts in found.items() if parts} == {}
 
 
-def test_files_of_the_library_are_short():
+def test_files_of_the_library_have_at_most_400_lines():
     lines = {str(file.relative_to(ROOT)): len(file.read_text(encoding="utf-8").splitlines()) for file in LIBRARY}
     assert len(lines) > 200
-    assert {name: count for name, count in lines.items() if count > LONGEST} == {}
+    assert {name: count for name, count in lines.items() if count > MOST_LINES} == {}
 
 
-def test_no_file_is_a_drawer():
+def test_no_file_has_a_catch_all_name():
     assert not {file.name for file in SOURCES} & {"utils.py", "helpers.py", "misc.py", "common.py"}
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_what_a_module_says_is_public_is_there(module):
+def test_names_in_all_exist_once_and_are_public(module):
     names = getattr(importlib.import_module(module), "__all__", [])
     assert len(set(names)) == len(names)
     assert [name for name in names if not hasattr(importlib.import_module(module), name)] == []

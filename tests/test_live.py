@@ -1,4 +1,4 @@
-"""A camera or a video: the belief goes on from frame to frame, fades, and is that of a search where nothing changes."""
+"""Live perception of a camera or a video: beliefs persist and fade, and equal those of a search if nothing changes."""
 
 import math
 from itertools import pairwise
@@ -21,7 +21,7 @@ SIZE = (160, 120)
 
 
 class Squares(Detector):
-    """Detects the bounding box of what is red (class 1) and what is green (class 2); its score is how saturated."""
+    """Detects the bounding boxes of red (class 1) and green (class 2) pixels; the score is their saturation."""
 
     def __init__(self) -> None:
         super().__init__("squares", ("red", "green"), SIZE)
@@ -40,7 +40,7 @@ class Squares(Detector):
 
 
 def scene(x, y=8, size=24):
-    """Grey, with a green square."""
+    """A green square on grey."""
     picture = torch.full((3, 120, 160), 0.4)
     picture[:, y : y + size, max(x, 0) : max(x + size, 0)] = torch.tensor([0.1, 0.9, 0.1])[:, None, None]
     return picture
@@ -79,8 +79,8 @@ def tensors(belief):
 
 
 @pytest.mark.parametrize("name", observers())
-def test_a_still_picture_at_rate_zero_is_an_ordinary_search(name, one_thread):
-    """To the bit: cells, values, belief, and which cells the gaze is kept from."""
+def test_live_search_of_a_constant_image_at_rate_zero_equals_a_search(name, one_thread):
+    """Cells, posterior, detections and visited cells are equal to the bit."""
     agent, image = agent_with(observers()[name]), scene(100, 80)
     live = agent.live("green", rate=0, seed=5)
     with torch.inference_mode():
@@ -94,7 +94,7 @@ def test_a_still_picture_at_rate_zero_is_an_ordinary_search(name, one_thread):
     assert set(moments[0].seconds) == {"open", "foveate", "detect", "weigh", "update belief", "choose"}
 
 
-def test_an_exploration_at_rate_zero_is_an_ordinary_one(one_thread):
+def test_live_exploration_of_a_constant_image_at_rate_zero_equals_an_exploration(one_thread):
     model = learned(MapEvidence)
     agent = agent_with(Semantic(3))
     agent = ActivePerception(
@@ -111,7 +111,7 @@ def test_an_exploration_at_rate_zero_is_an_ordinary_one(one_thread):
 
 
 @pytest.mark.parametrize("name", observers())
-def test_nothing_fades_at_rate_zero_and_little_is_kept_at_a_great_one(name):
+def test_beliefs_do_not_fade_at_rate_zero_and_vanish_at_a_high_rate(name):
     observer, grid = observers()[name], Grid(8, 6, SIZE)
     eye, like = agent_with(observer).eye, torch.zeros(1)
     fixation = grid.centres[[20]]
@@ -121,14 +121,14 @@ def test_nothing_fades_at_rate_zero_and_little_is_kept_at_a_great_one(name):
     visited = torch.zeros(1, 48, dtype=torch.bool)
     for before, after in zip(tensors(belief), tensors(observer.fade(belief, look, 1.0, visited)), strict=True):
         assert torch.equal(before, after)
-    # What is left of it adds next to nothing to the next look.
+    # The remaining evidence hardly changes the belief after the next look.
     fresh = observer.update(observer.start(1, grid, like), look)
     again = observer.update(observer.fade(belief, look, 1e-7, visited), look)
     torch.testing.assert_close(again.probability(2), fresh.probability(2), atol=1e-4, rtol=1e-4)
 
 
 def test_dirichlet_parameters_return_to_the_prior_exponentially():
-    """β − β₀ after n looks that see nothing is e^(−rn) times as large."""
+    """n looks without detections multiply β − β₀ by e^(−rn)."""
     agent = agent_with(Semantic(3, prior=0.25))
     live = agent.live("green", rate=0.2, start=0)
     first = live.step(scene(4)).belief.beta
@@ -138,7 +138,7 @@ def test_dirichlet_parameters_return_to_the_prior_exponentially():
     torch.testing.assert_close(last - 0.25, math.exp(-1) * (first - 0.25), atol=1e-6, rtol=1e-5)
 
 
-def test_learned_evidence_returns_to_that_of_a_look_that_shows_nothing():
+def test_learned_evidence_returns_to_that_of_a_look_without_detections():
     observer = Target(learned(TargetEvidence))
     grid, distance = Grid(8, 6, SIZE), torch.rand(4)
     fixation = torch.tensor([[10.0, 20.0]])
@@ -152,18 +152,18 @@ def test_learned_evidence_returns_to_that_of_a_look_that_shows_nothing():
     for _ in range(30):
         belief = observer.fade(belief, look, math.exp(-0.5), belief.visited)
     torch.testing.assert_close(belief.nearest, unseen.expand_as(belief.nearest), atol=1e-4, rtol=1e-4)
-    # A look counts by exp(-6 d): what fades as much as by distance is as far away.
+    # The weight of a look at distance d is exp(-6 d); fading by a factor f adds -log(f) / 6 to the distance.
     torch.testing.assert_close((-6 * (belief.closest - look.distance)).exp(), torch.full((1, 48), math.exp(-15)))
 
 
-def test_what_left_the_view_fades_and_the_target_is_followed():
-    """A square moves from the left to the right, and the most probable cell goes with it."""
+def test_the_belief_follows_a_moving_target_and_old_evidence_fades():
+    """A square moves from the left to the right, and the most probable cell moves with it."""
     live = agent_with(Semantic(3)).live("green", rate=0.3, seed=1)
-    there, grid = [], Grid(8, 6, SIZE)
+    frames, grid = [], Grid(8, 6, SIZE)
     for x in [8] * 12 + list(range(8, 129, 8)) + [128] * 12:
         moment = live.step(scene(x))
-        there.append((x, moment))
-    begun, ended = there[11][1], there[-1][1]
+        frames.append((x, moment))
+    begun, ended = frames[11][1], frames[-1][1]
     left = grid.footprint(torch.tensor([[8.0, 8, 32, 32]]))[0]
     right = grid.footprint(torch.tensor([[128.0, 8, 152, 32]]))[0]
     assert left[begun.probability.argmax()]
@@ -171,15 +171,15 @@ def test_what_left_the_view_fades_and_the_target_is_followed():
     assert begun.probability[left].max() > 0.7
     assert ended.probability[left & ~right].max() < 0.45
     still = agent_with(Semantic(3)).live("green", rate=0, seed=1)
-    for x, _ in there:
+    for x, _ in frames:
         kept = still.step(scene(x))
-    assert kept.probability[left].max() > 0.7, "without a rate nothing is forgotten"
-    # The gaze goes on from where it was.
-    for (_, before), (_, after) in pairwise(there):
+    assert kept.probability[left].max() > 0.7, "at rate 0 nothing is forgotten"
+    # Each frame is fixated at the cell chosen after the frame before.
+    for (_, before), (_, after) in pairwise(frames):
         assert after.cell == before.next_cell
 
 
-def test_cells_are_free_again_when_half_is_forgotten():
+def test_cells_can_be_fixated_again_after_the_half_life_of_evidence():
     live, picture = (
         agent_with(Semantic(3)).live("green", rate=math.log(2) / 4.5, start=0),
         torch.full((3, 120, 160), 0.4),
@@ -192,7 +192,7 @@ def test_cells_are_free_again_when_half_is_forgotten():
     assert len(set(cells)) < 40
 
 
-def test_where_every_cell_was_fixated_the_gaze_goes_to_the_oldest():
+def test_after_all_cells_the_gaze_returns_to_the_oldest_fixation():
     agent = agent_with(Semantic(3))
     agent.columns, agent.rows = 3, 2
     live = agent.live("green", rate=0)
@@ -201,7 +201,7 @@ def test_where_every_cell_was_fixated_the_gaze_goes_to_the_oldest():
     assert cells == cells[:6] * 3
 
 
-def test_ages():
+def test_cells_count_as_visited_up_to_an_age():
     age = torch.tensor([[0.0, 3, 4, torch.inf], [0, 1, 2, 3]])
     assert Forgetting(math.log(2) / 3.5).visited(age).tolist() == [
         [True, True, False, False],
@@ -213,12 +213,12 @@ def test_ages():
 
 
 class Deciding(Semantic):
-    """An observer by which a search may decide."""
+    """An observer with thresholds, so that a search can decide."""
 
     thresholds = Thresholds(0.6, 0.01)
 
 
-def test_decisions_of_the_moment():
+def test_each_frame_has_a_decision():
     live = agent_with(Deciding(3)).live("green", rate=0.2, start=9)
     outcomes = [live.step(scene(8)).decision for _ in range(8)]
     assert outcomes[-1].outcome == "found"
@@ -232,7 +232,7 @@ def test_decisions_of_the_moment():
     assert agent_with(Deciding(3)).live("green", confirm=1.0).thresholds == Thresholds(1.0, 0.01)
 
 
-def test_frames_of_any_kind_and_of_one_size():
+def test_frames_may_have_any_type_but_must_have_the_same_size():
     live = agent_with(Semantic(3)).live("green")
     live.step((scene(8).permute(1, 2, 0).numpy() * 255).astype(np.uint8))
     with pytest.raises(InputError, match=r"frame: expected 160 × 120 pixels, the size of the first frame, got 80 × 60"):
@@ -244,12 +244,12 @@ def test_frames_of_any_kind_and_of_one_size():
             agent_with(Semantic(3)).live(**wrong)
 
 
-class Stubborn(Semantic):
-    """An observer that was written for scenes that stand still."""
+class NotFading(Semantic):
+    """An observer that does not implement fading."""
 
     fade = Semantic.__mro__[1].fade
 
 
-def test_observers_that_cannot_forget_say_so():
-    with pytest.raises(InputError, match="observer: expected one whose belief can fade, got Stubborn"):
-        agent_with(Stubborn(3)).live("green").step(scene(8))
+def test_observers_without_fading_are_refused():
+    with pytest.raises(InputError, match="observer: expected one whose belief can fade, got NotFading"):
+        agent_with(NotFading(3)).live("green").step(scene(8))

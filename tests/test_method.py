@@ -1,4 +1,4 @@
-"""docs/method.md leads from every equation to code that exists."""
+"""The code that docs/method.md names for each equation exists."""
 
 import importlib
 import re
@@ -17,7 +17,7 @@ def test_the_page_has_equations():
 
 
 @pytest.mark.parametrize("symbol", SYMBOLS)
-def test_symbol_exists(symbol):
+def test_symbol_of_the_page_exists(symbol):
     parts = symbol.split(".")
     for length in range(len(parts), 0, -1):
         try:
@@ -27,4 +27,4 @@ def test_symbol_exists(symbol):
         for name in parts[length:]:
             found = getattr(found, name)
         return
-    pytest.fail(f"{symbol} is not there")
+    pytest.fail(f"{symbol} does not exist")

@@ -1,4 +1,4 @@
-"""The models that the package ships: whole, small, told apart by detector, and fitted as the cards say."""
+"""The models that the package ships: their size, names and metadata, and plausible outputs."""
 
 import json
 from pathlib import Path
@@ -22,16 +22,16 @@ GAZE = sorted(semfov.gaze.LearnedGaze.shipped.glob("*.safetensors"))
 
 
 @pytest.mark.parametrize("path", OBSERVATION, ids=lambda path: path.stem)
-def test_observation_model(path):
+def test_shipped_observation_models(path):
     model = semfov.FovealObservationModel.from_pretrained(path.stem)
     assert path.stat().st_size < 1_100_000
     assert len(model.classes) == 80
     zoom = path.stem.endswith("-zoom")
     assert model.alpha.shape == (81, 4 if zoom else 8, 81)
-    # Those of windows know how many cells hold each class.
+    # Models for windows also have the number of cells that hold each class.
     assert ("cells" in model.metadata) == zoom
     assert bool((model.miss_rate > 0).all() and (model.miss_rate < 1).all())
-    # Objects are missed more often far out than near the fovea, and where the picture is reduced more.
+    # Objects are missed more often at larger distances from the fovea, and if the image is reduced more.
     assert model.miss_rate[1:, -1].mean() > model.miss_rate[1:, 0].mean()
     assert sum(map(sum, model.metadata["counts"])) == model.metadata["samples"]
     card = (Path(path).parent / "README.md").read_text(encoding="utf-8")
@@ -40,18 +40,18 @@ def test_observation_model(path):
     assert "/" not in text.replace("://", "")
 
 
-def check_eye(model, path):
-    """A model's name tells the eye that it was trained for."""
+def check_name(model, path):
+    """The name of a model matches the detector and the sensor that it was trained for."""
     detector = path.stem.removesuffix("-published")
     assert model.metadata["detector"]["name"] == detector
     assert learned_for(detector, model.metadata["sensor"]["growth"]) == path.stem
 
 
 @pytest.mark.parametrize("path", TARGET, ids=lambda path: path.stem)
-def test_target_evidence(path):
+def test_shipped_models_of_target_evidence(path):
     model = semfov.TargetEvidence.from_pretrained(path.stem)
     assert path.stat().st_size < 100_000
-    check_eye(model, path)
+    check_name(model, path)
     assert "/" not in json.dumps(model.metadata)
     grid = semfov.Grid(10, 10, (640, 480))
     box = torch.tensor([[[300.0, 200.0, 360.0, 260.0]]])
@@ -67,13 +67,13 @@ def test_target_evidence(path):
 
 
 @pytest.mark.parametrize("path", MAPS, ids=lambda path: path.stem)
-def test_map_evidence(path):
+def test_shipped_models_of_map_evidence(path):
     model = semfov.MapEvidence.from_pretrained(path.stem)
     assert path.stat().st_size < 100_000
-    check_eye(model, path)
+    check_name(model, path)
     assert "/" not in json.dumps(model.metadata)
     assert f"`{path.stem}`" in (path.parent / "README.md").read_text(encoding="utf-8")
-    # A sure detection at the fovea is named where it is, and a cell far from it is empty.
+    # A confident detection at the fovea determines the class of its cell, and distant cells are background.
     grid, fixation = semfov.Grid(10, 10, (640, 480)), torch.tensor([[330.0, 230.0]])
     scores = torch.full((1, 1, 81), 0.001)
     scores[..., 7] = 0.92
@@ -88,13 +88,13 @@ def test_map_evidence(path):
 
 
 @pytest.mark.parametrize("path", sorted(ContextPrior.shipped.glob("*.safetensors")), ids=lambda path: path.stem)
-def test_context(path):
+def test_shipped_context_priors(path):
     prior = ContextPrior.from_pretrained(path.stem)
     assert path.stat().st_size < 100_000
     assert set(prior.weights) == {"evidence", "map"}
     assert all(weight > 0 for pair in prior.weights.values() for weight in pair)
     index = {name: place for place, name in enumerate(prior.classes, 1)}
-    # Kites fly, and ties are on people.
+    # Kites are high in images, and ties are close to people.
     kite = prior.place[index["kite"]]
     assert kite[:5].mean() > kite[5:].mean()
     tie = prior.cooccurrence[index["tie"], index["person"]]
@@ -104,13 +104,13 @@ def test_context(path):
     assert "/" not in text.replace("://", "")
 
 
-def test_learned_gaze():
+def test_shipped_learned_gaze():
     assert [path.stem for path in GAZE] == ["yolov3-tiny"]
     gaze = semfov.gaze.LearnedGaze.from_pretrained("yolov3-tiny")
     assert GAZE[0].stat().st_size < 20_000
     assert gaze.metadata["detector"]["name"] == "yolov3-tiny"
     assert "/" not in json.dumps(gaze.metadata)
-    # It goes where the target is seen, wherever that is, and not where it has been.
+    # The gaze goes to the cell where the target was detected, not to the visited cell.
     start = gaze.observer(81).start(1, semfov.Grid(10, 10, (640, 480)), torch.empty(0))
     for cell in (0, 37, 99):
         beta, visited = start.beta.clone(), torch.zeros(1, 100, dtype=torch.bool)
@@ -121,7 +121,7 @@ def test_learned_gaze():
             assert gaze(DirichletBelief(beta, closest), visited, 7, 10).argmax() == cell
 
 
-def test_class_templates():
+def test_shipped_class_templates():
     paths = sorted(semfov.gaze.ClassTemplates.shipped.glob("*.safetensors"))
     assert [path.stem for path in paths] == ["yolov3-tiny"]
     model = semfov.gaze.ClassTemplates.from_pretrained("yolov3-tiny")
@@ -130,12 +130,12 @@ def test_class_templates():
     assert "/" not in json.dumps(model.metadata)
     assert sum(model.metadata["counts"]) == 13_988
     assert "13,988 objects" in (paths[0].parent / "README.md").read_text(encoding="utf-8")
-    # What is most like the average object of a class is that itself.
+    # The average object of a class matches the template of its own class best.
     average = (model.templates + model.mean)[:, :, None, None]
     assert torch.equal(model(average)[..., 0, 0].argmax(-1), torch.arange(80))
 
 
-def test_gaze_habits():
+def test_shipped_gaze_habits():
     paths = sorted(semfov.gaze.GazeHabits.shipped.glob("*.safetensors"))
     assert [path.stem for path in paths] == ["osie-vocus2"]
     habits = semfov.gaze.GazeHabits.from_pretrained("osie-vocus2")
@@ -145,7 +145,7 @@ def test_gaze_habits():
     card = (paths[0].parent / "README.md").read_text(encoding="utf-8")
     assert f"{habits.metadata['held_out_bits']:.3f} ± " in card
     assert f"{habits.metadata['fitted_choices']:,} fixations" in card
-    # People go by what they see, to the centre, by short steps, and sooner back to what they left longer ago.
+    # People prefer salient places, the centre and short gaze shifts, and return rather to older fixations.
     place = habits.place.view(10, 10)
     assert float(habits.pull) > 0
     assert place[4:6, 4:6].mean() > place[[0, 9]].mean()
@@ -154,13 +154,13 @@ def test_gaze_habits():
 
 
 @pytest.mark.parametrize("path", ZOOM, ids=lambda path: path.stem)
-def test_glimpse_evidence(path):
+def test_shipped_models_of_glimpse_evidence(path):
     model = GlimpseEvidence.from_pretrained(path.stem)
     assert path.stat().st_size < 100_000
     assert model.metadata["detector"]["name"] == path.stem
     assert "/" not in json.dumps(model.metadata)
     assert f"`{path.stem}`" in (path.parent / "README.md").read_text(encoding="utf-8")
-    # The stronger the hint of a class, the more probable is it that a closer look shows it.
+    # The higher the score of a class, the more probable it is that a closer look shows the class.
     scores = torch.zeros(5, model.classes)
     scores[:, 6] = torch.tensor([0.0, 0.01, 0.05, 0.2, 0.7])
     summary = torch.stack([scores.sum(1), torch.full((5,), 0.01), (scores > 0.02).sum(1).float()], 1)
@@ -168,7 +168,7 @@ def test_glimpse_evidence(path):
         odds = model.presence(scores, summary, torch.ones(5), target=7)
         taper = model.taper(16)
     assert bool((odds.diff() > 0).all())
-    # The stronger a class was seen, and the more often, the more probable is it that the picture holds it.
+    # The higher and the more frequent the scores of a class, the more probable is its presence in the image.
     assert model.thresholds is not None
     case = torch.zeros(3, 11)
     best = torch.tensor([0.02, 0.3, 0.9])
@@ -176,12 +176,12 @@ def test_glimpse_evidence(path):
     case[:, 9] = torch.tensor([0.0, 0.35, 0.7])
     with torch.no_grad():
         assert bool((model.anywhere(best, case).diff() > 0).all())
-    # What lies in the middle of a window is found, what lies at its border may be cut.
+    # Objects in the middle of a window are detected; objects at its border may be cut.
     assert taper[8] > taper[0]
     torch.testing.assert_close(taper, taper.flip(0))
 
 
-def test_both_kinds_exist_for_every_detector():
+def test_every_detector_has_all_kinds_of_models():
     names = {"yolov3-tiny", "yolox-nano"}
     learned = {learned_for(name, growth) for name in names for growth in (1.0, 2.0)}
     assert {path.stem for path in TARGET} == {path.stem for path in MAPS} == learned
@@ -201,7 +201,7 @@ def test_recommended_model_is_fitted_for_the_sensor(detector, growth):
 
 @pytest.mark.parametrize("sensor", PUBLISHED_SENSORS)
 @pytest.mark.parametrize("detector", ["yolov3-tiny", "yolox-nano"])
-def test_published_model_is_of_maximum_likelihood_for_the_named_sensor(detector, sensor):
+def test_published_model_is_fitted_by_maximum_likelihood_for_the_named_sensor(detector, sensor):
     model = semfov.FovealObservationModel.from_pretrained(f"{detector}-{sensor}")
     fitted = model.metadata["sensor"]
     assert (fitted["sigma"], fitted["growth"]) == pytest.approx((SENSORS[sensor]["sigma"], SENSORS[sensor]["growth"]))

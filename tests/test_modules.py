@@ -1,4 +1,4 @@
-"""The eye and the agent as parts of others' modules; every public module has its tester."""
+"""The eye and the agent as parts of a user's modules; every public module has a tester."""
 
 import ast
 from inspect import isabstract, isclass
@@ -17,7 +17,7 @@ from tests.small import GRID, Blobs, observing, rand
 
 class TestEye(TensorTester):
     batched = (1,)
-    test_no_rows = None  # a detector wants an image
+    test_no_rows = None  # a detector needs an image
 
     def make(self):
         return Eye(Foveation(9.0), Blobs(), reference=64.0)
@@ -31,16 +31,16 @@ class TestEye(TensorTester):
 
 
 class InOrder(Policy):
-    """A policy whose choices do not depend on what is seen."""
+    """A policy whose choices do not depend on the belief."""
 
     def forward(self, target, grid):
         return Static(rand(len(grid)))
 
 
 class TestActivePerception(TensorTester):
-    """What it believes after it has looked at three given cells."""
+    """The beliefs of an agent after looks at three given cells."""
 
-    test_shapes = test_no_rows = None  # one picture at a time
+    test_shapes = test_no_rows = None  # one image at a time
 
     def make(self):
         strategy = (observing(), InOrder())
@@ -56,7 +56,7 @@ class TestActivePerception(TensorTester):
 
 
 def names_of_testers(source: str) -> set[str]:
-    """Classes that derive from a tester, or from one that does."""
+    """Test classes that derive from a tester, directly or through other classes."""
     classes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef)]
     bases = {node.name: {ast.unparse(base).split(".")[-1] for base in node.bases} for node in classes}
     found = {"BaseTester", "TensorTester", "GraphTester"}
@@ -67,7 +67,7 @@ def names_of_testers(source: str) -> set[str]:
 
 
 def test_every_public_module_has_a_tester():
-    """Also what joins the API reference one day."""
+    """The modules are those of the API reference, so modules that are added to it are included."""
     files = sorted(Path(__file__).parent.rglob("test_modules.py"))
     tested = set().union(*(names_of_testers(file.read_text(encoding="utf-8")) for file in files))
     modules = {
@@ -80,14 +80,14 @@ def test_every_public_module_has_a_tester():
     assert sorted(modules - {name.removeprefix("Test") for name in tested}) == []
 
 
-def test_the_scan_finds_testers_alone():
+def test_the_scan_finds_only_testers():
     source = (
         "class TestA(GraphTester): pass\nclass MyTester(TestA): pass\nclass TestB(MyTester): pass\nclass TestC: pass"
     )
     assert names_of_testers(source) == {"TestA", "TestB"}
 
 
-def test_the_page_on_testing_shows_a_whole_tester():
+def test_the_page_on_testing_shows_a_complete_tester():
     root = Path(__file__).parents[1]
     shown = (root / "docs/testing.md").read_text(encoding="utf-8").partition("```python\n")[2].partition("```")[0]
     assert "class TestLogPolar(GraphTester):" in shown

@@ -1,4 +1,4 @@
-"""The package as a whole: what it exports, what importing it costs, which way imports run."""
+"""The package as a whole: its public names, the cost of importing it, and the direction of imports."""
 
 import ast
 import os
@@ -53,8 +53,8 @@ SURFACE = {
     "saliency",
 }
 
-# A room imports from itself and from the rooms before it.
-ROOMS = [
+# A subpackage imports only from itself and from the subpackages before it.
+SUBPACKAGES = [
     "version",
     "errors",
     "io",
@@ -117,7 +117,7 @@ COMMANDS = [
     ("eval.foveal_training", ["--help"]),
 ]
 
-# Each command in a fork of its own: all have imported the package, and nothing of each other.
+# Each command runs in a separate fork: all start with the package imported, and their imports stay separate.
 EACH = f"""
 import importlib, os, sys
 import semfov
@@ -136,8 +136,8 @@ for number, (command, arguments) in enumerate({COMMANDS}):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_help_and_mistakes_wait_for_nothing_heavy():
-    """Time is not measured here: it is what is imported that takes it."""
+def test_help_and_wrong_arguments_import_no_heavy_packages():
+    """The start takes long because of imports, so the test checks them instead of the time."""
     result = subprocess.run([sys.executable, "-c", EACH], capture_output=True, text=True, check=True, cwd=ROOT)
     ends = [line for line in result.stdout.splitlines() if line.startswith("ends")]
     wanted = [0 if "--help" in arguments else 1 for _, arguments in COMMANDS]
@@ -145,10 +145,10 @@ def test_help_and_mistakes_wait_for_nothing_heavy():
 
 
 def imports(source: str, module: str, *, package: bool = False) -> list[tuple[str, str]]:
-    """Everything that a module imports, anywhere in it: the module that a statement names, and what it takes of it.
+    """All imports of a module, also inside functions: the module that is named, and the full name that is imported.
 
     Raises:
-        ValueError: a name is only known when it runs.
+        ValueError: the name of an import is computed at run time.
     """
     own = module if package else module.rpartition(".")[0]
     found = []
@@ -162,7 +162,7 @@ def imports(source: str, module: str, *, package: bool = False) -> list[tuple[st
             words = {word.arg: word.value for word in node.keywords}
             asked, *more = [*node.args, *(words[name] for name in ("name", "package") if name in words)]
             if not isinstance(asked, ast.Constant):
-                raise ValueError(f"{module}, line {node.lineno}: imports what only it knows, {ast.unparse(node)}")
+                raise ValueError(f"{module}, line {node.lineno}: imports a computed name, {ast.unparse(node)}")
             base = more[0].value if more and isinstance(more[0], ast.Constant) else own
             name = resolve_name(asked.value, base) if asked.value.startswith(".") else asked.value
             found.append((name, name))
@@ -188,9 +188,9 @@ def packages_above(module: str) -> Iterable[str]:
 
 
 def graph_of(modules: dict[str, Path]) -> dict[str, set[str]]:
-    """Which modules each one runs when it is imported: those it names, and the packages that these are in.
+    """The modules that the import of each module runs: the modules that it names, and the packages above them.
 
-    The packages that the module itself is in are running already.
+    Packages above the module itself are left out, as their import has already started.
     """
     graph: dict[str, set[str]] = {}
     for module, file in modules.items():
@@ -238,11 +238,11 @@ APPS = {app: modules_of(ROOT / app) for app in ("train", "eval")}
         ("text = 'import semfov.viz'  # from semfov import viz", []),
     ],
 )
-def test_the_scan_sees_every_form_of_import(source, found):
+def test_the_scan_finds_every_form_of_import(source, found):
     assert imports(source, "semfov.belief.grid") == found
 
 
-def test_the_scan_resolves_within_a_package_and_refuses_what_it_cannot_see():
+def test_the_scan_resolves_relative_imports_and_refuses_computed_names():
     assert imports("from .grid import Grid", "semfov.belief", package=True) == [
         ("semfov.belief.grid", "semfov.belief.grid.Grid")
     ]
@@ -251,16 +251,16 @@ def test_the_scan_resolves_within_a_package_and_refuses_what_it_cannot_see():
             imports(hidden, "semfov.eye")
 
 
-def test_every_room_is_in_the_order():
-    rooms = {name.split(".")[1] for name in MODULES if name != "semfov"}
-    assert sorted(ROOMS) == sorted(rooms)
+def test_every_subpackage_is_in_the_import_order():
+    found = {name.split(".")[1] for name in MODULES if name != "semfov"}
+    assert sorted(SUBPACKAGES) == sorted(found)
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_imports_run_one_way(room):
-    files = {name: file for name, file in MODULES.items() if name.split(".")[1:2] == [room]}
+@pytest.mark.parametrize("subpackage", SUBPACKAGES)
+def test_imports_go_in_one_direction(subpackage):
+    files = {name: file for name, file in MODULES.items() if name.split(".")[1:2] == [subpackage]}
     assert files
-    allowed = ROOMS[: ROOMS.index(room) + 1]
+    allowed = SUBPACKAGES[: SUBPACKAGES.index(subpackage) + 1]
     for module, file in files.items():
         for asked, taken in imports_of(module, file):
             first, *more = taken.split(".")
@@ -270,16 +270,16 @@ def test_imports_run_one_way(room):
                 assert more[0] in allowed, f"{module} imports {taken}"
 
 
-def test_the_package_itself_imports_rooms_alone():
-    """It may hand on what is theirs, and nothing is defined for all in its `__init__`."""
+def test_the_top_level_package_imports_only_from_subpackages():
+    """Its `__init__` only re-exports names of the subpackages."""
     for asked, taken in imports_of("semfov", MODULES["semfov"]):
         assert taken.split(".")[0] not in OUTSIDE
         if taken.startswith("semfov"):
-            assert asked.split(".")[1] in ROOMS
+            assert asked.split(".")[1] in SUBPACKAGES
 
 
 @pytest.mark.parametrize("modules", [MODULES, MODULES | APPS["train"] | APPS["eval"]], ids=["package", "with apps"])
-def test_no_module_imports_itself_by_way_of_others(modules):
+def test_imports_have_no_cycles(modules):
     graph = graph_of(modules)
     assert sum(map(len, graph.values())) > 500
     try:
@@ -288,8 +288,8 @@ def test_no_module_imports_itself_by_way_of_others(modules):
         pytest.fail(" imports ".join(reversed(error.args[1])))
 
 
-def test_circles_are_found(tmp_path):
-    """By way of a package too, whose `__init__` runs when a part of it is imported."""
+def test_import_cycles_are_detected(tmp_path):
+    """Also cycles through a package, whose `__init__` runs when a module in it is imported."""
     folder = tmp_path / "toy"
     sources = {
         "__init__.py": "", "one.py": "def f():\n    from toy.rooms.two import g",
@@ -310,7 +310,7 @@ def test_circles_are_found(tmp_path):
 
 
 @pytest.mark.parametrize(("app", "other"), [("train", "eval"), ("eval", "train")])
-def test_training_and_evaluation_know_nothing_of_each_other(app, other):
+def test_training_and_evaluation_do_not_import_each_other(app, other):
     assert APPS[app]
     for module, file in APPS[app].items():
         for _, taken in imports_of(module, file):

@@ -1,8 +1,8 @@
-"""What the README says works: commands and code run as printed, links lead somewhere, pictures are small.
+"""The README is correct: commands and code run as printed, the targets of links exist, images are small.
 
-Commands run in a folder of their own that holds what they name: PHOTO.jpg, and a data set of one picture in COCO's
-format. The demonstration runs in a process of its own; the others run in this one, which has imported what they need.
-Only `make` is asked what it would do: it sets up an environment and takes minutes.
+Commands run in a temporary folder with the files that they name: PHOTO.jpg, and a data set of one image in COCO
+format. The demonstration runs in a new process; the other commands run in this one, where their imports are loaded.
+`make` runs only as `--dry-run`, because it sets up an environment, which takes minutes.
 """
 
 import importlib
@@ -42,19 +42,19 @@ def test_links_lead_somewhere():
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
-def test_pictures_are_small():
+def test_images_are_small():
     for link in re.findall(r"!\[[^]]+\]\(([^)]+)\)", README):
         assert (ROOT / link).stat().st_size < 300_000
         with Image.open(ROOT / link) as picture:
             assert max(picture.size) <= 1000
 
 
-def test_every_command_is_run_or_asked_below():
+def test_every_command_is_covered_by_a_test():
     assert set(PYTHON) | set(OWN) | set(MAKE) | set(PIP) == set(LINES)
     assert len(PYTHON) >= 3
 
 
-def test_what_pip_installs_is_this_or_needed_by_it():
+def test_pip_installs_only_this_package_and_its_dependencies():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     needed = {re.split(r"[<>=\[ ]", each)[0] for each in project["dependencies"]} | {project["name"]}
     for line in PIP:
@@ -63,8 +63,8 @@ def test_what_pip_installs_is_this_or_needed_by_it():
 
 
 @pytest.mark.slow
-def test_a_detector_of_ones_own_in_three_commands(tmp_path, run):
-    """As printed, but for the size of the fit, and for a detector that knows colours in place of cups."""
+def test_the_three_commands_for_a_custom_detector_run(tmp_path, run):
+    """As printed, except for a smaller fit and a detector of colours instead of cups."""
     assert [COMMANDS[line][2] for line in OWN] == ["train.fit_detector", "eval.demo", "eval.search"]
     assert all(line in (ROOT / "docs/detectors.md").read_text() for line in OWN)
     spec = importlib.util.spec_from_file_location("colours", ROOT / "tests/training/test_fit_detector.py")
@@ -76,20 +76,20 @@ def test_a_detector_of_ones_own_in_three_commands(tmp_path, run):
         colours.write_photographs(tmp_path / name).rename(tmp_path / instances)
     Image.open(tmp_path / "OTHERS/3.png").convert("RGB").save(tmp_path / "PHOTO.jpg")
     fit, demo, search = ([word.replace("cup", "red") for word in COMMANDS[line]] for line in OWN)
-    assert written(run([*fit, *colours.SMALL], tmp_path, tmp_path / "cache"), tmp_path)
+    assert written_files(run([*fit, *colours.SMALL], tmp_path, tmp_path / "cache"), tmp_path)
     assert "“red”" in run(demo, tmp_path, tmp_path / "cache")
     few = ["--data.min_instances", "0", "--data.limit", "1"]
-    assert written(run([*search, *few], tmp_path, tmp_path / "cache"), tmp_path)
+    assert written_files(run([*search, *few], tmp_path, tmp_path / "cache"), tmp_path)
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 @pytest.mark.parametrize("line", MAKE)
-def test_make_knows_what_to_do(line):
+def test_make_has_the_target(line):
     dry = subprocess.run([*COMMANDS[line], "--dry-run"], cwd=ROOT, capture_output=True, text=True, check=True)
     assert {"search": "-m eval.search", "test": "-m pytest"}[COMMANDS[line][1]] in dry.stdout
 
 
-def test_programs_named_in_the_text_are_there():
+def test_programs_named_in_the_text_exist():
     named = set(re.findall(r"python -m ([\w.]+)", README))
     assert len(named) > 5
     assert [name for name in named if importlib.util.find_spec(name) is None] == []
@@ -97,7 +97,7 @@ def test_programs_named_in_the_text_are_there():
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """A cache that has the default detector's weights and nothing else."""
+    """A cache with only the weights of the default detector."""
     try:
         kept = fetch("yolov3-tiny")
     except semfov.DataError as error:
@@ -115,7 +115,7 @@ def save(image, path):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Where a reader may be: photographs, and one of them as a data set in COCO's format, where the text has it."""
+    """A reader's folder: photographs, and one of them as a COCO data set at the path that the README uses."""
     scenes = semfov.EmbeddedScenes(["cup"], count=1)
     for name in ("PHOTO.jpg", "kitchen.jpg", "photographs/PHOTO.jpg"):
         save(scenes[0].image, tmp_path / name)
@@ -124,7 +124,7 @@ def folder(tmp_path):
     save(scene.image, tmp_path / "coco/val2017" / name)
     height, width = scene.image.shape[-2:]
     images = [{"id": 0, "file_name": name, "width": width, "height": height}]
-    # As many boxes as the published selection asks for.
+    # The published selection needs this number of boxes.
     boxes = scene.boxes.tolist() + [[20.0 * n, 0.0, 20.0 * n + 15, 15.0] for n in range(8)]
     annotations = [
         {"id": n, "image_id": 0, "category_id": 47, "bbox": [x, y, right - x, bottom - y]}
@@ -147,7 +147,7 @@ def film(folder):
 
 @pytest.fixture
 def run(monkeypatch, capsys, one_thread):
-    """Runs a command where a reader would, and returns what it prints."""
+    """Runs a command in a reader's folder and returns its output."""
 
     def call(words, folder, cache):
         monkeypatch.chdir(folder)
@@ -163,8 +163,8 @@ def run(monkeypatch, capsys, one_thread):
     return call
 
 
-def run_apart(words, folder, cache):
-    """The same in a process of its own, with `.venv/bin` on the path."""
+def run_in_new_process(words, folder, cache):
+    """Like `run`, in a new process where warnings are errors."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "SEMFOV_CACHE": str(cache), "PYTHONWARNINGS": "error"}
     call = [sys.executable, *words[1:]]
     done = subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, check=False)
@@ -172,8 +172,8 @@ def run_apart(words, folder, cache):
     return done.stdout
 
 
-def written(printed, folder):
-    """The files that a command says it wrote."""
+def written_files(printed, folder):
+    """The files that a command lists as written, after checking that they exist."""
     names = [line.strip() for line in printed.partition("written:\n")[2].partition("\n\n")[0].splitlines()]
     assert names
     assert [name for name in names if not (folder / name).is_file()] == []
@@ -185,14 +185,14 @@ def written(printed, folder):
 @pytest.mark.parametrize("line", PYTHON, ids=lambda line: COMMANDS[line][2])
 def test_command_runs_as_printed(line, folder, weights, run):
     words = COMMANDS[line]
-    names = written((run_apart if line == DEMO else run)(words, folder, weights), folder)
+    names = written_files((run_in_new_process if line == DEMO else run)(words, folder, weights), folder)
     for option in ("--report", "--out"):
         if option in words:
             asked = words[words.index(option) + 1]
             assert [name for name in names if name.startswith(asked)]
 
 
-# What the comment behind the demonstration's command says it takes, too.
+# Further options that the comment after the demonstration's command names.
 ALSO = {
     "folder": lambda words: [word.replace("PHOTO.jpg", "photographs") for word in words],
     "explore": lambda words: [*words[: words.index("--target")], "--explore", *words[words.index("--target") + 2 :]],
@@ -202,25 +202,25 @@ ALSO = {
 @pytest.mark.weights
 @pytest.mark.slow
 @pytest.mark.parametrize("other", ALSO)
-def test_demonstration_also_takes(other, folder, weights, run):
+def test_demonstration_runs_with_the_options_of_its_comment(other, folder, weights, run):
     for word in ("folder", "--explore"):
         assert word in DEMO.partition("#")[2]
     words = ALSO[other](COMMANDS[DEMO])
     printed = run([*words, "--shifts", "2"], folder, weights)
-    assert "cup.html" in written(printed, folder)
+    assert "cup.html" in written_files(printed, folder)
     assert ("explored with 2 gaze shifts" in printed) == (other == "explore")
 
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_help_of_the_fit_that_is_named(folder, weights, run):
+def test_help_command_runs(folder, weights, run):
     (line,) = re.findall(r"`(python -m [\w.]+ --help)`", README)
     assert "usage" in run(shlex.split(line), folder, weights)
 
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_code_runs(folder, weights, monkeypatch):
+def test_code_runs_as_printed(folder, weights, monkeypatch):
     (code,) = re.findall(r"```python\n(.*?)```", README, re.S)
     assert len([line for line in code.splitlines() if line]) <= 12
     monkeypatch.chdir(folder)

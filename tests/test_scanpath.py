@@ -1,4 +1,4 @@
-"""Scanpaths in words, as tables and as files, and the views that they keep."""
+"""Scanpaths as text, tables and files, and the views that they keep."""
 
 import builtins
 import dataclasses
@@ -24,7 +24,7 @@ from semfov.sensor.foveation import foveate
 
 
 class Bright(Detector):
-    """Sees one object where the picture is brightest, of a class that depends on its colour."""
+    """Detects one object at the brightest place of the image, of a class that depends on its colour."""
 
     def __init__(self, size=(96, 96), stride=None) -> None:
         super().__init__("bright", ("red", "green"), size)
@@ -62,7 +62,7 @@ def scanpath(request, agent, image):
 
 
 def same(a, b):
-    """Whether two values are equal to the bit, whatever they are made of."""
+    """Whether two values of any type, also nested ones, are equal to the bit."""
     if isinstance(a, torch.Tensor):
         return a.dtype == b.dtype and a.shape == b.shape and torch.equal(a.nan_to_num(7.0), b.nan_to_num(7.0))
     if dataclasses.is_dataclass(a):
@@ -73,8 +73,8 @@ def same(a, b):
     return type(a) is type(b) and a == b
 
 
-def test_agents_keep_what_they_looked_at(agent, image, scanpath):
-    """The views are what the eye gave the detector, up to the rounding of bytes."""
+def test_scanpaths_of_agents_keep_the_views(agent, image, scanpath):
+    """The views equal the input of the detector, up to rounding to bytes."""
     view = agent.eye.open(image[None])
     with torch.inference_mode():
         shown = agent.eye.foveated(view, scanpath.fixations)
@@ -91,7 +91,7 @@ def test_agents_keep_what_they_looked_at(agent, image, scanpath):
 
 
 @pytest.mark.parametrize("growth", [1.0, 2.0])
-def test_views_of_a_stretched_canvas_are_foveated_as_the_eye_does(growth):
+def test_views_of_a_stretched_canvas_equal_those_of_the_eye(growth):
     class Wide(Bright):
         def fit(self, images):
             canvas = torch.nn.functional.interpolate(images, (64, 128), mode="bilinear")
@@ -111,7 +111,7 @@ def test_large_photographs_are_reduced():
     assert kept.placement.size == (2 * LONGEST, 700)
 
 
-def test_a_scanpath_without_a_photograph_says_so(scanpath):
+def test_a_scanpath_without_a_photograph_has_no_views_or_pictures(scanpath):
     bare = replace(scanpath, stimulus=None)
     assert bare.image is None
     for call in (bare.views, bare.plot, bare.animate):
@@ -119,7 +119,7 @@ def test_a_scanpath_without_a_photograph_says_so(scanpath):
             call()
 
 
-def test_repr_is_three_lines(scanpath):
+def test_repr_has_three_lines(scanpath):
     first, second, third = repr(scanpath).splitlines()
     assert first.startswith("Scanpath: ")
     assert f"{scanpath.shifts} gaze shifts" in first
@@ -132,7 +132,7 @@ def test_repr_is_three_lines(scanpath):
     assert max(map(len, repr(scanpath).splitlines())) < 200
 
 
-def test_rows_are_what_happened(scanpath):
+def test_rows_match_the_scanpath(scanpath):
     rows = scanpath.rows()
     json.dumps(rows, allow_nan=False)
     assert [row["fixation"] for row in rows] == list(range(len(scanpath)))
@@ -166,7 +166,7 @@ def test_to_frame(scanpath):
 
 
 @pytest.mark.parametrize("target", [None, 1])
-def test_nothing_seen_and_nothing_timed(scanpath, target):
+def test_rows_without_detections_and_times(scanpath, target):
     nothing = replace(
         scanpath, detections=(Detections.empty(1, 2),) * len(scanpath), seconds=(), posterior=None, target=target
     )
@@ -176,7 +176,7 @@ def test_nothing_seen_and_nothing_timed(scanpath, target):
         assert row["probability"] == expected
 
 
-def test_without_pandas(scanpath, monkeypatch):
+def test_to_frame_without_pandas_names_the_remedy(scanpath, monkeypatch):
     importing = builtins.__import__
 
     def without(name, *arguments, **options):
@@ -189,7 +189,7 @@ def test_without_pandas(scanpath, monkeypatch):
         scanpath.to_frame()
 
 
-def test_files_hold_everything(scanpath, tmp_path):
+def test_files_keep_every_field(scanpath, tmp_path):
     path = tmp_path / "a.safetensors"
     scanpath.save(path)
     loaded = Scanpath.load(path)
@@ -222,7 +222,7 @@ VARIANTS = ["bare", "nothing seen", "not finite", "padded", "double", "found", "
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_files_hold_scanpaths_of_every_kind(name, scanpath, tmp_path):
+def test_files_keep_scanpaths_of_every_kind(name, scanpath, tmp_path):
     changed = variants(scanpath)[name]
     changed.save(tmp_path / "a.safetensors")
     loaded = Scanpath.load(tmp_path / "a.safetensors")
@@ -231,7 +231,7 @@ def test_files_hold_scanpaths_of_every_kind(name, scanpath, tmp_path):
 
 
 def spoil(tensors, record):
-    """Files that say what cannot be, by what an error must name."""
+    """Contents of inconsistent files, with the name that the error must contain."""
 
     def changed(name, value):
         return {**tensors, name: value}, record
@@ -273,12 +273,12 @@ def spoil(tensors, record):
         yield name.split(".")[0], (tensors, {key: value for key, value in record.items() if key != name})
 
 
-def test_files_that_cannot_be_are_refused_by_name(scanpath, tmp_path):
+def test_inconsistent_files_are_refused_with_the_name_of_the_field(scanpath, tmp_path):
     scanpath.save(tmp_path / "a.safetensors")
     tensors, record = read(tmp_path / "a.safetensors", KIND)
     record.pop("kind")
     for number, (named, (parts, told)) in enumerate(spoil(tensors, record)):
-        # What may be null may be missing, too.
+        # Fields that may be null may also be missing.
         if named in ("decision", "ending", "target", "placement", "settings") and len(told) < len(record):
             continue
         path = tmp_path / f"{number}.safetensors"
@@ -309,7 +309,7 @@ def test_other_files_are_refused(scanpath, tmp_path):
         Scanpath.load(path)
 
 
-def test_a_file_that_cannot_be_written_leaves_what_was_there(scanpath, tmp_path, monkeypatch):
+def test_a_failed_write_keeps_the_old_file(scanpath, tmp_path, monkeypatch):
     path = tmp_path / "a.safetensors"
     scanpath.save(path)
     before = path.read_bytes()
@@ -320,8 +320,8 @@ def test_a_file_that_cannot_be_written_leaves_what_was_there(scanpath, tmp_path,
     assert [file.name for file in tmp_path.iterdir()] == ["a.safetensors"]
 
 
-def test_nothing_but_tensors_and_json(scanpath, tmp_path):
-    """The file is what any reader of safetensors reads."""
+def test_files_can_be_read_by_safetensors(scanpath, tmp_path):
+    """Another reader of safetensors reads the same tensors."""
     scanpath.save(tmp_path / "a.safetensors")
     shutil.copy(tmp_path / "a.safetensors", tmp_path / "b.safetensors")
     tensors = load_file(tmp_path / "b.safetensors")
@@ -329,7 +329,7 @@ def test_nothing_but_tensors_and_json(scanpath, tmp_path):
     assert len(tensors["mask"]) == sum(look.mask.shape[-1] for look in scanpath.detections)
 
 
-def test_pictures_of_a_loaded_scanpath(scanpath, tmp_path):
+def test_a_loaded_scanpath_can_be_drawn(scanpath, tmp_path):
     scanpath.save(tmp_path / "a.safetensors")
     loaded = Scanpath.load(tmp_path / "a.safetensors")
     figure = loaded.plot()
@@ -342,11 +342,11 @@ def test_pictures_of_a_loaded_scanpath(scanpath, tmp_path):
     assert path.stat().st_size > 1000
 
 
-def test_views_by_an_independent_way(scanpath):
-    """The canvas and the sensor, put together by hand."""
+def test_views_equal_foveation_of_the_kept_canvas(scanpath):
+    """Foveation of the kept canvas by a direct call."""
     kept = scanpath.stimulus
     gaze = kept.placement.points_to_canvas(scanpath.fixations[:1])
-    # With growth 2 the fovea of a canvas of another size is as wide in pixels.
+    # With growth 2 the width of the fovea in pixels does not depend on the size of the canvas.
     sigma = kept.settings["sensor"]["sigma"]
     whole = foveate(kept.canvas[None].float() / 255, gaze[0], sigma=sigma, levels=5, growth=2.0)[0]
     left, top = kept.placement.offset

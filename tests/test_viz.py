@@ -1,4 +1,4 @@
-"""Figures hold what they should: curves, fixations, one scale for an episode."""
+"""Figures show the correct data: curves, fixations, beliefs, and one scale for an episode."""
 
 import warnings
 from dataclasses import replace
@@ -62,14 +62,14 @@ def image():
 
 
 def draw(figure):
-    """Render it; a figure that cannot be laid out warns."""
+    """Render the figure; a warning, such as one of a failed layout, is an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         figure.draw_without_rendering()
     return figure
 
 
-def test_curves_and_bands():
+def test_plot_shows_curves_and_error_bands():
     curves = {"random": np.linspace(0, 0.8, 31), "predictive": np.linspace(0, 0.9, 31)}
     figure = draw(plot_cumulative_performance(curves, {"random": np.full(31, 0.02)}))
     axes = figure.axes[0]
@@ -78,7 +78,7 @@ def test_curves_and_bands():
     assert len(axes.collections) == 1
 
 
-def test_of_many_curves_the_legend_names_the_highest_and_random_gaze():
+def test_the_legend_of_many_curves_names_the_highest_ones_and_random_gaze():
     curves = {"random": np.zeros(21)} | {f"policy {number}": np.linspace(0, number / 20, 21) for number in range(16)}
     (axes,) = draw(plot_success_rate(curves, title="exploration")).axes
     named = [text.get_text() for text in axes.get_legend().get_texts()]
@@ -120,7 +120,7 @@ def test_belief_is_the_posterior(scanpath):
 
 
 def test_belief_is_laid_over_a_grey_photograph(scanpath, image):
-    """Where it is 0 the photograph is as it is, and where it is greater it hides more."""
+    """The photograph is unchanged where the belief is 0, and hidden more where the belief is higher."""
     certain = replace(scanpath, posterior=torch.linspace(0, 1, 12).expand(3, 12))
     figure = draw(plot_belief(certain, image=image))
     photograph, overlay = figure.axes[0].images
@@ -133,13 +133,13 @@ def test_belief_is_laid_over_a_grey_photograph(scanpath, image):
     assert opacity[0] == 0
     assert (np.diff(opacity) > 0).all()
     assert opacity[-1] == pytest.approx(0.85)
-    # The colour bar has the same colours.
+    # The colour bar has the same colours as the overlay.
     (scale,) = figure.axes[1:]
     assert scale.collections[-1].get_cmap() is overlay.get_cmap()
     assert overlay.get_alpha() is None
 
 
-def test_pictures_take_the_photograph_that_the_scanpath_kept(scanpath, image):
+def test_figures_use_the_photograph_that_the_scanpath_kept(scanpath, image):
     from semfov.detection import Placement
     from semfov.scanpath import Stimulus
     from semfov.scanpath.stimulus import in_bytes
@@ -158,23 +158,23 @@ def test_pictures_take_the_photograph_that_the_scanpath_kept(scanpath, image):
         plot_foveated_strip(scanpath)
 
 
-def test_the_legend_tells_whose_boxes_they_are(scanpath, image):
+def test_the_legend_names_the_source_of_each_kind_of_box(scanpath, image):
     decision = Decision("found", 0.9, 11, torch.tensor([50.0, 40, 70, 55]))
     sought = replace(scanpath, decision=decision, ending="decision")
     (axes,) = draw(plot_scanpath(sought, image, boxes=torch.tensor([[60.0, 45, 79, 59]]))).axes
-    told = {
+    entries = {
         text.get_text(): line
         for text, line in zip(axes.get_legend().get_texts(), axes.get_legend().get_lines(), strict=True)
     }
-    assert list(told) == ["annotated: cup", "where the cup was found", "last look: cup", "last look: other objects"]
+    assert list(entries) == ["annotated: cup", "where the cup was found", "last look: cup", "last look: other objects"]
     for box in axes.patches:
-        near = [line for line in told.values() if to_rgba(line.get_color()) == box.get_edgecolor()]
+        near = [line for line in entries.values() if to_rgba(line.get_color()) == box.get_edgecolor()]
         assert [line.get_linestyle() for line in near] == [box.get_linestyle()]
     (bare,) = draw(plot_scanpath(scanpath, image, detections=False)).axes
     assert bare.get_legend() is None
 
 
-def test_belief_refuses_what_is_not_there(scanpath):
+def test_belief_refuses_unknown_fixations_and_targets(scanpath):
     for arguments, named in [((3,), "fixation"), ((-4,), "fixation")]:
         with pytest.raises(InputError, match=named):
             plot_belief(scanpath, *arguments)
@@ -182,7 +182,7 @@ def test_belief_refuses_what_is_not_there(scanpath):
         plot_belief(scanpath, target=3)
 
 
-def test_belief_of_the_search_comes_before_that_of_the_map(scanpath):
+def test_belief_shows_the_posterior_of_the_search_rather_than_the_map(scanpath):
     searched = replace(scanpath, posterior=torch.rand(3, 12))
     shown = np.asarray(draw(plot_belief(searched)).axes[0].images[0].get_array())
     np.testing.assert_allclose(shown, searched.posterior[-1].reshape(3, 4))
@@ -240,7 +240,7 @@ def test_labels_do_not_overlap(scanpath, image):
         assert not any(a.overlaps(b) for n, a in enumerate(extents) for b in extents[n + 1 :])
 
 
-def test_fixation_is_scanpath_view_and_belief(scanpath, image):
+def test_plot_of_a_fixation_shows_scanpath_view_and_belief(scanpath, image):
     path, seen, believed, _ = draw(plot_fixation(scanpath, 1, image, image * 0.5)).axes
     assert [text.get_text() for text in path.texts if text.get_visible()] == ["0", "1"]
     np.testing.assert_allclose(np.asarray(seen.images[0].get_array()), (image * 0.5).permute(1, 2, 0))
@@ -251,7 +251,7 @@ def test_fixation_is_scanpath_view_and_belief(scanpath, image):
     assert explored.axes[2].get_title() == "semantic map after fixation 1"
 
 
-def test_semantic_map_names_what_is_more_probable_than_background():
+def test_semantic_map_names_classes_that_are_more_probable_than_background():
     beliefs = torch.tensor([[[1.0, 50, 1], [1, 50, 1], [50, 9, 9], [1, 1, 1], [1, 1, 50], [50, 9, 9]]])
     p = beliefs[0] / beliefs[0].sum(-1, keepdim=True)
     grid = Grid(3, 2, (30, 20))
@@ -284,7 +284,7 @@ def test_saliency_frames_the_most_salient_cell(image):
     assert len(draw(plot_saliency(saliency, image)).axes) == 3  # photograph, map, its scale
 
 
-def test_figures_look_the_same_whatever_the_settings():
+def test_figures_do_not_depend_on_matplotlib_settings():
     import matplotlib as mpl
 
     curves = {"random": np.linspace(0, 1, 5)}
@@ -295,7 +295,7 @@ def test_figures_look_the_same_whatever_the_settings():
 
 
 def test_colours_differ_in_lightness_or_hue_for_dichromats():
-    """The least distance in CIELAB as people without red or green cones see it (Viénot et al. 1999)."""
+    """The smallest distance in CIELAB, with simulated red and green dichromacy (Viénot et al. 1999)."""
     from itertools import combinations
 
     from skimage.color import rgb2lab
@@ -311,7 +311,7 @@ def test_colours_differ_in_lightness_or_hue_for_dichromats():
         assert min(np.linalg.norm(a - b) for a, b in combinations(lab, 2)) > 15
 
 
-def test_episode_has_one_scale_and_at_most_so_many_panels(scanpath, image):
+def test_episode_has_one_scale_and_a_limited_number_of_panels(scanpath, image):
     figure = draw(plot_episode(scanpath, image, [image] * 3, most=2))
     assert len(figure.axes) == 1 + 2 * 2 + 1  # the last is the scale
     maps = [axes.images[-1] for axes in figure.axes if axes.get_title().startswith("p(cup)")]
@@ -349,7 +349,7 @@ def test_reliability_of_cells_lies_on_the_diagonal_in_log_odds():
     assert [line.get_color() for line in last.lines] == [line.get_color() for line in first.lines[1:]]
 
 
-def test_scanpath_without_target_needs_one(scanpath):
+def test_belief_of_a_scanpath_without_target_needs_a_target(scanpath):
     fields = {name: getattr(scanpath, name) for name in scanpath.__dataclass_fields__}
     with pytest.raises(InputError, match="target"):
         plot_belief(Scanpath(**{**fields, "target": None}))

@@ -1,4 +1,4 @@
-"""A small Darknet network with every kind of layer, and weights files for it."""
+"""Fixtures: a small Darknet network with every kind of layer, weights files for it, and ONNX models."""
 
 import struct
 from collections.abc import Callable, Iterator
@@ -106,7 +106,7 @@ anchors=4,6, 8,10, 20,12
 classes=2
 """
 
-# Filters, inputs per group, kernel side, batch norm: of each convolution of SMALL_CFG, in order.
+# Filters, inputs per group, kernel side and batch norm of each convolution of SMALL_CFG, in order.
 SMALL_CONVOLUTIONS = [(8, 3, 3, 1), (12, 8, 3, 1), (12, 4, 3, 1), (14, 18, 1, 0), (6, 36, 1, 1), (7, 14, 3, 0)]
 
 
@@ -141,7 +141,7 @@ def write_weights(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def threads() -> Iterator[Callable[[], Iterator[int]]]:
-    """Runs a loop with one thread and with two, and restores the number at the end."""
+    """Yield 1 and 2 after setting that number of threads, and restore the number at the end."""
     before = torch.get_num_threads()
 
     def numbers() -> Iterator[int]:
@@ -155,12 +155,12 @@ def threads() -> Iterator[Callable[[], Iterator[int]]]:
 
 @pytest.fixture(scope="session")
 def exports(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where networks that run in onnxruntime are exported to: not into the user's cache."""
+    """A folder for exported networks instead of the user's cache."""
     return tmp_path_factory.mktemp("cache")
 
 
 @pytest.fixture(autouse=True)
-def _keep_exports_there(monkeypatch: pytest.MonkeyPatch, exports: Path) -> None:
+def _export_to_temporary_folder(monkeypatch: pytest.MonkeyPatch, exports: Path) -> None:
     monkeypatch.setattr("semfov.detection.onnx_twin.cache_folder", lambda: exports)
 
 

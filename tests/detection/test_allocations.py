@@ -1,4 +1,4 @@
-"""Files of others ask for no more memory than there is any use for; what is no detector is refused by name."""
+"""Untrusted files cannot allocate excessive memory, and files that are not detectors are refused by name."""
 
 import json
 import os
@@ -40,7 +40,7 @@ DEEP = "".join("[convolutional]\nfilters=8000\nsize=3\npad=1\n" for _ in range(3
         NET + "[dropout]\n" * 5000 + HEAD,
     ],
 )
-def test_networks_that_are_too_large_are_refused_before_they_are_made(cfg):
+def test_too_large_networks_are_refused_before_memory_is_allocated(cfg):
     tracemalloc.start()
     try:
         with pytest.raises(DataError) as caught:
@@ -52,7 +52,7 @@ def test_networks_that_are_too_large_are_refused_before_they_are_made(cfg):
         tracemalloc.stop()
 
 
-def test_files_that_are_none_or_too_long(tmp_path):
+def test_pipes_and_too_long_files_are_refused(tmp_path):
     path = tmp_path / "long.cfg"
     path.write_text("#" * 2**21)
     with pytest.raises(DataError, match="at most"):
@@ -84,7 +84,7 @@ def constant(name, values):
     return numpy_helper.from_array(np.asarray(values), name)
 
 
-def test_outputs_of_integers_or_of_no_rank_are_refused_by_name(tmp_path):
+def test_integer_and_scalar_outputs_are_refused_by_name(tmp_path):
     cast = helper.make_node("Cast", ["image"], ["label"], to=TensorProto.INT64)
     with pytest.raises(InputError, match=r"output 'label': expected floating-point numbers, got tensor\(int64\)"):
         load_onnx(save(tmp_path / "integers.onnx", [cast], [("label", TensorProto.INT64, [1, 3, 32, 32])]))
@@ -95,7 +95,7 @@ def test_outputs_of_integers_or_of_no_rank_are_refused_by_name(tmp_path):
 
 
 @pytest.mark.parametrize("side", [100_000, 2**40])
-def test_tensors_that_are_too_large_are_refused_before_they_are_made(tmp_path, side):
+def test_too_large_tensors_are_refused_before_memory_is_allocated(tmp_path, side):
     identity = helper.make_node("Identity", ["image"], ["out"])
     big = [1, 3, side, side]
     with pytest.raises(SemfovError, match="at most"):
@@ -109,7 +109,7 @@ def test_tensors_that_are_too_large_are_refused_before_they_are_made(tmp_path, s
         load_onnx(save(tmp_path / "batch.onnx", [identity], [("out", TensorProto.FLOAT, batch)], inputs=batch))
 
 
-def test_weights_outside_of_the_models_folder_are_refused(tmp_path):
+def test_weights_outside_the_folder_of_the_model_are_refused(tmp_path):
     (tmp_path / "secret").write_bytes(bytes(4))
     folder = tmp_path / "model"
     folder.mkdir()
@@ -137,7 +137,7 @@ def test_weights_outside_of_the_models_folder_are_refused(tmp_path):
         {"noise": "x" * 2**21},
     ],
 )
-def test_metadata_is_bounded(tmp_path, metadata):
+def test_invalid_or_excessive_metadata_is_refused_in_one_line(tmp_path, metadata):
     reshape = helper.make_node("Reshape", ["image", "shape"], ["out"])
     shape = constant("shape", np.array([1, 384, 8]))
     outputs = [("out", TensorProto.FLOAT, [1, 384, 8])]
@@ -148,7 +148,7 @@ def test_metadata_is_bounded(tmp_path, metadata):
     assert len(str(caught.value)) < 1000
 
 
-def test_an_ordinary_model_still_loads(tmp_path):
+def test_an_ordinary_network_is_accepted(tmp_path):
     with torch.random.fork_rng(devices=[]):
         network = Darknet(parse_cfg(NET + HEAD))
     assert [tuple(each.shape) for each in network(torch.zeros(1, 3, 32, 32))] == [(1, 7, 32, 32)]

@@ -1,4 +1,4 @@
-"""Detectors against independent implementations' COCO figures on the development photographs."""
+"""COCO figures of detectors on the development photographs match those of independent implementations."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ pytestmark = [pytest.mark.long, pytest.mark.shared]
 
 
 def measured(detector: Detector, shared: Path) -> list[tuple[float, float]]:
-    """AP and AP50 with per-class and with class-agnostic suppression."""
+    """AP and AP50, first with per-class and then with class-agnostic suppression."""
     coco = shared / "coco"
     annotations = coco / "annotations/instances_eval300.json"
     return average_precision(detector, coco / "eval300", annotations, list(SELECTIONS.values()))

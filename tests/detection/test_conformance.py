@@ -1,4 +1,4 @@
-"""What every detector promises, whatever stands behind it."""
+"""Properties of every detector, whatever its network and runtime."""
 
 import copy
 import json
@@ -40,7 +40,7 @@ def build_exported(static):
 
 
 def build_onnx(*shapes, **options):
-    """A model with one output of each shape; its values do not matter here, but centres have to lie on the canvas."""
+    """A model with one output of each given shape; values are random, but centres lie on the canvas."""
 
     def build(tmp_path, small_cfg, small_weights, make_onnx):
         generator = np.random.default_rng(0)
@@ -92,7 +92,7 @@ def torchvision_detector(kind):
     }[kind]()
     with torch.no_grad():
         for name, parameter in model.named_parameters():
-            if "head" in name and parameter.ndim == 4:  # fresh heads give the same scores everywhere
+            if "head" in name and parameter.ndim == 4:  # untrained heads give the same scores everywhere
                 nn.init.kaiming_normal_(parameter)
     return TorchvisionDetector(model.requires_grad_(False), NAMES)
 
@@ -166,7 +166,7 @@ def detector(adapter, tmp_path, small_cfg, small_weights, make_onnx) -> Detector
 
 
 def photographs(batch, height, width, dtype=torch.float32):
-    """Smooth random pictures."""
+    """Smooth random images."""
     coarse = torch.rand(batch, 3, 5, 7, dtype=dtype, generator=torch.Generator().manual_seed(3))
     return torch.nn.functional.interpolate(coarse, (height, width), mode="bicubic").clamp(0, 1)
 
@@ -196,7 +196,7 @@ def same(one: Detections, other: Detections, tolerance: float) -> None:
     torch.testing.assert_close(one.boxes, other.boxes, rtol=tolerance, atol=100 * tolerance)
 
 
-def test_simplex_and_shapes(detector):
+def test_scores_are_on_the_simplex_and_shapes_are_right(detector):
     images = photographs(3, 60, 83)
     before = images.clone()
     found = detector(images)
@@ -205,7 +205,7 @@ def test_simplex_and_shapes(detector):
     assert torch.equal(images, before)
 
 
-def test_nothing_found(detector):
+def test_images_without_detections_give_empty_tensors(detector):
     detector.selection = Selection(threshold=1.0)
     found = detector(photographs(2, 40, 50))
     assert found.boxes.shape == (2, 0, 4)
@@ -214,7 +214,7 @@ def test_nothing_found(detector):
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
-def test_an_empty_image(detector, value):
+def test_uniform_images_give_valid_detections(detector, value):
     images = torch.full((1, 3, 48, 64), value)
     assert_valid(detector, detector(images), images)
 
@@ -231,19 +231,19 @@ def test_an_empty_image(detector, value):
     ],
     ids=lambda images: f"{images.dtype} {tuple(images.shape)}",
 )
-def test_what_is_no_batch_of_images(detector, images):
+def test_inputs_that_are_not_a_batch_of_images_are_refused(detector, images):
     with pytest.raises(InputError, match=r"images: expected floating-point RGB in \[0, 1\] of shape \(B, 3, H, W\)"):
         detector(images)
 
 
-def test_no_canvas(detector):
+def test_an_empty_batch_of_canvases_is_refused(detector):
     canvas, placement = detector.fit(photographs(1, 40, 50))
     with pytest.raises(InputError, match="canvas: expected at least one image"):
         detector.detect(canvas[:0], placement)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
-def test_other_precisions(detector, dtype):
+def test_images_may_have_other_precisions(detector, dtype):
     images = photographs(1, 45, 64, dtype=torch.float64).to(dtype)
     found = detector(images)
     assert int(found.count) > 0
@@ -253,19 +253,19 @@ def test_other_precisions(detector, dtype):
     torch.testing.assert_close(total, torch.ones_like(total), rtol=0, atol=max(1e-5, 4 * coarse))
 
 
-def test_a_batch_is_a_loop(detector):
+def test_a_batch_equals_a_loop(detector):
     images = photographs(5, 50, 70) * torch.linspace(0.4, 1, 5)[:, None, None, None]
     loop = Detections.stack([detector(image[None]) for image in images])
     same(detector(images), loop, 1e-5)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1), (17, 31), (200, 301), (512, 64)])
-def test_any_image_size(detector, size):
+def test_images_may_have_any_size(detector, size):
     images = photographs(1, *size)
     assert_valid(detector, detector(images), images)
 
 
-def test_fit_propose_and_detect_make_the_whole(detector):
+def test_fit_and_detect_equal_a_call_of_the_detector(detector):
     images = photographs(2, 45, 64)
     canvas, placement = detector.fit(images)
     assert canvas.shape[:2] == (2, 3)
@@ -278,17 +278,17 @@ def test_fit_propose_and_detect_make_the_whole(detector):
     torch.testing.assert_close(free.scores[free.mask].sum(-1), torch.ones(int(free.count.sum())))
 
 
-def test_determinism(detector):
+def test_detections_are_reproducible(detector):
     images = photographs(2, 45, 64)
     same(detector(images), detector(images), 0.0)
 
 
-def test_a_copy_does_the_same(detector):
+def test_a_copy_gives_the_same_detections(detector):
     images = photographs(1, 45, 64)
     same(copy.deepcopy(detector)(images), detector(images), 1e-6)
 
 
-def test_device_moves(detector, device):
+def test_detector_moves_between_devices(detector, device):
     images = photographs(2, 45, 64)
     before = detector(images)
     found = detector.to(device)(images.to(device))
@@ -298,7 +298,7 @@ def test_device_moves(detector, device):
     same(detector.to("cpu")(images), before, 1e-6)
 
 
-def test_gradients_where_promised(adapter, detector):
+def test_differentiable_detectors_pass_gradients_to_the_image(adapter, detector):
     images = photographs(1, 45, 64).requires_grad_()
     found = detector(images)
     if adapter.gradients:
@@ -309,7 +309,7 @@ def test_gradients_where_promised(adapter, detector):
         assert not found.scores.requires_grad
 
 
-def test_settings_are_json_and_tell_detectors_apart(detector):
+def test_settings_are_json_and_differ_between_detectors(detector):
     settings = detector.settings()
     assert json.loads(json.dumps(settings)) == settings
     detector.selection = replace(detector.selection, iou=0.123)
@@ -317,7 +317,7 @@ def test_settings_are_json_and_tell_detectors_apart(detector):
 
 
 @pytest.mark.parametrize("policy", ["residual", "normalised", "uniform", "none"])
-def test_every_background_policy(detector, policy):
+def test_detectors_accept_every_background_policy(detector, policy):
     detector.background = policy
     images = photographs(1, 45, 64)
     found = detector(images)

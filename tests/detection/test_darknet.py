@@ -1,4 +1,4 @@
-"""The torch module against a plain walk through cfg and weights: batch norm unfolded, numbers read one by one."""
+"""The torch module against a plain implementation that reads cfg and weights directly, without folded batch norm."""
 
 import configparser
 import re
@@ -16,8 +16,8 @@ from semfov.detection.darknet_weights import read_weights
 from semfov.errors import DataError, InputError
 
 
-class Walk:
-    """One layer after the other, as the cfg tells, in float64."""
+class PlainDarknet:
+    """Computes the layers of a cfg one after the other, in float64."""
 
     def __init__(self, cfg: str, weights: Path, header: int = 20) -> None:
         number = iter(range(1000))
@@ -58,7 +58,7 @@ class Walk:
                 size, stride = int(options["size"]), int(options["stride"])
                 before = (size - 1) // 2
                 padded = F.pad(x, (before, size - 1 - before) * 2, value=-1e30)
-                # The size must not depend on the padding where the stride is 2.
+                # With stride 2 the size must not depend on the padding.
                 x = F.max_pool2d(padded, size, stride)[..., : -(-x.shape[2] // stride), : -(-x.shape[3] // stride)]
             elif kind == "upsample":
                 x = x.repeat_interleave(2, 2).repeat_interleave(2, 3)
@@ -77,12 +77,12 @@ class Walk:
 
 @pytest.mark.parametrize("version", [(0, 1), (0, 2)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_small_network(small_cfg, write_weights, version, dtype):
+def test_small_network_equals_the_plain_implementation(small_cfg, write_weights, version, dtype):
     weights = write_weights(version)
     network = Darknet(read_cfg(small_cfg)).to(dtype)
     read_weights(network, weights)
     image = torch.rand(3, 3, 32, 64, dtype=torch.float64)
-    expected = Walk(small_cfg.read_text(), weights, 20 if version == (0, 2) else 16)(image)
+    expected = PlainDarknet(small_cfg.read_text(), weights, 20 if version == (0, 2) else 16)(image)
     actual = network(image.to(dtype))
     assert [tuple(m.shape) for m in actual] == [(3, 14, 4, 8), (3, 7, 16, 32)]
     tolerance = {"atol": 1e-4, "rtol": 1e-4} if dtype == torch.float32 else {"atol": 1e-10, "rtol": 1e-10}
@@ -92,13 +92,13 @@ def test_small_network(small_cfg, write_weights, version, dtype):
 
 
 @pytest.mark.weights
-def test_published_yolov3_tiny(tiny_weights):
+def test_published_yolov3_tiny_equals_the_plain_implementation(tiny_weights):
     sections = yolov3_tiny()
     lines = [f"[{s.kind}]\n" + "".join(f"{key}={value}\n" for key, value in s.options.items()) for s in sections]
     network = Darknet(sections).eval().requires_grad_(False)
     read_weights(network, tiny_weights)
     image = torch.rand(1, 3, 96, 64, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    expected = Walk("".join(lines), tiny_weights)(image)
+    expected = PlainDarknet("".join(lines), tiny_weights)(image)
     for a, e in zip(network(image.float()), expected, strict=True):
         torch.testing.assert_close(a.double(), e, atol=2e-4, rtol=0)
 
@@ -111,8 +111,8 @@ def test_gradient_reaches_the_image(small_cfg, write_weights):
     assert torch.autograd.grad(sum(m.sum() for m in network(image)), network.layers[0].weight)[0].any()
 
 
-def test_a_batch_is_its_images_one_by_one(small_cfg, write_weights):
-    """Up to rounding, as matrix products of other sizes round otherwise."""
+def test_a_batch_equals_its_images_one_by_one(small_cfg, write_weights):
+    """Equal up to rounding, which depends on the size of matrix products."""
     network = Darknet(read_cfg(small_cfg)).requires_grad_(False)
     read_weights(network, write_weights())
     images = torch.rand(4, 3, 64, 96)
@@ -122,7 +122,7 @@ def test_a_batch_is_its_images_one_by_one(small_cfg, write_weights):
             torch.testing.assert_close(together[i : i + 1], alone, atol=1e-4, rtol=1e-4)
 
 
-def test_keeps_the_image(small_cfg):
+def test_the_image_is_not_changed(small_cfg):
     image = torch.rand(1, 3, 32, 64)
     before = image.clone()
     Darknet(read_cfg(small_cfg))(image)
@@ -130,7 +130,7 @@ def test_keeps_the_image(small_cfg):
 
 
 @pytest.mark.parametrize("batch", [1, 2])
-def test_compiles_whole(small_cfg, batch):
+def test_compiles_to_a_single_graph(small_cfg, batch):
     network = Darknet(read_cfg(small_cfg)).eval()
     image = torch.rand(batch, 3, 32, 64)
     compiled = torch.compile(network, fullgraph=True, backend="eager")
@@ -138,8 +138,8 @@ def test_compiles_whole(small_cfg, batch):
         torch.testing.assert_close(actual, expected)
 
 
-def test_reads_only_what_is_needed_later():
-    # Without dropping outputs, the 107 layers of YOLOv3 hold many times the largest one.
+def test_keeps_only_outputs_that_later_layers_need():
+    # If no outputs were dropped, the 107 layers of YOLOv3 would need many times the memory of the largest one.
     network = Darknet(yolov3(classes=1)).requires_grad_(False)
     alive = []
     original = network.run
@@ -156,7 +156,7 @@ def test_reads_only_what_is_needed_later():
 
 
 @pytest.mark.parametrize("size", [(3, 32, 31), (3, 0, 32), (1, 32, 32)])
-def test_refuses_images_that_do_not_fit(small_cfg, size):
+def test_refuses_images_of_unsuitable_size(small_cfg, size):
     with pytest.raises(InputError, match="image: expected"):
         Darknet(read_cfg(small_cfg))(torch.zeros(1, *size))
 
@@ -190,14 +190,14 @@ MAPS = "[convolutional]\nfilters=6\nactivation=linear\n"
         (NET + MAPS + "[yolo]\nmask=0\nanchors=1,2,3\nclasses=1\n", "got 3 numbers and the mask (0,)"),
     ],
 )
-def test_refuses_cfgs_with_one_line(text, message):
+def test_refuses_invalid_cfgs_with_an_error_of_one_line(text, message):
     with pytest.raises(DataError) as caught:
         Darknet(parse_cfg(text))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_dropout_does_nothing():
+def test_dropout_is_ignored():
     sections = parse_cfg(NET + "[dropout]\nprobability=.5\n" + MAPS + YOLO)
     network, plain = Darknet(sections), Darknet([s for s in sections if s.kind != "dropout"])
     network.layers[1].load_state_dict(plain.layers[0].state_dict())

@@ -8,7 +8,7 @@ from semfov.errors import DataError
 
 
 def test_agrees_with_configparser(small_cfg):
-    # The standard library's parser wants unique names of sections.
+    # The parser of the standard library needs unique section names.
     number = iter(range(100))
     parser = configparser.ConfigParser()
     parser.read_string(re.sub(r"\[(\w+)\]", lambda match: f"[{next(number)} {match[1]}]", small_cfg.read_text()))
@@ -26,7 +26,7 @@ def test_comments_blanks_and_repeated_keys():
     assert section.where == "cfg:4"
 
 
-def test_values():
+def test_values_are_converted_and_checked():
     section = Section("yolo", {"mask": "1,2,", "anchors": "1.5,2,3,4", "size": "3", "word": "x"}, "a.cfg:7")
     assert section.integers("mask") == (1, 2)
     assert section.numbers("anchors") == (1.5, 2.0, 3.0, 4.0)
@@ -44,12 +44,12 @@ def test_values():
 
 
 @pytest.mark.parametrize("text", ["width=3", "[net]\nwidth 3", "[net"])
-def test_refuses_what_is_no_cfg(text):
+def test_refuses_invalid_syntax(text):
     with pytest.raises(DataError, match=r"cfg:\d: expected \[section\] or key=value"):
         parse_cfg(text)
 
 
-def test_files_that_cannot_be_read(tmp_path):
+def test_refuses_unreadable_files(tmp_path):
     with pytest.raises(DataError, match=r"cannot read the cfg .*missing.cfg"):
         read_cfg(tmp_path / "missing.cfg")
     binary = tmp_path / "binary.cfg"

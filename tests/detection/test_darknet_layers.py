@@ -26,7 +26,7 @@ def darknet_maxpool(image: np.ndarray, size: int, stride: int, padding: int) -> 
     ("size", "stride", "padding"),
     [(2, 2, 1), (2, 1, 1), (5, 1, 4), (13, 1, 12), (3, 2, 2), (3, 2, 0), (2, 2, 0), (3, 1, 3)],
 )
-def test_maxpool_is_darknets(shape, size, stride, padding):
+def test_maxpool_equals_darknets(shape, size, stride, padding):
     if min(shape) + padding < size:
         pytest.skip("no output")
     image = np.random.default_rng(0).normal(size=shape) - 5
@@ -34,7 +34,7 @@ def test_maxpool_is_darknets(shape, size, stride, padding):
     np.testing.assert_array_equal(actual[0, 0].numpy(), darknet_maxpool(image, size, stride, padding))
 
 
-def test_leaky_keeps_a_tenth():
+def test_activations_equal_their_formulas():
     x = torch.tensor([-2.0, 3.0])
     torch.testing.assert_close(ACTIVATIONS["leaky"](x.clone()), torch.tensor([-0.2, 3.0]))
     torch.testing.assert_close(ACTIVATIONS["relu"](x.clone()), torch.tensor([0.0, 3.0]))
@@ -44,18 +44,18 @@ def test_leaky_keeps_a_tenth():
     torch.testing.assert_close(ACTIVATIONS["linear"](x), x)
 
 
-def test_upsample_repeats():
+def test_upsample_repeats_pixels():
     image = torch.rand(1, 2, 3, 4)
     torch.testing.assert_close(Upsample(2)(image), image.repeat_interleave(2, 2).repeat_interleave(2, 3))
 
 
-def test_route_takes_parts():
+def test_route_concatenates_groups_of_channels():
     a, b = torch.rand(1, 4, 2, 2), torch.rand(1, 6, 2, 2)
     torch.testing.assert_close(Route()(a, b), torch.cat([a, b], 1))
     torch.testing.assert_close(Route(2, 1)(a, b), torch.cat([a[:, 2:], b[:, 3:]], 1))
 
 
-def test_shortcut_leaves_its_inputs_alone():
+def test_shortcut_does_not_change_its_inputs():
     a, b = torch.full((1, 1, 2, 2), -1.0), torch.zeros(1, 1, 2, 2)
     torch.testing.assert_close(Shortcut("leaky")(a, b), torch.full((1, 1, 2, 2), -0.1))
     assert a.unique().item() == -1

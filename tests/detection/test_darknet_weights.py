@@ -43,7 +43,7 @@ def test_batch_norm_is_folded(network, write_weights):
         (lambda data: data[: 20 + 24 * 4] + np.full(8, -1, "<f4").tobytes() + data[20 + 32 * 4 :], "variances"),
     ],
 )
-def test_refuses_damaged_files_with_one_line(network, write_weights, damage, message):
+def test_refuses_damaged_files_with_an_error_of_one_line(network, write_weights, damage, message):
     path = write_weights()
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(DataError) as caught:

@@ -32,14 +32,14 @@ def test_stack_pads_to_the_longest():
     torch.testing.assert_close(whole.scores[0, :2], parts[0].scores[0])
 
 
-def test_images_of_a_batch():
+def test_a_batch_can_be_indexed_by_image():
     d = detections([2, 1, 3])
     assert d[1:].count.tolist() == [1, 3]
     assert d[0].count.item() == 2
     assert d[torch.tensor([2, 0])].count.tolist() == [3, 2]
 
 
-def test_empty_follows_its_model():
+def test_empty_detections_take_number_of_classes_and_dtype():
     d = Detections.empty(2, 80, like=torch.zeros(1, dtype=torch.float64))
     assert d.scores.shape == (2, 0, 81)
     assert d.boxes.dtype == torch.float64
@@ -55,11 +55,11 @@ def test_empty_follows_its_model():
         (torch.zeros(1, 2, 4), torch.zeros(1, 2, 3), torch.zeros(1, 2)),
     ],
 )
-def test_refuses_what_does_not_fit(boxes, scores, mask):
+def test_refuses_tensors_of_inconsistent_shapes(boxes, scores, mask):
     with pytest.raises(InputError):
         Detections(boxes, scores, mask)
 
 
-def test_refuses_to_stack_nothing():
+def test_refuses_to_stack_an_empty_list():
     with pytest.raises(InputError, match="at least one"):
         Detections.stack([])

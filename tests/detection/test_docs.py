@@ -1,4 +1,4 @@
-"""The snippets of docs/detectors.md run as they stand, one after another; its table of heads is complete."""
+"""The snippets of docs/detectors.md run as printed, one after another, and its table of heads is complete."""
 
 import json
 import re
@@ -23,7 +23,7 @@ def blocks(language):
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_snippets(tiny_weights, make_onnx, tmp_path, monkeypatch):
+def test_snippets_run_as_printed(tiny_weights, make_onnx, tmp_path, monkeypatch):
     from torchvision.models.detection import ssdlite320_mobilenet_v3_large
 
     monkeypatch.chdir(tmp_path)
@@ -45,7 +45,7 @@ def test_snippets(tiny_weights, make_onnx, tmp_path, monkeypatch):
     assert detector.classes == COCO_CLASSES
 
 
-def test_settings_beside_a_model(make_onnx):
+def test_the_settings_file_of_a_model_is_valid(make_onnx):
     (text,) = blocks("json")
     path = make_onnx({"out": np.random.default_rng(0).random((1, 84, 8)).astype(np.float32)})
     path.with_suffix(".json").write_text(text)
@@ -55,7 +55,7 @@ def test_settings_beside_a_model(make_onnx):
     assert detector.preprocessing.settings().items() >= written["preprocessing"].items()
 
 
-def test_the_table_of_heads():
+def test_the_table_of_heads_is_complete_and_correct():
     rows = re.findall(r"^\| `([\w-]+)` \|.*\| (BGR|RGB) \| (.*) \| (.*) \| `(\w+)` \|$", PAGE, flags=re.MULTILINE)
     assert {row[0] for row in rows} == set(HEADS)
     for head, channels, values, fitted, background in rows:

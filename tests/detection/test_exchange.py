@@ -1,4 +1,4 @@
-"""Detections in the forms of Supervision, torchvision and COCO, and back, against these packages themselves."""
+"""Conversion of detections to and from the formats of Supervision, torchvision and COCO, tested with these packages."""
 
 import builtins
 import contextlib
@@ -41,20 +41,20 @@ def same(a, b):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("count", [0, 1, 5])
-def test_supervision_and_back_loses_nothing(count, dtype):
+def test_conversion_to_supervision_and_back_is_lossless(count, dtype):
     seen = some(count, padding=2, dtype=dtype)
-    given_out = seen.to_supervision(CLASSES)
-    assert isinstance(given_out, supervision.Detections)
-    assert len(given_out) == count
-    np.testing.assert_array_equal(given_out.class_id, seen.labels[0, :count].numpy() - 1)
-    np.testing.assert_array_equal(given_out.confidence, seen.confidence[0, :count].numpy())
-    assert given_out.data["class_name"].tolist() == [CLASSES[label - 1] for label in seen.labels[0, :count].tolist()]
-    back = Detections.from_supervision(given_out, len(CLASSES))
+    converted = seen.to_supervision(CLASSES)
+    assert isinstance(converted, supervision.Detections)
+    assert len(converted) == count
+    np.testing.assert_array_equal(converted.class_id, seen.labels[0, :count].numpy() - 1)
+    np.testing.assert_array_equal(converted.confidence, seen.confidence[0, :count].numpy())
+    assert converted.data["class_name"].tolist() == [CLASSES[label - 1] for label in seen.labels[0, :count].tolist()]
+    back = Detections.from_supervision(converted, len(CLASSES))
     assert same(back, some(count, dtype=dtype))
 
 
-def test_supervision_works_with_them():
-    """Its own selection, merging and drawing take what comes out."""
+def test_supervision_can_select_merge_and_draw_them():
+    """The selection, merging and drawing of Supervision accept the converted detections."""
     seen = some(5)
     out = seen.to_supervision(CLASSES)
     sure = out[out.confidence > float(seen.confidence[0, 2])]
@@ -66,8 +66,8 @@ def test_supervision_works_with_them():
     assert scene.any()
 
 
-def test_detections_of_others_by_supervision():
-    """With a class and a confidence alone, what is left of 1 is background; the most confident comes first."""
+def test_detections_of_other_models_in_supervisions_format():
+    """With only a class and a confidence the rest of the probability is background; order is by confidence."""
     theirs = supervision.Detections(
         xyxy=np.array([[0, 0, 5, 5], [1, 2, 3, 4]]), confidence=np.array([0.25, 0.75]), class_id=np.array([0, 2])
     )
@@ -80,7 +80,7 @@ def test_detections_of_others_by_supervision():
     assert Detections.from_supervision(supervision.Detections.empty(), 3).scores.shape == (1, 0, 4)
 
 
-def test_torchvision_and_back():
+def test_conversion_to_torchvision_and_back():
     seen = some(5, padding=1)
     out = seen.to_torchvision()
     assert {name: tuple(value.shape) for name, value in out.items()} == {
@@ -99,8 +99,8 @@ def test_torchvision_and_back():
     assert (target.confidence == 1).all()
 
 
-def test_torchvisions_own_detector(device):
-    """What a detector of torchvision's returns is taken as it is."""
+def test_output_of_a_torchvision_detector(device):
+    """The output of a torchvision detector is accepted without changes."""
     from torchvision.models.detection import ssdlite320_mobilenet_v3_large
 
     torch.manual_seed(0)
@@ -148,18 +148,18 @@ def test_coco_results_are_read_by_pycocotools(category, count):
         assert each["score"] == pytest.approx(float(seen.confidence[0, row]))
 
 
-def test_names_in_either_spelling():
+def test_category_names_may_be_spelled_differently():
     assert category_ids([{"id": 72, "name": "tv"}, {"id": 1, "name": "person"}], ["person", "TVmonitor"]) == [1, 72]
 
 
-def test_what_does_not_fit_is_refused_by_name():
+def test_inconsistent_arguments_are_refused_by_name():
     two = Detections.stack([some(), some()])
     for call in (two.to_supervision, two.to_torchvision, lambda: two.to_coco(1, [1, 2, 3])):
         with pytest.raises(InputError, match=r"one image, such as detections\[0\], got a batch of shape \(2,\)"):
             call()
     assert same(Detections.from_supervision(two[0].to_supervision(), 3), some())
     seen = some()
-    for call, told in (
+    for call, message in (
         (lambda: seen.to_supervision(["one"]), "classes: expected 3 names"),
         (lambda: seen.to_coco(1, [1, 2]), "categories: expected one id for each of 3 classes"),
         (lambda: seen.to_coco(1, [{"id": 1, "name": "person"}]), "classes: expected the names"),
@@ -168,18 +168,18 @@ def test_what_does_not_fit_is_refused_by_name():
         (lambda: Detections.from_supervision(supervision.Detections(np.zeros((1, 4))), 3), "class_id"),
         (lambda: Detections.from_torchvision({"boxes": seen.boxes[0]}, 3), "'labels'"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             call()
     boxes = torch.zeros(1, 4)
-    for labels, scores, told in (([0], [0.5], "labels"), ([4], [0.5], "labels"), ([1], [1.5], "scores"),
+    for labels, scores, message in (([0], [0.5], "labels"), ([4], [0.5], "labels"), ([1], [1.5], "scores"),
                                  ([1], [float("nan")], "scores"), ([1], [0.5, 0.5], "scores"),
                                  ([1, 1], [0.5, 0.5], "boxes")):  # fmt: skip
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             Detections.from_torchvision({"boxes": boxes, "labels": torch.tensor(labels),
                                          "scores": torch.tensor(scores)}, 3)  # fmt: skip
 
 
-def test_without_supervision(monkeypatch):
+def test_to_supervision_without_the_package_names_the_remedy(monkeypatch):
     importing = builtins.__import__
 
     def without(name, *arguments, **options):

@@ -23,14 +23,14 @@ def small_weights(write_weights):
 
 @pytest.fixture
 def small(small_cfg, small_weights):
-    """A network with every kind of layer and activation but one."""
+    """A function that loads a network with every kind of layer."""
     return lambda **options: load_yolo(
         str(small_cfg), weights=small_weights, classes=CLASSES, **{"stride": 16, "runtime": "torch", **options}
     )
 
 
 @pytest.mark.parametrize("static", [False, True])
-def test_equal_outputs(small, tmp_path, static):
+def test_exported_model_equals_torch(small, tmp_path, static):
     detector = small(stride=None if static else 16)
     path = tmp_path / "small.onnx"
     export_onnx(detector, path, static=static)
@@ -60,14 +60,14 @@ def test_a_dynamic_export_takes_any_multiple_of_the_stride(small, tmp_path, size
 
 
 @pytest.mark.parametrize("activation", ["linear", "leaky", "relu", "mish", "swish", "logistic"])
-def test_every_activation(small_cfg, small_weights, tmp_path, activation):
+def test_every_activation_can_be_exported(small_cfg, small_weights, tmp_path, activation):
     small_cfg.write_text(small_cfg.read_text().replace("activation=leaky", f"activation={activation}"))
     detector = load_yolo(str(small_cfg), weights=small_weights, classes=CLASSES, stride=16, runtime="torch")
     export_onnx(detector, tmp_path / "small.onnx")
     assert largest_difference(detector, tmp_path / "small.onnx") <= 1e-4
 
 
-def test_the_model_says_what_it_is(small, tmp_path):
+def test_the_exported_model_contains_its_settings(small, tmp_path):
     import onnx
 
     detector = small(background="uniform", input_size=(96, 64))
@@ -84,7 +84,7 @@ def test_the_model_says_what_it_is(small, tmp_path):
     assert exported.classes == CLASSES
 
 
-def test_what_cannot_be_exported(small, tmp_path, make_onnx):
+def test_other_detectors_and_unwritable_files_are_refused(small, tmp_path, make_onnx):
     other = load_onnx(make_onnx({"output0": np.ones((1, 84, 7), np.float32).swapaxes(1, 2)}), classes=("a", "b", "c"))
     with pytest.raises(InputError, match="OnnxDetector"):
         export_onnx(other, tmp_path / "out.onnx")
@@ -96,7 +96,7 @@ def test_what_cannot_be_exported(small, tmp_path, make_onnx):
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_command_line(tiny_weights, tmp_path):
+def test_command_line_exports_an_equal_model(tiny_weights, tmp_path):
     path = tmp_path / "tiny.onnx"
     command = [
         sys.executable,

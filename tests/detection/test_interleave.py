@@ -1,4 +1,4 @@
-"""The benchmark of sensor and detector in turn runs, and its shares are shares."""
+"""The benchmark of alternating sensor and detector runs, and its shares are between 0 and 100 %."""
 
 import re
 
@@ -18,7 +18,7 @@ def same_threads():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [["--threads", "1", "2"], ["--processor-time", "--keep-memory"]])
-def test_tables(make_onnx, monkeypatch, capsys, options):
+def test_benchmark_prints_its_tables(make_onnx, monkeypatch, capsys, options):
     model = make_onnx({"output": np.random.default_rng(0).random((1, 84, 85)).astype(np.float32)})
     arguments = ["interleave", "--model", str(model), "--repetitions", "2", "--fixations", "2", *options]
     monkeypatch.setattr("sys.argv", arguments)
@@ -26,7 +26,7 @@ def test_tables(make_onnx, monkeypatch, capsys, options):
     lines = capsys.readouterr().out.splitlines()
     threads = 2 if "--threads" in options else 1
     turns = [line for line in lines if re.match(r"\| \d \| (on|off) ", line)]
-    assert len(turns) == (3 if threads == 2 else 1)  # one thread has nobody to wait for
+    assert len(turns) == (3 if threads == 2 else 1)  # with one thread no thread has to wait for another
     parts = [line for line in lines if re.match(r"\| \d \| (search|exploration)", line)]
     assert len(parts) == 3 * threads
     for line in parts:

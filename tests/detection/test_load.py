@@ -45,12 +45,12 @@ def test_options(small_cfg, write_weights, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["yolov3-tinny", "nothing"])
-def test_unknown_names(name):
+def test_unknown_names_are_refused_with_the_known_ones(name):
     with pytest.raises(InputError, match=f"unknown detector '{name}'; .*yolov3-tiny"):
         load_detector(name)
 
 
-def test_files_that_do_not_fit(small_cfg, write_weights, tmp_path):
+def test_missing_and_unsuitable_files_are_refused(small_cfg, write_weights, tmp_path):
     with pytest.raises(InputError, match=r"expected a cfg and its weights"):
         load_detector("x.weights")
     with pytest.raises(InputError, match="weights: expected the path"):
@@ -65,7 +65,7 @@ def test_files_that_do_not_fit(small_cfg, write_weights, tmp_path):
         load_detector(small_cfg, weights=write_weights(), classes=tmp_path / "missing.names")
 
 
-def test_other_rooms_are_called_when_needed(monkeypatch):
+def test_onnx_and_torchvision_loaders_are_imported_when_needed(monkeypatch):
     calls = []
     for module, function in [("onnx", "load_onnx"), ("torchvision", "load_torchvision")]:
         stand_in = SimpleNamespace(**{function: lambda name, _f=function, **options: calls.append((_f, name, options))})
@@ -80,7 +80,7 @@ def test_other_rooms_are_called_when_needed(monkeypatch):
     ]
 
 
-def test_coco_classes(shared):
+def test_coco_classes_equal_those_of_the_annotations(shared):
     import json
 
     annotations = json.loads((shared / "coco/annotations/instances_eval300.json").read_text())
@@ -114,7 +114,7 @@ def test_recognises_photographs(tiny, name, label):
 
 @pytest.mark.weights
 def test_a_batch_equals_its_images_one_by_one(tiny):
-    """Up to rounding: matrix products of other sizes may round otherwise, so the evaluation looks one at a time."""
+    """Equal up to rounding, which depends on the size of matrix products; evaluations therefore use batches of one."""
     images = torch.rand(3, 3, 200, 300, generator=torch.Generator().manual_seed(1))
     whole = tiny.propose(tiny.fit(images)[0])
     for index in range(3):
@@ -125,8 +125,8 @@ def test_a_batch_equals_its_images_one_by_one(tiny):
 
 @pytest.mark.weights
 @pytest.mark.parametrize("runtime", ["torch", "onnxruntime"])
-def test_one_thread_repeats_itself_and_two_agree_with_it(tiny_weights, threads, runtime):
-    """To the bit, and up to rounding: matrix products are cut otherwise for other numbers of threads."""
+def test_one_thread_is_reproducible_and_two_threads_agree_with_it(tiny_weights, threads, runtime):
+    """One thread repeats its result to the bit; two threads agree up to rounding, as they split matrix products."""
     detector = load_detector("yolov3-tiny", weights=tiny_weights, runtime=runtime)
     image = torch.rand(1, 3, 240, 320, generator=torch.Generator().manual_seed(1))
     (one, again), (two, _) = [[detector.propose(detector.fit(image)[0]) for _ in range(2)] for _ in threads()]
@@ -137,7 +137,7 @@ def test_one_thread_repeats_itself_and_two_agree_with_it(tiny_weights, threads, 
 
 
 @pytest.mark.weights
-def test_either_runtime_finds_the_same(tiny, tiny_weights):
+def test_both_runtimes_give_the_same_detections(tiny, tiny_weights):
     from skimage import data
 
     image = torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255

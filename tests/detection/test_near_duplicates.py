@@ -1,4 +1,4 @@
-"""Boxes that are nearly the same, found among neighbours, beside torchvision, which compares all boxes."""
+"""Suppression of near-duplicate boxes by comparing neighbours, against torchvision, which compares all boxes."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from semfov.detection.near_duplicates import distinct, neighbours
 
 
 def crowd(count, seed, extent=400.0):
-    """Boxes around a few places, so that many are nearly the same; of very different sizes, beyond the border too."""
+    """Boxes of very different sizes around a few places, also outside the image, so that many nearly coincide."""
     generator = np.random.default_rng(seed)
     places = generator.uniform(-50, extent, (max(count // 6, 1), 2))
     sizes = np.exp(generator.uniform(0, 6, (len(places), 2)))
@@ -21,7 +21,7 @@ def crowd(count, seed, extent=400.0):
 
 @pytest.mark.parametrize("iou", [0.9, 0.95, 0.99, 1.0])
 @pytest.mark.parametrize("count", [1, 300])
-def test_survivors_are_those_of_torchvision(count, iou):
+def test_kept_boxes_equal_those_of_torchvision(count, iou):
     dropped = 0
     for seed in range(10):
         boxes = crowd(count, seed)
@@ -31,11 +31,11 @@ def test_survivors_are_those_of_torchvision(count, iou):
     assert (dropped > 0) == (count == 300 and iou < 1)
 
 
-def test_no_boxes_are_no_survivors():
+def test_without_boxes_no_boxes_are_kept():
     assert distinct(np.zeros((0, 4), np.float32), 0.95).tolist() == []
 
 
-def test_neighbours_are_all_intervals_that_meet():
+def test_neighbours_are_all_pairs_of_intersecting_intervals():
     generator = np.random.default_rng(0)
     start = np.sort(generator.uniform(0, 10, 40))
     end = start + generator.exponential(1.0, 40)

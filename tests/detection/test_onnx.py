@@ -34,8 +34,8 @@ def pixels(rows):
     return np.concatenate([rows[..., :2] * SIDE, rows[..., 2:4] * 20, rows[..., 4:]], -1)
 
 
-# Each maker gives: outputs of a model; and a function from what it gives for one image to boxes and scores, where
-# scores have background first, as the default policy of the head makes them.
+# Each function returns the outputs of a model, and a function that decodes the outputs of one image to boxes and
+# scores. Background is the first score, computed as by the default policy of the head.
 
 
 def residual(classes, objectness=None):
@@ -171,7 +171,7 @@ MAKERS = {
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", MAKERS)
-def test_every_head_from_file_to_score_vectors(make_onnx, kind, dtype):
+def test_score_vectors_of_every_head_equal_a_plain_implementation(make_onnx, kind, dtype):
     outputs, read = MAKERS[kind]()
     path = make_onnx(outputs, producer="PaddlePaddle" if kind == "picodet" else "pytorch")
     detector = load_onnx(path, classes=NAMES, threshold=0.0, iou=1.0, limit=1000)
@@ -191,7 +191,7 @@ def test_every_head_from_file_to_score_vectors(make_onnx, kind, dtype):
     assert found.boxes.dtype == found.scores.dtype == dtype
 
 
-def test_load_detector_and_settings(make_onnx):
+def test_load_detector_sets_name_digest_and_settings(make_onnx):
     path = make_onnx(yolox()[0])
     detector = load_detector(path, classes=NAMES, threshold=0.1)
     assert detector.name == "model"
@@ -203,7 +203,7 @@ def test_load_detector_and_settings(make_onnx):
     assert load_onnx(path, classes=NAMES, preprocessing={"channels": "rgb"}).settings() != detector.settings()
 
 
-def test_preprocessing_is_data(make_onnx):
+def test_preprocessing_is_set_by_head_file_and_arguments(make_onnx):
     path = make_onnx(yolox()[0])
     assert load_onnx(path, classes=NAMES).preprocessing == Preprocessing("bgr", 255.0, corner=True)
     path.with_suffix(".json").write_text(json.dumps({"classes": NAMES, "preprocessing": {"std": [2, 2, 2]}}))
@@ -214,7 +214,7 @@ def test_preprocessing_is_data(make_onnx):
 
 
 @pytest.mark.parametrize("side", [SIDE, [SIDE, SIDE]])
-def test_input_size_beside_the_model(make_onnx, side):
+def test_input_size_is_read_from_the_settings_file(make_onnx, side):
     path = make_onnx(yolox()[0], dynamic=True, batch="batch")
     path.with_suffix(".json").write_text(json.dumps({"classes": NAMES, "input_size": side}))
     assert load_onnx(path).input_size == (SIDE, SIDE)
@@ -223,7 +223,7 @@ def test_input_size_beside_the_model(make_onnx, side):
 @pytest.mark.parametrize(
     ("settings", "offset"), [({}, (0, 16)), ({"corner": True}, (0, 0)), ({"stretch": True}, (0, 0))]
 )
-def test_where_the_image_lies(make_onnx, settings, offset):
+def test_settings_determine_the_placement_of_the_image(make_onnx, settings, offset):
     detector = load_onnx(make_onnx(yolov8()[0]), classes=NAMES, preprocessing={"fill": 1.0, **settings})
     canvas, placement = detector.fit(torch.zeros(1, 3, 20, 40))
     padding = 0 if "stretch" in settings else SIDE * SIDE / 2
@@ -232,7 +232,7 @@ def test_where_the_image_lies(make_onnx, settings, offset):
     assert float(canvas.sum()) == 3 * padding
 
 
-def test_a_model_of_any_size(make_onnx):
+def test_a_model_with_dynamic_size_needs_an_input_size(make_onnx):
     path = make_onnx(yolox()[0], dynamic=True, batch="batch")
     with pytest.raises(InputError, match="input_size"):
         load_onnx(path, classes=NAMES)
@@ -243,7 +243,7 @@ def test_a_model_of_any_size(make_onnx):
         load_onnx(path, classes=NAMES, input_size=SIDE, stride=0)
 
 
-def test_options_that_do_not_fit_the_model(make_onnx):
+def test_options_that_contradict_the_model_are_refused(make_onnx):
     path = make_onnx(yolox()[0])
     for options, message in (
         ({"input_size": 32}, "input_size: expected the model's fixed size, 64 x 64"),
@@ -266,14 +266,14 @@ def test_options_that_do_not_fit_the_model(make_onnx):
         detector.propose(torch.zeros(1, 3, 64, 64, dtype=torch.uint8))
 
 
-def test_the_wrong_head_shows(make_onnx):
-    rows = pixels(random(1, 84, 8)) * 50  # decoded boxes, as YOLOv6 gives them in the shape of YOLOX
+def test_outputs_of_a_wrong_head_are_refused(make_onnx):
+    rows = pixels(random(1, 84, 8)) * 50  # decoded boxes, as YOLOv6 returns them in the shape of YOLOX
     detector = load_onnx(make_onnx({"output": rows}), classes=NAMES)
     with pytest.raises(DataError, match="expected finite boxes"):
         detector(torch.ones(1, 3, 64, 64))
 
 
-def test_scores_without_their_sigmoid(make_onnx):
+def test_scores_without_sigmoid_need_the_option_logits(make_onnx):
     outputs = {"output0": pixels(random(1, 252, 8))}
     outputs["output0"][..., 4:] = 8 * outputs["output0"][..., 4:] - 4
     path = make_onnx(outputs)
@@ -285,7 +285,7 @@ def test_scores_without_their_sigmoid(make_onnx):
     torch.testing.assert_close(found.objectness[0], raw[:, 4].sigmoid())
 
 
-def test_scores_that_stand_for_no_class_are_left_out(make_onnx):
+def test_scores_of_unused_class_ids_are_dropped(make_onnx):
     outputs, _ = yolox()
     path = make_onnx(outputs)
     whole = load_onnx(path, classes=NAMES)
@@ -295,11 +295,11 @@ def test_scores_that_stand_for_no_class_are_left_out(make_onnx):
     assert torch.equal(part.propose(canvas).classes, whole.propose(canvas).classes[..., [0, 2]])
 
 
-def test_class_names_of_coco(make_onnx):
+def test_coco_class_names_are_the_default_for_80_and_91_classes(make_onnx):
     assert load_onnx(make_onnx({"output": random(1, 84, 85)})).classes == COCO_CLASSES
     outputs = {"logits": random(1, 9, 92), "pred_boxes": random(1, 9, 4)}
     detector = load_onnx(make_onnx(outputs))
-    assert detector.classes == COCO_CLASSES  # by their 91 ids, without the gaps
+    assert detector.classes == COCO_CLASSES  # from 91 ids, without the unused ones
     assert detector.propose(torch.ones(1, 3, SIDE, SIDE)).classes.shape[-1] == 80
 
 
@@ -308,7 +308,7 @@ def test_metadata_of_ultralytics_names_the_classes(make_onnx):
     assert load_onnx(path).classes == ("a", "b", "c")
 
 
-def test_published_models_by_name(make_onnx, monkeypatch, tmp_path):
+def test_published_models_are_loaded_by_name(make_onnx, monkeypatch, tmp_path):
     path = make_onnx({"output": random(1, 84, 85)})
     detector = load_detector("yolox-nano", weights=path)
     assert detector.name == "yolox-nano"

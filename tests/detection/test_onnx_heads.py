@@ -1,4 +1,4 @@
-"""Every decoder against one box at a time in plain Python."""
+"""Every decoder against plain Python code that decodes one box at a time."""
 
 import math
 
@@ -106,7 +106,7 @@ def test_detr_softmax_and_sigmoid(dtype):
     assert torch.equal(rows.classes, logits)
 
 
-def test_gradients():
+def test_decoders_are_differentiable():
     def numbers(found):
         return tuple(x for x in (found.boxes, found.classes, found.objectness, found.background) if x is not None)
 
@@ -121,13 +121,13 @@ def test_gradients():
     assert check(lambda x, y: numbers(heads.decode_distances(x, y, (16, 16), strides=(8, 16))), (raw, distances))
 
 
-def test_compiles():
+def test_decoder_compiles():
     raw = noise(1, 84, 8)
     compiled = torch.compile(heads.decode_yolox, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(raw, (64, 64)).boxes, heads.decode_yolox(raw, (64, 64)).boxes)
 
 
-def test_wrong_shapes_are_named():
+def test_wrong_shapes_are_refused_by_name():
     with pytest.raises(InputError, match="84 rows, one for each cell of a 64 x 64 canvas"):
         heads.decode_yolox(noise(1, 83, 8), (64, 64))
     with pytest.raises(InputError, match="bins"):

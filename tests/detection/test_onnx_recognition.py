@@ -41,14 +41,14 @@ def maps(*levels, bins=32, names=("cls_pred_stride_{}", "dis_pred_stride_{}")):
         ("nanodet-plus", signature((1, 2125, 112), canvas=(320, 320), classes=80)),
     ],
 )
-def test_certain(expected, given):
+def test_unambiguous_signatures_are_recognised(expected, given):
     assert recognise(given) == expected
 
 
 @pytest.mark.parametrize(
     ("fits", "given"),
     [
-        ("yolox and yolov5 fit", signature((1, 8400, 85))),  # YOLOv6 has this shape too, with boxes decoded
+        ("yolox and yolov5 fit", signature((1, 8400, 85))),  # YOLOv6 also has this shape, with decoded boxes
         ("nanodet-plus and yolov5 fit", signature((1, 2125, 112), canvas=(320, 320))),
         ("picodet and nanodet fit", signature(*maps(1600, 400, 100, names=("a{}", "b{}")), canvas=(320, 320))),
         ("no head fits", signature((1, 300, 84))),
@@ -58,7 +58,7 @@ def test_certain(expected, given):
         ("with 20 classes: no head fits", signature((1, 84, 8400), classes=20)),
     ],
 )
-def test_doubtful_lists_the_choices(fits, given):
+def test_ambiguous_signatures_are_refused_with_a_list_of_heads(fits, given):
     with pytest.raises(InputError, match=fits) as error:
         recognise(given)
     assert all(head in str(error.value) for head in HEADS)
@@ -72,6 +72,6 @@ def test_doubtful_lists_the_choices(fits, given):
         signature(("labels", (1, 300)), ("boxes", (1, 300, 4)), ("scores", (1, 300))),
     ],
 )
-def test_boxes_that_lost_their_scores_are_refused(given):
+def test_outputs_without_score_vectors_are_refused(given):
     with pytest.raises(InputError, match="export"):
         recognise(given)

@@ -23,7 +23,7 @@ def images(count, dtype=torch.float32):
 
 @pytest.mark.parametrize("batch", [1, 2, 3, "batch"])
 @pytest.mark.parametrize("count", [1, 3, 4])
-def test_any_batch_through_a_fixed_or_dynamic_one(make_onnx, batch, count):
+def test_batches_of_any_size_with_fixed_and_dynamic_models(make_onnx, batch, count):
     base = values(1, 5, 4)
     session = OnnxSession(make_onnx({"a": base, "b": base[..., 0]}, batch=batch))
     image = images(count)
@@ -35,7 +35,7 @@ def test_any_batch_through_a_fixed_or_dynamic_one(make_onnx, batch, count):
 
 @pytest.mark.parametrize("model", [np.float16, np.float32, np.float64])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_dtype_follows_the_image(make_onnx, model, dtype):
+def test_outputs_have_the_dtype_of_the_image(make_onnx, model, dtype):
     base = values(1, 5, 4)
     image = images(1, dtype)
     output = OnnxSession(make_onnx({"a": base}, dtype=model))(image)["a"]
@@ -64,25 +64,25 @@ def test_threads_do_not_spin_unless_asked(make_onnx):
         assert options.get_session_config_entry(entry) == str(int(spinning))
 
 
-def test_sizes_and_scales_that_models_ask_for(make_onnx):
+def test_inputs_for_image_size_and_scale_are_filled(make_onnx):
     extra = {"orig_target_sizes": (7, [1, 2]), "im_shape": (1, [1, 2]), "scale_factor": (1, [1, 2])}
     session = OnnxSession(make_onnx({"a": values(1, 5, 4)}, extra=extra))
     assert session(images(2))["a"].shape == (2, 5, 4)
 
 
-def test_survives_pickling_and_copying(make_onnx):
+def test_sessions_can_be_pickled_and_copied(make_onnx):
     session = OnnxSession(make_onnx({"a": values(1, 5, 4)}), threads=1)
     for twin in (pickle.loads(pickle.dumps(session)), copy.deepcopy(session)):
         assert twin.threads == 1
         assert torch.equal(twin(images(1))["a"], session(images(1))["a"])
 
 
-def test_says_nothing_about_unused_inputs(make_onnx, capfd):
+def test_unused_inputs_cause_no_output(make_onnx, capfd):
     OnnxSession(make_onnx({"a": values(1, 5, 4)}, extra={"scale_factor": (1, [1, 2])}))(images(1))
     assert capfd.readouterr() == ("", "")
 
 
-def test_files_and_inputs_that_do_not_fit(make_onnx, tmp_path):
+def test_unsuitable_files_and_inputs_are_refused(make_onnx, tmp_path):
     with pytest.raises(DataError, match=r"missing\.onnx': no such file"):
         OnnxSession(tmp_path / "missing.onnx")
     damaged = tmp_path / "damaged.onnx"
@@ -99,6 +99,6 @@ def test_files_and_inputs_that_do_not_fit(make_onnx, tmp_path):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_a_device_that_is_not_there(make_onnx):
+def test_a_missing_device_is_refused(make_onnx):
     with pytest.raises(InputError, match="CPUExecutionProvider"):
         OnnxSession(make_onnx({"a": values(1, 5, 4)}), device="cuda")

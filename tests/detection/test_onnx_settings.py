@@ -6,11 +6,11 @@ from semfov.detection.onnx_settings import read_settings
 from semfov.errors import DataError
 
 
-def test_nothing_is_known(tmp_path):
+def test_settings_are_empty_without_file_and_metadata(tmp_path):
     assert read_settings(tmp_path / "model.onnx", {}) == {"preprocessing": {}}
 
 
-def test_beside_the_model_goes_before_inside(tmp_path):
+def test_the_settings_file_overrides_the_metadata(tmp_path):
     inside = {"head": "yolox", "classes": ["a"], "preprocessing": {"scale": 1.0, "channels": "rgb"}}
     beside = {"head": "yolov5", "licence": "MIT", "preprocessing": {"scale": 255.0}}
     (tmp_path / "model.json").write_text(json.dumps(beside))
@@ -29,7 +29,7 @@ def test_metadata_of_ultralytics(tmp_path):
 
 
 @pytest.mark.parametrize("names", ["person,dog", "{1: 'a'}", "{0: ", "3"])
-def test_other_metadata_of_that_name_is_left_alone(tmp_path, names):
+def test_metadata_of_another_form_is_ignored(tmp_path, names):
     assert read_settings(tmp_path / "model.onnx", {"names": names}) == {"preprocessing": {}}
 
 
@@ -45,7 +45,7 @@ def test_other_metadata_of_that_name_is_left_alone(tmp_path, names):
         ('{"heads": "yolox"}', "unknown key 'heads'; known: name, head"),
     ],
 )
-def test_damaged_files_are_named(tmp_path, text, message):
+def test_invalid_settings_are_refused_with_the_name_of_the_file(tmp_path, text, message):
     (tmp_path / "model.json").write_text(text)
     with pytest.raises(DataError, match=rf"model\.json.*{message}"):
         read_settings(tmp_path / "model.onnx", {})
@@ -53,7 +53,7 @@ def test_damaged_files_are_named(tmp_path, text, message):
         read_settings(tmp_path / "other.onnx", {"semfov": text})
 
 
-def test_bytes_that_are_no_text(tmp_path):
+def test_binary_settings_files_are_refused(tmp_path):
     (tmp_path / "model.json").write_bytes(b"\xff\xfe")
     with pytest.raises(DataError, match="cannot read"):
         read_settings(tmp_path / "model.onnx", {})

@@ -21,7 +21,7 @@ CLASSES = ("cat", "dog")
 
 @pytest.fixture
 def make(small_cfg, write_weights):
-    """Loads the small network."""
+    """A function that loads the small network."""
     weights = write_weights()
     return lambda runtime="auto", **options: load_yolo(
         str(small_cfg), weights=weights, classes=CLASSES, stride=16, runtime=runtime, **options
@@ -30,7 +30,7 @@ def make(small_cfg, write_weights):
 
 @pytest.fixture
 def looks(monkeypatch):
-    """Canvases that onnxruntime looked at."""
+    """Canvases that were given to onnxruntime."""
     seen = []
     call = OnnxTwin.__call__
     monkeypatch.setattr(OnnxTwin, "__call__", lambda self, *given: (seen.append(given[1]), call(self, *given))[1])
@@ -39,7 +39,7 @@ def looks(monkeypatch):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A cache of this test's own, empty."""
+    """An empty cache for one test."""
     path = tmp_path / "cache"
     monkeypatch.setattr("semfov.detection.onnx_twin.cache_folder", lambda: path)
     return path
@@ -59,7 +59,7 @@ def same_as(network, canvas, found, side):
 
 @pytest.mark.parametrize("shape", [(1, 3, 32, 64), (1, 3, 64, 64), (3, 3, 16, 48)])
 @pytest.mark.parametrize("runtime", ["auto", "onnxruntime"])
-def test_equals_torch(make, looks, shape, runtime):
+def test_onnxruntime_equals_torch(make, looks, shape, runtime):
     detector, canvas = make(runtime), canvases(*shape)
     same_as(make("torch"), canvas, detector.propose(canvas), 64)
     assert len(looks) == 1
@@ -67,7 +67,7 @@ def test_equals_torch(make, looks, shape, runtime):
 
 
 @pytest.mark.weights
-def test_published_weights_equal_torch(tiny_weights, looks):
+def test_onnxruntime_equals_torch_with_published_weights(tiny_weights, looks):
     from skimage import data
 
     image = torch.from_numpy(data.coffee()).permute(2, 0, 1)[None] / 255
@@ -78,7 +78,7 @@ def test_published_weights_equal_torch(tiny_weights, looks):
     assert len(looks) == 1
 
 
-def test_gradients_take_torch(make, looks):
+def test_gradients_are_computed_by_torch(make, looks):
     detector = make()
     canvas = canvases(1, 3, 32, 64).requires_grad_()
     detector.propose(canvas).classes.sum().backward()
@@ -94,8 +94,8 @@ def test_gradients_take_torch(make, looks):
     assert len(looks) == 2
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:FutureWarning")  # torch's own, of its jvp
-def test_forward_gradients_and_transforms_take_torch(make, looks):
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:FutureWarning")  # raised by jvp of torch
+def test_forward_gradients_and_transforms_are_computed_by_torch(make, looks):
     detector, canvas = make(), canvases(2, 3, 32, 64)
     tangent = torch.ones_like(canvas)
     with forward_ad.dual_level():
@@ -108,7 +108,7 @@ def test_forward_gradients_and_transforms_take_torch(make, looks):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore:.*torch.jit.trace")
-def test_graphs_take_torch(make, looks):
+def test_compiled_and_traced_graphs_use_torch(make, looks):
     detector, canvas = make(), canvases(1, 3, 32, 64)
     compiled = torch.compile(lambda x: detector.propose(x).classes, fullgraph=True, backend="eager")(canvas)
     traced = torch.jit.trace(lambda x: detector.propose(x).classes, canvas, check_trace=False)(canvas)
@@ -117,7 +117,7 @@ def test_graphs_take_torch(make, looks):
         torch.testing.assert_close(classes, make("torch").propose(canvas).classes)
 
 
-def test_other_precisions_take_torch(make, looks):
+def test_networks_of_other_precision_use_torch(make, looks):
     detector, canvas = make(), canvases(1, 3, 32, 64)
     exact = detector.double().propose(canvas)
     assert exact.boxes.dtype == torch.float64
@@ -129,7 +129,7 @@ def test_other_precisions_take_torch(make, looks):
     torch.testing.assert_close(found.classes.double(), exact.classes, atol=1e-5, rtol=0)
 
 
-def test_other_devices_and_tensors_of_other_kinds_take_torch(make, looks):
+def test_other_devices_and_tensor_subclasses_use_torch(make, looks):
     class Marked(torch.Tensor):
         pass
 
@@ -141,7 +141,7 @@ def test_other_devices_and_tensors_of_other_kinds_take_torch(make, looks):
     assert not looks
 
 
-def test_changed_weights_take_torch(make, looks):
+def test_changed_weights_use_torch(make, looks):
     detector, network, canvas = make(), make("torch"), canvases(1, 3, 32, 64)
     before = detector.propose(canvas).classes
     kept = copy.deepcopy(detector.state_dict())
@@ -158,7 +158,7 @@ def test_changed_weights_take_torch(make, looks):
     assert len(looks) == 3
 
 
-def test_what_onnxruntime_is_asked_for_and_cannot(make):
+def test_runtime_onnxruntime_refuses_what_it_does_not_support(make):
     canvas = canvases(1, 3, 32, 64)
     with pytest.raises(InputError, match="runtime: expected 'auto' or 'torch' or 'onnxruntime', got 'onnx'"):
         make("onnx")
@@ -175,20 +175,20 @@ def test_what_onnxruntime_is_asked_for_and_cannot(make):
 
 
 @pytest.mark.parametrize("size", [(3, 32, 60), (1, 32, 64)])
-def test_refuses_images_that_do_not_fit(make, size):
+def test_refuses_images_of_unsuitable_size(make, size):
     with pytest.raises(InputError, match="image: expected"):
         make().propose(torch.zeros(1, *size))
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda detector: pickle.loads(pickle.dumps(detector))])
-def test_copies_do_the_same(make, looks, duplicate):
+def test_copies_give_the_same_outputs(make, looks, duplicate):
     detector, canvas = make(), canvases(1, 3, 32, 64)
     classes = detector.propose(canvas).classes
     assert torch.equal(duplicate(detector).propose(canvas).classes, classes)
     assert len(looks) == 2
 
 
-def test_same_bits_for_any_threads_and_any_batch(make, threads):
+def test_outputs_do_not_depend_on_the_number_of_threads_or_the_batch(make, threads):
     canvas = canvases(3, 3, 64, 64)
     detector = make()
     one, two = [detector.propose(canvas) for _ in threads()]
@@ -198,7 +198,7 @@ def test_same_bits_for_any_threads_and_any_batch(make, threads):
     assert torch.equal(alone.boxes[0], one.boxes[1])
 
 
-def test_a_session_is_opened_for_its_threads_and_its_process(make, threads, monkeypatch):
+def test_another_number_of_threads_or_process_opens_a_new_session(make, threads, monkeypatch):
     detector, canvas = make(), canvases(1, 3, 32, 64)
     for number in threads():
         detector.propose(canvas)
@@ -213,7 +213,7 @@ def test_a_session_is_opened_for_its_threads_and_its_process(make, threads, monk
 
 
 @pytest.mark.parametrize("damage", [b"", b"half", None])
-def test_a_damaged_export_is_made_again(make, folder, damage):
+def test_a_damaged_export_is_replaced(make, folder, damage):
     network = make("torch").network
     path = exported(network, folder)
     whole = path.read_bytes()
@@ -224,7 +224,7 @@ def test_a_damaged_export_is_made_again(make, folder, damage):
     assert os.listdir(folder) == [path.name]
 
 
-def test_an_export_is_for_one_network(make, folder, monkeypatch):
+def test_every_network_and_version_has_its_own_export(make, folder, monkeypatch):
     network = make("torch").network
     path = exported(network, folder)
     assert path.name.split(".")[1] == hashlib.sha256(path.read_bytes()).hexdigest()
@@ -238,14 +238,14 @@ def test_an_export_is_for_one_network(make, folder, monkeypatch):
     assert len(os.listdir(folder)) == 3
 
 
-def test_a_cache_that_cannot_be_written_to(make, folder, looks):
+def test_onnxruntime_works_without_a_writable_cache(make, folder, looks):
     folder.write_text("a file where the folder should be")
     canvas = canvases(1, 3, 32, 64)
     same_as(make("torch"), canvas, make().propose(canvas), 64)
     assert len(looks) == 1
 
 
-def test_only_the_first_look_needs_the_package_onnx(make, folder, monkeypatch):
+def test_only_the_first_call_needs_the_package_onnx(make, folder, monkeypatch):
     canvas = canvases(1, 3, 32, 64)
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "onnx", None)
@@ -256,7 +256,7 @@ def test_only_the_first_look_needs_the_package_onnx(make, folder, monkeypatch):
     assert torch.equal(make().propose(canvas).classes, found.classes)
 
 
-def test_exporting_leaves_random_numbers_and_settings_alone(make, folder):
+def test_exporting_does_not_change_random_state_or_depend_on_default_dtype(make, folder):
     detector, canvas = make(), canvases(1, 3, 32, 64)
     torch.manual_seed(3)
     before = torch.get_rng_state()
@@ -281,7 +281,7 @@ print(hashlib.sha256(found.boxes.numpy().tobytes() + found.classes.numpy().tobyt
 
 
 @pytest.mark.slow
-def test_processes_that_export_at_once(small_cfg, write_weights, make, tmp_path):
+def test_processes_can_export_at_the_same_time(small_cfg, write_weights, make, tmp_path):
     environment = {**os.environ, "SEMFOV_CACHE": str(tmp_path / "cold"), "PYTHONWARNINGS": "error"}
     call = [sys.executable, "-c", LOOK, str(small_cfg), str(write_weights())]
 
@@ -296,7 +296,7 @@ def test_processes_that_export_at_once(small_cfg, write_weights, make, tmp_path)
     assert len(os.listdir(tmp_path / "cold" / "exported")) == 1
 
 
-def test_the_digest_tells_networks_apart(make):
+def test_the_digest_depends_on_the_weights_but_not_on_the_dtype(make):
     network = make("torch").network
     before = network_digest(network)
     assert network_digest(copy.deepcopy(network).double()) == before
@@ -304,8 +304,8 @@ def test_the_digest_tells_networks_apart(make):
     assert network_digest(network) != before
 
 
-def test_another_graph_has_another_version(make):
-    """A change of the graph has to raise VERSION; then the digest here changes with it."""
+def test_a_change_of_the_graph_needs_a_new_version(make):
+    """If the graph changes, increase VERSION and update the digest here."""
     from onnx.helper import get_attribute_value
 
     graph = network_model(make("torch").network, "darknet").graph

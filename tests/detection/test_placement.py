@@ -14,7 +14,7 @@ sides = st.integers(1, 90)
 
 
 @given(sides, sides, st.sampled_from([None, 32]), st.booleans(), st.sampled_from([torch.float32, torch.float64]))
-def test_boxes_and_points_return(width, height, stride, stretch, dtype):
+def test_boxes_and_points_are_mapped_to_the_canvas_and_back(width, height, stride, stretch, dtype):
     canvas, placement = letterbox(
         torch.zeros(1, 3, height, width, dtype=dtype), (64, 48), stride=stride, stretch=stretch
     )
@@ -23,7 +23,7 @@ def test_boxes_and_points_return(width, height, stride, stretch, dtype):
     image = torch.tensor([[0.0, 0.0, width, height], [0.3 * width, 0.1 * height, 0.9 * width, 0.8 * height]]).to(dtype)
     scale, offset = torch.tensor(placement.scale * 2).to(dtype), torch.tensor(placement.offset * 2).to(dtype)
     torch.testing.assert_close(placement.boxes_to_image(image * scale + offset), image, atol=1e-3, rtol=1e-5)
-    # A point is a pixel centre: half a pixel from the edges of its pixel, on both sides of the way.
+    # A point is the centre of a pixel, half a pixel from its edges, both in the image and on the canvas.
     points = torch.rand(5, 2, dtype=dtype) * torch.tensor([width, height])
     there = placement.points_to_canvas(points)
     box = torch.cat([there + 0.5, there + 0.5], -1)
@@ -33,7 +33,7 @@ def test_boxes_and_points_return(width, height, stride, stretch, dtype):
 
 
 @given(sides, sides, st.sampled_from([None, 32]))
-def test_the_image_lies_where_the_placement_says(width, height, stride):
+def test_the_image_is_at_the_place_given_by_the_placement(width, height, stride):
     canvas, placement = letterbox(torch.ones(1, 1, height, width), (64, 64), fill=0.25, stride=stride)
     bright = canvas[0, 0] > 0.99
     rows, columns = bright.nonzero(as_tuple=True)
@@ -48,13 +48,13 @@ def test_the_image_lies_where_the_placement_says(width, height, stride):
         assert all(side % stride == 0 for side in canvas.shape[-2:])
 
 
-def test_boxes_are_cut_to_the_image():
+def test_boxes_are_clipped_to_the_image():
     _, placement = letterbox(torch.zeros(1, 3, 50, 100), (100, 100))
     boxes = placement.boxes_to_image(torch.tensor([[-5.0, 0.0, 300.0, 40.0]]))
     torch.testing.assert_close(boxes, torch.tensor([[0.0, 0.0, 100.0, 15.0]]))
 
 
-def test_corner_and_stretch():
+def test_options_corner_and_stretch():
     image = torch.rand(1, 3, 20, 40)
     canvas, placement = letterbox(image, (80, 80), corner=True)
     assert placement.offset == (0, 0)
@@ -65,7 +65,7 @@ def test_corner_and_stretch():
 
 
 @pytest.mark.parametrize("size", [(37, 29), (60, 45), (100, 81)])
-def test_resize_is_opencv_bilinear_down_to_half(size):
+def test_resize_equals_bilinear_opencv_down_to_half_the_size(size):
     image = np.random.default_rng(0).random((58, 74, 3), dtype=np.float32)
     expected = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
     actual = resize(torch.from_numpy(image).permute(2, 0, 1)[None], size)[0].permute(1, 2, 0)
@@ -73,47 +73,47 @@ def test_resize_is_opencv_bilinear_down_to_half(size):
 
 
 @pytest.mark.parametrize("size", [(36, 58), (74, 20), (30, 7), (1, 1)])
-def test_resize_is_pillows_bilinear_below_half(size):
-    """Pillow's has antialiasing."""
+def test_resize_equals_bilinear_pillow_below_half_the_size(size):
+    """Bilinear resizing in Pillow has antialiasing."""
     image = np.random.default_rng(0).random((58, 74), dtype=np.float32)
     expected = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BILINEAR))
     actual = resize(torch.from_numpy(image)[None, None], size)[0, 0]
     np.testing.assert_allclose(actual.numpy(), expected, atol=1e-5)
 
 
-def test_resize_averages_where_it_would_skip_pixels():
+def test_resize_averages_pixels_that_it_would_otherwise_skip():
     stripes = torch.zeros(1, 1, 8, 64)
     stripes[..., ::4] = 1
     small = resize(stripes, (8, 1))
     torch.testing.assert_close(small[..., 1:-1], torch.full((1, 1, 1, 6), 0.25), atol=0.03, rtol=0)
 
 
-def test_same_size_is_a_copy():
+def test_resize_to_the_same_size_returns_a_copy():
     image = torch.rand(1, 3, 8, 8)
     canvas = resize(image, (8, 8))
     canvas.zero_()
     assert image.any()
 
 
-def test_gradient_flows():
+def test_letterbox_is_differentiable():
     image = torch.rand(1, 1, 5, 7, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: letterbox(x, (9, 9))[0], (image,))
 
 
 @pytest.mark.parametrize("size", [(416, 312), (700, 500), (300, 200)])
-def test_resize_repeats_itself_on_one_thread_and_agrees_on_two(size, threads):
+def test_resize_is_reproducible_on_one_thread_and_agrees_on_two(size, threads):
     image = torch.rand(1, 3, 480, 640)
     (one, again), (two, _) = [[resize(image, size) for _ in range(2)] for _ in threads()]
     assert torch.equal(one, again)
     torch.testing.assert_close(two, one, atol=5e-5, rtol=0)
 
 
-def test_refuses_bytes():
+def test_refuses_images_of_bytes():
     with pytest.raises(InputError, match="floating-point pixels"):
         letterbox(torch.zeros(1, 3, 8, 8, dtype=torch.uint8), (32, 32))
 
 
 @pytest.mark.parametrize("shape", [(3, 8, 8), (1, 3, 0, 8)])
-def test_refuses_no_image(shape):
+def test_refuses_tensors_of_other_shapes(shape):
     with pytest.raises(InputError, match="image"):
         letterbox(torch.zeros(shape), (32, 32))

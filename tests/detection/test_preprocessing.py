@@ -17,7 +17,7 @@ numbers = st.floats(0.1, 200)
     st.tuples(numbers, numbers, numbers),
     st.sampled_from([torch.float32, torch.float64]),
 )
-def test_each_pixel_by_hand(channels, scale, mean, std, dtype):
+def test_every_pixel_equals_the_formula(channels, scale, mean, std, dtype):
     canvas = torch.rand(2, 3, 2, 3, dtype=dtype, generator=torch.Generator().manual_seed(0))
     before = canvas.clone()
     image = Preprocessing(channels=channels, scale=scale, mean=mean, std=std)(canvas)
@@ -49,12 +49,12 @@ def test_each_pixel_by_hand(channels, scale, mean, std, dtype):
         {"colour": "rgb"},
     ],
 )
-def test_refuses(settings):
+def test_refuses_invalid_settings(settings):
     with pytest.raises(InputError, match=next(iter(settings)) if "channels" not in settings else "channel order"):
         Preprocessing().merged(settings)
 
 
-def test_merging_keeps_the_rest():
+def test_merging_keeps_the_other_settings():
     merged = Preprocessing(channels="bgr", scale=255.0).merged({"std": [2, 2, 2], "stretch": True})
     assert merged == Preprocessing(channels="bgr", scale=255.0, std=(2.0, 2.0, 2.0), stretch=True)
     assert Preprocessing(**merged.settings()) == merged

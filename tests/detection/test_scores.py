@@ -26,7 +26,7 @@ def candidates(classes, objectness=None, background=None) -> Candidates:
         ("own", [0.6, 0.2], None, [0.1], [0.1, 0.675, 0.225]),
     ],
 )
-def test_policies_by_hand(policy, classes, objectness, background, expected):
+def test_background_policies_on_computed_examples(policy, classes, objectness, background, expected):
     scores = score_vectors(candidates(classes, objectness, background), policy)
     torch.testing.assert_close(scores, torch.tensor([[expected]], dtype=torch.float64), **EXACT)
 
@@ -37,7 +37,7 @@ def test_policies_by_hand(policy, classes, objectness, background, expected):
     st.sampled_from(["residual", "normalised", "uniform", "none"]),
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_points_of_the_simplex(dtype, classes, objectness, policy):
+def test_score_vectors_are_points_of_the_simplex(dtype, classes, objectness, policy):
     c = Candidates(
         torch.zeros(1, 4, dtype=dtype), torch.tensor([classes], dtype=dtype), torch.tensor([objectness]).to(dtype)
     )
@@ -49,26 +49,26 @@ def test_points_of_the_simplex(dtype, classes, objectness, policy):
         assert scores[0, 1:].argmax() == torch.tensor(classes, dtype=dtype).argmax()
 
 
-def test_classes_that_are_all_zero_share_evenly():
+def test_class_scores_that_are_all_zero_share_the_objectness_evenly():
     torch.testing.assert_close(
         score_vectors(candidates([0.0, 0.0], [0.5])), torch.tensor([[[0.5, 0.25, 0.25]]], dtype=torch.float64), **EXACT
     )
 
 
-def test_confidence():
+def test_confidence_is_objectness_times_best_class_score():
     assert candidates([0.6, 0.2], [0.5]).confidence.item() == pytest.approx(0.3)
     assert candidates([0.6, 0.2]).confidence.item() == pytest.approx(0.6)
 
 
 @pytest.mark.parametrize("policy", ["residual", "normalised", "uniform", "none"])
-def test_gradients(policy):
+def test_score_vectors_are_differentiable(policy):
     classes = torch.rand(2, 3, dtype=torch.float64, requires_grad=True)
     objectness = torch.rand(2, dtype=torch.float64, requires_grad=True)
     boxes = torch.zeros(2, 4, dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda c, o: score_vectors(Candidates(boxes, c, o), policy), (classes, objectness))
 
 
-def test_compiles_whole():
+def test_compiles_to_a_single_graph():
     c = Candidates(torch.rand(5, 4), torch.rand(5, 3), torch.rand(5))
     compiled = torch.compile(score_vectors, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(c), score_vectors(c))
@@ -79,6 +79,6 @@ def test_refuses_an_unknown_policy():
         score_vectors(candidates([0.5]), "residul")
 
 
-def test_own_needs_a_head_with_background():
+def test_policy_own_needs_a_head_with_background():
     with pytest.raises(InputError, match="expects a head with a background score"):
         score_vectors(candidates([0.5]), "own")

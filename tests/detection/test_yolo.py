@@ -25,7 +25,7 @@ def detector(small_cfg, write_weights) -> YoloV3:
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.05])
-def test_decoding_is_the_scalar_loop(scale):
+def test_decoding_equals_a_scalar_loop(scale):
     raw = torch.randn(2, 2 * 8, 3, 5, dtype=torch.float64)
     candidates = decode_yolo(raw, ANCHORS, (160, 96), scale)
     for image in range(2):
@@ -53,7 +53,7 @@ def test_decoding_keeps_dtype_and_device(dtype, device):
         assert part.device.type == device.type
 
 
-def test_decoding_gradients():
+def test_decoding_is_differentiable():
     raw = torch.randn(1, 16, 2, 2, dtype=torch.float64, requires_grad=True)
 
     def parts(raw):
@@ -63,18 +63,18 @@ def test_decoding_gradients():
     assert torch.autograd.gradcheck(parts, (raw,))
 
 
-def test_decoding_compiles_whole():
+def test_decoding_compiles_to_a_single_graph():
     raw = torch.randn(1, 16, 2, 3)
     compiled = torch.compile(lambda raw: decode_yolo(raw, ANCHORS, (96, 64)).boxes, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(raw), decode_yolo(raw, ANCHORS, (96, 64)).boxes)
 
 
-def test_decoding_refuses_other_channels():
+def test_decoding_refuses_a_wrong_number_of_channels():
     with pytest.raises(InputError, match="raw: expected a multiple of 2 anchors"):
         decode_yolo(torch.zeros(1, 15, 1, 1), ANCHORS, (32, 32))
 
 
-def test_proposals_of_all_heads(detector):
+def test_proposals_of_all_heads_are_concatenated(detector):
     canvas = torch.rand(2, 3, 32, 64)
     candidates = detector.propose(canvas)
     assert candidates.boxes.shape == (2, 2 * 4 * 8 + 16 * 32, 4)
@@ -85,7 +85,7 @@ def test_proposals_of_all_heads(detector):
     torch.testing.assert_close(candidates.classes, torch.cat([first.classes, second.classes], 1))
 
 
-def test_boxes_come_back_to_the_image(detector):
+def test_boxes_are_mapped_back_to_the_image(detector):
     detector.selection = Selection(threshold=0.0, limit=5)
     image = torch.rand(1, 3, 100, 150)
     canvas, placement = detector.fit(image)
@@ -99,7 +99,7 @@ def test_boxes_come_back_to_the_image(detector):
         assert bool((proposed == box).all(-1).any())
 
 
-def test_gradient_from_scores_to_image(detector):
+def test_gradients_of_scores_reach_the_image(detector):
     detector.network.double()
     image = torch.rand(1, 3, 32, 64, dtype=torch.float64, requires_grad=True)
     found = detector(image)
@@ -109,14 +109,14 @@ def test_gradient_from_scores_to_image(detector):
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_twice_is_the_same_bits(detector):
+def test_detections_are_reproducible_to_the_bit(detector):
     image = torch.rand(1, 3, 32, 64)
     first, second = detector(image), detector(image)
     assert torch.equal(first.scores, second.scores)
     assert torch.equal(first.boxes, second.boxes)
 
 
-def test_settings_tell_what_results_depend_on(detector, small_cfg, write_weights):
+def test_settings_contain_runtime_digest_and_cfg(detector, small_cfg, write_weights):
     before = detector.settings()
     assert before["runtime"] == "torch"
     other = read_cfg(small_cfg)
@@ -136,7 +136,7 @@ def test_settings_tell_what_results_depend_on(detector, small_cfg, write_weights
         ({"stride": 6}, "stride: expected None or a multiple of 8"),
     ],
 )
-def test_refuses_settings(small_cfg, options, message):
+def test_refuses_invalid_settings(small_cfg, options, message):
     with pytest.raises(InputError, match=message):
         YoloV3(Darknet(read_cfg(small_cfg)), **({"classes": ("cat", "dog")} | options))
 
@@ -147,6 +147,6 @@ def test_refuses_images_of_another_shape(detector, image):
         detector(image)
 
 
-def test_refuses_bytes(detector):
+def test_refuses_canvases_of_bytes(detector):
     with pytest.raises(InputError, match="floating-point RGB"):
         detector.propose(torch.zeros(1, 3, 32, 32, dtype=torch.uint8))

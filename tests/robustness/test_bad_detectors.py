@@ -1,4 +1,4 @@
-"""A detector that returns what is no score is told of, and not passed over as one that sees nothing."""
+"""Invalid scores and boxes of a detector raise an error, and are not treated as an image without detections."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from semfov.errors import DataError, InputError
 
 
 class Given(Detector):
-    """Returns the same for every canvas."""
+    """Returns given candidates for every canvas."""
 
     def __init__(self, candidates):
         super().__init__("given", ("cat", "cup"), (32, 32))
@@ -40,14 +40,14 @@ def candidates(**changes):
         ({"objectness": 2.0}, r"objectness.*\[0, 1\]"),
     ],
 )
-def test_what_is_no_detection_is_refused(changes, message):
+def test_invalid_detections_are_refused(changes, message):
     image = torch.rand(1, 3, 32, 32)
     assert Given(candidates())(image).count.tolist() == [2]
     with pytest.raises(InputError, match=message):
         Given(candidates(**changes))(image)
 
 
-def test_a_kernel_that_fills_the_memory_is_refused():
+def test_a_network_with_a_huge_kernel_is_refused():
     from semfov.detection.darknet import Darknet
     from semfov.detection.darknet_config import parse_cfg
 

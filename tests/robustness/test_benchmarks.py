@@ -1,4 +1,4 @@
-"""What is timed side by side computes the same; and the figures come out of times as they should."""
+"""Benchmarks: programs that are compared give the same results, and figures are computed correctly from times."""
 
 import json
 import platform
@@ -24,7 +24,7 @@ def same_threads():
 
 
 @pytest.mark.parametrize("number", range(len(COMPARISONS)))
-def test_programs_agree(number):
+def test_compared_programs_give_the_same_results(number):
     with torch.inference_mode():
         comparison = COMPARISONS[number]()
         comparison.agree()
@@ -32,8 +32,8 @@ def test_programs_agree(number):
     assert set(comparison.share) <= set(comparison.peers)
 
 
-def test_ratios_are_of_whole_work():
-    """A peer that needs twice the time for a quarter of the work is eight times as slow."""
+def test_ratios_take_the_share_of_the_work_into_account():
+    """A peer that needs twice the time for a quarter of the work is eight times slower."""
     clock = iter(range(10**6))
     seconds = {"ours": 3, "peer": 6}
 
@@ -47,14 +47,14 @@ def test_ratios_are_of_whole_work():
     assert comparison_rows(measured) == [["work", "peer", "3,000", "24,000", "8 (8 to 8)"]]
 
 
-def test_runs_take_turns_at_being_first():
+def test_the_order_of_runs_rotates():
     order: list[str] = []
     interleaved({name: lambda name=name: order.append(name) for name in "abc"}, 0.0, time.perf_counter, least=3)
     rounds = ["".join(order[i : i + 3]) for i in range(0, len(order), 3)]
     assert rounds == ["abc", "bca", "cab", "abc"]
 
 
-def test_a_turn_of_many_runs_counts_as_their_mean():
+def test_repeated_runs_in_a_turn_are_averaged():
     clock = iter(range(10**6))
     found = interleaved({"a": lambda: next(clock)}, 0.0, lambda: float(next(clock)), least=1, times=4)
     assert found == {"a": [1e3 * 5 / 4]}
@@ -75,7 +75,7 @@ def test_decisions_have_a_row_for_every_published_cost(tmp_path, monkeypatch, sa
     assert platform.node() not in json.dumps(figures["machine"]).split('"')
 
 
-def test_bytes_of_the_sensor_are_those_of_its_tensors():
+def test_bytes_of_the_sensor_equal_the_size_of_its_tensors():
     path = paths()["foveation, pyramid included"]
     assert path.bytes == 2 * 3 * 480 * 640 * 4
     assert path.run().numel() * 4 * 2 == path.bytes

@@ -1,4 +1,4 @@
-"""What a newcomer calls, right and wrong: each gives the right result, or an error that names argument and remedy."""
+"""Public entry points with right and wrong arguments: the right result, or an error with argument and remedy."""
 
 import io
 import re
@@ -39,8 +39,8 @@ GREYS = torch.from_numpy(GREY)[None].expand(3, -1, -1) / 255
 DEEPS = torch.from_numpy(DEEP.astype(np.int32))[None].expand(3, -1, -1) / 65535
 
 
-class Quiet(Detector):
-    """Sees one cup, wherever it looks."""
+class OneCup(Detector):
+    """Detects one cup at the same place of every canvas."""
 
     def __init__(self):
         super().__init__("quiet", ("cup", "wine glass"), (32, 32))
@@ -52,7 +52,7 @@ class Quiet(Detector):
 
 @pytest.fixture(scope="module")
 def agent():
-    observer, eye = observers.Semantic(3), Eye(Foveation(10.0), Quiet(), reference=64.0)
+    observer, eye = observers.Semantic(3), Eye(Foveation(10.0), OneCup(), reference=64.0)
     return ActivePerception(eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(4, 3))
 
 
@@ -60,12 +60,12 @@ def agent():
 def zooming():
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        return ZoomAgent(ZoomEye(Quiet()), GlimpseEvidence(2, 8)).eval()
+        return ZoomAgent(ZoomEye(OneCup()), GlimpseEvidence(2, 8)).eval()
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A photograph, what is none, and a folder without any."""
+    """A folder with a photograph, files that are not images, and an empty folder."""
     path = tmp_path_factory.mktemp("pictures")
     Image.fromarray(PIXELS).save(path / "photo.png")
     (path / "notes.txt").write_text("no picture")
@@ -74,8 +74,8 @@ def folder(tmp_path_factory):
     return path
 
 
-def turned():
-    """A photograph that its EXIF data turn upright, as a camera that was held sideways stores it."""
+def stored_sideways():
+    """A photograph that is stored sideways, with the EXIF orientation that turns it upright."""
     exif = Image.Exif()
     exif[0x0112] = 6
     file = io.BytesIO()
@@ -83,8 +83,8 @@ def turned():
     return Image.open(file)
 
 
-def over_white():
-    """Transparent in its left half."""
+def half_transparent():
+    """A photograph whose left half is transparent."""
     alpha = np.full((30, 44, 1), 255, np.uint8)
     alpha[:, :22] = 0
     return Image.fromarray(np.concatenate([PIXELS, alpha], -1), "RGBA")
@@ -99,8 +99,8 @@ PICTURES = {
     "path": (lambda folder: folder / "photo.png", RGB),
     "pillow": (lambda _: Image.fromarray(PIXELS), RGB),
     "pillow file": (lambda folder: Image.open(folder / "photo.png"), RGB),
-    "pillow sideways": (lambda _: turned(), RGB),
-    "pillow alpha": (lambda _: over_white(), WHITE),
+    "pillow sideways": (lambda _: stored_sideways(), RGB),
+    "pillow alpha": (lambda _: half_transparent(), WHITE),
     "pillow grey": (lambda _: Image.fromarray(GREY), GREYS),
     "pillow grey alpha": (lambda _: Image.fromarray(GREY).convert("LA"), GREYS),
     "pillow 16 bits": (lambda _: Image.fromarray(DEEP), DEEPS),
@@ -128,8 +128,8 @@ PICTURES = {
 
 
 @pytest.mark.parametrize("kind", PICTURES)
-def test_pictures_of_any_kind(kind, folder, agent, zooming):
-    """At every door, with the values that they have."""
+def test_images_of_any_type_are_accepted(kind, folder, agent, zooming):
+    """Every function that takes an image reads the same pixel values."""
     make, expected = PICTURES[kind]
     image = as_image(make(folder))
     assert image.dtype == expected.dtype
@@ -160,7 +160,7 @@ def closed():
     return image
 
 
-NO_PICTURES = {
+INVALID_IMAGES = {
     "0 to 255": (lambda _: RGB * 255, r"expected RGB in \[0, 1\], got numbers from 0 to 255; divide by 255"),
     "array 0 to 255": (lambda _: PIXELS.astype(np.float32), "divide by 255"),
     "0 to 65535": (lambda _: RGB * 65535, "divide by the value of white"),
@@ -199,20 +199,20 @@ NO_PICTURES = {
 }
 
 
-@pytest.mark.parametrize("kind", NO_PICTURES)
-def test_what_is_no_picture(kind, folder, agent):
-    """Every door that takes one picture tells so in one line that begins with the argument, or the file."""
-    make, told = NO_PICTURES[kind]
-    for door in (as_image, lambda image: agent.search(image, "cup"), agent.explore):
-        with pytest.raises(SemfovError, match=told) as error:
-            door(make(folder))
+@pytest.mark.parametrize("kind", INVALID_IMAGES)
+def test_invalid_images_are_refused_with_the_remedy(kind, folder, agent):
+    """Every function that takes an image raises an error of one line that starts with the argument."""
+    make, message = INVALID_IMAGES[kind]
+    for function in (as_image, lambda image: agent.search(image, "cup"), agent.explore):
+        with pytest.raises(SemfovError, match=message) as error:
+            function(make(folder))
         assert str(error.value).startswith("image")
         assert "\n" not in str(error.value)
 
 
 @pytest.mark.slow
-def test_batches_go_on_working():
-    """Foveation takes batches of any channels and range, keeps gradients, and compiles whole."""
+def test_foveation_accepts_batches():
+    """Foveation accepts batches with any number of channels and any range of values, and passes gradients."""
     batch = RGB[None].repeat(2, 1, 1, 1)
     gaze = [[3, 4], [20, 12]]
     wanted = foveate(batch, torch.tensor(gaze), sigma=6.0)
@@ -232,12 +232,12 @@ def test_batches_go_on_working():
 
 
 @pytest.mark.parametrize("gaze", [(1, 2, 3), "ab", None, [[1, 2], [3]], (float("nan"), 2), 5, {}, []])
-def test_what_is_no_gaze(gaze, agent):
+def test_invalid_gazes_are_refused(gaze, agent):
     with pytest.raises(SemfovError, match=r"^gaze: expected "):
         foveate(RGB, gaze, sigma=6.0)
 
 
-def test_fixations_as_people_write_them(agent):
+def test_fixations_may_be_tuples_lists_and_arrays(agent):
     view = agent.eye.open(PIXELS)
     wanted = agent.eye.look(view, torch.tensor([[20.0, 12.0]])).boxes
     for fixation in ((20, 12), [20.0, 12.0], np.array([20, 12]), [[20, 12]]):
@@ -255,12 +255,12 @@ NAMES = {
 
 
 @pytest.mark.parametrize(("name", "known"), NAMES.items())
-def test_names_as_people_write_them(name, known):
+def test_class_names_are_recognised_in_other_spellings(name, known):
     assert COCO_CLASSES[class_index(name, COCO_CLASSES) - 1] == known
 
 
 @pytest.mark.parametrize("index", [2, np.int64(2), np.uint8(2), torch.tensor(2)])
-def test_indices_of_any_kind(index, agent):
+def test_class_indices_of_any_integer_type_are_accepted(index, agent):
     assert agent.search(PIXELS, index, shifts=0).target == 2
 
 
@@ -273,12 +273,12 @@ SUGGESTED = {
 
 
 @pytest.mark.parametrize(("name", "meant"), SUGGESTED.items())
-def test_other_names_are_told_the_class(name, meant):
+def test_unknown_names_are_refused_with_a_suggested_class(name, meant):
     with pytest.raises(SemfovError, match=rf"^target: unknown class '{name}'; did you mean '{re.escape(meant)}'"):
         class_index(name, COCO_CLASSES, "target")
 
 
-def test_synonyms_lead_to_classes_and_stand_in_no_ones_way():
+def test_synonyms_are_no_class_names_and_suggest_only_known_classes():
     for word, classes in SYNONYMS.items():
         assert set(classes) <= set(COCO_CLASSES)
         assert word not in {name.replace(" ", "") for name in COCO_CLASSES}
@@ -287,7 +287,7 @@ def test_synonyms_lead_to_classes_and_stand_in_no_ones_way():
 
 
 @pytest.mark.parametrize("target", ["", "qqqq", 0, 3, -1, True, 1.0, None, ["cup"], torch.ones(2)])
-def test_what_is_no_target(target, agent, zooming):
+def test_invalid_targets_are_refused(target, agent, zooming):
     for search in (agent.search, zooming.search, zooming.find_all):
         with pytest.raises(SemfovError, match=r"^target: (expected a name, or a whole number from 1 to 2|unknown)"):
             search(PIXELS, target)
@@ -301,13 +301,13 @@ ARGUMENTS = [
 
 
 @pytest.mark.parametrize(("name", "value"), ARGUMENTS)
-def test_arguments_of_a_search(name, value, agent):
+def test_invalid_arguments_of_a_search_are_refused_by_name(name, value, agent):
     with pytest.raises(SemfovError, match=f"^{name}: expected "):
         agent.search(PIXELS, "cup", **{name: value})
 
 
 @pytest.mark.parametrize(
-    ("call", "told"),
+    ("call", "message"),
     [
         (
             lambda: ActivePerception.recommended(sigma=50),
@@ -323,14 +323,14 @@ def test_arguments_of_a_search(name, value, agent):
         (lambda: check_detector("nosuch.onnx"), r"detector: no such file: nosuch\.onnx; check the path"),
     ],
 )
-def test_agents_that_cannot_be(call, told):
-    with pytest.raises(SemfovError, match=f"^{told}"):
+def test_invalid_arguments_of_presets_are_refused_with_the_remedy(call, message):
+    with pytest.raises(SemfovError, match=f"^{message}"):
         call()
 
 
 @pytest.mark.parametrize("kind", [TargetEvidence, MapEvidence])
-def test_grids_that_learned_models_hold_for(kind):
-    """Half to twice the cells that they were fitted on."""
+def test_learned_models_accept_only_grids_of_similar_size(kind):
+    """A grid may have from half to twice the columns and rows that a model was fitted on."""
     model = kind.from_pretrained("yolov3-tiny")
     settings = {"detector": model.metadata["detector"], "sensor": model.metadata["sensor"]}
     for grid in ((10, 10), (20, 20), (5, 5), (16, 12)):
@@ -368,8 +368,8 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_mistakes_on_the_command_line(command, folder, monkeypatch, capsys):
-    """Told in one line, before a detector is loaded."""
+def test_wrong_values_on_the_command_line_give_an_error_of_one_line(command, folder, monkeypatch, capsys):
+    """The error comes before a detector is loaded."""
     monkeypatch.setattr(program, "make_agent", lambda config: pytest.fail("the agent was loaded"))
     assert program.main(command.replace("FOLDER", str(folder)).split()) == 1
     error = capsys.readouterr().err
@@ -379,7 +379,7 @@ def test_mistakes_on_the_command_line(command, folder, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("command", ["--nosuch", "--shifts many --target cup", "--sensor wide", "--agent best", "a b"])
-def test_usage_on_the_command_line(command, monkeypatch, capsys):
+def test_wrong_options_on_the_command_line_end_with_exit_code_2(command, monkeypatch, capsys):
     monkeypatch.setattr(program, "make_agent", lambda config: pytest.fail("the agent was loaded"))
     with pytest.raises(SystemExit) as stopped:
         program.main(command.split())
@@ -387,7 +387,7 @@ def test_usage_on_the_command_line(command, monkeypatch, capsys):
     assert command.split()[0].strip("-") in capsys.readouterr().err.replace("Unrecognized arguments: b", "a b")
 
 
-def test_classes_are_listed_without_loading_anything(monkeypatch, capsys):
+def test_classes_are_listed_without_loading_the_agent(monkeypatch, capsys):
     monkeypatch.setattr(program, "make_agent", lambda config: pytest.fail("the agent was loaded"))
     assert program.main([]) == 0
     assert "wine glass" in capsys.readouterr().out

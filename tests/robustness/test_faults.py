@@ -1,4 +1,4 @@
-"""Kills, full disks, damaged and shared files: a run ends in one line, and goes on to the undisturbed result."""
+"""Kills, full disks, damaged and shared files: the error has one line, and the next run gives the same result."""
 
 import errno
 import json
@@ -26,31 +26,31 @@ pytestmark = [pytest.mark.weights, pytest.mark.slow]
 
 
 def start(out: Path, cache: Path, *more: str, **options: Any) -> subprocess.Popen[str]:
-    """Start a small search in a session of its own."""
+    """Start a small search in a new session."""
     call = [*SEARCH, "--out", str(out), "--cache", str(cache), *more]
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(call, cwd=ROOT, env=environment, start_new_session=True, **pipes, **options)
 
 
-def ends(process: subprocess.Popen[str], code: int) -> str:
-    """Last line of what the process says when it ends, as it must, with this exit code and without a traceback."""
+def wait_for_end(process: subprocess.Popen[str], code: int) -> str:
+    """Check that the process ends with this exit code and without a traceback; return the last line of its errors."""
     error = process.communicate(timeout=300)[1]
     assert process.returncode == code, error
     assert "Traceback" not in error
     return error.strip().splitlines()[-1] if code else ""
 
 
-def bits(out: Path) -> list[bytes]:
+def result_files(out: Path) -> list[bytes]:
     return [(out / name).read_bytes() for name in RESULTS]
 
 
 def wait_for(found: Callable[[], Any]) -> Any:
     deadline = time.monotonic() + 300
-    while not (what := found()):
-        assert time.monotonic() < deadline, "nothing happened"
+    while not (found_value := found()):
+        assert time.monotonic() < deadline, "the condition was not met within 300 s"
         time.sleep(0.005)
-    return what
+    return found_value
 
 
 def workers_of(process: subprocess.Popen[str]) -> list[int]:
@@ -62,7 +62,7 @@ def workers_of(process: subprocess.Popen[str]) -> list[int]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
-    """Folder of a small search that nobody disturbs, `out` and `cache`."""
+    """A folder with `out` and `cache` of a small search that ran without faults."""
     folder = tmp_path_factory.mktemp("whole")
     assert run_here(folder) == 0
     return folder
@@ -70,26 +70,26 @@ def whole(tmp_path_factory) -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", ["store", "evaluation", "fit", "workers", "reports"])
-def test_killed_runs_resume_to_the_same_bits(command, tmp_path):
+def test_killed_runs_resume_with_results_equal_to_the_bit(command, tmp_path):
     figures = tmp_path / "figures.json"
     call = [sys.executable, "-m", "benchmarks.faults", "--only", command, "--kills", "3", "--json", str(figures)]
     subprocess.run(call, cwd=ROOT, check=True, capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    came = json.loads(figures.read_text())[command]
-    assert len(came["progress"]) == came["identical"] == 3
-    assert came["left"] == 0
+    figures_of_command = json.loads(figures.read_text())[command]
+    assert len(figures_of_command["progress"]) == figures_of_command["identical"] == 3
+    assert figures_of_command["left"] == 0
 
 
 @pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
-def test_one_misfortune_after_another(whole, tmp_path):
-    """A worker is killed, the next run meets a full disk, the next is interrupted, and the last one finishes."""
+def test_a_run_finishes_after_a_killed_worker_a_full_disk_and_an_interrupt(whole, tmp_path):
+    """One worker is killed, the second run has a full disk, the third is interrupted, and the last one finishes."""
     out, cache = tmp_path / "out", tmp_path / "cache"
     process = start(out, cache, "--workers", "2")
     os.kill(wait_for(partial(workers_of, process))[-1], signal.SIGKILL)
-    assert "a worker process died" in ends(process, 1)
+    assert "a worker process died" in wait_for_end(process, 1)
 
     limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (2000, 2000))
-    message = ends(start(out, cache, "--workers", "1", preexec_fn=limit), 1)
+    message = wait_for_end(start(out, cache, "--workers", "1", preexec_fn=limit), 1)
     assert message.startswith("error: cannot write")
     assert str(cache) in message
 
@@ -97,17 +97,17 @@ def test_one_misfortune_after_another(whole, tmp_path):
     workers = wait_for(partial(workers_of, process))
     wait_for(lambda: list(tmp_path.rglob("*.safetensors")))
     os.killpg(process.pid, signal.SIGINT)
-    assert "interrupted" in ends(process, 130)
+    assert "interrupted" in wait_for_end(process, 130)
     wait_for(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
 
-    ends(start(out, cache, "--workers", "2"), 0)
-    assert bits(out) == bits(whole / "out")
+    wait_for_end(start(out, cache, "--workers", "2"), 0)
+    assert result_files(out) == result_files(whole / "out")
     assert not list(tmp_path.rglob("*.part"))
 
 
 @pytest.mark.parametrize("full", ["cache", "out"])
-def test_full_disk(whole, tmp_path, capsys, full):
-    """A file system of 8 kB: the error names the file, nothing half-written counts, and space is all it needs."""
+def test_a_run_goes_on_after_a_full_disk(whole, tmp_path, capsys, full):
+    """On a file system of 8 kB the error names the file and no part is left; with more space the run finishes."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8k", "tmpfs", disk], capture_output=True, check=False)
@@ -123,23 +123,23 @@ def test_full_disk(whole, tmp_path, capsys, full):
         assert not list(disk.rglob("*.part"))
         subprocess.run(["mount", "-o", "remount,size=64m", disk], check=True)
         assert run_in(out, cache) == 0
-        assert bits(out) == bits(whole / "out")
+        assert result_files(out) == result_files(whole / "out")
     finally:
-        # Files there may still be mapped into this process.
+        # This process may still have files of the disk mapped into memory.
         subprocess.run(["umount", "--lazy", disk], check=True)
 
 
-def test_two_processes_share_a_cache(whole, tmp_path):
+def test_two_processes_can_share_a_cache(whole, tmp_path):
     together = [start(tmp_path / name, tmp_path / "cache", "--workers", "1") for name in ("first", "second")]
     for process in together:
-        ends(process, 0)
-    assert bits(tmp_path / "first") == bits(tmp_path / "second") == bits(whole / "out")
+        wait_for_end(process, 0)
+    assert result_files(tmp_path / "first") == result_files(tmp_path / "second") == result_files(whole / "out")
     assert not list(tmp_path.rglob("*.part"))
 
 
 @pytest.mark.parametrize("full", ["cache", "out"])
-def test_full_disk_while_writing(whole, tmp_path, monkeypatch, capsys, full):
-    """No space from some write on: one line that names the file, and the same command goes on once there is space."""
+def test_a_run_goes_on_after_a_write_without_space(whole, tmp_path, monkeypatch, capsys, full):
+    """Without space the error names the file in one line; with space the same command finishes."""
     from semfov.io import files
 
     out, cache, replace = tmp_path / "out", tmp_path / "cache", files.Path.replace
@@ -158,30 +158,30 @@ def test_full_disk_while_writing(whole, tmp_path, monkeypatch, capsys, full):
     assert not list(tmp_path.rglob("*.part"))
     monkeypatch.undo()
     assert run_in(out, cache) == 0
-    assert bits(out) == bits(whole / "out")
+    assert result_files(out) == result_files(whole / "out")
 
 
 @pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
-def test_two_runs_on_one_cache_while_one_is_killed(whole, tmp_path):
+def test_a_killed_run_does_not_disturb_another_run_on_the_same_cache(whole, tmp_path):
     killed, other = (start(tmp_path / name, tmp_path / "cache", "--workers", "2") for name in ("killed", "other"))
     wait_for(lambda: list((tmp_path / "cache").rglob("*.safetensors")) or killed.poll() is not None)
     workers = workers_of(killed) if killed.poll() is None else []
     killed.kill()
     killed.communicate(timeout=300)
-    ends(other, 0)
+    wait_for_end(other, 0)
     wait_for(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
-    ends(start(tmp_path / "killed", tmp_path / "cache", "--workers", "2"), 0)
-    assert bits(tmp_path / "killed") == bits(tmp_path / "other") == bits(whole / "out")
+    wait_for_end(start(tmp_path / "killed", tmp_path / "cache", "--workers", "2"), 0)
+    assert result_files(tmp_path / "killed") == result_files(tmp_path / "other") == result_files(whole / "out")
 
 
 def test_damaged_and_swapped_files_are_computed_again(whole, tmp_path):
-    """Of the scenes' looks one is cut and both are swapped; of their outcomes too; a reader would not notice."""
+    """Stored looks and outcomes of scenes are swapped, cut, or changed by one bit; the results stay the same."""
     looks = sorted((whole / "cache" / "looks").rglob("*.safetensors"))
     parts = sorted((whole / "out" / "parts").rglob("*.json"))
     assert len(looks) == len(parts) == 2
     kept = {file: file.read_bytes() for file in (*looks, *parts)}
-    expected = bits(whole / "out")
+    expected = result_files(whole / "out")
     for files in (looks, parts):
         for damage in ("swapped", "cut", "flipped"):
             for file, other in zip(files, reversed(files), strict=True):
@@ -193,17 +193,17 @@ def test_damaged_and_swapped_files_are_computed_again(whole, tmp_path):
                     part.unlink()
             damaged = {file: file.read_bytes() for file in files}
             assert run_here(whole) == 0
-            assert bits(whole / "out") == expected, damage
+            assert result_files(whole / "out") == expected, damage
             assert all(file.read_bytes() != damaged[file] for file in files)
 
 
 def run_here(folder: Path) -> int:
-    """The small search in this process."""
+    """Run the small search in this process."""
     return run_in(folder / "out", folder / "cache")
 
 
 def run_in(out: Path, cache: Path) -> int:
-    """The same in other folders."""
+    """Run the small search in this process, in the given folders."""
     import torch
 
     from eval.search import main
@@ -250,7 +250,7 @@ def test_damaged_weights_are_refused(tmp_path, capsys, monkeypatch):
 
 
 def test_unwritable_output_is_named(tmp_path, capsys, whole):
-    """No user, root included, can make a folder there."""
+    """No user, not even root, can create a folder in /proc."""
     from eval.search import main
 
     cache = str(whole / "cache")

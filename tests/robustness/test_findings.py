@@ -1,4 +1,4 @@
-"""What fuzzing has found, each as its smallest case."""
+"""Errors that fuzzing found, each as a minimal case."""
 
 import math
 import subprocess
@@ -17,8 +17,8 @@ from semfov.io.cached import read_tensors, write_tensors
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("oriented", [True, False])
-def test_grey_tiffs_are_turned_once(tmp_path, orientation, oriented):
-    """Pillow turns TIFFs while it loads them, and mixes up the rows of those that it maps into memory."""
+def test_grey_tiffs_are_rotated_only_once(tmp_path, orientation, oriented):
+    """Pillow rotates TIFFs while it loads them, and mixes up rows of TIFFs that it maps into memory."""
     pixels = np.arange(6, dtype=np.uint8).reshape(2, 3) * 40
     exif = Image.Exif()
     exif[0x0112] = orientation
@@ -31,7 +31,7 @@ def test_grey_tiffs_are_turned_once(tmp_path, orientation, oriented):
 
 
 @pytest.mark.parametrize("value", [1e30, math.inf])
-def test_points_far_outside_count_to_the_nearest_cell(value):
+def test_points_far_outside_belong_to_the_nearest_cell(value):
     grid, far = Grid(3, 2, (30, 20)), torch.tensor([[value, 5.0], [-value, 5.0]])
     if math.isinf(value):
         with pytest.raises(InputError, match="points: expected finite numbers"):
@@ -41,7 +41,7 @@ def test_points_far_outside_count_to_the_nearest_cell(value):
 
 
 @pytest.mark.parametrize("rule", ["overlap", "centre", "box_centre", "soft"])
-def test_boxes_of_nan_cover_nothing_in_silence_no_more(rule):
+def test_boxes_of_nan_are_refused(rule):
     grid = Grid(3, 2, (30, 20))
     with pytest.raises(InputError, match="boxes: expected finite numbers"):
         grid.footprint(torch.tensor([[0.0, 0.0, math.nan, 5.0]]), rule)
@@ -49,13 +49,13 @@ def test_boxes_of_nan_cover_nothing_in_silence_no_more(rule):
         grid.box_distance(torch.tensor([[0.0, 0.0, math.nan, 5.0]]), torch.zeros(2))
 
 
-def test_windows_of_huge_boxes_are_flat():
+def test_soft_footprints_of_huge_boxes_are_uniform():
     weights = Grid(3, 2, (30, 20)).footprint(torch.tensor([[-1e30, -1e30, 1e30, 1e30]]), "soft")
     torch.testing.assert_close(weights, torch.ones(1, 6))
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
-def test_parameters_that_are_none_are_refused(bad):
+def test_invalid_dirichlet_parameters_are_refused(bad):
     beta, likelihood = torch.tensor([0.5, bad]), torch.tensor([0.2, 0.8])
     for rule in (fusion.kaplan, fusion.product, fusion.sum):
         with pytest.raises(InputError, match="beta: expected positive, finite"):
@@ -65,14 +65,14 @@ def test_parameters_that_are_none_are_refused(bad):
 
 
 @pytest.mark.parametrize("distance", [math.nan, -0.1])
-def test_distances_that_are_none_are_refused(distance):
-    """NaN was the outermost level."""
+def test_invalid_distances_are_refused(distance):
+    """NaN was treated as the outermost level."""
     model = FovealObservationModel.identity(["cup"], [0.2])
     with pytest.raises(InputError, match="distance: expected numbers from 0 up"):
         model.calibrate(torch.tensor([0.4, 0.6]), torch.tensor(distance))
 
 
-def test_a_changed_bit_in_a_model_is_noticed(tmp_path):
+def test_a_changed_bit_in_a_model_file_is_detected(tmp_path):
     path = tmp_path / "model.safetensors"
     FovealObservationModel.identity(["cup"], [0.2]).save(path)
     content = bytearray(path.read_bytes())
@@ -83,8 +83,8 @@ def test_a_changed_bit_in_a_model_is_noticed(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_model_that_does_not_fit_on_the_disk_is_told_of(tmp_path):
-    """`safetensors` tells of it by an error of its own; what was there before stays."""
+def test_a_model_that_does_not_fit_on_the_disk_raises_an_error(tmp_path):
+    """`safetensors` raises its own type of error for it; the old file must stay unchanged."""
     path = tmp_path / "model.safetensors"
     FovealObservationModel.identity(["cup"], [0.2]).save(path)
     before = path.read_bytes()
@@ -102,7 +102,7 @@ def test_a_model_that_does_not_fit_on_the_disk_is_told_of(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
-def test_tensors_of_another_file_are_not_taken(tmp_path):
+def test_tensors_copied_from_another_cache_file_are_ignored(tmp_path):
     first, second = tmp_path / "1.safetensors", tmp_path / "2.safetensors"
     for number, path in enumerate((first, second)):
         write_tensors(path, "key", {"a": torch.full((3,), float(number))})
@@ -111,7 +111,7 @@ def test_tensors_of_another_file_are_not_taken(tmp_path):
     assert read_tensors(first, "key") is None
 
 
-def test_buffers_of_an_acquisition_are_leaves():
-    """Or it could not be copied."""
+def test_buffers_of_an_acquisition_function_require_no_gradient():
+    """Otherwise the function could not be copied."""
     model = FovealObservationModel.identity(["cup"], [0.2], miss_rate=torch.full((2, 2), 0.5))
     assert not any(b.requires_grad for b in acquisition.ExpectedAccuracy(model, Grid(2, 2, (4, 4))).buffers())

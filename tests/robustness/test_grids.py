@@ -1,4 +1,4 @@
-"""Learned models on finer and coarser grids than they were fitted on know as well whether a target is there."""
+"""Learned models estimate the presence of a target equally well on finer and coarser grids than in the fit."""
 
 import json
 import random
@@ -14,8 +14,8 @@ CASES = 8
 @pytest.mark.slow
 @pytest.mark.weights
 @pytest.mark.shared
-def test_presence_is_known_as_well_on_other_grids(shared):
-    """Squared error of the probability that the image holds a target, some there and some not."""
+def test_presence_is_estimated_equally_well_on_other_grids(shared):
+    """Compare squared errors of the probability of presence, for present and absent targets."""
     records = json.loads((shared / "coco" / "annotations" / "instances_fit.json").read_text(encoding="utf-8"))
     names = {category["id"]: category["name"] for category in records["categories"]}
     held: dict[int, set[str]] = {}
@@ -36,6 +36,6 @@ def test_presence_is_known_as_well_on_other_grids(shared):
             paths = [agent.search(read_image(path), target, shifts=8) for path, target, _ in asked]
         chances = torch.stack([path.presence[-1] for path in paths])
         errors[grid] = float((chances - torch.tensor([truth for _, _, truth in asked])).square().mean())
-    assert errors[10, 10] < 0.2, "chance is 0.25"
+    assert errors[10, 10] < 0.2, "a constant probability of 0.5 gives 0.25"
     assert errors[20, 20] < errors[10, 10] + 0.04
     assert errors[5, 5] < errors[10, 10] + 0.04

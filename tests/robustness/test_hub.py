@@ -16,12 +16,12 @@ def load(name, **options):
     return torch.hub.load(ROOT, name, source="local", **options)
 
 
-def test_entry_points_are_listed_and_explained():
+def test_entry_points_are_listed_and_have_docstrings():
     names = torch.hub.list(ROOT, source="local") if "source" in torch.hub.list.__code__.co_varnames else None
     spec = importlib.util.spec_from_file_location("hubconf", Path(ROOT, "hubconf.py"))
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    entries = {n for n, thing in vars(module).items() if callable(thing) and not n.startswith("_") and n != "Any"}
+    entries = {n for n, value in vars(module).items() if callable(value) and not n.startswith("_") and n != "Any"}
     assert entries == {
         "foveation", "yolov3_tiny_agent", "yolov3_tiny_detector", "yolov3_tiny_eye", "yolov3_tiny_observation",
     }  # fmt: skip
@@ -32,7 +32,7 @@ def test_entry_points_are_listed_and_explained():
         assert importlib.util.find_spec(package) is not None
 
 
-def test_parts_without_weights():
+def test_sensor_and_observation_model_load_without_detector_weights():
     sensor = load("foveation", sigma=20.0, levels=3)
     image = torch.rand(1, 3, 40, 40)
     expected = semfov.foveate(image, torch.tensor([8.0, 9.0]), sigma=20.0, levels=3)
@@ -41,7 +41,7 @@ def test_parts_without_weights():
 
 
 @pytest.mark.weights
-def test_eye_sees():
+def test_eye_returns_scores_of_all_classes():
     scene = semfov.EmbeddedScenes(("person", "cat", "cup", "motorcycle"), count=1)[0]
     with torch.inference_mode():
         seen = load("yolov3_tiny_eye")(scene.image[None], torch.tensor([[320.0, 240.0]]))
@@ -75,7 +75,7 @@ def test_agents_search_and_explore(kind):
 
 
 @pytest.mark.weights
-def test_the_recommended_agent_is_given_unless_another_is_asked_for():
+def test_the_recommended_agent_is_the_default():
     assert type(load("yolov3_tiny_agent").searching.observer) is observers.Target
     with pytest.raises(semfov.InputError, match="kind: expected recommended, published, raw, got 'best'"):
         load("yolov3_tiny_agent", kind="best")

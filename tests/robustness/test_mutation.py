@@ -1,4 +1,4 @@
-"""What is read of mutation tests: a module as mutmut leaves it, written out by hand."""
+"""Reading the results of mutation tests, from a module in the format that mutmut writes."""
 
 import json
 from collections import Counter
@@ -46,7 +46,7 @@ def path(tmp_path):
     return tmp_path / "shapes.py"
 
 
-def test_mutants_have_their_function_their_change_and_their_status(path):
+def test_mutants_are_read_with_function_change_and_status(path):
     weaker = "check(a >= 0, 'a', 'a positive number', a)"
     first, words, killed, method = read(path, {})
     assert (first.function, first.change, first.status) == ("shapes.area", weaker, "survived")
@@ -56,11 +56,11 @@ def test_mutants_have_their_function_their_change_and_their_status(path):
     assert next(read(path, {"shapes.area": [weaker]})).status == "aside"
 
 
-def test_the_score_counts_what_was_run():
+def test_the_score_counts_only_mutants_that_were_run():
     assert score(Counter(killed=3, survived=1, aside=9, **{"not run": 5})) == "75.0%"
     assert score(Counter(killed=1, untested=1)) == "50.0%"
 
 
-def test_every_change_that_is_set_aside_is_of_a_function_of_the_library():
+def test_changes_that_are_set_aside_belong_to_functions_of_the_library():
     assert listed()
     assert all(function.startswith("semfov.") and all(changes) for function, changes in listed().items())

@@ -1,4 +1,4 @@
-"""Digits: single against double precision over long episodes, special functions against mpmath, bits of seeds."""
+"""Numerical accuracy: single against double precision over long episodes, special functions against mpmath."""
 
 import math
 
@@ -23,8 +23,8 @@ def likelihoods(count: int, components: int, sharpness: float) -> torch.Tensor:
 
 @pytest.mark.parametrize("sharpness", [0.1, 1.0, 5.0])
 @pytest.mark.parametrize("components", [2, 81])
-def test_300_updates_in_single_precision(components, sharpness):
-    """Kaplan's rule only multiplies and adds positive numbers: errors add up, and do not blow up."""
+def test_300_updates_in_single_precision_are_close_to_double_precision(components, sharpness):
+    """Kaplan's rule only multiplies and adds positive numbers, so rounding errors grow slowly."""
     double = torch.full((components,), 0.5, dtype=torch.float64)
     single = double.float()
     for likelihood in likelihoods(300, components, sharpness):
@@ -37,8 +37,8 @@ def test_300_updates_in_single_precision(components, sharpness):
 
 
 @pytest.mark.parametrize("sharpness", [0.1, 5.0])
-def test_300_updates_in_double_precision(sharpness):
-    """Against sixty digits."""
+def test_300_updates_in_double_precision_are_close_to_sixty_digits(sharpness):
+    """The reference is computed with sixty digits."""
     double = torch.full((5,), 0.5, dtype=torch.float64)
     exact = [mp.mpf(1) / 2] * 5
     for likelihood in likelihoods(300, 5, sharpness):
@@ -54,7 +54,7 @@ TAILS = [1e-8, 1e-4, 0.02, 0.5, 1.0, 1.5, 37.0, 1e3, 1e5, 1e7]
 
 
 def rows() -> torch.Tensor:
-    """Parameters of every pair of magnitudes, with a third in the middle."""
+    """Parameters for every pair of magnitudes, with their geometric mean as a third parameter."""
     return torch.tensor([[a, b, math.sqrt(a * b)] for a in TAILS for b in TAILS], dtype=torch.float64)
 
 
@@ -62,19 +62,19 @@ def exact_normaliser(row: list[mpmath.mpf]) -> mpmath.mpf:
     return mp.fsum(mp.loggamma(a) for a in row) - mp.loggamma(mp.fsum(row))
 
 
-def close(found: torch.Tensor, exact: list[mpmath.mpf], size: list[mpmath.mpf]) -> None:
-    """Rounding is that of the largest term of the sum, `size`; nothing else is lost."""
+def assert_close_to_exact(found: torch.Tensor, exact: list[mpmath.mpf], size: list[mpmath.mpf]) -> None:
+    """The error is at most the rounding error of the largest term of the sum, `size`."""
     for value, wanted, largest in zip(found.tolist(), exact, size, strict=True):
         assert abs(value - wanted) <= 1e-14 * max(abs(largest), 1), (value, float(wanted), float(largest))
 
 
-def test_log_normaliser_in_the_tails():
+def test_log_normaliser_is_accurate_for_tiny_and_huge_parameters():
     table = [[mp.mpf(a) for a in row] for row in rows().tolist()]
     size = [mp.fsum(abs(mp.loggamma(a)) for a in row) + abs(mp.loggamma(mp.fsum(row))) for row in table]
-    close(dirichlet.log_normaliser(rows()), [exact_normaliser(row) for row in table], size)
+    assert_close_to_exact(dirichlet.log_normaliser(rows()), [exact_normaliser(row) for row in table], size)
 
 
-def test_entropy_in_the_tails():
+def test_entropy_is_accurate_for_tiny_and_huge_parameters():
     exact, size = [], []
     for row in [[mp.mpf(a) for a in row] for row in rows().tolist()]:
         total = mp.fsum(row)
@@ -82,11 +82,11 @@ def test_entropy_in_the_tails():
         exact.append(exact_normaliser(row) - mp.fsum(terms))
         largest = max(abs((a - 1) * mp.digamma(b)) for a in row for b in (a, total))
         size.append(largest + abs(mp.loggamma(total)) + max(abs(mp.loggamma(a)) for a in row))
-    close(dirichlet.entropy(rows()), exact, [5 * value for value in size])
+    assert_close_to_exact(dirichlet.entropy(rows()), exact, [5 * value for value in size])
 
 
-def test_divergence_in_the_tails():
-    """Of neighbours in the table: never below zero by more than its terms round."""
+def test_divergence_is_accurate_for_tiny_and_huge_parameters():
+    """Between neighbouring rows of the table: negative at most by the rounding error of the terms."""
     alpha, other = rows(), rows().roll(1, 0)
     exact, size = [], []
     for a, b in zip(alpha.tolist(), other.tolist(), strict=True):
@@ -97,13 +97,13 @@ def test_divergence_in_the_tails():
         largest = max(abs((x - y) * mp.digamma(z)) for x, y in zip(a, b, strict=True) for z in (x, total))
         size.append(largest + sum(abs(mp.loggamma(z)) for z in (*a, *b, total, mp.fsum(b))))
     assert min(exact) >= 0
-    close(dirichlet.kl_divergence(alpha, other), exact, [5 * value for value in size])
+    assert_close_to_exact(dirichlet.kl_divergence(alpha, other), exact, [5 * value for value in size])
 
 
-def test_inverse_digamma_in_the_tails():
+def test_inverse_digamma_is_accurate_for_tiny_and_huge_arguments():
     x = torch.logspace(-8, 8, 65, dtype=torch.float64)
     level = torch.tensor([float(mp.digamma(mp.mpf(v))) for v in x.tolist()], dtype=torch.float64)
-    # A rounding of ψ(x) by one unit moves x by that over ψ'(x), relative to x.
+    # A rounding error of ψ(x) changes x by the error divided by ψ'(x).
     slack = [
         4e-16 * max(abs(y), 1) / float(mp.polygamma(1, v)) / v for v, y in zip(x.tolist(), level.tolist(), strict=True)
     ]
@@ -111,15 +111,15 @@ def test_inverse_digamma_in_the_tails():
     assert bool(((found / x - 1).abs() <= 4 * torch.tensor(slack) + 1e-14).all())
 
 
-def test_trigamma_in_the_tails():
-    """What Newton's steps divide by: torch's has ten digits, which sets how fast they arrive and not where."""
+def test_trigamma_is_accurate_for_tiny_and_huge_arguments():
+    """The divisor of Newton steps; ten digits in torch affect the speed of convergence, not the result."""
     x = torch.logspace(-6, 8, 57, dtype=torch.float64)
     exact = [float(mp.polygamma(1, mp.mpf(v))) for v in x.tolist()]
     np.testing.assert_allclose(torch.polygamma(1, x).numpy(), exact, rtol=1e-9)
 
 
-def test_maps_do_not_depend_on_the_batch():
-    """Bits of fused beliefs, and choices of every acquisition, for all episodes at once and one by one."""
+def test_beliefs_and_choices_do_not_depend_on_the_batch():
+    """Fused beliefs and choices of every acquisition function are the same in a batch and alone."""
     generator = torch.Generator().manual_seed(3)
     beta = 0.5 + torch.rand(16, 30, 9, generator=generator)
     likelihood = torch.rand(16, 12, 9, generator=generator).softmax(-1)
@@ -147,7 +147,7 @@ def test_maps_do_not_depend_on_the_batch():
         assert torch.equal(together, torch.cat(alone))
 
 
-def test_scenes_of_a_seed_are_the_same_bits():
+def test_scenes_of_a_seed_are_reproducible_to_the_bit():
     classes = ("person", "cat", "cup", "motorcycle")
     first, again, other = (EmbeddedScenes(classes, count=2, seed=seed) for seed in (5, 5, 6))
     assert first.digest(1) == again.digest(1) != other.digest(1)

@@ -1,4 +1,4 @@
-"""The sensor and one step of search as ONNX graphs: onnxruntime computes what torch does."""
+"""The sensor and one step of a search as ONNX graphs: results of onnxruntime equal those of torch."""
 
 import warnings
 from pathlib import Path
@@ -47,9 +47,9 @@ class SearchStep(nn.Module):
 
 
 def run(module: nn.Module, inputs: tuple[Tensor, ...], path: Path) -> list[np.ndarray]:
-    """Export, and run in onnxruntime."""
+    """Export the module and run it in onnxruntime."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the exporter's own doing
+        warnings.simplefilter("ignore")  # warnings inside the exporter
         torch.onnx.export(module, inputs, path, dynamo=True, verbose=False, external_data=False)
     session = ort.InferenceSession(path, providers=["CPUExecutionProvider"])
     names = [value.name for value in session.get_inputs()]
@@ -61,7 +61,7 @@ def seeded(*shape: int) -> Tensor:
 
 
 @pytest.mark.parametrize(("sensor", "tolerance"), [(Foveation(15.0, levels=3), 2e-6), (LogPolar(15.0), 2e-4)])
-def test_sensor(sensor, tolerance, tmp_path):
+def test_exported_sensor_equals_torch(sensor, tolerance, tmp_path):
     inputs = seeded(1, 3, 48, 64), torch.tensor([[40.2, 30.5]])
     (view,) = run(sensor.eval(), inputs, tmp_path / "sensor.onnx")
     with torch.no_grad():
@@ -69,7 +69,7 @@ def test_sensor(sensor, tolerance, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["predictive", "negative entropy"])
-def test_step(name, tmp_path):
+def test_exported_search_step_equals_torch(name, tmp_path):
     alpha = 0.5 + 5 * seeded(4, 3, 4) + 4 * torch.eye(4)[:, None]
     model = FovealObservationModel(alpha, [0.2, 0.5], CLASSES).eval().requires_grad_(False)
     folded = FoldedObservationModel(model)

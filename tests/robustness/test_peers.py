@@ -1,4 +1,4 @@
-"""Programs that measure beside peers and beside other sensors: they count what they say they count."""
+"""Benchmark programs that compare with peers and other sensors compute the quantities that they report."""
 
 import subprocess
 import sys
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 
 class RedSquares(Detector):
-    """Proposes one box around all that is red, of the second of two classes."""
+    """Proposes one box around all red pixels, of the second of two classes."""
 
     def __init__(self, size=(64, 64)):
         super().__init__("red", ("nothing", "red"), size, fill=0.0)
@@ -31,21 +31,21 @@ class RedSquares(Detector):
         return Candidates(box.view(1, 1, 4), torch.tensor([[[0.0, 0.75]]]), torch.tensor([[0.8]]))
 
 
-def test_contrast_of_a_sensor_that_keeps_everything_is_whole():
+def test_contrast_of_a_sensor_without_blur_is_1():
     assert acuity.contrasts(Foveation(1e9), 8.0) == pytest.approx([1.0] * 7, abs=1e-3)
     kept = acuity.contrasts(LogPolar(60.0), 8.0)
     assert kept[0] > 0.85
     assert kept[-1] < 0.05
 
 
-def test_finest_gratings_grow_with_the_distance():
+def test_wavelengths_of_the_finest_gratings_grow_with_the_distance():
     found = [float(value.strip("≤ >")) for value in acuity.finest(LogPolar(60.0))]
     assert found == sorted(found)
-    # Two neighbours to a wave at least: 1 + 350 / 60 times as far apart as in the middle.
+    # At least two samples per wavelength; samples are 1 + 350 / 60 times as far apart as in the centre.
     assert 2 * (1 + 350 / 60) < found[-1] < 4 * (1 + 350 / 60)
 
 
-def test_errors_and_finds_are_counted_by_distance():
+def test_errors_and_found_objects_are_counted_by_distance():
     image = torch.zeros(1, 3, 64, 640)
     image[0, 0, 20:40, 100:120] = 1
     boxes, labels = torch.tensor([[100.0, 20, 120, 40], [600, 20, 620, 40]]), torch.tensor([2, 2])
@@ -59,14 +59,14 @@ def test_errors_and_finds_are_counted_by_distance():
     assert float(tally.pixels.sum()) > 40_000
 
 
-def test_sahi_is_asked_for_by_name():
-    """Where it is not there, or is not what it should be."""
+def test_missing_sahi_is_named_with_the_remedy():
+    """The import fails with the command that installs SAHI."""
     code = "import sys; sys.modules['sahi'] = None; import benchmarks.sahi"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "pip install --no-deps sahi" in result.stderr.splitlines()[-1]
 
 
-def test_sahi_takes_a_detector():
+def test_sahi_accepts_a_detector_of_semfov():
     pytest.importorskip("sahi")
     from sahi.predict import get_sliced_prediction
 

@@ -1,6 +1,6 @@
-"""Functions in others' hands: vectorised, differentiated, and observers with all that they are made of.
+"""Functions and observers in a user's code: `vmap`, gradients, copies and state.
 
-What every module must withstand is in `tests/base_tester.py`.
+The tests of every public module are in `tests/base_tester.py`.
 """
 
 import copy
@@ -19,42 +19,42 @@ from tests.small import GRID, beliefs, context, detections, evidence, look, mode
 
 
 @pytest.mark.parametrize("rule", ["kaplan", "product", "sum"])
-def test_fusion_vectorises(rule):
+def test_vmap_of_fusion_equals_a_loop(rule):
     update = getattr(fusion, rule)
     beta, likelihood = 0.5 + rand(6, 4), 0.1 + rand(6, 4)
     expected = torch.stack([update(*pair) for pair in zip(beta, likelihood, strict=True)])
     torch.testing.assert_close(torch.func.vmap(update)(beta, likelihood), expected)
 
 
-def test_calibration_vectorises():
+def test_vmap_of_calibration_equals_a_loop():
     observation = model().requires_grad_(False)
     scores, distance = rand(7, 5, 4).softmax(-1), rand(7, 5)
     expected = torch.stack([observation(*pair) for pair in zip(scores, distance, strict=True)])
     torch.testing.assert_close(torch.func.vmap(observation)(scores, distance), expected)
 
 
-def test_choice_vectorises():
+def test_vmap_of_the_choice_equals_a_loop():
     values, noise = rand(5, 2, 12), rand(5, 2, 12).flip(-1)
     visited = noise > 0.8
     expected = torch.stack([select_fixation(*each) for each in zip(values, visited, noise, strict=True)])
     assert torch.equal(torch.func.vmap(select_fixation)(values, visited, noise), expected)
 
 
-def test_gradients_of_each_sample():
-    """`vmap(grad(...))`, as for influence and per-sample clipping."""
+def test_vmap_of_gradients_equals_a_loop():
+    """`vmap(grad(...))` as used for influence functions and per-sample gradient clipping."""
     observation = model().requires_grad_(False)
     scores, distance = rand(7, 4).softmax(-1), rand(7)
 
-    def surprise(one: Tensor, there: Tensor) -> Tensor:
-        return -observation(one, there)[2].log()
+    def surprise(one: Tensor, eccentricity: Tensor) -> Tensor:
+        return -observation(one, eccentricity)[2].log()
 
     every = torch.func.vmap(torch.func.grad(surprise))(scores, distance)
-    for one, there, gradient in zip(scores, distance, every, strict=True):
+    for one, eccentricity, gradient in zip(scores, distance, every, strict=True):
         one = one.clone().requires_grad_()
-        torch.testing.assert_close(torch.autograd.grad(surprise(one, there), one)[0], gradient)
+        torch.testing.assert_close(torch.autograd.grad(surprise(one, eccentricity), one)[0], gradient)
 
 
-def test_gradients_flow_from_the_choice_back_to_gaze_and_scores():
+def test_gradients_of_acquisition_values_reach_gaze_and_width_of_the_fovea():
     """Sensor, calibration, fusion and acquisition in one graph."""
     gaze, width = torch.tensor([30.0, 20.0], requires_grad=True), torch.tensor(9.0, requires_grad=True)
     view = semfov.foveate(rand(1, 3, 48, 64), gaze, sigma=width)
@@ -68,8 +68,8 @@ def test_gradients_flow_from_the_choice_back_to_gaze_and_scores():
         assert float(leaf.grad.abs().sum()) > 0
 
 
-def test_observers_and_evidence_are_modules_too():
-    """Modules that take detections: state and copies; a belief is what the caller keeps, and no observer changes it."""
+def test_observers_can_be_copied_saved_and_loaded():
+    """State and copies of modules that take detections; an update does not change the belief that it is given."""
     scores, boxes, fixation = (each[:1] for each in look())
     seen, own = detections(scores, boxes), observing()
     twin, start = copy.deepcopy(own), own.start(1, GRID, scores)
@@ -84,7 +84,7 @@ def test_observers_and_evidence_are_modules_too():
     assert not torch.equal(changed.beta, after.beta)
     twin.load_state_dict(own.state_dict())
     assert torch.equal(twin(start, seen, fixation, GRID).beta, changed.beta)
-    # Observers that stand in one another are one module with all their parts.
+    # A nested observer is one module that contains all its parts.
     whole = Context(Target(evidence()), context(evidence=(0.5, 0.2))).eval()
     again = pickle.loads(pickle.dumps(whole))
     assert list(again.state_dict()) == list(whole.state_dict())
@@ -95,7 +95,7 @@ def test_observers_and_evidence_are_modules_too():
 
 @pytest.mark.parametrize("size", [(48, 64), (200, 300)])
 @pytest.mark.parametrize("which", ["image", "gaze", "sigma"])
-def test_sensor_vectorises(size, which):
+def test_vmap_of_the_sensor_equals_a_loop(size, which):
     given = {"image": rand(1, 3, *size), "gaze": torch.tensor([20.0, 30.0]), "sigma": torch.tensor(9.0)}
     many = {"image": rand(4, 1, 3, *size), "gaze": 40 * rand(5, 2), "sigma": 1 + 9 * rand(5)}[which]
 

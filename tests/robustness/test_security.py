@@ -1,4 +1,4 @@
-"""Files from elsewhere are data: nothing in them is run, and nothing leads out of the folder they belong in."""
+"""Untrusted files are only data: nothing in them is executed, and no path leads outside their folder."""
 
 import ast
 import io
@@ -29,8 +29,8 @@ CLASSES = [f"class {n}" for n in range(1, 91)]
 EXTRACTING = ("extractall", "extract", "unpack_archive")
 
 
-def faults(source: str) -> list[str]:
-    """Calls that run, or may run, what a file says."""
+def unsafe_calls(source: str) -> list[str]:
+    """Calls that can execute the content of a file."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if not isinstance(node, ast.Call):
@@ -55,18 +55,18 @@ def faults(source: str) -> list[str]:
         "eval(text)",
     ],
 )  # fmt: skip
-def test_the_scan_finds(line):
-    assert faults(line)
+def test_the_scan_finds_unsafe_calls(line):
+    assert unsafe_calls(line)
 
 
-def test_the_scan_lets_pass_what_is_written_in_the_source():
-    assert not faults("exec('')")
-    assert faults("exec('' + text)")
+def test_the_scan_allows_exec_of_constants_only():
+    assert not unsafe_calls("exec('')")
+    assert unsafe_calls("exec('' + text)")
 
 
-def test_sources_run_nothing_that_they_read():
+def test_sources_have_no_unsafe_calls():
     assert len(SOURCES) > 100
-    assert {str(file): found for file in SOURCES if (found := faults(file.read_text(encoding="utf-8")))} == {}
+    assert {str(file): found for file in SOURCES if (found := unsafe_calls(file.read_text(encoding="utf-8")))} == {}
 
 
 def test_every_download_is_pinned():
@@ -84,8 +84,8 @@ def test_every_download_is_pinned():
         assert len(bytes.fromhex(archive.sha256)) == 32
 
 
-class Evil:
-    """Makes a file when it is unpickled."""
+class Unsafe:
+    """Creates a file when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -96,11 +96,11 @@ class Evil:
 
 def test_a_pickled_checkpoint_is_refused(tmp_path):
     mark, weights = tmp_path / "run", tmp_path / "weights.pth"
-    torch.save({"weight": torch.zeros(1), "evil": Evil(mark)}, weights)
+    torch.save({"weight": torch.zeros(1), "evil": Unsafe(mark)}, weights)
     with pytest.raises(DataError, match=r"weights\.pth"):
         load_detector("torchvision:ssdlite320_mobilenet_v3_large", weights=weights, classes=CLASSES)
     assert not mark.exists()
-    pickle.loads(pickle.dumps(Evil(mark)))
+    pickle.loads(pickle.dumps(Unsafe(mark)))
     assert mark.exists()
 
 
@@ -119,7 +119,7 @@ def test_settings_that_would_run_code_are_refused(tmp_path, capsys):
 
 
 def archive(path: Path, *members: tuple[str, bytes | None, str]) -> None:
-    """A tar file of (name, content, target of a link)."""
+    """Write a tar file with members of (name, content, target of a link)."""
     with tarfile.open(path, "w:gz") as tar:
         for name, content, link in members:
             entry = tarfile.TarInfo(name)
@@ -131,8 +131,8 @@ def archive(path: Path, *members: tuple[str, bytes | None, str]) -> None:
 
 
 @pytest.mark.parametrize("target", ["../../../../etc/passwd", "/etc/passwd", "p-1/other"])
-def test_archives_give_their_one_member_and_nothing_else(tmp_path, monkeypatch, target):
-    """Names that lead out stay in the archive, and a link leads nowhere else."""
+def test_nothing_is_extracted_from_archives_with_links_or_outside_paths(tmp_path, monkeypatch, target):
+    """Members with outside paths are not extracted, and a link is not followed."""
     source = SourceDistribution("p", "1", "0" * 64, 100, "p-1/weights")
 
     def download(self, folder: Path) -> None:
