@@ -6,7 +6,7 @@ from torch.nn.functional import poisson_nll_loss
 
 from semfov.errors import InputError
 from semfov.training.zoom_examples import LookedAt, ZoomExample
-from semfov.training.zoom_survey import SurveyExample, CountedLook, fit_survey, judge_survey
+from semfov.training.zoom_survey import CountedLook, SurveyExample, fit_survey, judge_survey
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.gist import Gist
