@@ -38,7 +38,7 @@ def test_windows_are_of_all_magnifications():
 
 
 @pytest.mark.slow
-def test_every_nth_mosaic_is_of_other_photographs():
+def test_every_nth_mosaic_is_made_of_held_out_photographs():
     kept, held = (EmbeddedScenes(("person", "cat"), count=3, seed=seed) for seed in (0, 1))
     both = HeldOutMosaics(*(Mosaics(some, 2, 2, tile=(64, 48), count=6) for some in (kept, held)), every=3)
     assert len(both) == 6
@@ -75,7 +75,7 @@ def test_samples_are_detections_with_octaves(sampler, tmp_path):
 
 
 @pytest.mark.slow
-def test_misses_are_counted_in_what_a_window_shows(sampler):
+def test_misses_are_counted_in_the_cells_that_a_window_shows(sampler):
     samples, edges = sampler.sample(1), torch.tensor([1.5, 2.5])
     counts = count_misses(sampler.scenes, samples, {1}, edges, sampler.cells)
     size = sampler.scenes.annotation(1).size
@@ -105,7 +105,7 @@ def observation():
     return FovealObservationModel(alpha, [0.5, 1.5, 2.5], ("red", "blue"), miss_rate=miss, metadata=cells)
 
 
-def test_what_is_expected_of_closer_looks():
+def test_expected_finds_of_closer_looks_follow_from_the_model():
     model = observation()
     rates = ObservedRates(model, LATTICE)
     span = LATTICE.span(1)
@@ -124,7 +124,7 @@ def test_what_is_expected_of_closer_looks():
             expected = held[t] * (1 - miss[t, level[2]])
             assert float(told[t, 0, *cell]) == pytest.approx(float(expected), rel=1e-4)
         assert float(told[0, 0, *cell]) == pytest.approx(float(told[1:, 0, *cell].sum()), rel=1e-4)
-    # What was found is not to be found again, and there is no look closer than the closest.
+    # Objects already found are not expected again, and no look is closer than the finest level.
     assert told[2, 0, 9:12, 9:12].max() < 1e-6
     assert told[:, LATTICE.levels - 2 :].max() < 1e-6
     assert rates.taper(5).tolist() == [1.0] * 5
