@@ -71,10 +71,10 @@ def class_odds(model, nearest, best, mean, distance, looks, targets, columns):
     answer = []
     for row in range(len(nearest)):
         rival = np.delete(nearest, row, 0).max(0)
-        told = readout_features(
+        features = readout_features(
             nearest[row], best[row], mean[row], distance, looks, float(model.prior[targets[row]].detach()), columns
         )
-        answer.append(nearest[row] + run_network(model.read, np.concatenate([told, (rival / 2 + 1)[:, None]], -1)))
+        answer.append(nearest[row] + run_network(model.read, np.concatenate([features, (rival / 2 + 1)[:, None]], -1)))
     return np.stack(answer)
 
 
@@ -95,8 +95,8 @@ def emptiness(model, odds, distance, looks, columns, stands_for=None):
         4 * distance,
         np.log(looks) / 2,
     ]
-    told = np.stack([np.broadcast_to(value, none.shape) for value in each], -1)
-    return none - np.log(np.maximum(anything, 1e-6)) + run_network(model.void, told)
+    features = np.stack([np.broadcast_to(value, none.shape) for value in each], -1)
+    return none - np.log(np.maximum(anything, 1e-6)) + run_network(model.void, features)
 
 
 def gain(model, probabilities, closest, looks, distance):
@@ -105,8 +105,14 @@ def gain(model, probabilities, closest, looks, distance):
     for cell, (p, before, now) in enumerate(zip(probabilities, closest, distance, strict=True)):
         if now < before:
             second, first = np.sort(p[1:])[-2:]
-            told = [*map(log_scaled, (first, second, p[0])), 4 * before, 4 * now, 4 * (before - now), np.log(looks) / 2]
-            answer[cell] = run_network(model.worth, told)
+            features = [
+                *map(log_scaled, (first, second, p[0])),
+                4 * before,
+                4 * now,
+                4 * (before - now),
+                np.log(looks) / 2,
+            ]
+            answer[cell] = run_network(model.worth, features)
     return answer
 
 

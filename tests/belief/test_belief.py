@@ -245,10 +245,10 @@ def test_context_fades_with_the_inner_belief(monkeypatch):
         observer.fade(belief.inner, look, 0.25, visited)
     with pytest.raises(InputError, match=r"^look: expected ContextLook"):
         observer.fade(belief, look.inner, 0.25, visited)
-    told = []
-    monkeypatch.setattr(observer.observer, "fade", lambda *given: told.append(given) or belief.inner)
+    calls = []
+    monkeypatch.setattr(observer.observer, "fade", lambda *given: calls.append(given) or belief.inner)
     observer.fade(belief, look, 0.25, visited)
-    assert [one is other for one, other in zip(told[0], (belief.inner, look.inner, 0.25, visited), strict=True)] == [
+    assert [one is other for one, other in zip(calls[0], (belief.inner, look.inner, 0.25, visited), strict=True)] == [
         True
     ] * 4
 

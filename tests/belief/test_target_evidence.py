@@ -370,7 +370,7 @@ def test_a_fixated_cell_that_shows_the_target_keeps_its_probability():
     assert first == second == later
     assert int(history[-1].present.argmax()) == cell
     assert all(float(each.anywhere) > 0.9 for each in history[1:])
-    # For the next look, the fixated cell and its neighbours are unlikely.
+    # For the next look, fixated cells are ruled out, but not their neighbours.
     assert float(history[1].following[0, cell]) < 0.001
     assert float(history[1].following[0, 0]) < 0.001 < float(history[1].following[0, 8])
     # A fixated cell that showed nothing equals any other cell that showed nothing.

@@ -89,7 +89,7 @@ def check_same_episodes(ours, theirs, steps):
             ended = np.flatnonzero(mine[4]["_final_obs"])
             assert all(equal(final[0][row], final[1][row]) for row in ended)
             mine[4]["final_info"], other[4]["final_info"] = (
-                rows_of_infos(told[4]["final_info"], ended) for told in (mine, other)
+                rows_of_infos(results[4]["final_info"], ended) for results in (mine, other)
             )
         assert equal(mine[4], other[4])
         ends += int((mine[2] | mine[3]).sum())
@@ -106,13 +106,13 @@ def test_a_seed_repeats_an_episode_and_other_seeds_give_others(sceneries, task):
     def episode(seed):
         env, random = KINDS[task](sceneries[task], belief=True), MaskedRandom(0)
         observation, info = env.reset(seed=seed)
-        told = [observation]
+        record = [observation]
         for _ in range(4):
             observation, reward, terminated, _, info = env.step(random(observation, info))
-            told.append({**observation, "reward": reward})
+            record.append({**observation, "reward": reward})
             if terminated:
                 break
-        return told
+        return record
 
     first, second = episode(5), episode(5)
     assert len(first) == len(second)
@@ -177,11 +177,11 @@ def test_a_repeated_look_costs_its_price_and_shows_nothing_new(sceneries):
     env = GazeSearch(sceneries["search"], belief=True)
     observation, info = env.reset(seed=2)
     cell = int(np.flatnonzero(info["action_mask"] == 0)[0])
-    again, reward, _, _, told = env.step(cell)
+    again, reward, _, _, later_info = env.step(cell)
     assert reward == -0.05
     assert np.array_equal(again["belief"], observation["belief"])
-    assert equal(told["detections"], info["detections"])
-    assert told["passes"] == 2
+    assert equal(later_info["detections"], info["detections"])
+    assert later_info["passes"] == 2
 
 
 def test_infos_have_the_detections_of_the_look(sceneries):
@@ -303,8 +303,8 @@ def test_importing_registers_the_names_once():
         "print(sorted(name for name in gymnasium.registry if 'semfov' in name))"
     )
     call = [sys.executable, "-W", "error::UserWarning", "-c", code]
-    told = subprocess.run(call, capture_output=True, text=True, check=True, cwd=ROOT).stdout
-    assert told.strip() == str(sorted(IDS.values()))
+    output = subprocess.run(call, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert output.strip() == str(sorted(IDS.values()))
 
 
 def test_without_gymnasium_the_error_has_the_install_command():
@@ -313,5 +313,5 @@ def test_without_gymnasium_the_error_has_the_install_command():
         "from semfov.errors import DataError\n"
         "try:\n    import semfov.envs\nexcept DataError as error:\n    print(error)"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
-    assert 'pip install "semfov[envs]"' in told
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert 'pip install "semfov[envs]"' in output

@@ -121,10 +121,10 @@ def test_observations_and_infos_follow_the_windows(zoom_scenery):
     for wrapper, key in ((BeliefObservation(env), "belief"), (GlimpseObservation(env, 32), "glimpse")):
         assert wrapper.observation_space == env.observation_space[key]
         assert np.array_equal(wrapper.observation(observation), observation[key])
-    same, reward, _, _, told = env.step(closest)
+    same, reward, _, _, later_info = env.step(closest)
     assert reward == -0.01
     assert np.array_equal(same["belief"], observation["belief"])
-    assert told["passes"] == 3
+    assert later_info["passes"] == 3
     with pytest.raises(InputError, match=r"action: expected \(x, y, magnification\)"):
         env.step(np.array([0.0, 1.5, 0.0]))
 

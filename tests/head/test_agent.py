@@ -95,12 +95,12 @@ def test_paths_can_be_plotted_and_animated(agent, panorama, tmp_path):
 
 def test_arguments_are_checked(agent, panorama):
     world = Panorama(panorama)
-    for arguments, told in (
+    for arguments, message in (
         ({"target": "blu"}, "target"),
         ({"target": "blue", "passes": 0}, "passes"),
         ({"target": "blue", "start": 10**6}, "start"),
         ({"target": "blue", "confirm": 2.0}, "confirm"),
         ({"target": "blue", "foresight": -1.0}, "foresight"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             agent.search(world, **arguments)

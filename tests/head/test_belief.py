@@ -176,8 +176,8 @@ def test_explore_gain_equals_brute_force(views, eye, models):
             if belief.owner[0, x] < 0:
                 value += float(area[x]) * 0.2 / (1 + float(distance) / fovea)
             else:
-                told = belief.class_probabilities()[:, x : x + 1], belief.closest[:, x : x + 1], belief.looks
-                value += float(area[x] * model.gain(*told, distance[None, None, None])[0, 0, 0])
+                inputs = belief.class_probabilities()[:, x : x + 1], belief.closest[:, x : x + 1], belief.looks
+                value += float(area[x] * model.gain(*inputs, distance[None, None, None])[0, 0, 0])
         assert float(gains[action]) == pytest.approx(value, rel=1e-3, abs=1e-4)
 
 

@@ -88,9 +88,9 @@ def test_boxes_of_the_annotation_lie_in_the_panorama(scenes):
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [({"width": 101}, "width"), ({"slot": 180.0}, "slot"), ({"rings": ((95.0, 1),)}, "rings"), ({"count": 0}, "count")],
 )
-def test_invalid_settings_are_refused(scenes, settings, told):
-    with pytest.raises(InputError, match=told):
+def test_invalid_settings_are_refused(scenes, settings, message):
+    with pytest.raises(InputError, match=message):
         Panoramas(scenes, **settings)

@@ -1,4 +1,4 @@
-"""Scenes seen through a window: points of pixels and scene, poses that cover the scene, boxes as regions."""
+"""Scenes seen through a window: conversion of points, poses that cover the scene, boxes as regions."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Standard errors of means against values by hand."""
+"""Standard errors of means against values computed by hand."""
 
 import numpy as np
 

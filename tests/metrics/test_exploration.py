@@ -20,7 +20,7 @@ def test_answers_are_the_classes_of_overlapping_objects():
     assert found == {0: {1, 2}, 1: {2}, 2: {2}, 11: {3}}
 
 
-def test_a_cell_is_right_if_its_most_probable_class_overlaps_it():
+def test_a_cell_is_right_if_an_object_of_its_most_probable_class_overlaps_it():
     """Section IV-A: the "highest categorical score" must fit an overlapping object, and background has a score, too."""
     answers = torch.tensor([[False, True, False]] * 4)
     beta = torch.tensor([[[0.2, 0.7, 0.1], [0.6, 0.3, 0.1], [0.1, 0.3, 0.6], [0.4, 0.35, 0.25]]])

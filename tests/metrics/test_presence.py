@@ -115,9 +115,9 @@ def test_roc_counts_at_every_threshold(cases):
     alarms, hits = roc(score, present)
     levels = sorted({s for s, _ in cases}, reverse=True)
     for level, alarm, hit in zip(levels, alarms[1:], hits[1:], strict=True):
-        told = [p for s, p in cases if torch.tensor(s) >= torch.tensor(level)]
-        assert hit == pytest.approx(sum(told) / int(present.sum()))
-        assert alarm == pytest.approx((len(told) - sum(told)) / int((~present).sum()))
+        reached = [p for s, p in cases if torch.tensor(s) >= torch.tensor(level)]
+        assert hit == pytest.approx(sum(reached) / int(present.sum()))
+        assert alarm == pytest.approx((len(reached) - sum(reached)) / int((~present).sum()))
     assert (alarms[0], hits[0], alarms[-1], hits[-1]) == (0, 0, 1, 1)
     assert np.trapezoid(hits, alarms) == pytest.approx(area_under_roc(score, present))
 

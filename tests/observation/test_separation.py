@@ -43,9 +43,9 @@ def test_visibility_equals_d_prime_of_random_scores():
         ratio = {}
         for source in (0, target):
             scores = torch.as_tensor(rng.dirichlet(alpha[source, level].numpy(), count))
-            told = [Dirichlet(alpha[k, level], validate_args=False).log_prob(scores) for k in (target, 0)]
+            log_densities = [Dirichlet(alpha[k, level], validate_args=False).log_prob(scores) for k in (target, 0)]
             seen = rng.random(count) >= float(missed[source, level])
-            ratio[source] = np.where(seen, (told[0] - told[1]).numpy(), 0)
+            ratio[source] = np.where(seen, (log_densities[0] - log_densities[1]).numpy(), 0)
         apart = ratio[target].mean() - ratio[0].mean()
         expected = apart / np.sqrt((ratio[target].var() + ratio[0].var()) / 2)
         assert float(visibility(model)[target, level].detach()) == pytest.approx(expected, rel=0.02)

@@ -75,9 +75,9 @@ def test_pooling_of_all_windows_equals_pooling_of_each():
     top, summary = pool_all(scores, 3)
     assert top.shape == (63, 4)
     for number, (row, column) in enumerate((r, c) for r in range(7) for c in range(9)):
-        one, told = pool(scores, (column, row, column + 3, row + 3))
+        one, one_summary = pool(scores, (column, row, column + 3, row + 3))
         torch.testing.assert_close(top[number], one)
-        torch.testing.assert_close(summary[number], told)
+        torch.testing.assert_close(summary[number], one_summary)
 
 
 def test_odds_of_one_window_equal_those_in_the_table_of_all_windows(belief):

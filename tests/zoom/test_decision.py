@@ -70,8 +70,8 @@ def test_features_of_a_search_equal_those_computed_from_its_looks(eye, picture):
     assert case[10] == pytest.approx(math.log(len(seen)) / 2)
     assert case.shape == (CASE,)
     boxes = torch.cat([turn.glance.detections.boxes[0] for turn in seen])
-    told = torch.cat([turn.glance.detections.scores[0, :, target] for turn in seen])
-    assert tally.box.tolist() == boxes[told.argmax()].tolist()
+    confidence = torch.cat([turn.glance.detections.scores[0, :, target] for turn in seen])
+    assert tally.box.tolist() == boxes[confidence.argmax()].tolist()
 
 
 def test_before_fitting_the_probability_is_the_best_score(eye, picture):
@@ -115,19 +115,19 @@ def test_a_fitted_probability_is_calibrated():
     fit_judge(model, known, steps=250)
     new, odds = synthetic(4000, 2)
     with torch.no_grad():
-        told = model.anywhere(new.best, new.case)[:, 0]
+        log_odds = model.anywhere(new.best, new.case)[:, 0]
     best = F.binary_cross_entropy_with_logits(odds, new.there.float())
-    loss = F.binary_cross_entropy_with_logits(told, new.there.float())
+    loss = F.binary_cross_entropy_with_logits(log_odds, new.there.float())
     raw = F.binary_cross_entropy(new.best[:, 0], new.there.float())
     assert loss < best + 0.1 * (raw - best)
-    assert calibration_error(told.sigmoid(), new.there) < 0.03 < calibration_error(new.best[:, 0], new.there)
+    assert calibration_error(log_odds.sigmoid(), new.there) < 0.03 < calibration_error(new.best[:, 0], new.there)
 
     class Bounds:
         false_alarms, surest, lost = 0.05, 1.0, 0.02
 
     rows = judge_searches(model, new, Bounds())
     assert "ECE" in rows[0]
-    sure = (told.sigmoid() >= model.thresholds.confirm) & new.looked[:, 0]
+    sure = (log_odds.sigmoid() >= model.thresholds.confirm) & new.looked[:, 0]
     assert sure[~new.there].double().mean() <= 0.05
 
 

@@ -157,8 +157,8 @@ def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path, fi
 def test_the_file_records_classes_input_size_and_cells(network, tmp_path):
     export_look(ZoomEye(network), tmp_path / "look.onnx", cells=16)
     session = ort.InferenceSession(tmp_path / "look.onnx", providers=["CPUExecutionProvider"])
-    told = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
-    assert told == {"classes": ["red", "green", "blue"], "input_size": [128, 128], "cells": 16}
+    metadata = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
+    assert metadata == {"classes": ["red", "green", "blue"], "input_size": [128, 128], "cells": 16}
 
 
 def test_bad_input(network, tmp_path):

@@ -113,7 +113,7 @@ def test_expected_finds_of_closer_looks_follow_from_the_model():
     scores[3, 4, 0] = 0.2
     found[10, 10, 1] = True
     look = Gist(1, (0, 0), 1, scores, torch.zeros(span, span), found)
-    told = rates.rates(look, torch.tensor([0, 1, 2])).exp()
+    expected_finds = rates.rates(look, torch.tensor([0, 1, 2])).exp()
     level = [sum(float(octave) > edge for edge in (0.5, 1.5, 2.5)) for octave in LATTICE.octaves]
     miss, share = model.miss_rate, torch.tensor([98.0, 2, 3]).double() / 103
     nothing = share * miss[:, level[1]]
@@ -122,11 +122,11 @@ def test_expected_finds_of_closer_looks_follow_from_the_model():
     for cell, held in (((20, 20), nothing), ((3, 4), seen)):
         for t in (1, 2):
             expected = held[t] * (1 - miss[t, level[2]])
-            assert float(told[t, 0, *cell]) == pytest.approx(float(expected), rel=1e-4)
-        assert float(told[0, 0, *cell]) == pytest.approx(float(told[1:, 0, *cell].sum()), rel=1e-4)
+            assert float(expected_finds[t, 0, *cell]) == pytest.approx(float(expected), rel=1e-4)
+        assert float(expected_finds[0, 0, *cell]) == pytest.approx(float(expected_finds[1:, 0, *cell].sum()), rel=1e-4)
     # Objects already found are not expected again, and no look is closer than the finest level.
-    assert told[2, 0, 9:12, 9:12].max() < 1e-6
-    assert told[:, LATTICE.levels - 2 :].max() < 1e-6
+    assert expected_finds[2, 0, 9:12, 9:12].max() < 1e-6
+    assert expected_finds[:, LATTICE.levels - 2 :].max() < 1e-6
     assert rates.taper(5).tolist() == [1.0] * 5
 
 

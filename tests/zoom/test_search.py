@@ -75,13 +75,13 @@ def test_invalid_arguments_are_refused(agent, picture):
         agent.explore(picture, passes=0)
     with pytest.raises(InputError, match="batch: expected a whole number from 1"):
         agent.find_all(picture, 1, batch=0)
-    for wrong, told in (
+    for wrong, message in (
         ({"passes": 2.5}, "passes: expected a whole number"),
         ({"passes": True}, "passes: expected a whole number"),
         ({"confirm": 1.5}, "confirm: expected a probability from 0 to 1, got 1.5"),
         ({"give_up": float("nan")}, "give_up: expected a probability from 0 to 1"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             agent.search(picture, "red", **wrong)
     for worth in (-1, float("nan"), "much"):
         with pytest.raises(InputError, match="worth: expected a number"):
@@ -89,7 +89,7 @@ def test_invalid_arguments_are_refused(agent, picture):
     for target in (0, 4, 1.0, True, None):
         with pytest.raises(InputError, match="target: expected a name, or a whole number from 1 to 3"):
             agent.find_all(picture, target)
-    for image, told in (
+    for image, message in (
         (picture * 255, "picture: expected RGB in .*; divide by"),
         (picture * torch.nan, "picture: expected RGB in .*NaN"),
         (picture.long(), "picture: expected bytes, 16-bit numbers or floats"),
@@ -97,15 +97,15 @@ def test_invalid_arguments_are_refused(agent, picture):
         (picture[:, :0], "picture: expected at least one pixel"),
         (7, "picture: expected a path"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             agent.explore(image)
 
 
 def test_evidence_must_have_the_classes_of_the_detector(detector):
     with pytest.raises(InputError, match="evidence: expected one for the detector's 3 classes, got 5"):
         ZoomAgent(ZoomEye(detector), GlimpseEvidence(5, 8))
-    for wrong, told in (({"patience": 0}, "patience"), ({"foresight": 2}, "foresight"), ({"classes": 0}, "classes")):
-        with pytest.raises(InputError, match=told):
+    for wrong, message in (({"patience": 0}, "patience"), ({"foresight": 2}, "foresight"), ({"classes": 0}, "classes")):
+        with pytest.raises(InputError, match=message):
             GlimpseEvidence(**wrong)
 
 

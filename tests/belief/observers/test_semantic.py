@@ -75,8 +75,8 @@ def believe_by_loop(looks, *, tempering=1.0, footprint="overlap", memory="all", 
 )
 def test_belief_equals_the_loop(looks, options):
     belief = watch(Semantic(4, **options), looks)
-    told = {("missed" if name == "misses" else name): value for name, value in options.items()}
-    torch.testing.assert_close(belief.beta[0], believe_by_loop(looks, **told), rtol=1e-5, atol=1e-6)
+    loop_options = {("missed" if name == "misses" else name): value for name, value in options.items()}
+    torch.testing.assert_close(belief.beta[0], believe_by_loop(looks, **loop_options), rtol=1e-5, atol=1e-6)
     offset = torch.cdist(GRID.centres, FIXATIONS) / 100
     torch.testing.assert_close(belief.closest[0].float(), offset.amin(1))
 
