@@ -99,8 +99,8 @@ def test_loss_equals_the_poisson_loss_window_by_window(survey):
                 if 0 <= y < logs.shape[1] and 0 <= x < logs.shape[2]:
                     expected = expected + weight[y - y1] * weight[x - x1] * logs[steps - 1, y, x].exp()
         terms.append(poisson_nll_loss(expected, closer.found.sum().double(), log_input=False, eps=0))
-    counted = Told.of(mosaic, overview, overview.found)
-    torch.testing.assert_close(counted.loss(survey, logs), torch.stack(terms).mean())
+    told = Told.of(mosaic, overview, overview.found)
+    torch.testing.assert_close(told.loss(survey, logs), torch.stack(terms).mean())
 
 
 def test_objects_that_were_seen_before_are_not_new():
