@@ -1,4 +1,4 @@
-"""What the tests of learned evidence share: looks at random, and a twin of the networks in numpy."""
+"""Shared by the tests of learned evidence: random looks, and reference networks in numpy."""
 
 from types import SimpleNamespace
 
@@ -17,7 +17,7 @@ def array(tensor):
     return tensor.detach().cpu().double().numpy()
 
 
-def neural(network, inputs):
+def run_network(network, inputs):
     """A network with an activation after every layer but the last, on the last axis of an array, in float64."""
     value = np.asarray(inputs, dtype=np.float64)
     for number, layer in enumerate(network):
@@ -26,7 +26,7 @@ def neural(network, inputs):
     return value[..., 0]
 
 
-def shrunk(odds):
+def log_scaled(odds):
     return np.log(odds + 1e-3) / 2 + 1
 
 
@@ -36,12 +36,12 @@ def blurred(values, columns, sigma):
     return scipy.ndimage.gaussian_filter(table, sigma, mode="constant", radius=3).ravel()
 
 
-def peaks(values, columns):
+def local_maxima(values, columns):
     return scipy.ndimage.maximum_filter(values.reshape(-1, columns), 3, mode="nearest").ravel()
 
 
-def described(nearest, best, mean, distance, looks, prior, columns):
-    """The 14 numbers that the looks say of every cell, `(X·Y, 14)`."""
+def readout_features(nearest, best, mean, distance, looks, prior, columns):
+    """The 14 features of every cell after the looks, `(X·Y, 14)`."""
     cells, odds = len(nearest), scipy.special.expit(nearest)
     down, right = np.divmod(np.arange(cells), columns)
     rows = cells // columns
@@ -52,12 +52,12 @@ def described(nearest, best, mean, distance, looks, prior, columns):
         best / 2 + 1,
         mean / 2 + 1,
         4 * distance,
-        shrunk(blurred(odds, columns, 0.6)),
-        shrunk(blurred(odds, columns, 1.5)),
-        peaks(nearest, columns) / 2 + 1,
+        log_scaled(blurred(odds, columns, 0.6)),
+        log_scaled(blurred(odds, columns, 1.5)),
+        local_maxima(nearest, columns) / 2 + 1,
         nearest.max() / 2,
         best.max() / 2,
-        shrunk(odds.sum()),
+        log_scaled(odds.sum()),
         x**2 + y**2,
         y,
         np.log(looks) / 2,
@@ -67,14 +67,14 @@ def described(nearest, best, mean, distance, looks, prior, columns):
 
 
 def class_odds(model, nearest, best, mean, distance, looks, targets, columns):
-    """Log odds of T classes `(T, X·Y)`, each with the strongest of the others beside it."""
+    """Log odds of T classes `(T, X·Y)`; each is read together with the strongest other class."""
     answer = []
     for row in range(len(nearest)):
         rival = np.delete(nearest, row, 0).max(0)
-        told = described(
+        features = readout_features(
             nearest[row], best[row], mean[row], distance, looks, float(model.prior[targets[row]].detach()), columns
         )
-        answer.append(nearest[row] + neural(model.read, np.concatenate([told, (rival / 2 + 1)[:, None]], -1)))
+        answer.append(nearest[row] + run_network(model.read, np.concatenate([features, (rival / 2 + 1)[:, None]], -1)))
     return np.stack(answer)
 
 
@@ -86,17 +86,17 @@ def emptiness(model, odds, distance, looks, columns, stands_for=None):
     second, first = np.sort(odds, 0)[-2:]
     each = [
         none / 2,
-        shrunk(anything),
+        log_scaled(anything),
         first / 3,
         second / 3,
-        shrunk(blurred(anything, columns, 0.6)),
-        shrunk(blurred(anything, columns, 1.5)),
-        shrunk(anything.mean()),
+        log_scaled(blurred(anything, columns, 0.6)),
+        log_scaled(blurred(anything, columns, 1.5)),
+        log_scaled(anything.mean()),
         4 * distance,
         np.log(looks) / 2,
     ]
-    told = np.stack([np.broadcast_to(value, none.shape) for value in each], -1)
-    return none - np.log(np.maximum(anything, 1e-6)) + neural(model.void, told)
+    features = np.stack([np.broadcast_to(value, none.shape) for value in each], -1)
+    return none - np.log(np.maximum(anything, 1e-6)) + run_network(model.void, features)
 
 
 def gain(model, probabilities, closest, looks, distance):
@@ -105,21 +105,27 @@ def gain(model, probabilities, closest, looks, distance):
     for cell, (p, before, now) in enumerate(zip(probabilities, closest, distance, strict=True)):
         if now < before:
             second, first = np.sort(p[1:])[-2:]
-            told = [*map(shrunk, (first, second, p[0])), 4 * before, 4 * now, 4 * (before - now), np.log(looks) / 2]
-            answer[cell] = neural(model.worth, told)
+            features = [
+                *map(log_scaled, (first, second, p[0])),
+                4 * before,
+                4 * now,
+                4 * (before - now),
+                np.log(looks) / 2,
+            ]
+            answer[cell] = run_network(model.worth, features)
     return answer
 
 
 @pytest.fixture(scope="session")
-def twin():
-    """The networks and what they read, in numpy and scipy."""
+def reference():
+    """The networks and their inputs, in numpy and scipy."""
     return SimpleNamespace(
         array=array,
-        neural=neural,
-        shrunk=shrunk,
+        run_network=run_network,
+        log_scaled=log_scaled,
         blurred=blurred,
-        peaks=peaks,
-        described=described,
+        local_maxima=local_maxima,
+        readout_features=readout_features,
         class_odds=class_odds,
         emptiness=emptiness,
         gain=gain,
@@ -128,7 +134,7 @@ def twin():
 
 @pytest.fixture
 def random_looks():
-    """Looks at a grid: boxes that overlap, some of them padding; the third look sees nothing."""
+    """Random looks at a grid: boxes overlap, some are padding, and the third look has no detections."""
 
     def make(grid=None, looks=4, most=5, components=5, seed=0, dtype=torch.float32):
         generator = torch.Generator().manual_seed(seed)
@@ -149,7 +155,7 @@ def random_looks():
 
 @pytest.fixture
 def toy_map():
-    """A small model of map evidence, all of whose parameters are drawn at random."""
+    """A small model of map evidence with random parameters."""
 
     def make(components=5, widths=(8, 6), seed=1, metadata=None):
         generator = torch.Generator().manual_seed(seed)
@@ -164,7 +170,7 @@ def toy_map():
 
 @pytest.fixture
 def gathered():
-    """What looks say of some episodes and classes, at random; the rows of an episode share their looks."""
+    """Random evidence gathered for some episodes and classes; the rows of an episode share their looks."""
 
     def make(episodes=2, classes=4, cells=24, seed=5, dtype=torch.float64):
         generator = torch.Generator().manual_seed(seed)

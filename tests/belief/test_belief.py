@@ -1,4 +1,4 @@
-"""Beliefs: what they say of a target, whichever kind they are."""
+"""Beliefs of every kind: the probability of a target, indexing, mapping and fading."""
 
 import pytest
 import torch
@@ -32,7 +32,7 @@ def seen(observer):
 
 
 def tensors_of(belief):
-    """All tensors of a belief, whatever it is made of."""
+    """All tensors of a belief, those of nested beliefs included."""
     found = []
     for name in belief.__dataclass_fields__:
         part = getattr(belief, name)
@@ -54,7 +54,7 @@ def context_observer():
 OBSERVERS = {"all classes": lambda: Semantic(4), "target": target_observer, "context": context_observer}
 
 
-def test_probability_of_a_target_is_that_of_a_loop():
+def test_probability_of_a_target_equals_a_loop():
     beta, targets = rand(3, 12, 5), torch.tensor([1, 4, 2])
     belief = DirichletBelief(beta)
     for batch, target in enumerate(targets.tolist()):
@@ -67,7 +67,7 @@ def test_probability_of_a_target_is_that_of_a_loop():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_before_the_first_look_nothing_is_near(dtype):
+def test_before_the_first_look_all_distances_are_infinite(dtype):
     belief = DirichletBelief(torch.ones(2, 12, 5, dtype=dtype))
     assert belief.closest.shape == (2, 12)
     assert belief.closest.dtype == dtype
@@ -78,7 +78,7 @@ def test_before_the_first_look_nothing_is_near(dtype):
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
-def test_every_kind_answers_for_the_target_and_can_be_indexed(kind):
+def test_every_kind_has_a_probability_of_the_target_and_can_be_indexed(kind):
     belief = seen(OBSERVERS[kind]())
     assert isinstance(belief, Belief)
     present = belief.probability(2)
@@ -90,7 +90,7 @@ def test_every_kind_answers_for_the_target_and_can_be_indexed(kind):
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
-def test_every_kind_is_mapped_tensor_by_tensor(kind):
+def test_map_is_applied_to_every_tensor_of_every_kind(kind):
     belief = seen(OBSERVERS[kind]())
     met = []
 
@@ -107,7 +107,7 @@ def test_every_kind_is_mapped_tensor_by_tensor(kind):
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
-def test_a_detached_belief_is_the_same_without_its_past(kind):
+def test_a_detached_belief_has_the_same_values_and_no_gradients(kind):
     observer = OBSERVERS[kind]()
     boxes, mask = looks().boxes, looks().mask
     scores = looks().scores.requires_grad_()
@@ -120,7 +120,7 @@ def test_a_detached_belief_is_the_same_without_its_past(kind):
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
-def test_a_call_of_an_observer_is_to_weigh_and_to_update(kind):
+def test_calling_an_observer_equals_weigh_and_update(kind):
     observer = OBSERVERS[kind]()
     called = observer(observer.start(2, GRID, looks().scores), looks(), FIXATIONS, GRID, 2)
     for one, other in zip(tensors_of(called), tensors_of(seen(observer)), strict=True):
@@ -128,7 +128,7 @@ def test_a_call_of_an_observer_is_to_weigh_and_to_update(kind):
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
-def test_an_observer_refuses_what_another_made(kind):
+def test_an_observer_refuses_beliefs_and_looks_of_another_kind(kind):
     observer = OBSERVERS[kind]()
     own, said = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
     for make in (make for name, make in OBSERVERS.items() if name != kind):
@@ -139,14 +139,14 @@ def test_an_observer_refuses_what_another_made(kind):
 
 
 @pytest.mark.parametrize("kind", ["target", "context"])
-def test_a_belief_about_one_target_answers_for_it_whatever_is_asked(kind):
+def test_a_belief_about_one_target_gives_its_probability_for_any_class(kind):
     belief = seen(OBSERVERS[kind]())
     assert torch.equal(belief.probability(3), belief.present)
     assert torch.equal(belief.probability(torch.tensor([1, 2])), belief.present)
 
 
 @pytest.mark.parametrize("kind", ["target", "context"])
-def test_a_belief_about_one_target_is_none_about_all_classes(kind):
+def test_a_belief_about_one_target_is_refused_where_all_classes_are_needed(kind):
     belief = seen(OBSERVERS[kind]())
     with pytest.raises(InputError, match=rf"all classes \(DirichletBelief\), got {type(belief).__name__}"):
         dirichlet_belief(belief)
@@ -155,12 +155,12 @@ def test_a_belief_about_one_target_is_none_about_all_classes(kind):
 
 
 @pytest.mark.parametrize("target", [-1, 5, [0, 5]])
-def test_there_is_no_such_class(target):
+def test_a_class_index_out_of_range_is_refused(target):
     with pytest.raises(InputError, match="target: expected a class index from 0 to 4"):
         DirichletBelief(rand(2, 12, 5)).probability(torch.tensor(target))
 
 
-def test_pick_takes_a_component_for_each_row_of_any_shape():
+def test_pick_selects_one_component_per_row():
     values, target = rand(2, 3, 4, 5), torch.tensor([4, 0])
     got = pick(values, target)
     for row in range(2):
@@ -173,7 +173,7 @@ def test_gradients_reach_the_parameters():
     assert torch.autograd.gradcheck(lambda b: DirichletBelief(b).probability(torch.tensor([1, 3])), beta)
 
 
-def test_beliefs_are_made_inside_a_graph():
+def test_beliefs_can_be_created_inside_a_compiled_graph():
     def present(beta):
         return DirichletBelief(beta).probability(2)
 
@@ -182,13 +182,13 @@ def test_beliefs_are_made_inside_a_graph():
     torch.testing.assert_close(compiled(rand(2, 3, 4)), present(rand(2, 3, 4)))
 
 
-def test_it_is_public():
+def test_beliefs_and_observers_are_public():
     assert semfov.DirichletBelief is DirichletBelief
     assert semfov.Belief is Belief
     assert semfov.observers.Semantic is Semantic
 
 
-def test_some_episodes_take_what_others_believe():
+def test_put_replaces_the_beliefs_of_the_given_episodes():
     before, other = DirichletBelief(rand(4, 3, 2), rand(4, 3)), DirichletBelief(2 * rand(2, 3, 2), 2 * rand(2, 3))
     after = before.put(torch.tensor([3, 1]), other)
     for row, source in enumerate([before[0:1], other[1:2], before[2:3], other[0:1]]):
@@ -198,7 +198,7 @@ def test_some_episodes_take_what_others_believe():
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
-def test_what_is_not_faded_is_kept(kind):
+def test_fading_by_a_factor_of_one_changes_nothing(kind):
     observer, visited = OBSERVERS[kind](), torch.zeros(2, 12, dtype=torch.bool)
     belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
     same = observer.fade(belief, look, 1, visited)
@@ -207,7 +207,7 @@ def test_what_is_not_faded_is_kept(kind):
 
 
 def test_parameters_fade_towards_the_prior():
-    """A quarter of what was learned is left; the nearness exp(-6 d) of the closest look is a quarter as great."""
+    """A quarter of the evidence is left; the nearness exp(-6 d) of the closest look is a quarter as large."""
     observer = Semantic(4, prior=0.3)
     belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
     faded = observer.fade(belief, look, 0.25, torch.zeros(2, 12, dtype=torch.bool))
@@ -216,7 +216,7 @@ def test_parameters_fade_towards_the_prior():
     torch.testing.assert_close((-6 * faded.closest).exp(), (-6 * belief.closest).exp() / 4)
 
 
-def test_gathered_evidence_fades_towards_that_of_a_look_from_afar_that_shows_nothing():
+def test_gathered_evidence_fades_towards_that_of_an_empty_look_from_far_away():
     observer, visited = target_observer(), torch.arange(24).reshape(2, 12) % 3 == 0
     belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
     faded = observer.fade(belief, look, 0.25, visited)
@@ -232,7 +232,7 @@ def test_gathered_evidence_fades_towards_that_of_a_look_from_afar_that_shows_not
     assert torch.equal(faded.visited, visited)
 
 
-def test_context_fades_with_the_belief_that_it_is_added_to(monkeypatch):
+def test_context_fades_with_the_inner_belief(monkeypatch):
     observer, visited = context_observer(), torch.zeros(2, 12, dtype=torch.bool)
     belief, look = seen(observer), observer.weigh(looks(), FIXATIONS, GRID, 2)
     faded = observer.fade(belief, look, 0.25, visited)
@@ -245,16 +245,16 @@ def test_context_fades_with_the_belief_that_it_is_added_to(monkeypatch):
         observer.fade(belief.inner, look, 0.25, visited)
     with pytest.raises(InputError, match=r"^look: expected ContextLook"):
         observer.fade(belief, look.inner, 0.25, visited)
-    told = []
-    monkeypatch.setattr(observer.observer, "fade", lambda *given: told.append(given) or belief.inner)
+    calls = []
+    monkeypatch.setattr(observer.observer, "fade", lambda *given: calls.append(given) or belief.inner)
     observer.fade(belief, look, 0.25, visited)
-    assert [one is other for one, other in zip(told[0], (belief.inner, look.inner, 0.25, visited), strict=True)] == [
+    assert [one is other for one, other in zip(calls[0], (belief.inner, look.inner, 0.25, visited), strict=True)] == [
         True
     ] * 4
 
 
 @pytest.mark.parametrize("kind", OBSERVERS)
-def test_one_batch_of_looks_joined_is_itself(kind):
+def test_joining_a_single_batch_of_looks_changes_nothing(kind):
     observer = OBSERVERS[kind]()
     look = observer.weigh(looks(), FIXATIONS, GRID, 2)
     start = observer.start(2, GRID, looks().scores)

@@ -1,4 +1,4 @@
-"""What looks show of several classes, against loops over looks, classes, cells and detections in plain Python."""
+"""Features of looks for several classes, against loops over looks, classes, cells and detections in plain Python."""
 
 import math
 
@@ -28,8 +28,8 @@ def weight_of(box, cell):
     return math.exp(-(x**2) / (2 * across / 3) - y**2 / (2 * down / 3))
 
 
-def described(looks, look, target, cell):
-    """The ten numbers of a cell, detection by detection."""
+def features_by_loop(looks, look, target, cell):
+    """The ten features of a cell, detection by detection."""
     centre = (cell % 6 * 15 + 7, cell // 6 * 15 + 7)
     distance = math.dist(centre, FIXATIONS[look].tolist()) / 90
     touching = []
@@ -72,13 +72,13 @@ def test_features_of_several_classes_equal_a_loop(random_looks, dtype, device):
     for look in range(4):
         for row, target in enumerate(targets.tolist()):
             for cell in range(24):
-                expected = described(looks, look, target, cell)
+                expected = features_by_loop(looks, look, target, cell)
                 assert got[look, row, cell].tolist() == pytest.approx(expected, abs=close), (look, target, cell)
     assert 0 < float(got[..., 9].mean()) < 1
     assert bool((got[2, ..., 9] == 1).all())
 
 
-def test_one_class_is_one_of_several(random_looks):
+def test_features_of_one_class_equal_its_row_among_several(random_looks):
     looks, every = random_looks(), torch.arange(1, 5)
     together = class_features(looks, FIXATIONS, GRID, every)
     for target in range(1, 5):
@@ -86,7 +86,7 @@ def test_one_class_is_one_of_several(random_looks):
         torch.testing.assert_close(
             class_features(looks, FIXATIONS, GRID, every[target - 1 : target])[:, 0], together[:, target - 1]
         )
-    # Order and repetition of the classes are the caller's.
+    # The classes may be in any order and may repeat.
     mixed = torch.tensor([4, 2, 4])
     assert torch.equal(class_features(looks, FIXATIONS, GRID, mixed), together[:, mixed - 1])
 
@@ -103,14 +103,14 @@ def test_features_do_not_depend_on_padding_or_order(random_looks):
 
 
 @pytest.mark.parametrize("most", [0, 3])
-def test_nothing_was_detected(most):
-    """No detection, with padding or not even that."""
+def test_features_without_detections_equal_a_loop(most):
+    """No detections, with padding or without."""
     nothing = Detections(torch.zeros(4, most, 4), torch.zeros(4, most, 5), torch.zeros(4, most, dtype=torch.bool))
     got = class_features(nothing, FIXATIONS, GRID, torch.arange(1, 5))
     assert got.shape == (4, 4, 24, FEATURES)
     for look in range(4):
         for cell in range(24):
-            expected = described(nothing, look, 1, cell)
+            expected = features_by_loop(nothing, look, 1, cell)
             assert all(row.tolist() == pytest.approx(expected, abs=1e-5) for row in got[look, :, cell])
 
 
@@ -156,7 +156,7 @@ def test_bad_input(random_looks):
             look_features(looks, FIXATIONS, GRID, target)
 
 
-def test_a_look_without_detections_shows_what_is_said_of_nothing():
+def test_features_of_a_look_without_detections_equal_nothing_seen():
     grid, fixation = Grid(5, 4, (100, 60)), torch.tensor([[12.0, 34.0]])
     shown = look_features(Detections.empty(1, 3), fixation, grid, 2)
     assert torch.equal(nothing_seen(grid.distance(fixation)), shown)

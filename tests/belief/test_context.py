@@ -1,4 +1,4 @@
-"""Context: places and company against loops over cells, and what it adds to other observers."""
+"""Context: places and co-occurrence against loops over cells, and its effect on other observers."""
 
 import math
 from itertools import pairwise
@@ -43,7 +43,7 @@ def looks():
     return Detections(boxes, torch.rand(3, 4, 4, generator=generator).softmax(-1), mask)
 
 
-def reach(presence, cell, component, edge):
+def highest_presence_within(presence, cell, component, edge):
     """Highest presence of a class within a distance of a cell, in scalars."""
     best = 0.0
     for other in range(20):
@@ -54,7 +54,7 @@ def reach(presence, cell, component, edge):
 
 
 @pytest.mark.slow
-def test_company_equals_the_loop(prior, presence):
+def test_cooccurrence_equals_the_loop(prior, presence):
     got = prior(presence, GRID, torch.tensor([1, 3]), (0.0, 1.0))
     assert got.dtype == presence.dtype
     for row, target in enumerate([1, 3]):
@@ -63,13 +63,13 @@ def test_company_equals_the_loop(prior, presence):
             for component in range(4):
                 nearer = 0.0
                 for band, edge in enumerate([*EDGES, math.inf]):
-                    within = reach(presence[row], cell, component, edge)
+                    within = highest_presence_within(presence[row], cell, component, edge)
                     expected += (within - nearer) * float(prior.cooccurrence[target, component, band])
                     nearer = within
             assert float(got[row, cell]) == pytest.approx(expected, abs=1e-5)
 
 
-def test_reaches_grow_and_end_at_the_whole_image(presence):
+def test_presence_within_growing_distances_ends_with_the_whole_image(presence):
     steps = list(reaches(presence, GRID, EDGES))
     assert len(steps) == len(EDGES) + 1
     torch.testing.assert_close(steps[0], presence)
@@ -78,13 +78,13 @@ def test_reaches_grow_and_end_at_the_whole_image(presence):
     torch.testing.assert_close(steps[-1], presence.amax(1, keepdim=True).expand_as(presence))
 
 
-def test_places_are_read_between_the_cells_of_the_map(prior):
+def test_place_maps_are_interpolated_at_the_centres_of_cells(prior):
     same = prior.place_at(Grid(4, 4, (30, 20)))
     torch.testing.assert_close(same, prior.place.flatten(1))
     grid = Grid(3, 7, (30, 20))
     got = prior.place_at(grid)
     for cell in range(21):
-        # Centre of the cell on the scale of the map, whose first centre is at 0; beyond the outermost it stays.
+        # Centre of the cell in coordinates of the map, whose first centre is at 0, clamped to the outermost centres.
         x = min(max((cell % 3 + 0.5) / 3 * 4 - 0.5, 0), 3)
         y = min(max((cell // 3 + 0.5) / 7 * 4 - 0.5, 0), 3)
         left, top = min(int(x), 2), min(int(y), 2)
@@ -99,9 +99,9 @@ def test_places_are_read_between_the_cells_of_the_map(prior):
         torch.testing.assert_close(got[:, cell], expected)
 
 
-def test_weights_scale_the_two_parts(prior, presence):
-    place, company = (prior(presence, GRID, 2, weights) for weights in ((1.0, 0.0), (0.0, 1.0)))
-    torch.testing.assert_close(prior(presence, GRID, 2, (0.3, 0.7)), 0.3 * place + 0.7 * company)
+def test_weights_scale_place_and_cooccurrence(prior, presence):
+    place, cooccurrence = (prior(presence, GRID, 2, weights) for weights in ((1.0, 0.0), (0.0, 1.0)))
+    torch.testing.assert_close(prior(presence, GRID, 2, (0.3, 0.7)), 0.3 * place + 0.7 * cooccurrence)
     torch.testing.assert_close(place[0].float(), prior.place_at(GRID)[2])
     assert torch.equal(prior(presence, GRID, 2, (0.0, 0.0)), torch.zeros_like(place))
 
@@ -137,7 +137,7 @@ def test_observer_adds_context_to_the_log_odds(prior, looks, kind):
     expected = (present.log() - torch.log1p(-present) + context).sigmoid()
     torch.testing.assert_close(belief.probability(2), expected, rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(belief.closest, plain.closest)
-    # The same for where to look next; whether the target is there at all is as the other observer has it.
+    # The same holds for where to look next; the presence of the target is that of the inner observer.
     chance = plain.chance(2)
     expected = (chance.log() - torch.log1p(-chance) + context).sigmoid()
     torch.testing.assert_close(belief.chance(2), expected, rtol=1e-4, atol=1e-6)
@@ -147,7 +147,7 @@ def test_observer_adds_context_to_the_log_odds(prior, looks, kind):
 
 
 @pytest.mark.parametrize("kind", [0, 1], ids=["evidence", "map"])
-def test_looks_joined_over_targets_are_those_of_each(prior, looks, kind):
+def test_looks_joined_over_targets_equal_those_of_each_target(prior, looks, kind):
     observer = Context(observers()[kind], prior)
     said = [observer.weigh(looks, FIXATIONS, GRID, target) for target in (1, 3)]
     joined = type(said[0]).join(said)
@@ -158,7 +158,7 @@ def test_looks_joined_over_targets_are_those_of_each(prior, looks, kind):
         torch.testing.assert_close(both[row : row + 1].present, alone.present)
 
 
-def test_without_weight_nothing_changes(prior, looks):
+def test_weights_of_zero_change_nothing(prior, looks):
     inner = observers()[1]
     observer = Context(inner, prior, (0.0, 0.0))
     after = observer.update(observer.start(3, GRID, looks.scores), observer.weigh(looks, FIXATIONS, GRID, 1))
@@ -172,7 +172,7 @@ def test_gradients_reach_the_presence(prior):
     assert torch.autograd.gradcheck(lambda p: prior.double()(p, GRID, 1), presence)
 
 
-def test_saved_and_loaded_is_the_same_to_half_precision(tmp_path, prior):
+def test_a_prior_saved_and_loaded_is_the_same_up_to_half_precision(tmp_path, prior):
     prior.save(tmp_path / "toy.safetensors")
     loaded = ContextPrior.from_pretrained(tmp_path / "toy.safetensors")
     assert torch.equal(loaded.place, prior.place.half().float())
@@ -204,8 +204,8 @@ def test_bad_input(prior, looks):
 
 
 @pytest.mark.parametrize("size", [(60, 100), (100, 60)], ids=["tall", "wide"])
-def test_reaches_are_measured_in_longer_sides(presence, size):
-    """Cell by cell, in pictures of both formats."""
+def test_distances_between_cells_are_in_units_of_the_longer_side(presence, size):
+    """Cell by cell, in a tall and in a wide picture."""
     grid = Grid(4, 5, size)
     for edge, got in zip(EDGES, reaches(presence, grid, EDGES), strict=False):
         for cell in range(20):

@@ -1,4 +1,4 @@
-"""Context from tables: values and alignment against loops, what cannot be read, and the control."""
+"""Context from tables: values and class names against loops, unreadable files, and the permuted control."""
 
 import hashlib
 import math
@@ -21,9 +21,9 @@ def path(tmp_path):
     return file
 
 
-def test_values_count_by_comparison(path):
+def test_values_are_relative_to_the_means_of_their_row_and_column(path):
     prior = ContextPrior.from_table(path, CLASSES, source="a test", edges=(0.0, 0.2))
-    # The table's cup is the class itself, and so its glass is not asked; its desk and mug are synonyms.
+    # The row `cup` is the class itself, so its synonym `glass` is not used; `desk` and `mug` are synonyms of classes.
     values = {(1, 2): 1.0, (1, 3): 0.5, (2, 1): 3.0, (2, 3): -1.0, (3, 1): 0.0, (3, 2): 0.0}
     rows = {t: [v for (a, _), v in values.items() if a == t] for t in (1, 2, 3)}
     columns = {j: [v for (_, b), v in values.items() if b == j] for j in (1, 2, 3)}
@@ -41,20 +41,20 @@ def test_values_count_by_comparison(path):
     assert prior.metadata == {"table": {"source": "a test", "sha256": digest, "missing": ["zebra"]}}
 
 
-def test_a_constant_or_a_scale_of_classes_is_no_context(tmp_path):
+def test_effects_of_single_rows_and_columns_are_removed(tmp_path):
     names = [f"thing {chr(97 + n)}" for n in range(5)]
     one, other = torch.randn(2, 5, generator=torch.Generator().manual_seed(0))
     values = (one[:, None] + other).fill_diagonal_(math.nan)
     for full in (values, values.nan_to_num(0.7)):
         write_table(tmp_path / "t.csv", names, names, full)
         near = ContextPrior.from_table(tmp_path / "t.csv", names, source="s").cooccurrence
-        # Means leave out the diagonal, and so a sum of rows and columns is only about taken away.
+        # Means leave out the diagonal, so the effects of rows and columns are removed only approximately.
         assert float(near.abs().max()) < 0.5 * float(values[~values.isnan()].abs().max())
     write_table(tmp_path / "t.csv", names, names, torch.full((5, 5), 3.0))
     assert float(ContextPrior.from_table(tmp_path / "t.csv", names, source="s").cooccurrence.abs().max()) < 1e-6
 
 
-def test_places_are_rows_of_the_picture(path, tmp_path):
+def test_columns_of_the_table_of_places_become_rows_of_the_picture(path, tmp_path):
     heights = tmp_path / "heights.csv"
     heights.write_text("class,top,middle,bottom\ncow,0,1,5\nCUP,2,,\n", encoding="utf-8")
     prior = ContextPrior.from_table(path, CLASSES, source="a test", places=heights)
@@ -64,7 +64,7 @@ def test_places_are_rows_of_the_picture(path, tmp_path):
     assert prior.metadata["table"]["places_sha256"] == hashlib.sha256(heights.read_bytes()).hexdigest()
 
 
-def test_permuted_is_the_same_of_other_classes(path):
+def test_the_permuted_control_has_the_same_values_for_other_classes(path):
     prior = ContextPrior.from_table(path, CLASSES, source="a test")
     control = prior.permuted(3)
     assert torch.equal(control.cooccurrence.flatten().sort().values, prior.cooccurrence.flatten().sort().values)
@@ -80,13 +80,13 @@ def test_permuted_is_the_same_of_other_classes(path):
     assert control.digest() != prior.digest()
 
 
-def test_saved_and_loaded_it_keeps_where_it_comes_from(path, tmp_path):
+def test_a_prior_saved_and_loaded_keeps_the_record_of_its_source(path, tmp_path):
     prior = ContextPrior.from_table(path, CLASSES, source="a test")
     prior.save(tmp_path / "p.safetensors")
     assert ContextPrior.from_pretrained(tmp_path / "p.safetensors").metadata == prior.metadata
 
 
-def test_a_table_is_written_as_it_is_read(tmp_path):
+def test_a_written_table_is_read_back_unchanged(tmp_path):
     names, values = ["cup", 'a "b", c'], torch.tensor([[math.nan, 0.125], [-3.5, 7.0]])
     write_table(tmp_path / "t.csv", names, names, values)
     table = read_table(tmp_path / "t.csv")
@@ -94,7 +94,7 @@ def test_a_table_is_written_as_it_is_read(tmp_path):
     torch.testing.assert_close(table.values, values, equal_nan=True)
 
 
-def test_checksum_and_source_are_asked_for(path):
+def test_checksum_and_source_are_checked(path):
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     ContextPrior.from_table(path, CLASSES, source="s", sha256=digest.upper())
     with pytest.raises(DataError, match="download it again"):
@@ -121,7 +121,7 @@ def test_checksum_and_source_are_asked_for(path):
         (",cup\ncup,1\ncup,2\n", "first column, got cup"),
     ],
 )
-def test_what_is_no_table_is_told_by_line(path, text, message):
+def test_errors_in_a_table_name_the_line(path, text, message):
     path.write_text(text)
     with pytest.raises(DataError, match=message):
         read_table(path)
@@ -130,7 +130,7 @@ def test_what_is_no_table_is_told_by_line(path, text, message):
         read_table(path)
 
 
-def test_a_table_is_written_letter_by_letter(tmp_path):
+def test_a_written_table_has_exactly_the_expected_bytes(tmp_path):
     write_table(tmp_path / "t.csv", ["cup"], ["cow", "a, b"], torch.tensor([[0.125, math.nan]]))
     assert (tmp_path / "t.csv").read_bytes() == b',cow,"a, b"\ncup,0.125,\n'
 
@@ -138,13 +138,13 @@ def test_a_table_is_written_letter_by_letter(tmp_path):
 @pytest.mark.parametrize(
     ("edges", "profile"), [((), [1.0]), ((0.1,), [1.0, -1.0]), ((0.0, 0.1, 0.2), [1, 1 / 3, -1 / 3, -1])]
 )
-def test_company_falls_from_the_nearest_band_to_the_farthest(path, edges, profile):
+def test_cooccurrence_falls_from_the_nearest_band_to_the_farthest(path, edges, profile):
     near = ContextPrior.from_table(path, CLASSES, source="s", edges=(0.0, 0.2)).cooccurrence[..., 0]
     got = ContextPrior.from_table(path, CLASSES, source="s", edges=edges).cooccurrence
     torch.testing.assert_close(got, near[..., None] * torch.tensor(profile))
 
 
-def test_a_class_is_known_that_is_a_target_or_beside_one(path):
+def test_a_class_in_any_row_or_column_of_the_table_is_known(path):
     path.write_text(",cow\ncup,1\n", encoding="utf-8")
     prior = ContextPrior.from_table(path, CLASSES, source="s")
     assert prior.metadata["table"]["missing"] == ["dining table", "zebra"]
@@ -155,14 +155,14 @@ def test_a_class_is_known_that_is_a_target_or_beside_one(path):
         ContextPrior.from_table(path, ["spoon", "zebra"], source="s")
 
 
-def test_places_are_compared_within_each_class(path, tmp_path):
+def test_places_are_relative_to_the_mean_of_each_class(path, tmp_path):
     heights = tmp_path / "heights.csv"
     heights.write_text("class,top,bottom\ncow,0,4\ncup,30,10\n", encoding="utf-8")
     prior = ContextPrior.from_table(path, CLASSES, source="a test", places=heights)
     assert prior.place[[1, 3], :, 0].tolist() == [[10, -10], [-2, 2]]
 
 
-def test_a_digest_tells_priors_apart(path):
+def test_different_priors_have_different_digests(path):
     prior = ContextPrior.from_table(path, CLASSES, source="a test")
     tables, settings = (prior.place, prior.cooccurrence), {"weights": prior.weights, "metadata": {"a": 1, "b": 2}}
     same = ContextPrior(CLASSES, *tables, prior.edges, **settings).digest()
@@ -179,7 +179,7 @@ def test_a_digest_tells_priors_apart(path):
     assert len({same, *(other.digest() for other in others)}) == 1 + len(others)
 
 
-def test_a_control_has_the_weights_of_the_prior_and_one_of_seed_0_unless_told_otherwise(path):
+def test_the_permuted_control_keeps_the_weights_and_has_seed_0_by_default(path):
     prior = ContextPrior.from_table(path, CLASSES, source="a test")
     assert prior.permuted().digest() == prior.permuted(0).digest()
     assert prior.permuted().weights == prior.weights
@@ -187,5 +187,5 @@ def test_a_control_has_the_weights_of_the_prior_and_one_of_seed_0_unless_told_ot
         prior.check_compatible(["spoon"])
 
 
-def test_the_prior_that_is_shipped_is_that_of_coco():
+def test_the_default_prior_is_that_of_coco():
     assert ContextPrior.from_pretrained().digest() == ContextPrior.from_pretrained("coco").digest()

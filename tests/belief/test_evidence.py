@@ -1,4 +1,4 @@
-"""What a network is told when it reads several looks: against numpy and scipy."""
+"""Inputs of the networks that read several looks, against numpy and scipy."""
 
 import math
 
@@ -14,7 +14,7 @@ from semfov.belief.target_evidence import TargetEvidence
 
 
 class Recorder(nn.Module):
-    """Keeps what it reads, and corrects every cell by a half."""
+    """Records its inputs, and corrects every cell by 0.5."""
 
     def forward(self, inputs):
         self.read = inputs
@@ -22,7 +22,7 @@ class Recorder(nn.Module):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-def test_a_network_reads_what_was_gathered(toy_map, gathered, twin, dtype, device):
+def test_inputs_of_a_network_equal_a_reference_in_numpy(toy_map, gathered, reference, dtype, device):
     said = gathered(dtype=dtype)
     said = type(said)(*(getattr(said, name).to(device) for name in said.__dataclass_fields__))
     model, recorder = toy_map().to(device, dtype), Recorder()
@@ -32,31 +32,31 @@ def test_a_network_reads_what_was_gathered(toy_map, gathered, twin, dtype, devic
     assert recorder.read.shape == (8, 24, READOUT + 2)
     assert recorder.read.dtype == dtype
     for row in range(8):
-        expected = twin.described(
-            *(twin.array(getattr(said, name)[row]) for name in ("nearest", "best", "mean", "distance")),
+        expected = reference.readout_features(
+            *(reference.array(getattr(said, name)[row]) for name in ("nearest", "best", "mean", "distance")),
             float(said.looks[row]),
             float(model.prior[said.target[row]].detach()),
             6,
         )
         close = 1e-5 if dtype == torch.float32 else 1e-7
-        np.testing.assert_allclose(twin.array(recorder.read[row, :, :READOUT]), expected, atol=close, rtol=close)
+        np.testing.assert_allclose(reference.array(recorder.read[row, :, :READOUT]), expected, atol=close, rtol=close)
         assert torch.equal(recorder.read[row, :, READOUT:], torch.stack([more, 2 * more], -1))
 
 
 @pytest.mark.parametrize("columns", [1, 24])
-def test_grids_of_one_row_or_column(toy_map, gathered, twin, columns):
+def test_inputs_of_a_network_on_grids_of_one_row_or_column(toy_map, gathered, reference, columns):
     said, model, recorder = gathered(), toy_map().double(), Recorder()
     model.read_out(recorder, said.nearest, said, columns)
     for row in range(8):
-        rest = (twin.array(getattr(said, name)[row]) for name in ("nearest", "best", "mean", "distance"))
+        rest = (reference.array(getattr(said, name)[row]) for name in ("nearest", "best", "mean", "distance"))
         prior = float(model.prior[said.target[row]].detach())
-        expected = twin.described(*rest, float(said.looks[row]), prior, columns)
-        np.testing.assert_allclose(twin.array(recorder.read[row]), expected, atol=1e-7, rtol=1e-6)
+        expected = reference.readout_features(*rest, float(said.looks[row]), prior, columns)
+        np.testing.assert_allclose(reference.array(recorder.read[row]), expected, atol=1e-7, rtol=1e-6)
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.6, 1.5, 4.0])
 @pytest.mark.parametrize("columns", [1, 2, 6, 8, 24])
-def test_blur_is_that_of_scipy(columns, sigma, device):
+def test_blur_matches_scipy(columns, sigma, device):
     values = torch.rand(3, 24, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     got = blur(values.to(device), columns, sigma).cpu()
     assert got.shape == values.shape
@@ -79,7 +79,7 @@ def test_blur_keeps_the_sum_away_from_the_border():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-def test_looks_from_afar_count_less(dtype):
+def test_nearness_falls_with_distance(dtype):
     distance = torch.tensor([0.0, 1 / 6, 1 / 3, 1.25, math.inf], dtype=dtype)
     got = nearness(distance)
     assert got.dtype == dtype
@@ -87,23 +87,25 @@ def test_looks_from_afar_count_less(dtype):
     assert got[-1] == 0
 
 
-def test_logarithms_are_finite():
+def test_logarithms_of_odds_are_finite():
     odds = torch.tensor([0.0, 1e-12, 1e-3, 0.5, 1.0, 80.0], dtype=torch.float64)
     expected = [math.log(value + 1e-3) / 2 + 1 for value in odds.tolist()]
     assert logarithm(odds).tolist() == pytest.approx(expected)
     assert bool(logarithm(odds).isfinite().all())
 
 
-def test_networks_have_two_hidden_layers(twin):
+def test_networks_have_two_hidden_layers(reference):
     torch.manual_seed(0)
     made = network(5, 7).double()
     assert [layer.in_features for layer in made if isinstance(layer, nn.Linear)] == [5, 7, 7]
     inputs = torch.randn(4, 3, 5, dtype=torch.float64)
-    np.testing.assert_allclose(twin.array(made(inputs))[..., 0], twin.neural(made, inputs.numpy()), atol=1e-12)
+    np.testing.assert_allclose(
+        reference.array(made(inputs))[..., 0], reference.run_network(made, inputs.numpy()), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("kind", [MapEvidence, TargetEvidence])
-def test_classes_start_alike(kind):
+def test_all_classes_start_with_the_same_prior(kind):
     model = kind(4, 5, components=7)
     assert torch.equal(model.prior, torch.zeros(7))
     assert model.widths == (4, 5)

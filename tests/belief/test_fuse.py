@@ -32,7 +32,7 @@ def test_fuse_equals_the_loop(name, dtype):
     assert torch.equal(beta, before)
 
 
-def test_fuse_is_the_same_bits_in_any_batch():
+def test_fused_maps_do_not_depend_on_the_size_of_the_batch():
     torch.manual_seed(0)
     beta, likelihood = torch.rand(40, 100, 81) + 0.2, torch.rand(40, 12, 81)
     footprint = torch.rand(40, 12, 100) < 0.2
@@ -45,7 +45,7 @@ def test_fuse_is_the_same_bits_in_any_batch():
         assert torch.equal(torch.cat(parts), whole)
 
 
-def test_fuse_without_coverage_changes_nothing():
+def test_fuse_changes_nothing_if_detections_cover_no_cell():
     beta = torch.rand(2, 3, 4)
     got = fuse(beta, torch.zeros(2, 5, 4), torch.zeros(2, 5, 3, dtype=torch.bool))
     assert torch.equal(got, beta)
@@ -55,15 +55,15 @@ def test_fuse_without_coverage_changes_nothing():
 @pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
 @pytest.mark.parametrize("soft", [False, True])
 def test_fuse_vectorises(name, soft):
-    beta, likelihood, footprint = piled(soft)
+    beta, likelihood, footprint = stacked_maps(soft)
     expected = torch.stack([fuse(b, l, f, name) for b, l, f in zip(beta, likelihood, footprint, strict=True)])
     together = torch.func.vmap(lambda b, l, f: fuse(b, l, f, name))(beta, likelihood, footprint)
     torch.testing.assert_close(together, expected)
 
 
-def test_fuse_compiles_whole():
+def test_fuse_compiles_to_one_graph():
     """For any number of detections."""
-    beta, likelihood, footprint = (tensor[0] for tensor in piled(soft=True))
+    beta, likelihood, footprint = (tensor[0] for tensor in stacked_maps(soft=True))
     torch.compiler.reset()
     compiled = torch.compile(fuse, fullgraph=True, backend="eager")
     for looks in (4, 3):
@@ -71,7 +71,7 @@ def test_fuse_compiles_whole():
         torch.testing.assert_close(compiled(*given), fuse(*given))
 
 
-def piled(soft):
+def stacked_maps(soft):
     """Three batches of two maps, four detections each, the last of which is padding."""
     torch.manual_seed(2)
     beta, likelihood = torch.rand(3, 2, 6, 5) + 0.2, torch.rand(3, 2, 4, 5)
@@ -89,7 +89,7 @@ def test_fuse_gradients():
     assert torch.autograd.gradcheck(lambda b, l: fuse(b, l, footprint), (beta, likelihood))
 
 
-def test_300_updates_stay_near_float64():
+def test_300_updates_in_float32_stay_close_to_float64():
     torch.manual_seed(3)
     likelihood = torch.rand(1, 300, 81)
     likelihood[..., 2:] *= 1e-4
@@ -123,7 +123,7 @@ def test_a_look_of_the_observer_equals_the_loop():
     torch.testing.assert_close(updated.probabilities.sum(-1), torch.ones(1, 12))
 
 
-def test_observation_model_sees_the_distance():
+def test_the_observation_model_gets_the_distance_of_each_box():
     grid = Grid(4, 3, (100, 60))
     fixation = torch.tensor([[10.0, 10.0]])
     near = likelihoods(seen(grid), fixation, grid, Sharper())
@@ -144,7 +144,7 @@ def test_likelihoods_of_raw_scores_are_the_scores_and_uniform_for_padding():
     torch.testing.assert_close(tempered, raw.double().pow(0.25).float())
 
 
-def test_a_map_starts_with_the_prior_in_the_dtype_it_is_given():
+def test_a_map_starts_with_the_prior_in_the_given_dtype():
     start = Semantic(2, prior=0.25).start(3, Grid(2, 2, (10, 10)), torch.empty(0, dtype=torch.float64))
     assert torch.equal(start.beta, torch.full((3, 4, 2), 0.25, dtype=torch.float64))
     assert torch.equal(start.closest, torch.full((3, 4), torch.inf, dtype=torch.float64))
@@ -164,9 +164,9 @@ def test_bad_input():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
-def test_weights_are_exponents_in_any_precision(name, dtype):
+def test_weights_of_the_footprint_are_exponents_of_the_likelihood(name, dtype):
     """Row by row: λ to the power of its weight, scaled to a largest value of 1."""
-    beta, likelihood, footprint = (tensor[0] for tensor in piled(soft=True))
+    beta, likelihood, footprint = (tensor[0] for tensor in stacked_maps(soft=True))
     expected = beta.clone()
     for image, detection, cell in footprint.nonzero().tolist():
         said = (likelihood[image, detection] / likelihood[image, detection].max()) ** footprint[image, detection, cell]
@@ -181,7 +181,7 @@ def test_weights_are_exponents_in_any_precision(name, dtype):
 
 @pytest.mark.parametrize("batched", [0, 1, 2])
 def test_fuse_vectorises_over_one_argument_alone(batched):
-    arguments = piled(soft=True)
+    arguments = stacked_maps(soft=True)
     given = [tensor if number == batched else tensor[0] for number, tensor in enumerate(arguments)]
     dims = tuple(0 if number == batched else None for number in range(3))
     together = torch.func.vmap(fuse, in_dims=dims)(*given)
@@ -208,7 +208,7 @@ def test_shapes_that_do_not_fit_are_refused(argument, beta, likelihood, footprin
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
-def test_parameters_that_are_none_are_refused(value):
+def test_invalid_dirichlet_parameters_are_refused(value):
     beta = torch.tensor([[[1.0, 2.0], [value, 1.0]]])
     with pytest.raises(InputError, match=r"^beta: expected positive, finite Dirichlet parameters"):
         fuse(beta, torch.ones(1, 1, 2), torch.ones(1, 1, 2))
@@ -233,7 +233,7 @@ def test_an_error_says_what_is_wrong_with_likelihoods(bad, words):
 
 
 @pytest.mark.parametrize("name", ["kaplan", "product", "sum"])
-def test_one_detection_in_one_cell(name):
+def test_one_detection_changes_only_its_cell(name):
     beta, likelihood = torch.tensor([[[0.5, 1.5], [1.0, 2.0]]]), torch.tensor([[[0.2, 0.8]]])
     got = fuse(beta, likelihood, torch.tensor([[[False, True]]]), name)
     assert torch.equal(got[0, 0], beta[0, 0])

@@ -27,7 +27,7 @@ def exact_posterior_mean(beta: list[float], likelihood: list[float]) -> list[flo
 
 
 def scalar_kaplan(beta: list[float], likelihood: list[float]) -> list[float]:
-    """Equation 7 (eq:kaplanrule), letter by letter."""
+    """Equation 7 (eq:kaplanrule), in scalars."""
     expected = sum(b * l for b, l in zip(beta, likelihood, strict=True))
     return [b * (1 + l / expected) / (1 + min(likelihood) / expected) for b, l in zip(beta, likelihood, strict=True)]
 
@@ -44,7 +44,7 @@ def test_kaplan_matches_the_formula_and_the_exact_mean(likelihood, data):
     assert after[l.argmin()] == b[l.argmin()]
 
 
-def test_kaplan_mean_is_that_of_the_integrated_posterior():
+def test_kaplan_mean_equals_that_of_the_integrated_posterior():
     """Monte Carlo over the prior: the posterior mean of p is E[p (p·λ)] / E[p·λ]."""
     beta, likelihood = torch.tensor([0.7, 2.0, 1.3]).double(), torch.tensor([0.9, 0.2, 0.05]).double()
     torch.manual_seed(0)
@@ -63,7 +63,7 @@ def test_raw_scores_update_a_cell_as_in_equation_7():
 
 
 def test_kaplan_depends_on_the_order_of_detections():
-    """Section IV-A applies it "in no particular order": whoever fuses has to choose one."""
+    """Section IV-A applies it "in no particular order": the caller has to choose one."""
     beta = torch.full((3,), 0.5, dtype=torch.float64)
     first, second = torch.tensor([[0.7, 0.2, 0.1], [0.1, 0.1, 0.8]], dtype=torch.float64)
     one, other = fusion.kaplan(fusion.kaplan(beta, first), second), fusion.kaplan(fusion.kaplan(beta, second), first)
@@ -71,7 +71,7 @@ def test_kaplan_depends_on_the_order_of_detections():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_kaplan_special_cases(dtype):
+def test_kaplan_with_uniform_and_one_hot_likelihoods(dtype):
     beta = torch.tensor([0.5, 1.5, 3.0], dtype=dtype)
     torch.testing.assert_close(fusion.kaplan(beta, torch.full((3,), 0.37, dtype=dtype)), beta)
     one_hot = torch.tensor([0.0, 1.0, 0.0], dtype=dtype)
@@ -131,7 +131,7 @@ def test_gradients(rule):
 
 
 @pytest.mark.parametrize("rule", [fusion.kaplan, fusion.product, fusion.sum])
-def test_compiles_whole(rule):
+def test_rules_compile_to_one_graph(rule):
     beta, likelihood = torch.rand(5, 4) + 0.1, torch.rand(5, 4)
     compiled = torch.compile(rule, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(beta, likelihood), rule(beta, likelihood))

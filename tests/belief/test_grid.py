@@ -103,7 +103,7 @@ def test_batch_of_sizes_equals_single_grids():
     torch.testing.assert_close(batch.box_distance(boxes, fixation)[1], single)
 
 
-def test_distances_are_in_longer_sides():
+def test_distances_are_in_units_of_the_longer_side():
     grid = Grid(2, 1, (200, 100))
     assert grid.cell_distance.tolist() == [[0, 0.5], [0.5, 0]]
     box = torch.tensor([[90.5, 40.5, 110.5, 60.5]])
@@ -126,7 +126,7 @@ def test_bad_input(call):
 
 
 @pytest.mark.parametrize("shape", [(4,), (2, 3), (2, 5)])
-def test_what_are_no_boxes_is_refused_by_name(shape):
+def test_boxes_of_the_wrong_shape_are_refused_by_name(shape):
     grid, fixation = Grid(3, 2, (30, 20)), torch.zeros(2)
     for call in (lambda: grid.footprint(torch.zeros(shape)), lambda: grid.box_distance(torch.zeros(shape), fixation)):
         with pytest.raises(InputError, match=r"^boxes: expected a tensor of shape"):
@@ -134,7 +134,7 @@ def test_what_are_no_boxes_is_refused_by_name(shape):
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 1)])
-def test_what_are_no_points_is_refused_by_name(shape):
+def test_points_of_the_wrong_shape_are_refused_by_name(shape):
     grid, point = Grid(3, 2, (30, 20)), torch.zeros(shape)
     for name, call in (
         ("points", lambda: grid.cell_of(point)),
@@ -146,7 +146,7 @@ def test_what_are_no_points_is_refused_by_name(shape):
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf])
-def test_what_are_no_numbers_is_refused_by_name(number):
+def test_nan_and_infinity_are_refused_by_name(number):
     grid, box, point = Grid(3, 2, (30, 20)), torch.tensor([[1.0, 2.0, 3.0, 4.0]]), torch.tensor([1.0, number])
     bad = torch.where(box == 3, number, box)
     for name, call in (
@@ -161,7 +161,7 @@ def test_what_are_no_numbers_is_refused_by_name(number):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [torch.float32, torch.float64])
-def test_precision_is_that_of_what_is_asked_about(dtype, size):
+def test_results_have_the_dtype_of_the_boxes_and_points(dtype, size):
     grid, boxes = Grid(3, 2, torch.tensor([31.0, 17.0], dtype=size)), torch.tensor([[1.0, 2, 20, 15]], dtype=dtype)
     assert grid.footprint(boxes, "soft").dtype == dtype
     assert grid.distance(boxes[0, :2]).dtype == dtype

@@ -17,7 +17,7 @@ def draw(*shape, seed=3):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_evidence_of_looks_is_a_network_of_their_features(random_looks, toy_map, twin):
+def test_evidence_of_looks_is_the_network_applied_to_their_features(random_looks, toy_map, reference):
     model, looks, fixations = (
         toy_map().double(),
         random_looks(dtype=torch.float64),
@@ -27,39 +27,41 @@ def test_evidence_of_looks_is_a_network_of_their_features(random_looks, toy_map,
     got = model(looks, fixations, GRID, targets)
     assert got.shape == (4, 2, 24)
     features = class_features(looks, fixations, GRID, targets)
-    np.testing.assert_allclose(twin.array(got), twin.neural(model.look, twin.array(features)), atol=1e-12)
+    np.testing.assert_allclose(
+        reference.array(got), reference.run_network(model.look, reference.array(features)), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("classes", [2, 4])
 @pytest.mark.parametrize("columns", [1, 6, 24])
-def test_every_class_is_read_beside_its_strongest_rival(toy_map, gathered, twin, classes, columns):
+def test_log_odds_of_a_class_depend_on_its_strongest_rival(toy_map, gathered, reference, classes, columns):
     model, said = toy_map().double(), gathered(classes=classes)
     got = model.log_odds(said, columns, classes)
     assert got.shape == (2, classes, 24)
     for episode in range(2):
         rows = slice(episode * classes, (episode + 1) * classes)
-        expected = twin.class_odds(
+        expected = reference.class_odds(
             model,
-            *(twin.array(getattr(said, name)[rows]) for name in ("nearest", "best", "mean")),
-            twin.array(said.distance[rows][0]),
+            *(reference.array(getattr(said, name)[rows]) for name in ("nearest", "best", "mean")),
+            reference.array(said.distance[rows][0]),
             float(said.looks[rows][0]),
             said.target[rows].tolist(),
             columns,
         )
-        np.testing.assert_allclose(twin.array(got[episode]), expected, atol=1e-6)
+        np.testing.assert_allclose(reference.array(got[episode]), expected, atol=1e-6)
 
 
-def test_a_rival_matters_in_its_own_cell_alone(toy_map, gathered):
-    """The strongest other class: raising the second changes the odds of the first; raising the third, nothing."""
+def test_a_rival_changes_only_its_own_cell(toy_map, gathered):
+    """The rival is the strongest other class: the second class changes the odds of the first, the third none."""
     model, said = toy_map().double(), gathered(episodes=1)
     with torch.no_grad():
-        model.read[0].weight[:, :-1] = 0  # it reads the rival, and nothing else
+        model.read[0].weight[:, :-1] = 0  # the network reads only the rival
     before = model.log_odds(said, 6, 4)[0]
     order = said.nearest[:, 7].argsort(descending=True)
     changes = []
     for rank in range(4):
         changed = said.nearest.clone()
-        # The order of the classes stays.
+        # Small changes, which keep the order of the classes.
         changed[order[rank], 7] += 0.1 * (said.nearest[order[rank - 1], 7] - changed[order[rank], 7]) if rank else 0.1
         after = model.log_odds(type(said)(changed, *[getattr(said, name) for name in REST]), 6, 4)[0]
         moved = (after - changed - before + said.nearest).abs() > 1e-12
@@ -72,8 +74,8 @@ def test_a_rival_matters_in_its_own_cell_alone(toy_map, gathered):
 REST = ("best", "mean", "distance", "score", "looks", "visited", "target")
 
 
-def test_rivals_that_are_equal(toy_map, gathered):
-    """Of two classes with the same evidence each is the other's rival."""
+def test_classes_with_equal_evidence_are_rivals_of_each_other(toy_map, gathered):
+    """So both have the same log odds."""
     model, said = toy_map().double(), gathered(episodes=1, classes=2)
     nearest = said.nearest[:1].expand(2, -1)
     same = [getattr(said, name)[:1].expand(2, *getattr(said, name).shape[1:]) for name in REST]
@@ -83,21 +85,21 @@ def test_rivals_that_are_equal(toy_map, gathered):
 
 @pytest.mark.parametrize("columns", [1, 6, 24])
 @pytest.mark.parametrize("stands_for", [None, [1.0, 1, 9.5, 2]], ids=["all", "some"])
-def test_emptiness_equals_numpy(toy_map, twin, columns, stands_for):
+def test_emptiness_equals_numpy(toy_map, reference, columns, stands_for):
     model, odds, distance = toy_map().double(), 2 * draw(2, 4, 24) - 2, draw(2, 24, seed=4).abs() / 3
     looks = torch.tensor([1.0, 7.0], dtype=torch.float64)
     share = None if stands_for is None else torch.tensor([stands_for] * 2).double()
     got = model.emptiness(odds, distance, looks, columns, share)
     assert got.shape == (2, 24)
     for row in range(2):
-        expected = twin.emptiness(
-            model, twin.array(odds[row]), twin.array(distance[row]), float(looks[row]), columns, stands_for
+        expected = reference.emptiness(
+            model, reference.array(odds[row]), reference.array(distance[row]), float(looks[row]), columns, stands_for
         )
-        np.testing.assert_allclose(twin.array(got[row]), expected, atol=1e-6)
+        np.testing.assert_allclose(reference.array(got[row]), expected, atol=1e-6)
 
 
-def test_a_class_that_stands_for_several_counts_as_often(toy_map):
-    """The same as if it were given so many times, wherever it is not the most probable one."""
+def test_a_class_that_stands_for_several_counts_several_times(toy_map):
+    """The same as repeating the class that often, in cells where it is not the most probable one."""
     model, distance, looks = toy_map().double(), draw(2, 24, seed=4).abs(), torch.tensor([2.0, 5.0]).double()
     odds = 2 * draw(2, 4, 24)
     odds[:, 2:] -= 2
@@ -114,7 +116,7 @@ def test_a_class_that_stands_for_several_counts_as_often(toy_map):
     )
 
 
-def test_emptiness_without_a_correction_is_that_no_class_is_there(toy_map):
+def test_emptiness_without_a_correction_is_the_probability_of_no_class(toy_map):
     model = toy_map().double()
     with torch.no_grad():
         model.void[-1].weight.zero_()
@@ -124,8 +126,8 @@ def test_emptiness_without_a_correction_is_that_no_class_is_there(toy_map):
     torch.testing.assert_close(got, (1 - odds.sigmoid()).prod(1))
 
 
-def test_certain_cells_are_finite():
-    """Log odds as large as they come, in float32."""
+def test_emptiness_is_finite_for_certain_cells():
+    """Very large log odds, in float32."""
     model = MapEvidence(4, 4, components=4)
     odds = torch.tensor([-200.0, -40, 0, 40, 200]).expand(1, 3, -1).requires_grad_()
     got = model.emptiness(odds, torch.zeros(1, 5), torch.ones(1), 5)
@@ -135,7 +137,7 @@ def test_certain_cells_are_finite():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("wide", [False, True], ids=["same for all", "of each"])
-def test_gain_equals_a_loop(toy_map, twin, dtype, wide, device):
+def test_gain_equals_a_loop(toy_map, reference, dtype, wide, device):
     model = toy_map().to(device, dtype)
     generator = torch.Generator().manual_seed(0)
     probabilities = torch.rand(3, 24, 5, generator=generator).to(device, dtype)
@@ -149,17 +151,17 @@ def test_gain_equals_a_loop(toy_map, twin, dtype, wide, device):
     for episode in range(3):
         for fixation in range(4):
             where = per_episode[episode, fixation] if wide else distance[fixation]
-            expected = twin.gain(
+            expected = reference.gain(
                 model,
-                twin.array(probabilities[episode]),
-                twin.array(closest[episode]),
+                reference.array(probabilities[episode]),
+                reference.array(closest[episode]),
                 float(looks[episode]),
-                twin.array(where),
+                reference.array(where),
             )
-            np.testing.assert_allclose(twin.array(got[episode, fixation]), expected, atol=1e-5)
+            np.testing.assert_allclose(reference.array(got[episode, fixation]), expected, atol=1e-5)
 
 
-def test_no_gain_where_no_look_comes_nearer(toy_map):
+def test_gain_is_zero_where_the_look_is_not_closer_than_before(toy_map):
     model = toy_map().double()
     probabilities, looks = torch.rand(1, 24, 5).double(), torch.ones(1).double()
     distance = GRID.cell_distance.double()
@@ -174,7 +176,7 @@ def test_gradients(toy_map, gathered):
     model, said = toy_map().double().requires_grad_(False), gathered()
 
     def everything(nearest, best, mean, distance, closest):
-        odds = model.log_odds(type(said)(nearest, best, mean, distance, *late(said)), 6, 4)
+        odds = model.log_odds(type(said)(nearest, best, mean, distance, *remaining_fields(said)), 6, 4)
         nothing = model.emptiness(odds, closest, said.looks[::4], 6, torch.tensor([[1.0, 1, 2, 3]] * 2).double())
         probabilities = torch.cat([nothing[:, None], odds], 1).sigmoid().transpose(1, 2)
         return odds, nothing, model.gain(probabilities, closest, said.looks[::4], GRID.cell_distance[[2, 9]].double())
@@ -183,11 +185,11 @@ def test_gradients(toy_map, gathered):
     assert torch.autograd.gradcheck(everything, [value.clone().requires_grad_() for value in values], fast_mode=True)
 
 
-def late(said):
+def remaining_fields(said):
     return said.score, said.looks, said.visited, said.target
 
 
-def test_saved_and_loaded_is_the_same(tmp_path, toy_map, gathered):
+def test_a_model_saved_and_loaded_is_the_same(tmp_path, toy_map, gathered):
     model = toy_map(widths=(7, 5), metadata={"detector": {"name": "toy"}, "sensor": {}, "training": {"steps": 3}})
     path = tmp_path / "model.safetensors"
     model.save(path)
@@ -237,7 +239,7 @@ def test_saved_and_loaded_is_the_same(tmp_path, toy_map, gathered):
         "one tensor more",
     ],
 )
-def test_files_that_are_not_whole_are_refused(tmp_path, toy_map, change):
+def test_incomplete_files_are_refused(tmp_path, toy_map, change):
     model = toy_map()
     record = {"kind": model.kind, "version": "0", **model._record(), "metadata": {}}
     tensors = {name: tensor.detach() for name, tensor in model.state_dict().items()}
@@ -278,13 +280,13 @@ def test_shipped_maps_load(name):
         assert float(tensor.abs().sum()) > 0, key
 
 
-def test_a_map_is_shipped():
+def test_a_map_for_yolox_nano_is_shipped():
     assert (MapEvidence.shipped / "yolox-nano.safetensors").is_file()
 
 
 @pytest.mark.parametrize(
     ("name", "value"), [("look_width", 0), ("readout_width", 0), ("components", 2), ("components", 3.0)]
 )
-def test_sizes_that_cannot_be_are_refused(name, value):
+def test_invalid_sizes_are_refused(name, value):
     with pytest.raises(InputError, match=f"{name}: expected a whole number"):
         MapEvidence(**{name: value})

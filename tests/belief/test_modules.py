@@ -1,4 +1,4 @@
-"""Evidence and observers as parts of others' modules."""
+"""Evidence and observers as submodules of other modules."""
 
 import torch
 
@@ -20,7 +20,7 @@ class TestContextPrior(GraphTester):
 
 
 class LookTester(GraphTester):
-    """Of a module that takes one look."""
+    """Tests of a module that takes one look."""
 
     batched = (0, 1, 2)
 
@@ -47,7 +47,7 @@ class TestMapEvidence(LookTester):
 
 
 class ObserverTester(LookTester):
-    """What an observer believes of class 2 after it was shown the same from two points."""
+    """An observer's belief about class 2 after the same detections from two fixations."""
 
     @staticmethod
     def call(module, scores, boxes, fixation):

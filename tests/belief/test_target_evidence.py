@@ -46,10 +46,10 @@ def test_features_equal_a_loop(looks):
     assert got.shape == (3, 24, FEATURES)
     for look in range(3):
         for cell in range(24):
-            assert got[look, cell].tolist() == pytest.approx(describe(looks, look, cell), abs=1e-4)
+            assert got[look, cell].tolist() == pytest.approx(features_by_loop(looks, look, cell), abs=1e-4)
 
 
-def describe(looks, look, cell):
+def features_by_loop(looks, look, cell):
     distance = float(torch.linalg.vector_norm(GRID.centres[cell] - FIXATIONS[look])) / 90
     chosen, touched = None, []
     for detection in range(5):
@@ -86,7 +86,7 @@ def test_looks_without_any_detection():
     assert torch.isfinite(nothing).all()
 
 
-def test_neighbourhoods_are_those_of_scipy():
+def test_blur_and_local_maxima_match_scipy():
     torch.manual_seed(0)
     values = torch.rand(2, 24, dtype=torch.float64)
     steps = np.arange(-3, 4)
@@ -103,7 +103,7 @@ def sigmoid(value):
     return 1 / (1 + math.exp(-value))
 
 
-def neural(network, inputs):
+def run_network(network, inputs):
     """A network of two hidden layers, in float64 scalars of numpy."""
     value = np.array(inputs, dtype=np.float64)
     for number, layer in enumerate(network):
@@ -114,12 +114,12 @@ def neural(network, inputs):
     return float(value[0])
 
 
-def shrunk(odds):
+def log_scaled(odds):
     return math.log(odds + 1e-3) / 2 + 1
 
 
 def blurred(odds, sigma, columns=6):
-    """Gaussian average, over all that lies within 3 cells of each other; nothing lies outside."""
+    """Gaussian average over cells at most 3 cells apart, with zeros outside the grid."""
     kernel = [math.exp(-(step**2) / (2 * sigma**2)) for step in range(-3, 4)]
     kernel = [value / sum(kernel) for value in kernel]
     answer = []
@@ -134,7 +134,7 @@ def blurred(odds, sigma, columns=6):
 
 
 def read_cells(network, known, prior, nearest, more=None):
-    """What a network makes of 6 × 4 cells, cell by cell in scalars."""
+    """Output of a network for 6 × 4 cells, cell by cell in scalars."""
     best, mean, closest = known["best"], known["mean"], known["closest"]
     odds = [sigmoid(value) for value in nearest]
     narrow, wide = blurred(odds, 0.6), blurred(odds, 1.5)
@@ -148,24 +148,24 @@ def read_cells(network, known, prior, nearest, more=None):
             best[cell] / 2 + 1,
             mean[cell] / 2 + 1,
             4 * closest[cell],
-            shrunk(narrow[cell]),
-            shrunk(wide[cell]),
+            log_scaled(narrow[cell]),
+            log_scaled(wide[cell]),
             max(around) / 2 + 1,
             max(nearest) / 2,
             max(best) / 2,
-            shrunk(sum(odds)),
+            log_scaled(sum(odds)),
             x**2 + y**2,
             y,
             math.log(known["looks"]) / 2,
             prior,
         ]
         inputs += [] if more is None else [more[cell]]
-        cells.append(nearest[cell] + neural(network, inputs))
+        cells.append(nearest[cell] + run_network(network, inputs))
     return cells
 
 
 def read_out(model, known, target):
-    """Log odds of all cells, of all cells if none that was fixated holds the target, and of presence."""
+    """Log odds of all cells, of all cells if no fixated cell holds the target, and of presence."""
     nearest, prior, visited = known["nearest"], float(model.prior[target]), known["visited"]
     cells = read_cells(model.read, known, prior, nearest)
     emptied = [-8.0 if seen else value for value, seen in zip(nearest, visited, strict=True)]
@@ -179,13 +179,13 @@ def read_out(model, known, target):
         4 * sum(known["closest"]) / 24,
         math.log(known["looks"]) / 2,
         prior,
-        shrunk(known["score"]),
+        log_scaled(known["score"]),
     ]
-    return cells, following, max(cells) + neural(model.judge, inputs)
+    return cells, following, max(cells) + run_network(model.judge, inputs)
 
 
-def remember(looks, model, order, target):
-    """What looks in this order leave, look by look and cell by cell."""
+def gather_by_loop(looks, model, order, target):
+    """Evidence gathered from looks in this order, look by look and cell by cell."""
     evidence = model(looks, FIXATIONS, GRID, target)
     cells = range(24)
     known = {"nearest": [0.0] * 24, "best": [-math.inf] * 24, "closest": [math.inf] * 24, "score": 0.0, "looks": 0}
@@ -223,7 +223,7 @@ def test_belief_equals_a_loop_over_looks_and_cells(looks, model, order, target):
     with torch.no_grad():
         model.prior.copy_(torch.tensor([0.3, -1.0, 2.0, 0.7]))
         belief = believe(Target(model), looks, order, target)
-        known = remember(looks, model, order, target)
+        known = gather_by_loop(looks, model, order, target)
         cells, following, anywhere = read_out(model, known, target)
     for name in ("nearest", "best", "closest", "total", "weight"):
         assert getattr(belief, name)[0].tolist() == pytest.approx(known[name], abs=1e-5), name
@@ -233,7 +233,7 @@ def test_belief_equals_a_loop_over_looks_and_cells(looks, model, order, target):
     assert belief.present[0].tolist() == pytest.approx([sigmoid(value) for value in cells], abs=1e-5)
     assert belief.following[0].tolist() == pytest.approx([sigmoid(value) for value in following], abs=1e-5)
     assert float(belief.anywhere) == pytest.approx(sigmoid(anywhere), abs=1e-5)
-    # It is about the target that was searched for, whatever is asked.
+    # The belief is about the target of the search, whichever class is asked for.
     assert belief.probability(7) is belief.probability(torch.tensor([2])) is belief.present
     assert belief.chance(7) is belief.chance(torch.tensor([2])) is belief.following
     assert belief.presence(7) is belief.presence(torch.tensor([2])) is belief.anywhere
@@ -250,7 +250,7 @@ def test_belief_before_the_first_look(model):
 
 
 def test_without_learned_corrections_the_closest_look_decides(looks, model):
-    """Networks that add nothing leave the evidence of the closest look, and the most probable cell's for the image."""
+    """Without corrections a cell has the evidence of its closest look, and the image that of its most probable cell."""
     with torch.no_grad():
         for network in (model.read, model.guide, model.judge):
             network[-1].weight.zero_()
@@ -260,13 +260,13 @@ def test_without_learned_corrections_the_closest_look_decides(looks, model):
     closest = torch.cdist(GRID.centres, FIXATIONS).argmin(1)
     expected = said.t().gather(1, closest[:, None])[:, 0].sigmoid()
     torch.testing.assert_close(belief.present[0], expected)
-    # A search goes on because no fixated cell holds the target.
+    # For the next look, fixated cells are assumed not to hold the target.
     expected[FIXATED] = torch.tensor(-8.0).sigmoid()
     torch.testing.assert_close(belief.following[0], expected)
     torch.testing.assert_close(belief.anywhere, belief.present.amax(-1))
 
 
-def test_the_prior_of_a_class_counts_for_that_class_alone(looks, model):
+def test_the_prior_of_a_class_changes_only_that_class(looks, model):
     observer = Target(model)
     with torch.no_grad():
         before = {target: believe(observer, looks, (0, 1), target) for target in (1, 2)}
@@ -278,8 +278,8 @@ def test_the_prior_of_a_class_counts_for_that_class_alone(looks, model):
     assert not torch.isclose(before[2].anywhere, after[2].anywhere).any()
 
 
-def test_no_detection_at_all_and_a_single_column(model):
-    """Grids of one row or one column, and looks that hold not even padding."""
+def test_looks_without_detections_on_grids_of_one_row_or_column(model):
+    """The looks have no detections, not even padding."""
     for grid in (Grid(1, 5, (60, 90)), Grid(5, 1, (90, 60)), Grid(1, 1, (10, 10))):
         observer = Target(model)
         nothing = Detections(torch.zeros(2, 0, 4), torch.zeros(2, 0, 4), torch.zeros(2, 0, dtype=torch.bool))
@@ -316,7 +316,7 @@ def run_apart(observer, looks, row):
     return belief
 
 
-def test_a_batch_is_its_episodes_one_by_one(looks, model):
+def test_a_batch_equals_its_episodes_run_one_by_one(looks, model):
     with torch.no_grad():
         batch, joint = run_together(Target(model), looks), run_together(Target(model, together=True), looks)
         for row in range(3):
@@ -327,7 +327,7 @@ def test_a_batch_is_its_episodes_one_by_one(looks, model):
                 torch.testing.assert_close(getattr(joint, part.name)[row : row + 1], one, atol=1e-5, rtol=1e-5)
 
 
-def test_looks_and_beliefs_of_some_episodes(looks, model):
+def test_looks_and_beliefs_can_be_indexed_by_episode(looks, model):
     observer = Target(model)
     index = torch.tensor([2, 0])
     with torch.no_grad():
@@ -340,12 +340,12 @@ def test_looks_and_beliefs_of_some_episodes(looks, model):
     assert said[index].target.tolist() == [2, 2]
 
 
-def believer():
+def score_model():
     """A model whose evidence is the clipped score of the target, and nothing else: no correction of cell or image."""
     model = TargetEvidence(4, 4).requires_grad_(False).eval()
     for parameter in model.parameters():
         parameter.zero_()
-    # The second feature is log(score · weight) / 4 + 1; GELU of large numbers is the identity, of -large ones nothing.
+    # The second feature is log(score · weight) / 4 + 1; GELU is x for large x, and 0 for very negative x.
     model.look[0].weight[0, 1] = 100
     model.look[0].bias[0] = -60
     model.look[2].weight[0, 0] = 1
@@ -354,8 +354,8 @@ def believer():
     return model
 
 
-def test_a_fixated_cell_that_shows_the_target_is_not_forced_down():
-    observer, cell = Target(believer()), 9
+def test_a_fixated_cell_that_shows_the_target_keeps_its_probability():
+    observer, cell = Target(score_model()), 9
     x, y = GRID.centres[cell].tolist()
     box = torch.tensor([[[x - 7, y - 7, x + 7, y + 7]]])
     shown = Detections(box, torch.tensor([[[0.02, 0.02, 0.94, 0.02]]]), torch.ones(1, 1, dtype=torch.bool))
@@ -370,10 +370,10 @@ def test_a_fixated_cell_that_shows_the_target_is_not_forced_down():
     assert first == second == later
     assert int(history[-1].present.argmax()) == cell
     assert all(float(each.anywhere) > 0.9 for each in history[1:])
-    # Where to look next is another question.
+    # For the next look, fixated cells are ruled out, but not their neighbours.
     assert float(history[1].following[0, cell]) < 0.001
     assert float(history[1].following[0, 0]) < 0.001 < float(history[1].following[0, 8])
-    # A cell that was fixated and showed nothing is as any other that showed nothing.
+    # A fixated cell that showed nothing equals any other cell that showed nothing.
     assert float(history[0].present[0, 0]) == pytest.approx(blank)
 
 
@@ -411,7 +411,7 @@ def test_gradients_reach_every_parameter(looks):
     for name, parameter in model.named_parameters():
         assert parameter.grad is not None, name
         assert float(parameter.grad.abs().sum()) > 0, name
-    # Of the prior, that of the target alone.
+    # In the prior only the target has a gradient.
     assert model.prior.grad.nonzero()[:, 0].tolist() == [1]
 
 
@@ -438,7 +438,7 @@ def test_gradients_through_the_evidence(looks):
     assert torch.autograd.gradcheck(model.evidence, features[:1].double().clone().requires_grad_())
 
 
-def test_log_odds_equal_scalars_in_float64():
+def test_log_odds_equal_a_loop_in_float64():
     torch.manual_seed(1)
     model = TargetEvidence(4, 4, components=4).double().requires_grad_(False)
     torch.nn.init.normal_(model.prior)
@@ -462,7 +462,7 @@ def test_log_odds_equal_scalars_in_float64():
 
 
 @pytest.mark.parametrize("thresholds", [None, Thresholds(0.83, 0.05)], ids=["none", "chosen"])
-def test_saved_and_loaded_is_the_same(tmp_path, looks, thresholds):
+def test_a_model_saved_and_loaded_is_the_same(tmp_path, looks, thresholds):
     torch.manual_seed(1)
     model = TargetEvidence(8, 6, components=4, thresholds=thresholds).eval()
     torch.nn.init.normal_(model.prior)
@@ -511,8 +511,8 @@ def test_saved_and_loaded_is_the_same(tmp_path, looks, thresholds):
         "no guide",
     ],
 )
-def test_files_that_are_not_whole_are_refused(tmp_path, model, change):
-    """Those of earlier versions among them, which had neither a prior nor a network for presence."""
+def test_incomplete_files_are_refused(tmp_path, model, change):
+    """Among them files of earlier versions, without a prior or a network for presence."""
     record = {"kind": model.kind, "version": "0", **model._record(), "metadata": {}}
     tensors = {name: tensor.detach() for name, tensor in model.state_dict().items()}
     change(record, tensors)
@@ -539,5 +539,5 @@ def test_thresholds_are_changed_one_by_one():
     assert before.changed(place=0.4) == Thresholds(0.8, 0.1, 0.4)
 
 
-def test_there_are_the_classes_of_coco_unless_told_otherwise():
+def test_the_default_classes_are_those_of_coco():
     assert TargetEvidence(4, 3).prior.shape == (81,)

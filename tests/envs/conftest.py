@@ -1,4 +1,4 @@
-"""Small worlds that the tests of the environments share: two embedded scenes, seen from a few cells."""
+"""Small worlds, shared by the tests of the environments: two embedded scenes, seen from a few cells."""
 
 import pytest
 

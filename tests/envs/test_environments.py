@@ -1,4 +1,4 @@
-"""The environments against Gymnasium's own checker, its own vectorised environments, and what scenes really hold."""
+"""The environments against Gymnasium's own checker, its own vectorised environments, and the annotations of scenes."""
 
 import subprocess
 import sys
@@ -34,7 +34,7 @@ TASKS = list(KINDS)
 
 
 def equal(one, other):
-    """Whether observations or infos are the same, to the bit."""
+    """Whether observations or infos are the same bit for bit."""
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(equal(one[name], other[name]) for name in one)
     return np.array_equal(one, other)
@@ -44,7 +44,7 @@ def equal(one, other):
 @pytest.mark.parametrize(
     "more", [{}, {"belief": True, "glimpse": 32, "render_mode": "rgb_array"}], ids=["plain", "all"]
 )
-def test_gymnasiums_checker_has_nothing_to_say(world, task, more):
+def test_environments_pass_the_checker_of_gymnasium(world, task, more):
     """Warnings are errors."""
     env = gymnasium.make(IDS[task], **world, **more)
     assert isinstance(env.unwrapped, KINDS[task])
@@ -52,26 +52,26 @@ def test_gymnasiums_checker_has_nothing_to_say(world, task, more):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_episodes_side_by_side_are_those_of_gymnasiums_own(sceneries, task):
-    """Reset for reset and step for step, with the ends of episodes in between."""
+def test_vectorised_episodes_equal_those_of_gymnasium(sceneries, task):
+    """At every reset and every step, with ends of episodes in between."""
     options = {"belief": True, "scenery": sceneries[task]}
     ours = gymnasium.make_vec(IDS[task], num_envs=3, together=False, **options)
     assert isinstance(ours, GazeVectorEnv)
     theirs = SyncVectorEnv([lambda: KINDS[task](**options)] * 3)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
-    check_side_by_side(ours, theirs, steps=15)
+    check_same_episodes(ours, theirs, steps=15)
 
 
-def test_episodes_that_restart_at_once_are_those_of_gymnasiums_own(sceneries):
+def test_episodes_that_restart_in_the_same_step_equal_those_of_gymnasium(sceneries):
     mode = AutoresetMode.SAME_STEP
     options = {"belief": True, "scenery": sceneries["search"]}
     ours = GazeVectorEnv("search", 3, together=False, autoreset_mode=mode, **options)
     theirs = SyncVectorEnv([lambda: GazeSearch(**options)] * 3, autoreset_mode=mode)
-    check_side_by_side(ours, theirs, steps=15)
+    check_same_episodes(ours, theirs, steps=15)
 
 
-def check_side_by_side(ours, theirs, steps):
+def check_same_episodes(ours, theirs, steps):
     observations, infos = zip(ours.reset(seed=4), theirs.reset(seed=4), strict=True)
     assert equal(*observations)
     assert equal(*infos)
@@ -89,30 +89,30 @@ def check_side_by_side(ours, theirs, steps):
             ended = np.flatnonzero(mine[4]["_final_obs"])
             assert all(equal(final[0][row], final[1][row]) for row in ended)
             mine[4]["final_info"], other[4]["final_info"] = (
-                of_rows(told[4]["final_info"], ended) for told in (mine, other)
+                rows_of_infos(results[4]["final_info"], ended) for results in (mine, other)
             )
         assert equal(mine[4], other[4])
         ends += int((mine[2] | mine[3]).sum())
     assert ends > 2
 
 
-def of_rows(infos, rows):
-    """Infos of some environments: what others are filled with has no meaning."""
-    return {name: of_rows(each, rows) if isinstance(each, dict) else each[rows] for name, each in infos.items()}
+def rows_of_infos(infos, rows):
+    """Infos of the given environments; the values of the others have no meaning."""
+    return {name: rows_of_infos(each, rows) if isinstance(each, dict) else each[rows] for name, each in infos.items()}
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_seeds_repeat_episodes_and_different_seeds_do_not(sceneries, task):
+def test_a_seed_repeats_an_episode_and_other_seeds_give_others(sceneries, task):
     def episode(seed):
         env, random = KINDS[task](sceneries[task], belief=True), MaskedRandom(0)
         observation, info = env.reset(seed=seed)
-        told = [observation]
+        record = [observation]
         for _ in range(4):
             observation, reward, terminated, _, info = env.step(random(observation, info))
-            told.append({**observation, "reward": reward})
+            record.append({**observation, "reward": reward})
             if terminated:
                 break
-        return told
+        return record
 
     first, second = episode(5), episode(5)
     assert len(first) == len(second)
@@ -121,7 +121,7 @@ def test_seeds_repeat_episodes_and_different_seeds_do_not(sceneries, task):
     assert len(starts) > 2
 
 
-def test_a_search_is_over_on_the_cells_that_a_box_overlaps_and_nowhere_else(sceneries):
+def test_a_search_ends_only_in_cells_that_a_box_of_the_target_overlaps(sceneries):
     """By a loop over the boxes of the scene, for every cell."""
     scenery = sceneries["search"]
     env, scenes = GazeSearch(scenery, price=0.25, find=3.0), EmbeddedScenes(scenery.classes[1:], count=2)
@@ -146,7 +146,7 @@ def test_a_search_is_over_on_the_cells_that_a_box_overlaps_and_nowhere_else(scen
     assert 0 < hits < 40
 
 
-def test_random_gaze_finds_as_often_as_the_formula_says(world):
+def test_random_gaze_finds_targets_as_often_as_in_closed_form(world):
     """1 - C(N - m, n) / C(N, n) for m target cells; 500 episodes, four standard errors."""
     scenery = open_scenery("search", **{**world, "starts": 500, "policy": "random", "shifts": 3}, targets=["cat"])
     scene = scenery.scenes[0]
@@ -173,18 +173,18 @@ def test_rewards_of_an_exploration_add_up_to_its_success(sceneries):
     assert info["result"] != before
 
 
-def test_looking_twice_costs_and_shows_nothing_new(sceneries):
+def test_a_repeated_look_costs_its_price_and_shows_nothing_new(sceneries):
     env = GazeSearch(sceneries["search"], belief=True)
     observation, info = env.reset(seed=2)
     cell = int(np.flatnonzero(info["action_mask"] == 0)[0])
-    again, reward, _, _, told = env.step(cell)
+    again, reward, _, _, later_info = env.step(cell)
     assert reward == -0.05
     assert np.array_equal(again["belief"], observation["belief"])
-    assert equal(told["detections"], info["detections"])
-    assert told["passes"] == 2
+    assert equal(later_info["detections"], info["detections"])
+    assert later_info["passes"] == 2
 
 
-def test_infos_have_what_the_detector_saw_there(sceneries):
+def test_infos_have_the_detections_of_the_look(sceneries):
     scenery = sceneries["search"]
     env = GazeSearch(scenery)
     _, info = env.reset(seed=0)
@@ -198,7 +198,7 @@ def test_infos_have_what_the_detector_saw_there(sceneries):
     assert seen["scores"][seen["mask"]] == pytest.approx(live.scores[0].numpy(), abs=1e-4)
 
 
-def test_wrappers_show_the_belief_or_the_glimpse_alone(sceneries):
+def test_wrappers_return_only_the_belief_or_only_the_glimpse(sceneries):
     scenery = sceneries["search"]
     env = BeliefObservation(gymnasium.make(IDS["search"], scenery=scenery))
     observation, info = env.reset(seed=0)
@@ -228,7 +228,7 @@ def test_wrappers_show_the_belief_or_the_glimpse_alone(sceneries):
         BeliefObservation(gymnasium.make("CartPole-v1"))
 
 
-def test_a_picture_shows_the_episode_as_it_goes_on(sceneries):
+def test_the_rendered_picture_changes_as_the_episode_goes_on(sceneries):
     env = GazeSearch(sceneries["search"], render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
@@ -240,7 +240,7 @@ def test_a_picture_shows_the_episode_as_it_goes_on(sceneries):
     assert GazeSearch(sceneries["search"]).render() is None
 
 
-def test_mosaics_photographs_and_targets_make_environments(world, tmp_path):
+def test_environments_can_be_made_of_mosaics_photographs_and_targets(world, tmp_path):
     scenery = open_scenery("search", **world, mosaics=1, tiles=(2, 1), targets=["cup"])
     assert scenery.grid(0).extent.tolist() == [1280, 480]
     assert {episode.target for episode in scenery.episodes(0)} == {scenery.classes.index("cup")}
@@ -254,7 +254,7 @@ def test_mosaics_photographs_and_targets_make_environments(world, tmp_path):
         open_scenery("search", tmp_path / "nosuch", tmp_path / "nosuch.json")
 
 
-def test_mistakes_are_told(sceneries):
+def test_invalid_calls_are_refused(sceneries):
     scenery = sceneries["search"]
     env = GazeSearch(scenery)
     with pytest.raises(InputError, match="step: expected an episode in progress, got none; call reset"):
@@ -280,7 +280,7 @@ def test_mistakes_are_told(sceneries):
         gymnasium.make(IDS["search"], action="pixel")
 
 
-def test_environments_rest_until_a_reset_names_them(sceneries):
+def test_ended_environments_stay_idle_until_they_are_reset(sceneries):
     scenery = sceneries["search"]
     envs = GazeVectorEnv("search", 2, scenery, autoreset_mode="Disabled")
     episode = scenery.episodes(0)[0]
@@ -295,7 +295,7 @@ def test_environments_rest_until_a_reset_names_them(sceneries):
 
 
 def test_importing_registers_the_names_once():
-    """In a process of its own, where nothing was registered before."""
+    """In a separate process, where nothing was registered before."""
     code = (
         "import gymnasium, semfov.envs\n"
         "from semfov.envs.registration import register\n"
@@ -303,15 +303,15 @@ def test_importing_registers_the_names_once():
         "print(sorted(name for name in gymnasium.registry if 'semfov' in name))"
     )
     call = [sys.executable, "-W", "error::UserWarning", "-c", code]
-    told = subprocess.run(call, capture_output=True, text=True, check=True, cwd=ROOT).stdout
-    assert told.strip() == str(sorted(IDS.values()))
+    output = subprocess.run(call, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert output.strip() == str(sorted(IDS.values()))
 
 
-def test_without_gymnasium_the_error_has_the_command():
+def test_without_gymnasium_the_error_has_the_install_command():
     code = (
         "import sys; sys.modules['gymnasium'] = None\n"
         "from semfov.errors import DataError\n"
         "try:\n    import semfov.envs\nexcept DataError as error:\n    print(error)"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
-    assert 'pip install "semfov[envs]"' in told
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert 'pip install "semfov[envs]"' in output

@@ -1,4 +1,4 @@
-"""One table of looks for many scenes, and episodes that come and go, against each scene's own loop."""
+"""One table of looks for many scenes, with episodes that start and end, against a loop in each scene."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ TARGETS = [[1, 3], [2], [1, 2]]
 
 
 def stored(scene, dtype):
-    """What is seen from every cell of a scene; more in one scene than in another, and from some cells nothing."""
+    """Detections from every cell of a scene; their number differs between scenes, and some cells have none."""
     generator = torch.Generator().manual_seed(scene)
     most = 2 + scene
     size = torch.tensor(SIZES[scene], dtype=torch.float64)
@@ -50,8 +50,8 @@ def tensors(belief):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", OBSERVERS)
-def test_episodes_in_many_scenes_are_those_of_each_alone(kind, dtype):
-    """Two episodes go on in other scenes halfway; a scene is first entered then, and its looks are more."""
+def test_episodes_in_many_scenes_equal_each_episode_run_alone(kind, dtype):
+    """Halfway, two episodes move to other scenes, one of which is new and has more detections per look."""
     observer = OBSERVERS[kind](dtype)
     looks = SceneLooks(lambda scene: stored(scene, dtype), observer, 4)
     paths = torch.tensor([[0, 4, 2, 1], [5, 1, 0, 3], [3, 2, 4, 5], [1, 0, 5, 2]])
@@ -89,7 +89,7 @@ def test_episodes_in_many_scenes_are_those_of_each_alone(kind, dtype):
         assert torch.equal(seen.boxes[0, :count], expected.boxes[0, expected.mask[0]])
 
 
-def test_looks_with_fewer_detections_are_filled_up_with_some_that_concern_no_cell():
+def test_looks_with_fewer_detections_are_padded_with_detections_in_no_cell():
     few = SemanticLook(torch.rand(2, 1, 4), torch.ones(2, 1, 6, dtype=torch.bool), torch.zeros(2, 6))
     many = SemanticLook(torch.rand(1, 3, 4), torch.ones(1, 3, 6, dtype=torch.bool), torch.ones(1, 6))
     joined = SemanticLook.join([few, many])
@@ -101,7 +101,7 @@ def test_looks_with_fewer_detections_are_filled_up_with_some_that_concern_no_cel
     assert torch.equal(joined.distance, torch.cat([few.distance, many.distance]))
 
 
-def test_what_is_put_into_a_belief_leaves_the_others_and_the_belief_before():
+def test_put_changes_only_the_given_rows_and_not_the_original_belief():
     before = DirichletBelief(torch.rand(4, 6, 3) + 1, torch.rand(4, 6))
     other = DirichletBelief(torch.rand(2, 6, 3) + 3, torch.rand(2, 6))
     kept = before.beta.clone()

@@ -1,4 +1,4 @@
-"""Hand-made policies as agents make the fixations that the evaluations record, whatever they are run in."""
+"""Policies as agents in environments make the same fixations as those recorded in the evaluations."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ EXPLORATIONS = ["recommended", "random-raw", "kl-calibrated"]
 
 
 def evaluated(kind, scenery):
-    """What the evaluation records of the same settings, scene by scene: its own run, no part of the environment."""
+    """Records of the evaluation with the same settings, scene by scene: a separate run without the environment."""
     run = kind(scenery.run.config)
     return [record for scene in range(len(run.scenes)) for record in run.outcomes(scene)[0]]
 
@@ -32,7 +32,7 @@ def all_episodes(scenery):
     return [episode for scene in scenery.scenes for episode in scenery.episodes(scene)]
 
 
-def one_at_a_time(env, episodes):
+def run_one_at_a_time(env, episodes):
     """Fixated cells, the shift that found the target, and the results of every look."""
     agent, ran = PolicyAgent(env), []
     for episode in episodes:
@@ -55,8 +55,8 @@ def test_searches_equal_the_records_of_the_evaluation(world, policy):
     records, episodes = evaluated(SearchRun, scenery), all_episodes(scenery)
     assert len(records) == len(episodes) >= 12
     wanted = [(record["cells"], record["found_at"]) for record in records]
-    assert len({found for _, found in wanted}) > 1  # They do end at different times.
-    assert [(cells, found) for cells, found, _ in one_at_a_time(GazeSearch(scenery), episodes)] == wanted
+    assert len({found for _, found in wanted}) > 1  # The searches end at different times.
+    assert [(cells, found) for cells, found, _ in run_one_at_a_time(GazeSearch(scenery), episodes)] == wanted
     envs = GazeVectorEnv("search", 5, scenery, together=False, autoreset_mode="Disabled")
     assert [(list(ran.cells), ran.found_at) for ran in run_agent(envs, PolicyAgent(envs), episodes)] == wanted
 
@@ -69,7 +69,9 @@ def test_explorations_equal_the_records_of_the_evaluation(world, policy):
     assert len(records) == len(episodes) == 6
     wanted = [(record["cells"], [right / record["object_cells"] for right in record["right"]]) for record in records]
     assert any(len(set(results)) > 2 for _, results in wanted)
-    for (cells, _, results), (path, rates) in zip(one_at_a_time(GazeExplore(scenery), episodes), wanted, strict=True):
+    for (cells, _, results), (path, rates) in zip(
+        run_one_at_a_time(GazeExplore(scenery), episodes), wanted, strict=True
+    ):
         assert cells == path
         assert results == pytest.approx(rates, abs=1e-6)
     envs = GazeVectorEnv("exploration", 4, scenery, together=False, autoreset_mode="Disabled")
@@ -90,13 +92,13 @@ def test_beliefs_computed_together_agree_up_to_rounding(sceneries):
     assert beliefs[0].std() > 0.01
 
 
-def test_the_agent_is_found_behind_wrappers(sceneries):
+def test_the_policy_agent_accepts_wrapped_environments(sceneries):
     env = gymnasium.wrappers.TimeLimit(GazeSearch(sceneries["search"]), 3)
     observation, info = env.reset(seed=0)
     assert info["action_mask"][PolicyAgent(env)(observation, info)] == 1
 
 
-def test_settings_of_the_evaluation_make_an_environment(sceneries):
+def test_an_environment_can_be_made_from_the_settings_of_an_evaluation(sceneries):
     config = sceneries["search"].run.config
     scenery = open_scenery("search", config=replace(config, policies=("random",)))
     assert scenery.policy == "random"

@@ -1,4 +1,4 @@
-"""Environments with large pictures: the checker, the zoom's own choices, and what boxes and scores say was found."""
+"""Environments with large pictures: the checker, the choices of the zooming agent, and found objects."""
 
 import gymnasium
 import numpy as np
@@ -31,8 +31,8 @@ pytestmark = pytest.mark.usefixtures("kept_scenes")
     place=st.tuples(*[st.floats(0, 1)] * 3),
     number=st.integers(0, 10**6),
 )
-def test_an_action_goes_to_the_nearest_window_and_back(size, place, number):
-    """Of its level, by the distance between the middles of windows, tried one by one."""
+def test_an_action_selects_the_nearest_window_and_converts_back(size, place, number):
+    """The nearest of its level by the distance between centres, against trying all windows."""
     lattice = Lattice.over(size, (416, 416))
     window = window_of(lattice, np.array(place))
     assert window.level == round(place[2] * (lattice.levels - 1))
@@ -52,7 +52,7 @@ def test_an_action_goes_to_the_nearest_window_and_back(size, place, number):
 @pytest.mark.weights
 @pytest.mark.slow
 @pytest.mark.parametrize("task", KINDS)
-def test_gymnasiums_checker_has_nothing_to_say(cache, task):
+def test_environments_pass_the_checker_of_gymnasium(cache, task):
     env = gymnasium.make(IDS[task], action="window", mosaics=1, tiles=(2, 1), passes=6, cache=cache, **EVERYTHING)
     assert isinstance(env.unwrapped, KINDS[task])
     check_env(env.unwrapped)
@@ -60,8 +60,8 @@ def test_gymnasiums_checker_has_nothing_to_say(cache, task):
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_the_zooms_own_search_is_made_in_the_environment(zoom_scenery):
-    """Window for window, until an object is found by its box."""
+def test_the_environment_repeats_the_search_of_the_zooming_agent(zoom_scenery):
+    """Window by window, until an object is found by its box."""
     env = ZoomSearch(zoom_scenery)
     agent, lengths = ZoomPolicyAgent(env), set()
     targets = zoom_scenery.episodes(0)
@@ -85,7 +85,7 @@ def test_the_zooms_own_search_is_made_in_the_environment(zoom_scenery):
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_the_zooms_own_exploration_is_made_in_the_environment(zoom_scenery):
+def test_the_environment_repeats_the_exploration_of_the_zooming_agent(zoom_scenery):
     env = ZoomExplore(zoom_scenery, price=0.5, find=10.0)
     agent = ZoomPolicyAgent(env)
     _, info = env.reset(seed=0)
@@ -121,18 +121,18 @@ def test_observations_and_infos_follow_the_windows(zoom_scenery):
     for wrapper, key in ((BeliefObservation(env), "belief"), (GlimpseObservation(env, 32), "glimpse")):
         assert wrapper.observation_space == env.observation_space[key]
         assert np.array_equal(wrapper.observation(observation), observation[key])
-    same, reward, _, _, told = env.step(closest)
+    same, reward, _, _, later_info = env.step(closest)
     assert reward == -0.01
     assert np.array_equal(same["belief"], observation["belief"])
-    assert told["passes"] == 3
+    assert later_info["passes"] == 3
     with pytest.raises(InputError, match=r"action: expected \(x, y, magnification\)"):
         env.step(np.array([0.0, 1.5, 0.0]))
 
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_a_folder_of_pictures_about_which_nothing_is_known(zoom_scenery, cache, tmp_path):
-    """What a look shows with a score of 0.3 counts; pictures may have any size."""
+def test_environments_can_be_made_of_pictures_without_annotations(zoom_scenery, cache, tmp_path):
+    """Targets detected with a score of at least 0.3 count as found; pictures may have any size."""
     picture = zoom_scenery.image(0).permute(1, 2, 0).mul(255).byte().numpy()
     Image.fromarray(picture).save(tmp_path / "a.png")
     Image.fromarray(picture[:900, :1100]).save(tmp_path / "b.png")
@@ -165,15 +165,15 @@ def test_a_folder_of_pictures_about_which_nothing_is_known(zoom_scenery, cache, 
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_looks_are_kept_between_worlds(zoom_scenery, cache, monkeypatch):
-    """A second world of the same pictures needs no detector for what the first has seen."""
+def test_looks_are_cached_between_environments(zoom_scenery, cache, monkeypatch):
+    """A second environment with the same pictures needs no detector for looks that the first has made."""
     env = ZoomExplore(zoom_scenery)
     env.reset(seed=0)
     env.close()
     again = open_zoom_scenery(mosaics=1, tiles=(3, 2), passes=6, cache=cache)
 
     def refuse(*given, **options):
-        raise AssertionError("the detector was asked")
+        raise AssertionError("the detector was called")
 
     monkeypatch.setattr(again.run.eye, "glance", refuse)
     kept = again.glances(0).see([overview(again.glances(0))])[0]

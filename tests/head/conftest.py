@@ -1,4 +1,4 @@
-"""A head without weights: it sees squares of pure colour."""
+"""Models of a head that need no trained weights: the detector sees squares of pure colour."""
 
 import pytest
 import torch

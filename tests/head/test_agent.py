@@ -17,8 +17,8 @@ def agent(eye, models):
     return HeadAgent(eye, *models, speeds=Speeds(look=0.2)).eval()
 
 
-def test_boxes_come_back_as_directions(agent, panorama):
-    """What is seen across the seam lies behind, in the scene."""
+def test_boxes_are_returned_as_directions_in_the_scene(agent, panorama):
+    """An object seen across the seam of the panorama lies behind the viewer."""
     world = Panorama(panorama)
     views = agent.views(world)
     behind = int((views.poses - torch.tensor([-180.0, 0, 60])).abs().sum(-1).argmin())
@@ -35,7 +35,7 @@ def test_boxes_come_back_as_directions(agent, panorama):
     assert ((boxes[:, 1] > 70) & (boxes[:, 3] < 110)).all()
 
 
-def test_a_search_and_an_exploration(agent, panorama):
+def test_searches_and_explorations_keep_to_their_limits(agent, panorama):
     world = Panorama(panorama)
     path = agent.search(world, "blue", passes=5, confirm=1.0)
     assert len(path) == len(path.seconds) == len(path.maps) == len(path.detections) == 5
@@ -55,7 +55,7 @@ def test_a_search_and_an_exploration(agent, panorama):
     assert limited.seconds[-1] <= 1.0
 
 
-def test_what_is_seen_is_what_the_eye_sees(agent, panorama):
+def test_detections_of_a_path_equal_those_of_the_eye(agent, panorama):
     world = Panorama(panorama)
     path = agent.search(world, "blue", passes=2, confirm=1.0)
     detect = live(agent.eye, path.views)
@@ -63,7 +63,7 @@ def test_what_is_seen_is_what_the_eye_sees(agent, panorama):
         assert torch.equal(detect(action).boxes, seen.boxes)
 
 
-def test_a_flat_scene(agent):
+def test_boxes_of_a_flat_scene_lie_around_the_object(agent):
     image = torch.zeros(3, 480, 640)
     image[1, 200:240, 500:540] = 1
     path = agent.search(Flat(image, degree=4), "green", passes=4, confirm=1.0)
@@ -72,13 +72,13 @@ def test_a_flat_scene(agent):
     assert ((boxes[:, 0] > 470) & (boxes[:, 2] < 570) & (boxes[:, 1] > 170) & (boxes[:, 3] < 270)).all()
 
 
-def test_a_head_that_zooms(agent, panorama, eye, models):
+def test_a_head_that_zooms_uses_only_the_given_fields_of_view(agent, panorama, eye, models):
     wide = HeadAgent(eye, *models, fields=(40.0, 80.0))
     path = wide.explore(Panorama(panorama), passes=4)
     assert {float(path.views.poses[action // 100, 2]) for action in path.actions} <= {40.0, 80.0}
 
 
-def test_pictures(agent, panorama, tmp_path):
+def test_paths_can_be_plotted_and_animated(agent, panorama, tmp_path):
     world = Panorama(panorama)
     for path in (agent.search(world, "blue", passes=3, confirm=1.0), agent.explore(world, passes=2)):
         figure = plot_head_path(path, panorama)
@@ -95,12 +95,12 @@ def test_pictures(agent, panorama, tmp_path):
 
 def test_arguments_are_checked(agent, panorama):
     world = Panorama(panorama)
-    for arguments, told in (
+    for arguments, message in (
         ({"target": "blu"}, "target"),
         ({"target": "blue", "passes": 0}, "passes"),
         ({"target": "blue", "start": 10**6}, "start"),
         ({"target": "blue", "confirm": 2.0}, "confirm"),
         ({"target": "blue", "foresight": -1.0}, "foresight"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             agent.search(world, **arguments)

@@ -1,4 +1,4 @@
-"""A scene seen one window at a time: what is believed of it, and what a look is worth."""
+"""A scene seen one window at a time: the belief about it, and the value of a look."""
 
 from itertools import pairwise
 
@@ -26,26 +26,26 @@ def episode(views, eye, observer, actions, target=None):
         looks, observer, lambda _, cell: PerPrice(gain, None, int(cell)), torch.tensor(actions[:1]),
         Given(torch.tensor([actions])), most=len(actions),
     ) if target else rollout(
-        looks, observer, Scan(_Flat(views), [0], 1, 0), torch.tensor(actions[:1]), Given(torch.tensor([actions])),
+        looks, observer, Scan(_NoGain(views), [0], 1, 0), torch.tensor(actions[:1]), Given(torch.tensor([actions])),
         most=len(actions),
     )  # fmt: skip
     return [step.belief for step in steps]
 
 
-class _Flat(SearchGain):
+class _NoGain(SearchGain):
     def forward(self, belief, here, poses):
         return torch.zeros(len(self.views.grid))
 
 
-def ahead(views):
+def pose_ahead(views):
     """Pose that looks ahead, at the horizon."""
     return int((views.poses - torch.tensor([0.0, 0, 60])).abs().sum(-1).argmin())
 
 
-def test_a_view_is_believed_of_as_by_the_eye_alone(views, eye, models):
-    """The scene's cells have what the observer of a single picture says of the view, where they lie in it."""
+def test_belief_about_one_view_equals_that_of_an_eye_without_a_head(views, eye, models):
+    """Cells of the scene have the values of the observer of a single picture, at their place in the view."""
     evidence = models[0]
-    pose = ahead(views)
+    pose = pose_ahead(views)
     cells = [33, 66, 52]
     belief = episode(views, eye, SceneObserver(Target(evidence), views), [pose * 100 + c for c in cells], 3)[-1]
     image = views.world.view(views.poses[pose])[None]
@@ -56,7 +56,7 @@ def test_a_view_is_believed_of_as_by_the_eye_alone(views, eye, models):
         alone = inner(alone, eye.look(view, point), point, views.view_grid, 3)
     seen = views.seen[pose]
     for number in range(0, len(seen.cells), 7):
-        # Bilinear by hand, between the four cells around the point.
+        # Bilinear interpolation by hand, between the four cells around the point.
         at = (seen.points[number] + 0.5) / torch.tensor([6.4, 4.8]) - 0.5
         at = at.clamp(0, 9)
         low = at.floor().clamp(max=8).long()
@@ -67,8 +67,8 @@ def test_a_view_is_believed_of_as_by_the_eye_alone(views, eye, models):
         assert float(belief.probability(3)[0, seen.cells[number]]) == pytest.approx(float(expected), abs=1e-5)
 
 
-def test_cells_belong_to_the_view_that_saw_them_from_nearest(views, eye, models):
-    pose = ahead(views)
+def test_cells_belong_to_the_view_with_the_closest_look(views, eye, models):
+    pose = pose_ahead(views)
     other = int((views.poses - torch.tensor([30.0, 0, 60])).abs().sum(-1).argmin())
     actions = [pose * 100 + 50, other * 100 + 59, pose * 100 + 59]
     beliefs = episode(views, eye, SceneObserver(Target(models[0]), views), actions, 1)
@@ -87,8 +87,8 @@ def test_cells_belong_to_the_view_that_saw_them_from_nearest(views, eye, models)
     assert beliefs[-1].examined.sum() == len({int(views.gaze_cell[action]) for action in actions})
 
 
-def test_what_was_never_seen_has_the_prior(views, eye, models):
-    pose = ahead(views)
+def test_cells_that_were_never_seen_have_the_prior(views, eye, models):
+    pose = pose_ahead(views)
     belief = episode(views, eye, SceneObserver(Target(models[0]), views, prior=0.07), [pose * 100 + 55], 1)[0]
     unseen = belief.owner[0] < 0
     assert unseen.any()
@@ -97,7 +97,7 @@ def test_what_was_never_seen_has_the_prior(views, eye, models):
 
 
 def test_turning_the_world_turns_the_belief(eye, models, panorama):
-    """Nothing is special at the seam: the same scene by half a turn gives the same belief by half a turn."""
+    """The seam has no effect: a scene turned by half a circle gives the belief turned by half a circle."""
     beliefs = []
     for turned in (panorama, panorama.roll(180, -1)):
         views = Views(Panorama(turned, (64, 48)))
@@ -108,8 +108,8 @@ def test_turning_the_world_turns_the_belief(eye, models, panorama):
     torch.testing.assert_close(beliefs[0].roll(30, -1), beliefs[1], atol=1e-4, rtol=0)
 
 
-def test_search_gain_by_brute_force(views, eye, models):
-    pose = ahead(views)
+def test_search_gain_equals_brute_force(views, eye, models):
+    pose = pose_ahead(views)
     belief = episode(views, eye, SceneObserver(Target(models[0]), views), [pose * 100 + 55, pose * 100 + 12], 2)[-1]
     gains = SearchGain(views, 0.7)(belief, pose, range(len(views)))
     chance, fovea = belief.probability(2)[0], 100 / 640
@@ -127,7 +127,7 @@ def test_search_gain_by_brute_force(views, eye, models):
 
 
 def test_gain_per_price_by_hand(views, eye, models):
-    pose = ahead(views)
+    pose = pose_ahead(views)
     here = pose * 100 + 55
     belief = episode(views, eye, SceneObserver(Target(models[0]), views), [here], 2)[-1]
     gain, speeds = SearchGain(views), Speeds()
@@ -144,11 +144,11 @@ def test_gain_per_price_by_hand(views, eye, models):
     assert (tiling > OUT).any(-1).nonzero()[:, 0].tolist() == sorted(side_by_side)
 
 
-def test_a_dear_head_stays_and_a_free_one_turns(views, eye, models):
-    """The eye has found nothing near: how far it goes is a matter of the price."""
+def test_the_head_stays_if_turning_is_expensive_and_turns_if_it_is_cheap(views, eye, models):
+    """The eye has found nothing nearby: whether the head turns depends on the price."""
 
     def turned(speeds):
-        observer, gain, start = SceneObserver(Target(models[0]), views), SearchGain(views), ahead(views) * 100 + 55
+        observer, gain, start = SceneObserver(Target(models[0]), views), SearchGain(views), pose_ahead(views) * 100 + 55
         steps = look_around(
             views, live(eye, views), observer, lambda action: PerPrice(gain, speeds, action), start,
             target=1, speeds=speeds, passes=6,
@@ -160,8 +160,8 @@ def test_a_dear_head_stays_and_a_free_one_turns(views, eye, models):
     assert turned(Speeds(head=1e6, acceleration=1e9)) == 5
 
 
-def test_an_exploration_by_brute_force(views, eye, models):
-    model, pose = models[1], ahead(views)
+def test_explore_gain_equals_brute_force(views, eye, models):
+    model, pose = models[1], pose_ahead(views)
     belief = episode(views, eye, SceneObserver(LearnedMap(model), views), [pose * 100 + 55, pose * 100 + 11])[-1]
     gains = ExploreGain(views, model, 0.2)(belief, pose, [pose, 0])
     area, fovea = views.world.area, 100 / 640
@@ -176,8 +176,8 @@ def test_an_exploration_by_brute_force(views, eye, models):
             if belief.owner[0, x] < 0:
                 value += float(area[x]) * 0.2 / (1 + float(distance) / fovea)
             else:
-                told = belief.class_probabilities()[:, x : x + 1], belief.closest[:, x : x + 1], belief.looks
-                value += float(area[x] * model.gain(*told, distance[None, None, None])[0, 0, 0])
+                inputs = belief.class_probabilities()[:, x : x + 1], belief.closest[:, x : x + 1], belief.looks
+                value += float(area[x] * model.gain(*inputs, distance[None, None, None])[0, 0, 0])
         assert float(gains[action]) == pytest.approx(value, rel=1e-3, abs=1e-4)
 
 
@@ -190,7 +190,7 @@ def test_a_scan_goes_through_its_poses_in_order(views, eye, models):
     assert [step.action // 100 for step in steps] == [5, 5, 9, 9, 30, 30, 5, 5]
 
 
-def test_seconds_are_those_of_the_movements(views, eye, models):
+def test_seconds_of_a_path_add_up_those_of_its_movements(views, eye, models):
     observer, gain, speeds = SceneObserver(Target(models[0]), views), SearchGain(views), Speeds()
     found = look_around(
         views, live(eye, views), observer, lambda action: PerPrice(gain, speeds, action), 555,
@@ -206,17 +206,17 @@ def test_seconds_are_those_of_the_movements(views, eye, models):
     assert len({step.action for step in steps}) == len(steps)
 
 
-def test_the_gaze_rests_on_what_its_cell_overlaps(views):
-    """Boxes of the view itself, where both are rectangles."""
+def test_the_gaze_rests_on_the_boxes_that_its_cell_overlaps(views):
+    """For boxes of the view itself, where cells and boxes are rectangles."""
     boxes = [(10.0, 10.0, 20.0, 20.0), (30.2, 30.3, 30.6, 30.7), (50.0, 0.0, 64.0, 48.0)]
-    pose, hits = ahead(views), 0
+    pose, hits = pose_ahead(views), 0
     places = views.world.places(torch.tensor(boxes), views.poses[pose])
     for cell in range(100):
         x1, y1, x2, y2 = views.view_grid.edges[cell].tolist()
         found = rests_on(views, pose * 100 + cell, places).tolist()
         for rests, (left, top, right, bottom) in zip(found, boxes, strict=True):
             gap = min(right - x1, x2 - left, bottom - y1, y2 - top)
-            if abs(gap) > 0.3:  # where they all but touch, rounding decides
+            if abs(gap) > 0.3:  # where they almost touch, rounding decides
                 assert rests == (gap > 0)
             hits += rests
     assert hits > 20

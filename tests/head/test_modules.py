@@ -1,4 +1,4 @@
-"""The parts of a head as parts of others' modules."""
+"""The parts of a head as submodules of other modules."""
 
 from functools import cache
 
@@ -18,14 +18,14 @@ def views():
 
 
 class SceneTester(BaseTester):
-    """Of a module that acts in a scene of its own, one episode at a time."""
+    """Tests of a module that acts in its own scene, one episode at a time."""
 
     def inputs(self):
         return tuple(each[:1] for each in look()[:2])
 
     @staticmethod
     def seen(observer, scores, boxes):
-        """What an observer believes after a look from cell 55 of the first pose."""
+        """An observer's belief after a look at cell 55 of the first pose."""
         grid = views().grid
         return observer(observer.start(1, grid, scores), detections(scores, boxes), grid.centres[55][None], grid, 2)
 
@@ -82,4 +82,4 @@ class TestHeadAgent(BaseTester):
 
     @staticmethod
     def call(module, image):
-        return module.explore(Panorama(image, (64, 48)), passes=2).maps.clone()  # of inference
+        return module.explore(Panorama(image, (64, 48)), passes=2).maps.clone()  # a copy outside inference mode

@@ -29,13 +29,13 @@ def test_a_camera_that_looks_at_a_photograph_sees_it_undistorted(scenes):
         inner = slice(6, -6)
         apart = (seen - photograph)[:, inner, inner].abs()
         assert apart.mean() < 0.02
-        # Another photograph is far from it.
+        # Another photograph differs much more.
         other = scenes[(patch.index + 1) % 5].image[None]
         other = F.interpolate(other, (240, 320), mode="bilinear", antialias=True)[0]
         assert (seen - other)[:, inner, inner].abs().mean() > 3 * apart.mean()
 
 
-def test_regions_are_the_boxes_of_the_photographs(scenes):
+def test_regions_match_the_boxes_of_the_photographs(scenes):
     """A camera that looks at a patch sees each object where the photograph has it."""
     panoramas = Panoramas(scenes, width=512, count=2, seed=4)
     regions, labels = panoramas.regions(1), panoramas.annotation(1).labels
@@ -57,7 +57,7 @@ def test_regions_are_the_boxes_of_the_photographs(scenes):
     assert start == len(regions)
 
 
-def test_a_seed_makes_the_same_and_no_photograph_twice(scenes):
+def test_a_seed_repeats_a_panorama_and_uses_each_photograph_once(scenes):
     one, same, other = (Panoramas(scenes, rings=((0.0, 5),), width=256, count=3, seed=seed) for seed in (1, 1, 2))
     assert torch.equal(one[2].image, same[2].image)
     assert one.fingerprint == same.fingerprint != other.fingerprint
@@ -77,7 +77,7 @@ def test_no_two_photographs_overlap(scenes):
         assert not others.any()
 
 
-def test_boxes_of_the_annotation_hold_the_object(scenes):
+def test_boxes_of_the_annotation_lie_in_the_panorama(scenes):
     panoramas = Panoramas(scenes, width=1024, count=1)
     annotation = panoramas.annotation(0)
     assert annotation.size == (1024, 512)
@@ -88,9 +88,9 @@ def test_boxes_of_the_annotation_hold_the_object(scenes):
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [({"width": 101}, "width"), ({"slot": 180.0}, "slot"), ({"rings": ((95.0, 1),)}, "rings"), ({"count": 0}, "count")],
 )
-def test_settings_that_cannot_be_are_refused(scenes, settings, told):
-    with pytest.raises(InputError, match=told):
+def test_invalid_settings_are_refused(scenes, settings, message):
+    with pytest.raises(InputError, match=message):
         Panoramas(scenes, **settings)

@@ -1,4 +1,4 @@
-"""Seconds of eye and head: against published figures and a simulation."""
+"""Durations of movements of eye and head, against published values and a simulation."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from semfov.head import Speeds
 
 
 def test_saccades_follow_the_main_sequence():
-    """21 ms and 2.2 ms for each degree (Carpenter, 1988); no saccade takes no time."""
+    """21 ms plus 2.2 ms per degree (Carpenter, 1988); a saccade of 0° takes no time."""
     found = Speeds().saccade(torch.tensor([0.0, 5.0, 10.0, 20.0]))
     torch.testing.assert_close(found, torch.tensor([0.0, 0.032, 0.043, 0.065]))
 
@@ -29,7 +29,7 @@ def test_the_head_turns_as_a_motor_with_bounded_speed_and_acceleration(angle, sp
     assert time == pytest.approx(found, rel=0.01)
 
 
-def test_movements_happen_at_once():
+def test_the_price_is_that_of_the_longest_of_simultaneous_movements():
     speeds = Speeds()
     eye, head, zoom = torch.tensor(20.0), torch.tensor(90.0), torch.tensor(-3.0)
     none = torch.tensor(0.0)
@@ -40,6 +40,6 @@ def test_movements_happen_at_once():
 
 
 @pytest.mark.parametrize("settings", [{"look": 0.0}, {"head": -1.0}, {"eye": float("nan")}, {"acceleration": 0.0}])
-def test_speeds_that_cannot_be_are_refused(settings):
+def test_invalid_speeds_are_refused(settings):
     with pytest.raises(InputError, match=next(iter(settings))):
         Speeds(**settings)

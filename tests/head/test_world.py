@@ -1,4 +1,4 @@
-"""Scenes seen through a window: pixels and points there and back, poses that cover all, boxes as regions."""
+"""Scenes seen through a window: conversion of points, poses that cover the scene, boxes as regions."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ def world(request):
     return Flat(torch.rand(3, 480, 640), (64, 48), degree=4)
 
 
-def test_points_there_and_back(world):
+def test_points_are_converted_to_the_scene_and_back(world):
     points = torch.rand(40, 2) * 40
     for row in world.poses(60.0):
         there = world.to_scene(points, row[0])
@@ -27,7 +27,7 @@ def test_points_there_and_back(world):
 
 
 def test_every_second_pose_of_every_second_row_tiles_the_scene(world):
-    """All of a flat scene, and of a panorama what the head can reach."""
+    """All of a flat scene, and of a panorama the part that the head can reach."""
     rows = world.poses(60.0)
     tiling = [pose for row in rows[::2] for pose in row[::2]]
     seen = torch.stack([world.to_view(world.centres, pose)[1] for pose in tiling]).any(0)
@@ -38,13 +38,13 @@ def test_every_second_pose_of_every_second_row_tiles_the_scene(world):
         assert seen[latitude.abs() < 60].all()
 
 
-def test_cells_hold_their_centres(world):
+def test_cells_contain_their_centres(world):
     assert torch.equal(world.cell_of(world.centres), torch.arange(len(world.scene)))
     torch.testing.assert_close(world.pixels_of(world.centres), world.scene.centres, atol=1e-3, rtol=0)
     assert float(world.area.mean()) == pytest.approx(1)
 
 
-def test_boxes_come_back_as_places(world):
+def test_boxes_are_converted_to_places_and_back(world):
     boxes = torch.tensor([[10.0, 5, 30, 25], [40, 20, 64, 48]])
     pose = world.poses(60.0)[1][1]
     places = world.places(boxes, pose)
@@ -67,7 +67,7 @@ def test_a_view_of_a_panorama_is_perspective():
 
 
 def test_a_view_of_a_flat_scene_is_a_glimpse():
-    """Inside: at the border a glimpse shows what lies beyond."""
+    """Without the border pixels, where a glimpse also uses pixels from outside the window."""
     torch.manual_seed(0)
     image = torch.rand(3, 120, 160).mul(255).round() / 255
     pose = torch.tensor([79.5, 59.5, 16.0])
@@ -77,7 +77,7 @@ def test_a_view_of_a_flat_scene_is_a_glimpse():
 
 
 def test_angles_of_eye_and_head():
-    """Closed forms: a ring is turned through by its steps, and the eye sees from side to side the field of view."""
+    """Closed forms: poses of a ring differ by equal steps, and the angle from side to side is the field of view."""
     panorama = Panorama(torch.rand(3, 90, 180), (64, 48))
     ring = torch.stack(panorama.poses(60.0)[2])
     assert float(ring[0, 1]) == 0
@@ -101,7 +101,7 @@ def test_actions_are_cells_of_a_strip(world):
         torch.testing.assert_close(views.gaze[action], expected, atol=1e-3, rtol=1e-4)
 
 
-def test_prices_by_brute_force(world):
+def test_prices_equal_brute_force(world):
     from semfov.head import Speeds
 
     views, speeds = Views(world, (40.0, 80.0) if isinstance(world, Panorama) else (60.0,)), Speeds()

@@ -1,4 +1,4 @@
-"""Errors of means against hand counts."""
+"""Standard errors of means against values computed by hand."""
 
 import numpy as np
 
@@ -18,5 +18,5 @@ def test_standard_error_along_another_axis():
 
 
 def test_two_values_are_enough():
-    """Of a and b the standard deviation is |a - b| / √2, and the error of their mean |a - b| / 2."""
+    """For a and b the standard deviation is |a - b| / √2, and the standard error of their mean |a - b| / 2."""
     np.testing.assert_allclose(standard_error(np.array([[1.0, 2.0], [4.0, 2.0]])), [1.5, 0])

@@ -1,4 +1,4 @@
-"""Calibration figures against loops, known cases and torch's own losses."""
+"""Calibration metrics against loops, known cases and torch's own losses."""
 
 import json
 import math
@@ -25,7 +25,7 @@ def ece_by_loop(confidence, correct, bins):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_figures_equal_loops(dtype):
+def test_metrics_equal_loops(dtype):
     torch.manual_seed(0)
     p = (3 * torch.randn(500, 4, dtype=dtype)).softmax(1)
     labels = torch.randint(0, 4, (500,))
@@ -62,22 +62,22 @@ def test_bins_may_have_any_edges():
     torch.testing.assert_close(bins, torch.tensor([[2.0, 2, 1], [0.1, 0.5, 0.9], [1, 2, 1]], dtype=torch.float64))
 
 
-def test_certain_and_wrong_is_finite():
+def test_a_certain_but_wrong_prediction_has_a_finite_loss():
     assert math.isfinite(calibration(torch.tensor([[1.0, 0.0]]), torch.tensor([1])).nll)
 
 
-def test_nothing_to_judge():
+def test_without_predictions_the_error_is_nan():
     assert math.isnan(calibration(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)).ece)
 
 
-def test_shapes_must_fit():
+def test_shapes_that_do_not_match_are_refused():
     with pytest.raises(InputError, match="labels"):
         calibration(torch.ones(3, 2) / 2, torch.zeros(2, dtype=torch.long))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_sums_equal_loops(dtype, device):
-    """Figures of rare events by numpy, prediction by prediction."""
+    """Metrics of rare events in numpy, prediction by prediction."""
     generator = np.random.default_rng(0)
     p = generator.beta(0.2, 2, 3000).astype(np.float32)
     y = generator.random(3000) < p**1.3
@@ -90,7 +90,7 @@ def test_sums_equal_loops(dtype, device):
     assert sums.ece == pytest.approx(ece_by_loop(q.tolist(), y.tolist(), 15))
     assert sums.ece == pytest.approx(float(calibration_error(torch.tensor(p), torch.tensor(y))))
     assert (sums.probability, sums.rate) == pytest.approx((q.mean(), y.mean()))
-    # Both classes of a prediction of yes or no: the other one's half of the Brier score is as large.
+    # As predictions of two classes: the second class adds as much to the Brier score as the first.
     both = calibration(torch.tensor(np.stack([1 - q, q], 1)), torch.tensor(y).long())
     assert (sums.nll, 2 * sums.brier) == pytest.approx((both.nll, both.brier))
     for number, (low, high) in enumerate(zip([-1, *sums.EDGES.tolist()], [*sums.EDGES.tolist(), 1], strict=True)):
@@ -98,14 +98,14 @@ def test_sums_equal_loops(dtype, device):
         assert sums.bins[:, number].tolist() == pytest.approx([inside.sum(), q[inside].sum(), y[inside].sum()])
 
 
-def test_the_wide_bins_are_among_the_bins():
+def test_the_edges_include_those_of_fifteen_equal_bins():
     edges = BinarySums.EDGES.tolist()
     assert edges == sorted(edges)
     assert edges[6:] == [b / 15 for b in range(1, 15)]
     assert max(edges[:6]) < 1 / 15
 
 
-told = st.lists(st.tuples(st.floats(0, 1, width=32), st.booleans()), max_size=30)
+predictions = st.lists(st.tuples(st.floats(0, 1, width=32), st.booleans()), max_size=30)
 
 
 def sums_of(pairs):
@@ -113,36 +113,36 @@ def sums_of(pairs):
     return BinarySums.of(p, y)
 
 
-def same(a, b):
+def assert_equal_sums(a, b):
     assert a.bins[0].tolist() == b.bins[0].tolist()
     torch.testing.assert_close(a.bins, b.bins)
     assert (a.surprisal, a.square) == pytest.approx((b.surprisal, b.square))
 
 
-@given(told, told, told)
+@given(predictions, predictions, predictions)
 def test_sums_of_parts_add_up(a, b, c):
     whole = sums_of(a + b + c)
-    same((sums_of(a) + sums_of(b)) + sums_of(c), whole)
-    same(sums_of(c) + (sums_of(b) + sums_of(a)), whole)
-    same(whole + BinarySums.nothing(), whole)
+    assert_equal_sums((sums_of(a) + sums_of(b)) + sums_of(c), whole)
+    assert_equal_sums(sums_of(c) + (sums_of(b) + sums_of(a)), whole)
+    assert_equal_sums(whole + BinarySums.nothing(), whole)
 
 
-@given(told)
-def test_sums_come_back_from_json_to_the_bit(pairs):
+@given(predictions)
+def test_sums_are_exact_after_json(pairs):
     sums = sums_of(pairs)
     back = BinarySums.from_record(json.loads(json.dumps(sums.record())))
     assert torch.equal(back.bins, sums.bins)
     assert (back.surprisal, back.square) == (sums.surprisal, sums.square)
 
 
-def test_sums_over_nothing_have_no_figures():
+def test_sums_over_no_predictions_have_nan_metrics():
     nothing = BinarySums.nothing()
     assert nothing.count == 0
     for name in ("nll", "brier", "ece", "probability", "rate"):
         assert math.isnan(getattr(nothing, name))
 
 
-def test_certain_and_wrong_has_finite_sums():
+def test_certain_but_wrong_predictions_have_finite_sums():
     sums = BinarySums.of(torch.tensor([1.0, 0.0]), torch.tensor([False, True]))
     assert math.isfinite(sums.nll)
     assert (sums.brier, sums.ece) == (1, 1)
@@ -164,12 +164,12 @@ def test_settings_at_their_limits():
     assert calibration(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)).count == 0
 
 
-def test_one_prediction_has_the_error_of_its_confidence():
+def test_one_wrong_prediction_has_its_confidence_as_error():
     assert float(calibration_error(torch.tensor([0.8]), torch.tensor([False]))) == pytest.approx(0.8)
     assert float(calibration_error(torch.zeros(0), torch.zeros(0, dtype=torch.bool))) == 0
 
 
-def test_edges_between_bins_are_those_of_double_precision():
+def test_edges_between_bins_are_exact_in_double_precision():
     edges = torch.arange(1, 15, dtype=torch.float64) / 15
     for p in (edges, torch.nextafter(edges, torch.zeros_like(edges))):
         assert reliability(p, p > 0.5)[0].tolist() == [1] * 14 + [0]

@@ -1,4 +1,4 @@
-"""Figures of explorations: what is right for a cell, and when a belief is right about it."""
+"""Metrics of explorations: the right answers for a cell, and when a belief is right about it."""
 
 import numpy as np
 import torch
@@ -20,16 +20,16 @@ def test_answers_are_the_classes_of_overlapping_objects():
     assert found == {0: {1, 2}, 1: {2}, 2: {2}, 11: {3}}
 
 
-def test_success_is_the_most_probable_of_all_classes():
+def test_a_cell_is_right_if_an_object_of_its_most_probable_class_overlaps_it():
     """Section IV-A: the "highest categorical score" must fit an overlapping object, and background has a score, too."""
     answers = torch.tensor([[False, True, False]] * 4)
     beta = torch.tensor([[[0.2, 0.7, 0.1], [0.6, 0.3, 0.1], [0.1, 0.3, 0.6], [0.4, 0.35, 0.25]]])
     assert count_right(beta, answers).tolist() == [1]
-    # Without background as an answer the class is right where background was a little more probable.
+    # Without the background column, classes slightly less probable than background are right, too.
     assert count_right(beta[..., 1:], answers[:, 1:]).tolist() == [3]
 
 
-def test_what_is_not_known_is_not_right():
+def test_a_cell_with_tied_classes_is_not_right():
     answers = torch.tensor([[False, True], [False, True], [True, True]])
     beta = torch.tensor([[[0.5, 0.5], [0.5, 0.6], [0.6, 0.5]]])
     assert count_right(beta, answers).tolist() == [2]
@@ -40,7 +40,7 @@ def test_success_rate_by_hand():
 
 
 def test_answers_have_a_column_for_every_class_of_the_model():
-    """Also where the picture shows none of the last classes."""
+    """Also if the picture shows none of the last classes."""
     annotation = Annotation(
         torch.tensor([[1.0, 1, 5, 5]]), torch.tensor([1]), torch.zeros(1, dtype=torch.bool), (20, 10)
     )

@@ -1,4 +1,4 @@
-"""Figures of telling whether a target is there, against scipy and against trying every threshold."""
+"""Metrics of deciding whether a target is present, against scipy and against trying every threshold."""
 
 import math
 
@@ -18,21 +18,21 @@ shares = st.sampled_from([0.0, 0.01, 0.05, 0.25, 0.5, 0.9]) | st.floats(0, 0.99)
 
 
 def cases(hits, misses, seed=0):
-    """Scores of both kinds in a random order, and which kind each is."""
+    """Scores of present and absent targets in random order, and which are present."""
     order = torch.randperm(len(hits) + len(misses), generator=torch.Generator().manual_seed(seed))
     values = torch.tensor([*hits, *misses], dtype=torch.float64)
     return values[order], (torch.arange(len(values)) < len(hits))[order]
 
 
 @given(scores, scores, st.integers(0, 100))
-def test_area_is_the_statistic_of_mann_and_whitney(hits, misses, seed):
+def test_area_equals_the_mann_whitney_statistic(hits, misses, seed):
     statistic = mannwhitneyu(hits, misses, method="asymptotic").statistic if len({*hits, *misses}) > 1 else None
     expected = 0.5 if statistic is None else statistic / (len(hits) * len(misses))
     assert area_under_roc(*cases(hits, misses, seed)) == pytest.approx(expected, abs=1e-12)
 
 
 @given(scores, scores)
-def test_area_is_that_under_the_curve(hits, misses):
+def test_area_equals_the_area_under_the_roc_curve(hits, misses):
     """The trapezoids under the curve of hits over false alarms, from the strictest threshold to none."""
     area, before = 0.0, (0.0, 0.0)
     for threshold in sorted({*hits, *misses}, reverse=True):
@@ -43,7 +43,7 @@ def test_area_is_that_under_the_curve(hits, misses):
 
 
 @given(scores, scores)
-def test_area_of_the_opposite_and_of_the_double_score(hits, misses):
+def test_area_of_negated_and_of_doubled_scores(hits, misses):
     score, present = cases(hits, misses)
     area = area_under_roc(score, present)
     assert area_under_roc(-score, present) == pytest.approx(1 - area, abs=1e-12)
@@ -51,7 +51,7 @@ def test_area_of_the_opposite_and_of_the_double_score(hits, misses):
     assert area_under_roc(2 * score, present) == pytest.approx(area, abs=1e-12)
 
 
-def test_area_at_the_ends_and_in_single_precision():
+def test_area_of_perfect_reversed_and_constant_scores():
     present = torch.tensor([True, False, True, False])
     assert area_under_roc(torch.tensor([0.9, 0.1, 0.8, 0.2]), present) == 1
     assert area_under_roc(torch.tensor([0.1, 0.9, 0.2, 0.8]), present) == 0
@@ -59,13 +59,13 @@ def test_area_at_the_ends_and_in_single_precision():
 
 
 @pytest.mark.parametrize("present", [[True, True], [False, False], []], ids=["there", "not there", "none"])
-def test_cases_of_both_kinds_are_needed(present):
+def test_present_and_absent_cases_are_both_needed(present):
     with pytest.raises(InputError, match="present: expected both true and false values"):
         area_under_roc(torch.zeros(len(present)), torch.tensor(present, dtype=torch.bool))
 
 
 @given(scores, shares)
-def test_threshold_is_the_least_one(misses, share):
+def test_threshold_is_the_smallest_that_keeps_the_allowed_false_alarms(misses, share):
     values = torch.tensor(misses, dtype=torch.float64)
     got = threshold_for(values, share)
 
@@ -73,7 +73,7 @@ def test_threshold_is_the_least_one(misses, share):
         return sum(value >= threshold for value in misses)
 
     assert alarms(got) <= share * len(misses)
-    # The next smaller number is reached by too many.
+    # The next smaller number gives too many false alarms.
     assert alarms(math.nextafter(got, -math.inf)) > int(share * len(misses))
 
 
@@ -87,19 +87,19 @@ def test_hits_equal_trying_every_threshold(hits, misses, share):
 
 
 @given(scores, scores)
-def test_hits_grow_with_the_share(hits, misses):
+def test_hits_grow_with_the_allowed_share_of_false_alarms(hits, misses):
     given_cases = cases(hits, misses)
     found = [hits_at(*given_cases, share) for share in (0.0, 0.1, 0.3, 0.6, 0.99)]
     assert found == sorted(found)
 
 
-def test_a_score_in_single_precision_is_no_alarm_of_itself():
-    """The threshold lies between two doubles, and what is equal to the allowed case does not reach it."""
+def test_a_single_precision_score_equal_to_a_false_alarm_is_no_hit():
+    """The threshold is the next double above the absent case, so an equal score does not reach it."""
     score = torch.tensor([0.3, 0.3, 0.30000004])
     assert hits_at(score, torch.tensor([True, False, True]), 0.0) == 0.5
 
 
-def test_a_threshold_needs_a_case():
+def test_a_threshold_needs_at_least_one_case():
     with pytest.raises(InputError, match="absent: expected at least one case"):
         threshold_for(torch.zeros(0), 0.1)
 
@@ -115,9 +115,9 @@ def test_roc_counts_at_every_threshold(cases):
     alarms, hits = roc(score, present)
     levels = sorted({s for s, _ in cases}, reverse=True)
     for level, alarm, hit in zip(levels, alarms[1:], hits[1:], strict=True):
-        told = [p for s, p in cases if torch.tensor(s) >= torch.tensor(level)]
-        assert hit == pytest.approx(sum(told) / int(present.sum()))
-        assert alarm == pytest.approx((len(told) - sum(told)) / int((~present).sum()))
+        reached = [p for s, p in cases if torch.tensor(s) >= torch.tensor(level)]
+        assert hit == pytest.approx(sum(reached) / int(present.sum()))
+        assert alarm == pytest.approx((len(reached) - sum(reached)) / int((~present).sum()))
     assert (alarms[0], hits[0], alarms[-1], hits[-1]) == (0, 0, 1, 1)
     assert np.trapezoid(hits, alarms) == pytest.approx(area_under_roc(score, present))
 
@@ -127,7 +127,7 @@ def test_the_next_number_above_a_false_alarm_is_a_hit():
     assert hits_at(score, torch.tensor([False, True]), 0.0) == 1
 
 
-def test_where_every_alarm_may_be_false_every_target_is_told():
+def test_every_target_is_a_hit_if_all_false_alarms_are_allowed():
     score = torch.tensor([0.5, 0.7, 0.1], dtype=torch.float64)
     assert threshold_for(score, 1.0) == -math.inf
     assert hits_at(score, torch.tensor([False, True, True]), 1.0) == 1

@@ -1,4 +1,4 @@
-"""Objects found at a price in false boxes: against loops, and counts by hand."""
+"""Objects found for an allowed number of false boxes: against loops, and counts by hand."""
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ def overlap(a, b):
     return shared / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - shared)
 
 
-def twin(boxes, scores, truth, labels, iou):
+def found_by_loop(boxes, scores, truth, labels, iou):
     """Box by box in descending order of score, over all classes at once."""
     free = dict(enumerate(zip(truth, labels, strict=True)))
     found, false = [0.0] * len(truth), []
@@ -34,7 +34,7 @@ def twin(boxes, scores, truth, labels, iou):
 
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_objects_are_found_as_by_loops(seed, dtype):
+def test_found_objects_equal_those_of_a_loop(seed, dtype):
     generator = torch.Generator().manual_seed(seed)
     truth = torch.randint(0, 12, (6, 2), generator=generator).to(dtype)
     truth = torch.cat([truth, truth + torch.randint(4, 9, (6, 2), generator=generator)], -1)
@@ -43,14 +43,14 @@ def test_objects_are_found_as_by_loops(seed, dtype):
     boxes = truth[torch.randint(6, (20,), generator=generator)] + shift
     scores = torch.rand(20, 4, generator=generator, dtype=dtype).softmax(-1)
     found, false = found_objects(boxes, scores, truth, labels, iou=0.6)
-    expected, wrong = twin(boxes.tolist(), scores.tolist(), truth.tolist(), labels.tolist(), 0.6)
+    expected, wrong = found_by_loop(boxes.tolist(), scores.tolist(), truth.tolist(), labels.tolist(), 0.6)
     assert found.tolist() == pytest.approx(expected)
     assert sorted(false.tolist()) == pytest.approx(sorted(wrong))
     assert found.dtype == false.dtype == dtype
     assert 0 < (found > 0).sum() < 6 or seed > 0
 
 
-def test_nothing_seen_and_nothing_there():
+def test_images_without_boxes_or_without_objects():
     none, box = torch.zeros(0, 4), torch.tensor([[0.0, 0.0, 4.0, 4.0]])
     found, false = found_objects(none, torch.zeros(0, 3), box, torch.tensor([1]))
     assert (found.tolist(), false.tolist()) == ([0.0], [])
@@ -58,14 +58,14 @@ def test_nothing_seen_and_nothing_there():
     assert (found.tolist(), false.tolist()) == ([], [0.25])
 
 
-def test_device(device):
+def test_results_stay_on_the_device(device):
     box = torch.tensor([[0.0, 0.0, 4.0, 4.0]], device=device)
     found, false = found_objects(box, torch.tensor([[0.0, 1.0]], device=device), box, torch.tensor([1], device=device))
     assert found.device.type == false.device.type == device.type
 
 
 @given(st.lists(st.floats(0, 1), max_size=30), st.integers(1, 8), st.floats(0, 3))
-def test_the_least_score_at_which_no_more_are_false(scores, views, rate):
+def test_score_is_the_smallest_with_the_allowed_rate_of_false_boxes(scores, views, rate):
     false = torch.tensor(scores, dtype=torch.float64)
     score = score_for(false, views, rate)
     assert (false > score).sum() <= rate * views
@@ -74,13 +74,13 @@ def test_the_least_score_at_which_no_more_are_false(scores, views, rate):
         assert (false > lower.max()).sum() > rate * views - 1
 
 
-def test_refuses_no_views():
+def test_at_least_one_view_is_needed():
     with pytest.raises(InputError, match="views: expected at least 1, got 0"):
         score_for(torch.zeros(1), 0)
 
 
 def test_an_overlap_of_one_half_is_enough_and_less_is_not():
-    """An object of 4 × 2, and boxes that share 4 of 8, and 3 of 8, with it."""
+    """An object of 4 × 2 px, and boxes that cover 4 and 3 of its 8 px²."""
     truth, label, score = torch.tensor([[0.0, 0.0, 4.0, 2.0]]), torch.tensor([1]), torch.tensor([[0.1, 0.9]])
     for box, expected in (([0.0, 0.0, 2.0, 2.0], 0.9), ([0.0, 0.0, 1.5, 2.0], 0.0)):
         found, _ = found_objects(torch.tensor([box]), score, truth, label)
@@ -97,13 +97,13 @@ def test_an_overlap_of_one_half_is_enough_and_less_is_not():
         ("truth", ((2, 4), (2, 3), (4,), (4,))),
     ],
 )
-def test_refuses_shapes_that_do_not_fit(argument, shapes):
+def test_shapes_that_do_not_match_are_refused(argument, shapes):
     *tensors, labels = shapes
     with pytest.raises(InputError, match=f"^{argument}: expected a tensor of shape"):
         found_objects(*(torch.rand(shape) for shape in tensors), torch.ones(labels, dtype=torch.int64))
 
 
-def test_one_false_box_a_view_unless_told_otherwise():
+def test_one_false_box_per_view_is_allowed_by_default():
     scores = torch.tensor([0.9, 0.7, 0.5, 0.3, 0.1])
     assert score_for(scores, 1) == pytest.approx(0.7)
     assert score_for(scores, 3) == pytest.approx(0.3)

@@ -1,4 +1,4 @@
-"""Figures of searches against simulation and hand counts."""
+"""Metrics of searches against simulation and counts by hand."""
 
 import numpy as np
 
@@ -20,6 +20,6 @@ def test_random_search_equals_simulation():
 
 
 def test_random_search_by_hand():
-    """Hundred cells unless told otherwise, one of which the search starts in."""
+    """By default there are 100 cells, and the search starts in one of them."""
     np.testing.assert_allclose(random_search(1, 2), [0, 1 / 99, 2 / 99])
     np.testing.assert_allclose(random_search(0, 4, cells=5), 0)

@@ -14,7 +14,7 @@ EDGES = [0.1, 0.2]
 
 
 def detections(samples, seed, dtype=torch.float64):
-    """Overconfident scores with noise that all classes share, which plain Bayes counts as evidence once for each."""
+    """Overconfident scores with noise shared by all classes, which plain Bayes counts as evidence once per class."""
     generator = torch.Generator().manual_seed(seed)
     labels = torch.multinomial(torch.tensor([8.0, 4, 2, 1, 1]), samples, replacement=True, generator=generator)
     distance = torch.rand(samples, generator=generator, dtype=torch.float64) * 0.3
@@ -60,7 +60,7 @@ def test_trained_model_beats_raw_scores_and_plain_bayes_on_new_detections(dtype)
         assert float((correct[inside] - confidence[inside].double()).mean().abs()) < 0.04
 
 
-def test_one_level_is_a_logistic_regression_by_another_optimiser():
+def test_training_with_one_level_equals_logistic_regression_with_scipy():
     scores, _, labels = detections(400, 3)
     distance = torch.zeros(400, dtype=torch.float64)
     decay, bias_decay = 5.0, 2.0
@@ -86,7 +86,7 @@ def test_one_level_is_a_logistic_regression_by_another_optimiser():
     np.testing.assert_allclose(model.alpha[:, 0].detach(), alpha, rtol=2e-3)
 
 
-def test_training_depends_on_nothing_random():
+def test_training_is_deterministic():
     data = detections(800, 4, torch.float32)
     start = FovealObservationModel.identity(CLASSES, EDGES)
     torch.manual_seed(1)
@@ -97,7 +97,7 @@ def test_training_depends_on_nothing_random():
         assert torch.equal(tensor, second.state_dict()[name])
 
 
-def test_strong_priors_leave_the_scores_as_they_are():
+def test_strong_priors_leave_the_scores_unchanged():
     scores, distance, labels = detections(500, 5)
     start = FovealObservationModel.identity(CLASSES, EDGES).double()
     model = fit_discriminative(start, scores, distance, labels, decay=1e12, level_decay=1e12, bias_decay=1e12)
@@ -116,7 +116,7 @@ def test_levels_without_examples_follow_the_others():
     assert 0 < float(difference) < 0.1 * float((alpha[:, 0] - start.alpha[:, 0].detach()).abs().max())
 
 
-def test_training_needs_no_gradient_mode_and_survives_a_file(tmp_path):
+def test_training_works_under_no_grad_and_its_result_can_be_saved(tmp_path):
     data = detections(300, 7, torch.float32)
     with torch.no_grad():
         model = fit_discriminative(FovealObservationModel.identity(CLASSES, EDGES), *data)

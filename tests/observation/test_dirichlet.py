@@ -28,7 +28,7 @@ def random_case(dtype, shape=(4, 3), components=6, seed=0):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_log_prob_is_that_of_scipy_and_torch(dtype):
+def test_log_prob_matches_scipy_and_torch(dtype):
     alpha, log_scores = random_case(dtype)
     got = dirichlet.log_prob(alpha, log_scores)
     assert got.dtype == dtype
@@ -43,7 +43,7 @@ def test_log_prob_is_that_of_scipy_and_torch(dtype):
         assert float(got[i, j]) == pytest.approx(reference, rel=tolerance, abs=tolerance)
 
 
-def test_two_components_are_a_beta():
+def test_two_components_give_a_beta_distribution():
     alpha = torch.tensor([[0.3, 4.0], [7.0, 2.5]], dtype=torch.float64)
     x = torch.tensor([0.2, 0.9], dtype=torch.float64)
     log_scores = torch.stack([x, 1 - x], -1).log()
@@ -55,7 +55,7 @@ def test_two_components_are_a_beta():
 
 
 def mpmath_forms(alpha, other, log_scores):
-    """Log density, entropy and divergence in 60 digits."""
+    """Log density, entropy and divergence with 60 digits."""
     with mpmath.workdps(60):
         a, b, x = ([mpmath.mpf(v) for v in row] for row in (alpha, other, log_scores))
 
@@ -80,7 +80,7 @@ def mpmath_forms(alpha, other, log_scores):
         ([150.0, 1e-6, 40.0], [150.0, 1e-7, 41.0]),
     ],
 )
-def test_tails_agree_with_sixty_digits(alpha, other):
+def test_extreme_parameters_agree_with_60_digit_arithmetic(alpha, other):
     log_scores = [-1e-9, -300.0, -21.0]
     a, b, x = (torch.tensor(v, dtype=torch.float64) for v in (alpha, other, log_scores))
     reference = mpmath_forms(a.tolist(), b.tolist(), x.tolist())
@@ -92,7 +92,7 @@ def test_tails_agree_with_sixty_digits(alpha, other):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_entropy_and_divergence_are_those_of_torch(dtype):
+def test_entropy_and_divergence_match_torch(dtype):
     alpha, _ = random_case(dtype)
     other, _ = random_case(dtype, seed=1)
     p, q = (torch.distributions.Dirichlet(a.double()) for a in (alpha, other))
@@ -110,20 +110,20 @@ parameters = st.lists(st.floats(1e-3, 1e3), min_size=4, max_size=4).map(lambda v
 
 
 @given(parameters, parameters)
-def test_divergence_is_not_negative_and_zero_to_itself(alpha, other):
+def test_divergence_is_not_negative_and_zero_between_equal_distributions(alpha, other):
     scale = float((alpha.sum() + other.sum()) * 10)
     assert float(dirichlet.kl_divergence(alpha, other)) >= -1e-14 * scale
     assert float(dirichlet.kl_divergence(alpha, alpha)) == 0
 
 
-def test_moments_are_those_of_scipy():
+def test_moments_match_scipy():
     alpha = torch.tensor([0.4, 2.0, 7.5, 1.1], dtype=torch.float64)
     reference = scipy.stats.dirichlet(alpha.numpy())
     np.testing.assert_allclose(dirichlet.mean(alpha), reference.mean(), rtol=1e-14)
     np.testing.assert_allclose(dirichlet.covariance(alpha), reference.cov(), rtol=1e-12)
 
 
-def test_density_is_that_of_equation_9():
+def test_density_matches_equation_9():
     """eq:dirichlet, written with the gamma function."""
     alpha, scores = [0.7, 3.5, 1.2, 2.0], [0.1, 0.55, 0.05, 0.3]
     density = math.gamma(sum(alpha)) / math.prod(math.gamma(a) for a in alpha)
@@ -132,7 +132,7 @@ def test_density_is_that_of_equation_9():
     assert float(got.exp()) == pytest.approx(density, rel=1e-13)
 
 
-def test_mean_is_the_compound_multinomial_of_equation_4():
+def test_mean_matches_the_compound_multinomial_of_equation_4():
     """eq:finalsemanticmap, as printed, for one draw of class k: n_k = 1 and all other n_i = 0."""
     beta = [0.5, 2.0, 7.5, 1.1]
     for k, got in enumerate(dirichlet.mean(torch.tensor(beta, dtype=torch.float64)).tolist()):
@@ -143,8 +143,8 @@ def test_mean_is_the_compound_multinomial_of_equation_4():
         assert got == pytest.approx(printed, rel=1e-14)
 
 
-def test_covariance_of_the_class_is_that_of_equation_6():
-    """eq:confscores, σ_ij = -p_i p_j off the diagonal, which is what one draw of a class has."""
+def test_covariance_of_the_class_matches_equation_6():
+    """eq:confscores: σ_ij = -p_i p_j off the diagonal, the covariance of one draw of a class."""
     alpha = torch.tensor([[0.4, 2.0, 7.5], [1.0, 1.0, 2.0]], dtype=torch.float64)
     got = dirichlet.categorical_covariance(alpha)
     for row in range(2):
@@ -155,17 +155,17 @@ def test_covariance_of_the_class_is_that_of_equation_6():
                 assert float(got[row, i, j]) == pytest.approx(drawn, rel=1e-13)
                 if i != j:
                     assert float(got[row, i, j]) == pytest.approx(-p[i] * p[j], rel=1e-13)
-    # That of the probabilities under the Dirichlet is smaller: it shrinks as evidence grows.
+    # The covariance of the probabilities under the Dirichlet is smaller: it shrinks as evidence grows.
     torch.testing.assert_close(dirichlet.covariance(alpha), got / (alpha.sum(-1) + 1)[:, None, None])
 
 
 @pytest.mark.parametrize("beta", [[0.5, 0.5], [0.5, 3.0], [6.0, 1.5]])
-def test_divergence_from_the_prior_is_the_integral_of_equation_19(beta):
+def test_divergence_from_the_prior_equals_the_integral_of_equation_19(beta):
     """eq:kldivergence, between the Dirichlets themselves, β⁰ = 0.5: ∫ Dir(p | β) ln(Dir(p | β) / Dir(p | β⁰)) dp."""
     belief, prior = scipy.stats.beta(*beta), scipy.stats.beta(0.5, 0.5)
 
     def integrand(angle):
-        """With p = sin², which takes the poles of the densities out of the integral."""
+        """With p = sin², a substitution that removes the poles of the densities."""
         p = math.sin(angle) ** 2
         return belief.pdf(p) * (belief.logpdf(p) - prior.logpdf(p)) * math.sin(2 * angle)
 
@@ -174,7 +174,7 @@ def test_divergence_from_the_prior_is_the_integral_of_equation_19(beta):
     assert float(dirichlet.kl_divergence(one, other)) == pytest.approx(expected, abs=1e-9)
 
 
-def test_everything_has_gradients():
+def test_all_functions_have_gradients():
     alpha, log_scores = random_case(torch.float64, shape=(2,), components=3)
     other = alpha.flip(0).clone()
     for tensor in (alpha, other, log_scores):
@@ -187,7 +187,7 @@ def test_everything_has_gradients():
     assert check(lambda s: dirichlet.floor(s, 1e-3), (torch.tensor([0.2, 0.5, 0.3]).double().requires_grad_(),))
 
 
-def test_functions_compile_in_one_piece():
+def test_functions_compile_to_one_graph():
     alpha, log_scores = random_case(torch.float64)
     for function, arguments in [
         (dirichlet.log_prob, (alpha, log_scores)),

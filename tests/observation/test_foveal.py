@@ -56,7 +56,7 @@ def draw(alpha, counts, seed=0):
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-4), (torch.float64, 1e-11)])
-def test_likelihoods_are_the_dirichlets_of_scipy(dtype, tolerance):
+def test_likelihoods_match_dirichlets_of_scipy(dtype, tolerance):
     model = FovealObservationModel(table(dtype), EDGES, CLASSES)
     scores, distance = looks(dtype=dtype)
     got = model.log_likelihood(scores, distance).detach()
@@ -71,7 +71,7 @@ def test_likelihoods_are_the_dirichlets_of_scipy(dtype, tolerance):
             assert float(got[i, j, k]) == pytest.approx(expected, rel=tolerance, abs=tolerance)
 
 
-def test_large_parameters_keep_their_digits_in_single_precision():
+def test_large_parameters_stay_accurate_in_single_precision():
     alpha = torch.tensor([9e3, 1e3, 10.0])[None, None].repeat(3, 2, 1)
     alpha[1, :, 0] += 30
     scores, distance = torch.tensor([0.9, 0.099, 0.001]), torch.tensor(0.0)
@@ -86,7 +86,7 @@ def density_by_the_formula(scores, alpha):
     return math.gamma(sum(alpha)) / math.prod(math.gamma(a) for a in alpha) * powers
 
 
-def test_calibrated_scores_are_those_of_equation_11():
+def test_calibrated_scores_match_equation_11():
     """eq:corrected_scores: the densities of all classes at the box's distance, divided by their sum D."""
     model, (scores, distance) = FovealObservationModel(table(), EDGES, CLASSES), looks()
     got = model.calibrate(scores, distance).detach()
@@ -97,7 +97,7 @@ def test_calibrated_scores_are_those_of_equation_11():
         np.testing.assert_allclose(got[i, j], expected, rtol=1e-9, atol=0)
 
 
-def test_kaplans_rule_does_not_need_the_sum_of_equation_11():
+def test_kaplans_rule_does_not_need_the_normalisation_of_equation_11():
     """Section III-D: "the normalization of the likelihoods is not ultimately relevant"."""
     model, (scores, distance) = FovealObservationModel(table(), EDGES, CLASSES), looks()
     beta = torch.full((4,), 0.5, dtype=torch.float64)
@@ -106,7 +106,7 @@ def test_kaplans_rule_does_not_need_the_sum_of_equation_11():
         torch.testing.assert_close(kaplan(beta, model.calibrate(scores, distance)), kaplan(beta, densities))
 
 
-def test_calibration_with_a_prior_and_tempering_is_bayes():
+def test_calibration_with_a_prior_and_tempering_follows_bayes_rule():
     """Beyond the paper, in which the prior is uniform and τ is 1."""
     alpha, scores, distance = table(), *looks()
     log_prior = torch.randn(4, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
@@ -118,7 +118,7 @@ def test_calibration_with_a_prior_and_tempering_is_bayes():
     torch.testing.assert_close(model(scores, distance), model.calibrate(scores, distance))
 
 
-def test_no_detections_are_calibrated_to_none():
+def test_calibration_accepts_looks_without_detections():
     model = FovealObservationModel(table(), EDGES, CLASSES)
     assert model.calibrate(torch.zeros(2, 0, 4).double(), torch.zeros(2, 0).double()).shape == (2, 0, 4)
 
@@ -141,13 +141,13 @@ def test_identity_returns_the_scores(dtype):
     torch.testing.assert_close(model.calibrate(scores, distance), dirichlet.floor(scores, 1e-6))
 
 
-def test_levels_are_those_of_the_edges():
+def test_levels_follow_the_edges():
     model = FovealObservationModel(table(torch.float32), EDGES, CLASSES)
     distance = torch.tensor([0.0, 0.1, 0.1001, 0.25, 0.26, 9.0])
     assert model.level(distance).tolist() == [0, 0, 1, 1, 2, 2]
 
 
-def test_expected_scores_are_the_means_of_equation_16():
+def test_expected_scores_match_the_means_of_equation_16():
     """eq:expected_operator, its first factor: α_kd / Σ_j α_kdj."""
     model, alpha = FovealObservationModel(table(), EDGES, CLASSES), table().tolist()
     means = [[[a / sum(row) for a in row] for row in levels] for levels in alpha]
@@ -157,7 +157,7 @@ def test_expected_scores_are_the_means_of_equation_16():
     assert torch.equal(fixed.expected_scores(), given)
 
 
-def test_everything_is_differentiable():
+def test_all_methods_are_differentiable():
     model = FovealObservationModel(table(), EDGES, CLASSES, tempering=0.5)
     scores, distance = looks(shape=(3,))
     inputs = (model.log_alpha.detach().requires_grad_(), scores.requires_grad_())
@@ -186,7 +186,7 @@ class Method(torch.nn.Module):
         return getattr(self.model, self.method)(scores, distance)
 
 
-def test_alpha_learns_and_stays_positive():
+def test_alpha_can_be_trained_and_stays_positive():
     model = FovealObservationModel(table(torch.float32), EDGES, CLASSES)
     scores, distance = looks(shape=(64,), dtype=torch.float32)
     labels = scores.argmax(-1)
@@ -203,14 +203,14 @@ def test_alpha_learns_and_stays_positive():
 
 
 @pytest.mark.parametrize("method", ["log_likelihood", "calibrate"])
-def test_model_compiles_in_one_piece(method):
+def test_model_compiles_to_one_graph(method):
     model = FovealObservationModel(table(torch.float32), EDGES, CLASSES)
     scores, distance = looks(dtype=torch.float32)
     compiled = torch.compile(getattr(model, method), fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(scores, distance), getattr(model, method)(scores, distance))
 
 
-def test_nothing_stale_is_kept_between_calls():
+def test_calls_use_the_current_parameters():
     model = FovealObservationModel(table(), EDGES, CLASSES).eval()
     scores, distance = looks()
     with torch.inference_mode():
@@ -232,7 +232,7 @@ def test_nothing_stale_is_kept_between_calls():
         torch.testing.assert_close(model.calibrate(scores.float(), distance.float()), first.float())
 
 
-def test_inputs_stay_as_they_are():
+def test_inputs_are_not_modified():
     scores, distance = looks()
     scores[0, 0] = torch.tensor([0.0, 1.0, 0.0, 0.0])
     alpha, before = table(), (scores.clone(), distance.clone())
@@ -246,7 +246,7 @@ def test_inputs_stay_as_they_are():
 
 
 @pytest.mark.parametrize("method", ["newton", "fixed_point", "gradient"])
-def test_fit_recovers_the_dirichlets_of_much_data(method):
+def test_fit_recovers_the_dirichlets_from_many_samples(method):
     alpha = table().clamp(min=0.5)
     statistics = draw(alpha, torch.full((4, 3), 4000))
     model = FovealObservationModel.identity(CLASSES, EDGES).fit(statistics, method=method)
@@ -258,8 +258,8 @@ def test_fit_recovers_the_dirichlets_of_much_data(method):
     torch.testing.assert_close(model.alpha, reference.alpha, rtol=2e-6, atol=0)
 
 
-def test_without_shrinking_a_fit_is_the_maximum_of_the_likelihood():
-    """Section III-C, what the paper fits, against scipy's search for the maximum of equation 9's logarithm."""
+def test_a_fit_without_shrinkage_maximises_the_likelihood():
+    """Section III-C, the fit of the paper, against scipy's maximum of the logarithm of equation 9."""
     rows = np.random.default_rng(6).dirichlet([2.0, 0.7, 4.0, 1.5], 60)
     statistics = DirichletStatistics((4, 3), 4)
     here = torch.ones(60, dtype=torch.int64)
@@ -273,7 +273,7 @@ def test_without_shrinking_a_fit_is_the_maximum_of_the_likelihood():
     np.testing.assert_allclose(alpha[2, 1], np.exp(best.x), rtol=1e-4)
 
 
-def test_cells_with_little_data_lean_on_their_class():
+def test_cells_with_few_samples_follow_their_class():
     alpha = table()[:, :1].repeat(1, 3, 1)
     counts = torch.full((4, 3), 3000)
     counts[2, 1] = 0
@@ -284,7 +284,7 @@ def test_cells_with_little_data_lean_on_their_class():
     torch.testing.assert_close(fitted[3], torch.ones(3, 4, dtype=torch.float64))
 
 
-def test_no_data_at_all_is_the_uniform_density():
+def test_a_fit_without_data_gives_the_uniform_density():
     model = FovealObservationModel.identity(CLASSES, EDGES)
     with pytest.warns(UserWarning, match="level 0 has no inner neighbour"):
         model.fit(DirichletStatistics((4, 3), 4), prior=True, expected="empirical")
@@ -303,7 +303,7 @@ def test_identical_samples_and_zeros_give_finite_parameters():
     assert alpha[1, 0].argmax() == 1
 
 
-def test_poor_levels_fall_back_on_their_inner_neighbour_and_say_so():
+def test_levels_with_few_samples_copy_their_inner_neighbour_and_warn():
     alpha = table()
     counts = torch.full((4, 3), 400)
     counts[1:, 1:] = 5
@@ -332,7 +332,7 @@ def test_prior_is_the_frequency_of_the_classes():
 
 
 @pytest.mark.parametrize("expected", [None, table(torch.float32) / table(torch.float32).sum(-1, keepdim=True)])
-def test_a_file_gives_back_the_same_model(tmp_path, expected):
+def test_a_saved_model_is_loaded_unchanged(tmp_path, expected):
     metadata = {"detector": DETECTOR, "sensor": {"sigma": 100.0}, "counts": [[1, 2], [3, 4]]}
     model = FovealObservationModel(
         table(torch.float32),
@@ -397,7 +397,7 @@ def test_bad_files_are_refused(tmp_path):
 
 
 class Toy:
-    """What a model asks of a detector."""
+    """The part of a detector that a model needs: its classes and settings."""
 
     def __init__(self, classes=tuple(CLASSES), **settings):
         self.classes = classes
@@ -407,7 +407,7 @@ class Toy:
         return self._settings
 
 
-def test_a_detector_that_fits_is_accepted_and_others_are_not(tmp_path):
+def test_a_matching_detector_is_accepted_and_others_are_not(tmp_path):
     path = tmp_path / "model.safetensors"
     FovealObservationModel(table(), EDGES, CLASSES, metadata={"detector": DETECTOR}).save(path)
     load = FovealObservationModel.from_pretrained
@@ -466,7 +466,7 @@ def test_bad_arguments_are_named(call):
         call()
 
 
-def test_conversions_of_one_checkpoint_are_one_detector():
+def test_conversions_of_one_checkpoint_count_as_one_detector():
     pair = sorted(digest for digest, name in NETWORKS.items() if name == "yolox-nano")
     check_detector({"name": "yolox-nano", "digest": pair[0]}, {"name": "yolox-nano", "digest": pair[1]}, "model")
     with pytest.raises(InputError, match="the model was fitted for"):

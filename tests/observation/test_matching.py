@@ -41,13 +41,13 @@ def test_match_equals_a_loop():
         assert match(boxes, truth, labels, iou=0.3).tolist() == expected
 
 
-def test_nothing_to_match():
+def test_matching_without_boxes_or_without_objects():
     assert match(torch.zeros(0, 4), some_boxes(3, 0), torch.tensor([1, 2, 3])).tolist() == []
     assert match(some_boxes(2, 0), torch.zeros(0, 4), torch.zeros(0, dtype=torch.long)).tolist() == [0, 0]
 
 
 def test_an_overlap_of_one_half_is_a_match():
-    """Two thirds of the first object's 6 px², and half of the second's 8."""
+    """The boxes cover two thirds of the first object's 6 px², and half of the second object's 8 px²."""
     truth = torch.tensor([[0.0, 0, 3, 2], [10, 0, 14, 2]])
     boxes = torch.tensor([[0.0, 0, 2, 2], [10, 0, 12, 2], [10, 0, 11.9, 2]])
     assert match(boxes, truth, torch.tensor([4, 9])).tolist() == [4, 9, 0]
@@ -56,13 +56,13 @@ def test_an_overlap_of_one_half_is_a_match():
 
 
 @pytest.mark.parametrize("shape", [(4,), (3, 5), (3, 3)])
-def test_refuses_what_are_no_boxes(shape):
+def test_boxes_of_the_wrong_shape_are_refused(shape):
     with pytest.raises(InputError, match=r"^boxes: expected"):
         box_iou(torch.zeros(shape), some_boxes(2, 0))
     with pytest.raises(InputError, match=r"^others: expected"):
         box_iou(some_boxes(2, 0), torch.zeros(shape))
 
 
-def test_boxes_of_less_than_a_pixel_overlap_as_others_do():
+def test_iou_of_boxes_smaller_than_a_pixel_equals_torchvision():
     a, b = some_boxes(8, 2) / 100, some_boxes(9, 3) / 100
     torch.testing.assert_close(box_iou(a, b), torchvision_iou(a, b))

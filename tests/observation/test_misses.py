@@ -8,7 +8,7 @@ from semfov.errors import InputError
 from semfov.observation import MissCounts
 
 
-def drawn(looks, seed=0):
+def draw_looks(looks, seed=0):
     torch.manual_seed(seed)
     for _ in range(looks):
         yield torch.rand(12) < 0.4, torch.rand(4, 12) < 0.3, torch.randint(1, 4, (4,)), torch.randint(0, 3, (12,))
@@ -16,7 +16,7 @@ def drawn(looks, seed=0):
 
 def test_counts_equal_a_loop():
     counts, missed, total = MissCounts(4, 3), torch.zeros(4, 3), torch.zeros(4, 3)
-    for detected, objects, labels, level in drawn(5):
+    for detected, objects, labels, level in draw_looks(5):
         counts.update(detected, objects, labels, level)
         for cell in range(12):
             there = set(labels[objects[:, cell]].tolist()) or {0}
@@ -27,17 +27,17 @@ def test_counts_equal_a_loop():
     assert counts.missed.tolist() == missed.long().tolist()
 
 
-def test_merged_counts_are_those_of_all_looks():
-    parts = [MissCounts(4, 3).update(*look) for look in drawn(6)]
+def test_merged_counts_equal_the_counts_of_all_looks():
+    parts = [MissCounts(4, 3).update(*look) for look in draw_looks(6)]
     whole = MissCounts(4, 3)
-    for look in drawn(6):
+    for look in draw_looks(6):
         whole.update(*look)
     merged = MissCounts.merge(reversed(parts), 4, 3)
     assert torch.equal(merged.missed, whole.missed)
     assert torch.equal(merged.total, whole.total)
 
 
-def test_rates_shrink_to_those_of_all_objects():
+def test_rates_shrink_towards_the_rate_of_all_objects():
     counts = MissCounts(3, 2)
     counts.total[:] = torch.tensor([[100, 0], [40, 8], [0, 2]])
     counts.missed[:] = torch.tensor([[90, 0], [10, 6], [0, 2]])
@@ -49,7 +49,7 @@ def test_rates_shrink_to_those_of_all_objects():
     assert bool(((MissCounts(3, 2).rates() > 0) & (MissCounts(3, 2).rates() < 1)).all())
 
 
-def test_model_keeps_its_rates(tmp_path):
+def test_a_saved_model_keeps_its_miss_rates(tmp_path):
     rates = torch.rand(3, 2)
     model = FovealObservationModel.identity(["cup", "cat"], [0.2], miss_rate=rates)
     distance = torch.tensor([[0.1, 0.3]])

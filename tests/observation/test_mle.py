@@ -31,7 +31,7 @@ def normal(*shape, seed=0):
     ("components", "mean", "spread"),
     [(2, 0, 1.5), (2, 0, 3), (3, 0, 1), (10, 3, 2), (81, -1, 2), (81, -6, 1.5), (81, 4, 2)],
 )
-def test_parameters_come_back_from_their_expected_logs(method, components, mean, spread):
+def test_parameters_are_recovered_from_their_expected_logs(method, components, mean, spread):
     alpha = (normal(5, 4, components) * spread + mean).exp()
     got = mle(expected_logs(alpha), method=method)
     assert got.shape == alpha.shape
@@ -40,7 +40,7 @@ def test_parameters_come_back_from_their_expected_logs(method, components, mean,
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.integers(2, 12), st.integers(2, 30), st.floats(-3, 4))
-def test_methods_find_the_same_optimum_and_nothing_near_is_better(seed, components, samples, level):
+def test_all_methods_find_the_same_maximum(seed, components, samples, level):
     generator = np.random.default_rng(seed)
     truth = np.exp(generator.normal(level, 1.5, components))
     scores = floor(torch.from_numpy(generator.dirichlet(truth, samples)), 1e-6)
@@ -56,7 +56,7 @@ def test_methods_find_the_same_optimum_and_nothing_near_is_better(seed, componen
         assert float(log_prob(near, mean_log)) <= float(best)
 
 
-def test_optimum_is_stationary_to_forty_digits():
+def test_the_gradient_is_zero_at_the_optimum_in_40_digit_arithmetic():
     mean_log = expected_logs((normal(12, seed=3) * 2).exp()) - 0.01
     alpha = mle(mean_log)
     with mpmath.workdps(40):
@@ -65,14 +65,14 @@ def test_optimum_is_stationary_to_forty_digits():
             assert abs(total - mpmath.digamma(a) + mpmath.mpf(g)) < 1e-12 * max(1.0, abs(g))
 
 
-def test_beta_fit_is_that_of_scipy():
+def test_fit_of_a_beta_distribution_matches_scipy():
     samples = np.random.default_rng(0).beta(2.0, 0.7, 200)
     a, b, _, _ = scipy.stats.beta.fit(samples, floc=0, fscale=1)
     mean_log = torch.tensor([np.log(samples).mean(), np.log1p(-samples).mean()])
     np.testing.assert_allclose(mle(mean_log), [a, b], rtol=1e-6)
 
 
-def test_fit_is_that_of_the_pypi_package():
+def test_fit_matches_the_pypi_package():
     samples = np.random.default_rng(1).dirichlet([3.0, 0.5, 8.0, 1.0], 100)
     mean_log = torch.from_numpy(np.log(samples)).mean(0)
     reference = pypi.mle(samples, tol=1e-12)
@@ -82,7 +82,7 @@ def test_fit_is_that_of_the_pypi_package():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_batch_is_its_rows(method):
+def test_a_batch_equals_its_rows(method):
     alpha = (normal(6, 5) * 2).exp()
     mean_log = expected_logs(alpha)
     kept = mean_log.clone()
@@ -93,7 +93,7 @@ def test_a_batch_is_its_rows(method):
     assert mle(mean_log[:0], method=method).shape == (0, 5)
 
 
-def test_single_precision_goes_in_and_out():
+def test_single_precision_input_gives_single_precision_output():
     alpha = (normal(4, 6) * 0.5 + 1).exp()
     got = mle(expected_logs(alpha).float())
     assert got.dtype == torch.float32
@@ -110,7 +110,7 @@ def test_identical_samples_get_the_largest_precision(method):
     assert float(default.sum()) == pytest.approx(1e8)
 
 
-def test_bounded_precision_is_the_constrained_maximum():
+def test_a_bound_on_the_precision_gives_the_constrained_maximum():
     samples = np.random.default_rng(2).dirichlet([30.0, 5.0, 65.0], 50)
     mean_log = np.log(samples).mean(0)
     bound = 20.0
@@ -130,14 +130,14 @@ def test_bounded_precision_is_the_constrained_maximum():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_constant_component_is_fitted_like_any(method):
+def test_a_constant_component_is_fitted_like_any_other(method):
     rest = torch.from_numpy(np.random.default_rng(3).dirichlet([2.0, 3.0, 1.0], 40)) * 0.7
     mean_log = torch.cat([torch.full((40, 1), 0.3, dtype=torch.float64), rest], 1).log().mean(0)
     alpha = mle(mean_log, method=method)
     torch.testing.assert_close(expected_logs(alpha), mean_log, rtol=0, atol=1e-8)
 
 
-def test_zeros_are_refused_until_they_are_floored():
+def test_zeros_are_refused_unless_they_are_floored():
     scores = torch.tensor([[0.0, 0.4, 0.6], [0.0, 0.7, 0.3]], dtype=torch.float64)
     with pytest.raises(InputError, match=r"mean_log.*finite"):
         mle(scores.log().mean(0))
@@ -146,7 +146,7 @@ def test_zeros_are_refused_until_they_are_floored():
     torch.testing.assert_close(expected_logs(alpha), mean_log, rtol=0, atol=1e-8)
 
 
-def test_one_sample_is_drawn_to_its_parent():
+def test_one_sample_shrinks_towards_the_parent():
     sample = torch.tensor([0.7, 0.2, 0.1], dtype=torch.float64)
     mean_log = shrink(sample.log(), torch.tensor(1), vacuous(3), 2.0)
     torch.testing.assert_close(mean_log, (sample.log() + 2 * vacuous(3)) / 3)
@@ -155,7 +155,7 @@ def test_one_sample_is_drawn_to_its_parent():
     assert alpha.argmax() == 0
 
 
-def test_no_sample_is_the_parent():
+def test_without_samples_the_fit_is_the_parent():
     empty = torch.full((2, 4), torch.nan, dtype=torch.float64)
     parent = expected_logs(torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64))
     torch.testing.assert_close(shrink(empty, torch.zeros(2), parent, 1.0), parent.expand(2, 4))
@@ -163,7 +163,7 @@ def test_no_sample_is_the_parent():
     torch.testing.assert_close(alpha, torch.ones(2, 4, dtype=torch.float64))
 
 
-def test_shrinking_is_bayes_with_pseudo_counts():
+def test_shrinkage_equals_adding_samples_of_the_prior():
     data = torch.from_numpy(np.random.default_rng(4).dirichlet([2.0, 1.0, 4.0], 7)).log()
     prior = torch.from_numpy(np.random.default_rng(5).dirichlet([1.0, 1.0, 1.0], 3)).log()
     pooled = mle(torch.cat([data, prior]).mean(0))
@@ -171,14 +171,14 @@ def test_shrinking_is_bayes_with_pseudo_counts():
     torch.testing.assert_close(shrunk, pooled, rtol=1e-10, atol=0)
 
 
-def test_derivative_is_that_of_the_optimum():
+def test_gradients_of_the_optimum_are_correct():
     mean_log = expected_logs((normal(3, 4, seed=5)).exp()).requires_grad_()
     assert torch.autograd.gradcheck(mle, (mean_log,), rtol=1e-4)
     bounded = torch.tensor([[0.7, 0.2, 0.1]], dtype=torch.float64).log().requires_grad_()
     assert torch.autograd.gradcheck(lambda g: mle(g - 1e-3, max_precision=50.0), (bounded,), rtol=1e-4)
 
 
-def test_fixed_point_is_where_minkas_iteration_ends():
+def test_fixed_point_equals_the_limit_of_minkas_iteration():
     """ψ(α_k) = ψ(Σ α_old) + mean ln s_k (Minka, 2000, equation 9), round by round with scipy's ψ and a root finder."""
 
     def inverse(y):
@@ -191,7 +191,7 @@ def test_fixed_point_is_where_minkas_iteration_ends():
     np.testing.assert_allclose(mle(torch.from_numpy(mean_log), method="fixed_point"), alpha, rtol=1e-7)
 
 
-def test_inverse_digamma_inverts():
+def test_inverse_digamma_inverts_digamma():
     x = torch.logspace(-8, 8, 200, dtype=torch.float64)
     torch.testing.assert_close(inverse_digamma(x.digamma()), x, rtol=1e-10, atol=0)
 

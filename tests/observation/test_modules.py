@@ -1,4 +1,4 @@
-"""Observation models as parts of others' modules."""
+"""Observation models as submodules of other modules."""
 
 from semfov.observation import FoldedObservationModel
 from tests.base_tester import GraphTester

@@ -20,8 +20,8 @@ def make_model(dtype=torch.float64, missed=None, levels=3, seed=0):
     return FovealObservationModel(alpha, [0.1 * n for n in range(1, levels)], ["a", "b", "c"], miss_rate=missed)
 
 
-def test_moments_equal_those_of_scipys_density():
-    """Of two components the simplex is a line, and the Dirichlet a beta distribution."""
+def test_moments_of_the_log_ratio_equal_integrals_with_scipy():
+    """With two components the Dirichlet is a beta distribution."""
     source, target, background = (3.0, 2.0), (4.0, 1.5), (1.2, 2.5)
     density, p, q = (stats.beta(*each) for each in (source, target, background))
 
@@ -34,8 +34,8 @@ def test_moments_equal_those_of_scipys_density():
     assert [float(each) for each in got] == pytest.approx([mean, variance], rel=1e-6)
 
 
-def test_equals_draws_of_what_is_seen():
-    """Scores drawn from the Dirichlets, their log likelihood ratio taken, and replaced by 0 where nothing is seen."""
+def test_visibility_equals_d_prime_of_random_scores():
+    """Scores are drawn from the Dirichlets; their log likelihood ratio is set to 0 where the detector misses."""
     model, count = make_model(), 200_000
     alpha, missed = model.alpha.detach(), model.miss_rate
     rng = np.random.default_rng(0)
@@ -43,15 +43,15 @@ def test_equals_draws_of_what_is_seen():
         ratio = {}
         for source in (0, target):
             scores = torch.as_tensor(rng.dirichlet(alpha[source, level].numpy(), count))
-            told = [Dirichlet(alpha[k, level], validate_args=False).log_prob(scores) for k in (target, 0)]
+            log_densities = [Dirichlet(alpha[k, level], validate_args=False).log_prob(scores) for k in (target, 0)]
             seen = rng.random(count) >= float(missed[source, level])
-            ratio[source] = np.where(seen, (told[0] - told[1]).numpy(), 0)
+            ratio[source] = np.where(seen, (log_densities[0] - log_densities[1]).numpy(), 0)
         apart = ratio[target].mean() - ratio[0].mean()
         expected = apart / np.sqrt((ratio[target].var() + ratio[0].var()) / 2)
         assert float(visibility(model)[target, level].detach()) == pytest.approx(expected, rel=0.02)
 
 
-def test_what_is_never_detected_cannot_be_told():
+def test_visibility_is_zero_where_nothing_is_ever_detected():
     missed = torch.full((4, 3), 0.3, dtype=torch.float64)
     missed[:, 2] = 1
     seen = visibility(make_model(missed=missed)).detach()
@@ -61,7 +61,7 @@ def test_what_is_never_detected_cannot_be_told():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_it_falls_with_every_target_that_is_missed(dtype, device):
+def test_visibility_falls_as_the_miss_rate_grows(dtype, device):
     rates = torch.linspace(0, 0.95, 8, dtype=dtype)
     missed = torch.stack([torch.full_like(rates, 0.5), *[rates] * 3])
     one = make_model(dtype, levels=1)
@@ -80,8 +80,8 @@ def test_dtypes_agree():
 
 
 @pytest.mark.parametrize("name", ["yolov3-tiny-published", "yolox-nano-published"])
-def test_acuity_of_the_published_fovea_falls_off(name):
-    """Of nearly all classes, and on average at every step away from the fovea."""
+def test_visibility_with_the_published_fovea_falls_with_distance(name):
+    """For nearly all classes, and on average at every step away from the fovea."""
     seen = visibility(FovealObservationModel.from_pretrained(name).double()).detach()[1:]
     assert bool(seen.isfinite().all())
     assert bool((seen.mean(0).diff() < 0).all())

@@ -14,7 +14,7 @@ from semfov.observation.special import log_gamma_divergence
 mp = mpmath.mp.clone()
 mp.dps = 40
 
-# From next to the pole at 0 to where h is linear, and closely around c.
+# From close to the pole at 0 to where the function is linear, and close to c.
 POINTS = [*np.logspace(-8, 8, 97).tolist(), 0.5, 1.0, 2.0, 8.0]
 NEAR = [1 + step for step in (-0.1, -1e-2, -1e-3, 1e-3, 1e-2, 0.1, 0.5)]
 
@@ -26,8 +26,8 @@ def exact(x, c):
 
 @pytest.mark.parametrize("c", [0.25, 0.5, 1.0, 5.0, 100.0])
 @pytest.mark.parametrize(("dtype", "digits"), [(torch.float64, 5e-14), (torch.float32, 1e-6)], ids=str)
-def test_divergence_of_log_gamma_is_that_of_mpmath(dtype, digits, c):
-    """To some roundings of it, or of the distance from c, of which it is the small part near c."""
+def test_divergence_of_log_gamma_matches_mpmath(dtype, digits, c):
+    """Up to a few rounding errors of the value or of the distance from c, as the value is much smaller near c."""
     x = torch.tensor([*POINTS, *(c * step for step in NEAR)], dtype=dtype)
     got = log_gamma_divergence(x, c)
     assert got.dtype == dtype
@@ -35,14 +35,14 @@ def test_divergence_of_log_gamma_is_that_of_mpmath(dtype, digits, c):
         assert abs(value - exact(at, c)) <= digits * (exact(at, c) + abs(at - c)), at
 
 
-def test_divergence_of_log_gamma_from_itself_is_nothing():
+def test_divergence_of_log_gamma_from_itself_is_zero():
     for c in (0.5, 1.0, 7.0):
         x = torch.full((3,), c, dtype=torch.float64)
         assert log_gamma_divergence(x, c).abs().max() < 1e-15
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_divergence_of_log_gamma_at_the_ends_of_the_number_line(dtype):
+def test_divergence_of_log_gamma_of_very_small_and_very_large_numbers(dtype):
     """(c - x) ψ(x) is c / x near 0, and it is x where x is large."""
     x = torch.tensor([1e-38, 1e-30, 1e30, 1e38], dtype=dtype)
     expected = torch.tensor([5e37, 5e29, 1e30, 1e38], dtype=dtype)
@@ -60,7 +60,7 @@ def test_derivative_of_the_divergence_of_log_gamma():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_divergence_of_log_gamma_compiles_whole_and_maps(dtype):
+def test_divergence_of_log_gamma_compiles_to_one_graph_and_vectorises(dtype):
     x = torch.rand(3, 7, dtype=dtype) + 0.1
     whole = log_gamma_divergence(x, 0.5)
     torch.compiler.reset()
@@ -70,7 +70,7 @@ def test_divergence_of_log_gamma_compiles_whole_and_maps(dtype):
 
 
 def beliefs(classes, dtype=torch.float64):
-    """Dirichlets that know nothing, a little and much."""
+    """Dirichlets with no, little and much evidence."""
     generator = torch.Generator().manual_seed(classes)
     alpha = 0.5 + 3 * torch.rand(40, classes, generator=generator, dtype=torch.float64) ** 4
     alpha[0] = 0.5
@@ -81,7 +81,7 @@ def beliefs(classes, dtype=torch.float64):
 
 @pytest.mark.parametrize("parameter", [0.1, 0.5, 1.0, 7.0])
 @pytest.mark.parametrize("classes", [2, 5, 81])
-def test_divergence_is_that_of_torch_distributions(classes, parameter):
+def test_divergence_matches_torch_distributions(classes, parameter):
     alpha = beliefs(classes)
     one, base = (torch.distributions.Dirichlet(a) for a in (alpha, torch.full_like(alpha, parameter)))
     got = dirichlet.kl_from_symmetric(alpha, parameter)
@@ -93,7 +93,7 @@ def test_divergence_is_that_of_torch_distributions(classes, parameter):
 
 @pytest.mark.parametrize("classes", [2, 5, 81])
 def test_divergence_in_single_precision(classes):
-    """Rounding of each term, and no more: that of the sum of the parameters is computed in double."""
+    """The error is only that of rounding each term: the term of the sum of all parameters is computed in double."""
     alpha = beliefs(classes, torch.float32)
     got, exact = dirichlet.kl_from_symmetric(alpha, 0.5), dirichlet.kl_from_symmetric(alpha.double(), 0.5)
     assert got.dtype == torch.float32
@@ -101,7 +101,7 @@ def test_divergence_in_single_precision(classes):
     assert bool(((got - exact).abs() <= 3e-7 * terms.clamp(min=1)).all())
 
 
-def test_divergence_from_itself_is_nothing():
+def test_divergence_from_itself_is_zero():
     for dtype in (torch.float32, torch.float64):
         assert dirichlet.kl_from_symmetric(torch.full((81,), 0.5, dtype=dtype), 0.5).abs() < 1e-12
 
@@ -118,13 +118,13 @@ def test_divergence_has_gradients():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_divergence_compiles_whole(dtype):
+def test_divergence_compiles_to_one_graph(dtype):
     alpha = beliefs(5, dtype)
     torch.compiler.reset()
     compiled = torch.compile(dirichlet.kl_from_symmetric, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(alpha, 0.5), dirichlet.kl_from_symmetric(alpha, 0.5))
 
 
-def test_a_parameter_is_positive():
+def test_the_parameter_must_be_positive():
     with pytest.raises(InputError, match="parameter"):
         dirichlet.kl_from_symmetric(torch.ones(3), 0.0)

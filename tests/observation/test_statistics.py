@@ -1,4 +1,4 @@
-"""Sums that merge: values against numpy, bits against every order and split, files and errors."""
+"""Statistics that can be merged: values against numpy, the same bits in any order and split, files and errors."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def gather(scores, labels, levels):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_sums_are_those_of_numpy(dtype):
+def test_statistics_match_numpy(dtype):
     scores, labels, levels = samples(300, dtype=dtype)
     kept = scores.clone()
     got = gather(scores, labels, levels)
@@ -45,7 +45,7 @@ def test_sums_are_those_of_numpy(dtype):
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.lists(st.integers(0, 4), min_size=1, max_size=40), st.randoms())
-def test_no_order_and_no_split_changes_a_bit(seed, shards, random):
+def test_statistics_do_not_depend_on_the_order_or_split_of_samples(seed, shards, random):
     scores, labels, levels = samples(len(shards), seed=seed)
     whole = gather(scores, labels, levels)
 
@@ -79,14 +79,14 @@ def test_batches_of_any_size_give_the_same_bits():
         assert pieces == whole
 
 
-def test_pooling_is_the_sum_of_the_cells():
+def test_a_sum_over_cells_equals_pooled_statistics():
     scores, labels, levels = samples(200)
     pooled = gather(scores, labels, levels).sum(1)
     assert pooled == DirichletStatistics((3,), 5).update(scores, labels)
     assert gather(scores, labels, levels).sum(-2) == DirichletStatistics((2,), 5).update(scores, levels)
 
 
-def test_merging_leaves_the_other_as_it_is():
+def test_merging_does_not_change_the_other_table():
     one, two = (gather(*samples(20, seed=seed)) for seed in (0, 1))
     before = gather(*samples(20, seed=1))
     one.merge(two)
@@ -102,7 +102,7 @@ def test_cells_without_samples_have_no_mean():
         assert bool(mean.isnan().all())
 
 
-def test_a_file_gives_back_every_bit_and_is_the_same_each_time(tmp_path):
+def test_files_are_exact_and_the_same_each_time(tmp_path):
     statistics = gather(*samples(100))
     statistics.save(tmp_path / "a.safetensors", shard=3, key="abc")
     statistics.save(tmp_path / "b.safetensors", shard=3, key="abc")
@@ -160,7 +160,7 @@ def test_bad_updates_are_refused_and_change_nothing(scores, index, named):
     assert statistics == DirichletStatistics((3, 2), 3)
 
 
-def test_unlike_tables_do_not_merge():
+def test_tables_of_other_shapes_or_settings_cannot_be_merged():
     for other in (
         DirichletStatistics((2,), 4),
         DirichletStatistics((3,), 3),
@@ -170,9 +170,9 @@ def test_unlike_tables_do_not_merge():
             DirichletStatistics((2,), 3).merge(other)
 
 
-def test_a_full_cell_is_an_error():
+def test_too_many_samples_in_one_cell_are_refused():
     statistics = DirichletStatistics((1,), 2).update(torch.tensor([[1.0, 0.0]]), CELL)
-    # Zeros have the largest logarithm there is; the sums must be sound up to the last merge that is accepted.
+    # Zeros have the largest logarithms; the sums must be correct up to the last merge that is accepted.
     with pytest.raises(InputError, match=r"at most 1.*samples"):  # noqa: PT012 (doubling is the point)
         for _ in range(40):
             statistics.merge(statistics)

@@ -1,4 +1,4 @@
-"""Belief and policy: sums against plain loops, what was seen is not looked at again, joint batches."""
+"""Belief and policy: sums against plain loops, no look twice, jointly chosen batches."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def belief(glances, evidence):
     return known
 
 
-def test_finds_are_tapered_sums(belief, evidence):
+def test_expected_finds_are_tapered_sums_over_cells(belief, evidence):
     lattice = belief.lattice
     for level in range(1, lattice.levels):
         span, values, cells = lattice.span(level), belief.finds(level), belief.expected(level)
@@ -46,7 +46,7 @@ def test_finds_are_tapered_sums(belief, evidence):
             torch.testing.assert_close(values[row, column], (part * weight).sum())
 
 
-def test_sums_that_are_kept_are_those_computed_anew():
+def test_cached_window_sums_equal_recomputed_sums():
     generator = np.random.default_rng(0)
     for span, shape in ((3, (9, 14)), (8, (20, 8)), (16, (5, 40))):
         weight, cells = generator.random(span, np.float32), generator.random(shape, np.float32)
@@ -62,7 +62,7 @@ def test_sums_that_are_kept_are_those_computed_anew():
 
 @pytest.mark.parametrize("size", [(4096, 200), (4096, 530), (300, 4096)])
 def test_long_pictures_are_searched(detector, evidence, size):
-    """Windows of some levels are higher than the picture there, and cells of coarse looks reach beyond the last one."""
+    """At some levels windows are higher than the picture, and cells of coarse looks reach beyond the last cell."""
     image = torch.rand(3, size[1], size[0], generator=torch.Generator().manual_seed(0)) * 0.6
     agent = ZoomAgent(ZoomEye(detector), evidence)
     path = agent.search(image, "red", passes=10, confirm=1.0, give_up=0.0)
@@ -70,26 +70,26 @@ def test_long_pictures_are_searched(detector, evidence, size):
     assert path.lattice.levels > 4
 
 
-def test_pooling_of_all_windows_is_pooling_of_each():
+def test_pooling_of_all_windows_equals_pooling_of_each():
     scores = torch.rand(9, 11, 4, generator=torch.Generator().manual_seed(0)) ** 8
     top, summary = pool_all(scores, 3)
     assert top.shape == (63, 4)
     for number, (row, column) in enumerate((r, c) for r in range(7) for c in range(9)):
-        one, told = pool(scores, (column, row, column + 3, row + 3))
+        one, one_summary = pool(scores, (column, row, column + 3, row + 3))
         torch.testing.assert_close(top[number], one)
-        torch.testing.assert_close(summary[number], told)
+        torch.testing.assert_close(summary[number], one_summary)
 
 
-def test_odds_of_a_window_of_the_lattice_are_those_of_the_table(belief):
+def test_odds_of_one_window_equal_those_in_the_table_of_all_windows(belief):
     lattice = belief.lattice
     table = belief.odds(lattice.levels - 1)
-    # The picture ends within a cell of the overview: windows that lie on whole cells of it are compared.
+    # The picture ends inside a cell of the overview, so only windows on whole cells are compared.
     for row, column in ((0, 0), (6, 8), (12, 4)):
         window = on_lattice(lattice, (lattice.levels - 1, column, row))
         assert belief.odds_of(window) == pytest.approx(float(table[row, column]), abs=1e-4)
 
 
-def test_a_window_that_was_seen_is_worth_less(belief, glances):
+def test_a_window_that_was_seen_has_a_lower_value(belief, glances):
     lattice = belief.lattice
     window, value = best_find(belief, set())
     finest = on_lattice(lattice, (lattice.levels - 1, *window.cells[:2]))
@@ -99,8 +99,8 @@ def test_a_window_that_was_seen_is_worth_less(belief, glances):
     assert value > 0
 
 
-def test_nothing_is_expected_where_the_eye_looked_closest(belief, glances):
-    """To the borders: what they cut is expected of the next window."""
+def test_no_finds_are_expected_in_a_window_seen_at_the_finest_level(belief, glances):
+    """Up to its borders: objects that they cut are expected of the next window."""
     lattice = belief.lattice
     finest = lattice.levels - 1
     belief.add(glances.see([on_lattice(lattice, (finest, 5, 7))])[0])
@@ -110,8 +110,8 @@ def test_nothing_is_expected_where_the_eye_looked_closest(belief, glances):
 
 
 @pytest.mark.slow
-def test_odds_that_are_kept_are_those_computed_anew(belief, glances, evidence):
-    """After looks of all levels in any order, and plans that were dropped."""
+def test_cached_odds_equal_recomputed_odds(belief, glances, evidence):
+    """After looks of all levels in any order, and after plans that were dropped."""
     lattice, generator = belief.lattice, torch.Generator().manual_seed(5)
     seen = glances.see([on_lattice(lattice, (0, 0, 0))])
     for turn in range(25):
@@ -127,10 +127,10 @@ def test_odds_that_are_kept_are_those_computed_anew(belief, glances, evidence):
                 torch.testing.assert_close(belief.odds(level), anew.odds(level))
 
 
-def test_foresight_counts_cells_alone_that_were_not_looked_at_as_closely(belief, glances):
+def test_foresight_counts_only_cells_that_were_not_seen_as_closely(belief, glances):
     lattice = belief.lattice
     done = {on_lattice(lattice, (0, 0, 0))}
-    # All of the first level was looked at: a look at it again promises nothing beyond what it finds itself.
+    # The whole first level was looked at: another look at it has no value beyond its own finds.
     across, down = lattice.places(1)
     for row in range(0, down, lattice.span(1) // 2):
         for column in range(0, across, lattice.span(1) // 2):
@@ -162,7 +162,7 @@ def test_batches_are_chosen_jointly(belief):
     assert values == sorted(values, reverse=True)
 
 
-def test_closer_looks_replace_what_the_overview_said(belief, glances):
+def test_closer_looks_replace_the_evidence_of_the_overview(belief, glances):
     lattice = belief.lattice
     belief.add(glances.see([on_lattice(lattice, (1, 0, 0))])[0])
     span = lattice.span(1)
@@ -171,7 +171,7 @@ def test_closer_looks_replace_what_the_overview_said(belief, glances):
     assert float(belief.expected(1)[:span, :span].sum()) == 0
 
 
-def test_model_comes_back_from_its_file(tmp_path, evidence):
+def test_a_saved_model_is_loaded_unchanged(tmp_path, evidence):
     evidence.patience, evidence.foresight = 3.5, 0.25
     evidence.save(tmp_path / "a.safetensors")
     same = GlimpseEvidence.from_pretrained(tmp_path / "a.safetensors")
@@ -186,7 +186,7 @@ def test_model_comes_back_from_its_file(tmp_path, evidence):
 
 def test_context_adds_to_the_odds_of_every_window(glances, evidence, belief):
     pairs = torch.zeros(4, 4, 2)
-    pairs[1, 3] = torch.tensor([2.0, -2.0])  # red things are beside blue ones
+    pairs[1, 3] = torch.tensor([2.0, -2.0])  # red objects occur near blue ones
     prior = ContextPrior(["red", "green", "blue"], torch.zeros(4, 1, 1), pairs, [0.1])
     context, plain = WindowContext(prior, 1.5), belief
     known = ZoomBelief(glances.lattice, evidence, 1, context)

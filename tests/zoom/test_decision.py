@@ -1,4 +1,4 @@
-"""Whether a large picture holds a class: what is counted of a search, and what is decided."""
+"""Deciding whether a large picture holds a class: features of a search, and decisions."""
 
 import math
 from xml.etree import ElementTree
@@ -47,8 +47,8 @@ def turns(eye, picture, target, most=6):
         return [turn for turn, _ in zip(steps, range(most), strict=False)]
 
 
-def test_what_is_counted_of_a_search(eye, picture):
-    """Every feature from the looks themselves, in another way."""
+def test_features_of_a_search_equal_those_computed_from_its_looks(eye, picture):
+    """Every feature, computed in another way from the looks."""
     target, seen = 1, turns(eye, picture, 1)
     tally = Tally(seen[0].belief)
     for turn in seen:
@@ -70,11 +70,11 @@ def test_what_is_counted_of_a_search(eye, picture):
     assert case[10] == pytest.approx(math.log(len(seen)) / 2)
     assert case.shape == (CASE,)
     boxes = torch.cat([turn.glance.detections.boxes[0] for turn in seen])
-    told = torch.cat([turn.glance.detections.scores[0, :, target] for turn in seen])
-    assert tally.box.tolist() == boxes[told.argmax()].tolist()
+    confidence = torch.cat([turn.glance.detections.scores[0, :, target] for turn in seen])
+    assert tally.box.tolist() == boxes[confidence.argmax()].tolist()
 
 
-def test_before_it_is_fitted_the_best_score_is_the_probability(eye, picture):
+def test_before_fitting_the_probability_is_the_best_score(eye, picture):
     seen = turns(eye, picture, 1)
     tally = Tally(seen[0].belief)
     for turn in seen:
@@ -82,7 +82,7 @@ def test_before_it_is_fitted_the_best_score_is_the_probability(eye, picture):
         assert tally.presence(turn.ahead) == pytest.approx(min(max(tally.best, 1e-4), 1 - 1e-4), abs=1e-5)
 
 
-def test_thresholds_of_the_evidence_decide(eye, picture, tmp_path):
+def test_decisions_use_the_thresholds_of_the_evidence(eye, picture, tmp_path):
     torch.manual_seed(0)
     evidence = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.02))
     evidence.save(tmp_path / "own.safetensors")
@@ -99,7 +99,7 @@ def test_thresholds_of_the_evidence_decide(eye, picture, tmp_path):
 
 
 def synthetic(count, seed):
-    """Searches whose target is there with a probability that follows from their cases."""
+    """Random searches; the probability that the target is present follows from their features."""
     generator = torch.Generator().manual_seed(seed)
     case = torch.randn(count, 1, CASE, generator=generator)
     best = torch.rand(count, 1, generator=generator)
@@ -115,23 +115,23 @@ def test_a_fitted_probability_is_calibrated():
     fit_judge(model, known, steps=250)
     new, odds = synthetic(4000, 2)
     with torch.no_grad():
-        told = model.anywhere(new.best, new.case)[:, 0]
+        log_odds = model.anywhere(new.best, new.case)[:, 0]
     best = F.binary_cross_entropy_with_logits(odds, new.there.float())
-    loss = F.binary_cross_entropy_with_logits(told, new.there.float())
+    loss = F.binary_cross_entropy_with_logits(log_odds, new.there.float())
     raw = F.binary_cross_entropy(new.best[:, 0], new.there.float())
     assert loss < best + 0.1 * (raw - best)
-    assert calibration_error(told.sigmoid(), new.there) < 0.03 < calibration_error(new.best[:, 0], new.there)
+    assert calibration_error(log_odds.sigmoid(), new.there) < 0.03 < calibration_error(new.best[:, 0], new.there)
 
     class Bounds:
         false_alarms, surest, lost = 0.05, 1.0, 0.02
 
     rows = judge_searches(model, new, Bounds())
     assert "ECE" in rows[0]
-    sure = (told.sigmoid() >= model.thresholds.confirm) & new.looked[:, 0]
+    sure = (log_odds.sigmoid() >= model.thresholds.confirm) & new.looked[:, 0]
     assert sure[~new.there].double().mean() <= 0.05
 
 
-def test_a_path_shows_itself(eye, picture):
+def test_a_path_has_a_text_and_an_html_form(eye, picture):
     torch.manual_seed(0)
     agent = ZoomAgent(eye, GlimpseEvidence(3, 8))
     path = agent.explore(picture, passes=9, worth=0.0)

@@ -1,4 +1,4 @@
-"""A look as one ONNX graph, run by onnxruntime, beside the eye and the evidence that it was made of."""
+"""A look exported as one ONNX graph and run by onnxruntime, against the eye and the evidence of the export."""
 
 import json
 import warnings
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 
 class Cells(nn.Module):
-    """A head as YOLOv5's, `(B, N, 5 + 3)`: in every 8-px cell a box of each colour, as full as the cell is of it."""
+    """A head like that of YOLOv5, `(B, N, 5 + 3)`: a box in every 8-px cell, scored by its share of each colour."""
 
     def forward(self, images: Tensor) -> Tensor:
         full = nn.functional.avg_pool2d(images, 8).flatten(2).transpose(1, 2)
@@ -39,7 +39,7 @@ class Cells(nn.Module):
 def network(tmp_path_factory):
     path = tmp_path_factory.mktemp("network") / "cells.onnx"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of an exporter that is old, as many of the files are that people have
+        warnings.simplefilter("ignore")  # the old exporter warns; many existing files were made with it
         torch.onnx.export(Cells(), torch.zeros(1, 3, 128, 128), path, dynamo=False, opset_version=12, verbose=False)
     return load_onnx(
         path, head="yolov5", classes=["red", "green", "blue"], preprocessing={"channels": "bgr", "scale": 1.0}
@@ -63,7 +63,7 @@ def run(path, picture, fixation):
 
 
 def compare(found, glance, pixels, score):
-    """Boxes one for one, in any order of those that are equally sure."""
+    """Compare box by box; boxes with equal scores may be in any order."""
     seen = glance.detections
     assert len(found["boxes"]) == int(seen.mask.sum()) > 0
     match = box_iou(found["boxes"], seen.boxes[0]).argmax(-1)
@@ -76,19 +76,19 @@ def compare(found, glance, pixels, score):
     assert torch.equal(best, best.sort(descending=True).values)
 
 
-# Native pixels are the same; resampled ones may differ by a rounding of a byte.
+# Native pixels are equal; resampled ones may differ by the rounding of a byte.
 @pytest.mark.parametrize(
     ("fixation", "pixels", "score"),
     [
         ((511.5, 383.5, 1.0), 1e-3, 1e-6),  # native pixels
         ((20.0, 750.0, 1.0), 1e-3, 1e-6),  # at a corner, where the window is cut
-        ((1060.0, -20.0, 1.0), 1e-3, 1e-6),  # beyond it
+        ((1060.0, -20.0, 1.0), 1e-3, 1e-6),  # outside the picture
         ((511.5, 383.5, 0.125), 2.0, 0.01),  # the whole picture, with grey above and below
         ((300.2, 400.7, 0.4), 0.5, 0.01),
         ((300.2, 400.7, 3.3), 0.1, 0.01),
     ],
 )
-def test_a_file_of_a_network_sees_what_the_eye_sees(network, colours, tmp_path, fixation, pixels, score):
+def test_the_exported_look_detects_the_same_as_the_eye(network, colours, tmp_path, fixation, pixels, score):
     network.selection = Selection(threshold=0.3, iou=0.4, limit=40)
     eye = ZoomEye(network)
     export_look(eye, tmp_path / "look.onnx")
@@ -97,7 +97,7 @@ def test_a_file_of_a_network_sees_what_the_eye_sees(network, colours, tmp_path, 
     compare(found, eye.glance(eye.open(colours), torch.tensor([fixation])), pixels, score)
 
 
-def test_pictures_of_any_size_and_other_selections(network, colours, tmp_path):
+def test_the_exported_look_takes_pictures_of_any_size_and_any_selection(network, colours, tmp_path):
     for name, selection in {
         "each class": Selection(threshold=0.3, iou=0.1, limit=1000, per_class=True),
         "few": Selection(threshold=0.5, iou=0.9, limit=3),
@@ -112,7 +112,7 @@ def test_pictures_of_any_size_and_other_selections(network, colours, tmp_path):
             assert len(found["boxes"]) == 3 or name == "each class"
 
 
-def test_nothing_seen_is_no_box(network, tmp_path):
+def test_a_picture_without_objects_gives_no_boxes(network, tmp_path):
     export_look(ZoomEye(network), tmp_path / "look.onnx")
     found = run(tmp_path / "look.onnx", np.zeros((200, 300, 3), dtype=np.uint8), (100.0, 100.0, 1.0))
     assert found["boxes"].shape == (0, 4)
@@ -120,11 +120,11 @@ def test_nothing_seen_is_no_box(network, tmp_path):
 
 
 @pytest.mark.parametrize("finest", [1.0, 4.0])
-def test_evidence_says_the_same(detector, picture, tmp_path, finest):
-    """Of a torch detector, in windows of 32 cells: of a quarter of the picture's pixels, and of native ones."""
+def test_the_exported_evidence_matches_the_model(detector, picture, tmp_path, finest):
+    """With a torch detector, in windows of 32 cells: at reduced resolution, and with native pixels."""
     torch.manual_seed(3)
     evidence = GlimpseEvidence(3, 8).eval().requires_grad_(False)
-    # Parameters that are all alike would hide which is which.
+    # With equal parameters, a mix-up of them would not be noticed.
     for parameter in evidence.parameters():
         parameter.add_(0.1 * torch.randn_like(parameter))
     eye = ZoomEye(detector, finest=finest)
@@ -154,11 +154,11 @@ def test_evidence_says_the_same(detector, picture, tmp_path, finest):
         torch.testing.assert_close(found[f"odds_{step}"], expected, rtol=0, atol=tolerance)
 
 
-def test_the_model_says_what_it_is(network, tmp_path):
+def test_the_file_records_classes_input_size_and_cells(network, tmp_path):
     export_look(ZoomEye(network), tmp_path / "look.onnx", cells=16)
     session = ort.InferenceSession(tmp_path / "look.onnx", providers=["CPUExecutionProvider"])
-    told = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
-    assert told == {"classes": ["red", "green", "blue"], "input_size": [128, 128], "cells": 16}
+    metadata = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
+    assert metadata == {"classes": ["red", "green", "blue"], "input_size": [128, 128], "cells": 16}
 
 
 def test_bad_input(network, tmp_path):

@@ -23,7 +23,7 @@ def test_canvas_is_the_antialiased_glimpse_inside_its_border(detector):
     assert float((canvas - expected)[..., 3:-3, 3:-3].abs().max()) <= 1.01 / 255
 
 
-def test_whole_picture_is_pillows_resize(detector):
+def test_the_whole_picture_equals_a_resize_by_pillow(detector):
     pixels = np.random.default_rng(0).integers(256, size=(384, 512, 3), dtype=np.uint8)
     eye = ZoomEye(detector)
     view = eye.open(pixels)
@@ -35,7 +35,7 @@ def test_whole_picture_is_pillows_resize(detector):
 
 
 @pytest.mark.parametrize("magnification", [0.5, 1.0])
-def test_boxes_come_back_in_picture_pixels(detector, picture, magnification):
+def test_boxes_are_in_pixels_of_the_picture(detector, picture, magnification):
     eye = ZoomEye(detector)
     seen = eye.look(eye.open(picture), torch.tensor([[655.5, 335.5, magnification]]))
     red = seen.boxes[0][(seen.labels[0] == 1) & (seen.confidence[0] > 0.02)]
@@ -45,7 +45,7 @@ def test_boxes_come_back_in_picture_pixels(detector, picture, magnification):
     assert float((covered - torch.tensor([640.0, 320, 672, 352])).abs().max()) <= cell
 
 
-def test_a_batch_is_its_looks(detector, picture):
+def test_a_batch_equals_its_looks_one_by_one(detector, picture):
     eye = ZoomEye(detector)
     view = eye.open(picture)
     fixations = torch.tensor([[655.5, 335.5, 1.0], [159.5, 95.5, 0.5], [511.5, 383.5, 0.125]])
@@ -58,7 +58,7 @@ def test_a_batch_is_its_looks(detector, picture):
         torch.testing.assert_close(together.scores[number, :count], alone.scores[0, :count])
 
 
-def test_cut_boxes(detector, picture):
+def test_boxes_cut_by_the_window_are_kept_dropped_or_made_background(detector, picture):
     fixation = torch.tensor([[640.0 - 64 + 8 - 0.5, 335.5, 1.0]])  # its window ends in the red square
     keep, drop, nothing = (ZoomEye(detector, cut=cut) for cut in ("keep", "drop", "background"))
     seen = keep.glance(keep.open(picture), fixation)
@@ -69,21 +69,21 @@ def test_cut_boxes(detector, picture):
     torch.testing.assert_close(background.boxes, seen.detections.boxes)
 
 
-def test_the_border_of_the_picture_cuts_nothing(detector):
+def test_boxes_at_the_border_of_the_picture_do_not_count_as_cut(detector):
     image = torch.zeros(3, 256, 256)
     image[0, :32, :32] = 1
     eye = ZoomEye(detector)
     assert not bool(eye.glance(eye.open(image), torch.tensor([[63.5, 63.5, 1.0]])).cut.any())
 
 
-def test_beyond_the_picture_there_is_fill(detector, picture):
+def test_the_canvas_is_filled_beyond_the_picture(detector, picture):
     eye = ZoomEye(detector)
     canvas, frames = eye.glimpse(eye.open(picture), torch.tensor([[0.0, 0.0, 1.0]]))
     assert frames[0, :4].tolist() == [0, 0, 64, 64]
     assert float(canvas[0, :, :60, :60].abs().max()) == 0
 
 
-def test_settings_change_with_what_detections_depend_on(detector):
+def test_settings_include_the_treatment_of_cut_boxes(detector):
     assert ZoomEye(detector).settings() != ZoomEye(detector, cut="drop").settings()
     with pytest.raises(InputError, match="unknown treatment of cut boxes"):
         ZoomEye(detector, cut="hide")

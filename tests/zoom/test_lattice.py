@@ -32,7 +32,7 @@ def test_actions_are_numbered():
 
 
 @given(sizes)
-def test_one_fixation_is_a_row_of_all(size):
+def test_a_single_fixation_equals_its_row_among_all(size):
     lattice = Lattice.over(size, (416, 320))
     some = lattice.actions[:: max(len(lattice) // 20, 1)]
     fixations = [lattice.fixation(*action) for action in some.tolist()]

@@ -1,4 +1,4 @@
-"""The parts of the zoom as parts of others' modules."""
+"""The parts of the zooming eye as submodules of other modules."""
 
 import torch
 
@@ -8,7 +8,7 @@ from tests.small import Blobs, rand
 
 
 class TestGlimpseEvidence(TensorTester):
-    """What looks one octave closer are likely to show."""
+    """Evidence about looks one octave closer."""
 
     batched = (0, 1)
 
@@ -24,7 +24,7 @@ class TestGlimpseEvidence(TensorTester):
 
 
 class TestZoomEye(BaseTester):
-    """It takes pictures of bytes, from files too, and keeps them so."""
+    """Pictures are bytes, as in files, and stay bytes."""
 
     def make(self):
         return ZoomEye(Blobs())

@@ -38,7 +38,7 @@ def test_windows_are_of_all_magnifications():
 
 
 @pytest.mark.slow
-def test_every_nth_mosaic_is_of_other_photographs():
+def test_every_nth_mosaic_is_made_of_held_out_photographs():
     kept, held = (EmbeddedScenes(("person", "cat"), count=3, seed=seed) for seed in (0, 1))
     both = HeldOutMosaics(*(Mosaics(some, 2, 2, tile=(64, 48), count=6) for some in (kept, held)), every=3)
     assert len(both) == 6
@@ -75,7 +75,7 @@ def test_samples_are_detections_with_octaves(sampler, tmp_path):
 
 
 @pytest.mark.slow
-def test_misses_are_counted_in_what_a_window_shows(sampler):
+def test_misses_are_counted_in_the_cells_that_a_window_shows(sampler):
     samples, edges = sampler.sample(1), torch.tensor([1.5, 2.5])
     counts = count_misses(sampler.scenes, samples, {1}, edges, sampler.cells)
     size = sampler.scenes.annotation(1).size
@@ -105,7 +105,7 @@ def observation():
     return FovealObservationModel(alpha, [0.5, 1.5, 2.5], ("red", "blue"), miss_rate=miss, metadata=cells)
 
 
-def test_what_is_expected_of_closer_looks():
+def test_expected_finds_of_closer_looks_follow_from_the_model():
     model = observation()
     rates = ObservedRates(model, LATTICE)
     span = LATTICE.span(1)
@@ -113,7 +113,7 @@ def test_what_is_expected_of_closer_looks():
     scores[3, 4, 0] = 0.2
     found[10, 10, 1] = True
     look = Gist(1, (0, 0), 1, scores, torch.zeros(span, span), found)
-    told = rates.rates(look, torch.tensor([0, 1, 2])).exp()
+    expected_finds = rates.rates(look, torch.tensor([0, 1, 2])).exp()
     level = [sum(float(octave) > edge for edge in (0.5, 1.5, 2.5)) for octave in LATTICE.octaves]
     miss, share = model.miss_rate, torch.tensor([98.0, 2, 3]).double() / 103
     nothing = share * miss[:, level[1]]
@@ -122,11 +122,11 @@ def test_what_is_expected_of_closer_looks():
     for cell, held in (((20, 20), nothing), ((3, 4), seen)):
         for t in (1, 2):
             expected = held[t] * (1 - miss[t, level[2]])
-            assert float(told[t, 0, *cell]) == pytest.approx(float(expected), rel=1e-4)
-        assert float(told[0, 0, *cell]) == pytest.approx(float(told[1:, 0, *cell].sum()), rel=1e-4)
-    # What was found is not to be found again, and there is no look closer than the closest.
-    assert told[2, 0, 9:12, 9:12].max() < 1e-6
-    assert told[:, LATTICE.levels - 2 :].max() < 1e-6
+            assert float(expected_finds[t, 0, *cell]) == pytest.approx(float(expected), rel=1e-4)
+        assert float(expected_finds[0, 0, *cell]) == pytest.approx(float(expected_finds[1:, 0, *cell].sum()), rel=1e-4)
+    # Objects already found are not expected again, and no look is closer than the finest level.
+    assert expected_finds[2, 0, 9:12, 9:12].max() < 1e-6
+    assert expected_finds[:, LATTICE.levels - 2 :].max() < 1e-6
     assert rates.taper(5).tolist() == [1.0] * 5
 
 

@@ -18,7 +18,7 @@ def agent(detector):
     return ZoomAgent(ZoomEye(detector), GlimpseEvidence(3, 8)).eval()
 
 
-def test_search_finds_what_is_there(agent, picture):
+def test_search_finds_a_target_in_the_picture(agent, picture):
     path = agent.search(picture, "red")
     assert path.decision.outcome == "found"
     assert path.decision.probability >= 0.3
@@ -28,14 +28,14 @@ def test_search_finds_what_is_there(agent, picture):
     assert path.passes == len(path.glances)
 
 
-def test_search_without_a_target_ends(agent, picture):
+def test_search_for_an_absent_target_ends(agent, picture):
     path = agent.search(picture, "green", passes=7)
     assert path.decision.outcome in ("absent", "undecided")
     assert path.passes <= 7
     assert path.decision.box is None
 
 
-def test_find_all_and_explore(agent, picture):
+def test_find_all_finds_one_class_and_explore_finds_all(agent, picture):
     path = agent.find_all(picture, "blue", passes=12, worth=0.0)
     assert path.target == 3
     assert (path.objects.labels == 3).all()
@@ -46,16 +46,16 @@ def test_find_all_and_explore(agent, picture):
     assert everything.passes <= 24
 
 
-def test_it_ends_where_no_look_is_worth_its_price(agent, picture):
+def test_find_all_ends_when_no_look_has_enough_value(agent, picture):
     assert agent.find_all(picture, "blue", worth=1e9).passes == 1
 
 
-def test_pays_for_large_pictures_alone(agent, picture):
+def test_zooming_pays_only_for_large_pictures(agent, picture):
     assert agent.pays(picture)
     assert not agent.pays(picture[:, :200, :300])
 
 
-def test_figure(agent, picture):
+def test_a_path_can_be_plotted_in_new_and_in_given_axes(agent, picture):
     path = agent.search(picture, "red", passes=4)
     figure = plot_zoom_path(path, picture)
     assert len(figure.axes) == 1
@@ -68,20 +68,20 @@ def test_figure(agent, picture):
     assert not other.images
 
 
-def test_errors(agent, picture):
+def test_invalid_arguments_are_refused(agent, picture):
     with pytest.raises(InputError, match="did you mean 'red'"):
         agent.search(picture, "rad")
     with pytest.raises(InputError, match="passes: expected a whole number from 1"):
         agent.explore(picture, passes=0)
     with pytest.raises(InputError, match="batch: expected a whole number from 1"):
         agent.find_all(picture, 1, batch=0)
-    for wrong, told in (
+    for wrong, message in (
         ({"passes": 2.5}, "passes: expected a whole number"),
         ({"passes": True}, "passes: expected a whole number"),
         ({"confirm": 1.5}, "confirm: expected a probability from 0 to 1, got 1.5"),
         ({"give_up": float("nan")}, "give_up: expected a probability from 0 to 1"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             agent.search(picture, "red", **wrong)
     for worth in (-1, float("nan"), "much"):
         with pytest.raises(InputError, match="worth: expected a number"):
@@ -89,7 +89,7 @@ def test_errors(agent, picture):
     for target in (0, 4, 1.0, True, None):
         with pytest.raises(InputError, match="target: expected a name, or a whole number from 1 to 3"):
             agent.find_all(picture, target)
-    for image, told in (
+    for image, message in (
         (picture * 255, "picture: expected RGB in .*; divide by"),
         (picture * torch.nan, "picture: expected RGB in .*NaN"),
         (picture.long(), "picture: expected bytes, 16-bit numbers or floats"),
@@ -97,19 +97,19 @@ def test_errors(agent, picture):
         (picture[:, :0], "picture: expected at least one pixel"),
         (7, "picture: expected a path"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             agent.explore(image)
 
 
-def test_evidence_belongs_to_the_detector(detector):
+def test_evidence_must_have_the_classes_of_the_detector(detector):
     with pytest.raises(InputError, match="evidence: expected one for the detector's 3 classes, got 5"):
         ZoomAgent(ZoomEye(detector), GlimpseEvidence(5, 8))
-    for wrong, told in (({"patience": 0}, "patience"), ({"foresight": 2}, "foresight"), ({"classes": 0}, "classes")):
-        with pytest.raises(InputError, match=told):
+    for wrong, message in (({"patience": 0}, "patience"), ({"foresight": 2}, "foresight"), ({"classes": 0}, "classes")):
+        with pytest.raises(InputError, match=message):
             GlimpseEvidence(**wrong)
 
 
-def looked(level, column, row, boxes, scores, cut):
+def make_glance(level, column, row, boxes, scores, cut):
     lattice = Lattice.over((1024, 768), (128, 128))
     vectors = torch.zeros(1, len(boxes), 3)
     vectors[0, :, 1] = torch.tensor(scores)
@@ -118,23 +118,23 @@ def looked(level, column, row, boxes, scores, cut):
     return Glance(on_lattice(lattice, (level, column, row)), detections, torch.tensor(cut), torch.zeros(2), None)
 
 
-def test_the_closer_look_wins():
-    far = looked(0, 0, 0, [[100.0, 100, 200, 200]], [0.9], [False])
-    near = looked(2, 0, 0, [[105.0, 102, 198, 199]], [0.6], [False])
+def test_merging_prefers_the_closer_look():
+    far = make_glance(0, 0, 0, [[100.0, 100, 200, 200]], [0.9], [False])
+    near = make_glance(2, 0, 0, [[105.0, 102, 198, 199]], [0.6], [False])
     objects = merge([far, near])
     assert objects.boxes.tolist() == [[105.0, 102, 198, 199]]
     assert objects.passes.tolist() == [1]
 
 
-def test_a_cut_box_gives_way_to_the_whole():
-    far = looked(0, 0, 0, [[100.0, 100, 200, 200]], [0.4], [False])
-    near = looked(2, 0, 0, [[100.0, 100, 140, 200]], [0.9], [True])
+def test_merging_prefers_whole_boxes_to_cut_boxes():
+    far = make_glance(0, 0, 0, [[100.0, 100, 200, 200]], [0.4], [False])
+    near = make_glance(2, 0, 0, [[100.0, 100, 140, 200]], [0.9], [True])
     assert merge([far, near]).boxes.tolist() == [[100.0, 100, 200, 200]]
     assert merge([near]).boxes.tolist() == [[100.0, 100, 140, 200]]
 
 
-def test_small_things_in_front_of_large_ones_stay():
-    look = looked(1, 0, 0, [[0.0, 0, 200, 200], [50.0, 50, 90, 90]], [0.9, 0.8], [False, False])
+def test_merging_keeps_small_objects_in_front_of_large_ones():
+    look = make_glance(1, 0, 0, [[0.0, 0, 200, 200], [50.0, 50, 90, 90]], [0.9, 0.8], [False, False])
     assert len(merge([look])) == 2
     assert len(merge([look], score=0.85)) == 1
     assert len(merge([])) == 0
@@ -149,7 +149,7 @@ def area(box):
     return (box[2] - box[0]) * (box[3] - box[1])
 
 
-def test_merging_is_the_plain_loop():
+def test_merging_equals_a_plain_loop():
     """Many boxes of two classes from looks of all levels, a third of them cut."""
     generator = torch.Generator().manual_seed(1)
     glances = []
@@ -157,7 +157,7 @@ def test_merging_is_the_plain_loop():
         corner = torch.rand(40, 2, generator=generator) * 150
         boxes = torch.cat([corner, corner + 5 + torch.rand(40, 2, generator=generator) * 60], -1)
         scores, cut = torch.rand(40, generator=generator), torch.rand(40, generator=generator) < 0.33
-        glance = looked(turn % 3, 0, 0, boxes.tolist(), scores.tolist(), cut.tolist())
+        glance = make_glance(turn % 3, 0, 0, boxes.tolist(), scores.tolist(), cut.tolist())
         vectors = glance.detections.scores
         vectors[0, ::2, 2], vectors[0, ::2, 1] = vectors[0, ::2, 1].clone(), 0.0
         glances.append(glance)
@@ -192,7 +192,7 @@ def test_glances_treat_cut_boxes_as_their_eye_does(detector, picture):
     for cut in ("keep", "drop", "background"):
         eye = ZoomEye(detector, cut=cut)
         view = eye.open(picture)
-        window = on_lattice(view.lattice, (view.lattice.levels - 1, 33, 15))  # it ends in the red square
+        window = on_lattice(view.lattice, (view.lattice.levels - 1, 33, 15))  # its border lies in the red square
         other = on_lattice(view.lattice, (view.lattice.levels - 1, 34, 15))
         found[cut], whole = LiveGlances(eye, view).see([window, other])
         assert whole.detections.mask.shape == (1, len(whole.cut))

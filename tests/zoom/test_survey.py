@@ -1,4 +1,4 @@
-"""How many objects of any class closer looks find: predictions, beliefs that go by them, and their fit."""
+"""Numbers of objects of any class that closer looks find: predictions, beliefs that use them, and their fit."""
 
 import pytest
 import torch
@@ -32,7 +32,7 @@ def survey():
 
 
 def example(rule):
-    """A mosaic in which a closer look finds the objects that `rule` says of its window."""
+    """A mosaic in which a closer look finds as many objects as `rule` gives for its window."""
     objects = 12
     looks = [LookedAt(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(objects).bool())]
     for window in half_steps(LATTICE):
@@ -43,7 +43,7 @@ def example(rule):
     return ZoomExample(LATTICE, torch.randint(1, CLASSES + 1, (objects,)), tuple(looks))
 
 
-def test_classes_tell_the_same_hints_apart(survey):
+def test_rates_depend_on_the_class_of_the_hints(survey):
     """Rates depend on which class a hint is of, not only on how strong it is."""
     look = gist()
     other = Gist(0, (0, 0), 1, look.scores.roll(1, -1), look.size, look.found.roll(1, -1))
@@ -51,7 +51,7 @@ def test_classes_tell_the_same_hints_apart(survey):
     assert not torch.allclose(survey.rates(look), survey.rates(other))
 
 
-def test_far_cells_do_not_matter(survey):
+def test_rates_do_not_depend_on_distant_cells(survey):
     """Beyond the widest neighbourhood a cell matters only through the strongest hint of the look."""
     look = gist(1, (0, 0))
     look.scores[0, 0] = 0.9
@@ -63,7 +63,7 @@ def test_far_cells_do_not_matter(survey):
     torch.testing.assert_close(survey.rates(changed)[0, :, :4, :4], same)
 
 
-def test_explorers_go_by_the_survey_and_searches_by_their_class():
+def test_explorations_use_the_survey_and_searches_use_their_class():
     torch.manual_seed(0)
     evidence = GlimpseEvidence(CLASSES, 8).eval().requires_grad_(False)
     evidence.survey.foresight = 0.125
@@ -75,12 +75,12 @@ def test_explorers_go_by_the_survey_and_searches_by_their_class():
         assert belief.foresight == (0.125 if target == 0 else 0.35)
 
 
-def test_class_rates_are_of_classes():
+def test_rates_of_background_are_refused():
     with pytest.raises(InputError, match=r"targets: expected classes from 1 on, got \[0, 2\]"):
         GlimpseEvidence(CLASSES, 8).rates(gist(), torch.tensor([0, 2]))
 
 
-def test_loss_is_that_of_poisson_counts_window_by_window(survey):
+def test_loss_equals_the_poisson_loss_window_by_window(survey):
     """Against sums over the cells of each window, one at a time, and PyTorch's own Poisson likelihood."""
     mosaic = example(lambda look, window: sum(window.cells) % 5)
     overview = mosaic.looks[0]
@@ -111,8 +111,8 @@ def test_objects_that_were_seen_before_are_not_new():
         assert {int(n) for _, _, numbers in counts.values() for n in numbers} == {new}
 
 
-def test_the_fit_predicts_other_mosaics_better():
-    """Windows hold as many objects as hints of class 2, whatever else they show."""
+def test_fitting_improves_predictions_on_held_out_mosaics():
+    """The number of objects in a window follows only from its hints of class 2."""
     torch.manual_seed(1)
 
     def rule(look, window):

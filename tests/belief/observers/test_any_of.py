@@ -1,4 +1,4 @@
-"""Searches for any of several classes: their beliefs together, against the one observer for each."""
+"""Searches for any of several classes: the combined belief against one observer per class."""
 
 import pytest
 import torch
@@ -40,7 +40,7 @@ def believed(observer, looks, target):
     return belief
 
 
-def test_it_is_one_of_them_unless_it_is_none(inner, looks):
+def test_probability_of_any_class_is_one_minus_the_probability_of_none(inner, looks):
     several = believed(AnyOf(inner, WEIGHTS), looks, None)
     for what in ("probability", "chance", "presence"):
         missing = 1.0
@@ -50,7 +50,7 @@ def test_it_is_one_of_them_unless_it_is_none(inner, looks):
             torch.testing.assert_close(getattr(several, what)(asked), 1 - missing)
 
 
-def test_of_one_class_it_is_the_other_observer(inner, looks):
+def test_with_one_class_the_belief_equals_that_of_the_inner_observer(inner, looks):
     alone, single = believed(inner, looks, 2), believed(AnyOf(inner, {2: 1.0, 1: 0.0}), looks, None)
     torch.testing.assert_close(single.probability(2), alone.probability(2))
     torch.testing.assert_close(single.presence(2), alone.presence(2))
@@ -59,7 +59,7 @@ def test_of_one_class_it_is_the_other_observer(inner, looks):
     assert AnyOf(inner, {2: 1.0}).thresholds == inner.thresholds
 
 
-def test_the_likeliest_class_counts_its_weight(inner, looks):
+def test_the_likeliest_class_takes_the_weights_into_account(inner, looks):
     peaks = {index: float(believed(inner, looks, index).probability(index).max()) for index in (1, 2, 3)}
     for low in (1.0, 0.01):
         weights = {1: low, 2: 1.0, 3: low}
@@ -67,7 +67,7 @@ def test_the_likeliest_class_counts_its_weight(inner, looks):
         assert believed(AnyOf(inner, weights), looks, None).likeliest().tolist() == [best]
 
 
-def test_looks_are_taken_apart_and_joined(inner, looks):
+def test_joined_looks_give_the_same_belief_as_separate_looks(inner, looks):
     observer = AnyOf(inner, WEIGHTS)
     whole = observer.weigh(looks, FIXATIONS, GRID)
     parts = [whole[torch.tensor([n])] for n in range(3)]
@@ -78,7 +78,7 @@ def test_looks_are_taken_apart_and_joined(inner, looks):
         torch.testing.assert_close(both[row : row + 1].probability(1), alone.probability(1))
 
 
-def test_what_is_known_fades_as_the_other_observer_has_it(inner, looks):
+def test_belief_fades_like_that_of_the_inner_observer(inner, looks):
     observer = AnyOf(inner, WEIGHTS)
     visited = torch.zeros(1, 20, dtype=torch.bool)
     look = observer.weigh(looks[:1], FIXATIONS[:1], GRID)
@@ -102,7 +102,7 @@ def test_bad_input(inner):
             weights_by_class(target, classes)
 
 
-def test_some_episodes_and_classes_that_there_are_not(inner, looks):
+def test_beliefs_can_be_indexed_and_unknown_classes_are_refused(inner, looks):
     observer = AnyOf(inner, WEIGHTS)
     belief = observer.update(observer.start(3, GRID, looks.scores), observer.weigh(looks, FIXATIONS, GRID))
     assert torch.equal(belief[1:].closest, belief.closest[1:])
@@ -113,7 +113,7 @@ def test_some_episodes_and_classes_that_there_are_not(inner, looks):
         weights_by_class({99: 1.0}, ("cup", "wine glass"))
 
 
-def test_what_other_observers_made_is_refused_by_name(inner, looks):
+def test_beliefs_and_looks_of_other_observers_are_refused(inner, looks):
     observer, visited = AnyOf(inner, WEIGHTS), torch.zeros(3, 20, dtype=torch.bool)
     belief, look = observer.start(3, GRID, looks.scores), observer.weigh(looks, FIXATIONS, GRID)
     other = Landing(3)

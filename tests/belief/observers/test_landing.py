@@ -1,4 +1,4 @@
-"""Where eyes land, against every detection and cell one by one."""
+"""The observer of where eyes land, against a loop over detections and cells."""
 
 import math
 
@@ -21,7 +21,7 @@ def draw(looks=3, count=5, classes=4, dtype=torch.float64):
     return Detections(torch.cat([corner, corner + size], -1), scores, mask)
 
 
-def by_hand(seen, look, grid, classes, person, reach):
+def evidence_by_loop(seen, look, grid, classes, person, reach):
     """Evidence of one look, in plain Python."""
     table = [[0.0] * classes for _ in range(len(grid))]
     floor = reach * max(grid.extent.tolist())
@@ -46,11 +46,11 @@ def test_evidence_is_the_strongest_of_all_detections(person):
     observer = Landing(4, person)
     look = observer.weigh(seen, torch.zeros(3, 2, dtype=torch.float64), grid)
     for number in range(3):
-        expected = by_hand(seen, number, grid, 4, person, 15 / 800)
+        expected = evidence_by_loop(seen, number, grid, 4, person, 15 / 800)
         torch.testing.assert_close(look.evidence[number], expected)
 
 
-def test_belief_keeps_the_strongest_look_and_the_closest():
+def test_belief_keeps_the_strongest_evidence_and_the_smallest_distance():
     grid, seen = Grid(5, 4, (400, 300)), draw()
     observer, points = Landing(4), torch.tensor([[0.0, 0.0], [399.0, 299.0], [200.0, 10.0]], dtype=torch.float64)
     look = observer.weigh(seen, points, grid)
@@ -66,17 +66,17 @@ def test_belief_keeps_the_strongest_look_and_the_closest():
     torch.testing.assert_close(Objects()(None, grid)(belief, belief.closest < 0), values)
 
 
-def test_what_an_object_draws_grows_with_its_side():
-    """Summed over a fine grid, up to where the floor and the picture cut it."""
+def test_total_evidence_of_an_object_grows_with_its_side_length():
+    """Sums over a fine grid, of objects that are large enough and far enough from the picture's border."""
     grid = Grid(200, 150, (800, 600))
     boxes = torch.tensor([[[100.0, 100.0, 180.0, 180.0]], [[300.0, 200.0, 620.0, 520.0]]])
     seen = Detections(boxes, torch.tensor([[[0.0, 0.0, 1.0]]]).expand(2, 1, 3), torch.ones(2, 1).bool())
     sums = Landing(2).weigh(seen, torch.zeros(2, 2), grid).evidence.sum((1, 2))
-    # σ grows four times: the area 16 times, the height falls to a quarter.
+    # σ is four times as large: the area is 16 times as large, and the height a quarter.
     assert sums[1] / sums[0] == pytest.approx(4, rel=0.02)
 
 
-def test_nothing_seen_is_no_evidence_and_other_beliefs_are_refused():
+def test_no_detections_give_no_evidence_and_other_beliefs_are_refused():
     grid, observer = Grid(2, 2, (40, 40)), Landing(3)
     nothing = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 4), torch.zeros(1, 0).bool())
     belief = observer(observer.start(1, grid, torch.zeros(1)), nothing, torch.zeros(1, 2), grid)
@@ -90,12 +90,12 @@ def test_nothing_seen_is_no_evidence_and_other_beliefs_are_refused():
 
 
 @pytest.mark.parametrize("bad", [{"classes": 0}, {"classes": 3, "person": 4}, {"classes": 3, "reach": 0}])
-def test_settings_that_cannot_be(bad):
+def test_invalid_settings_are_refused(bad):
     with pytest.raises(InputError, match=next(reversed(bad))):
         Landing(**bad)
 
 
-def test_looks_and_beliefs_keep_their_shapes_and_take_their_parts():
+def test_looks_and_beliefs_can_be_indexed_and_joined():
     grid, seen = Grid(5, 4, (400, 300)), draw()
     observer, points = Landing(4), torch.tensor([[0.0, 0.0], [399.0, 299.0], [200.0, 10.0]], dtype=torch.float64)
     start, look = observer.start(3, grid, seen.scores), observer.weigh(seen, points, grid)
@@ -115,7 +115,7 @@ def test_evidence_is_computed_in_the_precision_of_the_scores():
     grid, seen = Grid(5, 4, (400, 300)), draw()
     look = Landing(4, None, reach=0.013).weigh(seen, torch.zeros(3, 2, dtype=torch.float64), grid)
     for number in range(3):
-        expected = by_hand(seen, number, grid, 4, None, 0.013)
+        expected = evidence_by_loop(seen, number, grid, 4, None, 0.013)
         torch.testing.assert_close(look.evidence[number], expected, rtol=1e-12, atol=1e-300)
     wide = Grid(5, 4, torch.tensor([400.0, 300.0], dtype=torch.float64))
     single = Detections(seen.boxes.float(), seen.scores.float(), seen.mask)

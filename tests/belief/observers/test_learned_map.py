@@ -1,4 +1,4 @@
-"""The learned map: what it gathers and believes against numpy, look by look; episodes, gradients, dtypes, devices."""
+"""The learned map: gathered evidence and belief against numpy, look by look; episodes, gradients, dtypes, devices."""
 
 from dataclasses import fields
 
@@ -22,7 +22,7 @@ CLASSES = torch.arange(1, 5)
 
 
 def believe(observer, looks, order, grid=GRID, fixations=FIXATIONS):
-    """The belief of one episode after looks in some order."""
+    """Belief of one episode after looks in the given order."""
     belief = observer.start(1, grid, looks.scores)
     for look in order:
         part = slice(look, look + 1)
@@ -30,17 +30,17 @@ def believe(observer, looks, order, grid=GRID, fixations=FIXATIONS):
     return belief
 
 
-def remember(model, looks, order, twin):
-    """The same in numpy: what is gathered, and the probabilities that are read from it."""
+def gather_in_numpy(model, looks, order, reference):
+    """The same in numpy: the gathered evidence, and the probabilities computed from it."""
     fixations, cells = FIXATIONS.to(looks.scores), 24
     features = class_features(looks, fixations, GRID, CLASSES)
-    said = twin.neural(model.look, twin.array(features))
-    shown = twin.array(highest_score(looks, CLASSES))
+    said = reference.run_network(model.look, reference.array(features))
+    shown = reference.array(highest_score(looks, CLASSES))
     nearest, best, total = np.zeros((4, cells)), np.full((4, cells), -np.inf), np.zeros((4, cells))
     closest, weight, score, visited = np.full(cells, np.inf), np.zeros(cells), np.zeros(4), [False] * cells
     for look in order:
         for cell in range(cells):
-            distance = float(np.hypot(*(twin.array(GRID.centres)[cell] - twin.array(fixations)[look]))) / 90
+            distance = float(np.hypot(*(reference.array(GRID.centres)[cell] - reference.array(fixations)[look]))) / 90
             if distance < closest[cell]:
                 closest[cell], nearest[:, cell] = distance, said[look, :, cell]
             best[:, cell] = np.maximum(best[:, cell], said[look, :, cell])
@@ -48,8 +48,8 @@ def remember(model, looks, order, twin):
             weight[cell] += np.exp(-6 * distance)
         score = np.maximum(score, shown[look])
         visited[FIXATED[look]] = True
-    odds = twin.class_odds(model, nearest, best, total / weight, closest, len(order), [1, 2, 3, 4], 6)
-    nothing = twin.emptiness(model, odds, closest, len(order), 6)
+    odds = reference.class_odds(model, nearest, best, total / weight, closest, len(order), [1, 2, 3, 4], 6)
+    nothing = reference.emptiness(model, odds, closest, len(order), 6)
     probabilities = scipy.special.expit(np.concatenate([nothing[None], odds])).T
     return {
         "probabilities": probabilities,
@@ -66,18 +66,18 @@ def remember(model, looks, order, twin):
 
 @pytest.mark.parametrize("order", [(0,), (2,), (1, 3), (0, 1, 2, 3), (3, 2, 1, 0), (1, 1, 0, 1)], ids=str)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-def test_belief_equals_a_twin_in_numpy(random_looks, toy_map, twin, order, dtype, device):
+def test_belief_equals_a_reference_in_numpy(random_looks, toy_map, reference, order, dtype, device):
     looks, model = random_looks(dtype=dtype), toy_map().to(dtype=dtype)
     with torch.no_grad():
         belief = believe(LearnedMap(model).to(device), looks.to(device), order)
-    expected = remember(model.cpu(), looks, order, twin)
+    expected = gather_in_numpy(model.cpu(), looks, order, reference)
     assert set(expected) == {part.name for part in fields(MapBelief)}
     close = 2e-4 if dtype == torch.float32 else 1e-6
     for name, value in expected.items():
         tensor = getattr(belief, name)
         assert tensor.device.type == device.type, name
         assert tensor.dtype in (dtype, torch.bool), name
-        np.testing.assert_allclose(twin.array(tensor[0]), np.asarray(value), atol=close, rtol=close, err_msg=name)
+        np.testing.assert_allclose(reference.array(tensor[0]), np.asarray(value), atol=close, rtol=close, err_msg=name)
 
 
 def test_belief_before_the_first_look(toy_map, device):
@@ -94,7 +94,7 @@ def test_belief_before_the_first_look(toy_map, device):
         assert len(getattr(belief, part.name)) == 2
 
 
-def test_belief_tells_of_every_class(random_looks, toy_map):
+def test_belief_has_a_probability_for_every_class(random_looks, toy_map):
     with torch.no_grad():
         belief = believe(LearnedMap(toy_map()), random_looks(), (0, 1, 3))[torch.tensor([0, 0, 0])]
     assert belief.class_probabilities() is belief.probabilities
@@ -126,7 +126,7 @@ def run(observer, looks, rows=slice(None)):
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_a_batch_is_its_episodes_one_by_one(random_looks, toy_map):
+def test_a_batch_equals_its_episodes_run_one_by_one(random_looks, toy_map):
     looks, model = random_looks(), toy_map(widths=(48, 24))
     with torch.no_grad():
         batch, joint = run(LearnedMap(model), looks), run(LearnedMap(model, together=True), looks)
@@ -139,8 +139,8 @@ def test_a_batch_is_its_episodes_one_by_one(random_looks, toy_map):
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_looks_are_weighed_alike_alone_and_in_a_batch(random_looks, toy_map):
-    """To the bit, so that looks can be weighed once and used by many episodes."""
+def test_looks_weighed_in_a_batch_equal_looks_weighed_alone(random_looks, toy_map):
+    """Bit for bit, so that looks can be weighed once and used by many episodes."""
     looks, model = random_looks(), toy_map(widths=(48, 24))
     observer = LearnedMap(model)
     with torch.no_grad():
@@ -165,8 +165,8 @@ def test_looks_are_weighed_alike_alone_and_in_a_batch(random_looks, toy_map):
     assert torch.equal(batch.distance, GRID.distance(FIXATIONS))
 
 
-def test_some_of_the_episodes_go_on(random_looks, toy_map):
-    """Beliefs are taken out of a batch, and map and detach reach every tensor."""
+def test_selected_episodes_of_a_batch_can_continue(random_looks, toy_map):
+    """Beliefs can be selected from a batch; `map` and `detach` apply to every tensor."""
     looks, observer, index = random_looks(), LearnedMap(toy_map()), torch.tensor([2, 0])
     with torch.no_grad():
         belief = run(observer, looks)
@@ -185,17 +185,17 @@ def test_some_of_the_episodes_go_on(random_looks, toy_map):
     constant = alive.detach()
     assert not any(getattr(constant, part.name).requires_grad for part in fields(MapBelief))
     assert torch.equal(constant.probabilities, alive.probabilities)
-    # A belief from before the first look can be taken apart, too.
+    # A belief from before the first look can be indexed, too.
     start = observer.start(4, GRID, looks.scores)[index]
     with torch.no_grad():
         first = observer(start, looks[index], FIXATIONS[index], GRID)
     assert first.probabilities.shape == (2, 24, 5)
 
 
-def test_the_order_of_looks_from_other_places_does_not_matter(random_looks, toy_map):
+def test_belief_does_not_depend_on_the_order_of_looks_at_different_cells(random_looks, toy_map):
     looks, observer = random_looks(dtype=torch.float64), LearnedMap(toy_map().double())
     distance = torch.cdist(GRID.centres.double(), FIXATIONS.double())
-    clear = distance.sort(-1).values.diff().abs()[:, 0] > 1e-6  # cells that are as far from two looks keep the first
+    clear = distance.sort(-1).values.diff().abs()[:, 0] > 1e-6  # cells equally far from two looks keep the first
     with torch.no_grad():
         one, other = believe(observer, looks, (0, 1, 3)), believe(observer, looks, (3, 0, 1))
     for name in ("best", "total", "weight", "score", "closest", "looks"):
@@ -203,12 +203,12 @@ def test_the_order_of_looks_from_other_places_does_not_matter(random_looks, toy_
     torch.testing.assert_close(one.nearest[..., clear], other.nearest[..., clear])
 
 
-def believer():
+def score_model():
     """A model whose evidence is the clipped score of each class, and nothing else."""
     model = MapEvidence(4, 4, components=4).requires_grad_(False).eval()
     for parameter in model.parameters():
         parameter.zero_()
-    # The second feature is log(score · weight) / 4 + 1; GELU of large numbers is the identity, of -large ones nothing.
+    # The second feature is log(score · weight) / 4 + 1; GELU is x for large x, and 0 for very negative x.
     model.look[0].weight[0, 1] = 100
     model.look[0].bias[0] = -60
     model.look[2].weight[0, 0] = 1
@@ -218,8 +218,8 @@ def believer():
 
 
 def test_several_classes_share_a_cell():
-    """A cup on a table: the cell holds both, and neither takes from the other."""
-    observer, cell = LearnedMap(believer()), 9
+    """A cup on a table: the cell holds both, and neither lowers the probability of the other."""
+    observer, cell = LearnedMap(score_model()), 9
     x, y = GRID.centres[cell].tolist()
     boxes = torch.tensor([[[x - 7, y - 7, x + 7, y + 7], [x - 7, y - 7, x + 37, y + 7]]])
     scores = torch.tensor([[[0.02, 0.94, 0.02, 0.02], [0.02, 0.02, 0.94, 0.02]]])
@@ -244,8 +244,8 @@ def test_several_classes_share_a_cell():
 
 @pytest.mark.parametrize("grid", [Grid(1, 5, (60, 90)), Grid(5, 1, (90, 60)), Grid(1, 1, (10, 10))], ids=str)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-def test_no_detection_at_all_and_a_single_row(toy_map, grid, dtype, device):
-    """Looks that hold not even padding."""
+def test_looks_without_detections_on_grids_of_one_row_or_column(toy_map, grid, dtype, device):
+    """The looks have no detections, not even padding."""
     observer = LearnedMap(toy_map().to(device, dtype))
     nothing = Detections.empty(2, 4, like=torch.empty(0, dtype=dtype, device=device))
     belief = observer.start(2, grid, nothing.scores)
@@ -258,7 +258,7 @@ def test_no_detection_at_all_and_a_single_row(toy_map, grid, dtype, device):
     assert bool(((belief.probabilities > 0) & (belief.probabilities < 1)).all())
 
 
-def test_padding_says_nothing(random_looks, toy_map):
+def test_padding_does_not_change_the_belief(random_looks, toy_map):
     looks, observer = random_looks(), LearnedMap(toy_map())
     wide = Detections(
         torch.cat([looks.boxes, torch.full((4, 2, 4), 30.0)], 1),
@@ -305,12 +305,12 @@ def test_gradients_reach_every_parameter(random_looks, toy_map):
         assert parameter.grad is not None, name
         assert bool(parameter.grad.isfinite().all()), name
         assert float(parameter.grad.abs().sum()) > 0, name
-    # Of the prior, that of the classes: background has none.
+    # In the prior only the classes have gradients: background has none.
     assert model.prior.grad.nonzero()[:, 0].tolist() == [1, 2, 3, 4]
 
 
-def test_the_prior_of_a_class(random_looks, toy_map):
-    """It changes the odds of its own class, and that nothing is there; no other class."""
+def test_the_prior_of_a_class_changes_only_that_class_and_background(random_looks, toy_map):
+    """It changes the odds of its own class and of an empty cell, but of no other class."""
     looks, model = random_looks(), toy_map()
     with torch.no_grad():
         before = believe(LearnedMap(model), looks, (0, 1)).probabilities
@@ -321,8 +321,8 @@ def test_the_prior_of_a_class(random_looks, toy_map):
 
 
 @pytest.mark.slow
-def test_graphs(random_looks, toy_map):
-    """One graph, without a break, for the whole of a look; it computes what the eager code does."""
+def test_a_look_compiles_to_one_graph_and_vectorises(random_looks, toy_map):
+    """A whole look is one graph without breaks; it computes the same as the eager code."""
     looks, observer = random_looks(), LearnedMap(toy_map().requires_grad_(False))
 
     def look(boxes, scores, mask, fixation):
@@ -343,7 +343,7 @@ def test_graphs(random_looks, toy_map):
         torch.testing.assert_close(got[0], expected, atol=1e-5, rtol=1e-4)
 
 
-def test_others_have_another_belief(toy_map, random_looks):
+def test_beliefs_and_looks_of_other_observers_are_refused(toy_map, random_looks):
     looks, observer = random_looks(), LearnedMap(toy_map())
     said, belief = observer.weigh(looks, FIXATIONS, GRID), observer.start(4, GRID, looks.scores)
     semantic, target = Semantic(5), Target(TargetEvidence(4, 4, components=5))

@@ -1,4 +1,4 @@
-"""The observer of all classes, with the options beyond the published one, against loops over cells."""
+"""The observer of all classes, with its options beyond the published method, against loops over cells."""
 
 import pytest
 import torch
@@ -23,7 +23,7 @@ def looks():
 
 
 class Misses:
-    """Background is missed always, class 3 never."""
+    """Miss rates: background is always missed, class 3 never."""
 
     def miss_likelihood(self, distance):
         return torch.stack([torch.ones_like(distance), 0.2 + distance, distance.clamp(max=1), 0 * distance], -1)
@@ -40,8 +40,8 @@ def watch(observer, looks):
     return belief
 
 
-def loop(looks, *, tempering=1.0, footprint="overlap", memory="all", missed=None):
-    """The same in scalars."""
+def believe_by_loop(looks, *, tempering=1.0, footprint="overlap", memory="all", missed=None):
+    """Belief after the three looks, cell by cell in scalars."""
     beta = torch.full((20, 4), 0.5, dtype=torch.float64)
     for cell in range(20):
         order = range(3)
@@ -75,20 +75,20 @@ def loop(looks, *, tempering=1.0, footprint="overlap", memory="all", missed=None
 )
 def test_belief_equals_the_loop(looks, options):
     belief = watch(Semantic(4, **options), looks)
-    told = {("missed" if name == "misses" else name): value for name, value in options.items()}
-    torch.testing.assert_close(belief.beta[0], loop(looks, **told), rtol=1e-5, atol=1e-6)
+    loop_options = {("missed" if name == "misses" else name): value for name, value in options.items()}
+    torch.testing.assert_close(belief.beta[0], believe_by_loop(looks, **loop_options), rtol=1e-5, atol=1e-6)
     offset = torch.cdist(GRID.centres, FIXATIONS) / 100
     torch.testing.assert_close(belief.closest[0].float(), offset.amin(1))
 
 
-def test_the_same_look_twice_teaches_a_closest_memory_nothing(looks):
+def test_repeating_a_look_does_not_change_a_memory_of_the_closest_look(looks):
     observer = Semantic(4, memory="closest")
     look = observer.weigh(looks[:1], FIXATIONS[:1], GRID)
     once = observer.update(observer.start(1, GRID, torch.empty(0)), look)
     assert torch.equal(observer.update(once, look).beta, once.beta)
 
 
-def test_misses_move_clear_cells_towards_background():
+def test_misses_move_cells_without_detections_towards_background():
     nothing = Detections.empty(1, 3)
     observer = Semantic(4, misses=MISSES)
     look = observer.weigh(nothing, FIXATIONS[:1], GRID)
@@ -98,7 +98,7 @@ def test_misses_move_clear_cells_towards_background():
     assert (background > 0.25).all()
 
 
-def test_a_call_is_to_weigh_and_to_update(looks):
+def test_calling_the_observer_equals_weigh_and_update(looks):
     observer = Semantic(4, tempering=0.5, memory="closest", footprint="soft")
     belief = observer.start(1, GRID, torch.empty(0, dtype=torch.float64))
     for look in range(3):
@@ -109,8 +109,8 @@ def test_a_call_is_to_weigh_and_to_update(looks):
 
 
 @pytest.mark.parametrize("options", [{}, {"footprint": "soft"}, {"misses": MISSES}], ids=["hard", "soft", "misses"])
-def test_a_batch_of_looks_is_each_look(looks, options):
-    """Weighed together, taken out one by one or joined again, they say the same to the bit."""
+def test_a_batch_of_looks_equals_each_look_alone(looks, options):
+    """Weighed together, selected one by one or joined again, looks give the same belief bit for bit."""
     observer = Semantic(4, **options)
     together = observer.weigh(looks, FIXATIONS, GRID)
     belief = observer.start(3, GRID, looks.scores)
@@ -125,8 +125,8 @@ def test_a_batch_of_looks_is_each_look(looks, options):
                 assert torch.equal(after.closest[0], batch.closest[look])
 
 
-def test_models_are_parts_of_the_observer():
-    """A fitted model is a parameter of it, told once where it serves twice; an object that is no module is kept."""
+def test_models_are_submodules_of_the_observer():
+    """The parameters of a fitted model are listed once, even if it is used twice; other objects are kept."""
     model = FovealObservationModel.identity(["a", "b"], [0.2], miss_rate=torch.full((3, 2), 0.5))
     observer = Semantic(3, model, misses=model)
     assert set(map(id, observer.parameters())) == set(map(id, model.parameters()))
@@ -138,12 +138,12 @@ def test_models_are_parts_of_the_observer():
 
 
 @pytest.mark.parametrize("options", [{"memory": "best"}, {"fusion": "max"}, {"prior": 0}])
-def test_bad_settings(options):
+def test_invalid_settings_are_refused(options):
     with pytest.raises(InputError):
         Semantic(3, **options)
 
 
-def test_tempering_is_positive(looks):
+def test_tempering_must_be_positive(looks):
     with pytest.raises(InputError, match="tempering"):
         likelihoods(looks, FIXATIONS, GRID, tempering=0)
     with pytest.raises(InputError, match="tempering"):
@@ -151,7 +151,7 @@ def test_tempering_is_positive(looks):
 
 
 @pytest.mark.parametrize("footprint", ["overlap", "soft"])
-def test_looks_with_fewer_detections_are_joined_to_those_with_more(looks, footprint):
+def test_looks_with_different_numbers_of_detections_can_be_joined(looks, footprint):
     observer = Semantic(4, footprint=footprint, misses=MISSES)
     few = Detections(looks.boxes[1:2, :2], looks.scores[1:2, :2], looks.mask[1:2, :2])
     many = Detections(looks.boxes.flatten(0, 1)[None], looks.scores.flatten(0, 1)[None], looks.mask.flatten()[None])
@@ -168,7 +168,7 @@ def test_looks_with_fewer_detections_are_joined_to_those_with_more(looks, footpr
         assert torch.equal(together.closest[row], alone.closest[0])
 
 
-def test_a_belief_keeps_its_precision_whatever_that_of_the_look(looks):
+def test_a_belief_keeps_its_dtype_whatever_the_dtype_of_the_look(looks):
     observer = Semantic(4, misses=MISSES)
     look = observer.weigh(looks[:1], FIXATIONS[:1], GRID)
     for dtype in (torch.float32, torch.float64):

@@ -1,4 +1,4 @@
-"""Figures of conditional and of fixation maps, against pysaliency where it is installed, and against closed forms."""
+"""Metrics of conditional and of fixation maps, against pysaliency where it is installed, and against closed forms."""
 
 import importlib.util
 import sys
@@ -28,7 +28,7 @@ SHAPE = (12, 17)
 def pysaliency(monkeypatch):
     if importlib.util.find_spec("pysaliency") is None:
         pytest.skip("pip install pysaliency")
-    # It asks for a name that setuptools has given up, and never calls it here; its ROC for one that NumPy has.
+    # It imports a module that setuptools has removed, which is not called here; its ROC uses a removed name of NumPy.
     if importlib.util.find_spec("pkg_resources") is None:
         monkeypatch.setitem(sys.modules, "pkg_resources", SimpleNamespace(resource_string=None, resource_listdir=None))
     monkeypatch.setattr(np, "trapz", np.trapezoid, raising=False)
@@ -37,8 +37,8 @@ def pysaliency(monkeypatch):
         return importlib.import_module("pysaliency")
 
 
-def picture(pysaliency, maps):
-    """A model, stimuli and fixations of pysaliency for maps, with fixations drawn at random."""
+def pysaliency_data(pysaliency, maps):
+    """Model, stimuli and random fixations of pysaliency for the given maps."""
     generator = np.random.default_rng(1)
     stimuli = pysaliency.Stimuli([np.full((*SHAPE, 3), number, dtype=np.uint8) for number in range(len(maps))])
 
@@ -47,7 +47,7 @@ def picture(pysaliency, maps):
             return maps[int(stimulus[0, 0, 0])]
 
     count = 8
-    # In distinct pixels, or a pixel would count twice as fixated.
+    # In distinct pixels; otherwise one pixel would count as fixated twice.
     pixels = [generator.choice(SHAPE[0] * SHAPE[1], count, replace=False) for _ in maps]
     xs = [(each % SHAPE[1]).astype(float) for each in pixels]
     ys = [(each // SHAPE[1]).astype(float) for each in pixels]
@@ -60,12 +60,12 @@ def picture(pysaliency, maps):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("levels", [None, 4], ids=["distinct", "many ties"])
-def test_all_are_those_of_pysaliency(pysaliency, levels):
+def test_metrics_match_pysaliency(pysaliency, levels):
     generator = np.random.default_rng(0)
     maps = generator.uniform(0, 1, (3, *SHAPE))
     if levels is not None:
         maps = np.round(maps * levels) / levels
-    model, stimuli, trains, xs, ys = picture(pysaliency, maps)
+    model, stimuli, trains, xs, ys = pysaliency_data(pysaliency, maps)
     np.testing.assert_allclose(nss(maps, xs, ys).ravel(), model.NSSs(stimuli, trains), atol=1e-12)
     np.testing.assert_allclose(
         auc(maps, xs, ys).ravel(), model.AUCs(stimuli, trains, nonfixations="uniform"), atol=1e-12
@@ -81,10 +81,10 @@ def test_all_are_those_of_pysaliency(pysaliency, levels):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_information_gain_is_that_of_pysaliency(pysaliency):
+def test_information_gain_matches_pysaliency(pysaliency):
     generator = np.random.default_rng(2)
     densities, base = (log_density(generator.uniform(0.1, 1, (2, *SHAPE))) for _ in range(2))
-    _, stimuli, trains, xs, ys = picture(pysaliency, densities)
+    _, stimuli, trains, xs, ys = pysaliency_data(pysaliency, densities)
 
     class Density(pysaliency.Model):
         def __init__(self, tables):
@@ -99,8 +99,8 @@ def test_information_gain_is_that_of_pysaliency(pysaliency):
     assert gain.mean() == pytest.approx(expected, abs=1e-12)
 
 
-def test_the_same_without_pysaliency():
-    """Every figure by its definition, pixel by pixel."""
+def test_metrics_match_their_definitions():
+    """Every metric by its definition, pixel by pixel, without pysaliency."""
     generator = np.random.default_rng(3)
     values = np.round(generator.uniform(0, 1, SHAPE), 1)
     x, y = np.array([0, 16, 5]), np.array([0, 11, 7])
@@ -113,7 +113,7 @@ def test_the_same_without_pysaliency():
     assert auc_shuffled(values, x, y, columns, rows) == pytest.approx(expected)
 
 
-def test_a_gaussian_gains_what_its_closed_form_says():
+def test_log_likelihood_of_a_gaussian_matches_its_entropy():
     """Mean log likelihood of draws from a normal density is minus its entropy."""
     sigma, side = 6.0, 80
     y, x = np.mgrid[0:side, 0:side]
@@ -125,7 +125,7 @@ def test_a_gaussian_gains_what_its_closed_form_says():
     assert bits == pytest.approx(2 * np.log2(side) - entropy, abs=0.03)
 
 
-def test_a_uniform_map_tells_nothing():
+def test_a_uniform_map_is_at_chance():
     flat = np.ones(SHAPE)
     x, y = [3, 4], [5, 6]
     assert nss(flat, x, y).tolist() == [0, 0]
@@ -134,7 +134,7 @@ def test_a_uniform_map_tells_nothing():
     np.testing.assert_allclose(log_likelihood(log_density(flat), x, y), 0, atol=1e-12)
 
 
-def test_a_floor_gives_every_pixel_a_chance():
+def test_a_floor_gives_every_pixel_a_probability():
     values = np.zeros(SHAPE)
     values[0, 0] = 1
     assert log_likelihood(log_density(values), [5], [5])[0] == -np.inf
@@ -142,7 +142,7 @@ def test_a_floor_gives_every_pixel_a_chance():
     assert np.exp(log_density(values, floor=0.1)).sum() == pytest.approx(1)
 
 
-def test_leading_dimensions_and_tensors():
+def test_batches_of_tensors_equal_single_maps():
     maps = torch.rand(2, 3, *SHAPE, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     x, y = torch.zeros(2, 3, 4), torch.ones(2, 3, 4)
     for figure in (nss, auc, log_likelihood):
@@ -151,7 +151,7 @@ def test_leading_dimensions_and_tensors():
         np.testing.assert_allclose(together[1, 2], figure(maps[1, 2], x[1, 2], y[1, 2]))
 
 
-def test_points_belong_to_the_pixel_that_they_are_nearest_to():
+def test_points_belong_to_the_nearest_pixel():
     values = np.arange(6.0).reshape(2, 3)
     assert log_likelihood(values, [0.49], [0.4]) == log_likelihood(values, [0], [0])
     assert log_likelihood(values, [0.51], [0.4]) == log_likelihood(values, [1], [0])
@@ -168,12 +168,12 @@ def test_points_belong_to_the_pixel_that_they_are_nearest_to():
         (lambda: auc_judd(np.ones((1, 1)), [0], [0]), "saliency"),
     ],
 )
-def test_what_cannot_be_is_refused_by_name(call, argument):
+def test_invalid_arguments_are_refused_by_name(call, argument):
     with pytest.raises(InputError, match=f"^{argument}"):
         call()
 
 
-def test_each_map_of_a_batch_is_a_density_of_its_own_in_double_precision():
+def test_each_map_of_a_batch_is_normalised_in_double_precision():
     maps = torch.rand(2, 3, *SHAPE, generator=torch.Generator().manual_seed(4))
     maps[1] *= 100
     density = log_density(maps, floor=0.2)
@@ -181,17 +181,17 @@ def test_each_map_of_a_batch_is_a_density_of_its_own_in_double_precision():
     np.testing.assert_array_equal(density, log_density(maps.double(), floor=0.2))
 
 
-def test_a_map_without_contrast_beside_one_with():
+def test_a_uniform_map_does_not_affect_other_maps_of_its_batch():
     maps = np.stack([np.ones(SHAPE), np.random.default_rng(5).uniform(0, 1, SHAPE)])
     got = nss(maps, [[3], [4]], [[5], [6]])
     assert got[0, 0] == 0
     assert got[1, 0] == pytest.approx((maps[1, 6, 4] - maps[1].mean()) / maps[1].std())
 
 
-def test_figures_are_computed_in_double_precision():
+def test_metrics_are_computed_in_double_precision():
     maps = torch.rand(SHAPE, generator=torch.Generator().manual_seed(6))
     assert nss(maps, [3], [4]) == nss(maps.double(), [3], [4])
-    # 1025.5 is no number of half precision.
+    # 1025.5 cannot be represented in half precision.
     wide = np.arange(2000.0)[None]
     assert log_likelihood(wide, np.array([1025], np.float16), np.array([0], np.float16)) == log_likelihood(
         wide, [1025], [0]
@@ -212,14 +212,14 @@ def test_figures_are_computed_in_double_precision():
         (lambda: auc_shuffled(np.ones(SHAPE), [1], [1], [], []), "x, other_x"),
     ],
 )
-def test_what_cannot_be_judged_is_refused_by_name(call, argument):
+def test_invalid_shapes_and_points_are_refused_by_name(call, argument):
     with pytest.raises(InputError, match=rf"^{argument}:"):
         call()
 
 
 def test_one_fixation_and_one_other_pixel_are_enough():
     assert auc_judd([[0.0, 1.0]], [1], [0]) == 1
-    # The one threshold lets both pixels through: a straight line from corner to corner.
+    # The only threshold passes both pixels: the curve is a straight line from corner to corner.
     assert auc_judd([[1.0, 0.0]], [1], [0]) == 0.5
     assert auc_shuffled([[0.0, 1.0]], [1], [0], [0], [0]) == 1
     assert auc_shuffled([[0.0, 1.0]], [0], [0], [1], [0]) == 0

@@ -11,24 +11,26 @@ from semfov.metrics.scanpath import multimatch
 package = pytest.importorskip("multimatch_gaze", reason="pip install multimatch-gaze")
 
 
-def fields(path, durations):
+def as_package_array(path, durations):
     rows = [(x, y, t) for (x, y), t in zip(path, durations, strict=True)]
     return np.array(rows, dtype=[("start_x", "<f8"), ("start_y", "<f8"), ("duration", "<f8")])
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_all_five_are_those_of_the_package(seed):
+def test_all_five_similarities_match_the_package(seed):
     generator = np.random.default_rng(seed)
     size = (1680, 1050)
     n, m = generator.integers(3, 12, 2)
     a, b = generator.uniform(0, size, (n, 2)), generator.uniform(0, size, (m, 2))
     s, t = generator.uniform(0.05, 0.9, n), generator.uniform(0.05, 0.9, m)
     ours = multimatch(a, b, size, (s, t))
-    np.testing.assert_allclose(ours, package.docomparison(fields(a, s), fields(b, t), size), atol=1e-12)
+    np.testing.assert_allclose(
+        ours, package.docomparison(as_package_array(a, s), as_package_array(b, t), size), atol=1e-12
+    )
     assert ours.mean == pytest.approx(np.mean(ours[:4]))
 
 
-def test_a_scanpath_is_most_like_itself_and_its_reverse_points_the_other_way():
+def test_a_scanpath_matches_itself_and_its_reverse_has_the_opposite_direction():
     path = np.array([[0.0, 0.0], [100.0, 0.0], [200.0, 0.0]])
     same = multimatch(path, path, (400, 300), ([1, 2, 3], [1, 2, 3]))
     assert same == (1, 1, 1, 1, 1)
@@ -43,14 +45,14 @@ def test_fewer_than_three_fixations_have_no_similarity():
     assert all(map(math.isnan, multimatch([[0, 0], [1, 1]], [[0, 0], [1, 1], [2, 2]], (10, 10))))
 
 
-def test_what_cannot_be_is_refused_by_name():
+def test_invalid_arguments_are_refused_by_name():
     with pytest.raises(InputError, match=r"^theirs:"):
         multimatch([[0, 0]] * 3, [0, 1, 2], (10, 10))
     with pytest.raises(InputError, match=r"^durations:"):
         multimatch([[0, 0]] * 3, [[0, 0]] * 3, (10, 10), ([1, 2, 3], [1, 2]))
 
 
-def test_bytes_are_numbers_and_fixations_without_duration_are_alike():
+def test_byte_coordinates_do_not_overflow_and_zero_durations_are_equal():
     path = np.array([[200, 10], [100, 250], [250, 20], [5, 5]], dtype=np.uint8)
     other = np.array([[10, 200], [255, 0], [30, 30]], dtype=np.uint8)
     times = np.array([200, 3, 250, 9], dtype=np.uint8), np.array([4, 255, 7], dtype=np.uint8)
@@ -59,6 +61,6 @@ def test_bytes_are_numbers_and_fixations_without_duration_are_alike():
     assert multimatch(path, path, (256, 256), ([0] * 4, [0] * 4)).duration == 1
 
 
-def test_the_first_scanpath_is_refused_by_its_name():
+def test_an_invalid_first_scanpath_is_refused_by_name():
     with pytest.raises(InputError, match=r"^ours:"):
         multimatch([0, 1, 2], [[0, 0]] * 3, (10, 10))

@@ -21,7 +21,7 @@ searches = st.lists(st.tuples(st.integers(-1, 12), st.sampled_from("abc")), min_
 
 
 @given(searches, st.integers(0, 10))
-def test_groups_count_alike_however_many_searches_they_have(cases, shifts):
+def test_groups_have_equal_weight_whatever_their_number_of_searches(cases, shifts):
     found, groups = zip(*cases, strict=True)
     expected = []
     for n in range(shifts + 1):
@@ -35,11 +35,11 @@ def test_groups_count_alike_however_many_searches_they_have(cases, shifts):
 
 
 @given(st.lists(st.floats(0, 1), min_size=2, max_size=20))
-def test_area_is_scipys_trapezoid(curve):
+def test_area_equals_the_trapezoid_rule_of_scipy(curve):
     assert performance_area(curve) == pytest.approx(trapezoid(curve, dx=1 / (len(curve) - 1)))
 
 
-def test_a_search_that_finds_at_once_has_area_one_and_a_mismatch_of_nothing():
+def test_finding_targets_at_once_gives_area_one_and_mismatch_zero():
     assert performance_area(np.ones(7)) == pytest.approx(1)
     assert probability_mismatch(np.ones(7), np.ones(7)) == 0
     assert probability_mismatch(torch.zeros(7), torch.ones(7)) == 7
@@ -53,11 +53,11 @@ def test_the_edges_of_a_box_are_on_the_target(kind):
     assert found_at(path, (50, 50, 60, 60)) == -1
 
 
-def test_the_straight_way_has_ratio_one_and_a_detour_less():
+def test_a_straight_scanpath_has_ratio_one_and_a_detour_less():
     box = (90, -10, 110, 10)
     assert scanpath_ratio([[0, 0], [50, 0], [100, 0]], box) == pytest.approx(1)
     assert scanpath_ratio([[0, 0], [0, 100], [100, 100], [100, 0]], box) == pytest.approx(1 / 3)
-    # What comes after the target does not count; nor does a gaze that stops short of its centre gain.
+    # Fixations after the target do not count; stopping short of its centre does not raise the ratio above 1.
     assert scanpath_ratio([[0, 0], [92, 0], [500, 500]], box) == 1
     assert np.isnan(scanpath_ratio([[100, 0], [0, 0]], box))
     assert np.isnan(scanpath_ratio([[0, 0], [1, 1]], box))
@@ -73,7 +73,7 @@ def test_the_straight_way_has_ratio_one_and_a_detour_less():
         (lambda: found_at([1, 2], (0, 0, 1, 1)), "points"),
     ],
 )
-def test_what_cannot_be_is_refused_by_name(call, argument):
+def test_invalid_arguments_are_refused_by_name(call, argument):
     with pytest.raises(InputError, match=f"^{argument}:"):
         call()
 
@@ -86,17 +86,17 @@ def test_all_four_edges_are_on_the_target():
         assert found_at([point], box) == -1
 
 
-def test_no_fixation_is_no_scanpath():
+def test_a_scanpath_without_fixations_is_refused():
     with pytest.raises(InputError, match=r"^points:"):
         found_at(np.zeros((0, 2)), (0, 0, 1, 1))
 
 
-def test_the_way_starts_at_the_first_fixation():
-    """From (10, 20) over (10, 50) to (50, 50): 40 and 30 along the sides of a triangle whose third is 50."""
+def test_the_scanpath_ratio_starts_at_the_first_fixation():
+    """From (10, 20) via (10, 50) to (50, 50): 30 and 40 along two sides of a triangle whose third side is 50."""
     assert scanpath_ratio([[10, 20], [10, 50], [50, 50]], (45, 45, 55, 55)) == pytest.approx(50 / 70)
 
 
-def test_pixels_kept_as_bytes_are_numbers():
+def test_byte_coordinates_do_not_overflow():
     """Their differences and sums do not wrap around at 256."""
     path, box = np.array([[200, 250], [250, 200]], dtype=np.uint8), np.array([240, 190, 254, 210], dtype=np.uint8)
     assert scanpath_ratio(path, box) == pytest.approx(min(1, np.hypot(47, 50) / np.hypot(50, 50)))
@@ -107,11 +107,11 @@ def test_pixels_kept_as_bytes_are_numbers():
     assert probability_mismatch(found, everyone) == 1
 
 
-def test_a_curve_may_be_of_yes_and_no():
+def test_a_curve_may_be_boolean():
     """One search, found by the second of three fixations."""
     assert performance_area(np.array([False, True, True])) == pytest.approx(0.75)
 
 
-def test_seven_fixations_are_summed_unless_told_otherwise():
+def test_tfp_auc_sums_seven_fixations_by_default():
     assert tfp_auc([0, 0], ["cup", "fork"]) == 7
     assert tfp_auc([6, 7], ["cup", "fork"]) == 0.5

@@ -1,4 +1,4 @@
-"""Scanpaths as words, against alignments by dynamic programming as the field's own code writes them."""
+"""Scanpaths as sequences of labels, against the usual alignments by dynamic programming."""
 
 import warnings
 
@@ -12,7 +12,7 @@ from semfov.errors import InputError
 from semfov.metrics.scanpath import cell_labels, cluster_labels, edit_distance, merge_close, sequence_score
 from semfov.metrics.scanpath.sequence import fitted_clusters
 
-words = st.lists(st.sampled_from(["cup", "fork", "oven", "tv"]), min_size=1, max_size=9)
+sequences = st.lists(st.sampled_from(["cup", "fork", "oven", "tv"]), min_size=1, max_size=9)
 
 
 def needleman_wunsch(a, b, gap=0.0):
@@ -31,25 +31,25 @@ def levenshtein(a, b):
     )  # fmt: skip
 
 
-@given(words, words)
-def test_the_sequence_score_is_the_alignment_without_a_price_of_gaps(a, b):
+@given(sequences, sequences)
+def test_the_sequence_score_is_an_alignment_without_gap_penalty(a, b):
     assert sequence_score(a, b) == pytest.approx(needleman_wunsch(a, b))
     assert sequence_score(a, b) == pytest.approx(sequence_score(b, a))
     assert sequence_score(a, a) == 1
 
 
-@given(words.map(lambda word: word[:5]), words.map(lambda word: word[:5]))
-def test_the_edit_distance_is_the_fewest_changes(a, b):
+@given(sequences.map(lambda word: word[:5]), sequences.map(lambda word: word[:5]))
+def test_the_edit_distance_is_the_levenshtein_distance(a, b):
     assert edit_distance(a, b) == levenshtein(a, b)
 
 
-def test_labels_of_arrays_are_letters_too():
+def test_scanpaths_may_be_arrays_of_labels():
     a, b = np.array([3, 7, 7]), np.array([3, 7])
     assert sequence_score(a, b) == pytest.approx(2 / 3)
     assert edit_distance(a, b) == 1
 
 
-def test_cells_are_those_of_the_grid():
+def test_cell_labels_match_the_grid():
     from semfov.belief.grid import Grid
 
     grid = Grid(5, 4, (101, 77))
@@ -57,7 +57,7 @@ def test_cells_are_those_of_the_grid():
     assert cell_labels([[-0.5, -0.5], [100.5, 76.5]], 5, 4, (101, 77)).tolist() == [0, 19]
 
 
-def test_clusters_part_what_lies_apart():
+def test_clusters_separate_distant_fixations():
     generator = np.random.default_rng(0)
     places = np.array([[100.0, 100.0], [400.0, 100.0], [250.0, 400.0]])
     truth = np.repeat([0, 1, 2], 20)
@@ -68,9 +68,9 @@ def test_clusters_part_what_lies_apart():
     assert len(set(cluster_labels(points, points, bandwidth=1000).tolist())) == 1
 
 
-def test_neighbours_merge_while_they_are_closer_than_half_a_window():
+def test_consecutive_fixations_closer_than_half_a_window_are_merged():
     path = [[0.0, 0.0], [4.0, 4.0], [5.0, 5.0], [50.0, 50.0]]
-    # (0,0)+(4,4) is (2,2); the next is 3 away and merges again.
+    # (0, 0) and (4, 4) merge into (2, 2); the next fixation is 3 away and merges, too.
     np.testing.assert_allclose(merge_close(path, (10, 10)), [[3.5, 3.5], [50, 50]])
     np.testing.assert_allclose(merge_close(path, (1, 1)), path)
     # Both differences have to be small.
@@ -85,17 +85,17 @@ def test_neighbours_merge_while_they_are_closer_than_half_a_window():
         (lambda: cell_labels([[100, 0]], 2, 2, (100, 100)), "points"),
     ],
 )
-def test_what_cannot_be_is_refused_by_name(call, argument):
+def test_invalid_arguments_are_refused_by_name(call, argument):
     with pytest.raises(InputError, match=f"^{argument}:"):
         call()
 
 
 def test_cells_of_points_in_half_precision():
-    """1025 is a number of half precision and 1025.5 is none."""
+    """1025 can be represented in half precision and 1025.5 cannot."""
     assert cell_labels(np.array([[1025, 0]], dtype=np.float16), 4096, 1, (4096, 1)).tolist() == [1025]
 
 
-def test_merging_goes_on_to_the_last_fixation_and_starts_anew_after_a_step():
+def test_merging_restarts_after_a_large_step_and_includes_the_last_fixation():
     np.testing.assert_allclose(merge_close([[0.0, 0.0], [50, 50], [52, 50]], (10, 10)), [[0, 0], [51, 50]])
     np.testing.assert_allclose(merge_close([[0.0, 0.0], [2, 0]], (10, 10)), [[1, 0]])
     # Half a window apart is not closer than half a window.
@@ -105,27 +105,27 @@ def test_merging_goes_on_to_the_last_fixation_and_starts_anew_after_a_step():
 
 
 @pytest.mark.parametrize("figure", [sequence_score, edit_distance])
-def test_both_words_are_refused_by_their_names(figure):
+def test_empty_sequences_are_refused_by_name(figure):
     with pytest.raises(InputError, match=r"^ours:"):
         figure([], [1])
     with pytest.raises(InputError, match=r"^theirs:"):
         figure([1], [])
 
 
-def test_letters_of_an_array_are_those_of_a_list():
-    """-1 too, whose hash is not itself."""
+def test_labels_in_an_array_equal_labels_in_a_list():
+    """Also -1, whose hash in Python is not -1."""
     assert sequence_score(np.array([3, -1, 300_000]), [3, -1, 300_000]) == 1
     assert edit_distance([3, -1], np.array([3, -1])) == 0
 
 
-def test_clusters_are_those_of_scikit_learn_from_seeds_in_bins():
+def test_clusters_match_scikit_learn_with_bin_seeding():
     points = np.random.default_rng(0).uniform(0, 500, (40, 2))
     expected = MeanShift(bandwidth=90, bin_seeding=True).fit(points).predict(points)
     assert cluster_labels(points, points, bandwidth=90).tolist() == expected.tolist()
 
 
-def test_of_its_warnings_only_that_about_bins_is_silent(monkeypatch):
-    """Where every fixation has a bin of its own."""
+def test_only_the_warning_about_bins_is_suppressed(monkeypatch):
+    """That warning comes where every fixation has its own bin."""
     points = [[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]]
     assert sorted(cluster_labels(points, points, bandwidth=1).tolist()) == [0, 1, 2]
     monkeypatch.setattr(MeanShift, "fit", lambda self, points: warnings.warn("another", stacklevel=1))
