@@ -235,7 +235,7 @@ boxes = st.tuples(corner, corner, st.floats(1, 40), st.floats(1, 40)).map(
 
 
 @given(boxes, st.lists(boxes, max_size=4))
-def test_overlap_equals_a_loop(box, others):
+def test_overlap_equals_a_loop_over_boxes(box, others):
     def area(b):
         return (b[2] - b[0]) * (b[3] - b[1])
 

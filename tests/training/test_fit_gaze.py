@@ -120,7 +120,7 @@ def test_gradient_equals_finite_differences(posterior):
     for number in range(6):
         if number:
             way = [torch.randn(p.shape, generator=generator, dtype=p.dtype) for p in parameters]
-        else:  # the width of the fovea alone
+        else:  # only the width of the fovea
             way = [torch.zeros_like(p) for p in parameters[:-1]] + [torch.ones_like(parameters[-1])]
         ends = []
         for sign in (1, -1):

@@ -16,7 +16,7 @@ from semfov.training.templates import TemplateSums, objects_of
 from train.fit_templates import main
 
 
-def test_features_are_what_the_last_convolution_reads():
+def test_features_are_the_input_of_the_last_convolution():
     """Read by a hook on that layer."""
     torch.manual_seed(0)
     network = Darknet(yolov3_tiny()).eval()

@@ -35,7 +35,7 @@ def test_the_tail_does_not_change_its_features(tail):
         assert torch.equal(tensor, before[number])
 
 
-def test_gradients_are_those_of_the_network(tail):
+def test_gradients_match_those_of_the_network(tail):
     image, parameters = torch.rand(1, 3, 32, 32), list(tail.named_parameters().values())
     for parameter in parameters:
         parameter.requires_grad_(True)
