@@ -18,7 +18,7 @@ FILES = ("beliefs.md", "beliefs.csv", "beliefs.json")
 
 @pytest.fixture(scope="module")
 def arguments(tmp_path_factory):
-    """Of a run of two scenes on 5 × 4 cells, by untrained models."""
+    """Arguments of a run of two scenes on 5 × 4 cells with untrained models."""
     folder = tmp_path_factory.mktemp("calibration")
     settings = make_eye(DetectorConfig(), SensorConfig()).settings()
     with torch.random.fork_rng():
@@ -42,13 +42,13 @@ def finished(arguments, tmp_path_factory):
 
 
 @pytest.mark.weights
-def test_run_leaves_tables_sums_and_figures(finished):
+def test_run_writes_tables_sums_and_figures(finished):
     for name in ("calibration.md", "config.yaml", "reliability.png", "beliefs.png", *FILES):
         assert (finished / name).stat().st_size > 200
     rows = list(csv.DictReader((finished / "beliefs.csv").read_text().splitlines()))
     whole = [row for row in rows if row["cells"] == "all"]
     assert [(row["belief"], row["looks"]) for row in whole] == [(b, n) for b in BELIEFS for n in ("1", "5", "15")]
-    # Two scenes, a class that is there and one that is not: 4 searches of 20 cells.
+    # Two scenes, each with a present and an absent class: 4 searches of 20 cells.
     assert {row["count"] for row in whole} == {"80"}
     assert {row["count"] for row in rows if (row["looks"], row["cells"]) == ("15", "fixated")} == {"60"}
     text = (finished / "beliefs.md").read_text()
@@ -64,23 +64,23 @@ def test_run_leaves_tables_sums_and_figures(finished):
 
 @pytest.mark.weights
 def test_sums_in_the_file_add_up_to_the_figures(finished):
-    told = json.loads((finished / "beliefs.json").read_text())
-    assert told["edges"] == BinarySums.EDGES.tolist()
+    written = json.loads((finished / "beliefs.json").read_text())
+    assert written["edges"] == BinarySums.EDGES.tolist()
     rows = list(csv.DictReader((finished / "beliefs.csv").read_text().splitlines()))
-    assert len(rows) == len(told["sums"])
-    for row, each in zip(rows, told["sums"], strict=True):
+    assert len(rows) == len(written["sums"])
+    for row, each in zip(rows, written["sums"], strict=True):
         assert (row["belief"], int(row["looks"]), row["cells"]) == (each["belief"], each["looks"], each["cells"])
         sums = BinarySums.from_record(each)
         assert (float(row["nll"]), float(row["ece"])) == pytest.approx((sums.nll, sums.ece), abs=1e-6)
-        parts = [s for s in told["sums"] if (s["belief"], s["looks"]) == (each["belief"], each["looks"])]
+        parts = [s for s in written["sums"] if (s["belief"], s["looks"]) == (each["belief"], each["looks"])]
         if each["cells"] == "all":
             assert sums.count == sum(BinarySums.from_record(s).count for s in parts) / 2
 
 
 @pytest.mark.weights
 @pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
-def test_finished_scenes_are_not_judged_again(finished, arguments, tmp_path, workers):
-    """Workers change no bit; a damaged part is computed again."""
+def test_finished_scenes_are_not_evaluated_again(finished, arguments, tmp_path, workers):
+    """The number of workers does not change the results; a damaged part is computed again."""
     threads = torch.get_num_threads()
     assert main([*arguments, "--workers", workers, "--out", str(tmp_path)]) == 0
     for name in FILES:
@@ -97,7 +97,7 @@ def test_finished_scenes_are_not_judged_again(finished, arguments, tmp_path, wor
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_scores_may_be_judged_alone(arguments, tmp_path, capsys):
+def test_scores_can_be_evaluated_without_beliefs(arguments, tmp_path, capsys):
     assert main([*arguments, "--beliefs", "false", "--workers", "1", "--out", str(tmp_path)]) == 0
     assert "classwise ECE" in capsys.readouterr().out
     assert not list(tmp_path.glob("beliefs*"))

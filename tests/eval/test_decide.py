@@ -24,7 +24,7 @@ SHARP = ["one sharp look, highest score", "sharp look and its quarters, highest 
 
 
 def rows_of(text):
-    """The cells of all tables, their heads and rules left out."""
+    """The cells of all tables without their heads and rules."""
     lines = [line for line in text.splitlines() if line[:1] == "|"]
     tables = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
     return [row for row in tables if not set("".join(row)) <= set("-:") and row[0]]
@@ -32,7 +32,7 @@ def rows_of(text):
 
 @pytest.fixture(scope="module")
 def arguments(tmp_path_factory):
-    """Of a run of two scenes on 4 × 3 cells, by an untrained model."""
+    """Arguments of a run of two scenes on 4 × 3 cells with an untrained model."""
     folder = tmp_path_factory.mktemp("decide")
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -60,7 +60,7 @@ def records_in(out):
 
 
 @pytest.mark.weights
-def test_run_leaves_table_and_records(finished):
+def test_run_writes_table_and_records(finished):
     records = records_in(finished)
     assert len(records) == 20
     for record in records:
@@ -86,7 +86,7 @@ def test_run_leaves_table_and_records(finished):
 @pytest.mark.weights
 @pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
 def test_finished_scenes_are_not_searched_again(finished, arguments, tmp_path, workers):
-    """A run that was stopped goes on; a damaged part is computed again; workers change no bit."""
+    """A damaged part is computed again, and the number of workers does not change the results."""
     out = tmp_path / "out"
     threads = torch.get_num_threads()
     assert main([*arguments, "--workers", workers, "--out", str(out)]) == 0
@@ -106,7 +106,7 @@ def test_finished_scenes_are_not_searched_again(finished, arguments, tmp_path, w
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_no_class_to_search_for_is_told(arguments, tmp_path, capsys):
+def test_scenes_without_a_searchable_class_are_reported(arguments, tmp_path, capsys):
     assert main([*arguments, "--data.max_target_area", "1e-9", "--workers", "1", "--out", str(tmp_path)]) == 1
     assert "no scene has a class that may be searched for; raise data.max_target_area" in capsys.readouterr().err
 
@@ -131,8 +131,8 @@ def record(policy, present, outcome, probability, looks, **more):
     )
 
 
-def test_the_table_by_hand():
-    """Four searches for what is there, two for what is not; the second policy finds nothing."""
+def test_table_matches_hand_calculations():
+    """Four searches for a present target, two for an absent one; the second policy decides nothing."""
     first = [
         record("a", True, "found", 0.9, 3, right_place=True, overlap=0.75, landing=[0.2, 0.8], landing_seen=True),
         record("a", True, "found", 0.8, 5, right_place=False, overlap=0.25, landing=[0.4, 0.9], landing_seen=True),
@@ -141,7 +141,7 @@ def test_the_table_by_hand():
         record("a", False, "found", 0.85, 2, right_place=False),
         record("a", False, "absent", 0.1, 3),
     ]
-    # Half of the four hits of `a` are two: from a score of 0.4 on, which the one of 0.425 that is not there has too.
+    # `a` finds two of four targets. A sharp look does so from a score of 0.4 on, which the absent 0.425 exceeds.
     fits = {
         0: {"right": True, "overlap": 0.5},
         1: {"right": False, "overlap": 0.1},
@@ -156,7 +156,7 @@ def test_the_table_by_hand():
     there = torch.tensor([each["present"] for each in first])
     score = torch.tensor([each["probability"] for each in first])
     hits = [f"{100 * hits_at(score, there, share):.0f}" for share in (0.01, 0.02, 0.05)]
-    # Of 8 pairs, 5 are in order: 0.9 beats both, the others the lower alone.
+    # 5 of 8 pairs are in order: 0.9 is above both absent targets, the other scores are above only the lower one.
     assert area == ["a", "0.625", *hits]
     assert hits == ["25", "25", "25"]
     assert other == ["b", "0.500", "0", "0", "0"]
@@ -169,8 +169,8 @@ def test_the_table_by_hand():
     assert nowhere == ["b", "0", "-", "0", "-", "0", "-"]
 
 
-def test_the_worth_of_searches_by_hand():
-    """Right decisions count 1, undecided ones nothing, and every look its price."""
+def test_utility_of_searches_matches_hand_calculations():
+    """A right decision adds 1, an undecided one 0, and every look costs its price."""
     records = [
         record("target-evidence", True, "found", 0.9, 3, right_place=True),
         record("target-evidence", True, "undecided", 0.6, 5),
@@ -183,6 +183,6 @@ def test_the_worth_of_searches_by_hand():
     assert rows_of(text)[-1] == ["0.1", "0.1500", "0.4000"]
 
 
-def test_shares_and_means_of_nothing():
+def test_shares_and_means_of_nothing_are_shown_as_a_dash():
     assert (percent(1, 8), percent(0, 3), percent(0, 0)) == ("12.5", "0.0", "-")
     assert (mean([1, 2]), mean([0.125], 2), mean([])) == ("1.5", "0.12", "-")

@@ -1,4 +1,4 @@
-"""The demonstration as a user runs it: with a detector that sees coloured squares, and with the agent that comes."""
+"""The demonstration as a user runs it, with a detector of red squares and with the agents of the package."""
 
 import json
 import re
@@ -22,7 +22,7 @@ from semfov.zoom import GlimpseEvidence
 
 
 class Squares(Detector):
-    """Detects the bounding box of what is red; its score is how saturated it is."""
+    """A detector of the bounding box of all red pixels; its score is their saturation."""
 
     def __init__(self) -> None:
         super().__init__("squares", ("red", "wine glass"), (160, 120))
@@ -58,14 +58,14 @@ def run(agent, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(program, "make_agent", lambda config: agent)
     monkeypatch.setattr(program, "known_classes", lambda config: None)
 
-    def call(*arguments):
+    def run_demo(*arguments):
         code = program.main([*map(str, arguments), "--out", str(tmp_path / "out")])
         return code, capsys.readouterr()
 
-    return call
+    return run_demo
 
 
-def test_search(run, photo, tmp_path):
+def test_search_prints_looks_and_writes_pictures(run, photo, tmp_path):
     code, printed = run(photo, "--target", "red", "--start", 47, "--report", tmp_path / "page.html")
     assert code == 0
     assert re.search(r"my photo\.png: “red” found after 1 gaze shift \(probability [01]\.\d\d\)", printed.out)
@@ -80,7 +80,7 @@ def test_search(run, photo, tmp_path):
     assert not (tmp_path / "out" / "belief_bars.png").exists()
 
 
-def test_a_description_is_spread_over_the_classes(run, photo, tmp_path):
+def test_a_description_is_matched_to_classes_by_word_vectors(run, photo, tmp_path):
     vectors = tmp_path / "vectors.txt"
     vectors.write_text("red 1 0.1\nwine 0 1\nglass 0.5 1\ncrimson 1 0\n")
     described = ["--target", "something crimson", "--embeddings", vectors]
@@ -103,7 +103,7 @@ def test_a_description_is_spread_over_the_classes(run, photo, tmp_path):
 
 
 @pytest.mark.parametrize("task", ["search", "exploration"])
-def test_only_what_is_asked_for_is_drawn(run, photo, tmp_path, task):
+def test_only_the_requested_pictures_are_drawn(run, photo, tmp_path, task):
     arguments = (photo, "--target", "red", "--start", 47) if task == "search" else (photo, "--explore", "--shifts", 1)
     code, _ = run(*arguments, "--draw", "[]")
     assert code == 0
@@ -126,15 +126,15 @@ def large(tmp_path):
 
 
 @pytest.fixture
-def zooming(tmp_path, monkeypatch):
-    """Evidence that is shipped for the detector."""
+def shipped_evidence(tmp_path, monkeypatch):
+    """Ship untrained evidence for large pictures for the detector of squares."""
     monkeypatch.setattr(GlimpseEvidence, "shipped", tmp_path / "shipped")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         GlimpseEvidence(2, 8).save(tmp_path / "shipped" / "squares.safetensors")
 
 
-def test_a_large_picture_is_looked_at_in_windows(run, large, zooming, tmp_path):
+def test_a_large_picture_is_looked_at_in_windows(run, large, shipped_evidence, tmp_path):
     code, printed = run(
         large, "--target", "red", "--confirm", 0.7, "--shifts", 5, "--start", 3, "--report", tmp_path / "page.html"
     )
@@ -152,7 +152,7 @@ def test_a_large_picture_is_looked_at_in_windows(run, large, zooming, tmp_path):
     assert "in 1 pass\n" in printed.out
 
 
-def test_small_and_large_pictures_of_a_folder(run, photo, large, zooming, tmp_path):
+def test_a_folder_may_have_small_and_large_pictures(run, photo, large, shipped_evidence, tmp_path):
     photo.rename(large.with_name(photo.name))
     code, _ = run(large.parent, "--target", "red", "--start", 47)
     assert code == 0
@@ -161,7 +161,7 @@ def test_small_and_large_pictures_of_a_folder(run, photo, large, zooming, tmp_pa
 
 
 @pytest.mark.slow
-def test_explore_a_folder(run, photo, tmp_path):
+def test_all_pictures_of_a_folder_are_explored(run, photo, tmp_path):
     Image.open(photo).save(photo.with_name("other.png"))
     code, printed = run(photo.parent, "--explore", "--shifts", 2, "--report", tmp_path / "page.html")
     assert code == 0
@@ -171,7 +171,7 @@ def test_explore_a_folder(run, photo, tmp_path):
         assert (tmp_path / "out" / folder / "map.png").is_file()
 
 
-def test_file_names_are_not_taken_for_markup(run, photo, tmp_path):
+def test_file_names_are_escaped_in_the_report(run, photo, tmp_path):
     photo = photo.rename(photo.with_name("<img src=x onerror=alert(1)>'\"&$x$.png"))
     code, _ = run(photo, "--target", "red", "--start", 47, "--report", tmp_path / "page.html")
     assert code == 0
@@ -181,15 +181,15 @@ def test_file_names_are_not_taken_for_markup(run, photo, tmp_path):
     assert data["episodes"][0]["name"] == photo.name
 
 
-def test_no_target_lists_the_classes(run, photo, tmp_path):
+def test_classes_are_listed_without_a_target(run, photo, tmp_path):
     code, printed = run(photo)
     assert code == 0
     assert "wine glass" in printed.out
     assert not (tmp_path / "out").exists()
 
 
-def test_mistakes_are_told_in_one_line(run, photo, tmp_path):
-    for arguments, told in [
+def test_errors_are_reported_in_one_line(run, photo, tmp_path):
+    for arguments, message in [
         ((photo, "--target", "goblet"), "did you mean 'wine glass'"),
         ((tmp_path / "none.jpg", "--target", "red"), "no such file"),
         ((photo, "--target", "red", "--explore"), "none with --explore"),
@@ -200,42 +200,42 @@ def test_mistakes_are_told_in_one_line(run, photo, tmp_path):
     ]:
         code, printed = run(*arguments)
         assert code == 1
-        assert told in printed.err
+        assert message in printed.err
         assert len(printed.err.strip().splitlines()) == 1
 
 
-def test_a_score_that_no_detection_has_confirms_nothing(run, photo):
+def test_a_threshold_that_no_score_reaches_confirms_nothing(run, photo):
     code, printed = run(photo, "--target", "red", "--start", 47, "--confirm", 1, "--shifts", 3)
     assert code == 0
     assert "“red” undecided after 3 gaze shifts" in printed.out
 
 
-class Sure(observers.Semantic):
-    """An observer by which a search may decide."""
+class WithThresholds(observers.Semantic):
+    """An observer with thresholds, so that a search can decide."""
 
     thresholds = Thresholds(0.99, 0.0)
 
 
-def test_embedded_boxes_decide_nothing(agent, photo):
-    """What is known of a picture is drawn, and kept from the search; thresholds come from the command line."""
-    observer = Sure(3)
-    sure = ActivePerception(
+def test_annotated_boxes_do_not_affect_decisions(agent, photo):
+    """Boxes of a picture are drawn but not used by the search; thresholds come from the command line."""
+    observer = WithThresholds(3)
+    deciding = ActivePerception(
         agent.eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(8, 6)
     ).eval()
     picture = Picture("photo", read_image(photo), boxes=torch.tensor([[0.0, 0.0, 160.0, 120.0]]))
     common = {"target": "red", "start": 47, "shifts": 4}
-    never = program.look_at(sure, picture, program.DemoConfig(**common))
+    never = program.look_at(deciding, picture, program.DemoConfig(**common))
     assert (never.found, never.shifts, never.decision.outcome) == (False, 4, "undecided")
-    soon = program.look_at(sure, picture, program.DemoConfig(**common, confirm=0.0))
+    soon = program.look_at(deciding, picture, program.DemoConfig(**common, confirm=0.0))
     assert soon.decision.outcome == "found"
     assert 1 <= soon.shifts < 4
     assert soon.posterior[-1][soon.cells].max() >= 0.9 * soon.posterior[-1].max()
-    tired = program.look_at(sure, picture, program.DemoConfig(**common, give_up=1.0))
+    tired = program.look_at(deciding, picture, program.DemoConfig(**common, give_up=1.0))
     assert (tired.found, tired.shifts) == (False, 0)
     assert tired.decision.outcome == ("absent" if tired.decision.probability < 0.5 else "undecided")
 
 
-def test_help(capsys):
+def test_help_lists_options(capsys):
     with pytest.raises(SystemExit) as stopped:
         program.main(["--help"])
     assert stopped.value.code == 0
@@ -246,17 +246,17 @@ def test_help(capsys):
     assert "--give_up" in printed
 
 
-def test_stages_of_every_look_are_measured(agent, photo):
+def test_the_stages_of_every_look_are_timed(agent, photo):
     picture = Picture("photo", read_image(photo))
     plain = agent.search(picture.image, "red", start=40)
-    watched = program.look_at(agent, picture, program.DemoConfig(target="red", start=40))
-    assert torch.equal(plain.cells, watched.cells)
-    assert torch.equal(plain.values, watched.values)
-    assert len(watched.seconds) == len(watched) > 1
-    assert all(set(look) == set(STAGES) and min(look.values()) > 0 for look in watched.seconds)
+    shown = program.look_at(agent, picture, program.DemoConfig(target="red", start=40))
+    assert torch.equal(plain.cells, shown.cells)
+    assert torch.equal(plain.values, shown.values)
+    assert len(shown.seconds) == len(shown) > 1
+    assert all(set(look) == set(STAGES) and min(look.values()) > 0 for look in shown.seconds)
 
 
-def test_what_a_look_took_is_printed(agent, photo):
+def test_the_duration_of_every_look_is_printed(agent, photo):
     picture = Picture("photo", read_image(photo))
     scanpath = program.look_at(agent, picture, program.DemoConfig(explore=True, start=40, shifts=2))
     lines = demo_text.told("photo", scanpath).splitlines()
@@ -266,66 +266,66 @@ def test_what_a_look_took_is_printed(agent, photo):
 
 
 @pytest.fixture(scope="module")
-def usual():
-    """The agent that a user gets."""
+def default_agent():
+    """The agent that the demonstration uses by default."""
     return program.make_agent(program.DemoConfig())
 
 
 @pytest.fixture(scope="module")
-def cup(usual) -> Picture:
-    return embedded_picture(usual.classes[1:], "cup", seed=0)
+def cup(default_agent) -> Picture:
+    return embedded_picture(default_agent.classes[1:], "cup", seed=0)
 
 
-def watched_and_plain(agent, picture, **how):
-    """The scanpaths of the demonstration, which measures each stage, and of the agent alone."""
+def demo_and_agent(agent, picture, **how):
+    """Scanpaths of the demonstration, which times each stage, and of the agent alone."""
     config = program.DemoConfig(start=0, shifts=2, until=0, **how)
-    watched = program.look_at(agent, picture, config)
-    assert len(watched.seconds) == len(watched)
-    assert all(set(look) == set(STAGES) for look in watched.seconds)
+    shown = program.look_at(agent, picture, config)
+    assert len(shown.seconds) == len(shown)
+    assert all(set(look) == set(STAGES) for look in shown.seconds)
     with torch.inference_mode():
         if config.target is None:
-            return watched, agent.explore(picture.image, start=0, shifts=2, until=0)
-        return watched, agent.search(picture.image, config.target, start=0, shifts=2)
+            return shown, agent.explore(picture.image, start=0, shifts=2, until=0)
+        return shown, agent.search(picture.image, config.target, start=0, shifts=2)
 
 
 @pytest.fixture(scope="module")
-def means(usual) -> Means:
-    """What every policy can be made from."""
-    name = usual.eye.detector.name
+def means(default_agent) -> Means:
+    """Models with which every policy can be made."""
+    name = default_agent.eye.detector.name
     model, gaze = FovealObservationModel.from_pretrained(name), LearnedGaze.from_pretrained(name)
     everything = MapEvidence.from_pretrained(name)
     return Means(*(each.requires_grad_(False) for each in (model, gaze, everything)))
 
 
 @pytest.fixture(scope="module")
-def fused(usual):
-    """The map of policies that need Dirichlets."""
-    return Semantic(len(usual.classes), tempering=0.5)
+def dirichlet_map(default_agent):
+    """The observer of policies that need Dirichlet distributions."""
+    return Semantic(len(default_agent.classes), tempering=0.5)
 
 
 @pytest.mark.weights
 @pytest.mark.parametrize("name", policy_names("search"))
-def test_every_search_can_be_watched(name, usual, means, fused, cup):
-    """By the map of all classes where a policy needs one, else by the belief that comes with the agent."""
-    mapping = usual.exploring.observer, usual.exploring.policy
-    observer = fused if name in ("predictive", "neighbourhood", "learned") else usual.searching.observer
-    agent = ActivePerception(usual.eye, (observer, named_policy(name, "search", means)), mapping).eval()
-    watched, plain = watched_and_plain(agent, cup, target="cup")
-    assert torch.equal(watched.cells, plain.cells)
-    assert torch.equal(watched.values, plain.values)
+def test_the_demonstration_searches_as_the_agent_does_with_every_policy(name, default_agent, means, dirichlet_map, cup):
+    """With a map of all classes for policies that need one, otherwise with the belief of the agent."""
+    mapping = default_agent.exploring.observer, default_agent.exploring.policy
+    observer = dirichlet_map if name in ("predictive", "neighbourhood", "learned") else default_agent.searching.observer
+    agent = ActivePerception(default_agent.eye, (observer, named_policy(name, "search", means)), mapping).eval()
+    shown, plain = demo_and_agent(agent, cup, target="cup")
+    assert torch.equal(shown.cells, plain.cells)
+    assert torch.equal(shown.values, plain.values)
 
 
 @pytest.mark.weights
 @pytest.mark.parametrize("name", policy_names("exploration"))
-def test_every_exploration_can_be_watched(name, usual, means, fused, cup):
-    seeking = usual.searching.observer, usual.searching.policy
-    observer = usual.exploring.observer if name in ("random", "closer-look", "expected-gain") else fused
+def test_the_demonstration_explores_as_the_agent_does_with_every_policy(name, default_agent, means, dirichlet_map, cup):
+    seeking = default_agent.searching.observer, default_agent.searching.policy
+    observer = default_agent.exploring.observer if name in ("random", "closer-look", "expected-gain") else dirichlet_map
     mapping = observer, named_policy(name, "exploration", means)
-    agent = ActivePerception(usual.eye, seeking, mapping).eval()
-    watched, plain = watched_and_plain(agent, cup, explore=True)
-    assert torch.equal(watched.cells, plain.cells)
-    assert torch.equal(watched.values, plain.values)
-    assert watched.shifts == 2
+    agent = ActivePerception(default_agent.eye, seeking, mapping).eval()
+    shown, plain = demo_and_agent(agent, cup, explore=True)
+    assert torch.equal(shown.cells, plain.cells)
+    assert torch.equal(shown.values, plain.values)
+    assert shown.shifts == 2
 
 
 @pytest.mark.weights
@@ -342,7 +342,7 @@ def test_every_exploration_can_be_watched(name, usual, means, fused, cup):
     ],
     ids=" ".join,
 )
-def test_agents_that_come_with_it(agent, task, cup, tmp_path, capsys):
+def test_agents_of_the_package_run_in_the_demonstration(agent, task, cup, tmp_path, capsys):
     photo = tmp_path / "photo.png"
     pixels = (cup.image * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
     Image.fromarray(pixels).save(photo)
@@ -358,7 +358,7 @@ def test_agents_that_come_with_it(agent, task, cup, tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_sensors_by_name(usual):
+def test_agents_have_their_own_sensor_unless_one_is_named(default_agent):
     """The recommended agent's sensor is `gradual`, the published agent's the wide fovea."""
     expected = {
         ("recommended", None): (100, 2),

@@ -51,7 +51,7 @@ def small(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def finished(small):
-    """The small run, done once."""
+    """The small run, finished."""
     threads = torch.get_num_threads()
     explore(small)
     torch.set_num_threads(threads)
@@ -62,8 +62,8 @@ def records_of(config: ExploreConfig) -> list[bytes]:
     return [(config.out / name).read_bytes() for name in RECORDS]
 
 
-def right_by_hand(run: ExploreRun, record: dict) -> tuple[list[int], list[int], list[int], int]:
-    """Right answers after each shift with an observer of its own and loops over cells and objects."""
+def count_right_by_loop(run: ExploreRun, record: dict) -> tuple[list[int], list[int], list[int], int]:
+    """Right answers after each gaze shift, with a new observer and loops over cells and objects."""
     index = run.scenes.ids.index(record["scene"])
     scene, grid, looks = run.scenes[index], run.grid(index), run.detections(index)
     observation = run.models.observation if record["policy"].endswith("calibrated") else None
@@ -86,7 +86,7 @@ def right_by_hand(run: ExploreRun, record: dict) -> tuple[list[int], list[int], 
     return *kinds, sum(map(bool, objects))
 
 
-def test_run_leaves_everything(finished):
+def test_run_writes_records_tables_and_figures(finished):
     run = ExploreRun(finished)
     records = [json.loads(line) for line in (finished.out / "episodes.jsonl").read_text().splitlines()]
     references = [record for record in records if record["policy"] in (FUSED, PAINTED)]
@@ -101,7 +101,7 @@ def test_run_leaves_everything(finished):
         assert record["start"] == record["cells"][0]
         assert len(set(record["cells"])) == 5
         counts = (record[name] for name in ("right", "right_without_background", "right_everywhere"))
-        assert (*counts, record["object_cells"]) == right_by_hand(run, record)
+        assert (*counts, record["object_cells"]) == count_right_by_loop(run, record)
     with (finished.out / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 3 * (3 + 2) * 5
@@ -135,13 +135,13 @@ def test_run_leaves_everything(finished):
     [{"store": False}, {"protocol": ProtocolConfig(starts=2, shifts=4, batch=1)}],
     ids=["without the stores", "small batches"],
 )
-def test_same_bits(finished, change, tmp_path):
+def test_records_do_not_depend_on_the_stores_or_the_batch_size(finished, change, tmp_path):
     again = replace(finished, out=tmp_path / "out", **change)
     explore(again)
     assert records_of(again) == records_of(finished)
 
 
-def test_saliency_is_that_of_what_the_sensor_shows(finished):
+def test_saliency_is_computed_from_the_foveated_image(finished):
     run = ExploreRun(finished)
     image, grid = run.scenes[0].image, run.grid(0)
     stored = run.saliency("vocus2", 0)
@@ -161,7 +161,7 @@ def test_saliency_is_that_of_what_the_sensor_shows(finished):
 
 
 def test_saliency_does_not_depend_on_the_detector(finished, tmp_path):
-    """Whatever size it works at and keeps of what it sees: the sensor shows the same."""
+    """The input size and the threshold of the detector do not change the foveated image."""
     alone = replace(finished, policies=("vocus2-raw",))
     small = replace(alone, detector=DetectorConfig(input_size=224, threshold=0.2), cache=tmp_path, out=tmp_path)
     run, other = ExploreRun(alone), ExploreRun(small)
@@ -170,7 +170,7 @@ def test_saliency_does_not_depend_on_the_detector(finished, tmp_path):
     assert torch.equal(other.saliency("vocus2", 0), run.saliency("vocus2", 0))
 
 
-def test_saliency_store_knows_what_it_depends_on(finished):
+def test_saliency_is_stored_by_all_settings_that_affect_it(finished):
     run, folder = ExploreRun(finished), finished.cache / "saliency"
     settings = run.eye.settings()["sensor"]
 
@@ -206,7 +206,7 @@ def test_killed_run_resumes_with_the_same_result(finished, tmp_path, kill_when):
     assert records_of(replace(finished, out=tmp_path / "out")) == records_of(finished)
 
 
-def test_errors_are_one_line(capsys, tmp_path):
+def test_wrong_policies_are_reported_in_one_line(capsys, tmp_path):
     assert main(["--policies", '["kl-row"]', "--out", str(tmp_path)]) == 1
     assert "did you mean 'kl-raw'" in capsys.readouterr().err
     assert main(["--policies", '["random"]', "--out", str(tmp_path)]) == 1
@@ -223,7 +223,7 @@ def test_help_names_every_preset(capsys):
     explained = "".join(re.search(r"--policies \[ITEM.*?\(type:", capsys.readouterr().out, re.DOTALL)[0].split())
     for name, preset in presets("exploration").items():
         if preset.policy in POLICIES and not POLICIES[preset.policy].__module__.startswith("semfov."):
-            continue  # registered by another test
+            continue  # a policy registered by another test
         assert f"`{name.removesuffix('-raw').removesuffix('-calibrated')}`" in explained, name
     for ending in ("-raw", "-calibrated"):
         assert f"`{ending}`" in explained

@@ -1,4 +1,4 @@
-"""What annotations call their images never decides where a run writes."""
+"""The image ids of annotations do not affect where a run writes."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ def threads():
     torch.set_num_threads(before)
 
 
-def test_a_run_writes_below_out_whatever_ids_are(tmp_path, threads):
+def test_a_run_writes_only_into_its_folders_whatever_the_image_ids_are(tmp_path, threads):
     from PIL import Image
 
     embedded = EmbeddedScenes(("person", "cat", "cup", "motorcycle"), count=len(IDS))
@@ -47,13 +47,13 @@ def test_a_run_writes_below_out_whatever_ids_are(tmp_path, threads):
     written = {path for path in tmp_path.rglob("*") if path.is_file()} - before
     assert all(path.is_relative_to(out) or path.is_relative_to(tmp_path / "cache") for path in written)
     pictures = [path for path in written if path.name.startswith("scanpath_")]
-    assert len(pictures) == len(IDS), "no picture takes another's place"
+    assert len(pictures) == len(IDS), "every picture has its own file"
     assert {path.parent for path in pictures} == {out}
     assert not Path("/x/evil").exists()
 
 
 @pytest.mark.parametrize("name", ["../x", "/x", "a/b", "", "x\0"])
-def test_a_model_is_not_written_elsewhere(tmp_path, name, capsys):
+def test_a_model_name_that_leaves_its_folder_is_refused(tmp_path, name, capsys):
     from train.fit_context import main as fit
 
     assert fit(["--name", name, "--out", str(tmp_path / "out")]) == 1

@@ -22,7 +22,7 @@ PROTOCOL = ["--protocol.starts", "2", "--protocol.shifts", "6", "--workers", "1"
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A comparison of YOLOv3-tiny with itself, less sure of everything; two scenes, 5 × 4 cells."""
+    """A comparison of YOLOv3-tiny with a copy of lower scores, on two scenes of 5 × 4 cells."""
     out = tmp_path_factory.mktemp("compared")
     detector = load_yolo("yolov3-tiny", runtime="torch")
     for number in (15, 22):
@@ -42,7 +42,7 @@ def finished(tmp_path_factory):
 
 
 def tables(out):
-    """Cells of every table by the first cell of its rows."""
+    """The rows of every table, by their first cell."""
     found = []
     for part in (out / "compared" / "foveal_training.md").read_text().split("\n\n"):
         rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in part.splitlines() if line[:1] == "|"]
@@ -54,7 +54,7 @@ def tables(out):
 ARMS = ["as shipped, raw", "calibrated", "fine-tuned, raw", "fine-tuned and calibrated"]
 
 
-def test_six_tables_of_four_arms(finished):
+def test_the_report_has_six_tables_of_four_arms(finished):
     effort, recall, calibration, surprise, performance, differences = tables(finished[0])
     for found in (effort, recall, calibration, surprise):
         assert [name for name in found if name in ARMS] == ARMS
@@ -65,13 +65,13 @@ def test_six_tables_of_four_arms(finished):
     assert sum(counts[:-1]) == counts[-1] > 10
 
 
-def test_a_detector_that_is_less_sure_keeps_fewer_boxes(finished):
+def test_a_less_confident_detector_keeps_fewer_boxes(finished):
     detections = {name: int(row[0]) for name, row in tables(finished[0])[2].items() if name in ARMS}
     assert detections["fine-tuned, raw"] < detections["as shipped, raw"] == detections["calibrated"]
 
 
-def test_calibration_is_that_of_eval_calibration(finished, tmp_path):
-    """The same photographs, fixations and models, by the command that judges scores alone."""
+def test_calibration_matches_eval_calibration(finished, tmp_path):
+    """The same photographs, fixations and models, with the command that evaluates only scores."""
     out, _ = finished
     arguments = [
         "--data.limit", "2", "--data.min_instances", "1", "--data.max_target_area", "0.5", "--fixations", "2",
@@ -87,7 +87,7 @@ def test_calibration_is_that_of_eval_calibration(finished, tmp_path):
         assert [count, *figures] == row[2:]
 
 
-def test_searches_are_those_of_eval_search(finished, tmp_path):
+def test_searches_match_eval_search(finished, tmp_path):
     out, _ = finished
     for detector, names in (("shipped", ARMS[:2]), ("tuned", ARMS[2:])):
         arguments = [
@@ -102,14 +102,14 @@ def test_searches_are_those_of_eval_search(finished, tmp_path):
         for name, policy in zip(names, ("non-predictive-raw", "non-predictive-calibrated"), strict=True):
             found = {}
             for row in rows:
-                told = dict(zip(columns, row.split(","), strict=True))
-                if (told["average"], told["policy"]) == ("all targets", policy):
-                    found[int(told["shifts"])] = 100 * float(told["performance"])
+                cells = dict(zip(columns, row.split(","), strict=True))
+                if (cells["average"], cells["policy"]) == ("all targets", policy):
+                    found[int(cells["shifts"])] = 100 * float(cells["performance"])
             ours = [float(cell.split(" ")[0]) for cell in tables(out)[4][name]]
             assert ours == pytest.approx([found[1], found[5]], abs=0.06)
 
 
-def test_the_same_command_again_does_nothing_twice(finished):
+def test_repeating_the_command_computes_nothing_again(finished):
     out, arguments = finished
     before = {path: path.stat().st_mtime_ns for path in (out / "compared").rglob("*.safetensors")}
     text = (out / "compared" / "foveal_training.md").read_text()
@@ -118,7 +118,7 @@ def test_the_same_command_again_does_nothing_twice(finished):
     assert (out / "compared" / "foveal_training.md").read_text() == text
 
 
-def test_fewer_photographs_may_be_searched_than_seen(finished):
+def test_searches_may_use_fewer_photographs_than_the_other_measures(finished):
     out, arguments = finished
     assert main([*arguments, "--searched", "1"]) == 0
     text = (out / "compared" / "foveal_training.md").read_text()
@@ -126,11 +126,11 @@ def test_fewer_photographs_may_be_searched_than_seen(finished):
     assert "longer side (2 photographs" in text
 
 
-def test_curves_are_by_photograph():
+def test_there_is_one_curve_for_each_photograph():
     curves = curves_of({"b": [1, -1], "a": [0, 2, 2]}, 2)
     np.testing.assert_allclose(curves, [cumulative_performance(np.array(f), 2) for f in ([0, 2, 2], [1, -1])])
 
 
-def test_a_detector_that_is_not_there(tmp_path, capsys):
+def test_a_missing_detector_names_the_command_that_makes_it(tmp_path, capsys):
     assert main(["--tuned", str(tmp_path / "none.onnx"), "--out", str(tmp_path)]) == 1
     assert "make it with python -m train.finetune_foveal" in capsys.readouterr().err

@@ -70,7 +70,7 @@ def finished(pictures):
 
 
 @pytest.mark.weights
-def test_every_row_is_there_and_floors_are_what_they_must_be(finished):
+def test_every_row_is_present_and_random_rows_are_at_chance(finished):
     table = {(row["row"], row["group"], row["figure"]): float(row["mean"]) for row in rows(finished / "summary.csv")}
     names = {"kl-calibrated", "objects-raw", "landing", "vocus2", "itti-koch", "landing + vocus2", "other people"}
     for name in names:
@@ -84,7 +84,7 @@ def test_every_row_is_there_and_floors_are_what_they_must_be(finished):
 
 
 @pytest.mark.weights
-def test_more_terms_fit_the_fitted_half_no_worse(finished):
+def test_more_terms_do_not_fit_the_fitted_half_worse(finished):
     bits = {(row["row"], row["group"]): float(row["bits of the fitted half"]) for row in rows(finished / "weights.csv")}
     for name in ("kl-calibrated", "landing", "vocus2"):
         assert bits[name, "with habits"] >= bits["nearby", "with habits"] - 1e-3
@@ -92,9 +92,9 @@ def test_more_terms_fit_the_fitted_half_no_worse(finished):
 
 
 @pytest.mark.weights
-def test_figures_are_of_the_half_that_was_not_fitted(finished):
-    told = {row["picture"] for row in rows(finished / "pictures.csv")}
-    assert told == {"1.png", "3.png"}
+def test_figures_come_from_the_held_out_half(finished):
+    written = {row["picture"] for row in rows(finished / "pictures.csv")}
+    assert written == {"1.png", "3.png"}
     assert len({row["row"] for row in rows(finished / "sequences.csv")}) == 6
     summary = (finished / "summary.md").read_text()
     assert "2 pictures" in summary
@@ -108,7 +108,7 @@ TABLES = ("summary.csv", "pictures.csv", "weights.csv", "sequences.csv")
 
 
 @pytest.mark.weights
-def test_a_second_run_goes_on(pictures, finished):
+def test_a_second_run_reuses_finished_parts(pictures, finished):
     before, threads = [(finished / name).read_bytes() for name in TABLES], torch.get_num_threads()
     part = next(finished.rglob("parts/**/*.json"))
     kept = part.stat().st_mtime_ns
@@ -120,7 +120,7 @@ def test_a_second_run_goes_on(pictures, finished):
 
 @pytest.mark.long
 @pytest.mark.weights
-def test_the_store_makes_no_difference(pictures, finished):
+def test_results_do_not_depend_on_the_store(pictures, finished):
     threads = torch.get_num_threads()
     assert main(viewing(pictures, "again", "--store", "false")) == 0
     torch.set_num_threads(threads)
@@ -130,7 +130,7 @@ def test_the_store_makes_no_difference(pictures, finished):
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_searches_of_people_models_floors_and_policies(pictures):
+def test_searches_of_people_models_random_draws_and_policies_are_compared(pictures):
     out, threads = pictures / "search", torch.get_num_threads()
     code = main(
         [
@@ -146,23 +146,23 @@ def test_searches_of_people_models_floors_and_policies(pictures):
     table = rows(out / "summary.csv")
     titles = list(dict.fromkeys(row["table"] for row in table))
     assert titles == ["all 4 pictures", "the 4 available pictures"]
-    there = {row["row"] for row in table if row["table"] == titles[1]}
-    assert there == {"people", "model", "random draws", "centre draws", "random", "non-predictive-raw"}
+    names = {row["row"] for row in table if row["table"] == titles[1]}
+    assert names == {"people", "model", "random draws", "centre draws", "random", "non-predictive-raw"}
     paths = read_table(out / "scanpaths" / "non-predictive-raw.csv")
     assert len(paths) == 4
-    # All start in the cell that the screen's first fixation is in, and end on the target or after nine shifts.
+    # All start in the cell of the screen's first fixation, and end at the target or after nine gaze shifts.
     assert {tuple(path.points[0].tolist()) for path in paths} == {(179.5, 89.5)}
     assert all(path.found or len(path) == 10 for path in paths)
     curve = [float(row["found"]) for row in rows(out / "curves.csv") if row["row"] == "people"][:10]
     assert curve == sorted(curve)
 
 
-def test_jobs_are_named(capsys):
+def test_an_unknown_job_is_refused_with_the_names_of_jobs(capsys):
     assert main(["dance"]) == 2
     assert "search or viewing" in capsys.readouterr().err
     assert main(["--help"]) == 0
 
 
-def test_missing_people_are_named(tmp_path, capsys):
+def test_a_missing_file_of_people_is_named(tmp_path, capsys):
     assert main(["search", "--people", str(tmp_path / "nobody.json"), "--out", str(tmp_path / "out")]) == 1
     assert "nobody.json" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The demonstration on videos: belief follows a photograph that moves through the view, and a video tells of it."""
+"""The demonstration on videos: the belief follows a moving photograph, and a video of it is written."""
 
 import re
 
@@ -38,8 +38,8 @@ def read(path):
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_a_photograph_that_pans(tmp_path, capsys):
-    """The target is found, is followed to the edge, and is forgotten when it has left the view."""
+def test_a_target_is_followed_in_a_panning_video_until_it_leaves_the_view(tmp_path, capsys):
+    """The target is found, is followed to the edge, and is absent once it has left the view."""
     scene = embedded_picture(ActivePerception.recommended().classes[1:], "motorcycle", 0)
     places = [89] * 8 + [89 + round(22.5 * shift) for shift in range(1, 11)] + [314] * 12
     path = write(tmp_path / "pan.avi", [scene.image[..., x : x + 320] for x in places])
@@ -51,7 +51,7 @@ def test_a_photograph_that_pans(tmp_path, capsys):
     left, top, right, bottom = scene.boxes[0].tolist()
     for x, line in zip(places[:14], lines, strict=False):
         column, row = map(int, re.search(r"most likely at \((\d), (\d)\)", line).groups())
-        # Its cell overlaps the annotated box, moved with the view.
+        # The most likely cell overlaps the annotated box, which moves with the view.
         assert left - x < 32 * (column + 1)
         assert right - x > 32 * column
         assert top < 48 * (row + 1)
@@ -65,7 +65,7 @@ def test_a_photograph_that_pans(tmp_path, capsys):
 
 
 class Red(Detector):
-    """Detects the bounding box of what is red."""
+    """A detector of the bounding box of all red pixels."""
 
     def __init__(self):
         super().__init__("red", ("red", "green"), (160, 120))
@@ -88,11 +88,11 @@ def run(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(program, "make_agent", lambda config: agent)
     monkeypatch.setattr(program, "known_classes", lambda config: None)
 
-    def call(*arguments):
+    def run_demo(*arguments):
         code = program.main([*map(str, arguments), "--out", str(tmp_path / "out")])
         return code, capsys.readouterr()
 
-    return call
+    return run_demo
 
 
 def frames(count=6):
@@ -102,7 +102,7 @@ def frames(count=6):
     return list(pictures)
 
 
-def test_a_video_and_what_does_not_go_with_it(run, tmp_path):
+def test_a_video_is_searched_and_options_for_photographs_are_refused(run, tmp_path):
     path = write(tmp_path / "red.avi", frames())
     code, printed = run(path, "--target", "red", "--frames", 4, "--start", 47)
     assert code == 0
@@ -121,8 +121,8 @@ def test_a_video_and_what_does_not_go_with_it(run, tmp_path):
         assert f"{option[2:]}: expected none for a video or a camera" in printed.err
 
 
-def test_a_camera_until_it_is_stopped(run, tmp_path, monkeypatch):
-    """Ctrl-C ends it in good order: what was seen until then is written."""
+def test_a_camera_runs_until_it_is_stopped(run, tmp_path, monkeypatch):
+    """Ctrl-C ends the run normally, and the frames until then are written."""
 
     def endless():
         yield from (Picture(f"frame {number}", frame) for number, frame in enumerate(frames(3)))
@@ -151,8 +151,8 @@ def moment(**changes):
     return Moment(**{**made, **changes})
 
 
-def test_what_is_drawn_into_a_frame():
-    """Belief colours its own cell, the gaze is where it is, and the box of the decision is around what was found."""
+def test_belief_gaze_next_cell_and_decision_are_drawn_into_a_frame():
+    """The belief colours the likely cell, the gaze is marked, and a box surrounds the found object."""
     grey = torch.full((3, 200, 400), 0.5)
     grid = Grid(4, 2, (400, 200))
     plain = moment(grid=grid, fixation=grid.centres[0])
@@ -177,7 +177,7 @@ def test_what_is_drawn_into_a_frame():
     assert large.shape == (320, 640, 3)
 
 
-def test_videos_are_written_whole_or_not_at_all(tmp_path):
+def test_videos_are_written_completely_or_not_at_all(tmp_path):
     path = tmp_path / "film.avi"
     generator = np.random.default_rng(0)
     shown = [np.full((48, 64, 3), shade, np.uint8) for shade in generator.integers(0, 256, 5)]

@@ -1,4 +1,4 @@
-"""The results page: tables come from what runs wrote, and differences are paired."""
+"""The results page: tables from the files of runs, and paired differences."""
 
 import json
 from pathlib import Path
@@ -27,7 +27,7 @@ def write_records(folder, records):
 
 
 def searches(policies, found_at):
-    """Searches of six scenes, four starts each; `found_at` tells for (policy, scene, repetition)."""
+    """Searches of six scenes, four starts each; `found_at` is a function of policy, scene and repetition."""
     return [
         {
             "policy": policy,
@@ -68,7 +68,7 @@ def searched(runs):
     return runs, records
 
 
-def test_every_policy_of_the_page_is_known(runs):
+def test_the_policies_of_each_run_have_different_labels(runs):
     for run in runs.values():
         if not isinstance(run, SearchConfig | ExploreConfig):
             continue
@@ -77,7 +77,7 @@ def test_every_policy_of_the_page_is_known(runs):
         assert len(set(labels)) == len(labels) > 0
 
 
-def test_settings_are_studied_on_the_fit_set_and_results_on_the_named_photographs(tmp_path):
+def test_studies_use_the_fit_set_and_results_use_the_listed_photographs(tmp_path):
     config = ResultsConfig(root=tmp_path / "val", annotations=tmp_path / "v.json", fit_root=tmp_path / "fit")
     for name, run in experiments(config).items():
         study = " " in name
@@ -97,7 +97,7 @@ def test_published_experiments_have_the_published_sensor_and_model(runs):
                 assert run.saliency.view == "foveated"
 
 
-def test_lines_become_tables(searched):
+def test_lines_of_the_template_are_replaced_by_tables(searched):
     runs, _ = searched
     text = fill("before\n@@ beyond-search-tiny second\nafter\n", runs)
     assert text == "before\n**two** (2)\n\n| b |\nafter\n"
@@ -112,8 +112,8 @@ def test_lines_become_tables(searched):
         fill("@@ beyond-search-tiny third\n", runs)
 
 
-def test_tables_of_decisions_and_beliefs(runs):
-    """Tables by their number in the file; the prose around them is the page's own."""
+def test_tables_of_decisions_and_beliefs_are_taken_from_their_files(runs):
+    """Tables are chosen by their number in the file, without the prose around them."""
     assert fill("@@ decide-tiny presence\n", runs) == "*Not run yet.*\n"
     for name, file in (("decide-tiny", "decisions.md"), ("beliefs-nano", "beliefs.md")):
         runs[name].out.mkdir(parents=True)
@@ -125,7 +125,7 @@ def test_tables_of_decisions_and_beliefs(runs):
         assert fill(f"@@ beliefs-nano {kind}\n", runs) == f"| {number} |\n|---|\n| x |\n"
 
 
-def test_decisions_and_beliefs_are_measured_on_all_photographs_of_the_page(runs):
+def test_decisions_and_beliefs_use_the_same_detector_and_sensor(runs):
     for name, detector in (("nano", "yolox-nano"), ("tiny", "yolov3-tiny")):
         decide, beliefs = runs[f"decide-{name}"], runs[f"beliefs-{name}"]
         assert decide.detector.name == beliefs.detector.name == detector
@@ -133,7 +133,7 @@ def test_decisions_and_beliefs_are_measured_on_all_photographs_of_the_page(runs)
         assert (decide.data.max_target_area, beliefs.target_area) == (0.2, 0.2)
 
 
-def test_every_line_of_the_template_is_known(runs):
+def test_every_line_of_the_template_can_be_filled(runs):
     for line in (ROOT / "docs/results.template.md").read_text(encoding="utf-8").splitlines():
         if line.startswith("@@ "):
             name, _, kind = line.removeprefix("@@ ").partition(" ")
@@ -155,18 +155,18 @@ def test_differences_are_paired_over_images(searched):
     assert expected in rows[2]
 
 
-def test_behind_is_behind_by_two_standard_errors():
+def test_a_policy_is_behind_by_more_than_two_standard_errors():
     mean, error = np.array([0.0, -0.1, -0.3, -0.2, 0.4]), np.array([0.0, 0.06, 0.1, 0.1, 0.1])
     assert behind(mean, error) == [2]
 
 
-def test_a_table_of_the_paper_counts_the_commonest_target_and_both_errors(runs):
+def test_tables_of_the_paper_use_the_commonest_target_and_both_errors(runs):
     found = {("random", 0): 3, ("random", 2): 20, ("random", 4): -1}
     records = searches(tuple(paper.TABLE_II), lambda policy, scene, _: found.get((policy, scene), 1))
     write_records(runs["search-published-nano"].out, records)
     rows = [cells_of(row) for row in fill("@@ table-2\n", runs).splitlines()]
     assert rows[0][:4] == ["policy", "", "paper", "YOLOX-nano, wide"]
-    # One of the three even scenes within 5 and 15 shifts, two within 30.
+    # The target of one of the three even scenes is found within 5 and 15 gaze shifts, of two within 30.
     assert rows[2][:4] == ["random", "CP@5", "45.20", "33.3 ± 33.3"]
     assert rows[4][1:4] == ["CP@30", "97.13", "66.7 ± 33.3"]
     assert rows[5][1:4] == ["max. SEM", "1.059", "0.000"]
@@ -179,12 +179,12 @@ def test_findings_have_verdicts(runs):
     answer = gain("random", "vocus2", (5, 15, 30), "search")(folder)
     assert answer == "+0.0 / +100.0 / +0.0: holds in part"
     assert gain("random", "vocus2", (5, 30), "search", expected=0)(folder).endswith("holds")
-    told = overtaken("random", "vocus2", "search")(folder)
-    assert told == "ahead at 9 to 20, behind at no shift: leads, not overtaken"
+    verdict = overtaken("random", "vocus2", "search")(folder)
+    assert verdict == "ahead at 9 to 20, behind at no shift: leads, not overtaken"
     assert len({finding.text for finding in FINDINGS}) == len(FINDINGS)
 
 
-def test_agreement_compares_the_same_episodes(tmp_path):
+def test_agreement_compares_policies_episode_by_episode(tmp_path):
     records = [
         {
             "policy": f"{policy}-{mode}",
@@ -201,7 +201,7 @@ def test_agreement_compares_the_same_episodes(tmp_path):
     assert cells_of(rows[3]) == ["calibrated", "100.0 %", "100.0 %"]
 
 
-def test_first_fixations_are_central_or_at_the_border(tmp_path):
+def test_first_fixations_are_counted_in_the_centre_and_at_the_border(tmp_path):
     middle, border = central(np.arange(100))
     assert middle.nonzero()[0].tolist() == [10 * row + column for row in (3, 4, 5, 6) for column in (3, 4, 5, 6)]
     assert border.sum() == 36

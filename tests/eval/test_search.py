@@ -44,7 +44,7 @@ def small(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def finished(small):
-    """The small run, done once."""
+    """The small run, finished."""
     threads = torch.get_num_threads()
     search(small)
     torch.set_num_threads(threads)
@@ -55,7 +55,7 @@ def records_of(config: SearchConfig) -> list[bytes]:
     return [(config.out / name).read_bytes() for name in RECORDS]
 
 
-def test_run_leaves_everything(finished):
+def test_run_writes_records_tables_and_figures(finished):
     records = [json.loads(line) for line in (finished.out / "episodes.jsonl").read_text().splitlines()]
     policies = [label(choice, "search") for choice in finished.policies]
     assert policies[2] == "non-predictive-raw, tempering 0.25"
@@ -94,14 +94,14 @@ def test_run_leaves_everything(finished):
     [{"store": False}, {"workers": 2}, {"protocol": ProtocolConfig(starts=3, shifts=6, batch=2)}],
     ids=["without the store", "two workers", "small batches"],
 )
-def test_same_bits(finished, change, tmp_path):
+def test_records_do_not_depend_on_the_store_the_workers_or_the_batch_size(finished, change, tmp_path):
     again = replace(finished, out=tmp_path / "out", cache=tmp_path / "cache", **change)
     search(again)
     assert records_of(again) == records_of(finished)
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_store_equals_looking_and_refuses_damage(finished):
+def test_stored_looks_equal_new_looks_and_damaged_files_are_refused(finished):
     run = SearchRun(finished)
     digest = run.scenes.digest(0)
     stored = run.store.load(digest)
@@ -128,13 +128,13 @@ def test_damaged_parts_are_computed_again(finished, tmp_path):
     assert records_of(again) == records_of(finished)
 
 
-def given(policy: PolicyConfig) -> dict:
-    """The mapping that a user writes for a policy."""
+def as_mapping(policy: PolicyConfig) -> dict:
+    """A policy as the mapping that a user would write."""
     return {name: value for name, value in asdict(policy).items() if value is not None}
 
 
 def command(config: SearchConfig, out: Path, cache: Path, *more: str) -> list[str]:
-    policies = [choice if isinstance(choice, str) else given(choice) for choice in config.policies]
+    policies = [choice if isinstance(choice, str) else as_mapping(choice) for choice in config.policies]
     return [
         sys.executable, "-m", "eval.search", "--data.limit", "2", "--belief.columns", "4", "--belief.rows", "3",
         "--protocol.starts", "3", "--protocol.shifts", "6", "--policies", json.dumps(policies),
@@ -166,7 +166,7 @@ def test_torchrun_ranks_share_the_work(finished, tmp_path):
     assert records_of(replace(finished, out=tmp_path / "out")) == records_of(finished)
 
 
-def test_errors_are_one_line(capsys, tmp_path):
+def test_wrong_policies_and_detectors_are_reported_in_one_line(capsys, tmp_path):
     assert main(["--policies", '["predicitve-raw"]', "--out", str(tmp_path)]) == 1
     assert "did you mean 'predictive-raw'" in capsys.readouterr().err
     assert main(["--detector.name", "yolov3-tinny", "--out", str(tmp_path)]) == 1
@@ -200,7 +200,7 @@ def test_help_and_print_config(capsys):
     explained = "".join(re.search(r"--policies \[ITEM.*?\(type:", text, re.DOTALL)[0].split())
     for name, preset in presets("search").items():
         if preset.policy in POLICIES and not POLICIES[preset.policy].__module__.startswith("semfov."):
-            continue  # registered by another test
+            continue  # a policy registered by another test
         alone = re.sub("-(raw|calibrated|learned)$", "", name)
         assert f"`{alone}`" in explained, name
     assert "`-raw`or`-calibrated`" in explained
@@ -219,7 +219,7 @@ def test_help_and_print_config(capsys):
     assert printed["sensor"]["sigma"] == 50
 
 
-def test_the_policy_that_help_spells_out_is_one(capsys):
+def test_the_example_of_a_policy_in_the_help_is_valid(capsys):
     with pytest.raises(SystemExit):
         main(["--help"])
     text = " ".join(capsys.readouterr().out.replace("-\n", "-").split())

@@ -1,4 +1,4 @@
-"""`python -m eval.words` on embedded scenes with the real detector: arms, pairs and controls, recomputed by loops."""
+"""`python -m eval.words` on embedded scenes with the real detector: arms, pairs and controls, against loops."""
 
 import json
 from collections import defaultdict
@@ -52,7 +52,7 @@ def records(config):
 
 
 @pytest.mark.slow
-def test_every_arm_starts_from_the_same_places(records):
+def test_every_arm_has_the_same_starts(records):
     arms = defaultdict(list)
     for record in records:
         search = record["scene"], record["target"], record["repetition"], record["start"], record["first_score"]
@@ -65,7 +65,7 @@ def test_every_arm_starts_from_the_same_places(records):
 
 
 @pytest.mark.slow
-def test_differences_are_those_of_pairs(records):
+def test_differences_are_paired_search_by_search(records):
     got = differences(records, "noise", 6)
     found = {(r["arm"], r["scene"], r["target"], r["repetition"]): r["found_at"] for r in records}
     scenes = defaultdict(list)
@@ -79,7 +79,7 @@ def test_differences_are_those_of_pairs(records):
 
 
 @pytest.mark.slow
-def test_table_has_those_apart_whose_first_look_misses(records, config):
+def test_table_lists_searches_that_miss_at_the_first_look_separately(records, config):
     arms = ["none", "counted", "noise", "noise, permuted"]
     scores = sorted(record["first_score"] for record in records if record["arm"] == "none")
     middle = scores[len(scores) // 2]
@@ -92,7 +92,7 @@ def test_table_has_those_apart_whose_first_look_misses(records, config):
 
 
 @pytest.mark.slow
-def test_the_same_command_goes_on(records, config):
+def test_repeating_the_command_reuses_its_results(records, config):
     written = (config.out / "episodes.jsonl").read_bytes()
     words(config)
     assert (config.out / "episodes.jsonl").read_bytes() == written
@@ -101,7 +101,7 @@ def test_the_same_command_goes_on(records, config):
     assert "yolov3-tiny" in text
 
 
-def test_bad_settings(config, folder, capsys):
+def test_invalid_settings_are_refused(config, folder, capsys):
     assert main(["--context", "none", "--out", str(folder / "x")]) == 1
     assert "context" in capsys.readouterr().err
     assert main(["--tables", f"[{folder / 'nothing.safetensors'}]", "--out", str(folder / "x")]) == 1

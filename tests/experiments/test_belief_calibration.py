@@ -1,4 +1,4 @@
-"""Beliefs judged along searches: sums against loops over cells, beliefs followed by hand, models that are not there."""
+"""Calibration of beliefs along searches: sums against loops over cells, beliefs step by step, missing models."""
 
 import math
 from dataclasses import replace
@@ -33,7 +33,7 @@ BELIEFS = ["raw", "published", "tempered", "learned", "learned map"]
 
 
 def write_models(folder):
-    """Untrained models that fit the default eye."""
+    """Save untrained models that fit the default eye."""
     settings = make_eye(DetectorConfig(), SensorConfig()).settings()
     with torch.random.fork_rng():
         torch.manual_seed(1)
@@ -60,8 +60,8 @@ def run(config):
     return BeliefCalibrationRun(config)
 
 
-def by_hand(run, target, path, detections, grid):
-    """Probabilities `(looks, X·Y)` of each belief after every look of a path, without a loop of episodes."""
+def probabilities_along(run, target, path, detections, grid):
+    """Probabilities of the target `(looks, X·Y)` after every look of a path, by belief."""
     model = FovealObservationModel.from_pretrained("yolov3-tiny")
     observers = {
         "raw": Semantic(81),
@@ -70,18 +70,18 @@ def by_hand(run, target, path, detections, grid):
         "learned": Target(run.models.evidence),
         "learned map": LearnedMap(run.models.map),
     }
-    told = {}
+    probabilities = {}
     for name, observer in observers.items():
-        belief, told[name] = observer.start(1, grid, detections.scores), []
+        belief, probabilities[name] = observer.start(1, grid, detections.scores), []
         for cell in path:
             belief = observer(belief, detections[cell : cell + 1], grid.centres[cell : cell + 1], grid, target)
-            told[name].append(belief.probability(target)[0])
-    return told
+            probabilities[name].append(belief.probability(target)[0])
+    return probabilities
 
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_sums_are_those_of_beliefs_followed_by_hand(run):
+def test_sums_match_beliefs_updated_step_by_step(run):
     assert list(run.observers) == BELIEFS
     assert run.left_out == {}
     for index in range(2):
@@ -101,14 +101,14 @@ def test_sums_are_those_of_beliefs_followed_by_hand(run):
                 choice = Greedy(drawn_from(noise))
                 steps = rollout(looks, Target(run.models.evidence), TargetPosterior(target), start, choice, most=15)
                 path = [int(step.cell) for step in steps]
-                told = by_hand(run, target, path, detections, grid)
-            # All 12 cells are fixated before there are 15 looks.
+                probabilities = probabilities_along(run, target, path, detections, grid)
+            # The search ends after 12 looks, when every cell has been fixated.
             assert sorted(path) == list(range(12))
             for name in BELIEFS:
                 judged = record["beliefs"][name]
                 assert list(judged["looks"]) == ["1", "5"]
                 for looked in (1, 5):
-                    seen, p = path[:looked], told[name][looked - 1]
+                    seen, p = path[:looked], probabilities[name][looked - 1]
                     groups = {cell: [] for cell in CELLS}
                     for cell in range(12):
                         closest = min(math.dist(grid.centres[cell], grid.centres[f]) for f in seen) / max(grid.size)
@@ -131,7 +131,7 @@ def test_sums_are_those_of_beliefs_followed_by_hand(run):
                 if hit == 0:
                     assert judged["landing"] is record["seen"] is None
                 else:
-                    pair = [float(told[name][number][path[hit]]) for number in (hit - 1, hit)]
+                    pair = [float(probabilities[name][number][path[hit]]) for number in (hit - 1, hit)]
                     assert judged["landing"] == pytest.approx(pair, abs=1e-5)
                     look = detections[path[hit] : path[hit] + 1]
                     over = grid.footprint(look.boxes)[0, :, path[hit]] & look.mask[0]
@@ -141,7 +141,7 @@ def test_sums_are_those_of_beliefs_followed_by_hand(run):
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_a_model_that_is_not_shipped_leaves_its_belief_out(config, run, tmp_path, monkeypatch):
+def test_a_belief_is_left_out_when_its_model_is_not_shipped(config, run, tmp_path, monkeypatch):
     for kind in (TargetEvidence, MapEvidence):
         monkeypatch.setattr(kind, "shipped", tmp_path)
     bare = BeliefCalibrationRun(replace(config, belief=BeliefConfig(columns=4, rows=3), out=tmp_path))
@@ -161,14 +161,14 @@ def test_a_model_that_is_not_shipped_leaves_its_belief_out(config, run, tmp_path
 
 
 @pytest.mark.weights
-def test_nothing_to_search_for_is_told(config, tmp_path):
+def test_scenes_without_a_searchable_class_are_reported(config, tmp_path):
     empty = BeliefCalibrationRun(replace(config, data=DataConfig(limit=1, max_target_area=1e-9), out=tmp_path))
     finish(empty, "believing")
     with pytest.raises(DataError, match="raise target_area"):
         write_belief_report(empty)
 
 
-def test_the_published_belief_has_the_model_of_its_sensor():
+def test_the_published_belief_uses_the_model_of_its_sensor():
     known, other = DetectorConfig("yolox-nano"), DetectorConfig("yolov3")
     assert published_model(known, SensorConfig("published-narrow")) == "yolox-nano-published-narrow"
     assert published_model(known, SensorConfig("gradual")) is None
@@ -176,7 +176,7 @@ def test_the_published_belief_has_the_model_of_its_sensor():
 
 
 def cells(*pairs):
-    """A record of cells with these probabilities, each with whether it holds the target."""
+    """A record of cells, given as pairs of a probability and whether the cell holds the target."""
     return BinarySums.of(torch.tensor([p for p, _ in pairs]), torch.tensor([y for _, y in pairs])).record()
 
 

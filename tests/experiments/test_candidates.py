@@ -40,34 +40,34 @@ def context():
 
 
 def strategy(policy, task="search", belief=None, fovea=FOVEA, **models):
-    """The strategy of a policy for two classes, by the models that are given."""
+    """The strategy of a policy for two classes, made with the given models."""
     return make_strategy(resolve(policy, task), task, belief or BeliefConfig(), 3, Models(**models), fovea)
 
 
-def needed(belief=None, *choices, task="search"):
+def needs_model(belief=None, *choices, task="search"):
     return needs_observation([resolve(choice, task) for choice in choices], belief or BeliefConfig())
 
 
-def test_a_model_is_needed_to_predict_to_calibrate_and_for_misses():
+def test_prediction_calibration_and_misses_need_an_observation_model():
     soft = PolicyConfig("non-predictive", footprint="soft")
-    assert not needed(None, "random", "target-evidence", "learned", "vocus2", "non-predictive-raw", soft)
-    assert not needed(None, "random-raw", "closer-look-raw", "itti-koch-raw", "recommended", task="exploration")
-    assert needed(None, PolicyConfig("non-predictive", misses=True))
-    assert needed(None, "random", "non-predictive-calibrated")
-    assert needed(None, "closer-look-calibrated", task="exploration")
-    assert needed(BeliefConfig(misses=True), "non-predictive-raw")
-    assert not needed(BeliefConfig(misses=True), PolicyConfig("non-predictive", misses=False))
+    assert not needs_model(None, "random", "target-evidence", "learned", "vocus2", "non-predictive-raw", soft)
+    assert not needs_model(None, "random-raw", "closer-look-raw", "itti-koch-raw", "recommended", task="exploration")
+    assert needs_model(None, PolicyConfig("non-predictive", misses=True))
+    assert needs_model(None, "random", "non-predictive-calibrated")
+    assert needs_model(None, "closer-look-calibrated", task="exploration")
+    assert needs_model(BeliefConfig(misses=True), "non-predictive-raw")
+    assert not needs_model(BeliefConfig(misses=True), PolicyConfig("non-predictive", misses=False))
     ahead = ("predictive", "neighbourhood", "foveal-hit", "place-information", "entropy-limit", "ideal-observer")
-    assert all(needed(None, PolicyConfig(name)) for name in ahead)
+    assert all(needs_model(None, PolicyConfig(name)) for name in ahead)
     without = {"random", "closer-look", "saliency", "expected-gain", "objects"}
     for name in known_policies("exploration"):
         scores = "learned" if name == "expected-gain" else "raw"
         given = PolicyConfig(name, scores, saliency="vocus2" if name == "saliency" else None)
-        assert needed(None, given, task="exploration") == (name not in without)
+        assert needs_model(None, given, task="exploration") == (name not in without)
 
 
-def test_a_model_is_needed_for_every_preset_that_cannot_be_made_without(model):
-    """What is needed is what making it asks for, and nothing else."""
+def test_presets_that_need_an_observation_model_cannot_be_made_without_it(model):
+    """`needs_observation` agrees with what making the strategy requires."""
     others = {"evidence": TargetEvidence(4, 4), "gaze": LearnedGaze(4), "map": MapEvidence(4, 4)}
     for task in ("search", "exploration"):
         for preset in presets(task).values():
@@ -79,51 +79,51 @@ def test_a_model_is_needed_for_every_preset_that_cannot_be_made_without(model):
                 strategy(preset, task, **others)
 
 
-def test_what_a_policy_needs_does_not_hang_on_saliency():
+def test_saliency_does_not_change_which_models_a_policy_needs():
     for policy in ("random", "non-predictive", "predictive", "target-evidence", "learned"):
-        assert needed(None, PolicyConfig(policy, saliency="vocus2")) == needed(None, PolicyConfig(policy))
+        assert needs_model(None, PolicyConfig(policy, saliency="vocus2")) == needs_model(None, PolicyConfig(policy))
 
 
 @pytest.fixture
-def asked(monkeypatch):
-    """Which models a run would load, by the names that they are asked for."""
-    asked = []
+def loaded(monkeypatch):
+    """The models that a run loads, as pairs of kind and name."""
+    loaded = []
     for kind in ("observation", "target_evidence", "map_evidence", "context", "learned_gaze"):
 
         def make(name, eye, kind=kind):
-            asked.append((kind, name))
+            loaded.append((kind, name))
             return kind
 
         monkeypatch.setattr(candidates, f"make_{kind}", make)
-    return asked
+    return loaded
 
 
-def test_a_run_loads_what_its_policies_need_and_nothing_else(asked):
+def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
     eye = SimpleNamespace()
     assert load_models(SearchConfig(policies=("random", "non-predictive-raw")), "search", eye) == Models()
     assert load_models(ExploreConfig(policies=("closer-look-raw", "vocus2-raw")), "exploration", eye) == Models()
-    assert asked == []
+    assert loaded == []
     learned = ExploreConfig(policies=("recommended", "vocus2-raw"), belief=BeliefConfig(map_model="everything"))
     assert load_models(learned, "exploration", eye) == Models(map="map_evidence")
-    assert asked == [("map_evidence", "everything")]
-    asked.clear()
+    assert loaded == [("map_evidence", "everything")]
+    loaded.clear()
     guided = PolicyConfig("target-evidence", saliency="vocus2", context="place")
     every = SearchConfig(
         policies=("random", guided, "learned", "predictive-raw"),
-        belief=BeliefConfig(model="mine", target_model="sought", context_model="company"),
+        belief=BeliefConfig(model="mine", target_model="sought", context_model="cooccurrence"),
         gaze_model="gaze",
     )
     models = load_models(every, "search", eye)
-    assert models == Models("observation", "target_evidence", {"company": "context"}, "learned_gaze")
-    assert sorted(asked) == [
-        ("context", "company"),
+    assert models == Models("observation", "target_evidence", {"cooccurrence": "context"}, "learned_gaze")
+    assert sorted(loaded) == [
+        ("context", "cooccurrence"),
         ("learned_gaze", "gaze"),
         ("observation", "mine"),
         ("target_evidence", "sought"),
     ]
 
 
-def test_context_is_loaded_where_a_policy_or_the_run_asks_for_it(asked):
+def test_context_is_loaded_when_a_policy_or_the_run_uses_it(loaded):
     eye = SimpleNamespace()
 
     def loads(belief, *choices):
@@ -138,7 +138,7 @@ def test_context_is_loaded_where_a_policy_or_the_run_asks_for_it(asked):
     assert loads(BeliefConfig(context_model="theirs"), both, own, both) == ["theirs", "mine"]
 
 
-def test_every_policy_has_its_own_context(context):
+def test_each_policy_gets_the_context_that_it_names(context):
     evidence = TargetEvidence(8, 6, components=3)
     other = context.permuted(1)
     given = {"coco": context, "mine": other}
@@ -148,12 +148,12 @@ def test_every_policy_has_its_own_context(context):
 
 
 @pytest.mark.parametrize("config", [SearchConfig, ExploreConfig])
-def test_a_run_has_a_policy(config):
+def test_a_run_without_policies_is_refused(config):
     with pytest.raises(InputError, match="policies: expected at least one"):
         load_models(config(policies=()), "search" if config is SearchConfig else "exploration", SimpleNamespace())
 
 
-def test_strategies_are_made_as_set(model):
+def test_strategies_follow_their_settings(model):
     ahead = strategy(PolicyConfig("predictive", misses=True, tempering=0.25), observation=model)
     assert ahead.observer.misses is model
     assert ahead.observer.observation is None
@@ -169,7 +169,7 @@ def test_strategies_are_made_as_set(model):
         strategy("non-predictive-calibrated")
 
 
-def test_what_a_policy_does_not_set_is_as_the_run_has_it(model):
+def test_settings_that_a_policy_leaves_out_come_from_the_run(model):
     run = BeliefConfig(prior=0.3, fusion="sum", footprint="soft", tempering=0.7, memory="closest", misses=True)
     plain = strategy("non-predictive-raw", belief=run, observation=model).observer
     settings = plain.prior, plain.fusion, plain.footprint, plain.tempering, plain.memory, plain.misses
@@ -180,23 +180,23 @@ def test_what_a_policy_does_not_set_is_as_the_run_has_it(model):
     assert settings == (0.3, "sum", "box_centre", 1.0, "all", None)
 
 
-def test_neighbours_come_from_a_predicted_map(model):
+def test_the_neighbourhood_policy_needs_an_observation_model(model):
     made = strategy("neighbourhood-raw", observation=model)
     assert isinstance(made.policy(1, GRID), NeighbourhoodPosterior)
     with pytest.raises(InputError, match="observation model"):
         strategy("neighbourhood-raw")
 
 
-def test_divergence_is_from_the_prior_of_the_run(model):
+def test_kl_divergence_is_measured_from_the_prior_of_the_run(model):
     explorer = strategy("kl-raw", "exploration", BeliefConfig(prior=0.25), observation=model)
     assert explorer.policy(None, GRID).prior == explorer.observer.prior == 0.25
 
 
-def test_the_closer_look_is_through_the_fovea_of_the_run():
+def test_closer_look_uses_the_fovea_of_the_run():
     assert strategy("closer-look-raw", "exploration", fovea=0.07).policy.fovea == 0.07
 
 
-def test_learned_beliefs_come_with_their_policies():
+def test_learned_policies_bring_their_own_belief():
     evidence, gaze = TargetEvidence(4, 4), LearnedGaze(4)
     sought = strategy("target-evidence", evidence=evidence)
     assert isinstance(sought.observer, observers.Target)
@@ -211,7 +211,7 @@ def test_learned_beliefs_come_with_their_policies():
             strategy(name)
 
 
-def test_context_is_added_where_a_policy_asks_for_it(context):
+def test_context_is_added_when_a_policy_or_the_run_asks_for_it(context):
     given = {"context": {"coco": context}, "evidence": TargetEvidence(4, 4)}
     assert isinstance(strategy("non-predictive-raw", **given).observer, observers.Semantic)
     parts = {"both": (1.0, 2.0), "place": (1.0, 0.0), "cooccurrence": (0.0, 2.0)}
@@ -231,7 +231,7 @@ def test_context_is_added_where_a_policy_asks_for_it(context):
         strategy(PolicyConfig("non-predictive", context="both"))
 
 
-def test_context_is_refused_where_a_policy_cannot_use_it(context, model):
+def test_context_is_refused_for_policies_that_cannot_use_it(context, model):
     for policy, task in (("predictive", "search"), ("random", "search"), ("random", "exploration")):
         with pytest.raises(
             InputError,
@@ -240,14 +240,14 @@ def test_context_is_refused_where_a_policy_cannot_use_it(context, model):
             strategy(PolicyConfig(policy, context="both"), task, context=context, observation=model)
 
 
-def test_saliency_alone_stands_on_the_belief_of_the_run(model):
+def test_saliency_alone_keeps_the_belief_of_the_run(model):
     made = strategy(PolicyConfig("saliency", "calibrated", saliency="vocus2"), "exploration", observation=model)
     assert isinstance(made.policy, policies.Random)
     assert made.observer.observation is model
 
 
 @pytest.mark.parametrize("rows", [1, 12], ids=["of the picture", "from every cell"])
-def test_saliency_takes_a_policys_place_or_stands_beside_it(rows):
+def test_saliency_replaces_a_policy_or_is_combined_with_it(rows):
     cell, visited = torch.tensor([5, 0]), torch.zeros(2, 12, dtype=torch.bool)
     table = torch.rand(rows, 12, generator=torch.Generator().manual_seed(0))
     seen = table[cell] if rows > 1 else table.expand(2, -1)
@@ -268,8 +268,8 @@ def test_saliency_takes_a_policys_place_or_stands_beside_it(rows):
 
 
 @pytest.mark.parametrize("name", ["foveal-hit", "place-information", "entropy-limit", "ideal-observer"])
-def test_searches_by_place_go_by_learned_evidence_too(model, name):
-    """The belief is that of `target-evidence`, and the policy looks for the place that it tells of."""
+def test_policies_that_need_a_target_position_work_with_learned_evidence(model, name):
+    """The belief is that of `target-evidence`, and the policy searches for the position that it estimates."""
     evidence = TargetEvidence(4, 4, components=3)
     made = strategy(PolicyConfig(name, "learned"), observation=model, evidence=evidence)
     assert isinstance(made.observer, observers.Target)
@@ -282,7 +282,7 @@ def test_searches_by_place_go_by_learned_evidence_too(model, name):
         strategy(PolicyConfig(name, "learned"), observation=model)
 
 
-def test_attention_takes_the_place_of_a_policy():
+def test_attention_maps_replace_a_policy():
     attention = torch.rand(12, 2, 12)
     candidate = Candidate(strategy("ivsn"), attention=attention, fovea=0.2)
     acquisition = candidate.acquisition(torch.tensor([2]), GRID, torch.tensor([5]))

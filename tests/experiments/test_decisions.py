@@ -1,4 +1,4 @@
-"""Searches that decide: records against a rollout by hand, overlaps and landings against loops."""
+"""Searches that decide whether a target is present: records against step-by-step searches, overlaps and landings."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ PUBLISHED = ["published belief", "published belief, a detection at the gaze"]
 
 
 def write_evidence(path, thresholds, seed=2):
-    """An untrained model that fits the default eye; it is lifted so that some searches find, and some give up."""
+    """Save an untrained model that fits the default eye; with large weights, some searches find or give up."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         model = TargetEvidence(
@@ -70,7 +70,7 @@ def run(config):
     return DecisionRun(config)
 
 
-def in_quarters(run, index, target):
+def scores_in_quarters(run, index, target):
     """Scores of the target in the four quarters of a scene."""
     image = run.scenes[index].image
     height, width = image.shape[-2] // 2, image.shape[-1] // 2
@@ -82,7 +82,7 @@ def in_quarters(run, index, target):
     return scores
 
 
-def test_quarters_cover_the_picture_once():
+def test_quarters_cover_every_pixel_once():
     image = torch.arange(35.0).reshape(1, 1, 5, 7)
     parts = quarters(image)
     assert [tuple(part.shape[-2:]) for part in parts] == [(2, 3), (2, 4), (3, 3), (3, 4)]
@@ -91,7 +91,7 @@ def test_quarters_cover_the_picture_once():
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_searches_by_price_stand_beside_those_by_thresholds(config):
+def test_searches_by_price_are_compared_with_searches_by_thresholds(config):
     run = DecisionRun(replace(config, prices=(0.01, 0.2), confirm=0.6))
     assert list(run.compared) == ["target-evidence", "random gaze", "price 0.01", "price 0.2", *PUBLISHED]
     assert run.thresholds == Thresholds(0.6, AT.give_up)
@@ -100,8 +100,8 @@ def test_searches_by_price_stand_beside_those_by_thresholds(config):
     assert looks["price 0.2"] <= looks["price 0.01"]
 
 
-def shows(step, grid, target, least=0.5):
-    """1 where the best class of a detection over the fixated cell is the target, detection by detection."""
+def detects_at_the_gaze(step, grid, target, least=0.5):
+    """1 if a detection over the fixated cell has the target as its best class and scores at least `least`, else 0."""
     detections = step.detections
     for box, scores, there in zip(detections.boxes[0], detections.scores[0], detections.mask[0], strict=True):
         over = bool(grid.footprint(box[None])[0, int(step.cell)])
@@ -112,7 +112,7 @@ def shows(step, grid, target, least=0.5):
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_records_are_those_of_searches_by_hand(run):
+def test_records_match_searches_run_step_by_step(run):
     outcomes, evidence = set(), run.models.evidence
     for index in range(3):
         records, seconds = run.outcomes(index)
@@ -130,7 +130,9 @@ def test_records_are_those_of_searches_by_hand(run):
             assert record["present"] == (target in annotation.labels.tolist())
             largest = [float(sharp.scores[0, d, target]) for d in range(sharp.scores.shape[1]) if sharp.mask[0, d]]
             assert record["sharp"] == pytest.approx(max(largest, default=0.0))
-            assert record["tiled"] == pytest.approx(max([*largest, *in_quarters(run, index, target)], default=0.0))
+            assert record["tiled"] == pytest.approx(
+                max([*largest, *scores_in_quarters(run, index, target)], default=0.0)
+            )
             start = torch.randint(12, (1,), generator=generator_for("start", 0, scene, target))
             noise = noise_for(run.config.protocol, 12, scene, target, 0)[None]
             acquisition = Uniform() if record["policy"] == "random gaze" else TargetPosterior(target)
@@ -144,7 +146,7 @@ def test_records_are_those_of_searches_by_hand(run):
                 choice = Greedy(drawn_from(noise))
                 for step in rollout(looks, observer, acquisition, start, choice, most=7):
                     steps.append(step)
-                    ended = shows(step, grid, target) if at_the_gaze else int(decide(step, target, AT))
+                    ended = detects_at_the_gaze(step, grid, target) if at_the_gaze else int(decide(step, target, AT))
                     if ended:
                         break
             belief, seen = steps[-1].belief, [int(step.cell) for step in steps]
@@ -166,13 +168,13 @@ def test_records_are_those_of_searches_by_hand(run):
             else:
                 before, after = (float(steps[n].belief.probability(target)[0, seen[hit]]) for n in (hit - 1, hit))
                 assert record["landing"] == pytest.approx([before, after], abs=1e-6)
-                assert record["landing_seen"] == bool(shows(steps[hit], grid, target, 0.0))
+                assert record["landing_seen"] == bool(detects_at_the_gaze(steps[hit], grid, target, 0.0))
     assert {"found", "absent"} <= outcomes
 
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_parts_are_of_what_decisions_depend_on(config, run, folder):
+def test_the_key_changes_only_with_settings_that_affect_decisions(config, run, folder):
     def key(**change):
         return DecisionRun(replace(config, **change)).key
 
@@ -204,7 +206,7 @@ def test_a_model_without_thresholds_still_decides(config, folder):
 
 
 @pytest.mark.weights
-def test_without_an_observation_model_the_published_belief_is_left_out(config, monkeypatch):
+def test_the_published_belief_is_left_out_without_an_observation_model(config, monkeypatch):
     monkeypatch.setattr(FovealObservationModel, "shipped", config.out / "none")
     assert list(DecisionRun(config).compared) == ["target-evidence", "random gaze"]
     named = replace(config, belief=replace(config.belief, model="nowhere.safetensors"))
@@ -212,16 +214,16 @@ def test_without_an_observation_model_the_published_belief_is_left_out(config, m
         DecisionRun(named)
 
 
-def test_the_place_of_a_sharp_look():
-    """Of two boxes the surer one counts, masked ones do not, and its middle is in the third cell of the second row."""
+def test_a_sharp_look_is_scored_by_its_most_confident_box():
+    """The valid box with the highest score counts; its centre is in the third cell of the second row."""
     grid = Grid(4, 3, (80, 60))
     boxes = torch.tensor([[[42.0, 22, 58, 38], [0, 0, 20, 20], [60, 40, 80, 60]]])
     scores = torch.tensor([[[0.4, 0.6], [0.5, 0.5], [0.1, 0.9]]])
     seen = Detections(boxes, scores, torch.tensor([[True, True, False]]))
     goal = torch.zeros(12, dtype=torch.bool)
     goal[6] = True
-    told = sharp_place(seen, grid, 1, goal, torch.tensor([[42.0, 22, 58, 54]]))
-    assert told == {"right": True, "overlap": pytest.approx(0.5)}
+    place = sharp_place(seen, grid, 1, goal, torch.tensor([[42.0, 22, 58, 54]]))
+    assert place == {"right": True, "overlap": pytest.approx(0.5)}
     assert sharp_place(seen, grid, 1, ~goal, boxes[0, :0]) == {"right": False, "overlap": None}
     assert sharp_place(Detections.empty(1, 1), grid, 1, goal, boxes[0]) is None
 
@@ -233,7 +235,7 @@ boxes = st.tuples(corner, corner, st.floats(1, 40), st.floats(1, 40)).map(
 
 
 @given(boxes, st.lists(boxes, max_size=4))
-def test_overlap_equals_a_loop(box, others):
+def test_overlap_equals_a_loop_over_boxes(box, others):
     def area(b):
         return (b[2] - b[0]) * (b[3] - b[1])
 
@@ -251,7 +253,7 @@ def test_overlap_equals_a_loop(box, others):
     ("path", "expected"),
     [((2, 3, 1), [0.1, 0.2]), ((1, 3, 2), None), ((0, 2), None), ((0, 1, 3), [0.1, 0.2]), ((0, 2, 3), [0.2, 0.3])],
 )
-def test_landing_is_before_and_after_the_first_look_at_the_target(path, expected):
+def test_landing_holds_probabilities_before_and_after_the_first_look_at_the_target(path, expected):
     """Probabilities of cell `c` after look `n` are (n + 1) / 10; the target is in cells 1 and 3."""
     goal = torch.tensor([False, True, False, True])
     beliefs = []

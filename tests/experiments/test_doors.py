@@ -1,4 +1,4 @@
-"""Values that cannot be are refused at the doors: one line that names the argument and its range, before any work."""
+"""Invalid values are refused before any work, with one line that names the argument and its range."""
 
 import dataclasses
 
@@ -13,8 +13,8 @@ from semfov.experiments import config as settings
 from semfov.experiments.settings import Range, check_settings
 
 
-class Quiet(Detector):
-    """Sees one cup."""
+class OneCup(Detector):
+    """A detector that always detects one cup."""
 
     def __init__(self, **options):
         super().__init__("quiet", ("cup", "cat"), (32, 32), **options)
@@ -27,7 +27,7 @@ class Quiet(Detector):
 @pytest.fixture
 def agent():
     observer = observers.Semantic(3)
-    eye = Eye(Foveation(10.0), Quiet(), reference=64.0)
+    eye = Eye(Foveation(10.0), OneCup(), reference=64.0)
     return ActivePerception(eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(4, 3))
 
 
@@ -35,7 +35,7 @@ IMAGE = torch.rand(3, 40, 50, generator=torch.Generator().manual_seed(0))
 
 
 @pytest.mark.parametrize(
-    ("image", "told"),
+    ("image", "message"),
     [
         (IMAGE * 255, r"^image: expected RGB in \[0, 1\], got numbers from .* to 25.*divide by 255"),
         (IMAGE - 0.5, r"^image: expected RGB in \[0, 1\], got numbers from -0\..*undo the normalisation"),
@@ -45,25 +45,25 @@ IMAGE = torch.rand(3, 40, 50, generator=torch.Generator().manual_seed(0))
         (IMAGE.masked_fill(IMAGE > 0.99, torch.inf), r"^image: expected RGB in \[0, 1\], got numbers"),
     ],
 )
-def test_images_that_are_none(agent, image, told):
+def test_invalid_images_are_refused_by_the_agent(agent, image, message):
     for look in (lambda: agent.search(image, "cup"), lambda: agent.explore(image)):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             look()
 
 
 @pytest.mark.parametrize("image", [IMAGE * 255, IMAGE - 0.5, IMAGE.masked_fill(IMAGE > 0.99, torch.nan)])
-def test_images_that_are_none_before_a_detector(agent, image):
+def test_invalid_images_are_refused_by_the_detector_and_the_eye(agent, image):
     for look in (lambda: agent.eye.detector(image[None]), lambda: agent.eye.open(image[None])):
         with pytest.raises(InputError, match=r"^images: expected RGB in \[0, 1\]"):
             look()
 
 
-def test_rounding_beyond_the_ends_is_let_through(agent):
+def test_rounding_errors_just_above_one_are_accepted(agent):
     agent.eye.open(IMAGE[None].clamp(0, 1) * (1 + 2e-7))
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "told"),
+    ("name", "value", "message"),
     [
         ("shifts", -1, "from 0 to 10,000, got -1"),
         ("shifts", 10**9, "from 0 to 10,000, got 1000000000"),
@@ -76,13 +76,13 @@ def test_rounding_beyond_the_ends_is_let_through(agent):
         ("start", True, "a whole number"),
     ],
 )
-def test_arguments_of_the_agent(agent, name, value, told):
+def test_arguments_out_of_range_are_refused_by_the_agent(agent, name, value, message):
     for look in (lambda: agent.search(IMAGE, "cup", **{name: value}), lambda: agent.explore(IMAGE, **{name: value})):
-        with pytest.raises(InputError, match=rf"^{name}: expected .*{told}"):
+        with pytest.raises(InputError, match=rf"^{name}: expected .*{message}"):
             look()
 
 
-def test_confirm_and_target(agent):
+def test_invalid_confirm_and_target_are_refused(agent):
     with pytest.raises(InputError, match=r"^confirm: expected a probability from 0 to 1, got 50"):
         agent.search(IMAGE, "cup", confirm=50)
     for target in (0, 3, -1, 10**12):
@@ -91,26 +91,26 @@ def test_confirm_and_target(agent):
 
 
 @pytest.mark.parametrize("wrong", [{"threshold": 2}, {"threshold": float("nan")}, {"iou": -0.1}, {"limit": -1}])
-def test_selections(wrong):
+def test_invalid_selections_are_refused(wrong):
     with pytest.raises(InputError, match=f"^{next(iter(wrong))}: expected a (whole )?number from 0 to "):
         Selection(**wrong)
 
 
 @pytest.mark.parametrize("stride", ["auto", 0, -32, 1.5, True])
-def test_strides(stride):
+def test_invalid_strides_are_refused(stride):
     with pytest.raises(InputError, match=r"^stride: expected a whole number from 1"):
-        Quiet(stride=stride)
+        OneCup(stride=stride)
 
 
 @pytest.mark.weights
-def test_a_stride_that_only_settings_know():
+def test_invalid_strides_and_thresholds_are_refused_when_a_detector_is_loaded():
     with pytest.raises(InputError, match=r"^stride: expected None or a multiple of 32, got 'auto'"):
         load_detector("yolov3-tiny", stride="auto")
     with pytest.raises(InputError, match=r"^threshold: expected a number from 0 to 1, got 2"):
         load_detector("yolov3-tiny", threshold=2)
 
 
-def test_embedded_scenes():
+def test_invalid_seeds_and_counts_of_embedded_scenes_are_refused():
     for wrong in ({"seed": -1}, {"count": 0}):
         with pytest.raises(InputError, match=f"^{next(iter(wrong))}: "):
             EmbeddedScenes(("cup",), **wrong)
@@ -120,7 +120,7 @@ CONFIGS = [value for value in vars(settings).values() if dataclasses.is_dataclas
 
 
 def ranges():
-    """Every setting with a range, with values just outside of it."""
+    """Every setting with a range: its class, name, type and range."""
     from typing import Annotated, get_args, get_origin, get_type_hints
 
     for config in CONFIGS:
@@ -132,7 +132,7 @@ def ranges():
                         yield config, name, base, allowed
 
 
-def test_there_are_ranges():
+def test_settings_with_a_range_are_found():
     assert len(list(ranges())) > 25
 
 
@@ -151,7 +151,7 @@ def test_settings_out_of_their_range_are_refused_by_name(config, name, base, all
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (["--protocol.batch", "0"], "protocol.batch: expected a whole number from 1 to 1,000,000,000, got 0"),
         (["--protocol.batch", "-1"], "protocol.batch: expected a whole number from 1 to 1,000,000,000, got -1"),
@@ -173,17 +173,17 @@ def test_settings_out_of_their_range_are_refused_by_name(config, name, base, all
         (["--detector.name", "nosuch.onnx"], "detector: no such file: nosuch.onnx; check the path"),
     ],
 )
-def test_command_lines(arguments, told, capsys, tmp_path):
+def test_invalid_command_lines_are_refused_before_any_work(arguments, message, capsys, tmp_path):
     from eval.search import main
 
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 1
     error = capsys.readouterr().err
-    assert error.startswith(f"error: {told}")
+    assert error.startswith(f"error: {message}")
     assert error.count("\n") == 1
-    assert not list(tmp_path.iterdir()), "before any work"
+    assert not list(tmp_path.iterdir()), "nothing is written"
 
 
-def test_help_tells_ranges(capsys):
+def test_help_shows_ranges(capsys):
     from eval.search import main
 
     with pytest.raises(SystemExit):

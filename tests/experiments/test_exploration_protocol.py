@@ -1,4 +1,4 @@
-"""The exploration protocol against a scalar twin."""
+"""The exploration protocol against a scalar reference implementation."""
 
 from itertools import pairwise
 
@@ -31,13 +31,13 @@ ANNOTATION = Annotation(
 
 
 class Scenes:
-    """Two scenes of which only the ids matter."""
+    """Two scenes; the protocol reads only their ids."""
 
     ids = (7, 8)
 
 
-class Told(Semantic):
-    """An observer that is told what looks say."""
+class FixedLook(Semantic):
+    """An observer that returns a given look, whatever is detected."""
 
     def __init__(self, look):
         super().__init__(4)
@@ -49,7 +49,7 @@ class Told(Semantic):
 
 @pytest.fixture
 def look():
-    """What three detections from each of 12 cells say about four classes."""
+    """Likelihoods of four classes for three detections from each of 12 cells."""
     torch.manual_seed(0)
     likelihood = torch.rand(12, 3, 4) ** 3
     return SemanticLook(likelihood, torch.rand(12, 3, 12) < 0.25, torch.zeros(12, 12))
@@ -77,7 +77,7 @@ def from_prior(beta):
 def explore_by_loop(episode, look, model, answers, noise, shifts):
     """KL exploration of one episode, cell by cell, from the description in the paper."""
     beta = np.full((12, 4), 0.5)
-    cell, cells, right, without = episode.start, [], [], []
+    cell, cells, right, without_background = episode.start, [], [], []
     for shift in range(shifts + 1):
         cells.append(cell)
         for likelihood, footprint in zip(look.likelihood[cell], look.footprint[cell], strict=True):
@@ -90,7 +90,7 @@ def explore_by_loop(episode, look, model, answers, noise, shifts):
                 winners = [k for k in offered if beta[place, k] > best * (1 - 1e-6)]
                 counts[number] += len(winners) == 1 and winners[0] in answers[place]
         right.append(counts[0])
-        without.append(counts[1])
+        without_background.append(counts[1])
         values = []
         for fixation in range(12):
             total = 0.0
@@ -104,55 +104,55 @@ def explore_by_loop(episode, look, model, answers, noise, shifts):
         free = [c for c in range(12) if c not in cells]
         if not free:
             right += [right[-1]] * (shifts - shift)
-            without += [without[-1]] * (shifts - shift)
+            without_background += [without_background[-1]] * (shifts - shift)
             break
         best = max(values[c] for c in free)
         tied = [c for c in free if values[c] > best * (1 - 1e-6)]
         cell = max(tied, key=lambda c: float(noise[shift, c]))
-    return tuple(cells), tuple(right), tuple(without)
+    return tuple(cells), tuple(right), tuple(without_background)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("batch", [2, 100])
 @pytest.mark.parametrize("shifts", [5, 14])
-def test_exploration_equals_a_scalar_twin(look, model, shifts, batch):
+def test_exploration_equals_a_scalar_reference(look, model, shifts, batch):
     protocol = ProtocolConfig(starts=5, shifts=shifts)
     episodes = explorations_of(Scenes(), 0, 12, protocol)
     noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
     answers = answers_of(ANNOTATION, GRID, 4)
-    # In float64, so that the twin breaks ties alike.
+    # In float64, so that the reference finds the same ties.
     double = SemanticLook(look.likelihood.double(), look.footprint, look.distance.double())
-    explorer = Candidate(Strategy(Told(double), policies.KL(model.double())))
-    like = Detections(NOTHING.boxes.double(), NOTHING.scores.double(), NOTHING.mask)
-    progress = run_explorations(episodes, explorer, like, GRID, answers, noise, shifts=shifts, batch=batch)
+    explorer = Candidate(Strategy(FixedLook(double), policies.KL(model.double())))
+    nothing = Detections(NOTHING.boxes.double(), NOTHING.scores.double(), NOTHING.mask)
+    progress = run_explorations(episodes, explorer, nothing, GRID, answers, noise, shifts=shifts, batch=batch)
     right_classes = [set(row.nonzero()[:, 0].tolist()) for row in answers]
     for episode, random, outcome in zip(episodes, noise, progress, strict=True):
         expected = explore_by_loop(episode, look, model, right_classes, random, shifts)
         assert (outcome.cells, outcome.right, outcome.right_without_background) == expected
 
 
-def test_both_answers_are_recorded(look):
-    """What `right` counts is among what is right when background is no answer, as no cell's answer is background."""
+def test_answers_with_and_without_background_are_both_recorded(look):
+    """No cell has background as its answer, so leaving it out can only raise the count of right cells."""
     protocol = ProtocolConfig(starts=6, shifts=5)
     episodes = explorations_of(Scenes(), 0, 12, protocol)
     noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
     answers = answers_of(ANNOTATION, GRID, 4)
     assert not answers[:, 0].any()
-    explorer = Candidate(Strategy(Told(look), policies.Random()))
+    explorer = Candidate(Strategy(FixedLook(look), policies.Random()))
     progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=5, batch=100)
     for outcome in progress:
         counts = zip(outcome.right, outcome.right_without_background, strict=True)
-        assert all(right <= without for right, without in counts)
+        assert all(right <= without_background for right, without_background in counts)
     assert any(outcome.right != outcome.right_without_background for outcome in progress)
 
 
-def test_saliency_as_a_prior_follows_the_gaze(look, model):
-    """From every cell the next fixation is that of the policy's value times what is salient as seen from there."""
+def test_saliency_prior_is_that_of_the_fixated_cell(look, model):
+    """The next fixation maximises the policy's value times the saliency as seen from the current cell."""
     protocol = ProtocolConfig(starts=4, shifts=6)
     episodes = explorations_of(Scenes(), 0, 12, protocol)
     noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
     table = torch.rand(12, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64) + 0.1
-    observer, policy = Told(look), policies.Surprise(model)
+    observer, policy = FixedLook(look), policies.Surprise(model)
     explorer, answers = Candidate(Strategy(observer, policy), table, 0.5), answers_of(ANNOTATION, GRID, 4)
     progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=6, batch=3)
     for outcome in progress:
@@ -165,15 +165,15 @@ def test_saliency_as_a_prior_follows_the_gaze(look, model):
             assert values[there] >= values.masked_fill(visited[0], 0).max() * (1 - 1e-5)
 
 
-def test_saliency_takes_the_place_of_the_policy(look):
-    """From each cell the next one is the most salient as seen from there, whatever is believed."""
+def test_saliency_alone_replaces_the_policy(look):
+    """The next fixation is the most salient cell as seen from the current one, whatever the belief."""
     protocol = ProtocolConfig(starts=12, shifts=11)
     episodes = explorations_of(Scenes(), 1, 12, protocol)
     assert sorted(episode.start for episode in episodes) == list(range(12))
     noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
     saliency = torch.rand(12, 12, generator=torch.Generator().manual_seed(1))
     for table in (saliency, saliency[:1]):
-        explorer = Candidate(Strategy(Told(look), policies.Random()), table)
+        explorer = Candidate(Strategy(FixedLook(look), policies.Random()), table)
         answers = answers_of(ANNOTATION, GRID, 4)
         progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=11, batch=100)
         for episode, outcome in zip(episodes, progress, strict=True):
@@ -185,7 +185,7 @@ def test_saliency_takes_the_place_of_the_policy(look):
             assert outcome.cells == tuple(cells)
 
 
-def test_starts_and_ties_have_seeds():
+def test_starts_and_tie_breaking_noise_depend_on_the_seed():
     one, other = ProtocolConfig(starts=6), ProtocolConfig(starts=6, seed=1)
     assert explorations_of(Scenes(), 0, 100, one) != explorations_of(Scenes(), 0, 100, other)
     assert explorations_of(Scenes(), 0, 100, one) == explorations_of(Scenes(), 0, 100, one)

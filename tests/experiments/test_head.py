@@ -1,4 +1,4 @@
-"""The experiment with a head that turns: the same with and without a store, resumed, its tables by hand."""
+"""The experiment with a head that turns: results with and without a store, resuming, and tables."""
 
 import json
 from dataclasses import replace
@@ -19,8 +19,8 @@ from semfov.head.views import Views
 pytestmark = pytest.mark.usefixtures("kept_scenes")
 
 
-class Noise:
-    """Five pictures of coloured noise with a box each: quick to make."""
+class NoiseScenes:
+    """Five pictures of coloured noise, each with one box."""
 
     classes, ids, fingerprint = ("person", "cat", "cup"), [0, 1, 2, 3, 4], "noise"
 
@@ -46,7 +46,7 @@ class Noise:
 @pytest.fixture(params=["panorama", "mosaic"])
 def config(request, tmp_path, monkeypatch, textures):
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures())
-    monkeypatch.setattr("semfov.experiments.head.make_scenes", lambda data, classes: Noise())
+    monkeypatch.setattr("semfov.experiments.head.make_scenes", lambda data, classes: NoiseScenes())
     torch.manual_seed(0)
     models = TargetEvidence(components=4).requires_grad_(False), MapEvidence(components=4).requires_grad_(False)
     monkeypatch.setattr("semfov.experiments.head.make_target_evidence", lambda name, eye: models[0])
@@ -65,16 +65,16 @@ def config(request, tmp_path, monkeypatch, textures):
 
 
 @pytest.mark.slow
-def test_the_store_changes_nothing(config):
+def test_results_do_not_depend_on_the_store(config):
     fresh = HeadRun(replace(config, store=False)).outcomes(0)[0]
     written = HeadRun(config).outcomes(0)[0]
     run = HeadRun(config)
-    run.eye.detector.propose = None  # nothing is looked at again
+    run.eye.detector.propose = None  # any new look would fail
     assert run.outcomes(0)[0] == written == fresh
 
 
 @pytest.mark.slow
-def test_tables_and_resuming(config, capsys):
+def test_tables_match_records_and_a_deleted_part_is_computed_again(config, capsys):
     head_report.head(config)
     text = (config.out / "head.md").read_text()
     assert text in capsys.readouterr().out
@@ -98,7 +98,7 @@ def test_tables_and_resuming(config, capsys):
 
 
 @pytest.mark.slow
-def test_every_way_starts_alike_and_the_eye_alone_stays(config):
+def test_all_ways_start_at_the_same_view_and_the_eye_alone_never_turns_the_head(config):
     for task in ("search", "exploration"):
         records = [record for record in HeadRun(config).outcomes(1)[0] if record["task"] == task]
         assert len({record["actions"][0] for record in records}) == 1
@@ -106,7 +106,7 @@ def test_every_way_starts_alike_and_the_eye_alone_stays(config):
         assert len({action // 100 for action in alone["actions"]}) == 1
 
 
-def test_a_scan_visits_all_of_the_scene(config):
+def test_a_raster_scan_visits_every_view_of_the_tiling(config):
     run = HeadRun(config)
     views = Views(run.world(0))
     order = raster(views, views.tiling[0][1][1])
@@ -116,7 +116,7 @@ def test_a_scan_visits_all_of_the_scene(config):
     assert np.median(steps) <= 60.1
 
 
-def test_answers_are_where_objects_are(config):
+def test_answers_lie_in_reachable_cells_inside_boxes(config):
     run = HeadRun(config)
     views, places, labels = Views(run.world(0)), run.places(0), run.scenes.annotation(0).labels
     answers = answers_of(views, places, labels, 3)
@@ -128,7 +128,7 @@ def test_answers_are_where_objects_are(config):
     assert not answers[:, 0].any()
 
 
-def test_means_and_paired_differences_by_hand():
+def test_means_and_paired_differences_match_hand_calculations():
     ours = [{"scene": 0, "v": 1.0}, {"scene": 0, "v": 3.0}, {"scene": 1, "v": 6.0}]
     others = [{"scene": 0, "v": 5.0}, {"scene": 1, "v": 7.0}]
     mean, error, apart, error_apart = head_report.compared(others, ours, lambda record: record["v"])
@@ -140,9 +140,9 @@ def test_means_and_paired_differences_by_hand():
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "name"),
     [({"passes": 0}, "passes"), ({"seconds": 0.0}, "seconds"), ({"width": 3}, "width"), ({"dwell": 0}, "dwell")],
 )
-def test_settings_have_ranges(settings, told):
-    with pytest.raises(InputError, match=f"{told}: expected"):
+def test_settings_out_of_range_are_refused(settings, name):
+    with pytest.raises(InputError, match=f"{name}: expected"):
         HeadConfig(**settings)

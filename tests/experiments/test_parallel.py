@@ -1,4 +1,4 @@
-"""Processes: none is left when the one that started them ends, and ranks wait for each other as long as it takes."""
+"""Processes: workers end with the process that started them, and ranks wait for each other."""
 
 import os
 import resource
@@ -62,14 +62,14 @@ def alive(number):
 
 
 @contextmanager
-def started(call, **options):
-    """A process that hears Ctrl-C, as one that was started in a terminal does; it is gone at the end in any case."""
+def running(call, **options):
+    """A process that reacts to Ctrl-C as in a terminal; it is killed when the block ends."""
 
-    def hear():
+    def reset_interrupt():
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
     options |= {"env": ENVIRONMENT, "stderr": subprocess.PIPE, "text": True}
-    process = subprocess.Popen(call, start_new_session=True, **options, **{"preexec_fn": hear})
+    process = subprocess.Popen(call, start_new_session=True, **options, **{"preexec_fn": reset_interrupt})
     try:
         yield process
     finally:
@@ -78,17 +78,17 @@ def started(call, **options):
         process.communicate()
 
 
-def wait_until(happened, seconds=120):
+def wait_until(condition, seconds=120):
     deadline = time.monotonic() + seconds
-    while not happened():
-        assert time.monotonic() < deadline, "it did not happen"
+    while not condition():
+        assert time.monotonic() < deadline, "timed out"
         time.sleep(0.05)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux's /proc")
 @pytest.mark.parametrize(
-    ("number", "code", "told"),
+    ("number", "code", "last_line"),
     [
         (signal.SIGKILL, -9, None),
         (signal.SIGTERM, 143, "terminated; give the same command again to continue"),
@@ -96,13 +96,13 @@ def wait_until(happened, seconds=120):
     ],
     ids=["SIGKILL", "SIGTERM", "SIGINT"],
 )
-def test_workers_end_with_the_process_that_started_them(tmp_path, number, code, told):
+def test_workers_end_when_the_process_that_started_them_ends(tmp_path, number, code, last_line):
     script = tmp_path / "script.py"
     script.write_text(WORK)
     folder = tmp_path / "folder"
     folder.mkdir()
     call = [sys.executable, str(script), str(folder)]
-    with started(call) as process:
+    with running(call) as process:
         wait_until(lambda: len(list(folder.glob("*.worker"))) == 2 or process.poll() is not None)
         workers = [int(path.stem) for path in folder.glob("*.worker")]
         assert len(workers) == 2
@@ -113,7 +113,7 @@ def test_workers_end_with_the_process_that_started_them(tmp_path, number, code, 
         assert "Traceback" not in error
         wait_until(lambda: not any(map(alive, workers)), seconds=20)
     assert [path.suffix for path in folder.iterdir()] == [".worker", ".worker"], "no unfinished file is left"
-    assert told is None or error.strip().splitlines()[-1] == told
+    assert last_line is None or error.strip().splitlines()[-1] == last_line
 
 
 @pytest.mark.slow
@@ -121,10 +121,10 @@ def test_workers_end_with_the_process_that_started_them(tmp_path, number, code, 
     ("module", "seconds"),
     [("eval.search", 0.25), ("eval.search", 0.8), ("eval.search", 1.6), ("train.fit_tempering", 2.4)],
 )
-def test_an_early_interrupt_ends_in_one_line(tmp_path, module, seconds):
+def test_an_early_interrupt_prints_no_traceback(tmp_path, module, seconds):
     call = [sys.executable, "-m", module, "--out", str(tmp_path), "--workers", "2"]
-    with started(call, cwd=ROOT) as process:
-        # Before that Python has not even begun to look for the module.
+    with running(call, cwd=ROOT) as process:
+        # Before torch is loaded, Python may not have started to import the module.
         wait_until(lambda: "torch" in Path(f"/proc/{process.pid}/maps").read_text() or process.poll() is not None)
         time.sleep(seconds)
         process.send_signal(signal.SIGINT)
@@ -150,7 +150,7 @@ print(sum((folder / str(task)).exists() for task in range(4)))
 
 
 @pytest.mark.slow
-def test_a_rank_waits_for_one_with_much_more_to_do(tmp_path):
+def test_a_rank_waits_for_a_slower_rank(tmp_path):
     call = [sys.executable, "-c", RANK, str(tmp_path), "2"]
     ranked = [{**ENVIRONMENT, "RANK": str(n), "WORLD_SIZE": "2"} for n in range(2)]
     ranks = [subprocess.Popen(call, env=own, stdout=subprocess.PIPE, text=True) for own in ranked]
@@ -158,7 +158,7 @@ def test_a_rank_waits_for_one_with_much_more_to_do(tmp_path):
     assert [process.returncode for process in ranks] == [0, 0]
 
 
-def test_there_is_nobody_to_wait_for_alone(monkeypatch):
+def test_a_single_process_does_not_wait_and_ranks_share_tasks(monkeypatch):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
     wait_for_others([1], lambda task: False)
     monkeypatch.setenv("WORLD_SIZE", "3")
@@ -168,10 +168,10 @@ def test_there_is_nobody_to_wait_for_alone(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_a_reader_that_leaves_is_no_traceback():
-    """As `python -m eval.demo | head -0`."""
+def test_a_closed_output_pipe_prints_no_traceback():
+    """As in `python -m eval.demo | head -0`."""
     call = [sys.executable, "-m", "eval.demo"]
-    with started(call, cwd=ROOT, stdout=subprocess.PIPE) as process:
+    with running(call, cwd=ROOT, stdout=subprocess.PIPE) as process:
         process.stdout.close()
         process.stdout = None
         error = process.communicate(timeout=120)[1]
@@ -179,15 +179,15 @@ def test_a_reader_that_leaves_is_no_traceback():
         assert error == ""
 
 
-def test_processor_seconds_are_what_the_system_counts():
-    """Of this process and of one that it started, which works for a while."""
+def test_processor_seconds_match_the_operating_system():
+    """Those of this process and of a subprocess that works for a while."""
 
-    def counted():
+    def system_seconds():
         parts = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
         return sum(part.ru_utime + part.ru_stime for part in parts)
 
-    before, expected = processor_seconds(), counted()
+    before, expected = processor_seconds(), system_seconds()
     subprocess.run([sys.executable, "-c", "sum(range(10**7))"], check=True)
     spent = processor_seconds() - before
-    assert spent == pytest.approx(counted() - expected, abs=0.05)
+    assert spent == pytest.approx(system_seconds() - expected, abs=0.05)
     assert spent > 0.05

@@ -1,4 +1,4 @@
-"""Policies as settings have them: names, mappings, what tables call them, and what is refused."""
+"""Policies in settings: names, mappings, labels in tables, and which are refused."""
 
 from dataclasses import asdict, fields, replace
 from itertools import combinations
@@ -26,7 +26,7 @@ ALIASES = {
     "exploration": {"recommended": "closer-look-learned", "published": "kl-calibrated"},
 }
 
-# One change each; together, every word that a setting can be.
+# One change each; together they cover every allowed word of every setting.
 CHANGES = [
     {"tempering": 0.25},
     {"tempering": 0.5},
@@ -45,7 +45,7 @@ def test_every_policy_has_a_preset(task):
         assert resolve(name, task) == resolve(preset, task) == preset
 
 
-def test_names_tell_policy_scores_and_saliency():
+def test_names_give_policy_scores_and_saliency():
     assert resolve("predictive-calibrated", "search") == PolicyConfig("predictive", "calibrated")
     assert resolve("place-information-raw", "search") == PolicyConfig("place-information", "raw")
     assert resolve("learned", "search") == PolicyConfig("learned")
@@ -62,14 +62,14 @@ def test_names_tell_policy_scores_and_saliency():
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_presets_are_called_by_their_names(task):
+def test_labels_of_presets_are_their_names(task):
     for name in presets(task):
         assert label(name, task) == ALIASES[task].get(name, name)
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_labels_are_unique(task):
-    """Two policies of a run with one label would be one policy of its tables."""
+    """Two policies with the same label would be merged in the tables of a run."""
     several = [{}, *CHANGES, *({**one, **other} for one, other in combinations(CHANGES, 2))]
     made = set()
     for preset in presets(task).values():
@@ -83,7 +83,7 @@ def test_labels_are_unique(task):
     assert labels >= {label(name, task) for name in presets(task)}
 
 
-def test_labels_say_what_differs_from_a_preset():
+def test_labels_list_the_differences_from_a_preset():
     central = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
     assert label(central, "search") == "non-predictive-raw, tempering 0.25, footprint box_centre"
     everything = PolicyConfig("predictive", "calibrated", 1.0, "soft", "closest", True, "vocus2", "none", "mine")
@@ -141,8 +141,8 @@ def test_an_exponent_out_of_range_is_refused(tempering):
 
 
 @pytest.mark.parametrize("policy", ["random", "learned", "target-evidence", "saliency"])
-def test_scores_that_a_policy_has_no_use_for_are_refused(policy):
-    """Its label could not tell it from the one with raw scores."""
+def test_scores_are_refused_for_policies_that_do_not_use_them(policy):
+    """Its label would be the same as with raw scores."""
     saliency = "vocus2" if policy == "saliency" else None
     with pytest.raises(InputError, match=f"^scores: .*'{policy}'"):
         resolve(PolicyConfig(policy, "calibrated", saliency=saliency), "search")
@@ -152,13 +152,13 @@ def test_scores_that_a_policy_has_no_use_for_are_refused(policy):
 @pytest.mark.parametrize(
     "change", [{"tempering": 0.25}, {"footprint": "soft"}, {"memory": "all"}, {"misses": True}], ids=str
 )
-def test_settings_of_a_map_are_refused_where_a_belief_comes_with_the_policy(policy, change):
+def test_settings_of_a_map_are_refused_for_policies_with_their_own_belief(policy, change):
     with pytest.raises(InputError, match=f"^{next(iter(change))}: .*'{policy}'"):
         resolve(PolicyConfig(policy, **change), "search")
 
 
 def parsed(config, *arguments):
-    """What a command line gives."""
+    """The policies that a command line gives."""
     got = []
     assert run_command(got.append, config, "Policies.", arguments) == 0
     (settings,) = got
@@ -168,14 +168,14 @@ def parsed(config, *arguments):
 MAPPING = "[{policy: non-predictive, tempering: 0.25}, random]"
 
 
-def test_a_mapping_is_a_policy_on_the_command_line():
+def test_a_policy_can_be_a_mapping_on_the_command_line():
     assert parsed(SearchConfig, "--policies", MAPPING) == (PolicyConfig("non-predictive", tempering=0.25), "random")
     given = "[recommended, {policy: kl, scores: calibrated, memory: closest, misses: true}]"
     expected = "recommended", PolicyConfig("kl", "calibrated", memory="closest", misses=True)
     assert parsed(ExploreConfig, "--policies", given) == expected
 
 
-def test_a_mapping_is_a_policy_in_yaml(tmp_path):
+def test_a_policy_can_be_a_mapping_in_yaml(tmp_path):
     path = tmp_path / "run.yaml"
     path.write_text(f"policies: {MAPPING}\n")
     assert parsed(SearchConfig, "--config", str(path)) == (PolicyConfig("non-predictive", tempering=0.25), "random")
@@ -184,7 +184,7 @@ def test_a_mapping_is_a_policy_in_yaml(tmp_path):
 
 
 @pytest.mark.parametrize("config", [SearchConfig, ExploreConfig])
-def test_settings_that_a_run_wrote_are_its_settings(config, tmp_path):
+def test_settings_that_a_run_wrote_can_be_read_back(config, tmp_path):
     policies = (PolicyConfig("random", saliency="vocus2"), *config().policies)
     path = tmp_path / "config.yaml"
     path.write_text(yaml.safe_dump(plain(asdict(replace(config(), policies=policies))), sort_keys=False))
@@ -200,20 +200,20 @@ BAD = {
 
 
 @pytest.mark.parametrize("wrong", BAD)
-def test_a_mapping_that_is_none_of_a_policy_is_refused_in_yaml(wrong, tmp_path, capsys):
+def test_an_invalid_mapping_is_refused_in_yaml(wrong, tmp_path, capsys):
     path = tmp_path / "run.yaml"
     path.write_text(f"policies:\n- {BAD[wrong]}\n")
     with pytest.raises(SystemExit) as stopped:
         parsed(SearchConfig, "--config", str(path))
     assert stopped.value.code == 2
-    told = capsys.readouterr().err
-    assert "policies" in told
-    assert wrong in told
+    error = capsys.readouterr().err
+    assert "policies" in error
+    assert wrong in error
 
 
 @pytest.mark.parametrize("wrong", BAD)
-def test_a_mapping_that_is_none_of_a_policy_is_refused_on_the_command_line(wrong, capsys):
-    """The parser may take such a thing for text, which is then no name."""
+def test_an_invalid_mapping_is_refused_on_the_command_line(wrong, capsys):
+    """The parser may read such a mapping as text, which is then an unknown name."""
 
     def run(config):
         for choice in config.policies:
@@ -224,6 +224,6 @@ def test_a_mapping_that_is_none_of_a_policy_is_refused_on_the_command_line(wrong
     except SystemExit as stopped:
         code = stopped.code
     assert code in (1, 2)
-    told = capsys.readouterr().err
-    assert "policies" in told
-    assert wrong in told
+    error = capsys.readouterr().err
+    assert "policies" in error
+    assert wrong in error

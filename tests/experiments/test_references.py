@@ -1,4 +1,4 @@
-"""What one sharp look gives: painted and fused maps against loops, and the counts of maps."""
+"""Maps from one sharp look: painted and fused maps, and counts of right cells, against loops."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from semfov.experiments.references import FUSED, PAINTED, sharp_maps
 GRID = Grid(5, 4, (100, 60))
 
 
-def seen(seed=0, most=6, dtype=torch.float32, device=None):
+def random_detections(seed=0, most=6, dtype=torch.float32, device=None):
     generator = torch.Generator().manual_seed(seed)
     corner = torch.rand(1, most, 2, generator=generator) * torch.tensor([75.0, 45])
     boxes = torch.cat([corner, corner + 2 + torch.rand(1, most, 2, generator=generator) * 35], -1)
@@ -25,7 +25,7 @@ def covers(box, cell):
     return box[0] < left + 20 and box[2] > left and box[1] < top + 15 and box[3] > top
 
 
-def each_detection(sharp):
+def valid_detections(sharp):
     rows = zip(sharp.boxes[0].tolist(), sharp.scores[0].tolist(), sharp.mask[0].tolist(), strict=True)
     return [(box, scores) for box, scores, real in rows if real]
 
@@ -38,8 +38,8 @@ def kaplan(beta, likelihood):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("seed", range(4))
-def test_maps_equal_loops(seed, dtype, device):
-    sharp = seen(seed, dtype=dtype, device=device)
+def test_maps_equal_loops_over_cells_and_detections(seed, dtype, device):
+    sharp = random_detections(seed, dtype=dtype, device=device)
     maps = sharp_maps(sharp, GRID)
     assert set(maps) == {FUSED, PAINTED}
     for probabilities in maps.values():
@@ -48,7 +48,7 @@ def test_maps_equal_loops(seed, dtype, device):
         assert probabilities.device.type == device.type
     for cell in range(20):
         painted, beta = [0.2, 0.0, 0.0, 0.0], np.full(4, 0.5)
-        for box, scores in each_detection(sharp):
+        for box, scores in valid_detections(sharp):
             if covers(box, cell):
                 painted[1:] = [max(pair) for pair in zip(painted[1:], scores[1:], strict=True)]
                 beta = kaplan(beta, np.array(scores))
@@ -57,7 +57,7 @@ def test_maps_equal_loops(seed, dtype, device):
 
 
 @pytest.mark.parametrize("most", [0, 3])
-def test_nothing_was_detected(most):
+def test_maps_without_detections_are_background_or_uniform(most):
     nothing = Detections(torch.zeros(1, most, 4), torch.rand(1, most, 4), torch.zeros(1, most, dtype=torch.bool))
     maps = sharp_maps(nothing, GRID)
     expected = torch.tensor([0.2, 0, 0, 0]).expand(1, 20, -1)
@@ -65,15 +65,15 @@ def test_nothing_was_detected(most):
     torch.testing.assert_close(maps[FUSED], torch.full((1, 20, 4), 0.25))
 
 
-def test_background_is_painted_where_no_score_is_higher():
+def test_background_is_painted_unless_a_class_scores_higher():
     box = torch.tensor([[[1.0, 1, 19, 14], [21, 1, 39, 14]]])
     scores = torch.tensor([[[0.6, 0.19, 0.11, 0.1], [0.6, 0.21, 0.1, 0.09]]])
     painted = sharp_maps(Detections(box, scores, torch.ones(1, 2, dtype=torch.bool)), GRID)[PAINTED][0]
     assert painted.argmax(-1).tolist() == [0, 1] + [0] * 18
 
 
-def counted(probabilities, answers):
-    """Cell by cell: the most probable class, where there is one, is an object's; or background where nothing is."""
+def counts_by_loop(probabilities, answers):
+    """Right cells with background as an answer, without it, and over the whole grid; ties give no answer."""
     totals = [0, 0, 0]
     for p, right in zip(probabilities.tolist(), answers.tolist(), strict=True):
 
@@ -88,8 +88,8 @@ def counted(probabilities, answers):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_counts_equal_a_loop(seed, device):
-    """Ties among them: rounded probabilities often share the first place."""
+def test_counts_equal_a_loop_over_cells(seed, device):
+    """Ties are included: rounded probabilities often share the maximum."""
     generator = torch.Generator().manual_seed(seed)
     probabilities = (torch.rand(6, 40, 4, generator=generator) * 4).round() / 4
     probabilities[0] = torch.rand(40, 4, generator=generator)
@@ -97,17 +97,17 @@ def test_counts_equal_a_loop(seed, device):
     answers[:, 0] = False
     got = counts_of(probabilities.to(device), answers.to(device))
     assert [tuple(each.shape) for each in got] == [(6,)] * 3
-    expected = [counted(rows, answers) for rows in probabilities]
+    expected = [counts_by_loop(rows, answers) for rows in probabilities]
     assert torch.stack(got, 1).tolist() == expected
     assert all(sum(column) > 0 for column in zip(*expected, strict=True))
 
 
-def test_counts_of_maps_that_know_all_and_nothing():
+def test_counts_of_perfect_empty_and_uniform_maps():
     answers = torch.zeros(10, 4, dtype=torch.bool)
     answers[:6, 1] = answers[4:7, 3] = True
     perfect = answers.float()
     perfect[:, 0] = (~answers.any(-1)).float()
-    perfect[4:6, 3] = 0.5  # two objects share these cells; either will do
+    perfect[4:6, 3] = 0.5  # two objects share these cells; either answer is right
     empty = torch.zeros(10, 4)
     empty[:, 0] = 1
     even = torch.full((10, 4), 0.25)

@@ -1,4 +1,4 @@
-"""A replayed episode has the beliefs and the values that it had when it was run, and the map that the agent keeps."""
+"""Replayed episodes have the same beliefs, values and maps as when they were run."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ SEMANTIC = (
     "learned",
     "vocus2",
 )
-TOGETHER = PolicyConfig(SOUGHT, context="both")
+WITH_CONTEXT = PolicyConfig(SOUGHT, context="both")
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +49,11 @@ def settings(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(settings):
-    return SearchRun(SearchConfig(**settings, policies=(*SEMANTIC, SOUGHT, TOGETHER)))
+    return SearchRun(SearchConfig(**settings, policies=(*SEMANTIC, SOUGHT, WITH_CONTEXT)))
 
 
-def watched(run, module):
-    """Records of the first scene by policy, each with the steps of all its episodes as they were run."""
+def run_and_record_steps(run, module):
+    """Records of the first scene by policy, each with the steps of all its episodes."""
     calls = []
 
     def spy(*given, **options):
@@ -73,11 +73,11 @@ def watched(run, module):
 
 @pytest.fixture(scope="module")
 def searched(run):
-    return watched(run, search_protocol)
+    return run_and_record_steps(run, search_protocol)
 
 
 def steps_of(steps, episode):
-    """Belief and values of one episode at each of its fixations, as long as it looked."""
+    """Belief and values of one episode at each fixation at which it looked."""
     for step in steps:
         row = (step.episodes == episode).nonzero()[:, 0]
         if len(row):
@@ -85,24 +85,24 @@ def steps_of(steps, episode):
 
 
 @pytest.mark.slow
-def test_a_semantic_search_has_the_beliefs_and_values_that_it_had(run, searched):
+def test_a_replayed_semantic_search_has_the_original_beliefs_and_values(run, searched):
     for name in list(run.policies)[: len(SEMANTIC)]:
         records, steps = searched[name]
         assert len(records) > 2
         for number, record in enumerate(records):
             path = replay(run, 0, record)
             assert path.cells.tolist() == record["cells"]
-            had = list(steps_of(steps, number))
-            # A search that ends on its target does not look from there; its replay does.
-            assert len(had) == len(path) - (record["found_at"] >= 0 or len(path) == 6)
-            for shift, (belief, values) in enumerate(had):
+            recorded = list(steps_of(steps, number))
+            # A search stops without a look when it reaches the target; its replay has that look.
+            assert len(recorded) == len(path) - (record["found_at"] >= 0 or len(path) == 6)
+            for shift, (belief, values) in enumerate(recorded):
                 torch.testing.assert_close(path.probabilities[shift], belief.probabilities[0])
                 torch.testing.assert_close(path.values[shift], values)
                 torch.testing.assert_close(path.posterior[shift], belief.probability(record["cue"])[0])
 
 
 @pytest.mark.parametrize("policy", [SOUGHT, f"{SOUGHT}, context both"])
-def test_a_search_by_target_evidence_has_the_recommended_map_beside_it(run, searched, policy):
+def test_a_replayed_search_by_target_evidence_also_has_the_recommended_map(run, searched, policy):
     records, steps = searched[policy]
     looks, grid = run.detections(0), run.grid(0)
     mapper = LearnedMap(MapEvidence.from_pretrained(run.eye.detector.name))
@@ -117,9 +117,9 @@ def test_a_search_by_target_evidence_has_the_recommended_map_beside_it(run, sear
             torch.testing.assert_close(path.probabilities[shift], known.probabilities[0])
 
 
-def test_the_map_beside_target_evidence_is_the_one_that_the_recommended_agent_keeps(run):
+def test_the_map_of_a_replayed_search_is_that_of_the_recommended_agent(run):
     agent, scene = ActivePerception.recommended(), run.scenes[0]
-    # Models are fitted on other grids, which makes no difference to whether two beliefs are one.
+    # The models were fitted on other grids, which does not matter for comparing two beliefs.
     agent.columns, agent.rows = 4, 3
     assert agent.eye.settings() == run.eye.settings()
     target = run.scenes.targets(0)[0]
@@ -145,8 +145,8 @@ def test_the_map_beside_target_evidence_is_the_one_that_the_recommended_agent_ke
         torch.testing.assert_close(mine.boxes[mine.mask], theirs.boxes[theirs.mask], rtol=1e-5, atol=1e-3)
 
 
-def test_what_a_run_adds_to_its_searches_does_not_change_the_map_beside_them(run, searched, settings):
-    """Context is of searches, and misses need a model that such a run may not have."""
+def test_context_and_misses_of_a_run_do_not_change_the_map_of_a_replay(run, searched, settings):
+    """The map uses no context, and no misses, which need a model that the run may not have."""
     belief = BeliefConfig(columns=4, rows=3, context="both", misses=True)
     everywhere = SearchRun(SearchConfig(**{**settings, "belief": belief}, policies=(SOUGHT,)))
     alone = PolicyConfig("non-predictive", misses=False, context="both")
@@ -159,28 +159,28 @@ def test_what_a_run_adds_to_its_searches_does_not_change_the_map_beside_them(run
     torch.testing.assert_close(replay(without, 0, {**record, "policy": name}).probabilities, expected)
 
 
-def test_a_search_for_another_class_is_replayed_as_it_believed(run, searched):
-    """In the control the searcher is told another class than the one that counts."""
+def test_a_search_with_a_wrong_cue_is_replayed_with_the_belief_about_the_cue(run, searched):
+    """In the control the cue is another class than the target."""
     record = {**searched["non-predictive-raw"][0][0], "cue": 7}
     path = replay(run, 0, record)
     assert path.target == record["target"] != 7
     torch.testing.assert_close(path.posterior, path.probabilities[..., 7])
 
 
-def test_reading_a_store_is_no_time_of_the_eyes(run, searched):
+def test_a_replay_from_the_store_has_no_times(run, searched):
     assert replay(run, 0, searched[SOUGHT][0][0]).seconds == ()
 
 
-def test_an_exploration_has_the_beliefs_and_values_that_it_had(settings):
+def test_a_replayed_exploration_has_the_original_beliefs_and_values(settings):
     policies = ("kl-calibrated", "recommended", "vocus2-raw", PolicyConfig("surprise", misses=True))
     run = ExploreRun(replace(ExploreConfig(**settings), policies=policies))
-    for records, steps in watched(run, exploration_protocol).values():
+    for records, steps in run_and_record_steps(run, exploration_protocol).values():
         for number, record in enumerate(records):
             path = replay(run, 0, record)
             assert path.cells.tolist() == record["cells"]
             assert (path.target, path.found, path.posterior) == (None, False, None)
-            had = list(steps_of(steps, number))
-            assert len(had) == len(path) == 6
-            for shift, (belief, values) in enumerate(had):
+            recorded = list(steps_of(steps, number))
+            assert len(recorded) == len(path) == 6
+            for shift, (belief, values) in enumerate(recorded):
                 torch.testing.assert_close(path.probabilities[shift], belief.probabilities[0])
                 torch.testing.assert_close(path.values[shift], values)

@@ -1,4 +1,4 @@
-"""What a run is made of, and what its outcomes are kept under."""
+"""Policies and saliency of a run, and the key under which its outcomes are stored."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def config(tmp_path):
     )
 
 
-def test_policies_are_called_by_their_labels(config):
+def test_policies_of_a_run_are_named_by_their_labels(config):
     central = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
     run = SearchRun(replace(config, policies=("random", central, "recommended")))
     assert run.policies == {
@@ -47,7 +47,7 @@ def test_policies_are_called_by_their_labels(config):
         run.candidate("randm", 0)
 
 
-def test_a_run_needs_every_saliency_model_once(config):
+def test_a_run_has_one_store_for_each_saliency_model(config):
     calibrated, sought = replace(GUIDED, scores="calibrated"), PolicyConfig("target-evidence", saliency="itti-koch")
     run = SearchRun(replace(config, policies=("vocus2", "random", GUIDED, sought, calibrated)))
     assert list(run.saliency_stores) == ["vocus2", "itti-koch"]
@@ -58,7 +58,7 @@ def test_a_run_needs_every_saliency_model_once(config):
     assert ExploreRun(replace(explored, policies=("kl-raw", mild))).saliency_stores == {}
 
 
-def test_saliency_has_its_weight_beside_a_policy_and_none_alone(config):
+def test_saliency_has_a_weight_only_when_combined_with_a_policy(config):
     run = SearchRun(replace(config, policies=("vocus2", GUIDED, "random"), saliency=SaliencyConfig(weight=0.3)))
     alone, beside, none = (run.candidate(name, 0) for name in run.policies)
     assert alone.weight is None
@@ -69,7 +69,7 @@ def test_saliency_has_its_weight_beside_a_policy_and_none_alone(config):
 
 
 @pytest.mark.slow
-def test_parts_are_of_what_the_outcomes_depend_on(config):
+def test_the_key_changes_only_with_settings_that_affect_outcomes(config):
     key = SearchRun(config).key
     for same in (
         {"workers": 3},

@@ -1,4 +1,4 @@
-"""The page of a run shows the run: its curves, its episodes as recorded, no more bytes than it may."""
+"""The page of a run: curves, episodes as recorded, and the limit on its size."""
 
 import json
 import re
@@ -52,7 +52,7 @@ def write_search(run, records, **options):
 
 
 @pytest.mark.slow
-def test_search(searched):
+def test_the_page_of_a_search_run_shows_curves_and_episodes(searched):
     run, records = searched
     curves, page, data = write_search(run, records)
     chosen = choose_episodes(records, list(run.policies), 18)
@@ -70,14 +70,14 @@ def test_search(searched):
     assert "min_instances" in page
 
 
-def test_no_more_than_the_limit(searched, monkeypatch):
+def test_the_size_limit_leaves_one_episode(searched, monkeypatch):
     run, records = searched
     monkeypatch.setattr(module, "LIMIT", 1)
     _, _, data = write_search(run, records)
     assert len(data["episodes"]) == 1
 
 
-def test_exploration(settings):
+def test_the_page_of_an_exploration_run_shows_episodes_as_recorded(settings):
     run = ExploreRun(ExploreConfig(**settings, policies=("random-raw", "kl-calibrated")))
     records = run.outcomes(0)[0]
     curves = {"all classes": explore_report.success(records, list(run.policies), "all classes")}
@@ -93,7 +93,7 @@ def test_exploration(settings):
     assert [episode["target"] for episode in data["episodes"]] == [None, None]
     kl = next(record for record in records if record["policy"] == "kl-calibrated" and record["repetition"] == 0)
     assert [each["cell"] for each in data["episodes"][1]["fixations"]] == kl["cells"]
-    # What was replayed is what the gaze followed: of the cells not yet visited, the next has the greatest value.
+    # The replayed values explain the gaze: the next cell has the greatest value of those not yet visited.
     fixations = data["episodes"][1]["fixations"]
     for number, each in enumerate(fixations[:-1]):
         values = np.array(each["values"], dtype=float)

@@ -1,4 +1,4 @@
-"""The search protocol against a scalar twin, the hypergeometric formula and its own independence of batches."""
+"""The search protocol against a scalar reference and the hypergeometric formula, and with other batch sizes."""
 
 from dataclasses import dataclass, replace
 
@@ -20,7 +20,7 @@ CLASSES = ("cat", "cup", "person")
 
 @dataclass
 class Annotated:
-    """Scenes of which only the annotations are known."""
+    """Scenes that have annotations but no images."""
 
     boxes: list[torch.Tensor]
     labels: list[torch.Tensor]
@@ -47,14 +47,14 @@ def scenes():
 
 @pytest.fixture
 def look():
-    """What three detections from each of 25 cells say about four classes."""
+    """Likelihoods of four classes for three detections from each of 25 cells."""
     torch.manual_seed(0)
     likelihood = torch.rand(25, 3, 4) ** 3
     return SemanticLook(likelihood, torch.rand(25, 3, 25) < 0.15, torch.zeros(25, 25))
 
 
-class Told(Semantic):
-    """An observer that is told what looks say."""
+class FixedLook(Semantic):
+    """An observer that returns a given look, whatever is detected."""
 
     def __init__(self, look):
         super().__init__(4)
@@ -71,7 +71,7 @@ NOTHING = Detections.empty(25, 3)
 def run(scenes, look, policy, protocol, batch=1024, index=0):
     episodes = episodes_of(scenes, index, 5, 5, protocol)
     noise = torch.stack([tie_noise(scenes, episode, 25, protocol) for episode in episodes])
-    candidate = Candidate(Strategy(Told(look), policy))
+    candidate = Candidate(Strategy(FixedLook(look), policy))
     outcomes = run_episodes(episodes, candidate, NOTHING, GRID, noise, shifts=protocol.shifts, batch=batch)
     return episodes, noise, outcomes
 
@@ -99,7 +99,7 @@ def search_by_loop(episode, look, noise, shifts):
 
 
 @pytest.mark.parametrize("ties", ["random", "first"])
-def test_search_equals_a_scalar_twin(scenes, look, ties):
+def test_search_equals_a_scalar_reference(scenes, look, ties):
     protocol = ProtocolConfig(starts=6, shifts=9, ties=ties)
     episodes, noise, outcomes = run(scenes, look, policies.NonPredictive(), protocol)
     assert len(episodes) == 18
@@ -118,13 +118,13 @@ def test_random_search_follows_the_hypergeometric_formula(scenes, look):
         assert (np.abs(curve - expected) <= 4.5 * error + 1e-12).all()
 
 
-def test_saliency_takes_the_place_of_the_policy(scenes, look):
+def test_saliency_alone_replaces_the_policy(scenes, look):
     protocol = ProtocolConfig(starts=3, shifts=8)
     episodes = episodes_of(scenes, 0, 5, 5, protocol)
     noise = torch.stack([tie_noise(scenes, episode, 25, protocol) for episode in episodes])
     saliency = torch.rand(25, 25, generator=torch.Generator().manual_seed(0))
     for table in (saliency, saliency[:1]):
-        candidate = Candidate(Strategy(Told(look), policies.Random()), table)
+        candidate = Candidate(Strategy(FixedLook(look), policies.Random()), table)
         outcomes = run_episodes(episodes, candidate, NOTHING, GRID, noise, shifts=8, batch=4)
         for episode, outcome in zip(episodes, outcomes, strict=True):
             cells = [episode.start]
@@ -137,14 +137,14 @@ def test_saliency_takes_the_place_of_the_policy(scenes, look):
 
 
 @pytest.mark.parametrize("policy", [policies.Random(), policies.NonPredictive()], ids=lambda policy: policy.name)
-def test_batches_change_nothing(scenes, look, policy):
+def test_outcomes_do_not_depend_on_the_batch_size(scenes, look, policy):
     protocol = ProtocolConfig(starts=7, shifts=12)
     _, _, whole = run(scenes, look, policy, protocol)
     for batch in (1, 5):
         assert run(scenes, look, policy, protocol, batch)[2] == whole
 
 
-def test_episodes_start_off_target_and_differ(scenes):
+def test_episodes_start_at_different_cells_outside_the_target(scenes):
     episodes = episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=10))
     assert {episode.target for episode in episodes} == {1, 2, 3}
     for target in (1, 2, 3):
@@ -155,7 +155,7 @@ def test_episodes_start_off_target_and_differ(scenes):
         assert all(episode.commonest == (target == 1) for episode in mine)
 
 
-def test_controls_change_the_cue_or_the_goal_and_nothing_else(scenes):
+def test_controls_change_only_the_cue_or_the_goal(scenes):
     plain = episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=3))
     wrong = episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=3, control="wrong-class"))
     moved = episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=3, control="permuted"))
@@ -176,24 +176,24 @@ def test_an_episode_does_not_depend_on_other_scenes(scenes):
     assert torch.equal(tie_noise(scenes, first[3], 25, protocol), tie_noise(alone, second[3], 25, protocol))
 
 
-def test_seeds_differ(scenes):
+def test_different_seeds_give_different_starts(scenes):
     starts = [[e.start for e in episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=10, seed=seed))] for seed in (0, 1)]
     assert starts[0] != starts[1]
 
 
-def test_more_starts_than_cells_repeat_evenly(scenes):
+def test_starts_repeat_evenly_when_there_are_more_than_cells(scenes):
     episodes = episodes_of(scenes, 0, 5, 5, ProtocolConfig(starts=48))
     starts = [episode.start for episode in episodes if episode.target == 2]
     assert len(starts) == 48
     assert sorted(np.bincount(starts, minlength=25).tolist()) == [0] + [2] * 24
 
 
-def test_no_cell_left_ends_the_search(scenes, look):
+def test_a_search_ends_when_no_cell_is_left(scenes, look):
     protocol = ProtocolConfig(starts=2, shifts=40)
     episodes = episodes_of(scenes, 0, 5, 5, protocol)[:1]
     hidden = [episodes[0].__class__(**{**episodes[0].__dict__, "goal": ()})]
     noise = tie_noise(scenes, episodes[0], 25, protocol)[None]
-    candidate = Candidate(Strategy(Told(look), policies.Random()))
+    candidate = Candidate(Strategy(FixedLook(look), policies.Random()))
     outcome = run_episodes(hidden, candidate, NOTHING, GRID, noise, shifts=40, batch=8)[0]
     assert outcome.found_at == -1
     assert sorted(outcome.cells) == list(range(25))

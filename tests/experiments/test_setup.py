@@ -23,7 +23,7 @@ from semfov.experiments.setup import make_scenes
         ({"name": "published", "sigma": 50, "reference": 320}, 50, 1, 50 / 320),
     ],
 )
-def test_a_sensor_is_known_by_name_and_may_be_changed(settings, sigma, growth, fovea):
+def test_a_sensor_is_chosen_by_name_and_may_be_changed(settings, sigma, growth, fovea):
     config = SensorConfig(**settings)
     sensor = config.make()
     assert (float(sensor.sigma), sensor.growth, sensor.levels) == pytest.approx((sigma, growth, 5))
@@ -31,7 +31,7 @@ def test_a_sensor_is_known_by_name_and_may_be_changed(settings, sigma, growth, f
     assert SensorConfig(levels=3, convention="opencv").make().convention == "opencv"
 
 
-def test_an_unknown_sensor_is_told(capsys):
+def test_an_unknown_sensor_gets_a_suggestion(capsys):
     with pytest.raises(InputError, match="did you mean 'published"):
         SensorConfig(name="publishd").make()
     with pytest.raises(SystemExit):
@@ -57,20 +57,20 @@ def choose(photographs, **settings):
 
 @pytest.mark.parametrize("ids", [[92, 3], ["92", "3"], {3, 92}, (3, 3, 92)], ids=str)
 def test_photographs_are_chosen_by_their_ids(photographs, ids):
-    """Numbers or text, in any order; the order of scenes is that of the ids."""
+    """Ids may be numbers or text, in any order; scenes are sorted by id."""
     scenes = choose(photographs, ids=ids)
     assert scenes.ids == [3, 92]
     assert [scene.name for scene in scenes] == ["3.png", "92.png"]
 
 
-def test_other_selections_follow_that_by_ids(photographs):
+def test_other_selections_apply_after_the_one_by_ids(photographs):
     assert choose(photographs, ids=[15, 92, 14], limit=2).ids == [14, 15]
     assert choose(photographs).ids == choose(photographs, ids=None).ids == [3, 14, 15, 92]
     with pytest.raises(DataError, match="none of 4 images"):
         CocoScenes(photographs, photographs / "cups.json", ("cup",), min_instances=2, ids=[14])
 
 
-def test_the_fingerprint_tells_which_photographs(photographs):
+def test_the_fingerprint_depends_on_the_chosen_photographs(photographs):
     every, some, same = (choose(photographs, ids=ids).fingerprint for ids in (None, [3, 14], ["14", "3"]))
     assert some == same != every
     assert choose(photographs, ids=[3, 14, 15, 92]).fingerprint == every

@@ -1,4 +1,4 @@
-"""Results of other code, other pixels and other threads are never taken for one's own."""
+"""Stored results of other code or other images are not used, and do not depend on threads."""
 
 import json
 import logging
@@ -49,7 +49,7 @@ def threads():
 
 
 @pytest.mark.slow
-def test_a_finished_run_of_other_code_is_told_and_computed_anew(config, monkeypatch, caplog):
+def test_a_run_finished_by_other_code_is_reported_and_computed_again(config, monkeypatch, caplog):
     first = SearchRun(config)
     finish(first, "searching")
     assert first.parts.load(0) is not None
@@ -59,7 +59,7 @@ def test_a_finished_run_of_other_code_is_told_and_computed_anew(config, monkeypa
     second = SearchRun(config)
     assert second.settings_key == first.settings_key
     assert second.key != first.key
-    assert second.store.key == first.store.key, "what was seen does not depend on how it is searched"
+    assert second.store.key == first.store.key, "stored looks do not depend on the code of the search"
     assert second.parts.load(0) is None
     with caplog.at_level(logging.WARNING):
         finish(second, "searching")
@@ -68,8 +68,8 @@ def test_a_finished_run_of_other_code_is_told_and_computed_anew(config, monkeypa
     assert second.parts.load(0) is not None
 
 
-def test_the_code_of_a_policy_of_the_users_own_counts(config, tmp_path, monkeypatch):
-    class Own(Policy):
+def test_the_key_depends_on_the_code_of_a_user_defined_policy(config, tmp_path, monkeypatch):
+    class OwnPolicy(Policy):
         name = "own-of-a-test"
         tasks = ("search",)
 
@@ -87,7 +87,7 @@ def test_the_code_of_a_policy_of_the_users_own_counts(config, tmp_path, monkeypa
         del POLICIES["own-of-a-test"]
 
 
-def test_an_image_of_the_same_size_is_another_image(tmp_path):
+def test_a_part_of_another_image_is_not_loaded(tmp_path):
     digest = {"now": "a" * 64}
     parts = Parts(tmp_path, "1-2", lambda index: digest["now"])
     parts.save(3, [{"policy": "random"}], {"look": 0.5})
@@ -109,7 +109,7 @@ def test_an_image_of_the_same_size_is_another_image(tmp_path):
         lambda part: None,
     ],
 )
-def test_a_part_with_something_else_in_it_counts_as_missing(tmp_path, damage):
+def test_a_part_with_invalid_content_counts_as_missing(tmp_path, damage):
     parts = Parts(tmp_path, "1-2", lambda index: "a")
     parts.save(0, [{"policy": "random"}], {"look": 0.5})
     part = damage(json.loads(parts.path(0).read_text()))
@@ -119,7 +119,7 @@ def test_a_part_with_something_else_in_it_counts_as_missing(tmp_path, damage):
     assert parts.load(0) is None
 
 
-def test_parts_of_every_other_kind_count_as_missing(tmp_path):
+def test_parts_that_are_not_valid_files_count_as_missing(tmp_path):
     parts = Parts(tmp_path, "1-2", lambda index: "a")
     parts.folder.mkdir()
     for content in (b"[" * 100_000, b"\xff\xfe", b"", b'{"key": 1' * 9):
@@ -133,7 +133,7 @@ def test_parts_of_every_other_kind_count_as_missing(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("detector", ["yolov3-tiny"])
-def test_an_emptied_store_is_filled_with_the_same_bits_on_any_number_of_threads(config, detector):
+def test_a_deleted_store_file_is_written_identically_with_more_threads(config, detector):
     run = SearchRun(config)
     finish(run, "searching")
     (file,) = (config.cache / "looks").rglob("*.safetensors")
@@ -146,15 +146,15 @@ def test_an_emptied_store_is_filled_with_the_same_bits_on_any_number_of_threads(
     assert file.read_bytes() == content
 
 
-def test_the_same_policy_twice_is_refused(config):
+def test_a_policy_given_twice_is_refused(config):
     for policies in (("random", "random"), ("random", PolicyConfig("random")), ("recommended", "target-evidence")):
         with pytest.raises(InputError, match=r"^policies: expected each policy once, got '.*' 2 times"):
             SearchRun(replace(config, policies=policies))
 
 
 @pytest.mark.slow
-def test_a_changed_choice_changes_the_printed_result(tmp_path):
-    """The same command and folder, with the choice of the next cell turned round in between."""
+def test_changed_code_of_cell_selection_changes_the_result(tmp_path):
+    """The same command and folder, after the choice of the next cell has been inverted."""
     tree = tmp_path / "tree"
     for name in ("semfov", "eval"):
         shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -167,20 +167,20 @@ def test_a_changed_choice_changes_the_printed_result(tmp_path):
         done = subprocess.run(call, cwd=tree, env=environment, capture_output=True, text=True, check=True)
         return (out / "episodes.jsonl").read_text(), done.stderr
 
-    # The first of them here: the tree has the same code.
+    # The first run is in this process, with the same code as the copied tree.
     assert main([*small, "--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache")]) == 0
     first = (tmp_path / "out" / "episodes.jsonl").read_text()
     choice = tree / "semfov" / "gaze" / "selection.py"
     text = choice.read_text()
     assert "masked_fill(visited, -torch.inf)" in text
     choice.write_text(text.replace("masked_fill(visited, -torch.inf)", "neg().masked_fill(visited, -torch.inf)"))
-    second, told = search(tmp_path / "out")
-    assert "by another version of the code" in told
+    second, error = search(tmp_path / "out")
+    assert "by another version of the code" in error
     assert second != first
     assert search(tmp_path / "fresh")[0] == second
 
 
-def test_records_come_from_the_parts_of_this_code_alone(config, monkeypatch):
+def test_parts_of_other_library_versions_are_not_loaded(config, monkeypatch):
     run = SearchRun(config)
     finish(run, "searching")
     assert gather(run)[0]

@@ -1,4 +1,4 @@
-"""Tables of a run: averages and both standard errors by hand, and what stands in which column."""
+"""Tables of a run: means and both standard errors against hand calculations, and the columns of each table."""
 
 import csv
 import io
@@ -11,7 +11,7 @@ from semfov.experiments import explore_report, search_report
 from semfov.experiments.summary import LAST_COLUMN, curve_of, curve_rows, curves_csv, percent
 from semfov.metrics.exploration import success_rate
 
-# Gaze shift at which a search found its target, by image and repetition.
+# Gaze shift at which each search found its target (-1: not found), by image and repetition.
 FOUND = {"one": [0, 1, -1], "two": [1, 1, 2], "three": [-1, 2, 0]}
 
 
@@ -24,7 +24,7 @@ def searches(policy="random"):
 
 
 def explorations(policy="kl-raw"):
-    """Two images of four cells with objects: after each of two shifts one more cell is right."""
+    """Two images with objects in four cells; each of two gaze shifts makes one more cell right."""
     return [
         {
             "policy": policy,
@@ -41,38 +41,42 @@ def explorations(policy="kl-raw"):
     ]
 
 
-def error(values):
+def standard_error(values):
     return statistics.stdev(values) / len(values) ** 0.5
 
 
 def found_by(shift):
-    """Share of an image's searches that have found their target, and of a repetition's."""
+    """Share of searches that have found their target, by image and by repetition."""
     hits = {scene: [0 <= at <= shift for at in found] for scene, found in FOUND.items()}
     return [statistics.mean(each) for each in hits.values()], [
         statistics.mean(r) for r in zip(*hits.values(), strict=True)
     ]
 
 
-def test_means_and_errors_by_hand():
+def test_means_and_errors_match_hand_calculations():
     curve = search_report.performance(searches(), ("random",), 2, "all targets")["random"]
     assert (curve.images, curve.episodes) == (3, 9)
     for shift in range(3):
         images, repetitions = found_by(shift)
         assert curve.mean[shift] == pytest.approx(statistics.mean(images))
-        assert curve.over_images[shift] == pytest.approx(error(images))
-        assert curve.over_repetitions[shift] == pytest.approx(error(repetitions))
+        assert curve.over_images[shift] == pytest.approx(standard_error(images))
+        assert curve.over_repetitions[shift] == pytest.approx(standard_error(repetitions))
 
 
 def test_the_last_column_is_the_largest_error_over_repetitions():
-    """The paper's Max. SEM: over the mean curves of the repetitions, the largest of all gaze shifts."""
+    """The paper's Max. SEM: the standard error over the repetitions' mean curves, at its largest gaze shift."""
     curves = search_report.performance(searches(), ("random",), 2, "all targets")
     (row,) = curve_rows(curves, [0, 2])
-    largest = max(error(found_by(shift)[1]) for shift in range(3))
-    assert row == ["random", *(percent(*map(float, each)) for each in ends(curves["random"])), f"{100 * largest:.2f}"]
+    largest = max(standard_error(found_by(shift)[1]) for shift in range(3))
+    assert row == [
+        "random",
+        *(percent(*map(float, each)) for each in first_and_last(curves["random"])),
+        f"{100 * largest:.2f}",
+    ]
     assert LAST_COLUMN == "max. SEM over repetitions"
 
 
-def ends(curve):
+def first_and_last(curve):
     return [(curve.mean[shift], curve.over_images[shift]) for shift in (0, 2)]
 
 
@@ -80,7 +84,7 @@ def cells_of(text):
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
 
 
-def test_search_tables_have_a_row_for_each_policy_and_no_times():
+def test_search_tables_have_a_row_for_each_policy_and_no_durations():
     curves = {
         average: search_report.performance(searches(), ("random",), 2, average) for average in search_report.AVERAGES
     }
@@ -108,15 +112,15 @@ def test_exploration_tables_name_the_published_answer_first():
     assert cells_of(everywhere)[2] == ["kl-raw", *["50.0 ± 0.0"] * 2, "100.0 ± 0.0", "0.00"]
 
 
-def test_csv_has_every_gaze_shift():
+def test_csv_has_a_row_for_every_gaze_shift():
     curves = {"all targets": search_report.performance(searches(), ("random",), 2, "all targets")}
     rows = list(csv.DictReader(io.StringIO(curves_csv(curves, ("average", "performance")))))
     assert [int(row["shifts"]) for row in rows] == [0, 1, 2]
     for row, shift in zip(rows, range(3), strict=True):
-        assert float(row["error_over_repetitions"]) == pytest.approx(error(found_by(shift)[1]), abs=1e-6)
+        assert float(row["error_over_repetitions"]) == pytest.approx(standard_error(found_by(shift)[1]), abs=1e-6)
 
 
-def test_one_repetition_has_no_error():
+def test_one_repetition_has_no_error_over_repetitions():
     curve = curve_of([r for r in explorations() if r["repetition"] == 0], lambda r: success_rate(r["right"], 4))
     assert np.isnan(curve.over_repetitions).all()
     assert curve.over_images == pytest.approx([0.125] * 3)

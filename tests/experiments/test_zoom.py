@@ -1,4 +1,4 @@
-"""The experiment with large pictures: the same with and without a store, resumed, and its orders."""
+"""The experiment with large pictures: results with and without a store, resuming, and orders of windows."""
 
 import json
 from dataclasses import replace
@@ -40,16 +40,16 @@ def config(tmp_path, monkeypatch, textures):
 
 
 @pytest.mark.slow
-def test_the_store_changes_nothing(config):
+def test_results_do_not_depend_on_the_store(config):
     fresh = ZoomRun(replace(config, store=False)).outcomes(0)[0]
     written = ZoomRun(config).outcomes(0)[0]
     run = ZoomRun(config)
-    run.eye.detector.propose = None  # nothing is looked at again
+    run.eye.detector.propose = None  # any new look would fail
     assert run.outcomes(0)[0] == written == fresh
 
 
 @pytest.mark.slow
-def test_tables_and_resuming(config, capsys):
+def test_tables_match_records_and_a_deleted_part_is_computed_again(config, capsys):
     zoom_report.zoom(config)
     text = (config.out / "zoom.md").read_text()
     assert text in capsys.readouterr().out
@@ -74,7 +74,7 @@ def test_tables_and_resuming(config, capsys):
 
 
 @pytest.mark.slow
-def test_a_damaged_store_is_looked_at_again(config):
+def test_damaged_stored_looks_are_computed_again(config):
     written = ZoomRun(config).outcomes(0)[0]
     store = ZoomRun(config).store
     (file,) = store.folder.glob("*.safetensors")
@@ -101,8 +101,8 @@ def test_measures_can_be_left_out(config, capsys):
     }
 
 
-def test_tables_of_decisions():
-    """Shares by hand, of two searches for what is there and two for what is not."""
+def test_tables_of_decisions_match_hand_calculations():
+    """Two searches for a target that is present and two for one that is absent."""
     common = {"measure": "decision", "way": "ours", "count": 17, "overview": 0.1, "slices": 0.2}
     records = [
         common | {"present": there, "outcome": outcome, "probability": p, "passes": passes, "overlap": overlap}
@@ -127,7 +127,7 @@ def test_tables_of_decisions():
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
         ({"passes": 1}, "passes: expected a whole number from 2"),
         ({"overlap": 1.0}, "overlap: expected a number from 0 to 0.9"),
@@ -136,12 +136,12 @@ def test_tables_of_decisions():
         ({"mosaics": -1}, "mosaics: expected"),
     ],
 )
-def test_settings_have_ranges(settings, told):
-    with pytest.raises(InputError, match=told):
+def test_settings_out_of_range_are_refused(settings, message):
+    with pytest.raises(InputError, match=message):
         ZoomConfig(**settings)
 
 
-def test_glances_come_back_from_a_file(config):
+def test_packed_glances_are_unpacked_unchanged(config):
     glances = ZoomRun(config).glances(1)
     windows = [*ZoomRun(config).slices(1, glances.lattice)]
     seen = [*glances.see(windows), *raster(glances, [])]
@@ -167,7 +167,7 @@ def test_orders_look_at_every_slice_once(config):
     assert len(tree) == len(set(tree))
 
 
-def test_slices_are_those_of_sahi():
+def test_slices_match_those_of_sahi():
     lattice = Lattice.over((3840, 2160), (416, 416))
     windows = slices(lattice, 640, 0.2)
     assert len(windows) == 32

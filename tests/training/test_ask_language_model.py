@@ -1,4 +1,4 @@
-"""`python -m train.ask_language_model` against a stand-in server: what it sends, keeps, counts, and survives."""
+"""`python -m train.ask_language_model` with a stand-in server: requests, kept answers, costs and errors."""
 
 import json
 import math
@@ -27,7 +27,7 @@ SAYS = {"fork": "Knives, of course.", "knife": "a fork; a table", "cow": "Nothin
 
 
 class Server:
-    """Answers by what is in a question; the first answers can be others."""
+    """A server that answers by the words of a question; its first answers can be set in `first`."""
 
     def __init__(self):
         self.requests, self.headers, self.first = [], [], []
@@ -96,11 +96,11 @@ def call(server, tmp_path, monkeypatch):
     return ["--url", server.url, "--model", "m", *files]
 
 
-def out_of(call):
+def output_folder(call):
     return Path(call[call.index("--out") + 1])
 
 
-def test_table_says_what_the_answers_say(server, call, monkeypatch):
+def test_tables_contain_the_answers(server, call, monkeypatch):
     monkeypatch.setenv("LANGUAGE_MODEL_KEY", "secret")
     assert main([*call, "--input_price", "2", "--output_price", "10"]) == 0
     assert len(server.requests) == 9
@@ -110,42 +110,45 @@ def test_table_says_what_the_answers_say(server, call, monkeypatch):
         assert asked["temperature"] == 0
         assert [message["role"] for message in asked["messages"]] == ["user"]
     assert {headers["Authorization"] for headers in server.headers} == {"Bearer secret"}
-    table = read_table(out_of(call) / "beside.csv")
+    table = read_table(output_folder(call) / "beside.csv")
     assert table.rows == table.columns == CLASSES
     expected = [[None, 1, 0], [1, None, 0], [0, 0, None]]
     for row, line in zip(table.values.tolist(), expected, strict=True):
         assert [None if math.isnan(value) else value for value in row] == line
-    heights = read_table(out_of(call) / "heights.csv")
+    heights = read_table(output_folder(call) / "heights.csv")
     assert heights.columns == ("top", "middle", "bottom")
     assert (heights.values[:, 2] > heights.values[:, 0]).all()
-    report = (out_of(call) / "report.md").read_text()
+    report = (output_folder(call) / "report.md").read_text()
     prompts = sum(len(asked["messages"][0]["content"].split()) for _, asked in server.requests)
     assert f"{(2 * prompts + 10 * 63) / 1e6:.4g}" in report
     assert "stand-in-1" in report
-    everything = "".join(path.read_text() for path in out_of(call).iterdir())
+    everything = "".join(path.read_text() for path in output_folder(call).iterdir())
     assert "secret" not in everything
-    prior = ContextPrior.from_table(out_of(call) / "beside.csv", CLASSES, source="test",
-                                    places=out_of(call) / "heights.csv")  # fmt: skip
+    prior = ContextPrior.from_table(output_folder(call) / "beside.csv", CLASSES, source="test",
+                                    places=output_folder(call) / "heights.csv")  # fmt: skip
     assert prior.cooccurrence[1, 2, 0] > 0 > prior.cooccurrence[1, 3, 0]
 
 
-def test_nothing_is_asked_twice(server, call):
+def test_a_question_is_not_asked_twice(server, call):
     assert main(call) == 0
-    first = (out_of(call) / "beside.csv").read_bytes(), (out_of(call) / "answers.jsonl").read_bytes()
+    first = (output_folder(call) / "beside.csv").read_bytes(), (output_folder(call) / "answers.jsonl").read_bytes()
     assert main([*call, "--parallel", "3"]) == 0
     assert len(server.requests) == 9
-    assert ((out_of(call) / "beside.csv").read_bytes(), (out_of(call) / "answers.jsonl").read_bytes()) == first
-    # Another length of answers, or another model, is another question.
+    assert (
+        (output_folder(call) / "beside.csv").read_bytes(),
+        (output_folder(call) / "answers.jsonl").read_bytes(),
+    ) == first
+    # A question with another length of answers is a new question.
     assert main([*call, "--tokens", "5"]) == 0
     assert len(server.requests) == 18
 
 
 @pytest.mark.slow
-def test_a_killed_command_goes_on(server, call):
+def test_a_killed_command_resumes_with_the_kept_answers(server, call):
     server.wait = 0.3
     command = [sys.executable, "-m", "train.ask_language_model", *call]
     process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE)
-    answers = out_of(call) / "answers.jsonl"
+    answers = output_folder(call) / "answers.jsonl"
     while not answers.exists() or answers.read_bytes().count(b"\n") < 2:
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.02)
@@ -154,7 +157,7 @@ def test_a_killed_command_goes_on(server, call):
     kept = answers.read_bytes()
     whole = kept.count(b"\n")
     assert 2 <= whole < 9
-    # As a power failure leaves it: a last line that was cut off.
+    # As after a power failure: the last line is incomplete.
     answers.write_bytes(kept + b'{"key": "abc", "ans')
     server.wait, before = 0.0, len(server.requests)
     assert main(call) == 0
@@ -177,7 +180,7 @@ def test_a_busy_server_is_asked_again(server):
         chat.ask("near a fork in")
 
 
-def test_a_server_that_is_not_there_is_told(tmp_path):
+def test_an_unreachable_server_is_reported_after_retries(tmp_path):
     closed = Server()
     closed.close()
     pauses = []
@@ -186,7 +189,7 @@ def test_a_server_that_is_not_there_is_told(tmp_path):
     assert pauses == [1.0, 2.0]
 
 
-def test_refusals_say_what_to_do(server, call, capsys):
+def test_errors_of_the_server_are_explained(server, call, capsys):
     cases = {
         401: ({"error": {"message": "bad key"}}, "environment variable"),
         404: ({"error": "no such model"}, "whether the server has the model 'm'"),
@@ -203,7 +206,7 @@ def test_refusals_say_what_to_do(server, call, capsys):
             ChatServer(server.url, "m").ask("?")
 
 
-def test_a_key_does_not_follow_where_an_answer_points(server):
+def test_a_key_is_not_sent_to_a_redirected_address(server):
     other = Server()
     try:
         for code in (302, 307):
@@ -215,7 +218,7 @@ def test_a_key_does_not_follow_where_an_answer_points(server):
         other.close()
 
 
-def test_no_more_is_asked_than_the_budget_pays(server, call, capsys):
+def test_questions_stop_when_the_budget_is_spent(server, call, capsys):
     price = ["--output_price", "1000000"]
     assert main([*call, *price, "--budget", "20"]) == 1
     assert "budget: the answers have cost 21, which reaches the limit of 20" in capsys.readouterr().err
@@ -224,9 +227,9 @@ def test_no_more_is_asked_than_the_budget_pays(server, call, capsys):
     assert len(server.requests) == 9
 
 
-def test_damaged_answers_are_told_by_line(server, call, capsys):
+def test_damaged_answers_are_reported_with_their_line(server, call, capsys):
     assert main(call) == 0
-    answers = out_of(call) / "answers.jsonl"
+    answers = output_folder(call) / "answers.jsonl"
     lines = answers.read_text().splitlines()
     for damaged in ("{}", "[]", '{"key": 1', '{"key": "a", "answer": 3, "prompt_tokens": 1, "completion_tokens": 1}'):
         answers.write_text("\n".join([lines[0], damaged, *lines[1:]]) + "\n")
@@ -238,12 +241,12 @@ def test_damaged_answers_are_told_by_line(server, call, capsys):
     ("answer", "value"),
     [("7", 0.7), ("Yes.", 1.0), ("no", 0.0), ("I'd say 10 of 10", 1.0), ("12", None), ("perhaps", None), ("", None)],
 )
-def test_grades_are_read(answer, value):
+def test_grades_are_read_from_answers(answer, value):
     got = answer_values(Question("beside", "fork", "cow", ""), answer, CLASSES)
     assert got == (None if value is None else {"cow": value})
 
 
-def test_prompts_of_pairs_are_asked_once_of_each(tmp_path):
+def test_prompts_of_pairs_are_asked_once_for_each_pair(tmp_path):
     prompts = tmp_path / "p.txt"
     prompts.write_text("[beside]\nIs a {name} near a {other}?\n\n[height]\nIs a {name} at the {height}?\n")
     questions = questions_of(read_prompts(prompts), CLASSES)
@@ -253,7 +256,7 @@ def test_prompts_of_pairs_are_asked_once_of_each(tmp_path):
     assert answer_values(questions[-1], "3", CLASSES) == {"bottom": 0.3}
 
 
-def test_prompts_of_the_package_can_be_asked():
+def test_prompts_of_the_package_give_questions_for_every_class():
     questions = questions_of(read_prompts(SHIPPED), COCO_CLASSES)
     assert len(questions) == 80 * len({question.text.replace(question.name, "") for question in questions[::80]})
     assert {question.section for question in questions} == {"beside", "height"}
@@ -270,13 +273,13 @@ def test_prompts_of_the_package_can_be_asked():
         ("[height]\nIs {name} at {height}?", "got none"),
     ],
 )
-def test_bad_prompts(tmp_path, text, message):
+def test_invalid_prompts_are_refused(tmp_path, text, message):
     (tmp_path / "p.txt").write_text(text)
     with pytest.raises(DataError, match=message):
         read_prompts(tmp_path / "p.txt")
 
 
-def test_bad_settings(server):
+def test_invalid_settings_are_refused(server):
     with pytest.raises(InputError, match="url"):
         ChatServer("ftp://host/v1", "m")
     with pytest.raises(InputError, match="key"):

@@ -61,8 +61,8 @@ def weights(out):
     return tensors, record["history"]
 
 
-def test_the_file_gives_what_the_trained_heads_give(trained):
-    """The heads are put into the network as it was; torch and the file then see the same."""
+def test_the_exported_file_gives_the_outputs_of_the_trained_heads(trained):
+    """With the trained heads, the original network in torch gives the same outputs as the file."""
     torch_detector = load_detector("yolov3-tiny", runtime="torch")
     kept, _ = weights(trained)
     heads = {name: tensor for name, tensor in kept.items() if name.startswith("layers.")}
@@ -80,7 +80,7 @@ def test_the_file_gives_what_the_trained_heads_give(trained):
     assert filed.classes == torch_detector.classes
 
 
-def test_training_lessens_the_loss_of_what_it_sees(trained):
+def test_training_lowers_the_loss_on_its_own_views(trained):
     figures = json.loads((trained / "training.json").read_text())
     epochs = figures["epochs"]
     assert [epoch["trial"] for epoch in epochs] == [False, True, True, False]
@@ -89,7 +89,7 @@ def test_training_lessens_the_loss_of_what_it_sees(trained):
     assert weights(trained)[1] == epochs
 
 
-def test_the_card_travels_in_the_file(trained):
+def test_the_model_card_is_stored_in_the_file(trained):
     model = onnx.load(trained / f"{NAME}.onnx")
     card = {entry.key: entry.value for entry in model.metadata_props}["model_card"]
     base = load_detector("yolov3-tiny").digest
@@ -98,12 +98,12 @@ def test_the_card_travels_in_the_file(trained):
     assert card in (trained / "report.md").read_text()
 
 
-def test_the_views_are_gone(trained):
+def test_stored_views_are_deleted_after_training(trained):
     assert not list((trained / "features").glob("*/*.safetensors"))
 
 
 @pytest.mark.long
-def test_two_workers_give_the_same_bits(trained, tmp_path):
+def test_weights_do_not_depend_on_the_number_of_workers(trained, tmp_path):
     assert main([*SMALL, "2", "--out", str(tmp_path)]) == 0
     for one, other in zip(weights(tmp_path)[0].items(), weights(trained)[0].items(), strict=True):
         assert one[0] == other[0]
@@ -113,7 +113,7 @@ def test_two_workers_give_the_same_bits(trained, tmp_path):
 @pytest.mark.parametrize(
     "until", [pytest.param("features/*/*.safetensors", marks=pytest.mark.long), "training.safetensors"]
 )
-def test_killed_training_resumes_with_the_same_bits(trained, tmp_path, kill_when, until):
+def test_killed_training_resumes_with_the_same_weights(trained, tmp_path, kill_when, until):
     call = [sys.executable, "-m", "train.finetune_foveal", *SMALL, "1", "--out", str(tmp_path)]
     kill_when(call, lambda: list(tmp_path.glob(until)), cwd=ROOT)
     threads = torch.get_num_threads()
@@ -123,8 +123,8 @@ def test_killed_training_resumes_with_the_same_bits(trained, tmp_path, kill_when
         assert torch.equal(tensor, weights(tmp_path)[0][name]), name
 
 
-def test_a_view_is_what_the_eye_sees_there(viewer):
-    """The augmentation draws where to look; the eye, asked to look there, gives the same features."""
+def test_a_view_equals_that_of_the_eye_at_the_same_fixation(viewer):
+    """The eye at the fixations drawn by the augmentation gives the same images and features."""
     scene = viewer.scenes[1]
     view = viewer.eye.open(scene.image)
     with one_thread():
@@ -149,7 +149,7 @@ def test_a_view_is_what_the_eye_sees_there(viewer):
     assert (gaze[0] - gaze[1]).abs().max() > 1
 
 
-def test_boxes_lie_on_the_canvas_where_the_detector_finds_them(viewer):
+def test_boxes_of_a_view_match_detections_on_the_canvas(viewer):
     with one_thread():
         viewer.see(0)
     loaded, _ = viewer.load(0)
@@ -159,7 +159,7 @@ def test_boxes_lie_on_the_canvas_where_the_detector_finds_them(viewer):
     assert torch.equal(loaded.labels[1], annotation.labels)
 
 
-def test_sharp_views_where_none_is_foveated(viewer):
+def test_views_are_sharp_when_none_is_foveated(viewer):
     sharp = Viewer(replace(viewer.config, foveated=0.0))
     scene = sharp.scenes[0]
     view = sharp.eye.open(scene.image)
@@ -175,6 +175,6 @@ def test_sharp_views_where_none_is_foveated(viewer):
         (["--data.limit", "1"], "data: expected at least 2 photographs, one to train on and one to hold out, got 1"),
     ],
 )
-def test_mistakes_are_told_in_one_line(arguments, message, tmp_path, capsys):
+def test_errors_are_reported_in_one_line(arguments, message, tmp_path, capsys):
     assert main(["--data.limit", "1", "--workers", "1", "--out", str(tmp_path), *arguments]) == 1
     assert message in capsys.readouterr().err

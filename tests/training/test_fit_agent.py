@@ -1,4 +1,4 @@
-"""`python -m train.fit_agent` in small, and the adapter to Stable-Baselines3 against its own."""
+"""`python -m train.fit_agent`, small, and its adapter to Stable-Baselines3 against the one of that library."""
 
 import json
 
@@ -38,13 +38,13 @@ def test_an_agent_learns_to_search_scenes_that_it_was_not_trained_on(cache, tmp_
     threads = torch.get_num_threads()
     assert main(arguments) == 0
     torch.set_num_threads(threads)
-    told = json.loads((out / "judged.json").read_text())
-    found = {name: np.array(each) for name, each in told["found_at"].items()}
+    written = json.loads((out / "judged.json").read_text())
+    found = {name: np.array(each) for name, each in written["found_at"].items()}
     assert {len(each) for each in found.values()} == {len(found["trained"])}
     first = {name: ((each > 0) & (each <= 2)).mean() for name, each in found.items()}
     assert first["trained"] > first["random"] + 0.2
     assert first["hand-made"] > first["random"] + 0.2
-    assert told["returns"][-1] > told["returns"][0]
+    assert written["returns"][-1] > written["returns"][0]
     report = (out / "report.md").read_text()
     assert report in capsys.readouterr().out
     assert "other scenes" in report
@@ -58,14 +58,14 @@ def test_an_agent_learns_to_search_scenes_that_it_was_not_trained_on(cache, tmp_
     assert not unexpected
 
 
-def test_the_same_scenes_are_not_judged(cache, capsys):
+def test_evaluation_on_the_training_scenes_is_refused(cache, capsys):
     alike = ["--data.limit", "1", "--judged.limit", "1", "--judged.scene_seed", "0", "--cache", str(cache)]
     assert main(alike) == 1
     assert "judged: expected scenes other than those of `data`" in capsys.readouterr().err
 
 
-def test_the_adapter_does_what_stable_baselines_own_does(scenery):
-    """Step for step, with the ends of episodes in between."""
+def test_the_adapter_matches_that_of_stable_baselines(scenery):
+    """Step by step, over the ends of several episodes."""
     ours = StableVecEnv(
         GazeVectorEnv("search", 3, scenery, belief=True, together=False, autoreset_mode="SameStep"), key="belief"
     )
@@ -83,21 +83,21 @@ def test_the_adapter_does_what_stable_baselines_own_does(scenery):
         assert mine[1] == pytest.approx(other[1])
         assert np.array_equal(mine[2], other[2])
         for row in np.flatnonzero(mine[2]):
-            told, expected = mine[3][row], other[3][row]
-            assert np.array_equal(told["terminal_observation"], expected["terminal_observation"]["belief"])
-            assert told["TimeLimit.truncated"] == expected["TimeLimit.truncated"]
-            assert told["result"] == expected["result"]
-            truncated += told["TimeLimit.truncated"]
+            info, expected = mine[3][row], other[3][row]
+            assert np.array_equal(info["terminal_observation"], expected["terminal_observation"]["belief"])
+            assert info["TimeLimit.truncated"] == expected["TimeLimit.truncated"]
+            assert info["result"] == expected["result"]
+            truncated += info["TimeLimit.truncated"]
             ends += 1
     assert 0 < truncated < ends
 
 
-def test_stable_baselines_checker_has_nothing_to_say(scenery):
-    """Of the belief it would say that numbers on a grid are no picture."""
+def test_the_checker_of_stable_baselines_has_no_complaints(scenery):
+    """The belief is left out: the checker would object that it is not an image."""
     check_env(GazeSearch(scenery, glimpse=64))
 
 
-def test_the_adapter_takes_environments_that_restart_at_once(scenery):
+def test_the_adapter_refuses_environments_without_same_step_reset(scenery):
     with pytest.raises(InputError, match="autoreset_mode='SameStep'"):
         StableVecEnv(GazeVectorEnv("search", 2, scenery))
     with pytest.raises(InputError, match="a GazeVectorEnv"):

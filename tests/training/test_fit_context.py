@@ -1,4 +1,4 @@
-"""`python -m train.fit_context`: counts and ratios against loops, weights against a search, the command itself."""
+"""`python -m train.fit_context`: counts and ratios against loops, weights against a grid search, and the command."""
 
 import json
 import math
@@ -31,7 +31,7 @@ def places():
     return made
 
 
-def test_occupation_equals_a_loop(places):
+def test_occupation_equals_a_loop_over_pictures(places):
     got = occupation(places, 3.0)
     pictures = sum(len(place.targets) for place in places)
     for cell in range(20):
@@ -43,7 +43,7 @@ def test_occupation_equals_a_loop(places):
             assert float(got[k, cell]) == pytest.approx((there + 3 * average) / (len(chosen) + 3), rel=1e-5)
 
 
-def test_pairs_equal_a_loop(places):
+def test_pairs_equal_a_loop_over_cells(places):
     chance = occupation(places, 3.0)
     observed, expected = count_pairs(places, chance, EDGES)
     for k in range(4):
@@ -68,7 +68,7 @@ def band_of(place, cell, component):
     return sum(nearest > edge + 1e-6 for edge in EDGES)
 
 
-def test_ratios_are_drawn_towards_those_of_all():
+def test_ratios_are_shrunk_towards_those_of_all_classes():
     observed, expected = torch.full((3, 3, 1), 2.0), torch.full((3, 3, 1), 1.0)
     raw = shrunk_ratio(observed, expected, 1e-9, 1e-9)
     assert raw[1, 2, 0] == pytest.approx(2)
@@ -80,7 +80,7 @@ def test_ratios_are_drawn_towards_those_of_all():
     assert float(shrunk_ratio(observed, expected, 5.0, 4.0)[1, 2, 0]) == pytest.approx(expect)
 
 
-def test_judging_without_context_is_the_share_of_target_cells(places):
+def test_likelihood_without_context_is_the_share_of_target_cells(places):
     prior = ContextPrior(["a", "b", "c"], torch.zeros(4, 2, 2), torch.zeros(4, 4, 3), EDGES)
     shares = [place.occupied[:, k].float().mean().log() for place in places for k in place.targets]
     for row in judge(prior, places, 4):
@@ -103,7 +103,7 @@ def test_gain_is_the_mean_over_photographs(places):
     assert row["error"] == pytest.approx(torch.tensor(gains).std().item() / len(gains) ** 0.5, abs=1e-5)
 
 
-def test_no_prior_is_weighed_on_what_it_counted(places):
+def test_a_prior_is_weighted_on_pictures_that_it_did_not_count(places):
     config = FitContextConfig(resolution=4, edges=EDGES, weigh=6, folds=3)
     square = [Places(place.occupied[:16], place.targets, Grid(4, 4, (80, 60)), 5) for place in places]
     folds = cross_fit(square, range(1, 12), ("a", "b", "c"), config)
@@ -114,13 +114,13 @@ def test_no_prior_is_weighed_on_what_it_counted(places):
     torch.testing.assert_close(folds[0][0].place, expected)
 
 
-def test_weights_are_the_best_of_a_search():
+def test_fitted_weights_have_the_highest_likelihood_in_their_neighbourhood():
     generator = torch.Generator().manual_seed(0)
-    log_odds, place, company = torch.randn(3, 400, 12, generator=generator)
+    log_odds, place, cooccurrence = torch.randn(3, 400, 12, generator=generator)
     gumbel = -torch.log(-torch.log(torch.rand(400, 12, generator=generator)))
-    best = (2 * log_odds + 1.0 * place + 0.5 * company + gumbel).argmax(-1)
+    best = (2 * log_odds + 1.0 * place + 0.5 * cooccurrence + gumbel).argmax(-1)
     goal = torch.nn.functional.one_hot(best, 12).bool()
-    cases = Cases(log_odds, place, company, goal, torch.zeros_like(goal))
+    cases = Cases(log_odds, place, cooccurrence, goal, torch.zeros_like(goal))
     weights = likeliest_weights(cases)
     assert weights == pytest.approx((0.5, 0.25), abs=0.12)
     gammas = torch.linspace(1, 3, 81)
@@ -130,13 +130,13 @@ def test_weights_are_the_best_of_a_search():
         assert max(float(hit(cases, g, g * moved[0], g * moved[1])) for g in gammas) < top
 
 
-def test_size_of_the_weights_is_the_one_that_lands_most_often():
+def test_the_size_of_weights_is_the_one_that_hits_the_target_most_often():
     generator = torch.Generator().manual_seed(1)
-    log_odds, place, company = torch.randn(3, 200, 12, generator=generator).round()
+    log_odds, place, cooccurrence = torch.randn(3, 200, 12, generator=generator).round()
     visited = torch.rand(200, 12, generator=generator) < 0.2
     goal = (torch.rand(200, 12, generator=generator) < 0.2) & ~visited
     goal[:, 0], visited[:, 0] = True, False
-    cases = Cases(log_odds, place, company, goal, visited)
+    cases = Cases(log_odds, place, cooccurrence, goal, visited)
     rate = 0.0
     for row in range(200):
         free = [cell for cell in range(12) if not visited[row, cell]]
@@ -159,7 +159,7 @@ def test_command_writes_a_prior_from_annotations(tmp_path):
     names = ["nothing", "place", "co-occurrence", "both", "both, of other classes"]
     assert [row["context"] for row in rows] == names
     assert "not fitted on looks" in (tmp_path / "report.md").read_text()
-    # What it counted by pictures is a table that the same command takes.
+    # The same command accepts its table of counts by pictures.
     table = ["--table", str(tmp_path / "pictures.csv"), "--source", "pictures", "--name", "shared"]
     assert main([*call[:-1], str(tmp_path / "again"), *table]) == 0
     shared = ContextPrior.from_pretrained(tmp_path / "again" / "shared.safetensors")
@@ -168,7 +168,7 @@ def test_command_writes_a_prior_from_annotations(tmp_path):
     assert "From a table" in (tmp_path / "again" / "report.md").read_text()
 
 
-def test_shared_pictures_equal_a_loop(places):
+def test_ratios_of_shared_pictures_equal_a_loop_over_classes(places):
     got = shared_pictures(places, 2.0)
     sets = [set(place.occupied.any(0).nonzero()[:, 0].tolist()) for place in places]
     for t in range(1, 4):

@@ -1,4 +1,4 @@
-"""`python -m train.fit_detector`: everything for a detector of coloured squares, from photographs to a search."""
+"""`python -m train.fit_detector` for a detector of coloured squares, from photographs to a search."""
 
 import json
 import shutil
@@ -39,7 +39,7 @@ SIDE = 64
 
 
 def write_network(path: Path, bias: float = -4.0) -> Path:
-    """A network that scores the three colours in 8 x 8 squares of a canvas of 64 x 64 pixels."""
+    """Save a network that scores three colours in 8 × 8 squares of a canvas of 64 × 64 pixels."""
     from onnx import TensorProto, helper, numpy_helper, save
 
     squares = SIDE // 8
@@ -76,7 +76,7 @@ def write_network(path: Path, bias: float = -4.0) -> Path:
 
 
 def write_photographs(folder: Path, count: int = 20) -> Path:
-    """Photographs of coloured squares on noise, with their boxes, and a category that the detector does not know."""
+    """Save photographs of coloured squares on noise, with boxes and a category that the detector does not know."""
     draw = np.random.default_rng(0)
     images, boxes = [], []
     for number in range(count):
@@ -107,7 +107,7 @@ SMALL = [
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """A network, photographs, and the folder that was fitted to them."""
+    """The parent folder of a network, photographs and the models fitted to them."""
     folder = tmp_path_factory.mktemp("fit_detector")
     write_network(folder / "colours.onnx")
     (folder / "photographs").mkdir()
@@ -130,7 +130,7 @@ def arguments(folder, *more):
 
 
 @pytest.mark.slow
-def test_the_folder_says_what_it_holds(home):
+def test_the_folder_describes_its_models(home):
     manifest = Manifest.read(home / "models")
     assert manifest.classes == CLASSES
     assert manifest.grid == (4, 4)
@@ -145,7 +145,7 @@ def test_the_folder_says_what_it_holds(home):
         assert "held-out photographs" in part.why, (name, part.why)
         assert (part.file is None) == (name == "tempering")
     thresholds = semfov.TargetEvidence.from_pretrained(home / "models/evidence.safetensors").thresholds
-    assert 0.49 < thresholds.confirm <= 0.9  # few searches judge
+    assert 0.49 < thresholds.confirm <= 0.9  # few searches to choose it from
     text = (home / "models/report.md").read_text()
     assert f"counts as found from a probability of {thresholds.confirm:.2f} on" in text
     assert f"gives up when no cell has a probability of {thresholds.give_up:.2f} or more" in text
@@ -156,7 +156,7 @@ def test_the_folder_says_what_it_holds(home):
             picture.verify()
 
 
-def test_the_agent_of_the_folder_finds_what_is_there(home):
+def test_the_agent_of_the_folder_finds_the_target(home):
     folder = ModelFolder(home / "models")
     agent = ActivePerception.from_pretrained(home / "models")
     assert agent.classes[1:] == CLASSES
@@ -190,14 +190,14 @@ def test_the_published_agent_takes_the_folder(home, search):
 
 
 def test_the_published_agent_needs_an_observation_model(home, tmp_path):
-    folder = copied(home, tmp_path)
-    rewrite(folder, observation=replace(Manifest.read(folder).parts["observation"], file=None, used=False))
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, observation=replace(Manifest.read(folder).parts["observation"], file=None, used=False))
     with pytest.raises(InputError, match=r"observation model, got .* without; fit one: python -m train\.fit_detector"):
         ActivePerception.published(folder)
 
 
-def test_searches_of_the_folder_are_those_of_the_report(home, capsys):
-    """`eval.search` on the held-out photographs alone gives the same cumulative performance, by other code."""
+def test_eval_search_with_the_folder_matches_the_report(home, capsys):
+    """`eval.search` on only the held-out photographs gives the same cumulative performance with other code."""
     (home / "ids.txt").write_text("0 4 8 12 16")
     out = home / "search"
     options = [
@@ -208,16 +208,16 @@ def test_searches_of_the_folder_are_those_of_the_report(home, capsys):
     assert search([*data(home), *options]) == 0
     lines = (out / "summary.csv").read_text().splitlines()
     rows = [line.split(",") for line in lines if line.startswith("all") or "all targets" in line]
-    told = {(row[1], int(row[2])): float(row[3]) for row in rows}
+    performance = {(row[1], int(row[2])): float(row[3]) for row in rows}
     report = (home / "models/report.md").read_text().split("## Target evidence")[1]
     for name, policy in (("fitted", "target-evidence"), ("raw", "non-predictive-raw")):
         row = next(line for line in report.splitlines() if line.startswith(f"| {name} "))
         shares = [float(cell.split("±")[0]) for cell in row.split("|")[2:5]]
-        assert shares == pytest.approx([100 * told[policy, n] for n in (1, 5, 15)], abs=0.051)
+        assert shares == pytest.approx([100 * performance[policy, n] for n in (1, 5, 15)], abs=0.051)
     capsys.readouterr()
 
 
-def test_the_same_command_again_fits_nothing(home, monkeypatch, capsys):
+def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
     before = {path.name: path.read_bytes() for path in (home / "models").glob("*.safetensors")}
     for name in ("fit_model", "fit_evidence", "fit_map_evidence", "hit_rates"):
         monkeypatch.setattr(detector_parts, name, None)
@@ -229,8 +229,8 @@ def test_the_same_command_again_fits_nothing(home, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_a_part_that_is_gone_is_fitted_again_alone(home, tmp_path, monkeypatch):
-    """As after a kill: what was finished is read back, the rest is made, and comes out the same."""
+def test_only_a_missing_part_is_fitted_again(home, tmp_path, monkeypatch):
+    """As after a killed run: finished parts are read, and the missing one is fitted with the same result."""
     shutil.copytree(home / "models", tmp_path / "models")
     (tmp_path / "models/map.safetensors").unlink()
     (tmp_path / "models/manifest.json").unlink()
@@ -252,14 +252,14 @@ def test_the_demonstration_takes_the_folder(home, tmp_path, capsys, agent):
     assert "0.png: “red”" in capsys.readouterr().out
 
 
-def copied(home, tmp_path):
+def copy_models(home, tmp_path):
     shutil.copytree(home / "models", tmp_path / "models")
     shutil.copy(home / "colours.onnx", tmp_path)
     return tmp_path / "models"
 
 
 def test_another_network_is_refused(home, tmp_path):
-    folder = copied(home, tmp_path)
+    folder = copy_models(home, tmp_path)
     write_network(tmp_path / "colours.onnx", bias=-3.0)
     with pytest.raises(DataError, match=r"detector: .*expected the network .*python -m train\.fit_detector"):
         ActivePerception.from_pretrained(folder)
@@ -267,9 +267,9 @@ def test_another_network_is_refused(home, tmp_path):
         ActivePerception.from_pretrained(home / "models", detector=tmp_path / "colours.onnx")
 
 
-def test_a_network_that_moved_is_found_or_given(home, tmp_path):
-    folder = copied(home, tmp_path / "here")
-    # Beside the folder, as it was: the two may go anywhere together.
+def test_a_moved_network_is_found_next_to_the_folder_or_can_be_given(home, tmp_path):
+    folder = copy_models(home, tmp_path / "here")
+    # The network is next to the folder as before, so the two may be moved together.
     assert ModelFolder(folder).detector_source()[0] == str(tmp_path / "here/models/../colours.onnx")
     place = tmp_path / "here/colours.onnx"
     place.rename(tmp_path / "elsewhere.onnx")
@@ -282,7 +282,7 @@ def test_a_network_that_moved_is_found_or_given(home, tmp_path):
 
 @pytest.mark.parametrize("name", ["manifest.json", "evidence.safetensors"])
 def test_a_changed_file_is_refused(home, tmp_path, name):
-    folder = copied(home, tmp_path)
+    folder = copy_models(home, tmp_path)
     content = (folder / name).read_bytes()
     (folder / name).write_bytes(content.replace(b"red", b"rod", 1) if name.endswith("json") else content[:-1] + b"?")
     with pytest.raises(DataError, match=f"{name}: damaged or changed"):
@@ -292,8 +292,8 @@ def test_a_changed_file_is_refused(home, tmp_path, name):
         ModelFolder(folder)
 
 
-def rewrite(folder, **parts):
-    """The record of a folder with all parts used or not, or with other parts."""
+def rewrite_manifest(folder, **parts):
+    """Rewrite the manifest of a folder so that all parts are used or unused, or with other parts."""
     known = Manifest.read(folder)
     changed = dict(known.parts) | {name: part for name, part in parts.items() if name != "used"}
     if "used" in parts:
@@ -301,16 +301,16 @@ def rewrite(folder, **parts):
     replace(known, parts=changed).write(folder)
 
 
-def test_a_part_that_is_no_better_is_not_used(home, tmp_path):
-    folder = copied(home, tmp_path)
-    rewrite(folder, used=True)
+def test_a_part_that_does_not_improve_is_not_used(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, used=True)
     agent = ActivePerception.from_pretrained(folder)
     assert isinstance(agent.searching.observer, Target)
     assert isinstance(agent.exploring.observer, LearnedMap)
     assert isinstance(agent.exploring.policy, Closer)
     given = SearchConfig(models=folder, policies=("recommended", "random"))
     assert with_models(given).policies == ("target-evidence", "random")
-    rewrite(folder, used=False)
+    rewrite_manifest(folder, used=False)
     agent = ActivePerception.from_pretrained(folder)
     for strategy, policy in ((agent.searching, None), (agent.exploring, Random)):
         assert isinstance(strategy.observer, Semantic)
@@ -323,7 +323,7 @@ def test_a_part_that_is_no_better_is_not_used(home, tmp_path):
     assert with_models(ExploreConfig(models=folder, policies=("recommended",))).policies == ("random-raw",)
 
 
-def test_settings_of_experiments_from_the_folder(home):
+def test_experiments_take_their_settings_from_the_folder(home):
     folder = home / "models"
     config = with_models(SearchConfig(models=folder, policies=("target-evidence", "predictive-calibrated")))
     assert config.detector.name == str(folder / "../colours.onnx")
@@ -337,9 +337,9 @@ def test_settings_of_experiments_from_the_folder(home):
         with_models(SearchConfig(models=folder, belief=SearchConfig().belief.__class__(map_model="x")))
 
 
-def test_policies_that_need_what_the_folder_has_not(home, tmp_path):
-    folder = copied(home, tmp_path)
-    rewrite(folder, observation=Part(None, None, False, "too few detections"))
+def test_policies_that_need_a_missing_part_are_left_out_or_refused(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, observation=Part(None, None, False, "too few detections"))
     kept = with_models(SearchConfig(models=folder)).policies
     assert "predictive-raw" not in kept
     assert {"random", "non-predictive-raw", "target-evidence"} <= set(kept)
@@ -348,58 +348,58 @@ def test_policies_that_need_what_the_folder_has_not(home, tmp_path):
         with_models(named)
 
 
-def test_a_folder_that_is_none(tmp_path):
+def test_a_folder_without_models_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"manifest\.json: no such file; .*train\.fit_detector"):
         ActivePerception.from_pretrained(tmp_path)
 
 
-def test_a_name_of_nothing():
+def test_an_unknown_model_name_is_refused():
     with pytest.raises(
         InputError, match=r"got 'mymodels'; make a folder by `python -m train\.fit_detector .*mymodels`"
     ):
         ActivePerception.from_pretrained("mymodels")
 
 
-def test_errors_name_the_command(home):
+def test_a_network_without_models_names_the_command_that_fits_them(home):
     network = str(home / "colours.onnx")
     for make in (ActivePerception.recommended, ActivePerception.from_pretrained, ActivePerception.published):
         with pytest.raises(InputError, match=r"python -m train\.fit_detector \S+colours\.onnx --data\.root"):
             make(network)
 
 
-def test_a_known_network_is_known_by_its_checksum(home, monkeypatch):
+def test_a_known_network_is_recognised_by_its_checksum(home, monkeypatch):
     network = home / "colours.onnx"
     assert semfov.load_detector(network).name == "colours"
     monkeypatch.setitem(semfov.io.compatibility.NETWORKS, sha256(network), "yolox-nano")
     assert semfov.load_detector(network).name == "yolox-nano"
 
 
-def test_annotations_without_any_of_the_classes(home, tmp_path, capsys):
+def test_annotations_without_any_class_of_the_detector_are_refused(home, tmp_path, capsys):
     record = json.loads((home / "photographs/instances.json").read_text())
     for category in record["categories"]:
         category["name"] = f"other {category['id']}"
     (tmp_path / "instances.json").write_text(json.dumps(record))
     given = arguments(home, "--data.annotations", str(tmp_path / "instances.json"), "--out", str(tmp_path / "out"))
     assert main(given) == 1
-    told = capsys.readouterr().err
-    assert "expected some of the detector's 3 classes (red, green, blue" in told
-    assert "'other 1'" in told
+    error = capsys.readouterr().err
+    assert "expected some of the detector's 3 classes (red, green, blue" in error
+    assert "'other 1'" in error
 
 
-def test_a_model_is_asked_for(capsys, tmp_path):
+def test_a_call_without_a_detector_or_with_two_is_refused(capsys, tmp_path):
     assert main(["--out", str(tmp_path)]) == 1
     assert "model: expected the name or the file of a detector, got none" in capsys.readouterr().err
     with pytest.raises(InputError, match=r"detector\.name: expected nothing, as model already names the detector"):
         FitDetectorConfig(model=Path("a.onnx"), detector=DetectorConfig(name="yolov3")).named()
 
 
-def test_settings_of_the_call_are_named():
+def test_unknown_settings_of_the_call_are_named():
     with pytest.raises(InputError, match="got 'clases'"):
         semfov.fit_detector("mine.onnx", "photographs", "instances.json", clases=["cat"])
 
 
-def test_classes_that_are_not_there(home):
-    """So many as are asked for, also of a photograph without a target."""
+def test_the_requested_number_of_absent_classes_is_chosen(home):
+    """Also for a photograph without a target."""
     scenes = EmbeddedScenes(("person", "cat", "cup", "zebra"), count=4)
     for index in range(4):
         annotation = scenes.annotation(index)
@@ -411,7 +411,7 @@ def test_classes_that_are_not_there(home):
             assert len(chosen) - len(absent) == (1 if area else 0)
 
 
-def test_the_surest_threshold_is_the_highest():
+def test_the_highest_threshold_can_be_limited():
     there, looked = torch.tensor([True, False]), torch.ones(1, 2, dtype=torch.bool)
     anywhere, left = torch.tensor([[0.95, 0.99]]), torch.tensor([[0.4, 0.0]])
     assert choose_thresholds(FitSearchConfig(), anywhere, looked, left, there).confirm == 1
@@ -419,15 +419,15 @@ def test_the_surest_threshold_is_the_highest():
     assert thresholds.confirm == 0.9
 
 
-def test_thin_classes_are_told():
-    told = "\n".join(thin_classes({"cat": 3, "dog": 50, "cup": 0}, 20))
-    assert "**No object to learn from** (1 classes): cup." in told
-    assert "**Fewer than 20 objects to learn from** (1 classes): cat 3." in told
+def test_classes_with_few_objects_are_reported():
+    report = "\n".join(thin_classes({"cat": 3, "dog": 50, "cup": 0}, 20))
+    assert "**No object to learn from** (1 classes): cup." in report
+    assert "**Fewer than 20 objects to learn from** (1 classes): cat 3." in report
     assert thin_classes({"cat": 20}, 20) == []
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_differences_are_those_of_a_paired_test(seed):
+def test_differences_match_a_paired_t_test(seed):
     draw = np.random.default_rng(seed)
     fitted, raw = draw.random((2, 8))
     difference = Difference.of(fitted, raw)
@@ -436,14 +436,14 @@ def test_differences_are_those_of_a_paired_test(seed):
     assert difference.better == (test.statistic > 1)
 
 
-def test_one_photograph_or_no_difference_tell_nothing():
+def test_one_photograph_or_no_difference_is_not_an_improvement():
     assert not Difference.of(np.array([1.0]), np.array([0.0])).better
     assert not Difference.of(np.ones(5), np.ones(5)).better
     assert Difference.of(np.ones(5), np.zeros(5)).better
 
 
-def test_one_bar_over_stages(capsys):
-    """It stands where the stages' times say, counts unknown tasks for nothing, and skips what was not worked on."""
+def test_one_progress_bar_covers_all_stages(capsys):
+    """Stages and tasks count by their weights; unknown tasks do not count, and skipped stages count as done."""
     with Whole("all", {"one": {"a": 3, "b": 1}, "two": {"c": 4}, "three": {"d": 2}}) as whole:
         with whole.stage("one"):
             seen = [(item, whole.done) for item in track(range(6), "a", "unit")]
@@ -461,13 +461,13 @@ def test_one_bar_over_stages(capsys):
     printed = capsys.readouterr().err
     assert "all: one" in printed
     assert "not among them" not in printed
-    # Outside, a task has a bar of its own again.
+    # Outside the stages a task has its own bar again.
     assert list(track(range(2), "alone", "unit")) == [0, 1]
     assert "alone" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_fitting_in_python_is_the_same(home, tmp_path):
+def test_fitting_from_python_returns_the_agent_of_the_folder(home, tmp_path):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     root = home / "photographs"
@@ -478,13 +478,13 @@ def test_fitting_in_python_is_the_same(home, tmp_path):
     torch.set_num_threads(threads)
     assert agent.eye.detector.selection.threshold == 0.05
     assert Manifest.read(tmp_path / "out").training["photographs"] == 6
-    # What three steps of training make is hardly better than raw scores; what is used is what was found better.
+    # Three training steps hardly improve on raw scores; the agent uses only the parts that improved.
     folder = ModelFolder(tmp_path / "out")
     assert isinstance(agent.searching.observer, Target) == folder.used("evidence")
     assert isinstance(agent.exploring.policy, Closer) == folder.used("map")
 
 
-def test_photographs_of_all_targets_are_taken():
+def test_fitting_uses_targets_of_all_sizes():
     config = FitDetectorConfig(model=Path("a.onnx"), data=DataConfig(max_target_area=0.1)).named()
     assert config.data.max_target_area is None
     assert config.detector.background is None

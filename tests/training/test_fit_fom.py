@@ -34,11 +34,11 @@ def fitted(tmp_path_factory):
     return out
 
 
-def bits(out: Path) -> list[bytes]:
+def fitted_bytes(out: Path) -> list[bytes]:
     return [(out / "yolov3-tiny.safetensors").read_bytes(), (out / "report.md").read_bytes()]
 
 
-def test_fit_leaves_a_model_and_a_report(fitted):
+def test_fit_writes_a_model_and_a_report(fitted):
     model = FovealObservationModel.from_pretrained(fitted / "yolov3-tiny.safetensors")
     counts = torch.tensor(model.metadata["counts"])
     assert counts.shape == (81, 8)
@@ -62,38 +62,38 @@ def test_estimators_agree(fitted):
     assert figures[2] == pytest.approx(figures[0], rel=1e-4, abs=1.1e-3)
 
 
-def test_two_workers_and_larger_shards_give_the_same_bits(fitted, tmp_path):
+def test_the_model_does_not_depend_on_workers_or_shard_size(fitted, tmp_path):
     assert main([*SMALL, "2", "--shard", "3", "--out", str(tmp_path)]) == 0
-    assert bits(tmp_path) == bits(fitted)
+    assert fitted_bytes(tmp_path) == fitted_bytes(fitted)
 
 
 @pytest.mark.long
-def test_two_ranks_give_the_same_bits(fitted, tmp_path):
+def test_the_model_does_not_depend_on_the_number_of_ranks(fitted, tmp_path):
     launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     call = [*launch, "-m", "train.fit_fom", *SMALL, "1", "--out", str(tmp_path)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     subprocess.run(call, cwd=ROOT, check=True, capture_output=True, env=environment)
-    assert bits(tmp_path) == bits(fitted)
+    assert fitted_bytes(tmp_path) == fitted_bytes(fitted)
 
 
 @pytest.mark.long
-def test_killed_fit_resumes_with_the_same_bits(fitted, tmp_path, kill_when):
+def test_killed_fit_resumes_with_the_same_model(fitted, tmp_path, kill_when):
     call = [sys.executable, "-m", "train.fit_fom", *SMALL, "1", "--out", str(tmp_path)]
     kill_when(call, lambda: list(tmp_path.glob("samples/*/*.safetensors")), cwd=ROOT)
     assert not (tmp_path / "report.md").exists()
     subprocess.run(call, cwd=ROOT, check=True, capture_output=True)
-    assert bits(tmp_path) == bits(fitted)
+    assert fitted_bytes(tmp_path) == fitted_bytes(fitted)
 
 
-def test_discriminative_fit_is_better_calibrated_than_the_published_one(fitted, tmp_path):
+def test_the_discriminative_fit_has_a_lower_loss_than_the_published_one(fitted, tmp_path):
     data = DataConfig(limit=6, min_instances=0, max_target_area=None)
     fit_fom(FitConfig(data=data, fixations=2, holdout=3, shard=2, out=tmp_path, cache=fitted, workers=1))
     figures = json.loads((tmp_path / "manifest.json").read_text())["held_out"]
-    # Raw scores are hard to beat with the hundred detections of four scenes.
+    # No comparison with raw scores: a hundred detections of four scenes are too few for it.
     assert figures["discriminative"]["nll"] < figures["Dirichlet, newton"]["nll"] / 2
 
 
-def test_calibration_report(fitted, tmp_path, capsys):
+def test_the_calibration_command_writes_a_report(fitted, tmp_path, capsys):
     model = fitted / "yolov3-tiny.safetensors"
     arguments = ["--data.limit", "3", "--fixations", "2", "--model", str(model), "--out", str(tmp_path)]
     assert calibrate([*arguments, "--beliefs", "false", "--workers", "1"]) == 0
@@ -105,7 +105,7 @@ def test_calibration_report(fitted, tmp_path, capsys):
     assert sum(counts[:-1]) == counts[-1]
 
 
-def test_samples_are_what_a_loop_sees():
+def test_samples_match_looks_at_random_fixations():
     settings = SampleSettings(DataConfig(limit=2), FitConfig().detector, FitConfig().sensor, 2, 0.5, 0)
     sampler = Sampler(settings)
     samples = sampler.sample(0)

@@ -1,4 +1,4 @@
-"""`python -m train.fit_gaze`: its gradient against finite differences, and that training helps."""
+"""`python -m train.fit_gaze`: its gradient against finite differences, and the effect of training."""
 
 import json
 from dataclasses import replace
@@ -21,7 +21,7 @@ SIDE, CELL = 48, 12
 
 
 class Textures(Detector):
-    """A detector of fine texture: a box for every cell, sure of it only where the fovea shows the texture sharply."""
+    """A detector of fine texture: a box for every cell, with a high score only where the texture is sharp."""
 
     def __init__(self) -> None:
         super().__init__("textures", ("red", "green"), (SIDE, SIDE), selection=Selection(threshold=0.0))
@@ -35,7 +35,7 @@ class Textures(Detector):
 
 
 def picture(generator: torch.Generator, **cells: int) -> torch.Tensor:
-    """Dim noise with a patch of red, of green texture in these cells."""
+    """Dim noise with patches of red and of green texture in the given cells."""
     image = 0.1 * torch.rand(3, SIDE, SIDE, generator=generator, dtype=torch.float64)
     for colour, cell in cells.items():
         channel = ("red", "green").index(colour)
@@ -46,7 +46,7 @@ def picture(generator: torch.Generator, **cells: int) -> torch.Tensor:
 
 
 class Pictures:
-    """Scenes in which green, which nobody can see, always stands in the upper row, and red below it."""
+    """Scenes with a green target in the upper row, which is not drawn, and a red object below it."""
 
     classes = ("red", "green")
     fingerprint = "pictures"
@@ -120,7 +120,7 @@ def test_gradient_equals_finite_differences(posterior):
     for number in range(6):
         if number:
             way = [torch.randn(p.shape, generator=generator, dtype=p.dtype) for p in parameters]
-        else:  # the width of the fovea alone
+        else:  # only the width of the fovea
             way = [torch.zeros_like(p) for p in parameters[:-1]] + [torch.ones_like(parameters[-1])]
         ends = []
         for sign in (1, -1):
@@ -136,7 +136,7 @@ def test_gradient_equals_finite_differences(posterior):
 
 
 def belief_loss(gaze, eye, searches, noise, hard) -> torch.Tensor:
-    """What the loss says of the belief alone: it depends on the policy by way of the views only."""
+    """The loss of the belief, which depends on the policy only through the views."""
     how = replace(SOFT, hard=hard)
     return loss_of(gaze, eye, searches, noise, replace(how, posterior=1.0)) - loss_of(
         gaze, eye, searches, noise, replace(how, posterior=0.0)
@@ -144,7 +144,7 @@ def belief_loss(gaze, eye, searches, noise, hard) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("hard", [True, False])
-def test_the_gradient_flows_through_the_fovea_and_nowhere_else(hard):
+def test_the_gradient_flows_only_through_the_fovea(hard):
     for sigma, flows in ((8.0, True), (1e9, False)):
         eye, searches, noise = toy(sigma)
         gaze = some_gaze()
@@ -153,7 +153,7 @@ def test_the_gradient_flows_through_the_fovea_and_nowhere_else(hard):
         assert largest > 1e-4 if flows else largest < 1e-9
 
 
-def test_windows_cut_the_gradient_and_not_the_loss():
+def test_windows_truncate_the_gradient_but_not_the_loss():
     eye, searches, noise = toy()
     gaze, how = some_gaze(), Relaxation(shifts=4, window=4)
     whole = backpropagate(gaze, eye, searches, noise, how)
@@ -167,13 +167,13 @@ def test_windows_cut_the_gradient_and_not_the_loss():
         torch.testing.assert_close(mine, theirs)
 
 
-def test_share_of_the_goal():
+def test_log_share_is_the_weight_of_goal_cells():
     weights = torch.tensor([[0.1, 0.2, 0.3, 0.4], [1.0, 1.0, 1.0, 1.0]])
     goal = torch.tensor([[True, False, True, False], [False] * 4])
     torch.testing.assert_close(log_share(weights.log(), goal), torch.tensor([0.4, 1.0]).log())
 
 
-def test_searches_are_those_of_the_agent():
+def test_searches_match_those_of_the_agent():
     eye, searches, _ = toy()
     gaze = some_gaze(1)
     with torch.no_grad():
@@ -205,7 +205,7 @@ def eye():
 
 
 @pytest.mark.slow
-def test_training_finds_more(config, eye):
+def test_training_finds_targets_earlier(config, eye):
     scenes, metadata = Pictures(12), {}
     learned, losses = train(config, eye, scenes, range(12), metadata)
     assert len(losses) == config.steps
@@ -217,7 +217,7 @@ def test_training_finds_more(config, eye):
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_a_stopped_run_ends_with_the_same_bits(config, eye):
+def test_a_resumed_run_ends_with_the_same_weights(config, eye):
     scenes = Pictures(6)
     whole, losses = train(replace(config, steps=6, out=config.out / "whole"), eye, scenes, range(6), {})
 
@@ -244,7 +244,7 @@ def test_a_stopped_run_ends_with_the_same_bits(config, eye):
         train(part, eye, scenes, range(6), {"another": 1})
 
 
-def test_learning_rate(config):
+def test_the_learning_rate_rises_and_then_decays(config):
     rates = [learning_rate(replace(config, steps=100), step) for step in range(100)]
     assert rates[:5] == pytest.approx([0.01, 0.02, 0.03, 0.04, 0.05])
     assert rates[5] == pytest.approx(0.05)
@@ -254,7 +254,7 @@ def test_learning_rate(config):
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_command(tmp_path, capsys):
+def test_the_command_writes_a_gaze_that_a_search_uses(tmp_path, capsys):
     threads = torch.get_num_threads()
     call = ["--data.limit", "4", "--data.min_instances", "1", "--holdout", "2", "--steps", "2", "--shifts", "2"]
     assert main([*call, "--photographs", "1", "--learn_sigma", "true", "--out", str(tmp_path)]) == 0
@@ -265,7 +265,7 @@ def test_command(tmp_path, capsys):
     assert json.loads((tmp_path / "judged.json").read_text())["found_at"].keys() == {"start", "learned"}
     assert "gain" in (tmp_path / "report.md").read_text()
     assert "written:" in capsys.readouterr().out
-    # The run looks through the width of fovea that was learned.
+    # The search uses the learned width of the fovea.
     found = [
         "--sensor.sigma",
         str(gaze.metadata["sensor"]["sigma"]),

@@ -1,4 +1,4 @@
-"""`python -m train.fit_humanlike`: people's choices against loops, habits that come back, and a run."""
+"""`python -m train.fit_humanlike`: people's choices against loops, recovered habits, and a run."""
 
 import json
 import math
@@ -28,14 +28,14 @@ GRID = Grid(4, 3, (80, 60))
 
 
 def people():
-    """One who returns, one who stays, one who leaves the picture, one who is never in it, one who looks once."""
+    """People who return to a cell, stay in one, leave the picture, are never in it, or look once."""
     cells = ([0, 5, 0, 11], [3, 3, 3], [7, None, 2], [None, None], [4])
     centres = GRID.centres.numpy().astype(np.float64)
     paths = [np.stack([centres[c] if c is not None else np.array([-9.0, 4.0]) for c in row]) for row in cells]
     return [Fixations("a", str(n + 1), path, (80, 60)) for n, path in enumerate(paths)]
 
 
-def test_choices_equal_the_loop():
+def test_choices_equal_a_loop_over_fixations():
     cells, count = cells_of(people(), GRID)
     assert count.tolist() == [4, 3, 2, 0, 1]
     choices = choices_in(cells, count, GRID, 6, torch.arange(1, 6))
@@ -52,7 +52,7 @@ def test_choices_equal_the_loop():
     assert Choices.join([some, some]).taken.tolist() == [3, 3, 3, 3]
 
 
-def make_seen():
+def random_detections():
     generator = torch.Generator().manual_seed(5)
     corner = torch.rand(12, 2, 2, generator=generator) * 50
     scores = torch.rand(12, 2, 3, generator=generator)
@@ -60,10 +60,10 @@ def make_seen():
     return Detections(boxes, scores / scores.sum(-1, keepdim=True), torch.ones(12, 2, dtype=torch.bool))
 
 
-def test_values_are_those_of_what_each_person_has_seen():
+def test_values_match_the_beliefs_of_each_person():
     """Person by person, look by look."""
     model = FovealObservationModel(1 + 3 * torch.rand(3, 2, 3), [0.4], ["cup", "cat"]).requires_grad_(False)
-    observer, value, seen = Semantic(3), NegativeEntropy(model, GRID), make_seen()
+    observer, value, seen = Semantic(3), NegativeEntropy(model, GRID), random_detections()
     cells, count = cells_of(people(), GRID)
     got = values_in(StoredLooks(seen, GRID), observer, lambda cell: value, cells, count)
     expected = []
@@ -77,7 +77,7 @@ def test_values_are_those_of_what_each_person_has_seen():
 
 
 def simulate(habits, grid, pictures=8, subjects=12, length=10):
-    """Scanpaths of people who have these habits, in pictures of which each has other values."""
+    """Scanpaths of people with these habits, in pictures that each have other values."""
     found = []
     for number in range(pictures):
         generator = torch.Generator().manual_seed(number)
@@ -92,12 +92,12 @@ def simulate(habits, grid, pictures=8, subjects=12, length=10):
         cells = torch.stack([step.cell for step in steps], 1)
         count = torch.full((subjects,), length)
         choices = choices_in(cells, count, grid, number, torch.arange(subjects))
-        told = values.expand(len(choices), len(grid))
-        found.append(replace(choices, values={"right": told, "wrong": torch.randn(told.shape, generator=generator)}))
+        right = values.expand(len(choices), len(grid))
+        found.append(replace(choices, values={"right": right, "wrong": torch.randn(right.shape, generator=generator)}))
     return Choices.join(found)
 
 
-def test_habits_come_back_and_every_true_term_gains():
+def test_fit_recovers_simulated_habits_and_true_terms_improve_it():
     grid = Grid(5, 4, (100, 80))
     place = -((grid.centres - grid.centres.mean(0)) / 40).square().sum(-1)
     step = torch.tensor([-2.0, 1.0, 1.0, 0.5, 0.0, -0.5, -1.0, -2.0])
@@ -112,13 +112,13 @@ def test_habits_come_back_and_every_true_term_gains():
     assert abs(float(wrong[-1].weights[0])) < 0.1
     habits = habits_of(right[-1], halves)
     assert float(habits.pull) == pytest.approx(1.2, abs=0.15)
-    # A constant added to a table changes nothing.
-    seen = torch.tensor([0, 4, 5, 6, 7])  # bins of length that the grid has
+    # Tables are determined up to a constant.
+    seen = torch.tensor([0, 4, 5, 6, 7])  # bins of step length that occur on the grid
     torch.testing.assert_close((habits.step - habits.step[3])[seen], (step - step[3])[seen], rtol=0, atol=0.3)
     torch.testing.assert_close(habits.back, true.back, rtol=0, atol=0.45)
 
 
-def test_the_centre_bias_alone_gains_nothing_over_itself():
+def test_the_centre_bias_has_no_gain_over_itself():
     grid = Grid(5, 4, (100, 80))
     flat = GazeHabits(0.0, torch.zeros(20), torch.zeros(8), EDGES, torch.zeros(5), AGES, 5)
     halves = Halves.of(simulate(flat, grid), grid, smoothing=1.0)
@@ -128,7 +128,7 @@ def test_the_centre_bias_alone_gains_nothing_over_itself():
     assert first.fitted == pytest.approx(0, abs=0.1)
 
 
-def test_too_few_people_are_told():
+def test_too_few_people_or_pictures_are_refused():
     grid = Grid(5, 4, (100, 80))
     flat = GazeHabits(0.0, torch.zeros(20), torch.zeros(8), EDGES, torch.zeros(5), AGES, 5)
     with pytest.raises(DataError, match="two people and two pictures"):
@@ -136,7 +136,7 @@ def test_too_few_people_are_told():
 
 
 def write_viewing(folder, pictures=4, subjects=4):
-    """Embedded scenes as files, and fixations drawn at random in them."""
+    """Save embedded scenes as files, with random fixations in them."""
     scenes = EmbeddedScenes(("person",), count=pictures, seed=0)
     generator, record = np.random.default_rng(0), {}
     for number in range(pictures):
@@ -150,7 +150,7 @@ def write_viewing(folder, pictures=4, subjects=4):
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_a_run_leaves_a_model_and_a_report(tmp_path, capsys):
+def test_a_run_writes_a_model_and_a_report(tmp_path, capsys):
     threads = torch.get_num_threads()
     given = write_viewing(tmp_path)
     small = ["--belief.columns", "4", "--belief.rows", "3", "--policies", "[kl-raw,vocus2-raw]"]
@@ -166,7 +166,7 @@ def test_a_run_leaves_a_model_and_a_report(tmp_path, capsys):
     ]
     text = (tmp_path / "out/report.md").read_text()
     assert "evaluated on 16 fixations of 2 other people in 2 other pictures" in text
-    # With few fixations the penalty on the weights counts, but nothing is worse than it was on what was fitted.
+    # With few fixations the penalty on the weights matters, but no term lowers the fit of the fitted half.
     for rows in (figures[:3], figures[3:7], figures[7:]):
         assert all(more["fitted"] >= less["fitted"] - 0.1 for less, more in pairwise(rows))
     assert main([*given, *small, "--save", "kl-rw", "--out", str(tmp_path / "out")]) == 1
@@ -175,7 +175,7 @@ def test_a_run_leaves_a_model_and_a_report(tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_pictures_of_another_size_are_told(tmp_path, capsys):
+def test_pictures_of_another_size_are_refused(tmp_path, capsys):
     given = write_viewing(tmp_path, pictures=2)
     Image.new("RGB", (640, 480)).save(tmp_path / "1.png")
     assert main([*given, "--policies", "[vocus2-raw]", "--out", str(tmp_path / "out")]) == 1

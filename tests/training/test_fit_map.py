@@ -25,8 +25,8 @@ CELLS = 16
 CLASSES = ("person", "cat", "cup", "motorcycle", "zebra", "banana", "kite", "toaster")
 
 
-def seen_in(index, most=5):
-    """What is seen from every cell of a scene, at random."""
+def random_detections(index, most=5):
+    """Random detections from every cell of a scene."""
     generator = torch.Generator().manual_seed(index)
     corner = torch.rand(CELLS, most, 2, generator=generator) * 400
     boxes = torch.cat([corner, corner + 20 + torch.rand(CELLS, most, 2, generator=generator) * 150], -1)
@@ -36,8 +36,10 @@ def seen_in(index, most=5):
 
 @pytest.fixture(scope="module")
 def run():
-    """A run that has looked at four embedded scenes."""
-    return SimpleNamespace(scenes=EmbeddedScenes(CLASSES, count=4), grid=lambda index: GRID, detections=seen_in)
+    """A stand-in for a run with stored looks at four embedded scenes."""
+    return SimpleNamespace(
+        scenes=EmbeddedScenes(CLASSES, count=4), grid=lambda index: GRID, detections=random_detections
+    )
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +56,7 @@ def classes_in(annotation, cell):
     }
 
 
-def test_examples_are_what_looks_from_every_cell_show(run, examples):
+def test_examples_match_looks_from_every_cell(run, examples):
     assert len(examples) == 4
     assert examples.features.shape == (4, CELLS, 6, CELLS, 10)
     assert examples.features.dtype == torch.float16
@@ -62,7 +64,7 @@ def test_examples_are_what_looks_from_every_cell_show(run, examples):
     assert examples.answers.shape == (4, CELLS, 7)
     for row in range(4):
         index, targets = int(examples.scene[row]), examples.targets[row]
-        annotation, seen = run.scenes.annotation(index), seen_in(index)
+        annotation, seen = run.scenes.annotation(index), random_detections(index)
         features = class_features(seen, GRID.centres, GRID, targets)
         torch.testing.assert_close(examples.features[row].float(), features, atol=2e-3, rtol=2e-3)
         for cell in range(CELLS):
@@ -74,12 +76,12 @@ def test_examples_are_what_looks_from_every_cell_show(run, examples):
         torch.testing.assert_close(examples.distance[row], torch.cdist(GRID.centres, GRID.centres) / 640)
 
 
-def test_classes_that_are_there_and_others_that_stand_for_the_rest(run, examples):
+def test_examples_have_all_present_classes_and_some_that_represent_the_others(run, examples):
     for row in range(4):
         annotation, targets = run.scenes.annotation(int(examples.scene[row])), examples.targets[row].tolist()
         assert len(set(targets)) == 6
         assert set(annotation.labels.tolist()) <= set(targets)
-        # Four that are there or score highest stand for themselves, two for the four that are left.
+        # Four classes, present or with the highest scores, represent themselves; two represent the four others.
         assert examples.stands_for[row].tolist() == [1, 1, 1, 1, 2, 2]
         assert float(examples.stands_for[row].sum()) == len(CLASSES)
     draws = {tuple(make_map_examples(run, 6, 2, seed).targets[0].tolist()) for seed in range(8)}
@@ -88,14 +90,14 @@ def test_classes_that_are_there_and_others_that_stand_for_the_rest(run, examples
 
 
 @pytest.mark.parametrize(("classes", "others"), [(8, 3), (9, 3), (12, 3), (20, 5)])
-def test_few_classes_stand_for_themselves(run, classes, others):
+def test_every_class_represents_itself_when_there_are_few(run, classes, others):
     made = make_map_examples(run, classes, others, 0)
     assert made.targets.shape == (4, 8)
     assert bool((made.stands_for == 1).all())
 
 
-def test_looks_of_examples_are_those_of_a_store(run):
-    """The same belief about all classes, but for the rounding of features to half precision."""
+def test_looks_of_examples_match_stored_looks(run):
+    """The beliefs about all classes are equal except for the rounding of features to half precision."""
     examples = make_map_examples(run, 12, 3, 0)
     torch.manual_seed(1)
     model = MapEvidence(6, 5, components=len(CLASSES) + 1).eval().requires_grad_(False)
@@ -106,14 +108,16 @@ def test_looks_of_examples_are_those_of_a_store(run):
     beliefs = [step.belief for step in steps]
     for row, scene in enumerate(chosen.scene.tolist()):
         path, order = cells[row : row + 1], chosen.targets[row]
-        alone = rollout(StoredLooks(seen_in(scene), GRID), observer, acquisition, path[:, 0], Given(path), most=4)
+        alone = rollout(
+            StoredLooks(random_detections(scene), GRID), observer, acquisition, path[:, 0], Given(path), most=4
+        )
         for number, step in enumerate(alone):
             stored = step.belief.probabilities[0]
             expected = torch.cat([stored[:, :1], stored[:, order]], -1)
             torch.testing.assert_close(beliefs[number].probabilities[row], expected, atol=5e-3, rtol=5e-3)
 
 
-def test_frequencies_equal_a_loop(run):
+def test_frequencies_equal_a_loop_over_cells(run):
     count = dict.fromkeys(range(9), 0)
     for index in (1, 3):
         for cell in range(CELLS):
@@ -140,12 +144,12 @@ def test_objective_equals_its_formula(examples):
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_training_repeats_itself(examples):
+def test_training_is_repeatable(examples):
     config, models = FitMapConfig(columns=4, rows=4, steps=6, gain_steps=3, batch=3, looks=3), []
     for seed in (5, 6):
         torch.manual_seed(0)
         model = MapEvidence(4, 4, components=len(CLASSES) + 1)
-        torch.manual_seed(seed)  # what the caller draws elsewhere changes nothing
+        torch.manual_seed(seed)  # random numbers drawn elsewhere change nothing
         train(config, model, examples, GRID)
         before = {name: value.clone() for name, value in model.state_dict().items()}
         train_gain(config, model, examples, GRID)
@@ -165,7 +169,7 @@ def test_training_repeats_itself(examples):
         ("others", 0, "a whole number from 1 to 1,000,000,000"),
     ],
 )
-def test_settings_that_make_no_sense_are_told(name, value, expected, capsys, tmp_path):
+def test_invalid_settings_are_refused(name, value, expected, capsys, tmp_path):
     assert main([f"--{name}", str(value), "--out", str(tmp_path)]) == 1
     assert f"{name}: expected {expected}, got {value}" in capsys.readouterr().err
 
@@ -189,7 +193,7 @@ def trained(tmp_path_factory):
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_training_leaves_model_and_report(trained):
+def test_training_writes_model_and_report(trained):
     model = MapEvidence.from_pretrained(trained / "out/yolov3-tiny.safetensors")
     assert model.metadata["detector"]["name"] == "yolov3-tiny"
     assert model.metadata["training"]["steps"] == 4
@@ -207,7 +211,7 @@ def test_training_leaves_model_and_report(trained):
 @pytest.mark.weights
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
-def test_same_bits_again(trained, tmp_path):
+def test_repeated_training_writes_the_same_files(trained, tmp_path):
     torch.manual_seed(1)
     assert main([*SMALL, "--out", str(tmp_path), "--cache", str(trained / "cache")]) == 0
     for name in ("yolov3-tiny.safetensors", "judged.json", "report.md"):
@@ -217,7 +221,7 @@ def test_same_bits_again(trained, tmp_path):
 @pytest.mark.weights
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
-def test_the_model_explores(trained, tmp_path):
+def test_the_model_works_in_an_exploration(trained, tmp_path):
     arguments = [
         "--policies", "[closer-look-learned, expected-gain-learned]", "--belief.map_model",
         str(trained / "out/yolov3-tiny.safetensors"), "--belief.columns", "4", "--belief.rows", "3", "--data.limit",

@@ -28,8 +28,8 @@ CELLS = 16
 CLASSES = ("person", "cat", "cup", "motorcycle", "zebra", "banana", "kite", "toaster")
 
 
-def seen_in(index, most=5):
-    """What is seen from every cell of a scene, at random."""
+def random_detections(index, most=5):
+    """Random detections from every cell of a scene."""
     generator = torch.Generator().manual_seed(index)
     corner = torch.rand(CELLS, most, 2, generator=generator) * 400
     boxes = torch.cat([corner, corner + 20 + torch.rand(CELLS, most, 2, generator=generator) * 150], -1)
@@ -39,9 +39,9 @@ def seen_in(index, most=5):
 
 @pytest.fixture(scope="module")
 def run():
-    """A run that has looked at five embedded scenes."""
+    """A stand-in for a run with stored looks at five embedded scenes."""
     scenes = EmbeddedScenes(CLASSES, count=5)
-    return SimpleNamespace(scenes=scenes, grid=lambda index: GRID, detections=seen_in)
+    return SimpleNamespace(scenes=scenes, grid=lambda index: GRID, detections=random_detections)
 
 
 @pytest.fixture(scope="module")
@@ -49,12 +49,12 @@ def examples(run):
     return make_examples(run, 2, 0.5, 0)
 
 
-def test_examples_are_what_looks_from_every_cell_show(run, examples):
+def test_examples_match_looks_from_every_cell(run, examples):
     assert len(examples) == len(examples.goal) > 10
     kinds = set()
     for row in range(len(examples)):
         index, target = int(examples.scene[row]), int(examples.target[row])
-        annotation, seen = run.scenes.annotation(index), seen_in(index)
+        annotation, seen = run.scenes.annotation(index), random_detections(index)
         features = look_features(seen, GRID.centres, GRID, target)
         assert examples.features.dtype == torch.float16
         assert torch.equal(examples.features[row], features.half())
@@ -77,7 +77,7 @@ def test_examples_are_what_looks_from_every_cell_show(run, examples):
     assert kinds == {True, False}
 
 
-def test_so_many_classes_there_and_not_there(run, examples):
+def test_as_many_absent_as_present_classes_are_chosen(run, examples):
     for index in range(len(run.scenes)):
         labels = set(run.scenes.annotation(index).labels.tolist())
         chosen = examples.target[examples.scene == index].tolist()
@@ -86,15 +86,15 @@ def test_so_many_classes_there_and_not_there(run, examples):
         assert 1 <= len(there) <= 2
         annotation = run.scenes.annotation(index)
         assert chosen == choose_classes(run.scenes, index, annotation, 2, 0.5, 0)
-        # Another scene, or seed, draws others; the number of scenes has nothing to do with it.
+        # The choice depends on the scene and the seed, not on the number of scenes.
         assert chosen == choose_classes(EmbeddedScenes(CLASSES, count=9), index, annotation, 2, 0.5, 0)
     draws = {seed: choose_classes(run.scenes, 0, run.scenes.annotation(0), 1, 1.0, seed) for seed in range(20)}
     assert len({tuple(draw) for draw in draws.values()}) > 5
     assert choose_classes(run.scenes, 0, run.scenes.annotation(0), 2, 0.0, 0) == []
 
 
-def test_looks_of_examples_are_those_of_a_store(run, examples):
-    """The same belief, but for the rounding of features to half precision."""
+def test_looks_of_examples_match_stored_looks(run, examples):
+    """The beliefs are equal except for the rounding of features to half precision."""
     torch.manual_seed(1)
     model = TargetEvidence(6, 5, components=len(CLASSES) + 1).eval().requires_grad_(False)
     cells = torch.tensor([[3, 7, 1, 12], [0, 15, 14, 2]])
@@ -105,7 +105,7 @@ def test_looks_of_examples_are_those_of_a_store(run, examples):
     beliefs = [step.belief for step in steps]
     for row, example in enumerate(chosen.tolist()):
         target = examples.target[example : example + 1]
-        stored = StoredLooks(seen_in(int(examples.scene[example])), GRID, target)
+        stored = StoredLooks(random_detections(int(examples.scene[example])), GRID, target)
         path = cells[row : row + 1]
         alone = rollout(stored, Target(model), TargetPosterior(target), path[:, 0], Given(path), most=4)
         for number, step in enumerate(alone):
@@ -117,7 +117,7 @@ def test_looks_of_examples_are_those_of_a_store(run, examples):
                 )
 
 
-def test_searches_go_over_every_cell_once(examples):
+def test_training_searches_visit_every_cell_once(examples):
     torch.manual_seed(1)
     model = TargetEvidence(4, 4, components=len(CLASSES) + 1).requires_grad_(False)
     for astray in (0.0, 0.5, 1.0):
@@ -135,7 +135,7 @@ def test_searches_go_over_every_cell_once(examples):
 
 @pytest.mark.parametrize("held", [[[2, 7], [], [4]], [[], [], []], [[4], [4], [4]]], ids=str)
 def test_objective_equals_its_formula(held):
-    """In scalars; the searches of the last case are over, those of the one before never were on the target."""
+    """Computed in scalars; one case has no target, and in the last one every search has visited its target."""
     generator = torch.Generator().manual_seed(0)
     cells, following = torch.rand(2, 3, CELLS, generator=generator, dtype=torch.float64)
     anywhere = torch.rand(3, generator=generator, dtype=torch.float64)
@@ -168,7 +168,7 @@ def test_objective_equals_its_formula(held):
 
 
 def test_gradients_of_certain_beliefs_are_finite():
-    """Probabilities of 0 and 1 that are wrong cost much, but not infinitely much."""
+    """Wrong probabilities of exactly 0 and 1 have a large but finite loss."""
     cells = torch.tensor([[0.0, 1.0] * 8, [1.0, 0.0] * 8]).requires_grad_()
     goal = torch.zeros(2, CELLS, dtype=torch.bool)
     goal[0, 2] = True
@@ -183,8 +183,8 @@ def test_gradients_of_certain_beliefs_are_finite():
     assert bool(cells.grad.isfinite().all())
 
 
-def brute_force(config, anywhere, place, left, there):
-    """All searches at all thresholds, look by look."""
+def best_thresholds_by_loop(config, anywhere, place, left, there):
+    """The best thresholds among all combinations, applied look by look."""
 
     def found(search, confirm, least, give_up):
         for look in range(len(anywhere)):
@@ -198,7 +198,7 @@ def brute_force(config, anywhere, place, left, there):
     holding = there.nonzero()[:, 0].tolist()
     others = (~there).nonzero()[:, 0].tolist()
 
-    def surest(least):
+    def confirm_and_hits(least):
         passing = []
         for confirm in torch.arange(0.99, 0.49, -0.01).tolist():
             if sum(found(search, confirm, least, 0.0) for search in others) > config.false_alarms * len(others):
@@ -207,21 +207,21 @@ def brute_force(config, anywhere, place, left, there):
         confirm = min(passing, default=1.0)
         return confirm, sum(found(search, confirm, least, 0.0) for search in holding)
 
-    wherever, least = surest(0.0)[1], 0.0
+    wherever, least = confirm_and_hits(0.0)[1], 0.0
     for candidate in torch.arange(0.95, 0.04, -0.05).tolist():
-        if candidate > least and wherever - surest(candidate)[1] <= config.lost * len(holding):
+        if candidate > least and wherever - confirm_and_hits(candidate)[1] <= config.lost * len(holding):
             least = candidate
-    confirm, told = surest(least)
+    confirm, hits = confirm_and_hits(least)
     kept = [
         give_up
         for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01)
-        if told - sum(found(search, confirm, least, give_up) for search in holding) <= config.lost * len(holding)
+        if hits - sum(found(search, confirm, least, give_up) for search in holding) <= config.lost * len(holding)
     ]
     return Thresholds(confirm, max(kept, default=0.0), least)
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_thresholds_equal_trying_all(seed):
+def test_thresholds_equal_the_best_of_all_combinations(seed):
     generator = torch.Generator().manual_seed(seed)
 
     def draw(*shape):
@@ -236,11 +236,11 @@ def test_thresholds_equal_trying_all(seed):
     place = looked * (0.3 * draw(looks, searched) + 0.7 * anywhere)
     config = FitSearchConfig(false_alarms=(0.0, 0.03, 0.2)[seed % 3], lost=(0.0, 0.05)[seed % 2])
     got = choose_thresholds(config, anywhere, place, left, there)
-    assert got == brute_force(config, anywhere, place, left, there)
+    assert got == best_thresholds_by_loop(config, anywhere, place, left, there)
 
 
-def test_thresholds_at_the_ends():
-    """Searches that tell nothing confirm nothing; those that tell all are confirmed from a half on."""
+def test_thresholds_of_uninformative_and_perfect_searches():
+    """Uninformative searches confirm nothing; perfect ones confirm from a probability of one half on."""
     there = torch.tensor([True, False])
     place, left = torch.tensor([[0.72, 0.72]]), torch.tensor([[0.4, 0.005]])
     config = FitSearchConfig()
@@ -253,7 +253,7 @@ def test_thresholds_at_the_ends():
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_training_is_repeatable_and_leaves_the_caller_alone(examples):
+def test_training_is_repeatable_and_keeps_the_global_random_state(examples):
     config = FitSearchConfig(columns=4, rows=4, steps=12, batch=4, looks=3)
     torch.manual_seed(5)
     state = torch.random.get_rng_state()
@@ -270,8 +270,8 @@ def test_training_is_repeatable_and_leaves_the_caller_alone(examples):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
-def test_training_learns_and_judging_tells(examples):
-    """More steps make a lower entropy of cells, on what was trained on."""
+def test_more_training_lowers_the_evaluated_loss(examples):
+    """More steps lower the cross entropy of cells on the training examples."""
     nll = []
     for steps in (1, 60):
         config = FitSearchConfig(columns=4, rows=4, steps=steps, batch=8, looks=4)
@@ -289,7 +289,7 @@ def test_training_learns_and_judging_tells(examples):
 
 
 @pytest.mark.parametrize("name", ["holdout", "looks"])
-def test_settings_that_make_no_sense_are_told(name, capsys, tmp_path):
+def test_invalid_settings_are_refused(name, capsys, tmp_path):
     assert main([f"--{name}", "1", "--out", str(tmp_path)]) == 1
     assert f"{name}: expected a whole number from 2 to" in capsys.readouterr().err
 
@@ -313,7 +313,7 @@ def trained(tmp_path_factory):
 
 @pytest.mark.weights
 @pytest.mark.slow
-def test_training_leaves_model_report_and_figures(trained):
+def test_training_writes_model_report_and_figures(trained):
     model = TargetEvidence.from_pretrained(trained / "out/yolov3-tiny.safetensors")
     assert model.metadata["detector"]["name"] == "yolov3-tiny"
     assert model.metadata["training"]["steps"] == 30
@@ -336,11 +336,11 @@ def test_training_leaves_model_report_and_figures(trained):
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
-def test_looks_are_shared_and_the_result_is_the_same(trained, tmp_path, workers):
-    """With what was seen before, by any number of workers: the same bits; no photograph is looked at again."""
+def test_stored_looks_are_reused_and_the_result_is_the_same(trained, tmp_path, workers):
+    """Files are identical for any number of workers, and no photograph is looked at again."""
     stored = {path: path.stat().st_mtime_ns for path in (trained / "cache/looks").rglob("*") if path.is_file()}
     assert len([path for path in stored if path.suffix == ".safetensors"]) >= 6
-    torch.manual_seed(1)  # what the caller draws elsewhere changes nothing
+    torch.manual_seed(1)  # random numbers drawn elsewhere change nothing
     assert main([*SMALL, "--workers", workers, "--out", str(tmp_path), "--cache", str(trained / "cache")]) == 0
     assert stored == {path: path.stat().st_mtime_ns for path in stored}
     for name in ("yolov3-tiny.safetensors", "judged.json", "report.md"):

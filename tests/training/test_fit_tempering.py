@@ -21,7 +21,7 @@ def looks(count, boxes=3, classes=4):
 
 
 @pytest.mark.parametrize("tempering", [0.3, 1.0])
-def test_hit_rate_equals_a_loop(tempering):
+def test_hit_rate_equals_a_loop_over_looks(tempering):
     grid, seen = Grid(4, 3, (96, 96)), looks(5)
     fixations = torch.tensor([[10.0, 10.0], [80.0, 80.0], [40.0, 30.0], [11.0, 9.0], [60.0, 90.0]])
     targets, goal = torch.tensor([1, 3]), torch.zeros(2, 12, dtype=torch.bool)
@@ -45,7 +45,7 @@ def test_hit_rate_equals_a_loop(tempering):
     assert 0 < rate < 1
 
 
-def test_looks_that_all_fixate_the_target_say_nothing():
+def test_there_is_no_hit_rate_when_every_fixation_is_on_the_target():
     grid, seen = Grid(4, 3, (96, 96)), looks(2)
     goal = torch.ones(1, 12, dtype=torch.bool)
     fixations = torch.tensor([[10.0, 10.0], [80.0, 80.0]])

@@ -1,4 +1,4 @@
-"""`python -m train.fit_templates`: its sums against loops, and a run on the embedded scenes that a search then uses."""
+"""`python -m train.fit_templates`: its sums against loops, and templates of embedded scenes used in a search."""
 
 import json
 
@@ -16,8 +16,8 @@ from semfov.training.templates import TemplateSums, objects_of
 from train.fit_templates import main
 
 
-def test_features_are_what_the_last_convolution_reads():
-    """Seen by a hook on it."""
+def test_features_are_the_input_of_the_last_convolution():
+    """Read by a hook on that layer."""
     torch.manual_seed(0)
     network = Darknet(yolov3_tiny()).eval()
     head = list(network.layers).index(network.heads[0])
@@ -28,13 +28,13 @@ def test_features_are_what_the_last_convolution_reads():
         network(image)
         features = network.features(image)
     assert features.shape == (2, 512, 2, 3)
-    # The first layers take one image of a batch at a time where all are computed.
+    # The first layers process one image at a time in a full pass, so rounding differs.
     torch.testing.assert_close(features, seen[0], rtol=1e-4, atol=1e-5)
     with pytest.raises(InputError, match="image"):
         network.features(torch.rand(1, 3, 30, 30))
 
 
-def test_sums_equal_the_means():
+def test_templates_from_sums_equal_means():
     generator = torch.Generator().manual_seed(0)
     sums, everything, objects, labels = TemplateSums(3, 4), [], [], []
     for count in (2, 0, 3):
@@ -53,7 +53,7 @@ def test_sums_equal_the_means():
 
 
 @pytest.mark.weights
-def test_objects_are_read_at_their_centres():
+def test_features_of_objects_are_taken_at_their_centres():
     detector = load_detector("yolov3-tiny")
     scenes = EmbeddedScenes(detector.classes, count=1)
     features, objects, labels = objects_of(detector, scenes, 0)
@@ -66,13 +66,13 @@ def test_objects_are_read_at_their_centres():
         near = ((centre + 0.5) / step - 0.5).round().long()
         own = features[:, near[1].clamp(0, features.shape[1] - 1), near[0].clamp(0, features.shape[2] - 1)]
         others = (features.flatten(1).t() @ found).sort().values
-        # Between four places the nearest is among the most alike.
+        # The centre is between four positions; the nearest of them is among the four most similar.
         assert float(own @ found) >= float(others[-4])
 
 
 @pytest.mark.slow
 @pytest.mark.weights
-def test_a_run_leaves_templates_that_a_search_goes_by(tmp_path, capsys):
+def test_a_run_writes_templates_that_a_search_uses(tmp_path, capsys):
     threads = torch.get_num_threads()
     assert main(["--data.limit", "6", "--holdout", "3", "--out", str(tmp_path)]) == 0
     path = tmp_path / "yolov3-tiny.safetensors"
@@ -96,10 +96,10 @@ def test_a_run_leaves_templates_that_a_search_goes_by(tmp_path, capsys):
     assert "no such file" in capsys.readouterr().err
 
 
-def test_a_detector_whose_features_are_not_at_hand_says_so():
-    class Closed(Detector):
+def test_a_detector_without_access_to_its_features_is_refused():
+    class ClosedDetector(Detector):
         def propose(self, canvas):
             raise NotImplementedError
 
     with pytest.raises(InputError, match=r"access to its features.*closed"):
-        Closed("closed", ("cup",), (32, 32)).features(torch.zeros(1, 3, 32, 32))
+        ClosedDetector("closed", ("cup",), (32, 32)).features(torch.zeros(1, 3, 32, 32))

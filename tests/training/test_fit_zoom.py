@@ -1,4 +1,4 @@
-"""`python -m train.fit_zoom`: small on the embedded scenes, and its examples there and back."""
+"""`python -m train.fit_zoom`: small on the embedded scenes, and its examples from a store."""
 
 import json
 import math
@@ -41,27 +41,27 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, te
     figures = json.loads((tmp_path / "out" / "figures.json").read_text())
     assert all(map(math.isfinite, figures.values()))
     assert (tmp_path / "out" / "report.md").read_text() in capsys.readouterr().out
-    recalls, passes = tried((tmp_path / "out" / "report.md").read_text())
+    recalls, passes = tables_of_choices((tmp_path / "out" / "report.md").read_text())
     near, far = (max(*values, 1e-9) for values in zip(*recalls.values(), strict=True))
     best = max(recalls, key=lambda value: recalls[value][0] / near + recalls[value][1] / far)
     assert model.survey.foresight == best
     assert model.patience == min(passes, key=passes.get)
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
-    # One part can be fitted again, and the others stay.
+    # Only one part is fitted again.
     fit_zoom(replace(config, evidence=path, refit=("survey",), survey_steps=2, out=tmp_path / "again"))
     other = GlimpseEvidence.from_pretrained(tmp_path / "again" / "bright.safetensors")
     changed = {name for name, tensor in other.state_dict().items() if not torch.equal(before[name], tensor)}
     assert changed
     assert all(name.startswith("survey.") for name in changed)
-    # Looks come from the store, and a fit of the same seed is the same.
+    # Looks come from the store, and a fit with the same seed gives the same model.
     monkeypatch.setattr(textures, "propose", None)
     fit_zoom(config)
     again = GlimpseEvidence.from_pretrained(tmp_path / "out" / "bright.safetensors")
     assert all(torch.equal(before[name], tensor) for name, tensor in again.state_dict().items())
 
 
-def tried(report):
-    """Recalls by foresight, and passes by patience, from the tables of a report."""
+def tables_of_choices(report):
+    """Recalls by foresight and numbers of passes by patience, from the tables of a report."""
     tables = {}
     for line in report.splitlines():
         cells = [cell.strip() for cell in line.split("|")[1:-1]]
@@ -75,7 +75,7 @@ def tried(report):
     return recalls, {float(value): float(row[0]) for value, row in tables["patience"].items()}
 
 
-def test_examples_are_the_same_from_a_store(tmp_path, textures):
+def test_examples_do_not_depend_on_the_store(tmp_path, textures):
     eye = ZoomEye(textures("bright"))
     mosaics = Mosaics(EmbeddedScenes(("person", "cat", "cup"), count=3), 2, 2, tile=(96, 72), count=1)
     store = GlanceStore(tmp_path, eye.settings(), 3)
@@ -83,7 +83,7 @@ def test_examples_are_the_same_from_a_store(tmp_path, textures):
     example = example_of(mosaics, 0, glances)
     glances.save()
     assert sum(look.window.within is not None for look in example.looks) == 4
-    eye.detector.propose = None  # nothing is looked at again
+    eye.detector.propose = None  # any new look would fail
     same = example_of(mosaics, 0, open_scene(eye, mosaics, 0, store))
     assert torch.equal(same.labels, example.labels)
     for one, other in zip(example.looks, same.looks, strict=True):
@@ -95,7 +95,7 @@ def test_examples_are_the_same_from_a_store(tmp_path, textures):
             assert torch.equal(other.gist.found, one.gist.found)
 
 
-def test_settings_have_ranges():
+def test_settings_out_of_range_are_refused():
     with pytest.raises(InputError, match="steps: expected a whole number from 1"):
         FitZoomConfig(steps=0)
 
@@ -115,7 +115,7 @@ def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, 
     assert model.edges.tolist() == [0.5, 1.5, 2.5]
     assert model.metadata["sensor"]["glimpse"] == "antialiased bilinear"
     model.check_compatible(ZoomEye(textures("bright")).settings())
-    # One of the two mosaics was fitted on, the other judged; all that it shows is counted.
+    # The model was fitted on one of the two mosaics and evaluated on the other; all samples of the first are counted.
     sampler = MosaicSettings.of(config).sampler()
     samples = sampler.load(tmp_path / "out" / "samples", 1)
     assert sum(map(sum, model.metadata["counts"])) == len(samples)

@@ -1,4 +1,4 @@
-"""Which epoch comes next: histories written by hand, and whole trainings with losses made up."""
+"""The schedule of epochs and learning rates, on trainings with given losses."""
 
 import pytest
 from hypothesis import given
@@ -14,8 +14,8 @@ def epoch(loss, rate=0.0, trial=False):
     return Epoch(rate, trial, training=1.0, objectness=loss, classes=0.0, boxes=0.0, seconds=1.0)
 
 
-def play(losses, config=CONFIG):
-    """A training whose epochs end with these losses: what each of them was."""
+def simulate(losses, config=CONFIG):
+    """The epochs of a training whose losses are given."""
     history = [epoch(losses[0])]
     for loss in losses[1:]:
         following = next_epoch(history, config)
@@ -25,38 +25,38 @@ def play(losses, config=CONFIG):
     return history
 
 
-def told(history):
+def rates_and_trials(history):
     return [(pytest.approx(each.rate), each.trial) for each in history[1:]]
 
 
-def test_rates_are_tried_from_the_start_and_the_best_goes_on():
-    history = play([9, 8, 7, 6])
-    assert told(history) == [(0.1, True), (0.9, True), (0.9, False)]
-    assert told(play([9, 7, 8, 6]))[-1] == (0.1, False)
+def test_each_rate_is_tried_for_one_epoch_and_training_continues_with_the_best():
+    history = simulate([9, 8, 7, 6])
+    assert rates_and_trials(history) == [(0.1, True), (0.9, True), (0.9, False)]
+    assert rates_and_trials(simulate([9, 7, 8, 6]))[-1] == (0.1, False)
 
 
-def test_an_epoch_that_is_no_better_divides_the_rate_and_two_end_it():
-    history = play([9, 8, 7, 7.5, 6, 6.5, 6.5, 1])
-    assert told(history)[2:] == [(0.9, False), (0.3, False), (0.3, False), (0.1, False)]
+def test_an_epoch_without_improvement_divides_the_rate_and_two_end_training():
+    history = simulate([9, 8, 7, 7.5, 6, 6.5, 6.5, 1])
+    assert rates_and_trials(history)[2:] == [(0.9, False), (0.3, False), (0.3, False), (0.1, False)]
     assert len(history) == 7
     assert best_of(history) == 4
 
 
-def test_the_detector_as_it_was_may_be_the_best():
-    history = play([5, 8, 7, 6, 6, 1])
+def test_the_untrained_detector_may_be_the_best():
+    history = simulate([5, 8, 7, 6, 6, 1])
     assert len(history) == 5
     assert best_of(history) == 0
 
 
-def test_epochs_are_counted_with_the_trials():
-    assert len(play([float(n) for n in range(30, 0, -1)])) == 1 + CONFIG.epochs
+def test_trials_count_as_epochs():
+    assert len(simulate([float(n) for n in range(30, 0, -1)])) == 1 + CONFIG.epochs
     few = FinetuneConfig(rates=(0.1, 0.2, 0.3), epochs=2)
-    assert len(play([9, 8, 7, 6, 5, 4], few)) == 4
+    assert len(simulate([9, 8, 7, 6, 5, 4], few)) == 4
 
 
 @given(st.lists(st.floats(0, 10), min_size=20, max_size=20))
 def test_every_training_ends_and_rates_never_grow(losses):
-    history = play(losses)
+    history = simulate(losses)
     assert next_epoch(history, CONFIG) is None
     rates = [each.rate for each in history[1:] if not each.trial]
     assert rates == sorted(rates, reverse=True)

@@ -1,4 +1,4 @@
-"""The end of a network alone, against the whole network."""
+"""The last layers of a network, against the whole network."""
 
 import pytest
 import torch
@@ -13,13 +13,13 @@ NETWORKS = {"yolov3-tiny": yolov3_tiny, "yolov3": yolov3}
 
 @pytest.fixture(params=[("yolov3-tiny", 1), ("yolov3-tiny", 2), ("yolov3", 1), ("yolov3", 3)], ids=str)
 def tail(request):
-    """Of a network of random weights with 3 classes."""
+    """The tail of a network with random weights and 3 classes."""
     name, depth = request.param
     torch.manual_seed(0)
     return Tail(Darknet(NETWORKS[name](classes=3)).requires_grad_(False), depth)
 
 
-def test_tail_after_features_is_the_network(tail):
+def test_features_followed_by_the_tail_equal_the_network(tail):
     image = torch.rand(2, 3, 64, 96)
     features = tail.features(image)
     assert list(features) == tail.inputs
@@ -27,7 +27,7 @@ def test_tail_after_features_is_the_network(tail):
         torch.testing.assert_close(ours, whole, rtol=1e-5, atol=1e-5)
 
 
-def test_features_are_the_tails_to_read_and_not_to_write(tail):
+def test_the_tail_does_not_change_its_features(tail):
     features = tail.features(torch.rand(1, 3, 32, 32))
     before = {number: tensor.clone() for number, tensor in features.items()}
     tail(features)
@@ -35,7 +35,7 @@ def test_features_are_the_tails_to_read_and_not_to_write(tail):
         assert torch.equal(tensor, before[number])
 
 
-def test_gradients_are_those_of_the_network(tail):
+def test_gradients_match_those_of_the_network(tail):
     image, parameters = torch.rand(1, 3, 32, 32), list(tail.named_parameters().values())
     for parameter in parameters:
         parameter.requires_grad_(True)
@@ -48,7 +48,7 @@ def test_gradients_are_those_of_the_network(tail):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
 
 
-def test_features_do_not_depend_on_what_is_trained(tail):
+def test_features_do_not_depend_on_the_trained_weights(tail):
     image = torch.rand(1, 3, 32, 32)
     before = tail.features(image)
     for parameter in tail.named_parameters().values():
@@ -59,14 +59,14 @@ def test_features_do_not_depend_on_what_is_trained(tail):
 
 def test_layers_of_yolov3_tiny():
     network = Darknet(yolov3_tiny())
-    told = {depth: (Tail(network, depth).trained, Tail(network, depth).inputs) for depth in (1, 2)}
-    assert told == {1: ([15, 22], [14, 21]), 2: ([14, 15, 21, 22], [13, 20])}
+    layers = {depth: (Tail(network, depth).trained, Tail(network, depth).inputs) for depth in (1, 2)}
+    assert layers == {1: ([15, 22], [14, 21]), 2: ([14, 15, 21, 22], [13, 20])}
     names = set(Tail(network).named_parameters())
     assert names == {f"layers.{number}.{what}" for number in (15, 22) for what in ("weight", "bias")}
     assert names <= set(dict(network.named_parameters()))
 
 
 @pytest.mark.parametrize("depth", [0, 3])
-def test_refuses_a_depth_that_the_network_has_not(depth):
+def test_a_depth_that_the_network_does_not_have_is_refused(depth):
     with pytest.raises(InputError, match="depth: expected"):
         Tail(Darknet(yolov3_tiny()), depth)

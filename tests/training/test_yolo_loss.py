@@ -32,8 +32,8 @@ def overlap(a, b):
     return shared / (a[2] * a[3] + b[2] * b[3] - shared)
 
 
-def twin(maps, boxes, labels, ignore):
-    """Loss by part, and the gradient of their sum, with nothing but loops over numbers."""
+def loss_by_loop(maps, boxes, labels, ignore):
+    """The parts of the loss, and the gradient of their sum, by loops over numbers."""
     losses = {"objectness": 0.0, "classes": 0.0, "boxes": 0.0}
     deltas = [torch.zeros_like(raw) for raw in maps]
     for image, (own, names) in enumerate(zip(boxes, labels, strict=True)):
@@ -90,7 +90,7 @@ def twin(maps, boxes, labels, ignore):
 
 
 def problem(seed, images=3, dtype=torch.float64):
-    """Random maps, boxes and labels; an image without objects among them."""
+    """Random maps, boxes and labels; one image has no objects."""
     generator = torch.Generator().manual_seed(seed)
     maps = [torch.randn(images, 16, *size, generator=generator, dtype=dtype) for size in SIZES]
     boxes, labels = [], []
@@ -105,43 +105,43 @@ def problem(seed, images=3, dtype=torch.float64):
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("ignore", [0.1, 0.5])
-def test_loss_and_gradient_are_darknets(seed, ignore):
+def test_loss_and_gradient_match_darknet(seed, ignore):
     maps, boxes, labels = problem(seed)
     maps = [raw.requires_grad_() for raw in maps]
     losses = yolo_loss(maps, HEADS, CANVAS, boxes, labels, ignore=ignore)
-    wanted, deltas = twin([raw.detach() for raw in maps], boxes, labels, ignore)
+    wanted, deltas = loss_by_loop([raw.detach() for raw in maps], boxes, labels, ignore)
     for name, value in wanted.items():
         assert getattr(losses, name).item() == pytest.approx(value, rel=1e-9), name
     for gradient, delta in zip(torch.autograd.grad(losses.total, maps), deltas, strict=True):
         torch.testing.assert_close(gradient, delta, rtol=1e-6, atol=1e-6)
 
 
-def test_some_boxes_are_ignored_in_these_problems():
+def test_a_low_overlap_threshold_ignores_some_boxes():
     maps, boxes, labels = problem(0)
     strict, lenient = (yolo_loss(maps, HEADS, CANVAS, boxes, labels, ignore=ignore) for ignore in (0.1, 1.0))
     assert strict.objectness < lenient.objectness
     assert strict.classes == lenient.classes > 0
 
 
-def test_two_objects_that_ask_for_one_box_and_one_at_the_border():
+def test_the_last_of_two_objects_assigned_to_one_box_counts_even_at_the_border():
     box = [24.0, 20.0, 64.0, 48.0]  # its centre is below the canvas
     boxes, labels = [torch.tensor([box, box], dtype=torch.float64)], [torch.tensor([1, 3])]
     maps = [raw[:1] for raw in problem(1)[0]]
     losses = yolo_loss(maps, HEADS, CANVAS, boxes, labels)
-    wanted, _ = twin(maps, boxes, labels, 0.5)
+    wanted, _ = loss_by_loop(maps, boxes, labels, 0.5)
     assert losses.classes.item() == pytest.approx(wanted["classes"])
     alone = yolo_loss(maps, HEADS, CANVAS, [boxes[0][1:]], [labels[0][1:]])
     assert losses.total.item() == pytest.approx(alone.total.item())
 
 
-def test_an_anchor_of_two_heads_is_trained_in_both():
+def test_an_anchor_that_two_heads_share_is_trained_in_both():
     maps = [torch.zeros(1, 16, *size, requires_grad=True) for size in SIZES]
     losses = yolo_loss(maps, HEADS, CANVAS, [torch.tensor([[10.0, 4.0, 30.0, 16.0]])], [torch.tensor([2])])
     gradients = torch.autograd.grad(losses.classes, maps)
     assert [int((gradient != 0).sum()) for gradient in gradients] == [3, 3]
 
 
-def test_gradients():
+def test_gradients_equal_finite_differences():
     maps, boxes, labels = problem(2, images=2)
     maps = [raw.requires_grad_() for raw in maps]
 
@@ -151,8 +151,8 @@ def test_gradients():
     assert torch.autograd.gradcheck(loss, maps)
 
 
-def test_a_perfect_box_costs_what_its_entropy_is():
-    """The centre of a cell, the anchor's own size: what is left is the entropy of a half, and saturated scores."""
+def test_the_loss_of_a_perfect_box_is_its_entropy():
+    """The box is centred in its cell and as large as its anchor: only the entropy of two offsets of 0.5 is left."""
     head = Head(((16.0, 16.0),), 1)
     raw = torch.full((1, 6, 2, 2), -50.0, dtype=torch.float64)
     raw[0, :4, 0, 0], raw[0, 4:, 0, 0] = 0.0, 50.0
@@ -163,7 +163,7 @@ def test_a_perfect_box_costs_what_its_entropy_is():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_dtype_and_device(dtype, device):
+def test_loss_keeps_dtype_and_device(dtype, device):
     maps, boxes, labels = problem(3, dtype=dtype)
     arguments = [[each.to(device) for each in many] for many in (maps, boxes, labels)]
     losses = yolo_loss(arguments[0], HEADS, CANVAS, *arguments[1:])
@@ -172,7 +172,7 @@ def test_dtype_and_device(dtype, device):
     assert losses.total.item() == pytest.approx(expected.total.item(), rel=1e-5)
 
 
-def test_batches_add_up():
+def test_the_loss_of_a_batch_is_the_sum_over_its_images():
     maps, boxes, labels = problem(4)
     whole = yolo_loss(maps, HEADS, CANVAS, boxes, labels)
     parts = [
@@ -182,8 +182,8 @@ def test_batches_add_up():
     assert (parts[0] + parts[1] + parts[2]).total.item() == pytest.approx(whole.total.item())
 
 
-def test_descending_finds_an_object():
-    """A network of one layer learns by the loss where an object is and what it is."""
+def test_gradient_descent_learns_the_position_and_class_of_an_object():
+    """A network of one layer is trained with the loss."""
     torch.manual_seed(0)
     head = Head(((12.0, 12.0),), 2)
     layer = torch.nn.Conv2d(4, head.channels, 1)
@@ -207,14 +207,14 @@ def test_descending_finds_an_object():
         ({"boxes": 2}, "labels: expected one tensor for each of 2 images, got 3"),
     ],
 )
-def test_refuses_what_does_not_fit(change, message):
+def test_a_wrong_number_of_maps_boxes_or_labels_is_refused(change, message):
     names = ("maps", "boxes", "labels")
     given = {name: each[: change.get(name, len(each))] for name, each in zip(names, problem(0), strict=True)}
     with pytest.raises(InputError, match=message):
         yolo_loss(given["maps"], HEADS, CANVAS, given["boxes"], given["labels"])
 
 
-def test_refuses_maps_of_other_heads():
+def test_maps_that_do_not_fit_the_heads_are_refused():
     maps, boxes, labels = problem(0)
     with pytest.raises(InputError, match="maps: expected a tensor of shape"):
         yolo_loss([maps[0][:, :15], maps[1]], HEADS, CANVAS, boxes, labels)

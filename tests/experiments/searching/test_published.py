@@ -1,4 +1,4 @@
-"""What Ruarte et al. (2025) published for files that we have, by their definitions."""
+"""Figures of Ruarte et al. (2025), computed again from their files by their definitions."""
 
 from itertools import combinations
 
@@ -34,20 +34,20 @@ def shifts(searches):
 
 
 @pytest.mark.parametrize("name", AREA)
-def test_area_under_cumulative_performance(searches, name):
+def test_area_under_cumulative_performance_matches_the_published_value(searches, name):
     curve = mean_performance(shifts(searches[name]), [each.subject for each in searches[name]], 9)
     assert performance_area(curve) == pytest.approx(AREA[name], abs=5e-4)
 
 
 @pytest.mark.parametrize("name", TFP_AUC)
-def test_tfp_auc(searches, name):
-    """Summed over seven fixations, a mean over target categories; pooled over searches people would have 4.899."""
+def test_tfp_auc_matches_the_published_value(searches, name):
+    """A sum over seven fixations, averaged over target categories; a mean over searches gives 4.899 for people."""
     found = [shift_found(each, 10**6) for each in searches[name]]
     assert tfp_auc(found, [each.target for each in searches[name]]) == pytest.approx(TFP_AUC[name], abs=5e-4)
 
 
 def similarities(pairs):
-    """MultiMatch's four of pairs that both found, mean by picture."""
+    """Mean of four MultiMatch similarities by picture, over pairs in which both searches found the target."""
     found = {}
     for a, b in pairs:
         if a.found and b.found:
@@ -59,13 +59,13 @@ def similarities(pairs):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["nnIBS", "elm_final"])
-def test_multimatch(searches, name):
-    """Means over the pictures for which there are similarities both of the model to people and among people."""
+def test_multimatch_similarities_match_the_published_values(searches, name):
+    """Means over the pictures that have similarities both between model and people and among people."""
     people = by_picture(searches["humans"])
     model = similarities((a, b) for a in searches[name] for b in people[a.picture])
     themselves = similarities(pair for picture in model for pair in combinations(people[picture], 2))
     rows = [model[picture] for picture in themselves]
     np.testing.assert_allclose(np.mean(rows, axis=0), MULTIMATCH[name], atol=0.001)
     if name == "nnIBS":
-        # Of the figures for people, which differ with the model, those beside nnIBS are published.
+        # The figures for people depend on the model; the published ones are those for nnIBS.
         np.testing.assert_allclose(np.mean(list(themselves.values()), axis=0), MULTIMATCH["humans"], atol=0.001)

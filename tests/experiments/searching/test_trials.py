@@ -1,4 +1,4 @@
-"""Searches in cells: against the grid's own footprints and closed forms."""
+"""Searches in cells, against footprints of the grid and closed forms."""
 
 import json
 from types import SimpleNamespace
@@ -35,18 +35,18 @@ def test_goal_cells_are_those_that_the_box_overlaps(seed):
     assert torch.equal(covered, expected)
 
 
-def test_edges_on_the_border_of_cells_do_not_reach_into_the_next():
+def test_a_box_that_ends_at_a_cell_border_does_not_cover_the_next_cell():
     assert goal_cells(search([[0, 0]], (40.0, 40.0, 80.0, 120.0)), GRID) == (1, 1, 1, 2)
 
 
-def test_scanpaths_are_merged_in_cells_and_cut_at_the_target():
+def test_scanpaths_in_cells_merge_repeated_fixations_and_end_at_the_target():
     path = search([[10, 10], [30, 30], [200, 200], [100, 100], [300, 10]])
     assert in_cells(path, GRID).tolist() == [[0, 0], [5, 5], [2, 2]]
     away = search([[10, 10], [200, 200]])
     assert in_cells(away, GRID).tolist() == [[0, 0], [5, 5]]
 
 
-def test_a_search_has_found_as_the_file_says_else_by_its_box():
+def test_a_search_is_found_by_the_flag_of_the_file_or_else_by_the_target_box():
     on = [[0, 0], [100, 100], [0, 0]]
     assert shift_found(search(on), 10) == 1
     assert shift_found(search(on, found=True), 10) == 2
@@ -54,7 +54,7 @@ def test_a_search_has_found_as_the_file_says_else_by_its_box():
     assert shift_found(search(on, found=True), 2) == -1
 
 
-def test_draws_without_return_find_as_often_as_the_formula_says():
+def test_random_draws_without_return_find_targets_as_often_as_the_formula():
     trials = [search([[0, 0]], picture=f"{number}.jpg") for number in range(3000)]
     drawn = drawn_searches(trials, GRID, (10, 10), np.ones(48), longest=10, seed=0, name="random")
     found = np.array([len(each) - 1 if each.found else -1 for each in drawn])
@@ -67,7 +67,7 @@ def test_draws_without_return_find_as_often_as_the_formula_says():
     assert {tuple(each.points[0]) for each in drawn} == {tuple(GRID.centres[0].tolist())}
 
 
-def test_people_beside_themselves_are_compared_with_others_alone():
+def test_people_are_compared_only_with_other_people():
     pytest.importorskip("sklearn")
     pytest.importorskip("rapidfuzz")
     far, near = [[10, 10], [200, 200], [100, 100]], [[10, 10], [10, 200], [100, 100]]
@@ -77,7 +77,7 @@ def test_people_beside_themselves_are_compared_with_others_alone():
     assert ours.mismatch == 0
     assert ours.area[0] == pytest.approx((0.5 + 7) / 9)
     assert ours.tfp_auc[0] == 5
-    # Three letters, of which two are shared.
+    # Each scanpath is a string of three letters; two of them are shared.
     assert ours.mean(4)[0] == pytest.approx(2 / 3)
     assert ours.mean(5)[0] == 1
     same = beside.score([search(far, subject="model", found=True)])
@@ -85,7 +85,7 @@ def test_people_beside_themselves_are_compared_with_others_alone():
     assert same.multimatch[0] > ours.multimatch[0]
 
 
-def test_what_searches_are_scored_by_must_be_there(tmp_path):
+def test_searches_without_a_target_or_box_are_refused(tmp_path):
     with pytest.raises(DataError, match="found none"):
         read_searches(tmp_path, SCREEN)
     write_ruarte(tmp_path / "a.json", [Fixations("a.jpg", "1", np.zeros((1, 2)), SCREEN)])
@@ -93,7 +93,7 @@ def test_what_searches_are_scored_by_must_be_there(tmp_path):
         read_searches(tmp_path, SCREEN)
 
 
-def test_a_screen_shows_the_picture_where_people_saw_it(tmp_path):
+def test_a_screen_shows_the_picture_at_the_position_of_the_experiment(tmp_path):
     from PIL import Image
 
     Image.new("RGB", (120, 120), (255, 0, 0)).save(tmp_path / "000000000007.jpg", quality=95)

@@ -1,4 +1,4 @@
-"""Densities of the next fixation: against loops, closed forms and weights that are known."""
+"""Densities of the next fixation, against loops, closed forms and known weights."""
 
 import math
 
@@ -23,7 +23,7 @@ def person(points, subject="1"):
 PEOPLE = [person([[40, 30], [5, 5], [79, 59]]), person([[40, 30], [41, 31], [5, 5], [-3, 70]], "2")]
 
 
-def test_weights_that_made_the_fixations_are_found():
+def test_fit_recovers_the_weights_that_generated_the_fixations():
     generator = torch.Generator().manual_seed(0)
     terms = [torch.randn(4000, 6, 8, generator=generator) for _ in range(2)]
     truth = torch.tensor([0.8, -0.5])
@@ -33,7 +33,7 @@ def test_weights_that_made_the_fixations_are_found():
     found = fit(["a", "b"], terms, bins)
     torch.testing.assert_close(found.values, truth, atol=0.06, rtol=0)
     assert found.bits > 0
-    # The same optimum as scipy's, which knows no gradient.
+    # The same optimum as scipy's, which is found without a gradient.
     flat = [term[:500].double().flatten(1).numpy() for term in terms]
 
     def cost(weights):
@@ -45,7 +45,7 @@ def test_weights_that_made_the_fixations_are_found():
     assert small.bits == pytest.approx((math.log(48) - cost(small.values.tolist())) / math.log(2), abs=1e-4)
 
 
-def test_densities_sum_to_one_and_terms_broadcast():
+def test_densities_sum_to_one_and_terms_are_broadcast():
     terms = [torch.rand(1, 5, 4), torch.rand(3, 5, 4)]
     density = log_densities(terms, torch.tensor([2.0, -1.0]))
     torch.testing.assert_close(density.exp().sum((1, 2)), torch.ones(3))
@@ -54,7 +54,7 @@ def test_densities_sum_to_one_and_terms_broadcast():
         fit([], [], torch.zeros(1, 2).long())
 
 
-def test_standardised_maps_have_mean_zero_and_deviation_one_and_even_ones_are_nothing():
+def test_standardised_maps_have_mean_zero_and_deviation_one_or_are_zero_if_uniform():
     maps = torch.rand(3, 5, 4) * 7 + 3
     maps[1] = 0.1
     found = standardised(maps)
@@ -63,7 +63,7 @@ def test_standardised_maps_have_mean_zero_and_deviation_one_and_even_ones_are_no
     assert found[1].eq(0).all()
 
 
-def test_events_are_every_fixation_after_the_one_before():
+def test_every_fixation_after_the_first_is_an_event():
     raster, grid = Grid(8, 6, (80, 60)), Grid(2, 2, (80, 60))
     events = events_of(PEOPLE, raster, grid, longest=20)
     assert events.bins.tolist() == [[0, 0], [7, 5], [4, 3], [0, 0], [0, 5]]
@@ -78,7 +78,7 @@ def test_events_are_every_fixation_after_the_one_before():
     assert len(events_of(PEOPLE, raster, grid, longest=2)) == 2
 
 
-def test_habits_are_blurred_counts():
+def test_habits_are_logarithms_of_blurred_counts():
     raster, grid = Grid(8, 6, (80, 60)), Grid(2, 2, (80, 60))
     events = events_of(PEOPLE, raster, grid, longest=20)
     habits = Habits.of([events], 8, 6, blur=0.7, floor=0.05)
@@ -96,7 +96,7 @@ def test_habits_are_blurred_counts():
                 assert near[number, y, x] == habits.jump[y - b + 5, x - a + 7]
 
 
-def test_blurring_keeps_the_sum_and_nothing_is_nothing():
+def test_blurring_keeps_the_sum_and_zero_width_keeps_the_map():
     maps = torch.rand(2, 9, 12)
     assert blurred(maps, 0.0) is maps
     inner = torch.zeros(1, 21, 21)
@@ -104,7 +104,7 @@ def test_blurring_keeps_the_sum_and_nothing_is_nothing():
     assert blurred(inner, 1.0).sum() == pytest.approx(1)
 
 
-def test_cells_become_maps_between_their_centres():
+def test_cell_values_are_interpolated_between_cell_centres():
     grid = Grid(2, 2, (80, 60))
     values = torch.tensor([[0.0, 1.0, 2.0, 3.0]])
     maps = enlarged(values, grid, 6, 8)
@@ -115,7 +115,7 @@ def test_cells_become_maps_between_their_centres():
     assert enlarged(values, grid, 2, 2).tolist() == [[[0, 1], [2, 3]]]
 
 
-def test_other_people_are_all_but_oneself():
+def test_maps_of_other_people_exclude_the_same_person():
     events = events_of(PEOPLE, Grid(8, 6, (80, 60)), Grid(2, 2, (80, 60)), longest=20)
     maps = people_maps(events, 6, 8)
     for number, who in enumerate(events.person.tolist()):

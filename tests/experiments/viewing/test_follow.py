@@ -1,4 +1,4 @@
-"""Policies along given scanpaths: together or one by one, from coarse looks or fine."""
+"""Policies along given scanpaths: together or one by one, with coarse or fine beliefs."""
 
 import torch
 
@@ -22,7 +22,7 @@ def detections(looks, classes=3, count=4):
     return Detections(boxes, scores, torch.rand(looks, count, generator=generator) < 0.8)
 
 
-def test_all_at_once_is_each_person_and_each_policy_alone():
+def test_following_all_people_and_policies_at_once_equals_following_each_alone():
     paths = [torch.tensor([4, 1, 1, 5]), torch.tensor([0, 2]), torch.tensor([5, 4, 3])]
     seen = detections(6)
     observer = Semantic(4)
@@ -43,7 +43,7 @@ def test_all_at_once_is_each_person_and_each_policy_alone():
         torch.testing.assert_close(together[name], torch.stack(expected))
 
 
-def test_a_fine_belief_is_of_looks_from_the_coarse_cell():
+def test_a_fine_belief_uses_looks_from_the_coarse_cell_of_each_fixation():
     fine, seen = Grid(9, 6, (90, 60)), detections(6)
     observer = Landing(3)
     looks = FineLooks(seen, GRID, fine)
