@@ -1,5 +1,6 @@
 """Training examples for evidence by magnification: looks at every window of a coarse lattice over mosaics."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from semfov.observation.matching import box_iou
 from semfov.zoom.gist import FOUND, Gist
 from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.networks import STEPS
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,28 @@ class ZoomExample:
     lattice: Lattice
     labels: Tensor
     looks: tuple[LookedAt, ...]
+
+
+def closer_windows(example: ZoomExample, looked_at: LookedAt) -> Iterator[tuple[LookedAt, int, tuple[int, ...]]]:
+    """List the closer looks of a mosaic at windows of the lattice inside a look, as far as it predicts them.
+
+    Args:
+        example: the mosaic.
+        looked_at: the look. Windows inside an overview may reach beyond the picture.
+
+    Yields:
+        The closer look, its octaves from the look, and its window `(x1, y1, x2, y2)` in cells of the gist.
+    """
+    look = looked_at.gist
+    assert look is not None
+    high, wide = look.scores.shape[:2]
+    for closer in example.looks:
+        steps = closer.window.level - look.level
+        corners = zip(closer.window.cells, look.first * 2, strict=True)
+        x1, y1, x2, y2 = ((cell - first) // look.scale for cell, first in corners)
+        inside = x1 >= 0 and y1 >= 0 and x2 <= wide and y2 <= high
+        if closer.window.within is None and 1 <= steps <= STEPS and (inside or look.level == 0):
+            yield closer, steps, (x1, y1, x2, y2)
 
 
 def found_by(glance: Glance, annotation: Annotation, score: float = FOUND, iou: float = 0.5) -> Tensor:

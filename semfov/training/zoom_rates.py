@@ -2,15 +2,19 @@
 
 import logging
 import random
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from semfov.experiments.zoom import SHOWN
-from semfov.training.zoom_examples import LookedAt, ZoomExample
+from semfov.training.zoom_examples import LookedAt, ZoomExample, closer_windows
 from semfov.zoom.belief import before_of
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.networks import STEPS
+from semfov.zoom.gist import Gist
+
+E = TypeVar("E")
 
 _log = logging.getLogger(__name__)
 
@@ -25,10 +29,34 @@ def fit_rates(model: GlimpseEvidence, examples: list[ZoomExample], steps: int, b
         batch: examples in a step.
     """
     own = [*model.rate.parameters(), model.prior, model.border]
+    descend_examples(
+        own, lambda example: rate_loss(model, example), examples, steps, batch, "expected number of objects"
+    )
+
+
+def descend_examples(
+    parameters: Iterable[nn.Parameter],
+    loss_of: Callable[[E], Tensor],
+    examples: Sequence[E],
+    steps: int,
+    batch: int,
+    title: str,
+) -> None:
+    """Minimise the mean loss of random examples.
+
+    Args:
+        parameters: the parameters to fit.
+        loss_of: loss of an example, a scalar.
+        examples: the training examples.
+        steps: number of steps.
+        batch: examples in a step.
+        title: name of the fit in the log.
+    """
+    own = [*parameters]
     optimizer = torch.optim.AdamW(own, lr=6e-3, weight_decay=0.1)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 6e-3, total_steps=steps)
     for step in range(steps):
-        losses = [rate_loss(model, example) for example in random.sample(examples, min(batch, len(examples)))]
+        losses = [loss_of(example) for example in random.sample(examples, min(batch, len(examples)))]
         loss = torch.stack(losses).mean()
         optimizer.zero_grad()
         loss.backward()
@@ -36,7 +64,7 @@ def fit_rates(model: GlimpseEvidence, examples: list[ZoomExample], steps: int, b
         optimizer.step()
         schedule.step()
         if step % 100 == 99:
-            _log.info("expected number of objects: step %d, loss %.4f", step + 1, float(loss.detach()))
+            _log.info("%s: step %d, loss %.4f", title, step + 1, float(loss.detach()))
 
 
 def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
@@ -58,12 +86,14 @@ def rate_loss(model: GlimpseEvidence, example: ZoomExample) -> Tensor:
         targets = _some(torch.arange(len(shown)) + 1, 1)
     looks = [look for look in example.looks if look.gist is not None]
     overview, *others = looks
-    logs = _log_rates(model, overview, targets, None)
+    assert overview.gist is not None
+    logs = model.rates(overview.gist, targets)
     losses = [_likelihood_loss(model, example, overview, logs, targets, overview.found)]
     for closer in random.sample(others, min(2, len(others))):
-        before = _before(overview, logs.detach(), closer)
+        assert closer.gist is not None
+        before = rates_before(overview.gist, logs.detach(), closer.gist)
         seen = overview.found | closer.found
-        closer_logs = _log_rates(model, closer, targets, before)
+        closer_logs = model.rates(closer.gist, targets, before)
         losses.append(_likelihood_loss(model, example, closer, closer_logs, targets, seen))
     return torch.stack(losses).mean()
 
@@ -72,20 +102,17 @@ def _some(values: Tensor, most: int) -> Tensor:
     return values[torch.randperm(len(values))[:most]]
 
 
-def _log_rates(model: GlimpseEvidence, looked_at: LookedAt, targets: Tensor, before: Tensor | None) -> Tensor:
-    assert looked_at.gist is not None
-    return model.rates(looked_at.gist, targets, before)
-
-
-def _before(overview: LookedAt, logs: Tensor, closer: LookedAt) -> Tensor:
+def rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
     """Convert the rates of the overview to the cells of a closer look, for windows one octave closer than that look.
 
+    Args:
+        first: gist of the overview.
+        logs: `(T, 3, rows, columns)`, logarithms of its rates.
+        look: gist of the closer look.
+
     Returns:
-        Rates `(T, rows, columns)`, as the prediction before the closer look.
+        Logarithms `(T, rows, columns)`, as the prediction before the closer look.
     """
-    first, look = overview.gist, closer.gist
-    assert first is not None
-    assert look is not None
     cells = (logs.exp() / first.scale**2).repeat_interleave(first.scale, -1).repeat_interleave(first.scale, -2)
     rows, columns = (n * look.scale for n in look.scores.shape[:2])
     part = cells[..., look.first[1] : look.first[1] + rows, look.first[0] : look.first[0] + columns]
@@ -97,19 +124,9 @@ def _likelihood_loss(
     model: GlimpseEvidence, example: ZoomExample, looked_at: LookedAt, logs: Tensor, targets: Tensor, seen: Tensor
 ) -> Tensor:
     """Compute the mean negative log likelihood over the closer windows inside a look."""
-    look = looked_at.gist
-    assert look is not None
     rates = logs.exp()
-    high, wide = look.scores.shape[:2]
     terms = []
-    for closer in example.looks:
-        steps = closer.window.level - look.level
-        x1, y1, x2, y2 = closer.window.cells
-        box = [x1 - look.first[0], y1 - look.first[1], x2 - look.first[0], y2 - look.first[1]]
-        x1, y1, x2, y2 = (n // look.scale for n in box)
-        inside = x1 >= 0 and y1 >= 0 and x2 <= wide and y2 <= high
-        if closer.window.within is not None or not 1 <= steps <= STEPS or not (inside or look.level == 0):
-            continue
+    for closer, steps, (x1, y1, x2, y2) in closer_windows(example, looked_at):
         weight = model.taper(x2 - x1)
         part = rates[:, steps - 1, max(y1, 0) : y2, max(x1, 0) : x2]
         expected = torch.einsum("tyx,y,x->t", part, weight[: part.shape[1]], weight[: part.shape[2]])

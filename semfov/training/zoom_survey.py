@@ -1,25 +1,21 @@
 """Fitting how many objects of any class closer looks find (`semfov.zoom.survey`)."""
 
-import logging
 import random
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.training.zoom_examples import LookedAt, ZoomExample
-from semfov.zoom.belief import before_of
+from semfov.training.zoom_examples import LookedAt, ZoomExample, closer_windows
+from semfov.training.zoom_rates import descend_examples, rates_before
 from semfov.zoom.gist import Gist
-from semfov.zoom.networks import STEPS
 from semfov.zoom.survey import Survey
 
 LATER = 2
 """Closer looks of a mosaic, beside its overview, whose predictions are fitted in one step."""
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -47,19 +43,12 @@ class CountedLook:
         Returns:
             The look with the numbers of new objects.
         """
-        look = looked.gist
-        assert look is not None
-        high, wide = look.scores.shape[:2]
         found = defaultdict(list)
-        for closer in example.looks:
-            steps = closer.window.level - look.level
-            corners = zip(closer.window.cells, look.first * 2, strict=True)
-            x1, y1, x2, y2 = ((cell - first) // look.scale for cell, first in corners)
-            inside = x1 >= 0 and y1 >= 0 and x2 <= wide and y2 <= high
-            if closer.window.within is None and 1 <= steps <= STEPS and (inside or look.level == 0):
-                found[steps, x2 - x1].append((y1, x1, int((closer.found & ~seen).sum())))
+        for closer, steps, (x1, y1, x2, _) in closer_windows(example, looked):
+            found[steps, x2 - x1].append((y1, x1, int((closer.found & ~seen).sum())))
+        assert looked.gist is not None
         counts = {key: torch.tensor(rows).unbind(-1) for key, rows in found.items()}
-        return cls(look, {key: (rows, columns, new) for key, (rows, columns, new) in counts.items()})
+        return cls(looked.gist, {key: (rows, columns, new) for key, (rows, columns, new) in counts.items()})
 
     def loss(self, survey: Survey, logs: Tensor) -> Tensor:
         """Mean Poisson negative log likelihood of the numbers, up to a constant.
@@ -109,22 +98,13 @@ class SurveyExample:
 
     def losses(self, survey: Survey, closer: Sequence[CountedLook]) -> list[Tensor]:
         """Losses of the overview and of closer looks, whose predictions build on those of the overview."""
-        logs = survey.rates(self.overview.gist)[0]
-        found = [self.overview.loss(survey, logs)]
-        cells = _spread(self.overview.gist, logs.detach())
+        first = self.overview.gist
+        logs = survey.rates(first)
+        found = [self.overview.loss(survey, logs[0])]
         for counted in closer:
-            look = counted.gist
-            rows, columns = (n * look.scale for n in look.scores.shape[:2])
-            part = cells[:, look.first[1] : look.first[1] + rows, look.first[0] : look.first[0] + columns]
-            before = before_of(part, torch.zeros(part.shape[1:], dtype=torch.long), look)
-            found.append(counted.loss(survey, survey.rates(look, before=before[None])[0]))
+            before = rates_before(first, logs.detach(), counted.gist)
+            found.append(counted.loss(survey, survey.rates(counted.gist, before=before)[0]))
         return found
-
-
-def _spread(look: Gist, logs: Tensor) -> Tensor:
-    """Rates in the cells of the lattice, `(3, rows, columns)`."""
-    cells = logs.exp() / look.scale**2
-    return cells.repeat_interleave(look.scale, -1).repeat_interleave(look.scale, -2)
 
 
 def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, batch: int = 4) -> None:
@@ -136,21 +116,12 @@ def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, ba
         steps: of the fit.
         batch: mosaics in each step.
     """
-    optimizer = torch.optim.AdamW(survey.parameters(), lr=6e-3, weight_decay=0.1)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 6e-3, total_steps=steps)
-    for step in range(steps):
-        losses = []
-        for example in random.sample(examples, min(batch, len(examples))):
-            closer = random.sample(example.closer, min(LATER, len(example.closer)))
-            losses.append(torch.stack(example.losses(survey, closer)).mean())
-        loss = torch.stack(losses).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(survey.parameters(), 1.0)
-        optimizer.step()
-        schedule.step()
-        if step % 100 == 99:
-            _log.info("survey: step %d, loss %.4f", step + 1, float(loss.detach()))
+
+    def loss_of(example: SurveyExample) -> Tensor:
+        closer = random.sample(example.closer, min(LATER, len(example.closer)))
+        return torch.stack(example.losses(survey, closer)).mean()
+
+    descend_examples(survey.parameters(), loss_of, examples, steps, batch, "survey")
 
 
 @torch.no_grad()
