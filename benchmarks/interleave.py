@@ -32,7 +32,6 @@ from torch import Tensor
 import semfov
 from benchmarks.detector_speed import photograph
 from benchmarks.timing import Comparison
-from semfov.agent import Strategy
 from semfov.detection import Detections
 from semfov.detection.export import export_onnx
 from semfov.detection.load import load_yolo
@@ -40,6 +39,7 @@ from semfov.detection.onnx import OnnxDetector, load_onnx
 from semfov.detection.onnx_session import OnnxSession
 from semfov.eye import Eye, View
 from semfov.gaze.selection import select_fixation
+from semfov.strategy import Strategy
 
 COLUMNS, ROWS, TARGET = 10, 10, 1
 EDGES = [50 * level / 640 for level in range(1, 8)]

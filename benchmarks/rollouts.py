@@ -6,9 +6,9 @@ import torch
 
 from benchmarks.timing import Comparison
 from semfov import Detections, Grid, observers, policies
-from semfov.agent import Strategy
 from semfov.experiments.candidates import Candidate
 from semfov.experiments.search_protocol import Episode, run_episodes
+from semfov.strategy import Strategy
 
 CLASSES, SHIFTS = 80, 30
 

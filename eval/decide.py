@@ -14,6 +14,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Annotated
 
 import torch
 
@@ -32,9 +33,10 @@ from semfov.experiments.fitted import with_models
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.run import finish
-from semfov.experiments.settings import Positive, Settings, Share, Workers
+from semfov.experiments.settings import Positive, Range, Settings, Share, Workers
 from semfov.experiments.summary import announce, gather, sensing, table
 from semfov.io.files import write_text
+from semfov.verifier import MOST
 from semfov.viz.presence import plot_roc
 from semfov.viz.style import save_figure
 
@@ -55,6 +57,9 @@ class DecideConfig(Settings):
             value (None: the model's own threshold).
         place: for a find, the fixated cell must hold the target with at least this probability (None: the model's own
             threshold).
+        closer: largest number of closer looks in a search; 0 decides without them.
+        verification: model of verification, by name or file (None: the one that is shipped for detector and sensor, if
+            there is one).
         prices: prices of a look in right decisions; for each price there are additional searches, which end when
             further looks are not worth their price.
         out: folder for tables, records and the figure.
@@ -71,6 +76,8 @@ class DecideConfig(Settings):
     confirm: Share | None = None
     give_up: Share | None = None
     place: Share | None = None
+    closer: Annotated[int, Range(0, 100)] = MOST
+    verification: str | None = None
     prices: tuple[Positive, ...] = (0.002, 0.005, 0.01, 0.02, 0.05)
     out: Path = Path("runs/decide")
     cache: Path | None = None

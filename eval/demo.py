@@ -44,6 +44,7 @@ from semfov.report.page import write_page
 from semfov.scanpath.stimulus import reduced
 from semfov.sensor import SENSORS
 from semfov.sensor.named import SensorName
+from semfov.verifier import MOST
 from semfov.viz.animation import film_of
 from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye
 
@@ -72,10 +73,13 @@ class DemoConfig(Settings):
             the agent's own).
         start: first cell, numbered row by row (none: drawn at random).
         shifts: largest number of gaze shifts (none: 30 for a search, 20 for an exploration).
-        confirm: the target can count as found when the probability of its presence reaches this value (none: the value
-            chosen when the belief was fitted; for agents without a fitted belief, a detection's score of 0.5).
+        confirm: the target counts as found when its probability reaches this value: at the place of a closer look, or
+            in the picture for a search without closer looks (none: the value chosen when the model was fitted; for
+            agents without a fitted belief, a detection's score of 0.5).
         give_up: a search gives up when, in every cell not fixated yet, the probability of the target is below this
             value (none: the value chosen when the belief was fitted).
+        closer: largest number of closer looks, in which a window around a place that seems to hold the target is
+            enlarged to the detector's input; 0: none.
         price: price of a look in right decisions: a search ends when further looks are not worth it (none: the search
             ends by thresholds).
         until: price of a look in cells: an exploration ends when no look is expected to name this many more cells right
@@ -103,6 +107,7 @@ class DemoConfig(Settings):
     shifts: Shifts | None = None
     confirm: Share | None = None
     give_up: Share | None = None
+    closer: Annotated[int, Range(0, 100)] = MOST
     price: Weight | None = None
     until: Weight | None = None
     seed: Seed = 0
@@ -278,6 +283,7 @@ def look_at(
             return agent.explore(picture.image, shifts=shifts, until=config.until, **common)
         shifts = 30 if config.shifts is None else config.shifts
         common |= {"confirm": config.confirm, "give_up": config.give_up, "price": config.price}
+        common["closer"] = config.closer
         target = wanted if wanted and len(wanted) > 1 else config.target
         return agent.search(picture.image, target, shifts=shifts, **common)
 

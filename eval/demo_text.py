@@ -25,6 +25,9 @@ def told(name: str, scanpath: Scanpath) -> str:
     lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     if scanpath.target is None:
         lines += ["", "what is where:", *named(scanpath)]
+    for number, look in enumerate(scanpath.closer, 1):
+        chance = f"p {look.place:.3f} there, {look.presence:.3f} anywhere"
+        lines.append(f"closer look {number}, after fixation {look.fixation}, at {place(scanpath, look.cell)}: {chance}")
     return "\n".join([f"{name}: {viz.describe(scanpath)}. {viz.why_it_ended(scanpath)}".rstrip(), *lines, ""])
 
 

@@ -1,7 +1,8 @@
 """The agent: with a foveal sensor, it searches an image for a class or explores it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from os import PathLike, fspath
 from typing import Any, Self
 
@@ -9,8 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from semfov.belief.grid import Grid, check_cells
-from semfov.belief.observers import AnyBelief, AnyOf, LearnedMap, Observer
-from semfov.belief.observers.any_of import TargetLike, weights_by_class
+from semfov.belief.observers import AnyBelief, LearnedMap, Observer
+from semfov.belief.observers.any_of import TargetLike
+from semfov.belief.verification import Verification
 from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike, as_image
 from semfov.decision import check_thresholds, conclude, goal_cells, outcome_by_gain, outcome_of
@@ -19,12 +21,14 @@ from semfov.errors import InputError, check, check_whole
 from semfov.eye import Eye
 from semfov.gaze.acquisition import ExpectedGain
 from semfov.gaze.choice import Greedy, drawn_by, first_cell
-from semfov.gaze.policies import NonPredictive, Policy, Random
+from semfov.gaze.policies import Policy
 from semfov.io.schema import is_number
 from semfov.live import RATE, LivePerception
 from semfov.model_folder import open_folder
 from semfov.presets import published_parts, raw_parts, recommended_parts
 from semfov.scanpath import Ending, Scanpath, Stimulus, trace
+from semfov.strategy import Strategy
+from semfov.verifier import MOST, Verifier
 
 PRICE = 0.1
 """Default price of a look in an exploration by a learned map: the least expected increase in the number of correctly
@@ -34,20 +38,6 @@ MOST_SHIFTS = 10_000
 """Largest number of gaze shifts that can be asked for."""
 
 
-class Strategy(nn.Module):
-    """Observer and policy for a task.
-
-    Args:
-        observer: turns looks into a belief.
-        policy: chooses the next fixation from the belief.
-    """
-
-    def __init__(self, observer: Observer, policy: Policy) -> None:
-        super().__init__()
-        self.observer = observer
-        self.policy = policy
-
-
 class ActivePerception(nn.Module):
     """An agent that moves its gaze over an image to find a target, or to learn which classes are where.
 
@@ -55,6 +45,7 @@ class ActivePerception(nn.Module):
         eye: sensor and detector.
         search: observer and policy for search.
         explore: observer and policy for exploration; during a search this observer keeps the map of all classes.
+        verification: probabilities after closer looks (`semfov.belief.Verification`); None searches without them.
         grid: `(columns, rows)` of the belief, 1 to 200 each.
 
     Raises:
@@ -72,12 +63,14 @@ class ActivePerception(nn.Module):
         search: tuple[Observer, Policy],
         explore: tuple[Observer, Policy],
         *,
+        verification: Verification | None = None,
         grid: tuple[int, int] = (10, 10),
     ) -> None:
         super().__init__()
         self.eye = eye
         self.searching = Strategy(*search)
         self.exploring = Strategy(*explore)
+        self.verification = verification
         check_cells(grid)
         self.columns, self.rows = grid
 
@@ -204,12 +197,17 @@ class ActivePerception(nn.Module):
         confirm: float | None = None,
         give_up: float | None = None,
         price: float | None = None,
+        closer: int = MOST,
     ) -> Scanpath:
         """Search an image for a target class, and decide whether it is there (`Scanpath.decision`).
 
-        A search ends with `found` when the image holds the target with enough probability, and a fixated cell is nearly
-        as probable as the most probable one. It ends without the target when no remaining cell is probable enough to be
-        worth a look, and after `shifts` gaze shifts (`semfov.decision.decide`).
+        The recommended agent looks closely at places that seem to hold the target: it enlarges a window around them to
+        the detector's input (`semfov.verifier.Verifier`). The search ends with `found` when the target is probable
+        enough at such a place. It ends without the target when no remaining cell is probable enough to be worth a look,
+        and after `shifts` gaze shifts.
+
+        Without closer looks the search ends with `found` when the image holds the target with enough probability, and a
+        fixated cell is nearly as probable as the most probable one (`semfov.decision.decide`).
 
         The belief by Kaplan's rule has no calibrated thresholds, so it never gives up. Such a search finds the target
         when a detection that overlaps the fixated cell has the target as its best class, with a score of at least
@@ -226,9 +224,12 @@ class ActivePerception(nn.Module):
             shifts: largest number of gaze shifts, 0 to 10,000.
             seed: seed of the generator that draws the start and breaks ties.
             boxes: `(M, 4)`, true boxes `(x1, y1, x2, y2)` of the target in pixels of the image.
-            confirm: least probability that the image holds the target for `found`; None takes the threshold that was
-                chosen when the model was fitted, or a score of 0.5 for a belief without thresholds.
+            confirm: least probability for `found`: with closer looks, that the target is at the place; otherwise, that
+                the image holds it. None takes the threshold that was chosen when the model was fitted, or a score of
+                0.5 for a belief without thresholds.
             give_up: probability below which a cell is not worth a look; None takes the threshold of the model.
+            closer: largest number of closer looks, 0 to 100; each takes one more pass of the detector. 0 decides from
+                the foveated looks alone, as does an agent without a model of verification.
             price: price of a look, as a share of the value of a right decision; the search then ends when further looks
                 are not worth their price, instead of by thresholds (`semfov.decision.decide_by_price`).
 
@@ -239,18 +240,24 @@ class ActivePerception(nn.Module):
             InputError: the class is unknown (the message suggests the nearest names), or an argument does not fit.
             DataError: the file of the image cannot be read.
         """
-        strategy, index, wanted = self._sought(target)
+        strategy, index, wanted = self.searching.sought(target, self.classes)
         check_thresholds(confirm, give_up)
+        check_whole(closer, "closer", 0, 100)
         check(price is None or (is_number(price) and price >= 0), "price", "0 or more, or None", price)
         image, grid = self._frame(image)
         goal = None if boxes is None else goal_cells(boxes, grid, image)
-        chosen = self.searching.observer.thresholds
+        chosen = strategy.observer.thresholds
         if price is not None and (chosen is None or confirm is not None or give_up is not None):
             case = "for an agent without thresholds" if chosen is None else "together with confirm or give_up"
             raise InputError(f"price: expected None {case}, got {price}; the recommended agent takes one of them")
         thresholds = None if chosen is None else chosen.changed(confirm, give_up)
-
-        outcome = outcome_of(wanted, grid, goal, price, thresholds, 0.5 if confirm is None else confirm)
+        outcome: Callable[[Step], Tensor]
+        verifier, model = None, self.verification
+        if model is not None and model.thresholds is not None and closer and goal is None and price is None:
+            at = model.thresholds.changed(confirm, give_up)
+            outcome = verifier = Verifier(model, partial(self.eye.close_up, image), grid, index, at, closer)
+        else:
+            outcome = outcome_of(wanted, grid, goal, price, thresholds, 0.5 if confirm is None else confirm)
         scanpath, ended, last = self._gaze(image, grid, strategy, index, start, shifts, seed, outcome)
         index = int(last.belief.likeliest()) if isinstance(last.belief, AnyBelief) else index
         scanpath = replace(scanpath, found=ended == 1, target=index)
@@ -258,6 +265,10 @@ class ActivePerception(nn.Module):
             return replace(scanpath, ending="box") if ended else scanpath
         if ended:
             scanpath = replace(scanpath, ending="decision")
+        if verifier is not None:
+            decision = verifier.conclude(last)
+            found = decision.outcome == "found"
+            return replace(scanpath, found=found, decision=decision, closer=tuple(verifier.looks))
         # Without thresholds the target was found in the fixated cell.
         cell = None if thresholds is not None else int(last.cell)
         return replace(scanpath, decision=conclude(ended, last.belief, scanpath.detections, grid, index, cell))
@@ -340,17 +351,6 @@ class ActivePerception(nn.Module):
             seed=seed,
             thresholds=None if chosen is None else chosen.changed(confirm, give_up),
         )
-
-    def _sought(self, target: TargetLike) -> tuple[Strategy, int, dict[int, float]]:
-        """Observer and policy for a target, its class with the largest weight, and the weights of all its classes."""
-        if not isinstance(target, Mapping):
-            index = class_index(target, self.classes[1:], "target")
-            return self.searching, index, {index: 1.0}
-        wanted, policy = weights_by_class(target, self.classes[1:]), self.searching.policy
-        suits = isinstance(policy, NonPredictive | Random) or policy.by_place
-        check(suits, "target", f"one class for policy {policy.name!r}, which does not use probabilities", dict(target))
-        several = Strategy(AnyOf(self.searching.observer, wanted), policy)
-        return several, max(wanted, key=wanted.__getitem__), wanted
 
     def _frame(self, picture: ImageLike) -> tuple[Tensor, Grid]:
         """The image as a batch of one, and the grid over it."""

@@ -37,12 +37,15 @@ class Decision:
         cell: for `found`, the cell of the target (`conclude`).
         box: `(4,)`, the box `(x1, y1, x2, y2)` of the detection with the strongest evidence for the target in that
             cell; None if there is none.
+        place: for `found` after a closer look, the probability that the target is at that place
+            (`semfov.verifier.Verifier`); otherwise None.
     """
 
     outcome: Outcome
     probability: float
     cell: int | None = None
     box: Tensor | None = None
+    place: float | None = None
 
 
 def decide(step: Step, target: int | Tensor, thresholds: Thresholds) -> Tensor:
@@ -173,7 +176,7 @@ def conclude(
         cells = belief.probability(target)[0]
         shown = torch.stack([cells.new_zeros(len(grid)), *(strength(seen, grid, target) for seen in looks)]).amax(0)
         cell = int((cells * shown if bool(shown.any()) else cells).argmax())
-    return Decision("found", probability, cell, best_box(looks, grid, cell, target))
+    return Decision("found", probability, cell, strongest(looks, grid, cell, target)[1])
 
 
 def strength(seen: Detections, grid: Grid, target: int) -> Tensor:
@@ -182,8 +185,8 @@ def strength(seen: Detections, grid: Grid, target: int) -> Tensor:
     return shown.amax(0) if len(shown) else shown.sum(0)
 
 
-def best_box(looks: Sequence[Detections], grid: Grid, cell: int, target: int) -> Tensor | None:
-    """Box with the strongest evidence for the target in a cell: score times `soft` footprint.
+def strongest(looks: Sequence[Detections], grid: Grid, cell: int, target: int) -> tuple[float, Tensor | None]:
+    """Detection with the strongest evidence for the target in a cell: score times `soft` footprint.
 
     Args:
         looks: the detections of each look, batches of one.
@@ -192,15 +195,15 @@ def best_box(looks: Sequence[Detections], grid: Grid, cell: int, target: int) ->
         target: class 1..K.
 
     Returns:
-        `(4,)`, as `(x1, y1, x2, y2)`; None if no detection overlaps the cell.
+        The evidence, and the box `(4,)` as `(x1, y1, x2, y2)`; 0 and None if no detection overlaps the cell.
     """
-    score, box = 0.0, None
+    evidence, box = 0.0, None
     for seen in looks:
         weight = grid.footprint(seen.boxes, "soft")[0, :, cell] * seen.mask[0]
         scores = weight * seen.scores[0, :, target]
-        if scores.numel() and float(scores.max()) > score:
-            score, box = float(scores.max()), seen.boxes[0, int(scores.argmax())]
-    return box
+        if scores.numel() and float(scores.max()) > evidence:
+            evidence, box = float(scores.max()), seen.boxes[0, int(scores.argmax())]
+    return evidence, box
 
 
 def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:

@@ -1,6 +1,6 @@
 """The eye: a sensor and a detector together, which give the detections for a fixation in an image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -12,6 +12,7 @@ from semfov.detection.detector import Detector
 from semfov.detection.placement import Placement
 from semfov.errors import check, check_shape
 from semfov.sensor.base import Sensor
+from semfov.sensor.glimpse import glimpse, window_around
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,32 @@ class Eye(nn.Module):
         """
         points = _points(fixations, view)
         return self.detect(view, points, self.foveated(view, points))
+
+    def close_up(self, image: Tensor, box: Tensor) -> Detections:
+        """Look closely at a place: enlarge a window around it to the detector's input, and detect.
+
+        The window (`semfov.sensor.glimpse.window_around`) is taken from the image itself and not from its canvas, and
+        the sensor is not applied. It shows small objects larger than any look at the whole image. One such look costs
+        one pass of the detector.
+
+        Args:
+            image: `(1, 3, H, W)`, RGB in [0, 1].
+            box: `(4,)`, the place as `(x1, y1, x2, y2)` in pixels of the image.
+
+        Returns:
+            The detections, a batch of one, boxes in pixels of the image.
+
+        Raises:
+            InputError: a shape is wrong.
+        """
+        check_shape(image, "image", 1, 3, None, None)
+        window = window_around(box.to(image), (image.shape[-1], image.shape[-2]))
+        sides = window[2:] - window[:2]
+        scale = (sides.new_tensor(self.detector.input_size) / sides).amin()
+        width, height = (max(1, round(side)) for side in (sides * scale).tolist())
+        seen = self.detector(glimpse(image, window[None], (width, height)).clamp(0, 1))
+        unit = (sides / sides.new_tensor([width, height])).repeat(2)
+        return replace(seen, boxes=seen.boxes * unit + window[:2].repeat(2))
 
     def forward(self, image: ImageLike, fixations: PointLike) -> Detections:
         """Open an image and look from fixations.

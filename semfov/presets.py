@@ -12,6 +12,7 @@ from semfov.belief.grid import check_cells
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
 from semfov.belief.target_evidence import TargetEvidence
+from semfov.belief.verification import Verification
 from semfov.detection.load import load_detector
 from semfov.errors import check, lookup
 from semfov.eye import Eye
@@ -46,7 +47,11 @@ def recommended_parts(
         prior.check_compatible(detector.classes)
         observer = Context(observer, prior)
     mapping = LearnedMap(everything), Closer(sigma / eye.reference)
-    return {"eye": eye, "search": (observer, NonPredictive()), "explore": mapping, "grid": grid}
+    verification = Verification.if_shipped(name)
+    if verification is not None:
+        verification.check_compatible(eye.settings(), grid)
+    search = observer, NonPredictive()
+    return {"eye": eye, "search": search, "explore": mapping, "verification": verification, "grid": grid}
 
 
 def published_parts(

@@ -17,12 +17,12 @@ from semfov.decision import (
     NEARLY,
     OUTCOMES,
     Decision,
-    best_box,
     conclude,
     decide,
     decide_by_price,
     goal_cells,
     strength,
+    strongest,
 )
 from semfov.detection import Candidates, Detector
 from semfov.errors import InputError
@@ -188,7 +188,7 @@ def random_looks(count, most, seed):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_best_box_equals_a_loop(seed):
+def test_strongest_detection_equals_a_loop(seed):
     grid, looks = Grid(4, 3, SIZE), random_looks(3, 4, seed)
     parts = [looks[row : row + 1] for row in range(3)]
     for cell in range(12):
@@ -203,20 +203,21 @@ def test_best_box_equals_a_loop(seed):
                     score = weight * float(looks.scores[look, detection, target])
                     if score > best * (1 + 1e-6):
                         best, expected = score, box
-            got = best_box(parts, grid, cell, target)
+            evidence, got = strongest(parts, grid, cell, target)
+            assert evidence == pytest.approx(best)
             assert (got is None) == (expected is None)
             if expected is not None:
                 assert torch.equal(got, expected)
 
 
-def test_best_box_without_overlapping_detections_is_none():
+def test_strongest_detection_without_overlapping_detections_is_none():
     grid = Grid(4, 3, SIZE)
-    assert best_box([], grid, 0, 1) is None
-    assert best_box([Detections.empty(1, 3)], grid, 0, 1) is None
+    assert strongest([], grid, 0, 1) == (0.0, None)
+    assert strongest([Detections.empty(1, 3)], grid, 0, 1) == (0.0, None)
     far = Detections(torch.tensor([[[130.0, 100, 150, 110]]]), torch.full((1, 1, 4), 0.25), torch.ones(1, 1).bool())
-    assert best_box([far], grid, 0, 1) is None
-    assert best_box([far], grid, 11, 1).tolist() == [130, 100, 150, 110]
-    assert best_box([replace(far, mask=torch.zeros(1, 1).bool())], grid, 11, 1) is None
+    assert strongest([far], grid, 0, 1) == (0.0, None)
+    assert strongest([far], grid, 11, 1)[1].tolist() == [130, 100, 150, 110]
+    assert strongest([replace(far, mask=torch.zeros(1, 1).bool())], grid, 11, 1) == (0.0, None)
 
 
 class Square(Detector):
@@ -333,7 +334,7 @@ def test_cell_and_box_of_the_decision_equal_a_loop(seed):
     ]
     decision = conclude(1, belief, parts, grid, 2)
     assert decision.cell == value.index(max(value))
-    assert torch.equal(decision.box, best_box(parts, grid, decision.cell, 2))
+    assert torch.equal(decision.box, strongest(parts, grid, decision.cell, 2)[1])
     assert decision.probability == 0.75
     assert conclude(1, belief, parts, grid, 2, cell=5).cell == 5
     assert conclude(2, belief, parts, grid, 2) == Decision("absent", 0.75)

@@ -21,6 +21,7 @@ from semfov.scanpath import Stimulus
 from semfov.scanpath.files import KIND
 from semfov.scanpath.stimulus import LONGEST
 from semfov.sensor.foveation import foveate
+from semfov.verifier import CloserLook
 
 
 class Bright(Detector):
@@ -213,12 +214,17 @@ def variants(scanpath):
                                                      for each in scanpath.detections)),
         "double": replace(scanpath, **double),
         "found": replace(scanpath, found=True, target=2, decision=Decision("found", 0.1 + 0.2, 7, torch.rand(4))),
+        "closer": replace(
+            scanpath,
+            closer=(CloserLook(0, 3, torch.rand(4), 0.2, 0.4), CloserLook(1, 0, torch.rand(4), 0.7, 0.8)),
+            decision=Decision("found", 0.8, 0, torch.rand(4), 0.7),
+        ),
         "absent": replace(scanpath, target=1, decision=Decision("absent", 1e-300), ending="decision"),
         "other grid": replace(scanpath, grid=Grid(5, 4, (130.5, 90.25))),
     }  # fmt: skip
 
 
-VARIANTS = ["bare", "nothing seen", "not finite", "padded", "double", "found", "absent", "other grid"]
+VARIANTS = ["bare", "nothing seen", "not finite", "padded", "double", "found", "closer", "absent", "other grid"]
 
 
 @pytest.mark.parametrize("name", VARIANTS)
@@ -263,6 +269,10 @@ def spoil(tensors, record):
     yield "seconds", told(seconds=record["seconds"][1:])
     yield "decision", told(decision={"outcome": "perhaps", "probability": 0.5, "cell": None})
     yield "decision.cell", told(decision={"outcome": "found", "probability": 0.5, "cell": 20})
+    look = {"fixation": 0, "cell": 1, "place": 0.5, "presence": 0.5}
+    yield "closer_boxes", told(closer=[look])
+    yield "closer", (changed("closer_boxes", torch.zeros(1, 4))[0], {**record, "closer": [{**look, "cell": 20}]})
+    yield "closer[0].place", told(closer=[{**look, "place": 1.5}])
     yield "settings.sensor", told(settings={**record["settings"], "sensor": {}})
     yield (
         "settings.sensor.levels",
@@ -279,7 +289,7 @@ def test_inconsistent_files_are_refused_with_the_name_of_the_field(scanpath, tmp
     record.pop("kind")
     for number, (named, (parts, told)) in enumerate(spoil(tensors, record)):
         # Fields that may be null may also be missing.
-        if named in ("decision", "ending", "target", "placement", "settings") and len(told) < len(record):
+        if named in ("decision", "closer", "ending", "target", "placement", "settings") and len(told) < len(record):
             continue
         path = tmp_path / f"{number}.safetensors"
         write(path, parts, {"kind": KIND, **told})

@@ -11,6 +11,7 @@ from semfov.belief.grid import Footprint, Grid
 from semfov.belief.likelihood import Observation, likelihoods
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.target_evidence import TargetEvidence
+from semfov.belief.verification import Verification
 
 __all__ = [
     "Belief",
@@ -21,6 +22,7 @@ __all__ = [
     "MapEvidence",
     "Observation",
     "TargetEvidence",
+    "Verification",
     "fuse",
     "fusion",
     "likelihoods",

@@ -9,7 +9,6 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from semfov.agent import Strategy
 from semfov.belief import ContextPrior, Grid, MapEvidence, TargetEvidence
 from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
 from semfov.errors import InputError, check
@@ -29,6 +28,7 @@ from semfov.gaze.learned import LearnedGaze
 from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, Task, named_policy, wanted
 from semfov.gaze.templates import ClassTemplates
 from semfov.observation.foveal import FovealObservationModel
+from semfov.strategy import Strategy
 
 T = TypeVar("T")
 

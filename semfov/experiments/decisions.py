@@ -6,17 +6,17 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
 
-from semfov.agent import Strategy
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.look_features import highest_score
 from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
+from semfov.belief.verification import Verification
 from semfov.decision import conclude, confirms, decide, decide_by_price
 from semfov.detection.detections import Detections
 from semfov.episode import Step, Stopwatch, StoredLooks, rollout
@@ -26,23 +26,27 @@ from semfov.experiments.parts import Record
 from semfov.experiments.run import Run
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.seeds import generator_for, noise_for
-from semfov.experiments.settings import Positive, Share
-from semfov.experiments.setup import make_observation, published_model
+from semfov.experiments.settings import Positive, Range, Share
+from semfov.experiments.setup import make_observation, make_verification, published_model
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
+from semfov.strategy import Strategy
+from semfov.verifier import MOST, Verifier
 
 Rule = Callable[[Step, int, Grid], Tensor]
 """Maps a step of searches, their target and their grid to the number of each search's outcome; 0: it goes on."""
 
-AGENT, RANDOM, PUBLISHED, AT_THE_GAZE = (
+AGENT, UNVERIFIED, RANDOM, PUBLISHED, AT_THE_GAZE = (
     "target-evidence",
+    "target-evidence, no closer looks",
     "random gaze",
     "published belief",
     "published belief, a detection at the gaze",
 )
-"""Ways to search: the agent's; the agent's belief with random gaze; and the paper's belief and gaze with two rules."""
+"""Ways to search: the agent's, with closer looks and without; the agent's belief with random gaze; and the paper's
+belief and gaze with two rules."""
 
 SEEN_FROM = 0.5
 """Lowest score of a detection at the gaze that counts as a find where the belief has no thresholds."""
@@ -59,6 +63,9 @@ class DecisionConfig(SearchConfig):
             value (None: the model's own threshold).
         place: for a find, the fixated cell must hold the target with at least this probability (None: the model's own
             threshold).
+        closer: largest number of closer looks in a search; 0 decides without them.
+        verification: model of verification, by name or file (None: the one that is shipped for detector and sensor, if
+            there is one).
         prices: prices of a look, for additional searches that end by `decide_by_price` instead of by thresholds.
     """
 
@@ -66,6 +73,8 @@ class DecisionConfig(SearchConfig):
     confirm: Share | None = None
     give_up: Share | None = None
     place: Share | None = None
+    closer: Annotated[int, Range(0, 100)] = MOST
+    verification: str | None = None
     prices: tuple[Positive, ...] = ()
 
 
@@ -85,28 +94,52 @@ class DecisionRun(Run):
     def __init__(self, config: DecisionConfig) -> None:
         context = config.belief.context
         check(context == "none", "belief.context", "none, since decisions use the target evidence alone", context)
+        # The key of the run, which the base makes first, depends on this model.
+        self.verification: Verification | None = None
         super().__init__(config)
         evidence = self.models.evidence
         assert evidence is not None
         chosen = evidence.thresholds or Thresholds(0.9, 0.05)
         self.thresholds = chosen.changed(config.confirm, config.give_up, config.place)
+        # The shipped model was fitted with the shipped evidence.
+        if config.closer and (config.verification or config.belief.target_model is None):
+            self.verification = make_verification(config.verification, self.eye)
+        self.verified = {AGENT, RANDOM} if self.verification is not None else set()
         # All share one observer, so that the likelihoods of the looks are computed only once.
         observer = Target(evidence)
         learned, random = Strategy(observer, NonPredictive()), Strategy(observer, Random())
         self.compared: dict[str, tuple[Strategy, Rule]] = {
             AGENT: (learned, self._by_thresholds),
+            **({UNVERIFIED: (learned, self._by_thresholds)} if self.verified else {}),
             RANDOM: (random, self._by_thresholds),
             **{f"price {price:g}": (learned, by_price(price)) for price in config.prices},
         }
         model = self._published()
         if model is not None:
             self.models = replace(self.models, observation=model)
-            self.make_key()
             published = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Predictive(model))
             self.compared |= {PUBLISHED: (published, self._by_thresholds), AT_THE_GAZE: (published, at_the_gaze)}
+        self.make_key()
 
     def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
         return decide(step, target, self.thresholds)
+
+    def _verifier(
+        self, image: Tensor, grid: Grid, target: int, closer: dict[tuple[float, ...], Detections]
+    ) -> Verifier:
+        """The closer looks of one search; `closer` keeps those at this image."""
+        assert self.verification is not None
+        assert self.verification.thresholds is not None
+        config = self.config
+        thresholds = self.verification.thresholds.changed(config.confirm, config.give_up, config.place)
+
+        def close_up(box: Tensor) -> Detections:
+            key = tuple(box.tolist())
+            if key not in closer:
+                closer[key] = self.eye.close_up(image, box)
+            return closer[key]
+
+        return Verifier(self.verification, close_up, grid, target, thresholds, config.closer)
 
     def _published(self) -> FovealObservationModel | None:
         """The observation model of the published belief; None if the settings name none and none is shipped."""
@@ -122,8 +155,13 @@ class DecisionRun(Run):
         evidence, config = self.models.evidence, self.config
         assert evidence is not None
         chosen = asdict(evidence.thresholds) if evidence.thresholds else None
-        given = [config.confirm, config.give_up, config.place, config.prices]
-        what = ["decisions", super()._key(), chosen, given]
+        given = [config.confirm, config.give_up, config.place, config.prices, config.closer]
+        model = self.verification
+        verified = None
+        if model is not None:
+            assert model.thresholds is not None
+            verified = [asdict(model.thresholds), *(each.tolist() for each in model.parameters())]
+        what = ["decisions", super()._key(), chosen, given, verified]
         return hashlib.sha256(json.dumps(what).encode()).hexdigest()
 
     def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
@@ -142,6 +180,7 @@ class DecisionRun(Run):
             sharp = self.eye.detector(image)
             tiles = [self.eye.detector(tile) for tile in quarters(image)]
         watch.lap("look")
+        closer: dict[tuple[float, ...], Detections] = {}
         for target in classes:
             goal = covered[annotation.labels == target].any(0)
             start = generator_for("start", protocol.seed, self.scenes.ids[index], target)
@@ -161,21 +200,26 @@ class DecisionRun(Run):
                 def rule(step: Step, judge: Rule = judge, target: int = target) -> Tensor:
                     return judge(step, target, grid)
 
+                verifier = self._verifier(image, grid, target, closer) if name in self.verified else None
                 with torch.inference_mode():
-                    steps = search_steps(looks, strategy, target, cell, noise, rule)
-                last, seen = steps[-1], torch.cat([step.cell for step in steps])
-                ended = int(rule(last))
-                # If a detection at the gaze has ended the search, the target's place is the fixated cell.
-                place = int(last.cell) if judge is at_the_gaze else None
-                shown = [detections[cell] for cell in seen.split(1)]
-                decision = conclude(ended, last.belief, shown, grid, target, place)
+                    steps = search_steps(looks, strategy, target, cell, noise, verifier or rule)
+                    last, seen = steps[-1], torch.cat([step.cell for step in steps])
+                    if verifier is not None:
+                        decision = verifier.conclude(last)
+                    else:
+                        # If a detection at the gaze has ended the search, the target's place is the fixated cell.
+                        place = int(last.cell) if judge is at_the_gaze else None
+                        shown = [detections[cell] for cell in seen.split(1)]
+                        decision = conclude(int(rule(last)), last.belief, shown, grid, target, place)
+                closely = 0 if verifier is None else len(verifier.looks)
                 records.append(
                     {
                         "policy": name,
                         **common,
                         "outcome": decision.outcome,
                         "probability": decision.probability,
-                        "looks": len(steps),
+                        "looks": len(steps) + closely,
+                        "closer": closely,
                         "right_place": None if decision.cell is None else bool(goal[decision.cell]),
                         "overlap": overlap(decision.box, annotation.boxes[annotation.labels == target]),
                         "landing": landing([step.belief for step in steps], seen, goal, target),

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
+from semfov.belief import ContextPrior, MapEvidence, TargetEvidence, Verification
 from semfov.data.scene import Scenes
 from semfov.detection.detector import Detector
 from semfov.detection.load import check_detector, load_detector
@@ -190,6 +190,16 @@ def make_target_evidence(name: str | None, eye: Eye) -> TargetEvidence:
     """Load learned target evidence by name, or the one shipped for the eye; check that it fits the eye."""
     own = learned_for(eye.detector.name, float(fovea_of(eye).growth))
     model = TargetEvidence.from_pretrained(name or shipped_model(TargetEvidence, own, "MODEL"))
+    model.check_compatible(eye.settings())
+    return model.requires_grad_(False)
+
+
+def make_verification(name: str | None, eye: Eye) -> Verification | None:
+    """Load a model of verification by name, or the one shipped for the eye, if there is one; check that it fits."""
+    own = learned_for(eye.detector.name, float(fovea_of(eye).growth))
+    model = Verification.if_shipped(own) if name is None else Verification.from_pretrained(name)
+    if model is None:
+        return None
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
 

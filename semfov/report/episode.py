@@ -133,6 +133,9 @@ def about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
     if scanpath.decision is not None and scanpath.decision.cell is not None:
         row, column = divmod(scanpath.decision.cell, scanpath.grid.columns)
         decision += f" It is at column {column}, row {row}."
+    for look in scanpath.closer:
+        row, column = divmod(look.cell, scanpath.grid.columns)
+        decision += f" Closer look at column {column}, row {row}: probability {look.place:.2f}."
     told = None if settings is None else sensor_in_words(settings["sensor"])
     return {
         "detector": None if settings is None else settings["detector"]["name"],

@@ -18,6 +18,7 @@ from semfov.errors import DataError, InputError, check
 from semfov.io.schema import Anything, Array, Field, Flag, Json, Maybe, Number, Object, Pair, Schema, Text
 from semfov.io.storage import read, write
 from semfov.scanpath.stimulus import LONGEST, Stimulus
+from semfov.verifier import CloserLook
 from semfov.version import __version__
 
 KIND = "scanpath"
@@ -46,7 +47,14 @@ _SETTINGS = Object(
     Anything(),
     ("sensor", "detector"),
 )
-_DECISION = {"outcome": Text(get_args(Outcome)), "probability": Number(), "cell": Maybe(_WHOLE)}
+_CHANCE = Number(0, 1)
+_DECISION = {
+    "outcome": Text(get_args(Outcome)),
+    "probability": Number(),
+    "cell": Maybe(_WHOLE),
+    "place": Maybe(_CHANCE),
+}
+_CLOSER = {"fixation": _WHOLE, "cell": _WHOLE, "place": _CHANCE, "presence": _CHANCE}
 
 SCHEMA = Schema(
     {
@@ -60,6 +68,7 @@ SCHEMA = Schema(
         "posterior": Field(("n", "cells"), mixed=True, low=0, high=1 + 1e-3, optional=True),
         "presence": Field(("n",), mixed=True, low=0, high=1 + 1e-3, optional=True),
         "box": Field((4,), mixed=True, optional=True),
+        "closer_boxes": Field(("Q", 4), mixed=True, optional=True),
         "photograph": Field((3, "h", "w"), dtype=torch.uint8, optional=True),
         "canvas": Field((3, "H", "W"), dtype=torch.uint8, optional=True),
     },
@@ -71,7 +80,9 @@ SCHEMA = Schema(
         "lengths": Array(_WHOLE, "n", least=1),
         "target": Maybe(_WHOLE),
         "found": Flag(),
-        "decision": Maybe(Object(_DECISION, None, tuple(_DECISION))),
+        # Files of earlier versions have neither `place` nor `closer`.
+        "decision": Maybe(Object(_DECISION, None, ("outcome", "probability", "cell"))),
+        "closer": Maybe(Array(Object(_CLOSER, None, tuple(_CLOSER)))),
         "ending": Maybe(Text(_ENDINGS)),
         "seconds": Array(Object(dict.fromkeys(STAGES, Number(low=0)), Number(low=0))),
         "placement": Maybe(Object(_PLACEMENT, None, tuple(_PLACEMENT))),
@@ -98,6 +109,7 @@ def write_fields(path: str | PathLike[str], fields: Mapping[str, Any]) -> None:
         "lengths": [look.mask.shape[-1] for look in looks],
         **{name: fields[name] for name in ("target", "found", "ending")},
         "decision": None,
+        "closer": [{name: getattr(look, name) for name in _CLOSER} for look in fields["closer"]],
         "seconds": [dict(each) for each in fields["seconds"]],
         "placement": None,
         "settings": None,
@@ -106,6 +118,8 @@ def write_fields(path: str | PathLike[str], fields: Mapping[str, Any]) -> None:
         record["decision"] = {name: getattr(decision, name) for name in _DECISION}
         if decision.box is not None:
             tensors["box"] = decision.box
+    if fields["closer"]:
+        tensors["closer_boxes"] = torch.stack([look.box for look in fields["closer"]])
     if stimulus is not None:
         tensors |= {name: getattr(stimulus, name) for name in ("photograph", "canvas")}
         record["placement"] = {name: list(getattr(stimulus.placement, name)) for name in _PLACEMENT}
@@ -151,6 +165,12 @@ def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> dict[
         cell = decision["cell"]
         check(cell is None or cell < len(grid), "decision.cell", f"a cell number below {len(grid)}", cell)
         decision = Decision(**decision, box=tensors.get("box"))
+    closer = record.get("closer") or []
+    boxes = tensors.get("closer_boxes", torch.zeros(0, 4))
+    check(len(boxes) == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", len(boxes))
+    for look in closer:
+        inside = look["cell"] < len(grid) and look["fixation"] < count
+        check(inside, "closer", f"a cell below {len(grid)} and a fixation below {count}", look)
     return {
         "grid": grid,
         "classes": tuple(record["classes"]),
@@ -164,6 +184,7 @@ def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> dict[
         "posterior": tensors.get("posterior"),
         "presence": tensors.get("presence"),
         "decision": decision,
+        "closer": tuple(CloserLook(**look, box=box) for look, box in zip(closer, boxes, strict=True)),
         "ending": record["ending"],
         "seconds": tuple(seconds),
         "stimulus": _stimulus(tensors, record),

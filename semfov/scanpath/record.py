@@ -17,6 +17,7 @@ from semfov.errors import InputError
 from semfov.scanpath.drawing import drawn_by
 from semfov.scanpath.files import read_fields, write_fields
 from semfov.scanpath.stimulus import Stimulus
+from semfov.verifier import CloserLook
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -52,6 +53,7 @@ class Scanpath:
             for exploration.
         presence: `(n,)`, probability that the image holds the target after each look; None for exploration.
         decision: decision of the search; None for exploration, and for a search that ended on a given box.
+        closer: closer looks of a search, in order (`semfov.verifier.Verifier`).
         ending: reason for the end; None if it is not known.
         seconds: time of each look by stage (`semfov.episode.STAGES`).
         stimulus: the photograph, and the data for the foveated views of it; None if it was not kept.
@@ -75,6 +77,7 @@ class Scanpath:
     posterior: Tensor | None = None
     presence: Tensor | None = None
     decision: Decision | None = None
+    closer: tuple[CloserLook, ...] = ()
     ending: Ending | None = None
     seconds: tuple[Mapping[str, float], ...] = ()
     stimulus: Stimulus | None = None
@@ -285,7 +288,11 @@ def why_it_ended(scanpath: Scanpath) -> str:
     >>> why_it_ended(path)
     'The gaze is on a box of the target.'
     """
+    if scanpath.closer and scanpath.found:
+        return "A closer look confirmed the target."
     if scanpath.ending == "decision" and scanpath.decision is not None:
+        if len(scanpath.closer) and scanpath.decision.outcome == "undecided":
+            return "No closer look confirmed the target, but it is probably there."
         return {
             "found": "The target is probable enough, and was looked at closely enough.",
             "absent": "No remaining cell is worth a look, and the target is probably absent.",
@@ -321,6 +328,10 @@ def describe(scanpath: Scanpath) -> str:
     if decision is None:
         return f"“{name}” {'found after' if scanpath.found else 'not found in'} {shifts}"
     sure = f"probability {decision.probability:.2f}"
+    if decision.place is not None:
+        sure += f", {decision.place:.2f} at this place"
+    if scanpath.closer:
+        shifts += f" and {len(scanpath.closer)} closer look{'s' if len(scanpath.closer) != 1 else ''}"
     if decision.outcome == "found":
         return f"“{name}” found after {shifts} ({sure})"
     return f"“{name}” {'not there' if decision.outcome == 'absent' else 'undecided'} after {shifts} ({sure})"

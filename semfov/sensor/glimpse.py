@@ -95,6 +95,33 @@ def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> 
     return torch.cat([points + 0.5 - half, points + 0.5 + half], -1)
 
 
+def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0, least: float = 1 / 3) -> Tensor:
+    """Compute the window that shows a box closely, with some of its surroundings.
+
+    The window is a square, `context` times as large as the longer side of the box, and at least `least` times as large
+    as the longer side of the picture. It is moved to lie inside the picture. Where the picture is narrower, it is cut.
+
+    Args:
+        box: `(4,)`, as `(x1, y1, x2, y2)` in picture pixels.
+        picture: `(width, height)` of the picture.
+        context: side of the window, in longer sides of the box.
+        least: smallest side of the window, in longer sides of the picture.
+
+    Returns:
+        `(4,)`, the window as `(x1, y1, x2, y2)`, edges between pixels.
+
+    >>> window_around(torch.tensor([0.0, 30.0, 20.0, 50.0]), (90, 60))
+    tensor([ 0., 10., 60., 60.])
+    """
+    check_shape(box, "box", 4)
+    check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
+    low, high = box[:2], box[2:]
+    whole = box.new_tensor(picture)
+    side = torch.minimum((context * (high - low).amax()).clamp(min=least * max(picture)), whole)
+    start = torch.minimum(((low + high - side) / 2).clamp(min=0), whole - side)
+    return torch.cat([start, start + side])
+
+
 def ladder(picture: tuple[int, int], size: tuple[int, int], *, finest: float = 1.0) -> tuple[float, ...]:
     """List magnifications one octave apart, from the one that shows the whole picture up to a finest one.
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 
-from semfov.agent import Strategy
 from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
 from semfov.decision import decide
@@ -27,6 +26,7 @@ from semfov.io.manifest import Part
 from semfov.metrics.calibration import calibration, surprisal
 from semfov.model_folder import KINDS, Model
 from semfov.observation.foveal import FovealObservationModel
+from semfov.strategy import Strategy
 from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.detector_words import curves_figure, in_words, mean_percent, section, share
 from semfov.training.evidence import fit_evidence, judge

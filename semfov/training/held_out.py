@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.agent import Strategy
 from semfov.belief.grid import Grid
 from semfov.data.scene import legal_targets
 from semfov.decision import OUTCOMES, confirms
@@ -28,6 +27,7 @@ from semfov.experiments.seeds import generator_for, noise_for
 from semfov.metrics.averages import standard_error
 from semfov.metrics.exploration import answers_of, success_rate
 from semfov.metrics.search import cumulative_performance
+from semfov.strategy import Strategy
 from semfov.training.evidence_examples import LookingRun
 
 Array = NDArray[np.float64]

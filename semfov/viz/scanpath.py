@@ -9,6 +9,7 @@ from torch import Tensor
 
 from semfov.errors import check
 from semfov.scanpath import Scanpath, describe
+from semfov.verifier import CloserLook
 from semfov.viz.belief import draw_belief
 from semfov.viz.drawing import (
     choose_fixations,
@@ -71,6 +72,8 @@ def plot_scanpath(
     box = found_box(scanpath)
     if box is not None:
         draw_boxes(axes, box[None], FOUND, width=2.0)
+    for look in dismissed(scanpath):
+        draw_boxes(axes, look.box[None], FOUND, ":", 1.6)
     axes.set_title(describe(scanpath), parse_math=False)
     draw_legend(axes, scanpath, boxes, len(scanpath) - 1 if detections else None)
     lay_out(figure)
@@ -207,6 +210,8 @@ def draw_legend(axes: Axes, scanpath: Scanpath, boxes: Tensor | None, fixation: 
     if fixation is not None:
         if found_box(scanpath) is not None:
             kinds.append((FOUND, "-", f"where the {name} was found"))
+        if dismissed(scanpath):
+            kinds.append((FOUND, ":", "not confirmed by a closer look"))
         _, labels, _ = seen_well(scanpath, fixation, MOST_BOXES)
         if scanpath.target in labels:
             kinds.append((TARGET, "-", f"last look: {name}"))
@@ -230,6 +235,13 @@ def draw_legend(axes: Axes, scanpath: Scanpath, boxes: Tensor | None, fixation: 
 def found_box(scanpath: Scanpath) -> Tensor | None:
     """The box of the decision, where the target was found with one."""
     return None if scanpath.decision is None else scanpath.decision.box
+
+
+def dismissed(scanpath: Scanpath) -> list[CloserLook]:
+    """The closer looks at places other than that of a target that was found."""
+    decision = scanpath.decision
+    found = None if decision is None else decision.box
+    return [look for look in scanpath.closer if found is None or not look.box.equal(found)]
 
 
 def draw_view(axes: Axes, scanpath: Scanpath, fixation: int, view: Tensor) -> None:

@@ -2,6 +2,7 @@
 
 import torch
 
+from semfov.belief import Verification
 from semfov.belief.observers import AnyOf, Context, Landing, LearnedMap, Semantic, Target
 from tests.base_tester import GraphTester
 from tests.small import GRID, context, detections, evidence, look, mapping, model, observing, rand
@@ -17,6 +18,17 @@ class TestContextPrior(GraphTester):
     @staticmethod
     def call(module, presence):
         return module(presence, GRID, 2)
+
+
+class TestVerification(GraphTester):
+    batched = (0,)
+    differentiable = (0,)
+
+    def make(self):
+        return Verification()
+
+    def inputs(self):
+        return (rand(3, 7),)
 
 
 class LookTester(GraphTester):

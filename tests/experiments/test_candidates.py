@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from semfov import DirichletBelief, FovealObservationModel, Grid, TargetEvidence, observers, policies
-from semfov.agent import Strategy
 from semfov.belief import ContextPrior, MapEvidence
 from semfov.errors import InputError
 from semfov.experiments import candidates
@@ -23,6 +22,7 @@ from semfov.gaze.acquisition import (
     Static,
     TargetPosterior,
 )
+from semfov.strategy import Strategy
 
 GRID = Grid(4, 3, (40, 30))
 FOVEA = 100 / 640

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from semfov import Detections, FovealObservationModel, Grid, policies
-from semfov.agent import Strategy
 from semfov.belief.observers import Semantic, SemanticLook
 from semfov.data import Annotation
 from semfov.experiments.candidates import Candidate
@@ -19,6 +18,7 @@ from semfov.experiments.exploration_protocol import (
     run_explorations,
 )
 from semfov.metrics.exploration import answers_of
+from semfov.strategy import Strategy
 
 GRID = Grid(4, 3, (80, 60))
 NOTHING = Detections.empty(12, 3)

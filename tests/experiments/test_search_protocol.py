@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from semfov import Detections, Grid, fusion, policies
-from semfov.agent import Strategy
 from semfov.belief.observers import Semantic, SemanticLook
 from semfov.data import Annotation
 from semfov.experiments.candidates import Candidate
 from semfov.experiments.config import ProtocolConfig
 from semfov.experiments.search_protocol import Outcome, episodes_of, run_episodes, tie_noise
 from semfov.metrics.search import cumulative_performance, random_search
+from semfov.strategy import Strategy
 
 CLASSES = ("cat", "cup", "person")
 

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from semfov import Detections, FovealObservationModel, Grid
-from semfov.agent import Strategy
 from semfov.belief import MapEvidence, TargetEvidence
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.errors import InputError
@@ -13,6 +12,7 @@ from semfov.experiments.config import BeliefConfig, PolicyConfig
 from semfov.experiments.presets import label, presets, resolve
 from semfov.gaze.acquisition import CloserLook, ExpectedGain
 from semfov.gaze.policies import POLICIES, Closer, Gain, Means, Random, named_policy, policy_names
+from semfov.strategy import Strategy
 
 GRID = Grid(5, 4, (50, 40))
 

@@ -5,11 +5,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 from torch.nn import functional as F
 
 from semfov.errors import InputError
-from semfov.sensor.glimpse import Glimpse, glimpse, ladder, windows_at
+from semfov.sensor.glimpse import Glimpse, glimpse, ladder, window_around, windows_at
 
 
 def picture(height=47, width=61, channels=3, dtype=torch.float64, seed=0):
@@ -125,3 +127,33 @@ def test_errors_name_the_argument(change, message):
     call = {"image": torch.rand(1, 3, 8, 8), "boxes": torch.tensor([[0.0, 0, 4, 4]]), "size": (4, 4)} | change
     with pytest.raises(InputError, match=message):
         glimpse(**call)
+
+
+@given(
+    st.tuples(st.integers(20, 700), st.integers(20, 700)),
+    st.tuples(*[st.floats(0, 1)] * 4),
+    st.floats(1, 5),
+    st.floats(0.05, 1),
+)
+def test_a_window_around_a_box_is_as_large_and_as_central_as_the_picture_allows(picture, box, context, least):
+    (x1, x2), (y1, y2) = (sorted((box[n] * side, box[n + 2] * side)) for n, side in enumerate(picture))
+    given_box = torch.tensor([x1, y1, x2, y2], dtype=torch.float64)
+    window = window_around(given_box, picture, context=context, least=least).tolist()
+    side = max(context * max(x2 - x1, y2 - y1), least * max(picture))
+    for low, high, start, stop, length in zip((x1, y1), (x2, y2), window[:2], window[2:], picture, strict=True):
+        assert -1e-9 <= start <= stop <= length + 1e-9
+        assert stop - start == pytest.approx(min(side, length))
+        # The window covers the box, and nothing moves its centre away from the box's but the borders.
+        assert start <= low + 1e-6
+        assert stop >= high - 1e-6
+        if start > 1e-6 and stop < length - 1e-6:
+            assert (start + stop) / 2 == pytest.approx((low + high) / 2)
+
+
+def test_a_window_around_a_box_follows_the_box_with_a_gradient():
+    box = torch.tensor([20.0, 30.0, 40.0, 44.0], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda each: window_around(each, (300, 200)), box)
+    with pytest.raises(InputError, match="box: expected a tensor of shape"):
+        window_around(torch.zeros(3), (300, 200))
+    with pytest.raises(InputError, match="picture: expected"):
+        window_around(torch.zeros(4), (0, 200))

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.agent import Strategy
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Landing
 from semfov.data.classes import class_index
@@ -34,6 +33,7 @@ from semfov.experiments.viewing.follow import FineLooks, MapStore, follow
 from semfov.experiments.viewing.raster import Events, enlarged, events_of
 from semfov.gaze.policies import Objects, Task
 from semfov.io.storage import checksum
+from semfov.strategy import Strategy
 
 LANDING = "landing"
 """The exploration policy `objects` with a `Landing` observer, on the cells of the raster."""

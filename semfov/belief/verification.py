@@ -1,0 +1,148 @@
+"""Verification: what a closer look at a place says about the target there."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor, nn
+
+from semfov.belief.target_evidence import THRESHOLDS, Thresholds
+from semfov.detection.detections import Detections
+from semfov.io.pretrained import PretrainedForEye
+from semfov.io.schema import Field, Schema
+from semfov.observation.matching import box_iou
+
+FEATURES = 7
+"""Number of features of a closer look (`closer_features`)."""
+
+_SAME = 0.3
+"""Least overlap of a detection in the closer look with the examined box, to replace it."""
+_FLOOR = 1e-3
+
+
+class Verification(PretrainedForEye):
+    r"""Probabilities of a target after a closer look: that it is at the examined place, and that the image holds it.
+
+    A search that is about to end with `found` looks closely at the place first (`semfov.Eye.close_up`). Both
+    probabilities are logistic regressions on the features φ of that look and of the belief before it
+    (`closer_features`):
+
+    .. math:: \operatorname{logit} P = w^\top \phi + b
+
+    (Target verification follows guidance in models of human search, too: Malcolm and Henderson, 2009, *The effects of
+    target template specificity on visual search in real-world scenes*.)
+
+    Args:
+        thresholds: thresholds at which searches decide; None if none were chosen. `confirm` is the least probability
+            that the target is at the examined place, for `found`. `place` is the least probability of a cell that is
+            worth a closer look. `give_up` has the same meaning as without closer looks.
+        metadata: JSON values saved with the model: `detector` and `sensor` (the settings it was fitted for).
+
+    >>> model = Verification()  # not fitted yet
+    >>> model(torch.zeros(2, 7)).shape
+    torch.Size([2, 2])
+    """
+
+    kind: ClassVar[str] = "verification"
+    title: ClassVar[str] = "model of verification"
+    shipped: ClassVar[Path] = Path(__file__).parent / "models" / "verification"
+    schema: ClassVar[Schema] = Schema(
+        {
+            "linear.weight": Field((2, FEATURES), low=-1e3, high=1e3),
+            "linear.bias": Field((2,), low=-1e3, high=1e3),
+        },
+        {"thresholds": THRESHOLDS},
+    )
+
+    def __init__(self, *, thresholds: Thresholds | None = None, metadata: Mapping[str, Any] | None = None) -> None:
+        super().__init__()
+        self.metadata = dict(metadata or {})
+        self.thresholds = thresholds
+        self.linear = nn.Linear(FEATURES, 2)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Log odds after closer looks.
+
+        Args:
+            features: `(..., 7)` (`closer_features`).
+
+        Returns:
+            `(..., 2)`, log odds that the target is at the place, and that the image holds it.
+        """
+        value: Tensor = self.linear(features)
+        return value
+
+    @classmethod
+    def if_shipped(cls, name: str) -> Self | None:
+        """Load a model that is shipped with the package.
+
+        Args:
+            name: its name, that of the target evidence that it was fitted with.
+
+        Returns:
+            The model, in `eval` mode; None if there is none of this name.
+        """
+        return cls.from_pretrained(name) if (cls.shipped / f"{name}.safetensors").is_file() else None
+
+    def _record(self) -> dict[str, Any]:
+        """The thresholds."""
+        return {"thresholds": None if self.thresholds is None else asdict(self.thresholds)}
+
+    @classmethod
+    def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
+        """The model with the saved tensors and record."""
+        thresholds = None if record["thresholds"] is None else Thresholds(**record["thresholds"])
+        model = cls(thresholds=thresholds, metadata=record["metadata"])
+        model.load_state_dict(tensors)
+        return model
+
+
+def closer_features(
+    presence: float, cell: float, evidence: float, closer: Detections, box: Tensor, target: int
+) -> tuple[Tensor, Tensor]:
+    r"""Describe a closer look at a place, and find the box of the target in it.
+
+    Let :math:`s_l` be the scores of detection l of the closer look, :math:`o_l` its overlap (intersection over union)
+    with the examined box, and :math:`m = \arg\max_l s_{lt} o_l`. The features are the logits of
+
+    1. the probability that the image holds the target, before the closer look,
+    2. the probability that the cell holds it,
+    3. the evidence of the looks before, score times `soft` footprint (`semfov.decision.strength`),
+    4. :math:`s_{mt} o_m`, 5. :math:`\max_l s_{lt}`,
+    6. :math:`\max_l o_l \max_{k \ne t} s_{lk}`, the evidence for other classes there,
+    7. :math:`s_{mt}`,
+
+    with probabilities kept between 0.001 and 0.999.
+
+    Args:
+        presence: probability that the image holds the target.
+        cell: probability that the cell holds the target.
+        evidence: evidence for the target in the cell.
+        closer: detections of the closer look, a batch of one.
+        box: `(4,)`, the examined box.
+        target: class 1..K.
+
+    Returns:
+        The features `(7,)`, and the box `(4,)` of detection m, or the examined box if they overlap by less than 0.3.
+
+    >>> box = torch.tensor([0.0, 0.0, 9.0, 9.0])
+    >>> nothing = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 2), torch.zeros(1, 0, dtype=torch.bool))
+    >>> closer_features(0.9, 0.8, 0.5, nothing, box, 1)[0].round(decimals=1)
+    tensor([ 2.2000,  1.4000,  0.0000, -6.9000, -6.9000, -6.9000, -6.9000])
+    """
+    shown = closer.mask[0]
+    boxes, scores = closer.boxes[0][shown], closer.scores[0][shown]
+    before = [presence, cell, evidence]
+    seen = [0.0] * 4
+    if len(boxes):
+        overlap, score = box_iou(boxes, box[None])[:, 0], scores[:, target]
+        other = scores.index_fill(1, torch.tensor([0, target], device=scores.device), 0).amax(-1)
+        best = int((score * overlap).argmax())
+        seen = [
+            float(each) for each in (score[best] * overlap[best], score.max(), (overlap * other).max(), score[best])
+        ]
+        if float(overlap[best]) >= _SAME:
+            box = boxes[best]
+    return torch.tensor([*before, *seen]).to(box).logit(_FLOOR), box

@@ -1,0 +1,46 @@
+"""Observer and policy of a task."""
+
+from collections.abc import Mapping, Sequence
+
+from torch import nn
+
+from semfov.belief.observers import AnyOf, Observer
+from semfov.belief.observers.any_of import TargetLike, weights_by_class
+from semfov.data.classes import class_index
+from semfov.errors import check
+from semfov.gaze.policies import NonPredictive, Policy, Random
+
+
+class Strategy(nn.Module):
+    """Observer and policy for a task.
+
+    Args:
+        observer: turns looks into a belief.
+        policy: chooses the next fixation from the belief.
+    """
+
+    def __init__(self, observer: Observer, policy: Policy) -> None:
+        super().__init__()
+        self.observer = observer
+        self.policy = policy
+
+    def sought(self, target: TargetLike, classes: Sequence[str]) -> tuple["Strategy", int, dict[int, float]]:
+        """Prepare the search for a target.
+
+        Args:
+            target: a class by name or index, or several with weights.
+            classes: names of the classes, background first.
+
+        Returns:
+            Observer and policy for the target, its class with the largest weight, and the weights of all its classes.
+
+        Raises:
+            InputError: a class is unknown, or the policy cannot search for several classes.
+        """
+        if not isinstance(target, Mapping):
+            index = class_index(target, classes[1:], "target")
+            return self, index, {index: 1.0}
+        wanted, policy = weights_by_class(target, classes[1:]), self.policy
+        suits = isinstance(policy, NonPredictive | Random) or policy.by_place
+        check(suits, "target", f"one class for policy {policy.name!r}, which does not use probabilities", dict(target))
+        return Strategy(AnyOf(self.observer, wanted), policy), max(wanted, key=wanted.__getitem__), wanted

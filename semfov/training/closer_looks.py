@@ -1,0 +1,180 @@
+"""Searches of photographs that can be repeated: looks and closer looks are made once, and remembered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.belief.observers import Observer
+from semfov.data.scene import Scenes
+from semfov.detection.detections import Detections
+from semfov.episode import Looks, Sight, Step, rollout
+from semfov.experiments.search_protocol import choose_classes
+from semfov.experiments.seeds import generator_for
+from semfov.eye import Eye, View
+from semfov.gaze.acquisition import TargetPosterior
+from semfov.gaze.choice import Greedy, drawn_by
+
+
+@dataclass(frozen=True)
+class Sought:
+    """A class to search for in a photograph.
+
+    Attributes:
+        target: the class, 1..K.
+        goal: `(X·Y,)` boolean, cells that an object of the class overlaps.
+        start: `(1,)`, the first fixated cell.
+    """
+
+    target: int
+    goal: Tensor
+    start: Tensor
+
+    @property
+    def present(self) -> bool:
+        """Whether the photograph holds the class."""
+        return bool(self.goal.any())
+
+
+class Photograph:
+    """A photograph with the classes to search for, and all looks at it so far.
+
+    Args:
+        eye: sensor and detector.
+        scenes: the photographs.
+        index: index of the photograph.
+        number: number of the photograph among those that are searched.
+        grid: the cells.
+        sought: the classes to search for.
+    """
+
+    def __init__(
+        self, eye: Eye, scenes: Scenes, index: int, number: int, grid: Grid, sought: tuple[Sought, ...]
+    ) -> None:
+        self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
+        self.grid, self.sought = grid, sought
+        self.seen: dict[int, Detections] = {}
+        self.closer: dict[tuple[float, ...], Detections] = {}
+        self._image: Tensor | None = None
+        self._view: View | None = None
+
+    @property
+    def image(self) -> Tensor:
+        """The photograph, `(1, 3, H, W)`."""
+        if self._image is None:
+            self._image = self.scenes[self.index].image[None]
+        return self._image
+
+    def close(self) -> None:
+        """Free the pixels; a later look reads them again."""
+        self._image = self._view = None
+
+    def look(self, cell: int, fixation: Tensor) -> Detections:
+        """Look from a cell.
+
+        Args:
+            cell: the cell.
+            fixation: `(1, 2)`, its centre.
+
+        Returns:
+            The detections, a batch of one.
+        """
+        if cell not in self.seen:
+            if self._view is None:
+                self._view = self.eye.open(self.image)
+            self.seen[cell] = self.eye.look(self._view, fixation)
+        return self.seen[cell]
+
+    def close_up(self, box: Tensor) -> Detections:
+        """Look closely at a box `(4,)`; returns the detections, a batch of one."""
+        key = tuple(box.tolist())
+        if key not in self.closer:
+            self.closer[key] = self.eye.close_up(self.image, box)
+        return self.closer[key]
+
+
+class RememberedLooks(Looks):
+    """Looks at a photograph that are made only once, whatever is searched for.
+
+    Args:
+        photograph: the photograph.
+        target: class 1..K that is searched for.
+    """
+
+    def __init__(self, photograph: Photograph, target: int) -> None:
+        self.photograph, self.grid, self.target = photograph, photograph.grid, target
+        self.like = photograph.grid.centres
+
+    def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
+        """Look, or remember."""
+        seen = self.photograph.look(int(cell), fixation)
+        return Sight(observer.weigh(seen, fixation, self.grid, self.target), lambda: seen, {})
+
+
+def photographs(
+    eye: Eye,
+    scenes: Scenes,
+    chosen: Sequence[int],
+    cells: tuple[int, int],
+    *,
+    classes: int,
+    absent: int | None,
+    max_area: float,
+    seed: int,
+) -> list[Photograph]:
+    """Draw classes to search for in photographs.
+
+    Args:
+        eye: sensor and detector.
+        scenes: the photographs.
+        chosen: indices of those to search.
+        cells: `(columns, rows)` of the grid.
+        classes: maximum number of present classes in a photograph.
+        absent: maximum number of absent classes (None: as many as present ones).
+        max_area: classes that cover a larger share of the image are left out.
+        seed: seed of the classes and of the first fixations.
+
+    Returns:
+        The photographs with classes to search for.
+    """
+    found: list[Photograph] = []
+    for index in chosen:
+        annotation = scenes.annotation(index)
+        grid = Grid(*cells, annotation.size)
+        covered = grid.footprint(annotation.boxes)
+        sought = tuple(
+            Sought(
+                target,
+                covered[annotation.labels == target].any(0),
+                torch.randint(len(grid), (1,), generator=generator_for("start", seed, scenes.ids[index], target)),
+            )
+            for target in choose_classes(scenes, index, annotation, classes, max_area, seed, absent)
+        )
+        if sought:
+            found.append(Photograph(eye, scenes, index, len(found), grid, sought))
+    return found
+
+
+def search(
+    photograph: Photograph, sought: Sought, observer: Observer, looks: int, ends: Callable[[Step], Tensor] | None = None
+) -> Iterator[Step]:
+    """Search a photograph for a class, where it is most probable.
+
+    Args:
+        photograph: the photograph.
+        sought: the class.
+        observer: turns looks into a belief.
+        looks: maximum number of looks.
+        ends: maps a step to a number `(1,)` above 0 that ends the search; None makes all looks.
+
+    Returns:
+        The steps.
+    """
+    source = RememberedLooks(photograph, sought.target)
+    choice = Greedy(drawn_by(torch.Generator().manual_seed(0), len(photograph.grid), source.like))
+    rule = None if ends is None else lambda step: ends(step) > 0
+    return rollout(source, observer, TargetPosterior(sought.target), sought.start, choice, most=looks, ends=rule)

@@ -1,0 +1,229 @@
+"""Verification of the target by closer looks, before a search decides."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from semfov.belief.belief import Belief
+from semfov.belief.grid import Grid
+from semfov.belief.observers import AnyBelief
+from semfov.belief.target_evidence import Thresholds
+from semfov.belief.verification import Verification, closer_features
+from semfov.decision import OUTCOMES, Decision, place_known, strength, strongest
+from semfov.detection.detections import Detections
+from semfov.episode import Step
+from semfov.errors import check, check_whole
+
+MOST = 2
+"""Default for the largest number of closer looks in a search."""
+
+_COVERED = 0.5  # cells that the box of a closer look covers with at least this weight are not examined again
+
+
+@dataclass(frozen=True)
+class CloserLook:
+    """A closer look at a place that seems to hold the target.
+
+    Attributes:
+        fixation: number of the fixation after which it was made.
+        cell: the cell of the target, if it is there.
+        box: `(4,)`, the box of the target as `(x1, y1, x2, y2)` in pixels, if it is there.
+        place: probability that the target is there.
+        presence: probability that the image holds the target, after the closer look.
+    """
+
+    fixation: int
+    cell: int
+    box: Tensor
+    place: float
+    presence: float
+
+
+@dataclass(frozen=True)
+class CandidatePlace:
+    """A place that seems to hold the target.
+
+    Attributes:
+        cell: the cell.
+        box: `(4,)`, box of the detection with the strongest evidence there.
+        evidence: that evidence (`strongest`).
+        probability: probability that the cell holds the target.
+    """
+
+    cell: int
+    box: Tensor
+    evidence: float
+    probability: float
+
+
+class CandidatePlaces:
+    """Places that seem to hold the target of one search, the most evident first, each listed once.
+
+    A candidate is the cell with the largest product of probability and evidence, among the cells that no examined
+    candidate covers.
+
+    Args:
+        grid: the cells.
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        self.grid = grid
+        self.looks: list[Detections] = []
+        self.examined: Tensor | None = None
+
+    def see(self, look: Detections) -> None:
+        """Add the detections of a look, a batch of one."""
+        self.looks.append(look)
+
+    def next(self, cells: Tensor, target: int) -> CandidatePlace | None:
+        """Find the most evident place that was not examined.
+
+        Args:
+            cells: `(X·Y,)`, probability of the target in each cell.
+            target: class 1..K.
+
+        Returns:
+            The candidate; None if no detection that could be the target is left.
+        """
+        cells = self.open(cells)
+        shown = torch.stack([torch.zeros_like(cells), *(strength(look, self.grid, target) for look in self.looks)])
+        value = cells * shown.amax(0)
+        cell = int(value.argmax())
+        evidence, box = strongest(self.looks, self.grid, cell, target)
+        return (
+            None if box is None or float(value[cell]) <= 0 else CandidatePlace(cell, box, evidence, float(cells[cell]))
+        )
+
+    def open(self, cells: Tensor) -> Tensor:
+        """The probabilities, with 0 for the cells that were examined."""
+        return cells if self.examined is None else cells.masked_fill(self.examined, 0)
+
+    def dismiss(self, candidate: CandidatePlace) -> None:
+        """Do not list a candidate again, nor others in the cells that it covers."""
+        covered = self.grid.footprint(candidate.box[None], "soft")[0] >= _COVERED
+        covered[candidate.cell] = True
+        self.examined = covered if self.examined is None else self.examined | covered
+
+
+def cell_of(box: Tensor, grid: Grid) -> int:
+    """The cell that a box `(4,)` covers most (its `soft` footprint)."""
+    return int(grid.footprint(box[None], "soft")[0].argmax())
+
+
+class Verifier:
+    """Decides one search, with closer looks at the places that seem to hold the target.
+
+    When a fixated cell is probably the target's, or when no cell is worth a further fixation, the most evident place is
+    looked at closely. The search ends at once if the target is surely there: with a probability halfway between
+    `confirm` and 1, or more. Otherwise it goes on, until no cell is worth a fixation, or `most` closer looks were made.
+    Then it has found the target at the best of the examined places, if that is probable enough. If not, the target is
+    absent or the search undecided, by the probability that the image holds it.
+
+    Args:
+        model: gives the probabilities after closer looks.
+        close_up: looks closely at a box `(4,)` (`semfov.Eye.close_up`).
+        grid: the cells.
+        target: class 1..K.
+        thresholds: see `Verification`; None takes those of the model.
+        most: largest number of closer looks.
+
+    Raises:
+        InputError: no thresholds are given and the model has none, or `most` is out of range.
+
+    Example::
+
+        verifier = Verifier(Verification.from_pretrained("yolox-nano"), partial(eye.close_up, image), grid, target)
+        for step in rollout(looks, observer, policy, start, choice, most=31, ends=lambda step: verifier(step) > 0):
+            ...
+        print(verifier.conclude(step), verifier.looks)
+    """
+
+    def __init__(
+        self,
+        model: Verification,
+        close_up: Callable[[Tensor], Detections],
+        grid: Grid,
+        target: int,
+        thresholds: Thresholds | None = None,
+        most: int = MOST,
+    ) -> None:
+        thresholds = model.thresholds if thresholds is None else thresholds
+        check(thresholds is not None, "thresholds", "thresholds, since the model has none", None)
+        assert thresholds is not None
+        self.model, self.close_up, self.target, self.thresholds = model, close_up, target, thresholds
+        check_whole(most, "most", 1, 100)
+        self.most = most
+        self.candidates = CandidatePlaces(grid)
+        self.looks: list[CloserLook] = []
+        self._outcome = 0
+
+    def __call__(self, step: Step) -> Tensor:
+        """Decide whether the search ends with a step. Call it once for every step, in order.
+
+        Args:
+            step: a step of one search.
+
+        Returns:
+            `(1,)`, 0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
+        """
+        self.candidates.see(step.detections)
+        left = step.belief.chance(self.target).masked_fill(step.visited, 0).amax()
+        over = float(left) < self.thresholds.give_up
+        self._outcome = self._examine(step, over=over)
+        return torch.full_like(step.cell, self._outcome)
+
+    def conclude(self, step: Step) -> Decision:
+        """Make the decision of the search.
+
+        Args:
+            step: the last step. If the search did not end with it, all its fixations are spent: what is left of closer
+                looks is made now.
+
+        Returns:
+            The decision.
+        """
+        outcome = self._outcome or self._examine(step, over=True)
+        presence = self._presence(step.belief)
+        if OUTCOMES[outcome] != "found":
+            return Decision(OUTCOMES[outcome], presence)
+        best = self._best()
+        return Decision("found", max(presence, best.place), best.cell, best.box, best.place)
+
+    def _examine(self, step: Step, *, over: bool) -> int:
+        """Make the closer looks that are due after a step, and return the outcome."""
+        cells, least = step.belief.probability(self.target)[0], self.thresholds.place
+        target = int(step.belief.likeliest()) if isinstance(step.belief, AnyBelief) else self.target
+        while len(self.looks) < self.most:
+            seen = over or bool(place_known(self.candidates.open(cells), step.visited[0], least))
+            candidate = self.candidates.next(cells, target) if seen else None
+            if candidate is None or candidate.probability < least:
+                break
+            self.looks.append(self._look(step, candidate, target))
+            self.candidates.dismiss(candidate)
+            if self.looks[-1].place >= (1 + self.thresholds.confirm) / 2:
+                return OUTCOMES.index("found")
+        if not over and len(self.looks) < self.most:
+            return 0
+        if self.looks and self._best().place >= self.thresholds.confirm:
+            return OUTCOMES.index("found")
+        return OUTCOMES.index("absent") if self._presence(step.belief) < 0.5 else len(OUTCOMES) - 1
+
+    def _look(self, step: Step, candidate: CandidatePlace, target: int) -> CloserLook:
+        """Look closely at a candidate."""
+        presence = float(step.belief.presence(self.target))
+        closer = self.close_up(candidate.box)
+        features, box = closer_features(
+            presence, candidate.probability, candidate.evidence, closer, candidate.box, target
+        )
+        place, presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
+        return CloserLook(step.shift, cell_of(box, self.candidates.grid), box, place, presence)
+
+    def _best(self) -> CloserLook:
+        """The closer look with the largest probability of the place."""
+        return max(self.looks, key=lambda look: look.place)
+
+    def _presence(self, belief: Belief) -> float:
+        """Probability that the image holds the target: the largest after a closer look, or that of the belief."""
+        return max((look.presence for look in self.looks), default=float(belief.presence(self.target)))

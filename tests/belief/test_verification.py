@@ -1,0 +1,108 @@
+"""Verification by closer looks: features against a loop, files, and what the model refuses."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semfov import Detections
+from semfov.belief import TargetEvidence, Verification
+from semfov.belief.target_evidence import Thresholds
+from semfov.belief.verification import closer_features
+from semfov.errors import DataError
+
+
+def seen(count, seed):
+    """Random detections of one look, some of them masked."""
+    generator = torch.Generator().manual_seed(seed)
+    corner = torch.rand(1, count, 2, generator=generator) * 60
+    boxes = torch.cat([corner, corner + 5 + torch.rand(1, count, 2, generator=generator) * 60], -1)
+    scores = (2 * torch.randn(1, count, 4, generator=generator)).softmax(-1)
+    return Detections(boxes, scores, torch.rand(1, count, generator=generator) < 0.8)
+
+
+def overlap(one, other):
+    width = min(one[2], other[2]) - max(one[0], other[0])
+    height = min(one[3], other[3]) - max(one[1], other[1])
+    shared = max(0.0, width) * max(0.0, height)
+    areas = [(x2 - x1) * (y2 - y1) for x1, y1, x2, y2 in (one, other)]
+    return shared / (sum(areas) - shared)
+
+
+def logit(chance):
+    chance = min(max(chance, 0.001), 0.999)
+    return math.log(chance / (1 - chance))
+
+
+@given(st.integers(0, 6), st.integers(0, 10_000), *[st.floats(0, 1)] * 3)
+def test_features_equal_a_loop(count, seed, presence, cell, evidence):
+    closer, box = seen(count, seed), torch.tensor([20.0, 30, 70, 90])
+    target, best, match, chosen = 2, -1.0, None, box
+    highest = other = 0.0
+    for number in range(count):
+        if not closer.mask[0, number]:
+            continue
+        shared = overlap(closer.boxes[0, number].tolist(), box.tolist())
+        scores = closer.scores[0, number].tolist()
+        highest = max(highest, scores[target])
+        other = max(other, shared * max(scores[1], scores[3]))
+        if scores[target] * shared > best:
+            best, match = scores[target] * shared, (scores[target], shared, number)
+    if match is not None and match[1] >= 0.3:
+        chosen = closer.boxes[0, match[2]]
+    expected = [presence, cell, evidence, max(best, 0.0), highest, other, match[0] if match else 0.0]
+    features, found = closer_features(presence, cell, evidence, closer, box, target)
+    torch.testing.assert_close(features, torch.tensor([logit(each) for each in expected]), atol=2e-4, rtol=2e-4)
+    assert torch.equal(found, chosen)
+
+
+def test_detections_that_are_masked_change_nothing():
+    closer, box = seen(5, 1), torch.tensor([20.0, 30, 70, 90])
+    kept = closer.mask[0]
+    alone = Detections(closer.boxes[:, kept], closer.scores[:, kept], closer.mask[:, kept])
+    for one, other in zip(
+        closer_features(0.5, 0.5, 0.5, closer, box, 1), closer_features(0.5, 0.5, 0.5, alone, box, 1), strict=True
+    ):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("thresholds", [None, Thresholds(0.7, 0.3, 0.2)])
+def test_the_model_survives_a_file(tmp_path, thresholds):
+    model = Verification(thresholds=thresholds, metadata={"detector": {"name": "mine"}, "sensor": {}})
+    model.save(tmp_path / "mine.safetensors")
+    loaded = Verification.from_pretrained(tmp_path / "mine.safetensors")
+    features = torch.randn(3, 7)
+    assert torch.equal(loaded(features), model(features))
+    assert (loaded.thresholds, loaded.metadata) == (thresholds, model.metadata)
+    assert not loaded.training
+
+
+def test_files_of_other_models_are_refused(tmp_path):
+    TargetEvidence(4, 4, components=3).save(tmp_path / "other.safetensors")
+    with pytest.raises(DataError, match=r"verification"):
+        Verification.from_pretrained(tmp_path / "other.safetensors")
+
+
+def test_shipped_models_are_loaded_by_name_and_others_are_none():
+    assert Verification.if_shipped("no such model") is None
+    shipped = sorted(path.stem for path in Verification.shipped.glob("*.safetensors"))
+    assert shipped
+    for name in shipped:
+        model = Verification.if_shipped(name)
+        assert model is not None
+        assert model.thresholds is not None
+        evidence = TargetEvidence.from_pretrained(name)
+        # It was fitted for the detector and the sensor of the evidence of the same name.
+        assert model.metadata["sensor"] == evidence.metadata["sensor"]
+        model.check_compatible(evidence.metadata)
+
+
+@pytest.mark.parametrize("name", ["yolox-nano", "yolov3-tiny"])
+def test_a_better_closer_look_raises_both_shipped_probabilities(name):
+    """More score for the target at the place and in the window, and less for other classes, never lower the place."""
+    model = Verification.from_pretrained(name)
+    weak = torch.tensor([0.0, 0.0, 0.0, -5.0, -5.0, 2.0, -5.0])
+    strong = torch.tensor([0.0, 0.0, 0.0, 3.0, 3.0, -5.0, 3.0])
+    assert bool((model(strong) > model(weak)).all())

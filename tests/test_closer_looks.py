@@ -1,0 +1,163 @@
+"""Searches with closer looks: what an eye sees closely, and the decisions of an agent that looks closely."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from semfov import ActivePerception, Eye, Foveation, Scanpath
+from semfov.belief import Verification
+from semfov.belief.observers import Semantic
+from semfov.belief.target_evidence import Thresholds
+from semfov.detection import Candidates
+from semfov.errors import DataError, InputError
+from semfov.gaze.policies import NonPredictive, Random
+from semfov.scanpath import describe, why_it_ended
+from tests.test_decision import Scripted, Square, cells
+
+
+class Fine(Square):
+    """Detects red that is at least 30 pixels wide on the canvas as class 1, and smaller red as class 2."""
+
+    def propose(self, canvas):
+        found = super().propose(canvas)
+        if found.boxes.numel() and float(found.boxes[0, 0, 2] - found.boxes[0, 0, 0]) < 30:
+            return Candidates(found.boxes, found.classes.flip(-1))
+        return found
+
+
+class FromScore(Verification):
+    """The probability of the place is the score of the target in the closer look."""
+
+    def forward(self, features):
+        return torch.stack([features[..., 6], features[..., 6]], -1)
+
+
+AT = Thresholds(confirm=0.7, give_up=0.1, place=0.3)
+
+
+@pytest.fixture
+def image():
+    """A red square of 20 pixels in the last cell."""
+    picture = torch.full((3, 120, 160), 0.4)
+    picture[:, 90:110, 130:150] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
+    return picture
+
+
+def agent(observer, detector=None, thresholds=AT):
+    eye = Eye(Foveation(200.0), detector or Square(), reference=160.0)
+    verification = FromScore(thresholds=thresholds)
+    search, explore = (observer, NonPredictive()), (Semantic(3), Random())
+    return ActivePerception(eye, search, explore, verification=verification, grid=(4, 3)).eval()
+
+
+@pytest.mark.parametrize("box", [(130.0, 90, 150, 110), (125.0, 95, 140, 118), (110.0, 60, 160, 120)])
+def test_boxes_of_a_closer_look_are_in_pixels_of_the_image(image, box):
+    seen = agent(Scripted((cells(), 0.5))).eye.close_up(image[None], torch.tensor(box))
+    assert seen.count.tolist() == [1]
+    torch.testing.assert_close(seen.boxes[0, 0], torch.tensor([130.0, 90, 150, 110]), atol=1.0, rtol=0)
+
+
+def test_a_closer_look_shows_more_than_the_whole_image(image):
+    eye = Eye(Foveation(200.0), Fine(), reference=160.0)
+    whole = eye.detector(image[None])
+    close = eye.close_up(image[None], whole.boxes[0, 0])
+    assert (int(whole.labels[0, 0]), int(close.labels[0, 0])) == (2, 1)
+
+
+def test_a_closer_look_needs_one_image_and_one_box(image):
+    eye = Eye(Foveation(200.0), Square(), reference=160.0)
+    with pytest.raises(InputError, match="image: expected a tensor of shape"):
+        eye.close_up(image, torch.zeros(4))
+    with pytest.raises(InputError, match="box: expected a tensor of shape"):
+        eye.close_up(image[None], torch.zeros(3))
+
+
+def test_the_search_ends_with_the_box_of_the_closer_look(image):
+    script = [(cells(c5=0.4), 0.6), (cells(c11=0.9), 0.9), (cells(c11=0.95), 0.97)]
+    looking = agent(Scripted(*script))
+    scanpath = looking.search(image, "red", start=0)
+    assert scanpath.cells.tolist() == [0, 5, 11]
+    assert (scanpath.found, scanpath.decision.outcome, scanpath.decision.cell) == (True, "found", 11)
+    torch.testing.assert_close(scanpath.decision.box, torch.tensor([130.0, 90, 150, 110]), atol=1.0, rtol=0)
+    seen = looking.eye.close_up(image[None], scanpath.detections[2].boxes[0, 0])
+    assert scanpath.decision.place == pytest.approx(float(seen.scores[0, 0, 1]), abs=1e-6)
+    (look,) = scanpath.closer
+    assert (look.fixation, look.cell) == (2, 11)
+    assert describe(scanpath).startswith("“red” found after 2 gaze shifts and 1 closer look (probability 0.")
+    assert why_it_ended(scanpath) == "A closer look confirmed the target."
+
+
+def test_what_looks_like_the_target_from_afar_is_not_found_closely(image):
+    """Seen closely, the square has no score for green; the belief alone would have found it."""
+    script = [(cells(c11=0.9, rest=0.05), 0.95)]
+    alike = agent(Scripted(*script), Fine())
+    assert alike.search(image, "green", start=11, closer=0).decision.outcome == "found"
+    scanpath = alike.search(image, "green", start=11)
+    assert scanpath.decision.outcome == "absent"
+    assert not scanpath.found
+    assert [look.place < 0.2 for look in scanpath.closer] == [True]
+
+
+def test_without_closer_looks_or_without_their_model_the_belief_decides(image):
+    script = [(cells(c5=0.4), 0.9), (cells(c11=0.9), 0.9), (cells(c11=0.95), 0.97)]
+    made = agent(Scripted(*script))
+    plain = ActivePerception(
+        made.eye, (Scripted(*script), NonPredictive()), (Semantic(3), Random()), grid=(4, 3)
+    ).eval()
+    for one in (
+        made.search(image, "red", start=0, closer=0),
+        agent(Scripted(*script), thresholds=None).search(image, "red", start=0),
+    ):
+        other = plain.search(image, "red", start=0)
+        assert one.cells.tolist() == other.cells.tolist()
+        assert one.decision.outcome == other.decision.outcome
+        assert (one.decision.place, one.closer) == (None, ())
+
+
+def test_thresholds_can_be_changed_and_are_checked(image):
+    script = [(cells(c11=0.9, rest=0.2), 0.9)]
+    assert agent(Scripted(*script)).search(image, "red", start=11, confirm=0.99).decision.outcome != "found"
+    assert agent(Scripted(*script)).search(image, "red", start=11, confirm=0.5).decision.outcome == "found"
+    for wrong in (-1, 101, 0.5):
+        with pytest.raises(InputError, match="closer: expected a whole number from 0 to 100"):
+            agent(Scripted(*script)).search(image, "red", closer=wrong)
+
+
+def test_given_boxes_and_prices_end_a_search_without_closer_looks(image):
+    script = [(cells(c11=0.9), 0.9)]
+    for options in ({"boxes": [[130.0, 90, 150, 110]]}, {"price": 0.5}):
+        assert agent(Scripted(*script)).search(image, "red", start=11, **options).closer == ()
+
+
+def test_a_search_whose_shifts_are_spent_can_still_find_its_target(image):
+    scanpath = agent(Scripted((cells(c11=0.6), 0.6))).search(image, "red", start=0, shifts=0)
+    assert scanpath.ending == "shifts"
+    assert (scanpath.found, scanpath.decision.cell) == (True, 11)
+
+
+def test_closer_looks_survive_a_file(image, tmp_path):
+    scanpath = agent(Scripted((cells(c11=0.9), 0.9))).search(image, "red", start=11)
+    scanpath.save(tmp_path / "path.safetensors")
+    loaded = Scanpath.load(tmp_path / "path.safetensors")
+    (one,), (other,) = scanpath.closer, loaded.closer
+    assert torch.equal(one.box, other.box)
+    assert replace(one, box=other.box) == other
+    assert loaded.decision.place == scanpath.decision.place
+    replace(scanpath, closer=(replace(one, cell=12),)).save(tmp_path / "path.safetensors")
+    with pytest.raises(DataError, match="closer: expected a cell below 12"):
+        Scanpath.load(tmp_path / "path.safetensors")
+
+
+def test_the_picture_and_the_page_show_closer_looks(image):
+    from semfov.report.episode import about_data
+    from semfov.viz import plot_scanpath
+
+    scanpath = agent(Scripted((cells(c11=0.9, rest=0.05), 0.95)), Fine()).search(image, "green", start=11)
+    figure = plot_scanpath(scanpath)
+    (axes,) = figure.axes
+    texts = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert "not confirmed by a closer look" in texts
+    x, y = scanpath.closer[0].box[:2].tolist()
+    assert (pytest.approx(x), pytest.approx(y)) in [patch.get_xy() for patch in axes.patches]
+    assert "Closer look at column 3, row 2: probability 0." in about_data(scanpath, None)["decision"]
