@@ -187,7 +187,7 @@ class Grid:
 
     def _window(self, boxes: Tensor) -> Tensor:
         """Weights of the `soft` footprint, including cells that a box does not overlap."""
-        half = self._align(self._cell_size(), boxes[..., :2])[..., None, :] / 2
+        half = self._align(self._cell_size(), boxes)[..., None, :] / 2
         box_half = (boxes[..., None, 2:] - boxes[..., None, :2]) / 2
         middle = (boxes[..., None, :2] + boxes[..., None, 2:]) / 2
         offset = (self.centres + 0.5)[..., None, :, :].to(boxes) - middle

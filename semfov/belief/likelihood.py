@@ -78,4 +78,4 @@ def likelihoods(
     likelihood = torch.where(detections.mask[..., None], detections.scores, uniform)
     if observation is not None:
         likelihood = observation.calibrate(likelihood, grid.box_distance(detections.boxes, fixation))
-    return likelihood if tempering == 1 else likelihood.pow(tempering)
+    return likelihood.pow(tempering)

@@ -73,7 +73,7 @@ def class_features(detections: Detections, fixation: Tensor, grid: Grid, targets
     distance = grid.distance(fixation)[:, None]
     if detections.mask.shape[1] == 0:
         nothing = fixation.new_zeros(batch, 1, components)
-        detections = Detections(fixation.new_zeros(batch, 1, 4), nothing, nothing[..., 0] > 0)
+        detections = Detections(fixation.new_zeros(batch, 1, 4), nothing, nothing[..., 0].bool())
     # Dimensions: looks, classes, detections, cells.
     weight = (grid.footprint(detections.boxes, "soft") * detections.mask[..., None])[:, None]
     touches = weight > 0

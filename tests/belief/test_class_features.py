@@ -102,6 +102,15 @@ def test_features_do_not_depend_on_padding_or_order(random_looks):
     assert torch.equal(class_features(Detections(boxes, scores, looks.mask), FIXATIONS, GRID, every), expected)
 
 
+def test_features_of_boxes_smaller_than_a_pixel_equal_a_loop(random_looks):
+    looks = random_looks(dtype=torch.float64)
+    small = Detections(torch.cat([looks.boxes[..., :2], looks.boxes[..., :2] + 0.3], -1), looks.scores, looks.mask)
+    got = class_features(small, FIXATIONS.double(), GRID, torch.tensor([2]))[:, 0]
+    for look in range(4):
+        for cell in range(24):
+            assert got[look, cell].tolist() == pytest.approx(features_by_loop(small, look, 2, cell), abs=1e-9)
+
+
 @pytest.mark.parametrize("most", [0, 3])
 def test_features_without_detections_equal_a_loop(most):
     """No detections, with padding or without."""
@@ -149,8 +158,9 @@ def test_gradients_through_scores_and_boxes(random_looks):
 
 def test_bad_input(random_looks):
     looks = random_looks()
-    with pytest.raises(InputError, match="fixation"):
-        class_features(looks, FIXATIONS[:2], GRID, torch.tensor([1]))
+    for fixations in (FIXATIONS[:2], torch.zeros(4, 3)):
+        with pytest.raises(InputError, match=r"^fixation: expected a tensor of shape \(..., 4, 2\)"):
+            class_features(looks, fixations, GRID, torch.tensor([1]))
     for target in (0, 5):
         with pytest.raises(InputError, match="target: expected a class from 1 to 4"):
             look_features(looks, FIXATIONS, GRID, target)

@@ -10,6 +10,7 @@ from semfov import Detections, Grid
 from semfov.belief import ContextPrior, TargetEvidence
 from semfov.belief.context import presence_of, reaches
 from semfov.belief.observers import Context, Semantic, Target
+from semfov.belief.observers.context import log_odds
 from semfov.belief.target_evidence import Thresholds
 from semfov.errors import DataError, InputError
 
@@ -43,30 +44,29 @@ def looks():
     return Detections(boxes, torch.rand(3, 4, 4, generator=generator).softmax(-1), mask)
 
 
-def highest_presence_within(presence, cell, component, edge):
-    """Highest presence of a class within a distance of a cell, in scalars."""
-    best = 0.0
-    for other in range(20):
-        offset = (GRID.centres[cell] - GRID.centres[other]).abs().amax() / 100
-        if offset <= edge + 1e-6:
-            best = max(best, float(presence[other, component]))
-    return best
+def highest_presence_within(presence, cell, edge):
+    """Highest presence of each class within a distance of a cell, `(K+1,)`."""
+    offset = (GRID.centres - GRID.centres[cell]).abs().amax(-1) / 100
+    return presence[offset <= edge + 1e-6].amax(0)
 
 
-@pytest.mark.slow
 def test_cooccurrence_equals_the_loop(prior, presence):
     got = prior(presence, GRID, torch.tensor([1, 3]), (0.0, 1.0))
     assert got.dtype == presence.dtype
     for row, target in enumerate([1, 3]):
         for cell in range(20):
-            expected = 0.0
-            for component in range(4):
-                nearer = 0.0
-                for band, edge in enumerate([*EDGES, math.inf]):
-                    within = highest_presence_within(presence[row], cell, component, edge)
-                    expected += (within - nearer) * float(prior.cooccurrence[target, component, band])
-                    nearer = within
+            expected, nearer = 0.0, torch.zeros_like(presence[row, cell])
+            for band, edge in enumerate([*EDGES, math.inf]):
+                within = highest_presence_within(presence[row], cell, edge)
+                expected += float((within - nearer) @ prior.cooccurrence[target, :, band].to(within))
+                nearer = within
             assert float(got[row, cell]) == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("weights", [(1.0, 0.0), (0.0, 1.0)], ids=["place", "cooccurrence"])
+def test_context_has_the_precision_of_the_presence(prior, presence, weights):
+    for prior_dtype in (torch.float32, torch.float64):
+        assert prior.to(prior_dtype)(presence, GRID, 1, weights).dtype == presence.dtype
 
 
 def test_presence_within_growing_distances_ends_with_the_whole_image(presence):
@@ -158,6 +158,20 @@ def test_looks_joined_over_targets_equal_those_of_each_target(prior, looks, kind
         torch.testing.assert_close(both[row : row + 1].present, alone.present)
 
 
+@pytest.mark.parametrize("kind", [0, 1], ids=["evidence", "map"])
+def test_belief_before_the_first_look_has_even_odds_and_shows_nothing(prior, kind):
+    belief = Context(observers()[kind], prior).start(2, GRID, torch.empty(0, dtype=torch.float64))
+    even = torch.full((2, 20), 0.5, dtype=torch.float64)
+    assert torch.equal(belief.probability(1), even)
+    assert torch.equal(belief.chance(1), even)
+    assert torch.equal(belief.shown, torch.zeros(2, 20, 4, dtype=torch.float64))
+
+
+def test_log_odds_of_certain_cells_are_finite():
+    got = log_odds(torch.tensor([0.0, 0.2, 0.5, 1.0], dtype=torch.float64))
+    assert got.tolist() == pytest.approx([math.log(1e-6), math.log(0.25), 0, -math.log(1e-6)], rel=1e-6)
+
+
 def test_weights_of_zero_change_nothing(prior, looks):
     inner = observers()[1]
     observer = Context(inner, prior, (0.0, 0.0))
@@ -189,8 +203,9 @@ def test_bad_input(prior, looks):
     nothing = torch.zeros(1, 20, 4)
     with pytest.raises(InputError, match="target"):
         prior(nothing, GRID, 4)
-    with pytest.raises(InputError, match="presence"):
-        prior(nothing[:, :5], GRID, 1)
+    for presence in (nothing[:, :5], nothing[..., :3], nothing[0]):
+        with pytest.raises(InputError, match=r"^presence:"):
+            prior(presence, GRID, 1)
     with pytest.raises(InputError, match="size of one image"):
         prior(nothing, Grid(5, 4, torch.tensor([[100.0, 60.0]])), 1)
     with pytest.raises(InputError, match="target"):
@@ -207,7 +222,8 @@ def test_bad_input(prior, looks):
 def test_distances_between_cells_are_in_units_of_the_longer_side(presence, size):
     """Cell by cell, in a tall and in a wide picture."""
     grid = Grid(4, 5, size)
-    for edge, got in zip(EDGES, reaches(presence, grid, EDGES), strict=False):
+    edges = [*EDGES, 0.9]
+    for edge, got in zip(edges, reaches(presence, grid, edges), strict=False):
         for cell in range(20):
             offset = (grid.centres - grid.centres[cell]).abs().amax(-1) / 100
             near = presence[:, offset <= edge + 1e-6].amax(1)
@@ -215,7 +231,7 @@ def test_distances_between_cells_are_in_units_of_the_longer_side(presence, size)
 
 
 def test_tables_must_be_square(prior):
-    for place in (torch.zeros(4, 2, 3), torch.zeros(3, 2, 2), torch.zeros(2, 2)):
+    for place in (torch.zeros(4, 2, 3), torch.zeros(3, 2, 2), torch.zeros(2, 2), torch.zeros(4)):
         with pytest.raises(InputError, match=r"^place:"):
             ContextPrior(prior.classes, place, prior.cooccurrence, EDGES)
     for pairs in (torch.zeros(4, 3, 4), torch.zeros(3, 4, 4), torch.zeros(4, 4, 3)):

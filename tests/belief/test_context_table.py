@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from semfov.belief import ContextPrior
+from semfov.belief import ContextPrior, context_table
 from semfov.belief.context_table import read_table, write_table
 from semfov.errors import DataError, InputError
 
@@ -87,7 +87,8 @@ def test_a_prior_saved_and_loaded_keeps_the_record_of_its_source(path, tmp_path)
 
 
 def test_a_written_table_is_read_back_unchanged(tmp_path):
-    names, values = ["cup", 'a "b", c'], torch.tensor([[math.nan, 0.125], [-3.5, 7.0]])
+    names, values = ["cup", 'a "b", c', "two\r\nlines"], torch.tensor([[math.nan, 0.125], [-3.5, 7.0], [1000, -1000]])
+    values = torch.cat([values, values[:, :1]], 1)
     write_table(tmp_path / "t.csv", names, names, values)
     table = read_table(tmp_path / "t.csv")
     assert (table.rows, table.columns) == (tuple(names), tuple(names))
@@ -133,6 +134,24 @@ def test_errors_in_a_table_name_the_line(path, text, message):
 def test_a_written_table_has_exactly_the_expected_bytes(tmp_path):
     write_table(tmp_path / "t.csv", ["cup"], ["cow", "a, b"], torch.tensor([[0.125, math.nan]]))
     assert (tmp_path / "t.csv").read_bytes() == b',cow,"a, b"\ncup,0.125,\n'
+
+
+def test_a_byte_order_mark_is_not_part_of_the_first_cell(path):
+    path.write_text('\ufeff"of, with",cup\ncow,2\n', encoding="utf-8")
+    table = read_table(path)
+    assert (table.rows, table.columns, table.values.tolist()) == (("cow",), ("cup",), [[2.0]])
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (3, 3), (4, 3), (3, 4)])
+def test_the_number_of_names_is_limited(path, monkeypatch, rows, columns):
+    monkeypatch.setattr(context_table, "_MOST", 3)
+    names = [f"thing {index}" for index in range(4)]
+    write_table(path, names[:rows], names[:columns], torch.zeros(rows, columns))
+    if max(rows, columns) <= 3:
+        assert read_table(path).values.shape == (rows, columns)
+    else:
+        with pytest.raises(DataError, match="expected 1 to 3 names"):
+            read_table(path)
 
 
 @pytest.mark.parametrize(

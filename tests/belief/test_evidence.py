@@ -43,8 +43,8 @@ def test_inputs_of_a_network_equal_a_reference_in_numpy(toy_map, gathered, refer
         assert torch.equal(recorder.read[row, :, READOUT:], torch.stack([more, 2 * more], -1))
 
 
-@pytest.mark.parametrize("columns", [1, 24])
-def test_inputs_of_a_network_on_grids_of_one_row_or_column(toy_map, gathered, reference, columns):
+@pytest.mark.parametrize("columns", [1, 2, 12, 24])
+def test_inputs_of_a_network_on_grids_of_few_rows_or_columns(toy_map, gathered, reference, columns):
     said, model, recorder = gathered(), toy_map().double(), Recorder()
     model.read_out(recorder, said.nearest, said, columns)
     for row in range(8):
@@ -52,6 +52,11 @@ def test_inputs_of_a_network_on_grids_of_one_row_or_column(toy_map, gathered, re
         prior = float(model.prior[said.target[row]].detach())
         expected = reference.readout_features(*rest, float(said.looks[row]), prior, columns)
         np.testing.assert_allclose(reference.array(recorder.read[row]), expected, atol=1e-7, rtol=1e-6)
+
+
+def test_inputs_of_a_network_have_the_precision_of_the_evidence(toy_map, gathered):
+    model, recorder, said = toy_map().bfloat16(), Recorder(), gathered(dtype=torch.bfloat16)
+    assert model.read_out(recorder, said.nearest, said, 6).dtype == recorder.read.dtype == torch.bfloat16
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.6, 1.5, 4.0])

@@ -144,6 +144,12 @@ def test_likelihoods_of_raw_scores_are_the_scores_and_uniform_for_padding():
     torch.testing.assert_close(tempered, raw.double().pow(0.25).float())
 
 
+@pytest.mark.parametrize("shape", [(2,), (2, 2), (1, 3)])
+def test_likelihoods_need_one_fixation_for_each_look(shape):
+    with pytest.raises(InputError, match=r"^fixation: expected a tensor of shape \(..., 1, 2\)"):
+        likelihoods(seen(Grid(4, 3, (100, 60))), torch.zeros(shape), Grid(4, 3, (100, 60)))
+
+
 def test_a_map_starts_with_the_prior_in_the_given_dtype():
     start = Semantic(2, prior=0.25).start(3, Grid(2, 2, (10, 10)), torch.empty(0, dtype=torch.float64))
     assert torch.equal(start.beta, torch.full((3, 4, 2), 0.25, dtype=torch.float64))

@@ -76,6 +76,26 @@ def test_centre_rule_leaves_out_barely_touched_cells():
     assert set(grid.footprint(box, "centre")[0].nonzero()[:, 0].tolist()) == {21, 22}
 
 
+@pytest.mark.parametrize("size", [(96, 56), torch.tensor([100.0, 60.0]).double()], ids=["exact", "rounded"])
+def test_a_cell_as_a_box_covers_only_itself(size):
+    """Also where the size of the image has more digits than the box, so that borders are rounded."""
+    grid = Grid(6, 7, size)
+    assert torch.equal(grid.footprint(grid.edges.float()), torch.eye(42, dtype=torch.bool))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_a_centre_on_the_left_or_upper_border_of_a_box_is_inside_and_on_the_others_outside(dtype):
+    """The image is a pixel wide, so that errors of half a pixel would show."""
+    grid = Grid(6, 7, torch.tensor([1.0, 0.6], dtype=dtype))
+    centres, row, column = (grid.centres + 0.5).float(), torch.arange(42) // 6, torch.arange(42) % 6
+    far = torch.tensor([1.0, 0.6]).expand(42, 2)
+    inside = (column >= column[:, None]) & (row >= row[:, None])
+    assert torch.equal(grid.footprint(torch.cat([centres, far], -1), "centre"), inside)
+    before = (column < column[:, None]) & (row < row[:, None])
+    some = before.any(-1)
+    assert torch.equal(grid.footprint(torch.cat([0 * far, centres], -1), "centre")[some], before[some])
+
+
 def test_soft_weights_are_a_normal_window_inside_the_box():
     grid = Grid(10, 5, (100, 100))
     box = torch.tensor([[12.0, 12.0, 38.0, 58.0], [5.0, 5.0, 5.0, 9.0]], dtype=torch.float64)
@@ -88,11 +108,11 @@ def test_soft_weights_are_a_normal_window_inside_the_box():
 
 
 def test_batch_of_sizes_equals_single_grids():
-    sizes = [(640, 480), (300, 500)]
+    sizes = [(640, 480), (300, 500), (90, 90)]
     torch.manual_seed(0)
-    corner = torch.rand(2, 5, 2) * 300
-    boxes = torch.cat([corner, corner + torch.rand(2, 5, 2) * 200], -1)
-    fixation = torch.rand(2, 2) * 300
+    corner = torch.rand(3, 5, 2) * 300
+    boxes = torch.cat([corner, corner + torch.rand(3, 5, 2) * 200], -1)
+    fixation = torch.rand(3, 2) * 300
     batch = Grid(5, 4, torch.tensor(sizes))
     for rule in ("overlap", "centre", "box_centre", "soft"):
         singles = [Grid(5, 4, size).footprint(b, rule) for size, b in zip(sizes, boxes, strict=True)]
@@ -101,6 +121,7 @@ def test_batch_of_sizes_equals_single_grids():
         torch.testing.assert_close(getattr(batch, name)[1], getattr(Grid(5, 4, sizes[1]), name))
     single = Grid(5, 4, sizes[1]).box_distance(boxes[1], fixation[1])
     torch.testing.assert_close(batch.box_distance(boxes, fixation)[1], single)
+    torch.testing.assert_close(batch.distance(fixation)[1], Grid(5, 4, sizes[1]).distance(fixation[1]))
 
 
 def test_distances_are_in_units_of_the_longer_side():
@@ -115,6 +136,7 @@ def test_distances_are_in_units_of_the_longer_side():
     [
         lambda: Grid(0, 3, (10, 10)),
         lambda: Grid(3, 3, (10, 0)),
+        lambda: Grid(3, 3, (10, 10, 10)),
         lambda: Grid(3, 3, (10, 10)).footprint(torch.zeros(4)),
         lambda: Grid(3, 3, (10, 10)).footprint(torch.zeros(1, 4), "all"),
         lambda: Grid(3, 3, (10, 10)).cell_of(torch.zeros(3)),
@@ -123,6 +145,10 @@ def test_distances_are_in_units_of_the_longer_side():
 def test_bad_input(call):
     with pytest.raises(InputError):
         call()
+
+
+def test_an_image_may_be_as_small_as_a_pixel():
+    assert Grid(2, 1, (1, 0.5)).centres.tolist() == [[-0.25, -0.25], [0.25, -0.25]]
 
 
 @pytest.mark.parametrize("shape", [(4,), (2, 3), (2, 5)])

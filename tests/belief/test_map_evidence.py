@@ -161,6 +161,14 @@ def test_gain_equals_a_loop(toy_map, reference, dtype, wide, device):
             np.testing.assert_allclose(reference.array(got[episode, fixation]), expected, atol=1e-5)
 
 
+def test_gain_with_two_classes_equals_a_loop(toy_map, reference):
+    model, probabilities = toy_map(components=3).double(), draw(1, 24, 3).sigmoid()
+    closest, distance = torch.full((1, 24), 0.5, dtype=torch.float64), GRID.cell_distance[[3]].double()
+    got = model.gain(probabilities, closest, torch.ones(1).double(), distance)[0, 0]
+    expected = reference.gain(model, *map(reference.array, (probabilities[0], closest[0])), 1.0, distance[0].numpy())
+    np.testing.assert_allclose(reference.array(got), expected, atol=1e-9)
+
+
 def test_gain_is_zero_where_the_look_is_not_closer_than_before(toy_map):
     model = toy_map().double()
     probabilities, looks = torch.rand(1, 24, 5).double(), torch.ones(1).double()
@@ -170,6 +178,10 @@ def test_gain_is_zero_where_the_look_is_not_closer_than_before(toy_map):
     assert not got[[0, 13]].any()
     assert torch.equal(got != 0, distance < closest)
     assert not model.gain(probabilities, 0 * closest, looks, distance).any()
+    # Up to a millionth of the longer side, two distances count as equal.
+    for difference, closer in ((1e-6, False), (2e-6, True)):
+        got = model.gain(probabilities, torch.full_like(closest, difference), looks, 0 * distance)
+        assert bool((got != 0).all()) == closer
 
 
 def test_gradients(toy_map, gathered):
@@ -285,8 +297,22 @@ def test_a_map_for_yolox_nano_is_shipped():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("look_width", 0), ("readout_width", 0), ("components", 2), ("components", 3.0)]
+    ("name", "value"),
+    [("look_width", 0), ("readout_width", 0), ("components", 2), ("components", 10_001), ("components", 3.0)],
 )
 def test_invalid_sizes_are_refused(name, value):
     with pytest.raises(InputError, match=f"{name}: expected a whole number"):
         MapEvidence(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("settings", "widths", "components"),
+    [
+        ({}, (48, 24), 81),
+        ({"look_width": 1, "readout_width": 1, "components": 3}, (1, 1), 3),
+        ({"look_width": 1, "readout_width": 1, "components": 10_000}, (1, 1), 10_000),
+    ],
+)
+def test_default_sizes_and_sizes_at_their_limits(settings, widths, components):
+    model = MapEvidence(**settings)
+    assert (model.widths, len(model.prior)) == (widths, components)

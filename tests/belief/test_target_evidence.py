@@ -540,4 +540,5 @@ def test_thresholds_are_changed_one_by_one():
 
 
 def test_the_default_classes_are_those_of_coco():
-    assert TargetEvidence(4, 3).prior.shape == (81,)
+    assert TargetEvidence().prior.shape == (81,)
+    assert TargetEvidence().widths == (48, 24)

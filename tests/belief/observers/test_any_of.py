@@ -91,6 +91,23 @@ def test_belief_fades_like_that_of_the_inner_observer(inner, looks):
     torch.testing.assert_close(faded.probability(1), 1 - missing)
 
 
+def test_a_look_is_weighed_once_for_each_class_or_once_for_all(inner, looks):
+    """Once for all if the evidence does not depend on the target; classes without weight are left out."""
+    observer = AnyOf(inner, {1: 1.0, 2: 0.0, 3: 0.4})
+    once = 2 if inner.by_target else 1
+    assert len(observer.weigh(looks, FIXATIONS, GRID).inner) == len(observer.start(1, GRID, looks.scores).inner) == once
+    assert observer.weights == {1: 1.0, 3: 0.4}
+
+
+def test_the_inner_observer_fades_each_belief_with_its_look(inner, looks, monkeypatch):
+    observer, visited, calls = AnyOf(inner, WEIGHTS), torch.zeros(3, 20, dtype=torch.bool), []
+    belief, look = observer.start(3, GRID, looks.scores), observer.weigh(looks, FIXATIONS, GRID)
+    monkeypatch.setattr(inner, "fade", lambda *given: calls.append(given) or given[0])
+    observer.fade(belief, look, 0.5, visited)
+    for call, each, of in zip(calls, belief.inner, look.inner, strict=True):
+        assert all(one is other for one, other in zip(call, (each, of, 0.5, visited), strict=True))
+
+
 def test_bad_input(inner):
     for weights in ({}, {1: 0.0}, {1: 1.5}, {1: -0.1, 2: 1.0}):
         with pytest.raises(InputError, match="weights"):

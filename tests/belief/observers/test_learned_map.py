@@ -1,6 +1,6 @@
 """The learned map: gathered evidence and belief against numpy, look by look; episodes, gradients, dtypes, devices."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def believe(observer, looks, order, grid=GRID, fixations=FIXATIONS):
     return belief
 
 
-def gather_in_numpy(model, looks, order, reference):
+def gather_in_numpy(model, looks, order, reference, stands_for=None):
     """The same in numpy: the gathered evidence, and the probabilities computed from it."""
     fixations, cells = FIXATIONS.to(looks.scores), 24
     features = class_features(looks, fixations, GRID, CLASSES)
@@ -49,7 +49,7 @@ def gather_in_numpy(model, looks, order, reference):
         score = np.maximum(score, shown[look])
         visited[FIXATED[look]] = True
     odds = reference.class_odds(model, nearest, best, total / weight, closest, len(order), [1, 2, 3, 4], 6)
-    nothing = reference.emptiness(model, odds, closest, len(order), 6)
+    nothing = reference.emptiness(model, odds, closest, len(order), 6, stands_for)
     probabilities = scipy.special.expit(np.concatenate([nothing[None], odds])).T
     return {
         "probabilities": probabilities,
@@ -78,6 +78,24 @@ def test_belief_equals_a_reference_in_numpy(random_looks, toy_map, reference, or
         assert tensor.device.type == device.type, name
         assert tensor.dtype in (dtype, torch.bool), name
         np.testing.assert_allclose(reference.array(tensor[0]), np.asarray(value), atol=close, rtol=close, err_msg=name)
+
+
+def test_classes_that_stand_for_several_count_several_times_for_background(random_looks, toy_map, reference):
+    looks, model, stands_for = random_looks(dtype=torch.float64), toy_map().double(), [1, 3, 9, 2]
+    observer = LearnedMap(model)
+    with torch.no_grad():
+        look = observer.weigh(looks[:1], FIXATIONS[:1].double(), GRID)
+        look = replace(look, stands_for=torch.tensor([stands_for]))
+        belief = observer.update(observer.start(1, GRID, looks.scores), look)
+    expected = gather_in_numpy(model, looks, (0,), reference, stands_for)
+    np.testing.assert_allclose(reference.array(belief.probabilities[0]), expected["probabilities"], atol=1e-6)
+
+
+@pytest.mark.parametrize("make", [LearnedMap, Target])
+def test_episodes_are_computed_one_by_one_unless_together_is_set(make):
+    model = (MapEvidence if make is LearnedMap else TargetEvidence)(4, 4, components=4)
+    for observer, sizes in ((make(model), [1, 1, 1]), (make(model, together=True), [3])):
+        assert observer.each(lambda rows: torch.tensor([len(rows)]), torch.zeros(3, 2)).tolist() == sizes
 
 
 def test_belief_before_the_first_look(toy_map, device):

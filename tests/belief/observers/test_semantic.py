@@ -40,8 +40,9 @@ def watch(observer, looks):
     return belief
 
 
-def believe_by_loop(looks, *, tempering=1.0, footprint="overlap", memory="all", missed=None):
+def believe_by_loop(looks, *, tempering=1.0, footprint="overlap", memory="all", missed=None, rule="kaplan"):
     """Belief after the three looks, cell by cell in scalars."""
+    fuse = fusion.RULES[rule]
     beta = torch.full((20, 4), 0.5, dtype=torch.float64)
     for cell in range(20):
         order = range(3)
@@ -55,9 +56,9 @@ def believe_by_loop(looks, *, tempering=1.0, footprint="overlap", memory="all", 
                 if weight > 0:
                     covered = True
                     likelihood = looks.scores[look, detection].double() ** (tempering * weight)
-                    beta[cell] = fusion.kaplan(beta[cell], likelihood)
+                    beta[cell] = fuse(beta[cell], likelihood)
             if missed is not None and not covered:
-                beta[cell] = fusion.kaplan(beta[cell], missed.miss_likelihood(offset[look]).double())
+                beta[cell] = fuse(beta[cell], missed.miss_likelihood(offset[look]).double())
     return beta
 
 
@@ -70,12 +71,16 @@ def believe_by_loop(looks, *, tempering=1.0, footprint="overlap", memory="all", 
         {"footprint": "centre"},
         {"memory": "closest"},
         {"misses": MISSES},
+        {"fusion": "product"},
+        {"fusion": "sum"},
+        {"fusion": "sum", "misses": MISSES},
     ],
-    ids=["published", "tempered", "soft", "centre", "closest", "misses"],
+    ids=["published", "tempered", "soft", "centre", "closest", "misses", "product", "sum", "sum and misses"],
 )
 def test_belief_equals_the_loop(looks, options):
     belief = watch(Semantic(4, **options), looks)
-    loop_options = {("missed" if name == "misses" else name): value for name, value in options.items()}
+    names = {"misses": "missed", "fusion": "rule"}
+    loop_options = {names.get(name, name): value for name, value in options.items()}
     torch.testing.assert_close(belief.beta[0], believe_by_loop(looks, **loop_options), rtol=1e-5, atol=1e-6)
     offset = torch.cdist(GRID.centres, FIXATIONS) / 100
     torch.testing.assert_close(belief.closest[0].float(), offset.amin(1))
@@ -172,7 +177,15 @@ def test_a_belief_keeps_its_dtype_whatever_the_dtype_of_the_look(looks):
     observer = Semantic(4, misses=MISSES)
     look = observer.weigh(looks[:1], FIXATIONS[:1], GRID)
     for dtype in (torch.float32, torch.float64):
-        said = SemanticLook(look.likelihood.to(dtype), look.footprint, look.distance)
+        said = SemanticLook(look.likelihood.to(dtype), look.footprint, look.distance.to(dtype))
         for other in (torch.float32, torch.float64):
             start = observer.start(1, GRID, torch.empty(0, dtype=other))
             assert observer.update(start, said).beta.dtype == other
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_a_look_has_the_dtype_of_the_scores(looks, dtype):
+    seen = Detections(looks.boxes, looks.scores.to(dtype), looks.mask)
+    for fixations in (FIXATIONS, FIXATIONS.double()):
+        look = Semantic(4).weigh(seen, fixations, GRID)
+        assert look.likelihood.dtype == look.distance.dtype == dtype

@@ -3,6 +3,7 @@
 import importlib.util
 import sys
 import warnings
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -113,6 +114,20 @@ def test_metrics_match_their_definitions():
     assert auc_shuffled(values, x, y, columns, rows) == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("levels", [4, 1000], ids=["many ties", "few ties"])
+def test_area_of_judd_equals_a_loop_over_thresholds(levels):
+    generator = np.random.default_rng(4)
+    values = np.round(generator.uniform(0, 1, SHAPE) * levels) / levels
+    x, y = np.array([0.0, 16.4, 5.3, 2.0]), np.array([0.2, 11.4, 6.6, 9.0])
+    fixated = np.zeros(SHAPE, dtype=bool)
+    for point in zip([0, 11, 7, 9], [0, 16, 5, 2], strict=True):
+        fixated[point] = True
+    passed = [values >= threshold for threshold in sorted(values[fixated], reverse=True)]
+    curve = [(0, 0), *((each[~fixated].mean(), each[fixated].mean()) for each in passed), (1, 1)]
+    expected = sum((b[0] - a[0]) * (a[1] + b[1]) / 2 for a, b in pairwise(curve))
+    assert auc_judd(values, x, y) == pytest.approx(expected, abs=1e-12)
+
+
 def test_log_likelihood_of_a_gaussian_matches_its_entropy():
     """Mean log likelihood of draws from a normal density is minus its entropy."""
     sigma, side = 6.0, 80
@@ -171,6 +186,13 @@ def test_points_belong_to_the_nearest_pixel():
 def test_invalid_arguments_are_refused_by_name(call, argument):
     with pytest.raises(InputError, match=f"^{argument}"):
         call()
+
+
+def test_errors_say_which_values_and_how_many_points_are_wrong():
+    with pytest.raises(InputError, match=r"got values from -2 to 1, with sums from -1 to 2$"):
+        log_density([[[-2.0, 1.0]], [[1.0, 1.0]]])
+    with pytest.raises(InputError, match=r"got 2 of 3 outside it"):
+        nss(np.ones(SHAPE), [17, 3, 0], [0, 3, 12])
 
 
 def test_each_map_of_a_batch_is_normalised_in_double_precision():

@@ -48,8 +48,8 @@ def test_fewer_than_three_fixations_have_no_similarity():
 def test_invalid_arguments_are_refused_by_name():
     with pytest.raises(InputError, match=r"^theirs:"):
         multimatch([[0, 0]] * 3, [0, 1, 2], (10, 10))
-    with pytest.raises(InputError, match=r"^durations:"):
-        multimatch([[0, 0]] * 3, [[0, 0]] * 3, (10, 10), ([1, 2, 3], [1, 2]))
+    with pytest.raises(InputError, match=r"^durations: expected 3 and 4 numbers, one for each fixation, got \(3, 2\)"):
+        multimatch([[0, 0]] * 3, [[0, 0]] * 4, (10, 10), ([1, 2, 3], [1, 2]))
 
 
 def test_byte_coordinates_do_not_overflow_and_zero_durations_are_equal():

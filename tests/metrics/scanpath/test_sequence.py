@@ -90,6 +90,11 @@ def test_invalid_arguments_are_refused_by_name(call, argument):
         call()
 
 
+def test_an_error_says_how_many_points_are_outside_the_picture():
+    with pytest.raises(InputError, match=r"got 2 outside it"):
+        cell_labels([[100, 0], [0, 0], [120, 0]], 2, 2, (100, 100))
+
+
 def test_cells_of_points_in_half_precision():
     """1025 can be represented in half precision and 1025.5 cannot."""
     assert cell_labels(np.array([[1025, 0]], dtype=np.float16), 4096, 1, (4096, 1)).tolist() == [1025]
