@@ -1,7 +1,7 @@
 """Verification of the target by closer looks, before a search decides."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,11 +15,13 @@ from semfov.decision import OUTCOMES, Decision, place_known, strength, strongest
 from semfov.detection.detections import Detections
 from semfov.episode import Step
 from semfov.errors import check, check_whole
+from semfov.observation.matching import box_iou
 
 MOST = 2
 """Default for the largest number of closer looks in a search."""
 
-_COVERED = 0.5  # cells that the box of a closer look covers with at least this weight are not examined again
+_COVERED = 0.5  # cells that an examined box covers with at least this weight are not examined again
+_SAME = 0.5  # detections with at least this overlap are of the same object
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,8 @@ class CandidatePlace:
 class CandidatePlaces:
     """Places that seem to hold the target of one search, the most evident first, each listed once.
 
-    A candidate is the cell with the largest product of probability and evidence, among the cells that no examined
-    candidate covers.
+    A candidate is the cell with the largest product of probability and evidence. Detections that overlap a box that was
+    examined by half, and the cells that it covers, are left out.
 
     Args:
         grid: the cells.
@@ -71,11 +73,12 @@ class CandidatePlaces:
     def __init__(self, grid: Grid) -> None:
         self.grid = grid
         self.looks: list[Detections] = []
+        self.boxes: list[Tensor] = []
         self.examined: Tensor | None = None
 
     def see(self, look: Detections) -> None:
         """Add the detections of a look, a batch of one."""
-        self.looks.append(look)
+        self.looks.append(self._others(look, self.boxes))
 
     def next(self, cells: Tensor, target: int) -> CandidatePlace | None:
         """Find the most evident place that was not examined.
@@ -100,11 +103,27 @@ class CandidatePlaces:
         """The probabilities, with 0 for the cells that were examined."""
         return cells if self.examined is None else cells.masked_fill(self.examined, 0)
 
-    def dismiss(self, candidate: CandidatePlace) -> None:
-        """Do not list a candidate again, nor others in the cells that it covers."""
-        covered = self.grid.footprint(candidate.box[None], "soft")[0] >= _COVERED
+    def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
+        """Do not list a candidate again, nor others at its place.
+
+        Args:
+            candidate: the candidate.
+            box: `(4,)`, the box of the target in the closer look.
+        """
+        boxes = [candidate.box, box]
+        covered = (self.grid.footprint(torch.stack(boxes), "soft") >= _COVERED).any(0)
         covered[candidate.cell] = True
         self.examined = covered if self.examined is None else self.examined | covered
+        self.boxes += boxes
+        self.looks = [self._others(look, boxes) for look in self.looks]
+
+    @staticmethod
+    def _others(look: Detections, boxes: list[Tensor]) -> Detections:
+        """The look without the detections of objects in boxes."""
+        if not boxes or not look.mask.shape[1]:
+            return look
+        other = (box_iou(look.boxes[0], torch.stack(boxes)) < _SAME).all(-1)
+        return replace(look, mask=look.mask & other)
 
 
 def cell_of(box: Tensor, grid: Grid) -> int:
@@ -201,7 +220,7 @@ class Verifier:
             if candidate is None or candidate.probability < least:
                 break
             self.looks.append(self._look(step, candidate, target))
-            self.candidates.dismiss(candidate)
+            self.candidates.dismiss(candidate, self.looks[-1].box)
             if self.looks[-1].place >= (1 + self.thresholds.confirm) / 2:
                 return OUTCOMES.index("found")
         if not over and len(self.looks) < self.most:

@@ -10,6 +10,7 @@ from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.errors import InputError
 from semfov.verifier import CandidatePlaces, Verifier
+from tests.belief.test_verification import overlap
 from tests.test_decision import Known, random_looks
 
 GRID = Grid(4, 3, (160, 120))
@@ -152,18 +153,22 @@ def test_a_wrong_setting_is_named():
 
 @pytest.mark.parametrize("seed", range(6))
 def test_candidates_come_in_the_order_of_a_loop(seed):
-    """Cells by probability times the best score and footprint, each candidate's covered cells left out afterwards."""
+    """Cells by probability times the best score and footprint; what was examined is left out, in later looks too."""
     looks, chances = random_looks(3, 5, seed), torch.rand(12, generator=torch.Generator().manual_seed(seed))
-    candidates, free = CandidatePlaces(GRID), set(range(12))
-    for number in range(3):
+    candidates, free, examined = CandidatePlaces(GRID), set(range(12)), []
+    for number in range(2):
         candidates.see(looks[number : number + 1])
     weight = GRID.footprint(looks.boxes, "soft")
-    for _ in range(4):
+    for turn in range(4):
+        if turn == 1:
+            candidates.see(looks[2:])
         value, place = 0.0, None
         for cell in sorted(free):
-            for one in range(3):
+            for one in range(2 + (turn > 0)):
                 for other in range(5):
-                    if not looks.mask[one, other]:
+                    box = looks.boxes[one, other]
+                    same = any(overlap(box.tolist(), each.tolist()) >= 0.5 for each in examined)
+                    if same or not looks.mask[one, other]:
                         continue
                     evidence = float(weight[one, other, cell] * looks.scores[one, other, 2])
                     if evidence * float(chances[cell]) > value * (1 + 1e-6):
@@ -175,9 +180,9 @@ def test_candidates_come_in_the_order_of_a_loop(seed):
         assert candidate.cell == place
         assert candidate.probability == float(chances[place])
         assert candidate.evidence * candidate.probability == pytest.approx(value)
-        best = candidate.box
-        candidates.dismiss(candidate)
-        free -= {
-            cell for cell in range(12) if cell == place or float(GRID.footprint(best[None], "soft")[0, cell]) >= 0.5
-        }
+        closer = candidate.box + 7
+        candidates.dismiss(candidate, closer)
+        covered = GRID.footprint(torch.stack([candidate.box, closer]), "soft").amax(0)
+        free -= {cell for cell in range(12) if cell == place or float(covered[cell]) >= 0.5}
+        examined += [candidate.box, closer]
     assert candidates.next(torch.zeros(12), 2) is None

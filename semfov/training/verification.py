@@ -203,7 +203,7 @@ def examine(seen: Sequence[Photograph], evidence: TargetEvidence, config: FitVer
                     )
                     right = bool(sought.goal[cell_of(box, photograph.grid)])
                     rows.append((features, right, sought.present, photograph.number % config.folds))
-                    candidates.dismiss(candidate)
+                    candidates.dismiss(candidate, box)
         photograph.close()
     if len({right for _, right, _, _ in rows}) < 2:
         raise DataError("data: expected places that hold the target and places that do not, got only one kind")
