@@ -28,7 +28,15 @@ from semfov.experiments.config import (
     SensorConfig,
 )
 from semfov.experiments.decision_report import SHARES, mean, percent, telling
-from semfov.experiments.decisions import AGENT, LANDINGS, LANDINGS_TOLD, DecisionConfig, DecisionRun, landing_cells
+from semfov.experiments.decisions import (
+    AGENT,
+    LANDINGS,
+    LANDINGS_TOLD,
+    UNVERIFIED,
+    DecisionConfig,
+    DecisionRun,
+    landing_cells,
+)
 from semfov.experiments.fitted import with_models
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
@@ -143,6 +151,10 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
             ]
         )
     decided.append(sharp_decisions(groups[names[0]]))
+    closely = ""
+    if UNVERIFIED in groups:
+        each = mean([record["closer"] for record in groups[AGENT]], 2)
+        closely = f" Closer looks count as looks; {AGENT} makes {each} of them in a search."
     return "\n".join(
         [
             f"Is the target present? {len(there)} searches ({sensed}), {int(there.sum())} of them for a present class. "
@@ -150,7 +162,7 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
             "",
             *table(rows),
             "",
-            "Decisions in %, and mean numbers of looks. `place right`: the target overlaps the reported cell, in % of "
+            f"Decisions in %, and mean numbers of looks.{closely} `place right`: the target overlaps the reported cell, in % of "
             "the searches that report one. Searches in rows with a price end when further looks are not worth that "
             "price, in right decisions per look. In the row with a detection at the gaze, a search ends when such a "
             "detection has a score of 0.5 or more. All other searches end at thresholds. The threshold of the sharp "

@@ -24,12 +24,13 @@ viz.plot_episode(scanpath)
 #
 # ## The decision
 #
-# A search has one of three outcomes. `found` comes with a cell and a box. The probability of the decision is the
-# probability that the photograph holds the target anywhere.
+# A search has one of three outcomes. `found` comes with a cell and a box. Before it, the agent looks closely at the
+# place: it enlarges a window around the box to the detector's input. The decision has two probabilities: that the
+# photograph holds the target anywhere, and that the target is at this place.
 
 # %%
 decision = scanpath.decision
-print(decision.outcome, f"{decision.probability:.2f}", "in cell", decision.cell)
+print(decision.outcome, f"{decision.probability:.2f} anywhere, {decision.place:.2f} in cell", decision.cell)
 print("box", [round(side) for side in decision.box.tolist()])
 
 # %%

@@ -208,10 +208,11 @@ def draw_legend(axes: Axes, scanpath: Scanpath, boxes: Tensor | None, fixation: 
     if boxes is not None and len(boxes):
         kinds.append((TRUTH, "--", f"annotated: {name}"))
     if fixation is not None:
-        if found_box(scanpath) is not None:
+        found = found_box(scanpath) is not None
+        if found:
             kinds.append((FOUND, "-", f"where the {name} was found"))
         if dismissed(scanpath):
-            kinds.append((FOUND, ":", "not confirmed by a closer look"))
+            kinds.append((FOUND, ":", "another closer look" if found else "not confirmed by a closer look"))
         _, labels, _ = seen_well(scanpath, fixation, MOST_BOXES)
         if scanpath.target in labels:
             kinds.append((TARGET, "-", f"last look: {name}"))
