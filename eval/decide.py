@@ -165,8 +165,8 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
             f"Decisions in %, and mean numbers of looks.{closely} `place right`: the target overlaps the reported "
             "cell, in % of the searches that report one. Searches in rows with a price end when further looks are not "
             "worth that price, in right decisions per look. In the row with a detection at the gaze, a search "
-            "ends when such a detection has a score of 0.5 or more. All other searches end at thresholds. The threshold of the sharp "
-            f"look's score is chosen so that it has as many hits as {names[0]}.",
+            "ends when such a detection has a score of 0.5 or more. All other searches end at "
+            f"thresholds. The threshold of the sharp look's score is chosen so that it has as many hits as {names[0]}.",
             "",
             *table(decided),
             "",
