@@ -68,7 +68,7 @@ class ZoomBelief:
         self.gists: list[Gist] = []
         self._changes: list[Box] = [(0, 0, lattice.columns, lattice.rows)]
         self._summed: dict[tuple[int, int], int] = {}
-        self._expected: dict[tuple[int, int], Cells] = {}
+        self._expected: dict[int, Cells] = {}
         self._sums: dict[tuple[int, int], WindowSums] = {}
         self._odds = WindowOdds(lattice, self._presence)
         self._told: dict[Window, float] = {}
@@ -141,26 +141,26 @@ class ZoomBelief:
 
     def expected(self, level: int) -> Tensor:
         """Number of objects that looks of a level are expected to find in each cell, `(rows, columns)`."""
-        return torch.from_numpy(self._expect(level, 1).copy())
+        return torch.from_numpy(self._expect(level).copy())
 
-    def _expect(self, level: int, octaves: int) -> Cells:
-        """`expected`, but 0 in cells whose closest look is less than a number of octaves coarser."""
-        if (level, octaves) not in self._expected:
-            self._expected[level, octaves] = self._compute(level, octaves, (slice(None), slice(None)))
-        return self._expected[level, octaves]
+    def _expect(self, level: int) -> Cells:
+        """`expected`, not to be written to."""
+        if level not in self._expected:
+            self._expected[level] = self._compute(level, (slice(None), slice(None)))
+        return self._expected[level]
 
-    def _compute(self, level: int, octaves: int, at: tuple[slice, slice]) -> Cells:
-        """`_expect` for some rows and columns."""
+    def _compute(self, level: int, at: tuple[slice, slice]) -> Cells:
+        """`expected` in some rows and columns."""
         steps = level - self.source.numpy()[at]
         told = np.choose(steps - 1, self.rate.numpy()[:, *at], mode="clip")
-        return told * ((steps >= octaves) & (steps <= STEPS)) * self.left.numpy()[at]
+        return told * ((steps >= 1) & (steps <= STEPS)) * self.left.numpy()[at]
 
     def _renew(self, changed: Box) -> None:
         """Compute what is expected anew in cells that have changed."""
         x1, y1, x2, y2 = changed
         at = slice(y1, y2), slice(x1, x2)
-        for (level, octaves), cells in self._expected.items():
-            cells[at] = self._compute(level, octaves, at)
+        for level, cells in self._expected.items():
+            cells[at] = self._compute(level, at)
         self._changes.append(changed)
 
     def finds(self, level: int) -> Tensor:
@@ -194,7 +194,8 @@ class ZoomBelief:
         self._summed[level, octaves] = len(self._changes)
         x1, y1, x2, y2 = zip(*changes, strict=True)
         changed = min(x1), min(y1), max(x2), max(y2)
-        return sums.update(self._expect(level + octaves - 1, octaves), changed)
+        cells = self._expect(level) if octaves == 1 else self._expect(level + 1) * (self.source.numpy() < level)
+        return sums.update(cells, changed)
 
     def odds(self, level: int) -> Tensor:
         """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf where unknown."""
@@ -254,5 +255,7 @@ def before_of(rate: Tensor, source: Tensor, look: Gist) -> Tensor:
     steps = (look.level + 1 - source).clamp(1, STEPS)
     told = rate.gather(0, (steps - 1)[None])[0]
     rows, columns = look.scores.shape[:2]
-    told = F.pad(told[None, None], (0, columns * look.scale - told.shape[1], 0, rows * look.scale - told.shape[0]))
-    return (F.avg_pool2d(told, look.scale)[0, 0] * look.scale**2 + 1e-6).log()
+    if look.scale > 1:
+        told = F.pad(told, (0, columns * look.scale - told.shape[1], 0, rows * look.scale - told.shape[0]))
+        told = F.avg_pool2d(told[None], look.scale)[0] * look.scale**2
+    return (told + 1e-6).log()
