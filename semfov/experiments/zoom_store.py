@@ -80,8 +80,8 @@ class StoredGlances(Glances):
 
     _live: Glances | None
 
-    def see(self, windows: Sequence[Window]) -> list[Glance]:
-        """The looks at windows, read from the store or computed."""
+    def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
+        """The looks at windows, read from the store or computed; they have all their hints."""
         for window in windows:
             if window not in self._known:
                 with one_thread(), torch.inference_mode():

@@ -14,7 +14,7 @@ from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
 from semfov.zoom.odds import WindowOdds
-from semfov.zoom.sums import Cells, WindowSums
+from semfov.zoom.sums import Box, Cells, WindowSums
 
 
 class Rates(Protocol):
@@ -66,8 +66,10 @@ class ZoomBelief:
         self.source = torch.full(shape, -1)
         self.left = torch.ones(shape)
         self.gists: list[Gist] = []
-        self._sums: dict[tuple[int, bool], WindowSums] = {}
+        self._changes: list[Box] = [(0, 0, lattice.columns, lattice.rows)]
+        self._summed: dict[tuple[int, int], int] = {}
         self._expected: dict[int, Cells] = {}
+        self._sums: dict[tuple[int, int], WindowSums] = {}
         self._odds = WindowOdds(lattice, self._presence)
         self._told: dict[Window, float] = {}
 
@@ -88,8 +90,12 @@ class ZoomBelief:
         Args:
             left: `(rows, columns)`, a copy of `left` from before.
         """
-        np.copyto(self.left.numpy(), left.numpy())
-        self._expected.clear()
+        before, now = left.numpy(), self.left.numpy()
+        differs = before != now
+        if differs.any():
+            rows, columns = differs.any(1).nonzero()[0], differs.any(0).nonzero()[0]
+            np.copyto(now, before)
+            self._renew((int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1))
 
     def add(self, glance: Glance) -> None:
         """Update the belief with the result of a look."""
@@ -99,7 +105,6 @@ class ZoomBelief:
         self._spread(glance.gist)
         self.gists.append(glance.gist)
         self._told.clear()
-        self._expected.clear()
 
     def discount(self, window: Window) -> None:
         """Expect nothing more inside a window, because it was looked at as closely as possible, or is about to be.
@@ -108,8 +113,11 @@ class ZoomBelief:
         this one, and looking at borders again finds less than looking elsewhere.
         """
         x1, y1, x2, y2 = window.cells
-        self.left.numpy()[max(y1, 0) : max(y2, 0), max(x1, 0) : max(x2, 0)] = 0
-        self._expected.clear()
+        x1, y1, x2, y2 = max(x1, 0), max(y1, 0), min(x2, self.lattice.columns), min(y2, self.lattice.rows)
+        if x1 < x2 and y1 < y2:
+            for cells in (self.left.numpy(), *self._expected.values()):
+                cells[y1:y2, x1:x2] = 0
+            self._changes.append((x1, y1, x2, y2))
 
     def _spread(self, look: Gist) -> None:
         """Write the rates of a look to the cells that were not looked at as closely before."""
@@ -128,21 +136,36 @@ class ZoomBelief:
         newer = source < look.level
         np.copyto(rate, cells, where=newer)
         source[newer] = look.level
+        left, top = look.first
+        self._renew((left, top, left + columns, top + rows))
 
     def expected(self, level: int) -> Tensor:
         """Number of objects that looks of a level are expected to find in each cell, `(rows, columns)`."""
         return torch.from_numpy(self._expect(level).copy())
 
     def _expect(self, level: int) -> Cells:
+        """`expected`, not to be written to."""
         if level not in self._expected:
-            steps = level - self.source.numpy()
-            told = np.choose(steps - 1, self.rate.numpy(), mode="clip")
-            self._expected[level] = told * ((steps >= 1) & (steps <= STEPS)) * self.left.numpy()
+            self._expected[level] = self._compute(level, (slice(None), slice(None)))
         return self._expected[level]
+
+    def _compute(self, level: int, at: tuple[slice, slice]) -> Cells:
+        """`expected` in some rows and columns."""
+        steps = level - self.source.numpy()[at]
+        told = np.choose(steps - 1, self.rate.numpy()[:, *at], mode="clip")
+        return told * ((steps >= 1) & (steps <= STEPS)) * self.left.numpy()[at]
+
+    def _renew(self, changed: Box) -> None:
+        """Compute what is expected anew in cells that have changed."""
+        x1, y1, x2, y2 = changed
+        at = slice(y1, y2), slice(x1, x2)
+        for level, cells in self._expected.items():
+            cells[at] = self._compute(level, at)
+        self._changes.append(changed)
 
     def finds(self, level: int) -> Tensor:
         """Number of objects that a look at each window of a level is expected to find, `(down, across)`."""
-        return torch.from_numpy(self._sum(level, tapered=True)(self._expect(level)).copy())
+        return torch.from_numpy(self._sum(level, 1).copy())
 
     def value(self, level: int, foresight: float) -> Cells:
         """Value of each window of a level for finding objects (`semfov.zoom.policy.best_find`).
@@ -154,19 +177,25 @@ class ZoomBelief:
         Returns:
             `(down, across)`, not to be written to.
         """
-        values = self._sum(level, tapered=True)(self._expect(level))
+        values = self._sum(level, 1)
         if not foresight or level + 1 >= self.lattice.levels:
             return values
-        deeper = self._expect(level + 1) * (self.source.numpy() < level)
-        return values + np.float32(foresight) * self._sum(level, tapered=False)(deeper)
+        return values + np.float32(foresight) * self._sum(level, 2)
 
-    def _sum(self, level: int, *, tapered: bool) -> WindowSums:
-        """Sums over the windows of a level, with weights that fall off towards their borders or without."""
-        if (level, tapered) not in self._sums:
+    def _sum(self, level: int, octaves: int) -> Cells:
+        """`finds` of a level (1), or of looks one octave closer, in cells not looked at from the level yet (2)."""
+        if (level, octaves) not in self._sums:
             span = self.lattice.span(level)
-            weight = self._rates.taper(span).detach().numpy() if tapered else np.ones(span, np.float32)
-            self._sums[level, tapered] = WindowSums(weight, (self.lattice.rows, self.lattice.columns))
-        return self._sums[level, tapered]
+            weight = self._rates.taper(span).detach().numpy() if octaves == 1 else np.ones(span, np.float32)
+            self._sums[level, octaves] = WindowSums(weight, (self.lattice.rows, self.lattice.columns))
+        sums, changes = self._sums[level, octaves], self._changes[self._summed.get((level, octaves), 0) :]
+        if not changes:
+            return sums.sums
+        self._summed[level, octaves] = len(self._changes)
+        x1, y1, x2, y2 = zip(*changes, strict=True)
+        changed = min(x1), min(y1), max(x2), max(y2)
+        cells = self._expect(level) if octaves == 1 else self._expect(level + 1) * (self.source.numpy() < level)
+        return sums.update(cells, changed)
 
     def odds(self, level: int) -> Tensor:
         """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf where unknown."""
@@ -226,5 +255,7 @@ def before_of(rate: Tensor, source: Tensor, look: Gist) -> Tensor:
     steps = (look.level + 1 - source).clamp(1, STEPS)
     told = rate.gather(0, (steps - 1)[None])[0]
     rows, columns = look.scores.shape[:2]
-    told = F.pad(told[None, None], (0, columns * look.scale - told.shape[1], 0, rows * look.scale - told.shape[0]))
-    return (F.avg_pool2d(told, look.scale)[0, 0] * look.scale**2 + 1e-6).log()
+    if look.scale > 1:
+        told = F.pad(told, (0, columns * look.scale - told.shape[1], 0, rows * look.scale - told.shape[0]))
+        told = F.avg_pool2d(told[None], look.scale)[0] * look.scale**2
+    return (told + 1e-6).log()

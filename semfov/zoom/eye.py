@@ -5,9 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -56,13 +54,14 @@ class Seen:
     Attributes:
         detections: a batch of F, boxes in picture pixels.
         cut: `(F, L)`, boolean, true where the border of the window cuts the box.
-        hints: weak candidates, which may overlap; a batch of F, boxes in picture pixels.
+        hints: weak candidates, which may overlap; a batch of F, boxes in picture pixels. None where they were not asked
+            for.
         windows: `(F, 4)`, the windows in picture pixels, cut to the picture.
     """
 
     detections: Detections
     cut: Tensor
-    hints: Detections
+    hints: Detections | None
     windows: Tensor
 
 
@@ -125,24 +124,27 @@ class ZoomEye(nn.Module):
         """
         return self.glance(view, fixations).detections
 
-    def glance(self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None) -> Seen:
+    def glance(
+        self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None, *, hints: bool = True
+    ) -> Seen:
         """Look at a picture and return weak candidates too.
 
         Args:
             view: the picture, from `open`.
             fixations: `(F, 3)` or `(F, 2)`, as for `look`.
             within: for each look the box of the picture that it shows; None shows all that fits the canvas.
+            hints: whether weak candidates are selected.
 
         Returns:
             Detections and hints of each look.
         """
         canvas, frames = self.glimpse(view, fixations, within)
         candidates = self.detector.propose(canvas)
-        wanted = [self.detector.selection, HINTS]
-        detections, hints = select_several(candidates, None, wanted, self.detector.background)
+        wanted = [self.detector.selection, HINTS] if hints else [self.detector.selection]
+        detections, *weak = select_several(candidates, None, wanted, self.detector.background)
         place = _Placement(frames, view.picture.size, detections.boxes)
         found, cut = self._treat(place.to_picture(detections), place.cut(detections))
-        return Seen(found, cut, place.to_picture(hints), frames[:, :4])
+        return Seen(found, cut, place.to_picture(weak[0]) if weak else None, frames[:, :4])
 
     def glimpse(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None
@@ -263,16 +265,18 @@ class _Placement:
     """
 
     def __init__(self, frames: Tensor, size: tuple[int, int], like: Tensor) -> None:
-        values = (frames.double() if like.dtype == torch.float64 else frames.float()).numpy()
-        window: NDArray[np.floating] = values[:, :4]
-        canvas: NDArray[np.floating] = values[:, 4:]
-        scale = (window[:, 2:] - window[:, :2]) / (canvas[:, 2:] - canvas[:, :2])
-        # The border of the picture cuts no object.
-        near = np.where(window[:, :2] > 0, canvas[:, :2] + BORDER, -np.inf)
-        far = np.where(window[:, 2:] < size, canvas[:, 2:] - BORDER, np.inf)
-        corners = window[:, :2], window[:, 2:], canvas[:, :2], scale
-        rows = np.stack([*(np.tile(corner, 2) for corner in corners), np.concatenate([near, far], 1)])
-        self._low, self._high, self._first, self._scale, self._border = torch.from_numpy(rows).to(like)[:, :, None]
+        wide, high = size
+        inf = math.inf
+        rows = []
+        # Python's numbers: tensors this small spend their time in calls.
+        for x1, y1, x2, y2, u1, v1, u2, v2 in frames.tolist():
+            scale = (x2 - x1) / (u2 - u1), (y2 - y1) / (v2 - v1)
+            # The border of the picture cuts no object.
+            near = u1 + BORDER if x1 > 0 else -inf, v1 + BORDER if y1 > 0 else -inf, -inf, -inf
+            far = inf, inf, u2 - BORDER if x2 < wide else inf, v2 - BORDER if y2 < high else inf
+            rows.append([[x1, y1] * 2, [x2, y2] * 2, [u1, v1] * 2, [*scale] * 2, near, far])
+        numbers = torch.tensor(rows, dtype=like.dtype, device=like.device).view(-1, 6, 1, 4)
+        self._low, self._high, self._first, self._scale, self._near, self._far = numbers.unbind(1)
 
     def to_picture(self, detections: Detections) -> Detections:
         """Map canvas boxes to picture pixels and cut them to their windows."""
@@ -282,6 +286,5 @@ class _Placement:
 
     def cut(self, detections: Detections) -> Tensor:
         """Tell which boxes touch a border of their window that lies inside the picture, `(F, L)`."""
-        low, high = self._border.split(2, -1)
-        touches = (detections.boxes[..., :2] <= low) | (detections.boxes[..., 2:] >= high)
+        touches = (detections.boxes <= self._near) | (detections.boxes >= self._far)
         return touches.any(-1) & detections.mask

@@ -1,5 +1,6 @@
 """The gist of a look at a window: the strongest hint of every class in each cell."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,23 +65,21 @@ def gist(hints: Detections, detections: Detections, lattice: Lattice, action: tu
     pitch = np.array(lattice.pitch, np.float32) * scale
     kinds = hints.scores.shape[-1] - 1
 
-    def cells(boxes: Tensor) -> NDArray[np.int64]:
-        corners = boxes.float().numpy()
+    def cells(corners: NDArray[np.float32]) -> NDArray[np.int64]:
         place = np.floor(((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch).astype(np.int64)
         return place[:, 1].clip(0, rows - 1) * columns + place[:, 0].clip(0, columns - 1)
 
-    boxes, scores = hints.boxes[0].detach(), hints.scores[0, :, 1:].detach().float().contiguous()
+    boxes, scores = hints.boxes[0].detach().float().numpy(), hints.scores[0, :, 1:].detach().float().contiguous()
     at = cells(boxes)
     place = torch.from_numpy(at)[:, None].expand(-1, kinds)
     strongest = scores.new_zeros(rows * columns, kinds).scatter_reduce_(0, place, scores, "amax")
-    canvas = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3).log2().mean(-1)
-    canvas = (canvas + torch.tensor(lattice.magnifications[level]).log2()).clamp(min=0)
-    size, order = np.zeros(rows * columns, np.float32), scores.amax(-1).argsort().numpy()
-    # Of several hints in a cell the one written last remains: the most confident.
-    size[at[order]] = canvas.numpy()[order]
+    canvas = np.log2(np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-3)).mean(-1) + math.log2(lattice.magnifications[level])
+    size = np.zeros(rows * columns, np.float32)
+    # Of several hints in a cell the one written last remains: the most confident, which comes first.
+    size[at[::-1]] = np.maximum(canvas, 0)[::-1]
     found = np.zeros((rows * columns, kinds), np.bool_)
     sure = detections.confidence[0] >= FOUND
-    found[cells(detections.boxes[0, sure].detach()), detections.labels[0, sure].numpy() - 1] = True
+    found[cells(detections.boxes[0, sure].detach().float().numpy()), detections.labels[0, sure].numpy() - 1] = True
     shape = rows, columns
     return Gist(
         level,

@@ -39,7 +39,8 @@ class Glance:
         window: the window.
         detections: a batch of one, boxes in picture pixels.
         cut: `(L,)`, boolean, true where the border of the window cuts the box.
-        show: `(K,)`, highest score of each class in any hint.
+        show: `(K,)`, highest score of each class in any hint; in any detection where hints were not asked for
+            (`Glances.see`).
         gist: strongest hints in each cell; None for windows of the last level, which cannot be looked at more closely.
     """
 
@@ -88,8 +89,17 @@ class Glances(ABC):
     lattice: Lattice
 
     @abstractmethod
-    def see(self, windows: Sequence[Window]) -> list[Glance]:
-        """Look at windows, in one batch where that is possible."""
+    def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
+        """Look at windows, in one batch where that is possible.
+
+        Args:
+            windows: the windows.
+            hints: whether hints are needed in windows of the last level, too. Nothing can be looked at more closely
+                there, so explorations do without.
+
+        Returns:
+            The result of each look.
+        """
 
 
 class LiveGlances(Glances):
@@ -103,21 +113,28 @@ class LiveGlances(Glances):
     def __init__(self, eye: ZoomEye, view: ZoomView) -> None:
         self.eye, self.view, self.lattice = eye, view, view.lattice
 
-    def see(self, windows: Sequence[Window]) -> list[Glance]:
+    def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[Glance]:
         """Resample the windows and detect in them."""
         fixations = torch.tensor([window.fixation for window in windows], dtype=torch.float64)
-        seen = self.eye.glance(self.view, fixations, [window.within for window in windows])
+        hints = hints or any(_points_closer(window, self.lattice) for window in windows)
+        seen = self.eye.glance(self.view, fixations, [window.within for window in windows], hints=hints)
         return [glance(seen, n, window, self.lattice) for n, window in enumerate(windows)]
 
 
 def glance(seen: Seen, number: int, window: Window, lattice: Lattice) -> Glance:
     """The result of one of the looks of an eye."""
-    hints, detections = _only(seen.hints, number), _only(seen.detections, number)
+    detections = _only(seen.detections, number)
+    hints = detections if seen.hints is None else _only(seen.hints, number)
     scores = hints.scores[0, :, 1:].float()
     show = scores.amax(0) if len(scores) else scores.new_zeros(scores.shape[-1])
-    whole = window.within is None and window.level < lattice.levels - 1
+    whole = _points_closer(window, lattice)
     told = gist(hints, detections, lattice, (window.level, *window.cells[:2])) if whole else None
     return Glance(window, detections, seen.cut[number, : detections.mask.shape[1]], show, told)
+
+
+def _points_closer(window: Window, lattice: Lattice) -> bool:
+    """Whether a look at a window tells where to look more closely: it is on the lattice, and not of the last level."""
+    return window.within is None and window.level < lattice.levels - 1
 
 
 def _only(looks: Detections, number: int) -> Detections:

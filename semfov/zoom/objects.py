@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from semfov.detection.detections import Detections
 from semfov.detection.near_duplicates import intersection, neighbours, survivors
 from semfov.zoom.glances import Glance
 
@@ -79,27 +80,25 @@ def merge(
     >>> merge([look(0.2, [10.0, 10, 50, 50]), look(0.8, [11.0, 12, 51, 50])]).boxes
     tensor([[11., 12., 51., 50.]])
     """
-    boxes, scores, labels, cuts, passes, scale = [], [], [], [], [], []
-    for turn, glance in enumerate(glances):
-        seen = glance.detections
-        label = seen.labels[0] if target is None else torch.full_like(seen.labels[0], target)
-        value = seen.confidence[0] if target is None else seen.scores[0, :, target]
-        enough = value >= score
-        boxes.append(seen.boxes[0, enough])
-        scores.append(value[enough])
-        labels.append(label[enough])
-        cuts.append(glance.cut[enough])
-        passes.append(torch.full_like(label[enough], turn))
-        scale.append(torch.full_like(value[enough], glance.window.fixation[2]))
-    if not boxes:
+    if not glances:
         nothing = torch.zeros(0)
         return Objects(nothing.view(0, 4), nothing, nothing.long(), nothing.long())
-    box, value, label, cut, number, closer = map(torch.cat, (boxes, scores, labels, cuts, passes, scale))
+    looks = [glance.detections for glance in glances]
+    seen = Detections(
+        *(torch.cat(parts, 1) for parts in zip(*((d.boxes, d.scores, d.mask) for d in looks), strict=True))
+    )
+    value = seen.confidence[0] if target is None else seen.scores[0, :, target]
+    label = seen.labels[0] if target is None else torch.full(value.shape, target)
+    counts = torch.tensor([found.mask.shape[1] for found in looks])
+    number = torch.arange(len(looks)).repeat_interleave(counts)
+    closer = torch.tensor([glance.window.fixation[2] for glance in glances]).to(value)[number]
+    cut = torch.cat([glance.cut for glance in glances])
+    enough = (value >= score).nonzero()[:, 0]
     # Stable sorts, the last key first.
-    order = value.argsort(descending=True, stable=True)
+    order = enough[value[enough].argsort(descending=True, stable=True)]
     order = order[closer[order].argsort(descending=True, stable=True)]
     order = order[cut[order].int().argsort(stable=True)]
-    box, value, label, cut, number = box[order], value[order], label[order], cut[order], number[order]
+    box, value, label, cut, number = seen.boxes[0, order], value[order], label[order], cut[order], number[order]
     kept = _unlike(box, label, cut, number, iou, inside)
     kept = kept[value[kept].argsort(descending=True, stable=True)]
     return Objects(box[kept], value[kept], label[kept], number[kept])

@@ -188,7 +188,8 @@ def find_everything(
     belief, done = ZoomBelief(glances.lattice, evidence, target or 0), set[Window]()
     chosen: list[Choice] = [(on_lattice(glances.lattice, (0, 0, 0)), float("inf"))]
     while chosen:
-        for glance, (_, value) in zip(glances.see([window for window, _ in chosen]), chosen, strict=True):
+        looks = glances.see([window for window, _ in chosen], hints=False)
+        for glance, (_, value) in zip(looks, chosen, strict=True):
             done.add(glance.window)
             belief.add(glance)
             yield glance, value

@@ -5,6 +5,9 @@ from numpy.typing import NDArray
 
 Cells = NDArray[np.float32]
 
+Box = tuple[int, int, int, int]
+"""Cells `(x1, y1, x2, y2)` of a lattice."""
+
 
 class WindowSums:
     r"""Weighted sums of the cells of every window.
@@ -12,14 +15,17 @@ class WindowSums:
     .. math:: S_{ij} = \sum_{k,l} r_k r_l \, x_{i+k,\,j+l}
 
     A sum along an axis is a product with a banded matrix. Sums are kept between calls. A call sums again the windows
-    that hold a cell which has changed since the last call.
+    that hold a cell which has changed.
 
     Args:
         weight: `(span,)`, r, weights of the cells along a side of a window.
         shape: `(rows, columns)` of the cells.
 
+    Attributes:
+        sums: `(down, across)`, S of the last call.
+
     >>> sums = WindowSums(np.ones(2, np.float32), (3, 3))
-    >>> sums(np.arange(9, dtype=np.float32).reshape(3, 3))
+    >>> sums.update(np.arange(9, dtype=np.float32).reshape(3, 3), (0, 0, 3, 3))
     array([[ 8., 12.],
            [20., 24.]], dtype=float32)
     """
@@ -30,33 +36,23 @@ class WindowSums:
         places = np.arange(max(self._places))
         self._band = np.zeros((len(places) + self._span - 1, len(places)), np.float32)
         self._band[places + np.arange(self._span)[:, None], places] = weight[:, None]
-        self._cells: Cells | None = None
-        self._sums = np.zeros(self._places, np.float32)
+        self.sums = np.zeros(self._places, np.float32)
 
-    def __call__(self, cells: Cells) -> Cells:
+    def update(self, cells: Cells, changed: Box) -> Cells:
         """Sum the cells of every window.
 
         Args:
-            cells: `(rows, columns)`, x; kept until the next call, so not to be written to. A window that reaches beyond
-                the cells sums those that it holds.
+            cells: `(rows, columns)`, x. A window that reaches beyond the cells sums those that it holds.
+            changed: the cells that may have changed since the last call, at the first call all of them.
 
         Returns:
             `(down, across)`; the next call changes it.
         """
-        if self._cells is None:
-            rows, columns = (slice(0, n) for n in self._places)
-        else:
-            changed = cells != self._cells
-            down, across = changed.any(1).nonzero()[0], changed.any(0).nonzero()[0]
-            if not len(down):
-                return self._sums
-            rows, columns = (
-                slice(max(int(places[0]) - self._span + 1, 0), min(int(places[-1]) + 1, most))
-                for places, most in ((down, self._places[0]), (across, self._places[1]))
-            )
-        part = cells[rows.start : rows.stop + self._span - 1, columns.start : columns.stop + self._span - 1]
-        upper = self._band[: part.shape[0], : rows.stop - rows.start]
-        right = self._band[: part.shape[1], : columns.stop - columns.start]
-        self._sums[rows, columns] = upper.T @ (part @ right)
-        self._cells = cells
-        return self._sums
+        x1, y1, x2, y2 = changed
+        reach = self._span - 1
+        top, left = max(y1 - reach, 0), max(x1 - reach, 0)
+        bottom, right = min(y2, self._places[0]), min(x2, self._places[1])
+        part = cells[top : bottom + reach, left : right + reach]
+        down, across = self._band[: part.shape[0], : bottom - top], self._band[: part.shape[1], : right - left]
+        self.sums[top:bottom, left:right] = down.T @ (part @ across)
+        return self.sums

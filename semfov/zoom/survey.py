@@ -70,10 +70,10 @@ class Survey(nn.Module):
         best = features(strongest)
         found = look.found.any(-1).to(best)
         kinds = self.mix(features(look.scores) - _LOWEST).movedim(-1, 0)
-        about = [*kinds, *neighbourhood_mean(kinds, 5)]
         parts = [*hint_maps(best[None], best, found[None], look.size), *memory_maps(best[None], before)]
-        value = through(self.rate, torch.stack([*parts, *(each[None] for each in about)], -1)) - 6
-        return value.clamp(max=3).movedim(-1, 1)
+        maps = torch.cat([*parts, kinds, neighbourhood_mean(kinds, 5)])
+        value = through(self.rate, maps.movedim(0, -1)) - 6
+        return value.clamp(max=3).movedim(-1, 0)[None]
 
     def taper(self, span: int) -> Tensor:
         """Weights r of the cells along a side of a window; objects at its border are cut.

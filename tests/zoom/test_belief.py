@@ -50,13 +50,14 @@ def test_cached_window_sums_equal_recomputed_sums():
     generator = np.random.default_rng(0)
     for span, shape in ((3, (9, 14)), (8, (20, 8)), (16, (5, 40))):
         weight, cells = generator.random(span, np.float32), generator.random(shape, np.float32)
-        kept = WindowSums(weight, shape)
+        kept, changed = WindowSums(weight, shape), (0, 0, shape[1], shape[0])
         for _ in range(6):
             padded = np.pad(cells, [(0, max(span - n, 0)) for n in shape])
             windows = np.lib.stride_tricks.sliding_window_view(padded, (span, span))
             expected = np.einsum("ijkl,k,l->ij", windows.astype(np.float64), weight, weight)
-            np.testing.assert_allclose(kept(cells), expected, rtol=1e-5)
-            cells, row, column = cells.copy(), generator.integers(shape[0]), generator.integers(shape[1])
+            np.testing.assert_allclose(kept.update(cells, changed), expected, rtol=1e-5)
+            row, column = int(generator.integers(shape[0])), int(generator.integers(shape[1]))
+            changed = column, row, min(column + 3, shape[1]), min(row + 2, shape[0])
             cells[row : row + 2, column : column + 3] = generator.random()
 
 
@@ -97,6 +98,23 @@ def test_a_window_that_was_seen_has_a_lower_value(belief, glances):
     belief.add(glances.see([finest])[0])
     assert belief.finds(lattice.levels - 1)[window.cells[1], window.cells[0]] < before
     assert value > 0
+
+
+def test_kept_values_equal_recomputed_values(belief, glances, evidence):
+    """After looks of all levels in any order, and after plans that were dropped."""
+    lattice, generator = belief.lattice, torch.Generator().manual_seed(6)
+    seen = glances.see([on_lattice(lattice, (0, 0, 0))])
+    for turn in range(12):
+        action = lattice.actions[int(torch.randint(len(lattice), (1,), generator=generator))].tolist()
+        seen += glances.see([on_lattice(lattice, tuple(action))])
+        belief.add(seen[-1])
+        jointly(lambda taken: best_find(belief, taken, 0.5), belief, set(), 1 + turn % 3)
+        anew = ZoomBelief(lattice, evidence, 1)
+        for glance in seen:
+            anew.add(glance)
+        for level in range(1, lattice.levels):
+            np.testing.assert_allclose(belief.value(level, 0.5), anew.value(level, 0.5), rtol=1e-4, atol=1e-6)
+            assert torch.equal(belief.expected(level), anew.expected(level))
 
 
 def test_no_finds_are_expected_in_a_window_seen_at_the_finest_level(belief, glances):
