@@ -145,4 +145,4 @@ def closer_features(
         ]
         if float(overlap[best]) >= _SAME:
             box = boxes[best]
-    return torch.tensor([*before, *seen]).to(box).logit(_FLOOR), box
+    return box.new_tensor([*before, *seen]).logit(_FLOOR), box

@@ -106,3 +106,13 @@ def test_a_better_closer_look_raises_both_shipped_probabilities(name):
     weak = torch.tensor([0.0, 0.0, 0.0, -5.0, -5.0, 2.0, -5.0])
     strong = torch.tensor([0.0, 0.0, 0.0, 3.0, 3.0, -5.0, 3.0])
     assert bool((model(strong) > model(weak)).all())
+
+
+def test_features_keep_double_precision_and_a_box_that_overlaps_by_exactly_the_least_share():
+    box = torch.tensor([0.0, 0, 10, 10], dtype=torch.float64)
+    part = torch.tensor([0.0, 0, 10, 3], dtype=torch.float64)
+    closer = Detections(part[None, None], torch.tensor([[[0.2, 0.8]]], dtype=torch.float64), torch.ones(1, 1).bool())
+    features, found = closer_features(0.5, 0.5, 0.5, closer, box, 1)
+    assert torch.equal(found, part)
+    assert features.dtype == torch.float64
+    assert features[3:].tolist() == pytest.approx([logit(0.24), logit(0.8), logit(0.0), logit(0.8)], abs=1e-6)
