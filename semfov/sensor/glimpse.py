@@ -110,8 +110,8 @@ def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0
     Returns:
         `(4,)`, the window as `(x1, y1, x2, y2)`, edges between pixels.
 
-    >>> window_around(torch.tensor([0.0, 30.0, 20.0, 50.0]), (90, 60))
-    tensor([ 0., 10., 60., 60.])
+    >>> window_around(torch.tensor([0.0, 30.0, 20.0, 50.0]), (90, 80))
+    tensor([ 0., 10., 60., 70.])
     """
     check_shape(box, "box", 4)
     check(min(picture) >= 1, "picture", "a width and a height in pixels", picture)
