@@ -44,6 +44,7 @@ from semfov.experiments.run import finish
 from semfov.experiments.settings import Positive, Range, Settings, Share, Workers
 from semfov.experiments.summary import announce, gather, sensing, table
 from semfov.io.files import write_text
+from semfov.metrics.calibration import calibration_error
 from semfov.verifier import MOST
 from semfov.viz.presence import plot_roc
 from semfov.viz.style import save_figure
@@ -129,15 +130,18 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
     names = list(dict.fromkeys(record["policy"] for record in records))
     groups = {name: [record for record in records if record["policy"] == name] for name in names}
     told, there = probabilities(records)
-    rows = [["", "area under ROC", *(f"hits at {share:.0%}" for share in SHARES)]]
-    rows += [[name, *figures] for name, figures in zip(told, telling(told, there), strict=True)]
+    rows = [["", "area under ROC", *(f"hits at {share:.0%}" for share in SHARES), "ECE"]]
+    # The references give scores, not probabilities.
+    errors = [f"{calibration_error(told[name], there):.3f}" if name in groups else "-" for name in told]
+    rows += [[name, *figures, error] for name, figures, error in zip(told, telling(told, there), errors, strict=True)]
     decided = [["", "found, there", "found, not there", "undecided", "looks, there", "looks, not there", "place right",
-                "IoU"]]  # fmt: skip
+                "expected", "IoU"]]  # fmt: skip
     for name, group in groups.items():
         present = [record for record in group if record["present"]]
         absent = [record for record in group if not record["present"]]
         found = [record for record in present if record["outcome"] == "found"]
         places = [record["right_place"] for record in group if record["outcome"] == "found"]
+        expected = [100 * record["place"] for record in group if record["place"] is not None]
         decided.append(
             [
                 name,
@@ -147,6 +151,7 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
                 mean([record["looks"] for record in present]),
                 mean([record["looks"] for record in absent]),
                 percent(sum(places), len(places)),
+                mean(expected),
                 mean([record["overlap"] for record in found if record["overlap"] is not None], 2),
             ]
         )
@@ -158,15 +163,17 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
     return "\n".join(
         [
             f"Is the target present? {len(there)} searches ({sensed}), {int(there.sum())} of them for a present class. "
-            "Hit rates in % at the given false alarm rates.",
+            "Hit rates in % at the given false alarm rates, and the expected calibration error (ECE) of the final "
+            "probability.",
             "",
             *table(rows),
             "",
             f"Decisions in %, and mean numbers of looks.{closely} `place right`: the target overlaps the reported "
-            "cell, in % of the searches that report one. Searches in rows with a price end when further looks are not "
-            "worth that price, in right decisions per look. In the row with a detection at the gaze, a search "
-            "ends when such a detection has a score of 0.5 or more. All other searches end at "
-            f"thresholds. The threshold of the sharp look's score is chosen so that it has as many hits as {names[0]}.",
+            "cell, in % of the searches that report one. `expected`: mean probability of these places by closer "
+            "looks, in %. Searches in rows with a price end when further looks are not worth that price, in right "
+            "decisions per look. In the row with a detection at the gaze, a search ends when such a detection has a "
+            "score of 0.5 or more. All other searches end at thresholds. The threshold of the sharp look's score is "
+            f"chosen so that it has as many hits as {names[0]}.",
             "",
             *table(decided),
             "",
@@ -194,6 +201,7 @@ def sharp_decisions(records: Sequence[Record]) -> list[str]:
         "1.0",
         "1.0",
         percent(sum(record["sharp_place"]["right"] for record in told), len(told)),
+        "-",
         mean(there, 2),
     ]
 

@@ -218,6 +218,7 @@ class DecisionRun(Run):
                         **common,
                         "outcome": decision.outcome,
                         "probability": decision.probability,
+                        "place": decision.place,
                         "looks": len(steps) + closely,
                         "closer": closely,
                         "right_place": None if decision.cell is None else bool(goal[decision.cell]),

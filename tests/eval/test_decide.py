@@ -125,6 +125,7 @@ def test_help_and_defaults(capsys):
 
 def record(policy, present, outcome, probability, looks, **more):
     base = {"right_place": None, "overlap": None, "landing": None, "landing_seen": None, "sharp_place": None}
+    base |= {"place": None, "closer": 0}
     base |= {"sharp": probability / 2, "tiled": probability / 4}
     return {"policy": policy, "present": present, "outcome": outcome, "probability": probability, "looks": looks} | (
         base | more
@@ -134,11 +135,24 @@ def record(policy, present, outcome, probability, looks, **more):
 def test_table_matches_hand_calculations():
     """Four searches for a present target, two for an absent one; the second policy decides nothing."""
     first = [
-        record("a", True, "found", 0.9, 3, right_place=True, overlap=0.75, landing=[0.2, 0.8], landing_seen=True),
-        record("a", True, "found", 0.8, 5, right_place=False, overlap=0.25, landing=[0.4, 0.9], landing_seen=True),
+        record(
+            "a", True, "found", 0.9, 3, right_place=True, place=0.9, overlap=0.75, landing=[0.2, 0.8], landing_seen=True
+        ),
+        record(
+            "a",
+            True,
+            "found",
+            0.8,
+            5,
+            right_place=False,
+            place=0.7,
+            overlap=0.25,
+            landing=[0.4, 0.9],
+            landing_seen=True,
+        ),
         record("a", True, "absent", 0.3, 4, landing=[0.3, 0.1], landing_seen=False),
         record("a", True, "undecided", 0.6, 8),
-        record("a", False, "found", 0.85, 2, right_place=False),
+        record("a", False, "found", 0.85, 2, right_place=False, place=0.8),
         record("a", False, "absent", 0.1, 3),
     ]
     # `a` finds two of four targets. A sharp look does so from a score of 0.4 on, which the absent 0.425 exceeds.
@@ -157,14 +171,16 @@ def test_table_matches_hand_calculations():
     score = torch.tensor([each["probability"] for each in first])
     hits = [f"{100 * hits_at(score, there, share):.0f}" for share in (0.01, 0.02, 0.05)]
     # 5 of 8 pairs are in order: 0.9 is above both absent targets, the other scores are above only the lower one.
-    assert area == ["a", "0.625", *hits]
+    # Of 15 bins, 0.8 and 0.85 share one, in which half of the targets are there; the others are alone.
+    assert area == ["a", "0.625", *hits, f"{(0.1 + 2 * (0.825 - 0.5) + 0.7 + 0.4 + 0.1) / 6:.3f}"]
     assert hits == ["25", "25", "25"]
-    assert other == ["b", "0.500", "0", "0", "0"]
-    assert sharp == [SHARP[0], "0.625", *hits]
-    assert tiled == [SHARP[1], "0.625", *hits]
-    assert a == ["a", "50.0", "50.0", "16.7", "5.0", "2.5", "33.3", "0.50"]
-    assert b == ["b", "0.0", "0.0", "100.0", "9.0", "9.0", "-", "-"]
-    assert look == ["one sharp look", "50.0", "50.0", "-", "1.0", "1.0", "33.3", "0.30"]
+    # All in one bin: 0.5 for a share of 4 in 6.
+    assert other == ["b", "0.500", "0", "0", "0", "0.167"]
+    assert sharp == [SHARP[0], "0.625", *hits, "-"]
+    assert tiled == [SHARP[1], "0.625", *hits, "-"]
+    assert a == ["a", "50.0", "50.0", "16.7", "5.0", "2.5", "33.3", "80.0", "0.50"]
+    assert b == ["b", "0.0", "0.0", "100.0", "9.0", "9.0", "-", "-", "-"]
+    assert look == ["one sharp look", "50.0", "50.0", "-", "1.0", "1.0", "33.3", "-", "0.30"]
     assert landed == ["a", "3", "0.300 → 0.600", "2", "0.300 → 0.850", "1", "0.300 → 0.100"]
     assert nowhere == ["b", "0", "-", "0", "-", "0", "-"]
 
@@ -181,6 +197,17 @@ def test_utility_of_searches_matches_hand_calculations():
     assert utility(records, 0.1) == pytest.approx((2 - 0.1 * 14) / 4)
     text = summary([*records, *by_price], "sensed", [0.1])
     assert rows_of(text)[-1] == ["0.1", "0.1500", "0.4000"]
+    assert "Closer looks" not in text
+
+
+def test_the_table_counts_closer_looks():
+    agent = [
+        record("target-evidence", present, "found", 0.9, 4, right_place=present, closer=2 - present)
+        for present in (1, 0)
+    ]
+    alone = [{**each, "policy": "target-evidence, no closer looks", "looks": 2, "closer": 0} for each in agent]
+    text = summary([*agent, *alone], "sensed", [])
+    assert "Closer looks count as looks; target-evidence makes 1.50 of them in a search." in text
 
 
 def test_shares_and_means_of_nothing_are_shown_as_a_dash():
