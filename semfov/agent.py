@@ -268,7 +268,8 @@ class ActivePerception(nn.Module):
         if verifier is not None:
             decision = verifier.conclude(last)
             found = decision.outcome == "found"
-            return replace(scanpath, found=found, decision=decision, closer=tuple(verifier.looks))
+            index = verifier.best().target if found else index
+            return replace(scanpath, found=found, target=index, decision=decision, closer=tuple(verifier.looks))
         # Without thresholds the target was found in the fixated cell.
         cell = None if thresholds is not None else int(last.cell)
         return replace(scanpath, decision=conclude(ended, last.belief, scanpath.detections, grid, index, cell))

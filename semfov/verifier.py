@@ -30,6 +30,7 @@ class CloserLook:
 
     Attributes:
         fixation: number of the fixation after which it was made.
+        target: the class that was looked for, 1..K; in a search for several classes the most probable one at that time.
         cell: the cell of the target, if it is there.
         box: `(4,)`, the box of the target as `(x1, y1, x2, y2)` in pixels, if it is there.
         place: probability that the target is there.
@@ -37,6 +38,7 @@ class CloserLook:
     """
 
     fixation: int
+    target: int
     cell: int
     box: Tensor
     place: float
@@ -207,7 +209,7 @@ class Verifier:
         presence = self._presence(step.belief)
         if OUTCOMES[outcome] != "found":
             return Decision(OUTCOMES[outcome], presence)
-        best = self._best()
+        best = self.best()
         return Decision("found", max(presence, best.place), best.cell, best.box, best.place)
 
     def _examine(self, step: Step, *, over: bool) -> int:
@@ -225,7 +227,7 @@ class Verifier:
                 return OUTCOMES.index("found")
         if not over and len(self.looks) < self.most:
             return 0
-        if self.looks and self._best().place >= self.thresholds.confirm:
+        if self.looks and self.best().place >= self.thresholds.confirm:
             return OUTCOMES.index("found")
         return OUTCOMES.index("absent") if self._presence(step.belief) < 0.5 else len(OUTCOMES) - 1
 
@@ -237,10 +239,14 @@ class Verifier:
             presence, candidate.probability, candidate.evidence, closer, candidate.box, target
         )
         place, presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
-        return CloserLook(step.shift, cell_of(box, self.candidates.grid), box, place, presence)
+        return CloserLook(step.shift, target, cell_of(box, self.candidates.grid), box, place, presence)
 
-    def _best(self) -> CloserLook:
-        """The closer look with the largest probability of the place."""
+    def best(self) -> CloserLook:
+        """The closer look with the largest probability of the place.
+
+        Returns:
+            The closer look; there must be at least one.
+        """
         return max(self.looks, key=lambda look: look.place)
 
     def _presence(self, belief: Belief) -> float:

@@ -1,19 +1,19 @@
 """Searches with closer looks: what an eye sees closely, and the decisions of an agent that looks closely."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 
 from semfov import ActivePerception, Eye, Foveation, Scanpath
-from semfov.belief import Verification
-from semfov.belief.observers import Semantic
+from semfov.belief import Belief, Verification
+from semfov.belief.observers import Observer, Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.detection import Candidates
 from semfov.errors import DataError, InputError
 from semfov.gaze.policies import NonPredictive, Random
 from semfov.scanpath import describe, why_it_ended
-from tests.test_decision import Scripted, Square, cells
+from tests.test_decision import Nothing, Scripted, Square, cells
 
 
 class Fine(Square):
@@ -83,7 +83,7 @@ def test_the_search_ends_with_the_box_of_the_closer_look(image):
     seen = looking.eye.close_up(image[None], scanpath.detections[2].boxes[0, 0])
     assert scanpath.decision.place == pytest.approx(float(seen.scores[0, 0, 1]), abs=1e-6)
     (look,) = scanpath.closer
-    assert (look.fixation, look.cell) == (2, 11)
+    assert (look.fixation, look.target, look.cell) == (2, 1, 11)
     assert describe(scanpath).startswith("“red” found after 2 gaze shifts and 1 closer look (probability 0.")
     assert why_it_ended(scanpath) == "A closer look confirmed the target."
 
@@ -161,3 +161,47 @@ def test_the_picture_and_the_page_show_closer_looks(image):
     x, y = scanpath.closer[0].box[:2].tolist()
     assert (pytest.approx(x), pytest.approx(y)) in [patch.get_xy() for patch in axes.patches]
     assert "Closer look at column 3, row 2: probability 0." in about_data(scanpath, None)["decision"]
+
+
+@dataclass(frozen=True)
+class Table(Belief):
+    """A belief about two classes: each has its probability in the last cell, and 0.2 in the others."""
+
+    last: tuple[float, float]
+    closest: torch.Tensor
+
+    def probability(self, target):
+        return torch.tensor([[0.2] * 11 + [self.last[target - 1]]])
+
+    def presence(self, target):
+        return torch.tensor([self.last[target - 1]])
+
+    def map(self, function):
+        return Table(self.last, function(self.closest))
+
+
+class Both(Observer):
+    """Returns scripted beliefs about two classes, one per look."""
+
+    def __init__(self, *script):
+        super().__init__()
+        self.script, self.looks = script, 0
+
+    def start(self, batch, grid, like):
+        return Table((0.5, 0.5), like.new_ones(1, len(grid)))
+
+    def weigh(self, detections, fixation, grid, target=None):
+        return Nothing(0)
+
+    def update(self, belief, look):
+        self.looks += 1
+        return Table(self.script[self.looks - 1], belief.closest)
+
+
+def test_a_search_for_several_classes_names_the_class_that_was_looked_at_closely(image):
+    """At the end green is more probable than red, but the closer look was at red."""
+    looking = agent(Both((0.6, 0.1), (0.6, 0.9)), Fine(), Thresholds(confirm=0.8, give_up=0.1, place=0.3))
+    scanpath = looking.search(image, {"red": 1.0, "green": 0.9}, start=11, shifts=1)
+    assert scanpath.found
+    assert [scanpath.classes[look.target] for look in scanpath.closer] == ["red"]
+    assert scanpath.classes[scanpath.target] == "red"

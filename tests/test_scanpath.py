@@ -216,7 +216,7 @@ def variants(scanpath):
         "found": replace(scanpath, found=True, target=2, decision=Decision("found", 0.1 + 0.2, 7, torch.rand(4))),
         "closer": replace(
             scanpath,
-            closer=(CloserLook(0, 3, torch.rand(4), 0.2, 0.4), CloserLook(1, 0, torch.rand(4), 0.7, 0.8)),
+            closer=(CloserLook(0, 2, 3, torch.rand(4), 0.2, 0.4), CloserLook(1, 1, 0, torch.rand(4), 0.7, 0.8)),
             decision=Decision("found", 0.8, 0, torch.rand(4), 0.7),
         ),
         "absent": replace(scanpath, target=1, decision=Decision("absent", 1e-300), ending="decision"),
@@ -269,9 +269,10 @@ def spoil(tensors, record):
     yield "seconds", told(seconds=record["seconds"][1:])
     yield "decision", told(decision={"outcome": "perhaps", "probability": 0.5, "cell": None})
     yield "decision.cell", told(decision={"outcome": "found", "probability": 0.5, "cell": 20})
-    look = {"fixation": 0, "cell": 1, "place": 0.5, "presence": 0.5}
+    look = {"fixation": 0, "target": 1, "cell": 1, "place": 0.5, "presence": 0.5}
     yield "closer_boxes", told(closer=[look])
     yield "closer", (changed("closer_boxes", torch.zeros(1, 4))[0], {**record, "closer": [{**look, "cell": 20}]})
+    yield "closer", (changed("closer_boxes", torch.zeros(1, 4))[0], {**record, "closer": [{**look, "target": 3}]})
     yield "closer[0].place", told(closer=[{**look, "place": 1.5}])
     yield "settings.sensor", told(settings={**record["settings"], "sensor": {}})
     yield (

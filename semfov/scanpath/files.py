@@ -54,7 +54,7 @@ _DECISION = {
     "cell": Maybe(_WHOLE),
     "place": Maybe(_CHANCE),
 }
-_CLOSER = {"fixation": _WHOLE, "cell": _WHOLE, "place": _CHANCE, "presence": _CHANCE}
+_CLOSER = {"fixation": _WHOLE, "target": _WHOLE, "cell": _WHOLE, "place": _CHANCE, "presence": _CHANCE}
 
 SCHEMA = Schema(
     {
@@ -169,8 +169,8 @@ def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> dict[
     boxes = tensors.get("closer_boxes", torch.zeros(0, 4))
     check(len(boxes) == len(closer), "closer_boxes", f"{len(closer)} boxes, one for each closer look", len(boxes))
     for look in closer:
-        inside = look["cell"] < len(grid) and look["fixation"] < count
-        check(inside, "closer", f"a cell below {len(grid)} and a fixation below {count}", look)
+        known = look["cell"] < len(grid) and look["fixation"] < count and 1 <= look["target"] < len(record["classes"])
+        check(known, "closer", f"a cell below {len(grid)}, a fixation below {count} and the index of a class", look)
     return {
         "grid": grid,
         "classes": tuple(record["classes"]),
