@@ -3,10 +3,10 @@
 import hashlib
 import os
 import re
+import secrets
 import stat
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from semfov.errors import DataError
@@ -17,7 +17,8 @@ _unfinished: set[Path] = set()
 def discard_unfinished() -> None:
     """Remove temporary files of unfinished writes, for a process that is about to exit without cleaning up."""
     for path in list(_unfinished):
-        path.unlink(missing_ok=True)
+        with suppress(OSError):
+            path.unlink()
 
 
 @contextmanager
@@ -40,10 +41,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-        os.close(handle)
-        temporary = Path(name)
+        temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+        # Known before it exists: a signal may end the process while the file is created.
         _unfinished.add(temporary)
+        temporary.touch(0o600, exist_ok=False)
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
@@ -53,7 +54,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
         raise DataError(f"cannot write {path}: {error.strerror or error}") from error
     finally:
         if temporary is not None:
-            temporary.unlink(missing_ok=True)
+            with suppress(OSError):
+                temporary.unlink()
             _unfinished.discard(temporary)
 
 

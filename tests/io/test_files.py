@@ -1,0 +1,43 @@
+"""Atomic writes: what is left of a write that does not finish."""
+
+from pathlib import Path
+
+import pytest
+
+from semfov.errors import DataError
+from semfov.io.files import discard_unfinished, replacing
+
+
+def test_a_process_that_ends_while_the_temporary_file_is_created_leaves_nothing(tmp_path, monkeypatch):
+    touch = Path.touch
+
+    def ended(path, *arguments, **options):
+        touch(path, *arguments, **options)
+        discard_unfinished()  # as a handler of a signal does before the process ends
+        raise SystemExit
+
+    monkeypatch.setattr(Path, "touch", ended)
+    with pytest.raises(SystemExit), replacing(tmp_path / "a.json"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_process_that_ends_within_a_write_leaves_the_old_file_alone(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text("old")
+    with replacing(path) as temporary:
+        temporary.write_text("new")
+        assert temporary.parent == tmp_path
+        assert temporary.stat().st_mode & 0o077 == 0
+        assert path.read_text() == "old"
+    assert path.read_text() == "new"
+    with pytest.raises(ValueError, match="invalid literal"), replacing(path):
+        int("x")
+    assert [each.name for each in tmp_path.iterdir()] == ["a.json"]
+    assert path.read_text() == "new"
+
+
+def test_a_path_below_a_file_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match=r"cannot write .*a\.json"), replacing(tmp_path / "file" / "a.json"):
+        pass
