@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from semfov.belief.grid import Grid, check_cells
-from semfov.belief.observers import AnyBelief, LearnedMap, Observer
-from semfov.belief.observers.any_of import TargetLike
+from semfov.belief.observers import LearnedMap, Observer
+from semfov.belief.observers.any_of import TargetLike, class_meant
 from semfov.belief.verification import Verification
 from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike, as_image
@@ -259,7 +259,7 @@ class ActivePerception(nn.Module):
         else:
             outcome = outcome_of(wanted, grid, goal, price, thresholds, 0.5 if confirm is None else confirm)
         scanpath, ended, last = self._gaze(image, grid, strategy, index, start, shifts, seed, outcome)
-        index = int(last.belief.likeliest()) if isinstance(last.belief, AnyBelief) else index
+        index = class_meant(last.belief, index)
         scanpath = replace(scanpath, found=ended == 1, target=index)
         if goal is not None:
             return replace(scanpath, ending="box") if ended else scanpath

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
-from semfov.belief.observers import AnyBelief
+from semfov.belief.observers.any_of import class_meant
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
 from semfov.decision import OUTCOMES, Decision, place_known, strength, strongest
@@ -105,6 +105,26 @@ class CandidatePlaces:
         """The probabilities, with 0 for the cells that were examined."""
         return cells if self.examined is None else cells.masked_fill(self.examined, 0)
 
+    def examine(
+        self, candidate: CandidatePlace, presence: float, close_up: Callable[[Tensor], Detections], target: int
+    ) -> tuple[Tensor, Tensor]:
+        """Look closely at a candidate, and dismiss it.
+
+        Args:
+            candidate: the candidate.
+            presence: probability that the image holds the target.
+            close_up: looks closely at a box `(4,)`.
+            target: class 1..K.
+
+        Returns:
+            The features of the closer look `(7,)`, and the box of the target in it `(4,)` (`closer_features`).
+        """
+        features, box = closer_features(
+            presence, candidate.probability, candidate.evidence, close_up(candidate.box), candidate.box, target
+        )
+        self.dismiss(candidate, box)
+        return features, box
+
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
         """Do not list a candidate again, nor others at its place.
 
@@ -133,13 +153,18 @@ def cell_of(box: Tensor, grid: Grid) -> int:
     return int(grid.footprint(box[None], "soft")[0].argmax())
 
 
+def surely(confirm: float) -> float:
+    """Probability of a place from which a search ends at once: halfway between the threshold `confirm` and 1."""
+    return (1 + confirm) / 2
+
+
 class Verifier:
     """Decides one search, with closer looks at the places that seem to hold the target.
 
     When a fixated cell is probably the target's, or when no cell is worth a further fixation, the most evident place is
-    looked at closely. The search ends at once if the target is surely there: with a probability halfway between
-    `confirm` and 1, or more. Otherwise it goes on, until no cell is worth a fixation, or `most` closer looks were made.
-    Then it has found the target at the best of the examined places, if that is probable enough. If not, the target is
+    looked at closely. The search ends at once if the target is there with a probability halfway between `confirm`
+    and 1, or more (`surely`). Otherwise it goes on, until no cell is worth a fixation, or `most` closer looks were
+    made. Then it has found the target at the best of the examined places, if that is probable enough. If not, the target is
     absent or the search undecided, by the probability that the image holds it.
 
     Args:
@@ -215,15 +240,14 @@ class Verifier:
     def _examine(self, step: Step, *, over: bool) -> int:
         """Make the closer looks that are due after a step, and return the outcome."""
         cells, least = step.belief.probability(self.target)[0], self.thresholds.place
-        target = int(step.belief.likeliest()) if isinstance(step.belief, AnyBelief) else self.target
+        target = class_meant(step.belief, self.target)
         while len(self.looks) < self.most:
             seen = over or bool(place_known(self.candidates.open(cells), step.visited[0], least))
             candidate = self.candidates.next(cells, target) if seen else None
             if candidate is None or candidate.probability < least:
                 break
             self.looks.append(self._look(step, candidate, target))
-            self.candidates.dismiss(candidate, self.looks[-1].box)
-            if self.looks[-1].place >= (1 + self.thresholds.confirm) / 2:
+            if self.looks[-1].place >= surely(self.thresholds.confirm):
                 return OUTCOMES.index("found")
         if not over and len(self.looks) < self.most:
             return 0
@@ -234,10 +258,7 @@ class Verifier:
     def _look(self, step: Step, candidate: CandidatePlace, target: int) -> CloserLook:
         """Look closely at a candidate."""
         presence = float(step.belief.presence(self.target))
-        closer = self.close_up(candidate.box)
-        features, box = closer_features(
-            presence, candidate.probability, candidate.evidence, closer, candidate.box, target
-        )
+        features, box = self.candidates.examine(candidate, presence, self.close_up, target)
         place, presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
         return CloserLook(step.shift, target, cell_of(box, self.candidates.grid), box, place, presence)
 

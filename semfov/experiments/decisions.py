@@ -21,6 +21,7 @@ from semfov.decision import conclude, confirms, decide, decide_by_price
 from semfov.detection.detections import Detections
 from semfov.episode import Step, Stopwatch, StoredLooks, rollout
 from semfov.errors import InputError, check
+from semfov.experiments.close_ups import CloseUps
 from semfov.experiments.config import PolicyConfig, SearchConfig
 from semfov.experiments.parts import Record
 from semfov.experiments.run import Run
@@ -124,21 +125,12 @@ class DecisionRun(Run):
     def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
         return decide(step, target, self.thresholds)
 
-    def _verifier(
-        self, image: Tensor, grid: Grid, target: int, closer: dict[tuple[float, ...], Detections]
-    ) -> Verifier:
-        """The closer looks of one search; `closer` keeps those at this image."""
+    def _verifier(self, close_up: CloseUps, grid: Grid, target: int) -> Verifier:
+        """The closer looks of one search."""
         assert self.verification is not None
         assert self.verification.thresholds is not None
         config = self.config
         thresholds = self.verification.thresholds.changed(config.confirm, config.give_up, config.place)
-
-        def close_up(box: Tensor) -> Detections:
-            key = tuple(box.tolist())
-            if key not in closer:
-                closer[key] = self.eye.close_up(image, box)
-            return closer[key]
-
         return Verifier(self.verification, close_up, grid, target, thresholds, config.closer)
 
     def _published(self) -> FovealObservationModel | None:
@@ -180,7 +172,7 @@ class DecisionRun(Run):
             sharp = self.eye.detector(image)
             tiles = [self.eye.detector(tile) for tile in quarters(image)]
         watch.lap("look")
-        closer: dict[tuple[float, ...], Detections] = {}
+        close_up = CloseUps(self.eye, lambda: image)
         for target in classes:
             goal = covered[annotation.labels == target].any(0)
             start = generator_for("start", protocol.seed, self.scenes.ids[index], target)
@@ -200,7 +192,7 @@ class DecisionRun(Run):
                 def rule(step: Step, judge: Rule = judge, target: int = target) -> Tensor:
                     return judge(step, target, grid)
 
-                verifier = self._verifier(image, grid, target, closer) if name in self.verified else None
+                verifier = self._verifier(close_up, grid, target) if name in self.verified else None
                 with torch.inference_mode():
                     steps = search_steps(looks, strategy, target, cell, noise, verifier or rule)
                     last, seen = steps[-1], torch.cat([step.cell for step in steps])

@@ -291,7 +291,7 @@ def why_it_ended(scanpath: Scanpath) -> str:
     if scanpath.closer and scanpath.found:
         return "A closer look confirmed the target."
     if scanpath.ending == "decision" and scanpath.decision is not None:
-        if len(scanpath.closer) and scanpath.decision.outcome == "undecided":
+        if scanpath.closer and scanpath.decision.outcome == "undecided":
             return "No closer look confirmed the target, but it is probably there."
         return {
             "found": "The target is probable enough, and was looked at closely enough.",

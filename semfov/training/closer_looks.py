@@ -13,6 +13,7 @@ from semfov.belief.observers import Observer
 from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Step, rollout
+from semfov.experiments.close_ups import CloseUps
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.seeds import generator_for
 from semfov.eye import Eye, View
@@ -58,7 +59,7 @@ class Photograph:
         self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
         self.grid, self.sought = grid, sought
         self.seen: dict[int, Detections] = {}
-        self.closer: dict[tuple[float, ...], Detections] = {}
+        self.close_up = CloseUps(eye, lambda: self.image)
         self._image: Tensor | None = None
         self._view: View | None = None
 
@@ -88,13 +89,6 @@ class Photograph:
                 self._view = self.eye.open(self.image)
             self.seen[cell] = self.eye.look(self._view, fixation)
         return self.seen[cell]
-
-    def close_up(self, box: Tensor) -> Detections:
-        """Look closely at a box `(4,)`; returns the detections, a batch of one."""
-        key = tuple(box.tolist())
-        if key not in self.closer:
-            self.closer[key] = self.eye.close_up(self.image, box)
-        return self.closer[key]
 
 
 class RememberedLooks(Looks):

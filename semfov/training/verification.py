@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from semfov.belief.observers import Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
-from semfov.belief.verification import FEATURES, Verification, closer_features
+from semfov.belief.verification import FEATURES, Verification
 from semfov.errors import DataError
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.decision_report import mean, percent
@@ -26,7 +26,7 @@ from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.training.closer_looks import Photograph, photographs, search
 from semfov.training.outputs import model_path, training_of, write_outputs
-from semfov.verifier import CandidatePlaces, Verifier, cell_of
+from semfov.verifier import CandidatePlaces, Verifier, cell_of, surely
 
 AFTER = (1, 3, 5, 8, 12)
 """Numbers of looks after which candidates are examined for the fit."""
@@ -123,7 +123,7 @@ class Verified:
     def found(self, confirm: float) -> tuple[bool | None, int]:
         """Decision at a threshold: whether the place is right (None: not found), and the number of looks until then."""
         for (place, right), end in zip(self.places, self.ends, strict=True):
-            if place >= (1 + confirm) / 2:
+            if place >= surely(confirm):
                 return right, end
         place, right = max(self.places, default=(0.0, False))
         return (right if place >= confirm else None), self.looks
@@ -183,27 +183,25 @@ def examine(seen: Sequence[Photograph], evidence: TargetEvidence, config: FitVer
         DataError: there is no candidate, or none of them is right, or none wrong.
     """
     rows: list[tuple[Tensor, bool, bool, int]] = []
+    observer = Target(evidence)
     for photograph in track(seen, "looking", "photograph"):
         for sought in photograph.sought:
             looks = []
-            for step in search(photograph, sought, Target(evidence), config.looks):
+            for step in search(photograph, sought, observer, config.looks):
                 looks.append(step.detections)
                 if len(looks) not in AFTER:
                     continue
                 candidates, cells = CandidatePlaces(photograph.grid), step.belief.probability(sought.target)[0]
-                candidates.looks = list(looks)
+                for look in looks:
+                    candidates.see(look)
                 for _ in range(_EACH):
                     candidate = candidates.next(cells, sought.target)
                     if candidate is None or candidate.probability < _LEAST:
                         break
-                    closer = photograph.close_up(candidate.box)
                     presence = float(step.belief.presence(sought.target))
-                    features, box = closer_features(
-                        presence, candidate.probability, candidate.evidence, closer, candidate.box, sought.target
-                    )
+                    features, box = candidates.examine(candidate, presence, photograph.close_up, sought.target)
                     right = bool(sought.goal[cell_of(box, photograph.grid)])
                     rows.append((features, right, sought.present, photograph.number % config.folds))
-                    candidates.dismiss(candidate, box)
         photograph.close()
     if len({right for _, right, _, _ in rows}) < 2:
         raise DataError("data: expected places that hold the target and places that do not, got only one kind")
@@ -263,12 +261,12 @@ def verify(
     Yields:
         The searches.
     """
-    always = Thresholds(1.0, config.give_up, config.place)
+    always, observer = Thresholds(1.0, config.give_up, config.place), Target(evidence)
     for photograph in track(seen, "verifying", "photograph"):
         model = folds[photograph.number % config.folds]
         for sought in photograph.sought:
             verifier = Verifier(model, photograph.close_up, photograph.grid, sought.target, always)
-            steps = list(search(photograph, sought, Target(evidence), config.looks, verifier))
+            steps = list(search(photograph, sought, observer, config.looks, verifier))
             decision = verifier.conclude(steps[-1])
             places = tuple((look.place, bool(sought.goal[look.cell])) for look in verifier.looks)
             ends = tuple(look.fixation + 1 + number for number, look in enumerate(verifier.looks, 1))

@@ -159,6 +159,19 @@ def _with(belief: AnyBelief, inner: tuple[Belief, ...]) -> AnyBelief:
     return replace(belief, inner=inner, closest=inner[0].closest)
 
 
+def class_meant(belief: Belief, target: int) -> int:
+    """The class that a search is about: the likeliest one of several (`AnyBelief.likeliest`), otherwise the target.
+
+    Args:
+        belief: belief of one episode.
+        target: class 1..K that was asked for.
+
+    Returns:
+        The class.
+    """
+    return int(belief.likeliest()) if isinstance(belief, AnyBelief) else target
+
+
 def weights_by_class(target: Mapping[str, float] | Mapping[int, float], classes: Sequence[str]) -> dict[int, float]:
     """Weights by class index for a target that is any of several classes.
 
