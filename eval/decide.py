@@ -14,7 +14,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated
 
 import torch
 
@@ -23,6 +22,7 @@ from semfov.experiments.command import run_command
 from semfov.experiments.config import (
     BeliefConfig,
     DataConfig,
+    DecidingConfig,
     DetectorConfig,
     ProtocolConfig,
     SensorConfig,
@@ -41,17 +41,16 @@ from semfov.experiments.fitted import with_models
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
 from semfov.experiments.run import finish
-from semfov.experiments.settings import Positive, Range, Settings, Share, Workers
+from semfov.experiments.settings import Positive, Workers
 from semfov.experiments.summary import announce, gather, sensing, table
 from semfov.io.files import write_text
 from semfov.metrics.calibration import calibration_error
-from semfov.verifier import MOST
 from semfov.viz.presence import plot_roc
 from semfov.viz.style import save_figure
 
 
 @dataclass(frozen=True)
-class DecideConfig(Settings):
+class DecideConfig(DecidingConfig):
     """Search for present and for absent classes, each until a decision.
 
     Args:
@@ -60,15 +59,6 @@ class DecideConfig(Settings):
         sensor: the foveal sensor.
         belief: the belief, a grid of class distributions; `target_model` is the learned evidence.
         protocol: the protocol; `shifts` and `seed` are used.
-        confirm: the target can count as found when the probability that the image holds it reaches this value (None:
-            the model's own threshold).
-        give_up: a search gives up when, in every cell not fixated yet, the probability of the target is below this
-            value (None: the model's own threshold).
-        place: for a find, the fixated cell must hold the target with at least this probability (None: the model's own
-            threshold).
-        closer: largest number of closer looks in a search; 0 decides without them.
-        verification: model of verification, by name or file (None: the one that is shipped for detector and sensor, if
-            there is one).
         prices: prices of a look in right decisions; for each price there are additional searches, which end when
             further looks are not worth their price.
         out: folder for tables, records and the figure.
@@ -82,11 +72,6 @@ class DecideConfig(Settings):
     sensor: SensorConfig = field(default_factory=SensorConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
-    confirm: Share | None = None
-    give_up: Share | None = None
-    place: Share | None = None
-    closer: Annotated[int, Range(0, 100)] = MOST
-    verification: str | None = None
     prices: tuple[Positive, ...] = (0.002, 0.005, 0.01, 0.02, 0.05)
     out: Path = Path("runs/decide")
     cache: Path | None = None

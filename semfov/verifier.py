@@ -164,8 +164,8 @@ class Verifier:
     When a fixated cell is probably the target's, or when no cell is worth a further fixation, the most evident place is
     looked at closely. The search ends at once if the target is there with a probability halfway between `confirm`
     and 1, or more (`surely`). Otherwise it goes on, until no cell is worth a fixation, or `most` closer looks were
-    made. Then it has found the target at the best of the examined places, if that is probable enough. If not, the target is
-    absent or the search undecided, by the probability that the image holds it.
+    made. Then it has found the target at the best of the examined places, if that is probable enough. If not, the
+    target is absent or the search undecided, by the probability that the image holds it.
 
     Args:
         model: gives the probabilities after closer looks.

@@ -24,6 +24,7 @@ from semfov.experiments.settings import (
 from semfov.gaze.saliency.cells import Reduction
 from semfov.sensor import SENSORS, Foveation, named_sensor
 from semfov.sensor.named import SensorName
+from semfov.verifier import MOST
 
 SaliencyModel = Literal["vocus2", "itti-koch"]
 Context = Literal["none", "place", "cooccurrence", "both"]
@@ -340,3 +341,26 @@ class ExploreConfig(Settings):
 
 
 RunConfig = SearchConfig | ExploreConfig
+
+
+@dataclass(frozen=True)
+class DecidingConfig(Settings):
+    """Settings of decisions.
+
+    Args:
+        confirm: the target counts as found when its probability reaches this value: at the place of a closer look, or
+            in the image for a search without closer looks (None: the model's own threshold).
+        give_up: a search gives up when, in every cell not fixated yet, the probability of the target is below this
+            value (None: the model's own threshold).
+        place: least probability of a cell that is worth a closer look, or, without closer looks, of the fixated cell
+            for a find (None: the model's own threshold).
+        closer: largest number of closer looks in a search; 0 decides without them.
+        verification: model of verification, by name or file (None: the one that is shipped for detector and sensor, if
+            there is one).
+    """
+
+    confirm: Share | None = None
+    give_up: Share | None = None
+    place: Share | None = None
+    closer: Annotated[int, Range(0, 100)] = MOST
+    verification: str | None = None

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -22,19 +22,19 @@ from semfov.detection.detections import Detections
 from semfov.episode import Step, Stopwatch, StoredLooks, rollout
 from semfov.errors import InputError, check
 from semfov.experiments.close_ups import CloseUps
-from semfov.experiments.config import PolicyConfig, SearchConfig
+from semfov.experiments.config import DecidingConfig, PolicyConfig, SearchConfig
 from semfov.experiments.parts import Record
 from semfov.experiments.run import Run
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.seeds import generator_for, noise_for
-from semfov.experiments.settings import Positive, Range, Share
+from semfov.experiments.settings import Positive
 from semfov.experiments.setup import make_observation, make_verification, published_model
 from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.strategy import Strategy
-from semfov.verifier import MOST, Verifier
+from semfov.verifier import Verifier
 
 Rule = Callable[[Step, int, Grid], Tensor]
 """Maps a step of searches, their target and their grid to the number of each search's outcome; 0: it goes on."""
@@ -54,28 +54,14 @@ SEEN_FROM = 0.5
 
 
 @dataclass(frozen=True)
-class DecisionConfig(SearchConfig):
+class DecisionConfig(DecidingConfig, SearchConfig):
     """Searches that end in a decision. `policies` is ignored.
 
     Args:
-        confirm: the target can count as found when the probability that the image holds it reaches this value (None:
-            the model's own threshold).
-        give_up: a search gives up when, in every cell not fixated yet, the probability of the target is below this
-            value (None: the model's own threshold).
-        place: for a find, the fixated cell must hold the target with at least this probability (None: the model's own
-            threshold).
-        closer: largest number of closer looks in a search; 0 decides without them.
-        verification: model of verification, by name or file (None: the one that is shipped for detector and sensor, if
-            there is one).
         prices: prices of a look, for additional searches that end by `decide_by_price` instead of by thresholds.
     """
 
     policies: tuple[str | PolicyConfig, ...] = ("target-evidence",)
-    confirm: Share | None = None
-    give_up: Share | None = None
-    place: Share | None = None
-    closer: Annotated[int, Range(0, 100)] = MOST
-    verification: str | None = None
     prices: tuple[Positive, ...] = ()
 
 
