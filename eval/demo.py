@@ -39,14 +39,13 @@ from semfov.experiments.command import run_command
 from semfov.experiments.settings import Range, Seed, Settings, Share, Shifts, Weight, Whole
 from semfov.io.manifest import Manifest
 from semfov.live import RATE
-from semfov.report.episode import Pool, episode_data
-from semfov.report.page import write_page
+from semfov.report import Pool, episode_data, write_page, zoom_data
 from semfov.scanpath.stimulus import reduced
 from semfov.sensor import SENSORS
 from semfov.sensor.named import SensorName
 from semfov.verifier import MOST
 from semfov.viz.animation import film_of
-from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye
+from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye, ZoomPath
 
 Drawn = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
 
@@ -88,7 +87,8 @@ class DemoConfig(Settings):
         seed: random seed of the start, of ties and of the embedded scene.
         frames: number of frames of a video or camera to look at (none: the whole video; a camera until Ctrl-C).
         rate: rate at which the belief about a video or camera fades from frame to frame (0: never).
-        report: HTML file to write: a page in which to step through the episodes.
+        report: HTML file to write: a page in which to step through the episodes, or through the looks at large
+            pictures.
         draw: figures to draw: `scanpath`, `views` (the foveated views), `belief` (in an exploration: the map of what is
             where), `belief_bars` and `animation`; `[]` draws nothing.
         out: folder for pictures and animations.
@@ -150,7 +150,12 @@ def demo(config: DemoConfig) -> None:
         if zooming is not None and zooming.pays(picture.image):
             folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
             only_likeliest(wanted)
-            written += zoom_in(zooming, picture, config, folder)
+            path, passes = zoom_in(zooming, picture, config)
+            small = reduced(picture.image).clamp(0, 1)
+            written.append(viz.save_figure(viz.plot_zoom_path(path, small), folder / "zoom.png"))
+            if config.report is not None:
+                given = {"settings": zooming.eye.settings(), "passes": passes}
+                episodes.append(zoom_data(path, picture.image, pool, name=picture.name, **given))
             continue
         scanpath = look_at(agent, picture, config, wanted)
         print(told(picture.name, scanpath))
@@ -193,8 +198,17 @@ def zoom_agent(config: DemoConfig, agent: ActivePerception) -> ZoomAgent | None:
     return zooming.eval().requires_grad_(False)
 
 
-def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig, folder: Path) -> list[Path]:
-    """Search or explore a picture larger than the detector's input, and print and draw its windows."""
+def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> tuple[ZoomPath, int]:
+    """Search or explore a picture larger than the detector's input, and print its windows.
+
+    Args:
+        agent: the agent for large pictures.
+        picture: the picture.
+        config: the settings.
+
+    Returns:
+        The path, and the largest number of passes.
+    """
     passes = 24 if config.shifts is None else config.shifts + 1
     if config.target is None:
         given = {"worth": config.until}
@@ -204,7 +218,7 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig, folder: Path
         path = agent.search(picture.image, config.target, passes=passes, **chosen(given))
     width, height = path.lattice.size
     print(f"{picture.name}, {width} × {height} px, looked at in windows: {path.describe()}")
-    unused = [name for name in ("sensor", "start", "price", "report") if getattr(config, name) is not None]
+    unused = [name for name in ("sensor", "start", "price") if getattr(config, name) is not None]
     if unused:
         print(f"  ignored for a picture of this size: {', '.join(unused)}")
     for number, glance in enumerate(path.glances):
@@ -212,7 +226,7 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig, folder: Path
         count = int((glance.detections.confidence >= viz.CONFIDENT).sum())
         where = f"at ({x:.0f}, {y:.0f})" if number else "the whole picture"
         print(f"  {number:2d}  {where} × {magnification:.2f}: {count} detection{'s' if count != 1 else ''}")
-    return [viz.save_figure(viz.plot_zoom_path(path, reduced(picture.image).clamp(0, 1)), folder / "zoom.png")]
+    return path, passes
 
 
 def chosen(values: dict[str, float | None]) -> dict[str, Any]:

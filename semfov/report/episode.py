@@ -15,7 +15,7 @@ from torch import Tensor
 from semfov.detection.placement import resize
 from semfov.scanpath import Scanpath, describe, sensor_in_words, why_it_ended
 from semfov.viz.belief import class_posterior
-from semfov.viz.labels import place_labels
+from semfov.viz.labels import Box, place_labels
 from semfov.viz.semantic import entropy
 
 Data = dict[str, Any]
@@ -168,25 +168,42 @@ def detection_data(scanpath: Scanpath, fixation: int, most: int = 10, scores: in
     Returns:
         For each detection its box, its label, pairs of class name and score, and the rectangle of its label.
     """
-    detections = scanpath.detections[fixation][0]
-    width, height = scanpath.grid.extent.tolist()
-    unit = width / 640
+    looked, classes = scanpath.detections[fixation][0], scanpath.classes
     kept = []
-    for box, vector in zip(detections.boxes[:most], detections.scores[:most], strict=True):
+    for box, vector in zip(looked.boxes[:most], looked.scores[:most], strict=True):
         if float(vector[1:].max()) >= LEAST:
             best = vector.topk(min(scores, len(vector)))
             pairs = zip(best.values.tolist(), best.indices.tolist(), strict=True)
-            top = [[scanpath.classes[index], rounded(score)] for score, index in pairs]
-            label = scanpath.classes[int(vector[1:].argmax()) + 1]
+            top = [[classes[index], rounded(score)] for score, index in pairs]
+            label = classes[int(vector[1:].argmax()) + 1]
             kept.append({"box": [round(x, 1) for x in box.tolist()], "label": label, "scores": top})
-    texts = [f"{number} {detection['label']}" for number, detection in enumerate(kept, 1)]
-    sizes = [(unit * (11.5 * len(text) + 8), unit * 25) for text in texts]
+    width, height = scanpath.grid.extent.tolist()
+    unit = width / 640
     x, y = (scanpath.fixations[fixation] + 0.5).tolist()
-    gaze = (x - 14 * unit, y - 14 * unit, x + 14 * unit, y + 14 * unit)
-    places = place_labels([tuple(detection["box"]) for detection in kept], sizes, (width, height), [gaze])
-    for detection, place in zip(kept, places, strict=True):
-        detection["tag"] = [round(x, 1) for x in place]
-    return kept
+    texts = [f"{number} {detection['label']}" for number, detection in enumerate(kept, 1)]
+    return tagged(kept, texts, (width, height), [(x - 14 * unit, y - 14 * unit, x + 14 * unit, y + 14 * unit)])
+
+
+def tagged(
+    detections: list[Data], texts: Sequence[str], frame: tuple[float, float], taken: Sequence[Box] = ()
+) -> list[Data]:
+    """Detections with `tag`, the rectangle of their text.
+
+    Args:
+        detections: each with its `box`.
+        texts: text of each.
+        frame: `(width, height)` of the picture in which they are drawn.
+        taken: rectangles that no text may cover.
+
+    Returns:
+        The detections.
+    """
+    unit = frame[0] / 640
+    sizes = [(unit * (11.5 * len(text) + 8), unit * 25) for text in texts]
+    places = place_labels([tuple(detection["box"]) for detection in detections], sizes, frame, taken)
+    return [
+        {**detection, "tag": [round(x, 1) for x in place]} for detection, place in zip(detections, places, strict=True)
+    ]
 
 
 def map_data(scanpath: Scanpath, classes: int | None) -> list[Data]:

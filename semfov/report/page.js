@@ -3,7 +3,7 @@
   const report = JSON.parse(document.getElementById("data").textContent);
   const find = (id) => document.getElementById(id);
   const GAZE = "#0072B2", TARGET = "#B84700", FOUND = "#00795A", OTHER = "#1F4E79", TRUTH = "#E69F00";
-  let episode, fixation = 0, chosenClass = 0, playing = null;
+  let episode, fixation = 0, chosenClass = 0, wantedClass = null, playing = null;
 
   // Elements: names and texts are set as text, never as markup.
   function make(namespace, tag, attributes = {}, children = []) {
@@ -26,6 +26,8 @@
     const { bytes: steps, max } = decode(map);
     return Array.from(steps.subarray(fixation * cells(), (fixation + 1) * cells()), (step) => step / 255 * max);
   }
+  // Episodes in large pictures have looks. Their pictures and tables are in the page, and need only be chosen.
+  const steps = () => episode.looks ?? episode.fixations;
   const short = (value) => value === null ? "none" : Number(value.toPrecision(3)).toString();
   const place = (cell) => `column ${cell % episode.grid[0]}, row ${Math.floor(cell / episode.grid[0])}`;
   function colour(scale, share) {
@@ -184,14 +186,31 @@
     find("seconds").replaceChildren(html("thead", {}, head), html("tbody", {}, rows));
   }
 
+  function showLook() {
+    const now = episode.looks[fixation], article = find(episode.article);
+    for (const look of article.querySelectorAll(".look")) look.hidden = Number(look.dataset.look) !== fixation;
+    for (const drawn of article.querySelectorAll("g[data-look]")) {
+      drawn.classList.toggle("now", Number(drawn.dataset.look) === fixation);
+      drawn.classList.toggle("later", Number(drawn.dataset.look) > fixation);
+    }
+    const frames = [box(now.box, { class: "under" }), box(now.box, { class: "over" })];
+    article.querySelector(".chosen").replaceChildren(...frames);
+    find("status").textContent = now.status;
+  }
+
   // Controls.
   function show() {
-    const now = episode.fixations[fixation], last = episode.fixations.length - 1;
+    const last = steps().length - 1;
     find("fixation").value = fixation;
-    find("fixation").setAttribute("aria-valuetext", `fixation ${fixation} of ${last}`);
+    find("fixation").setAttribute("aria-valuetext", `${episode.looks ? "look" : "fixation"} ${fixation} of ${last}`);
     find("number").textContent = `${fixation} of ${last}`;
     find("back").disabled = fixation === 0;
     find("forward").disabled = fixation === last;
+    if (episode.looks) showLook();
+    else showFixation(last);
+  }
+  function showFixation(last) {
+    const now = episode.fixations[fixation];
     drawPath();
     drawView();
     const believed = drawBelief();
@@ -205,20 +224,31 @@
     find("status").textContent = `At ${place(now.cell)}, the eye saw: ${seen}. ${believed}${sure}${end}`;
   }
   function go(number) {
-    const wanted = Math.min(Math.max(number, 0), episode.fixations.length - 1);
+    const wanted = Math.min(Math.max(number, 0), steps().length - 1);
     if (wanted === fixation) return;
     fixation = wanted;
     show();
   }
   function open(number) {
-    const wanted = episode ? episode.maps[chosenClass].label : null;
+    if (episode?.maps) wantedClass = episode.maps[chosenClass].label;
     episode = report.episodes[number];
     fixation = 0;
-    chosenClass = Math.max(0, episode.maps.findIndex((map) => map.label === wanted));
-    find("fixation").max = episode.fixations.length - 1;
-    find("class").replaceChildren(...episode.maps.map((map, index) => html("option", { value: index }, map.label)));
-    find("class").value = chosenClass;
-    for (const told of document.querySelectorAll("[data-about]")) told.textContent = episode[told.dataset.about] ?? "not recorded";
+    find("fixation").max = steps().length - 1;
+    find("episode-views").hidden = Boolean(episode.looks);
+    for (const article of document.querySelectorAll(".large")) article.hidden = article.id !== episode.article;
+    if (episode.maps) {
+      chosenClass = Math.max(0, episode.maps.findIndex((map) => map.label === wantedClass));
+      find("class").replaceChildren(...episode.maps.map((map, index) => html("option", { value: index }, map.label)));
+      find("class").value = chosenClass;
+    }
+    const word = episode.looks ? "look" : "fixation";
+    find("word").textContent = word[0].toUpperCase() + word.slice(1);
+    find("back").setAttribute("aria-label", `Previous ${word}`);
+    find("forward").setAttribute("aria-label", `Next ${word}`);
+    for (const told of document.querySelectorAll("[data-about]")) {
+      told.parentElement.hidden = !(told.dataset.about in episode);
+      told.textContent = episode[told.dataset.about] ?? "not recorded";
+    }
     show();
   }
   function stop() {
@@ -228,14 +258,15 @@
   }
   function play() {
     if (playing !== null) return stop();
-    if (fixation === episode.fixations.length - 1) go(0);
+    if (fixation === steps().length - 1) go(0);
     find("play").textContent = "Pause";
     playing = setInterval(() => {
       go(fixation + 1);
-      if (fixation === episode.fixations.length - 1) stop();
+      if (fixation === steps().length - 1) stop();
     }, 1000);
   }
 
+  document.documentElement.classList.add("scripted");
   if (!report.episodes.length) {
     find("viewer").hidden = true;
     return;
@@ -248,10 +279,16 @@
   find("back").addEventListener("click", () => { stop(); go(fixation - 1); });
   find("forward").addEventListener("click", () => { stop(); go(fixation + 1); });
   find("play").addEventListener("click", play);
+  document.addEventListener("click", (event) => {
+    const chosen = event.target.closest(".window");
+    if (!chosen) return;
+    stop();
+    go(Number(chosen.dataset.look));
+  });
   document.addEventListener("keydown", (event) => {
     // Lists and the slider use these keys themselves.
     if (event.target.closest("select, input, .wide") || event.altKey || event.ctrlKey || event.metaKey) return;
-    const moves = { ArrowLeft: fixation - 1, ArrowRight: fixation + 1, Home: 0, End: episode.fixations.length - 1 };
+    const moves = { ArrowLeft: fixation - 1, ArrowRight: fixation + 1, Home: 0, End: steps().length - 1 };
     if (!(event.key in moves)) return;
     event.preventDefault();
     stop();

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from semfov.io.files import write_text
 from semfov.report.episode import Data, Pool
+from semfov.report.looks import ABOUT, looks_html
 from semfov.viz.style import PROBABILITY, TIME, UNCERTAINTY, overlay_colours
 
 if TYPE_CHECKING:
@@ -21,12 +22,20 @@ FOLDER = Path(__file__).parent
 OPACITY = 0.82
 """Opacity over the photograph of colours that do not stand for probabilities."""
 
-ABOUT = {"name": "Photograph", "detector": "Detector", "sensor": "Sensor", "decision": "Decision"}
-"""Entries at the head of a page, by their keys in the data of an episode."""
-
 
 def write_page(path: Path, title: str, episodes: Sequence[Data], pool: Pool, *, sections: str = "") -> Path:
-    """Write a page on which a reader steps through episodes, and return its path; arguments as for `page_html`."""
+    """Write a page on which a reader steps through episodes.
+
+    Args:
+        path: the HTML file.
+        title: plain text.
+        episodes: data of the episodes, from `episode_data` and `zoom_data`, in any order.
+        pool: pictures of the episodes.
+        sections: HTML to insert above the episodes, with special characters already escaped.
+
+    Returns:
+        The path of the file.
+    """
     write_text(path, page_html(title, episodes, pool, sections=sections))
     return path
 
@@ -36,16 +45,19 @@ def page_html(title: str, episodes: Sequence[Data], pool: Pool, *, sections: str
 
     Args:
         title: plain text.
-        episodes: data of the episodes (`semfov.report.episode.episode_data`).
+        episodes: data of the episodes, from `episode_data` and `zoom_data`, in any order.
         pool: pictures of the episodes.
         sections: HTML to insert above the episodes, with special characters already escaped.
 
     Returns:
         The HTML of the page.
     """
+    # Pictures of large pictures are in the markup, which is complete without the script.
+    drawn = {episode["image"] for episode in episodes if "looks" not in episode}
+    drawn |= {each["view"] for episode in episodes if "looks" not in episode for each in episode["fixations"]}
     data = {
-        "episodes": list(episodes),
-        "pictures": pool.pictures,
+        "episodes": [_scripted(episode, number) for number, episode in enumerate(episodes)],
+        "pictures": [uri if number in drawn else None for number, uri in enumerate(pool.pictures)],
         "colours": {
             "time": colour_steps(TIME),
             "overlay": colour_steps(overlay_colours()),
@@ -59,22 +71,44 @@ def page_html(title: str, episodes: Sequence[Data], pool: Pool, *, sections: str
         "program": (FOLDER / "page.js").read_text(encoding="utf-8"),
         "data": json_script(data),
         "sections": sections,
-        "about": about_html(episodes[0] if episodes else None),
+        "about": about_html(episodes),
+        "looks": "".join(
+            looks_html(episode, pool, _place(number), headed=number == 0)
+            for number, episode in enumerate(episodes)
+            if "looks" in episode
+        ),
+        "fixations": " hidden" if episodes and all("looks" in episode for episode in episodes) else "",
     }
     template = (FOLDER / "page.html").read_text(encoding="utf-8")
     # All parts are inserted in one pass, so that braces inside a part are not taken for a placeholder.
     return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], template)
 
 
-def about_html(episode: Data | None) -> str:
-    """The head of the page: photograph, detector, sensor and decision; the script updates it for other episodes."""
-    if episode is None:
+def about_html(episodes: Sequence[Data]) -> str:
+    """The head of the page: facts about the first episode, which the script updates for other episodes."""
+    if not episodes:
         return ""
-    told = "".join(
-        f'<div><dt>{label}</dt><dd data-about="{key}">{escape(episode[key] or "not recorded")}</dd></div>'
-        for key, label in ABOUT.items()
-    )
-    return f'<dl id="about">{told}</dl>'
+    told = []
+    for key, label in ABOUT.items():
+        if any(key in episode for episode in episodes):
+            hidden = "" if key in episodes[0] else " hidden"
+            fact = escape(episodes[0].get(key) or "not recorded")
+            told.append(f'<div{hidden}><dt>{label}</dt><dd data-about="{key}">{fact}</dd></div>')
+    return f'<dl id="about" class="facts">{"".join(told)}</dl>'
+
+
+def _place(number: int) -> str:
+    """Id of the element with the looks of an episode."""
+    return f"large-{number}"
+
+
+def _scripted(episode: Data, number: int) -> Data:
+    """The part of an episode that the script needs."""
+    if "looks" not in episode:
+        return episode
+    looks = [{"box": look["box"], "status": look["status"]} for look in episode["looks"]]
+    about = {key: episode[key] for key in (*ABOUT, "summary")}
+    return {**about, "article": _place(number), "looks": looks}
 
 
 def json_script(data: Any) -> str:

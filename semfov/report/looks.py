@@ -1,0 +1,163 @@
+"""The looks at a large picture as HTML, which is complete without JavaScript."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+from semfov.report.curves import table_html
+from semfov.report.episode import Data, Pool
+from semfov.report.zoom import LISTED
+from semfov.viz.labels import place_labels
+
+ABOUT = {
+    "name": "Photograph",
+    "pixels": "Size",
+    "detector": "Detector",
+    "sensor": "Sensor",
+    "passes": "Passes of the detector",
+    "decision": "Decision",
+}
+"""Entries at the head of an episode, by their keys in its data."""
+
+
+NUMBER = (
+    "The value of a look is the number of new objects that it was expected to show, and a share of those that closer "
+    "looks would then show."
+)
+"""What values mean where objects are counted (`semfov.zoom.policy.best_find`)."""
+
+PROBABILITY = (
+    "The value of a look is the probability that it shows the target. For a wide window it is the sum of these "
+    "probabilities over the closer windows in it, divided by a constant, if that is larger."
+)
+"""What values mean in searches (`semfov.zoom.policy.best_hit`)."""
+
+
+def looks_html(data: Data, pool: Pool, place: str, *, headed: bool = True) -> str:
+    """The picture with its windows and objects, all looks, and a table of the objects.
+
+    Args:
+        data: data of the path (`semfov.report.zoom.zoom_data`).
+        pool: the pictures.
+        place: id of the element.
+        headed: whether the head of the page shows this path. Otherwise a head is added for readers without JavaScript.
+
+    Returns:
+        HTML.
+    """
+    name, count = escape(data["name"]), data["count"]
+    told = "".join(f"<div><dt>{ABOUT[key]}</dt><dd>{escape(data[key] or 'not recorded')}</dd></div>" for key in ABOUT)
+    head = "" if headed else f'<noscript><dl class="facts">{told}</dl></noscript>'
+    looks = "".join(_look(data, number, pool, f"{place}-look-{number}") for number in range(len(data["looks"])))
+    caption = "Windows, numbered in the order of the looks, and objects that were found"
+    value = PROBABILITY if data["decided"] else NUMBER
+    return (
+        f'<article class="large" id="{place}" aria-labelledby="{place}-name"><h3 id="{place}-name">{name}</h3>{head}'
+        f'<p class="hint keys">The keys ← and → step through the looks. Home and End go to the first and the last one. '
+        f"Click on the number or the border of a window to choose its look.</p>"
+        f'<div class="panes"><figure class="overview"><figcaption>{caption}</figcaption>{_picture(data, pool)}</figure>'
+        f'{looks}</div><p class="hint">{value} A look brought the objects whose final box comes from it.</p>'
+        f"<h3>Objects</h3>{_objects(data, count)}</article>"
+    )
+
+
+def _picture(data: Data, pool: Pool) -> str:
+    """The picture with numbered windows and objects."""
+    width, height = data["size"]
+    unit = max(width, height) / 640
+    windows = list(enumerate(data["looks"]))[1:]
+    sizes = [(unit * (8 * len(str(number)) + 8), unit * 17) for number, _ in windows]
+    tags = place_labels([tuple(look["box"]) for _, look in windows], sizes, (width, height))
+    shapes = []
+    for each in data["objects"]:
+        kind = "object target" if each["label"] == data["target"] else "object"
+        title = f"<title>{escape(each['label'])} {each['score']:.2f}, look {each['look']}</title>"
+        shapes.append(f'<g class="{kind}" data-look="{each["look"]}">{title}{_framed(each["box"])}</g>')
+    if data["found"] is not None:
+        shapes.append(f'<g class="object found"><title>decision</title>{_framed(data["found"])}</g>')
+    for (number, look), tag in zip(windows, tags, strict=True):
+        x, y = (tag[0] + tag[2]) / 2, (tag[1] + tag[3]) / 2
+        text = f'<text x="{x:.1f}" y="{y:.1f}" font-size="{13 * unit:.1f}">{number}</text>'
+        shapes.append(f'<g class="window" data-look="{number}">{_framed(look["box"])}{_rect(tag, "tag")}{text}</g>')
+    label = f"The picture with {len(windows)} numbered windows and {data['count']} objects"
+    return (
+        f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">'
+        f'{_image(pool.pictures[data["image"]], (width, height))}{"".join(shapes)}<g class="chosen"></g></svg>'
+    )
+
+
+def _look(data: Data, number: int, pool: Pool, place: str) -> str:
+    """A look: its pixels with its detections, its window and value, and a table of the detections."""
+    look = data["looks"][number]
+    x1, y1, x2, y2 = look["box"]
+    size, unit = (x2 - x1, y2 - y1), (x2 - x1) / 640
+    shapes, tags = [], []
+    rows = [["#", "class", "score", "box"]]
+    for order, each in enumerate(look["detections"], 1):
+        kind = "detection target" if each["label"] == data["target"] else "detection"
+        shapes.append(f'<g class="{kind}">{_framed(each["box"])}</g>')
+        left, top, right, bottom = each["tag"]
+        text = (
+            f'<text x="{left + 4 * unit:.1f}" y="{(top + bottom) / 2:.1f}" font-size="{19 * unit:.1f}" '
+            f'textLength="{max(right - left - 8 * unit, 0):.1f}" lengthAdjust="spacingAndGlyphs">'
+            f"{order}</text>"
+        )
+        tags.append(f'<g class="{kind}">{_rect(each["tag"], "tag")}{text}</g>')
+        corners = [n + low for n, low in zip(each["box"], (x1, y1, x1, y1), strict=True)]
+        rows.append([str(order), each["label"], f"{each['score']:.2f}", _corners(corners)])
+    value = "none: the first look" if look["value"] is None else f"{look['value']:.2g}"
+    facts = {
+        "Window": f"x {x1} to {x2}, y {y1} to {y2} ({size[0]} × {size[1]} px)",
+        "Magnification": f"{look['magnification']:.2g}",
+        "Value when it was chosen": value,
+        "Objects that it brought": look["brought"],
+    }
+    told = "".join(f"<div><dt>{key}</dt><dd>{escape(fact)}</dd></div>" for key, fact in facts.items())
+    table = "<p>No detections.</p>"
+    if len(rows) > 1:
+        table = table_html(rows, f"Detections of look {number}, with boxes (x1, y1, x2, y2) in picture pixels")
+    left = look["count"] - len(look["detections"])
+    label = f"The window of look {number} with {look['count']} detection{'s' if look['count'] != 1 else ''}"
+    return (
+        f'<section class="look" data-look="{number}" id="{place}" aria-labelledby="{place}-title">'
+        f'<h4 id="{place}-title">Look {number}{"" if number else ": the whole picture"}</h4>'
+        f'<svg viewBox="0 0 {size[0]} {size[1]}" role="img" aria-label="{label}">'
+        f"{_image(pool.pictures[look['view']], size)}{''.join(shapes)}{''.join(tags)}</svg>"
+        f'<dl class="facts">{told}</dl>{table}{_left_out(left, "detection")}</section>'
+    )
+
+
+def _objects(data: Data, count: int) -> str:
+    """The table of the objects, most confident first."""
+    if not count:
+        return "<p>No objects were found.</p>"
+    rows = [["#", "class", "score", "box", "look"]]
+    for order, each in enumerate(data["objects"][:LISTED], 1):
+        rows.append([str(order), each["label"], f"{each['score']:.2f}", _corners(each["box"]), str(each["look"])])
+    caption = "Objects, most confident first, with boxes (x1, y1, x2, y2) in picture pixels and the look of each box"
+    return table_html(rows, caption) + _left_out(count - len(rows) + 1, "object")
+
+
+def _left_out(count: int, what: str) -> str:
+    if not count:
+        return ""
+    return f"<p>{count} less confident {what}{'s are' if count != 1 else ' is'} left out.</p>"
+
+
+def _corners(box: Sequence[float]) -> str:
+    return ", ".join(f"{n:.0f}" for n in box)
+
+
+def _image(uri: str, size: tuple[int, int]) -> str:
+    return f'<image href="{uri}" width="{size[0]}" height="{size[1]}" preserveAspectRatio="none"/>'
+
+
+def _framed(box: Sequence[float]) -> str:
+    """A box drawn twice: a light line under a coloured one."""
+    return _rect(box, "under") + _rect(box, "over")
+
+
+def _rect(box: Sequence[float], kind: str) -> str:
+    x1, y1, x2, y2 = box
+    return f'<rect class="{kind}" x="{x1:g}" y="{y1:g}" width="{max(x2 - x1, 0):g}" height="{max(y2 - y1, 0):g}"/>'
