@@ -23,6 +23,7 @@ MODULES = (
     "semfov.live",
     "semfov.scanpath",
     "semfov.viz",
+    "semfov.report",
     "semfov.zoom",
     "semfov.head",
     "semfov.envs",

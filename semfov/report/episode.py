@@ -36,7 +36,16 @@ class Pool:
         self._index: dict[str, int] = {}
 
     def add(self, image: Tensor, width: int, quality: int) -> int:
-        """Add a picture `(3, H, W)`, reduced to at most `width` pixels, and return its number."""
+        """Add a picture.
+
+        Args:
+            image: `(3, H, W)`, RGB in [0, 1].
+            width: largest width in pixels; wider pictures are reduced.
+            quality: of the JPEG file.
+
+        Returns:
+            The number of the picture.
+        """
         uri = jpeg_uri(image, width, quality)
         if uri not in self._index:
             self._index[uri] = len(self.pictures)

@@ -140,11 +140,16 @@ def test_a_large_picture_is_looked_at_in_windows(run, large, shipped_evidence, t
     )
     assert code == 0
     assert "field.png, 1280 × 960 px, looked at in windows: red: found" in printed.out
-    assert "ignored for a picture of this size: start, report" in printed.out
+    assert "ignored for a picture of this size: start\n" in printed.out
     assert "   0  the whole picture × 0.12: 1 detection" in printed.out
     with Image.open(tmp_path / "out" / "zoom.png") as picture:
         picture.verify()
-    assert not (tmp_path / "page.html").exists()
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    (episode,) = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])["episodes"]
+    assert episode["name"] == "field.png"
+    assert episode["passes"].endswith(" of at most 6")
+    assert episode["decision"].startswith("“red” found")
+    assert len(episode["looks"]) == page.count('class="look"')
     code, printed = run(large, "--target", "red", "--confirm", 1, "--give_up", 0, "--shifts", 3)
     assert "red: undecided" in printed.out
     assert "in 4 passes" in printed.out
@@ -154,8 +159,12 @@ def test_a_large_picture_is_looked_at_in_windows(run, large, shipped_evidence, t
 
 def test_a_folder_may_have_small_and_large_pictures(run, photo, large, shipped_evidence, tmp_path):
     photo.rename(large.with_name(photo.name))
-    code, _ = run(large.parent, "--target", "red", "--start", 47)
+    code, _ = run(large.parent, "--target", "red", "--start", 47, "--report", tmp_path / "page.html")
     assert code == 0
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    episodes = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])["episodes"]
+    assert [each["name"] for each in episodes] == ["field.png", "my photo.png"]
+    assert ["looks" in each for each in episodes] == [True, False]
     assert (tmp_path / "out" / "000-field.png" / "zoom.png").is_file()
     assert (tmp_path / "out" / "001-my-photo.png" / "scanpath.png").is_file()
 

@@ -8,9 +8,13 @@ import pytest
 import torch
 
 from semfov import Detections, Grid, Scanpath
+from semfov.decision import Decision
 from semfov.experiments import run_report
 from semfov.experiments.config import DataConfig, PolicyConfig, SearchConfig
 from semfov.experiments.summary import Curve
+from semfov.report import Pool, write_page, zoom_data
+from semfov.zoom import Lattice, Objects, ZoomPath
+from semfov.zoom.glances import Glance, on_lattice
 
 
 @pytest.fixture
@@ -77,3 +81,40 @@ def run_page(scanpath: Scanpath, image: torch.Tensor, hostile: str, tmp_path: Pa
         shifts=(0, 2),
         others={hostile + "2": share},
     )
+
+
+@pytest.fixture
+def zoom_path(hostile: str) -> ZoomPath:
+    """Three looks at a picture of 400 × 300 px, the whole of it and two windows of 200 px."""
+    lattice = Lattice.over((400, 300), (100, 100))
+    boxes = torch.tensor([[[20.0, 20, 60, 50]], [[30.0, 24, 61, 52]], [[250.0, 110, 280, 160]]])
+    scores = torch.tensor([[0.3, 0.1, 0.5, 0.1], [0.1, 0.04, 0.8, 0.06], [0.1, 0.6, 0.2, 0.1]])
+    glances = tuple(
+        Glance(
+            on_lattice(lattice, action),
+            Detections(boxes[None, number], scores[None, number, None], torch.ones(1, 1, dtype=torch.bool)),
+            torch.zeros(1, dtype=torch.bool),
+            scores[number, 1:],
+            None,
+        )
+        for number, action in enumerate([(0, 0, 0), (1, 0, 0), (1, 16, 8)])
+    )
+    objects = Objects(boxes[1:, 0], torch.tensor([0.8, 0.2]), torch.tensor([2, 2]), torch.tensor([1, 2]))
+    classes = ("background", "cat", hostile, "cup")
+    decision = Decision("found", 0.93, None, boxes[1, 0])
+    return ZoomPath(lattice, classes, 2, glances, (float("inf"), 0.5, 0.25), objects, decision)
+
+
+@pytest.fixture
+def large_picture() -> torch.Tensor:
+    """Colours that tell the place: red grows along x, and green along y."""
+    across, down = torch.linspace(0, 1, 400).expand(300, 400), torch.linspace(0, 1, 300)[:, None].expand(300, 400)
+    return torch.stack([across, down, torch.full((300, 400), 0.5)])
+
+
+@pytest.fixture
+def zoom_page(zoom_path: ZoomPath, large_picture: torch.Tensor, hostile: str, tmp_path: Path) -> Path:
+    """The page of a large picture whose names are `hostile`."""
+    settings = {"detector": {"name": hostile}}
+    data = zoom_data(zoom_path, large_picture, pool := Pool(), name=hostile, settings=settings, passes=5)
+    return write_page(tmp_path / "large.html", hostile, [data], pool)

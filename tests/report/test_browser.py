@@ -11,8 +11,7 @@ from itertools import combinations
 
 import pytest
 
-from semfov.report.episode import Pool, episode_data
-from semfov.report.page import write_page
+from semfov.report import Pool, episode_data, write_page, zoom_data
 from semfov.viz.style import overlay_colours
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install playwright)")
@@ -162,14 +161,16 @@ def test_saccades_are_thin_and_fixations_coloured_by_time(opened):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", [(1200, 900), (360, 740)], ids=["desktop", "phone"])
-@pytest.mark.parametrize("kind", ["episodes", "run", "notebook"])
-def test_axe_finds_no_accessibility_violation(chromium, path, run_page, scanpath, kind, size, scheme, tmp_path):
+@pytest.mark.parametrize("kind", ["episodes", "run", "notebook", "large"])
+def test_axe_finds_no_accessibility_violation(
+    chromium, path, run_page, zoom_page, scanpath, kind, size, scheme, tmp_path
+):
     if kind == "notebook":
         frame = scanpath._repr_html_()
         page_file = tmp_path / "notebook.html"
         page_file.write_text(f'<!DOCTYPE html><html lang="en"><title>n</title><main><h1>n</h1>{frame}</main>', "utf-8")
     else:
-        page_file = path if kind == "episodes" else run_page
+        page_file = {"episodes": path, "run": run_page, "large": zoom_page}[kind]
     context = chromium.new_context(viewport={"width": size[0], "height": size[1]}, color_scheme=scheme)
     page = context.new_page()
     page.goto(page_file.as_uri())
@@ -280,15 +281,69 @@ def test_the_play_button_runs_to_the_last_fixation(opened):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_page_fits_on_a_phone_and_text_has_enough_contrast(chromium, path, scheme):
+@pytest.mark.parametrize("kind", ["small", "large"])
+def test_the_page_fits_on_a_phone_and_text_has_enough_contrast(chromium, path, zoom_page, kind, scheme):
     """Nothing is wider than the screen, and the contrast of text is 4.5 to 1 or more."""
     context = chromium.new_context(viewport={"width": 360, "height": 740}, color_scheme=scheme)
     page = context.new_page()
-    page.goto(path.as_uri())
+    page.goto((path if kind == "small" else zoom_page).as_uri())
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
     ratios = page.evaluate(CONTRAST)
     assert len(ratios) > 20
     assert min(ratios.values()) >= 4.5, ratios
+    context.close()
+
+
+def test_keys_and_clicks_choose_a_look(chromium, zoom_page, hostile):
+    page, told = watched(chromium)
+    page.goto(zoom_page.as_uri())
+    assert page.locator("#episode-views").is_hidden()
+    shown = page.locator(".look:visible")
+    assert shown.locator("h4").all_inner_texts() == ["Look 0: the whole picture"]
+    assert page.get_by_role("button", name="Next look").count() == 1
+    page.keyboard.press("ArrowRight")
+    assert shown.locator("h4").all_inner_texts() == ["Look 1"]
+    assert page.locator("#number").inner_text() == "1 of 2"
+    assert page.locator("#status").inner_text().startswith("Look 1 of 2 at (100, 100)")
+    chosen = page.locator(".chosen rect").first
+    assert [chosen.get_attribute(name) for name in ("x", "y", "width", "height")] == ["0", "0", "200", "200"]
+    assert page.locator(".window.now").get_attribute("data-look") == "1"
+    assert page.locator(".window.later").get_attribute("data-look") == "2"
+    page.locator(".window[data-look='2'] text").click()
+    assert shown.locator("h4").all_inner_texts() == ["Look 2"]
+    assert page.locator(".object.now").get_attribute("data-look") == "2"
+    page.locator("#fixation").focus()
+    page.keyboard.press("Home")
+    assert page.locator("#number").inner_text() == "0 of 2"
+    assert hostile in page.locator("#about").inner_text()
+    assert told == []
+    page.close()
+
+
+def test_small_and_large_pictures_are_chosen_on_one_page(chromium, scanpath, image, zoom_path, large_picture, tmp_path):
+    pool = Pool()
+    large = zoom_data(zoom_path, large_picture, pool, name="large.jpg")
+    small = episode_data(scanpath, image, [image] * 3, pool, name="small.jpg")
+    page, told = watched(chromium)
+    page.goto(write_page(tmp_path / "both.html", "both", [large, small, {**large, "name": "other.jpg"}], pool).as_uri())
+    for number, visible in ((1, []), (2, ["other.jpg"]), (0, ["large.jpg"])):
+        page.locator("#episode").select_option(index=number)
+        assert page.locator(".large:visible > h3:first-child").all_inner_texts() == visible
+        assert page.locator("#episode-views").is_visible() == (not visible)
+        assert page.locator("#word").inner_text() == ("Look" if visible else "Fixation")
+        assert page.locator("#about dd").nth(1).is_visible() == bool(visible)
+        page.locator("#forward").click()
+        assert page.locator("#number").inner_text() == "1 of 2"
+    assert told == []
+    page.close()
+
+
+def test_without_javascript_all_looks_are_shown(chromium, zoom_page):
+    context = chromium.new_context(java_script_enabled=False)
+    page = context.new_page()
+    page.goto(zoom_page.as_uri())
+    assert page.locator(".look:visible").count() == 3
+    assert page.locator(".controls").is_hidden()
     context.close()
 
 
@@ -306,7 +361,7 @@ CONTRAST = """() => {
     return [255, 255, 255];
   };
   const ratios = {};
-  const texts = "h1, h2, h3, p, label, output, button, select, figcaption, th, td, span";
+  const texts = "h1, h2, h3, h4, p, label, dt, dd, output, button, select, figcaption, th, td, span";
   for (const element of document.querySelectorAll(texts)) {
     if (!element.textContent.trim() || element.disabled) continue;
     const [a, b] = [light(channels(getComputedStyle(element).color)), light(behind(element))];

@@ -1,0 +1,223 @@
+"""The page of a large picture: complete without a script, and names are never interpreted as markup."""
+
+import base64
+import io
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from semfov.decision import Decision
+from semfov.errors import InputError
+from semfov.report import Pool, episode_data, page_html, zoom_data
+from semfov.report.zoom import LISTED, SHOWN
+from semfov.zoom import Objects
+
+VOID = {"meta", "link", "input", "br", "img", "hr"}
+
+
+class Elements(HTMLParser):
+    """Elements and texts of a page; all elements must be closed in their order, and ids occur once."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.found, self.texts, self.open = [], [], []
+        self.feed(page)
+        assert self.open == []
+        ids = [attributes["id"] for _, attributes in self.found if "id" in attributes]
+        assert len(ids) == len(set(ids))
+
+    def handle_starttag(self, tag, attributes):
+        self.found.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_startendtag(self, tag, attributes):
+        self.found.append((tag, dict(attributes)))
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+    def of(self, kind):
+        return [attributes for _, attributes in self.found if kind in (attributes.get("class") or "").split()]
+
+
+def script_data(page):
+    return json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])
+
+
+def pixels(uri):
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1]))), dtype=float) / 255
+
+
+def test_names_are_never_interpreted_as_markup(zoom_page, hostile):
+    page = zoom_page.read_text(encoding="utf-8")
+    assert hostile not in page
+    elements = Elements(page)
+    tags = [tag for tag, _ in elements.found]
+    assert tags.count("script") == 2
+    assert "img" not in tags
+    assert not [name for _, attributes in elements.found for name in attributes if name.startswith("on")]
+    # Title, heading, two entries of the head, name of the picture, rows of tables, and titles of objects.
+    assert elements.texts.count(hostile) >= 7
+    assert "<" not in re.search(r'id="data">(.*?)</script>', page, re.S)[1]
+
+
+def test_the_page_loads_nothing_from_elsewhere(zoom_page):
+    page = zoom_page.read_text(encoding="utf-8")
+    links = [a[name] for _, a in Elements(page).found for name in ("src", "href", "action", "data") if name in a]
+    assert len(links) >= 5
+    assert all(link.startswith("data:") for link in links)
+    assert "url(" not in page
+    assert "default-src 'none'" in page
+
+
+def test_pictures_are_in_the_markup_alone(zoom_page):
+    page = zoom_page.read_text(encoding="utf-8")
+    assert page.count("data:image/jpeg;base64,") == 4
+    assert script_data(page)["pictures"] == [None] * 4
+
+
+def test_each_look_shows_the_pixels_of_its_window(zoom_path, large_picture):
+    data = zoom_data(zoom_path, large_picture, pool := Pool(), name="field")
+    assert [look["box"] for look in data["looks"]] == [[0, 0, 400, 300], [0, 0, 200, 200], [200, 100, 400, 300]]
+    for look in data["looks"]:
+        x1, y1, x2, y2 = look["box"]
+        seen = pixels(pool.pictures[look["view"]])
+        # The resolution is that of the detector's input.
+        assert seen.shape[1] == round((x2 - x1) * look["magnification"])
+        assert seen[..., 0].mean() == pytest.approx((x1 + x2 - 1) / 2 / 399, abs=0.02)
+        assert seen[..., 1].mean() == pytest.approx((y1 + y2 - 1) / 2 / 299, abs=0.02)
+    assert pixels(pool.pictures[data["image"]]).shape == (300, 400, 3)
+
+
+def test_detections_are_in_pixels_of_their_window(zoom_path, large_picture, hostile):
+    shifted = zoom_data(zoom_path, large_picture, Pool(), name="field")["looks"]
+    for look, glance in zip(shifted, zoom_path.glances, strict=True):
+        x1, y1 = look["box"][:2]
+        (seen,) = look["detections"]
+        boxes = glance.detections.boxes[0, 0].tolist()
+        assert [n + low for n, low in zip(seen["box"], (x1, y1, x1, y1), strict=True)] == pytest.approx(boxes, abs=0.1)
+    # The last detection is of a cat, but the score of the target counts where it is large enough.
+    assert [(look["detections"][0]["label"], look["detections"][0]["score"]) for look in shifted] == [
+        (hostile, 0.5),
+        (hostile, 0.8),
+        (hostile, 0.2),
+    ]
+    explored = zoom_data(replace(zoom_path, target=None, decision=None), large_picture, Pool(), name="field")
+    assert explored["looks"][2]["detections"][0]["label"] == "cat"
+
+
+def test_windows_objects_and_looks_are_in_the_page_without_a_script(zoom_page, zoom_path):
+    elements = Elements(zoom_page.read_text(encoding="utf-8"))
+    assert [each["data-look"] for each in elements.of("window")] == ["1", "2"]
+    assert [each.get("data-look") for each in elements.of("object")] == ["1", "2", None]
+    looks = elements.of("look")
+    assert [each["data-look"] for each in looks] == ["0", "1", "2"]
+    assert not [each for each in looks if "hidden" in each]
+    told = " ".join(elements.texts)
+    for number, value in enumerate(["none: the first look", "0.5", "0.25"]):
+        assert re.search(rf"Look {number}\b.*?Value when it was chosen {re.escape(value)} ", told, re.S)
+    # Boxes of the table are in picture pixels.
+    assert "30, 24, 61, 52" in elements.texts
+    labels = {attributes.get("aria-label") for tag, attributes in elements.found if tag == "svg"}
+    assert "The picture with 2 numbered windows and 2 objects" in labels
+    assert "The window of look 1 with 1 detection" in labels
+
+
+def test_a_look_brought_the_objects_whose_box_comes_from_it(zoom_path, large_picture, hostile):
+    looks = zoom_data(zoom_path, large_picture, Pool(), name="field")["looks"]
+    assert [look["brought"] for look in looks] == ["none", f"1 × {hostile}", f"1 × {hostile}"]
+    assert looks[0]["status"] == "Look 0 of 2, at the whole picture. Objects that it brought: none."
+    assert looks[1]["status"].startswith("Look 1 of 2 at (100, 100), magnification 0.5. Its value was 0.5.")
+
+
+def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
+    many = LISTED + 7
+    scores = torch.linspace(0.9, 0.2, many)
+    place = torch.tensor([[10.0, 10, 20, 20]]).expand(many, 4)
+    objects = Objects(place, scores, torch.full((many,), 2), torch.zeros(many).long())
+    first = zoom_path.glances[0]
+    seen = replace(
+        first.detections,
+        boxes=place[None],
+        scores=first.detections.scores.expand(1, many, -1),
+        mask=torch.ones(1, many, dtype=torch.bool),
+    )
+    glances = (replace(first, detections=seen), *zoom_path.glances[1:])
+    data = zoom_data(replace(zoom_path, objects=objects, glances=glances), large_picture, pool := Pool(), name="crowd")
+    page = page_html("crowd", [data], pool)
+    assert "<p>7 less confident objects are left out.</p>" in page
+    assert f"<p>{many - SHOWN} less confident detections are left out.</p>" in page
+    assert page.count("0.90</td>") == 1
+    one = replace(zoom_path, objects=objects[torch.arange(LISTED + 1)])
+    page = page_html("crowd", [zoom_data(one, large_picture, pool := Pool(), name="crowd")], pool)
+    assert "<p>1 less confident object is left out.</p>" in page
+
+
+@pytest.mark.parametrize(
+    ("decision", "passes", "told"),
+    [
+        (
+            Decision("found", 0.93),
+            5,
+            "“cat” found, probability that the picture holds it: 0.93. The probability is high",
+        ),
+        (Decision("absent", 0.1), 5, "“cat” absent, probability that the picture holds it: 0.10. No remaining look is"),
+        (Decision("undecided", 0.6), 3, "“cat” undecided, .* 0.60. All 3 passes were used.$"),
+        (Decision("undecided", 0.6), 5, "0.60. No remaining look is worth a pass, but the target is probably there.$"),
+        (Decision("undecided", 0.2), 5, "0.20. No remaining look can show the target.$"),
+        (Decision("undecided", 0.6), None, "0.60.$"),
+        (None, 3, "^0 × cat found. All 3 passes were used.$"),
+        (None, 5, "^0 × cat found. No remaining look is expected to show enough new objects.$"),
+        (None, None, "^0 × cat found.$"),
+    ],
+)
+def test_the_head_tells_the_outcome_and_its_reason(zoom_path, large_picture, decision, passes, told):
+    nothing = zoom_path.objects.above(1)
+    path = replace(zoom_path, target=1, decision=decision, objects=nothing)
+    data = zoom_data(path, large_picture, pool := Pool(), name="field.png", passes=passes)
+    assert re.search(told, data["decision"])
+    page = page_html("t", [data], pool)
+    assert page.index(data["decision"]) < page.index("<main>")
+    texts = Elements(page).texts
+    assert {"field.png", "400 × 300 px", "windows of 100 × 100 px at magnifications 0.25, 0.5, 1"} <= set(texts)
+    assert ("3" if passes is None else f"3 of at most {passes}") in texts
+    assert "No objects were found." in texts
+
+
+def test_small_and_large_pictures_share_a_page(zoom_path, large_picture, scanpath, image):
+    pool = Pool()
+    small = episode_data(scanpath, image, [image * 0.5] * 3, pool, name="small.jpg")
+    large = zoom_data(zoom_path, large_picture, pool, name="large.jpg")
+    for episodes in ([small, large], [large, small]):
+        page = page_html("both", episodes, pool)
+        elements = Elements(page)
+        data = script_data(page)
+        assert [each["name"] for each in data["episodes"]] == [each["name"] for each in episodes]
+        assert data["pictures"] == [*pool.pictures[:2], *[None] * 4]
+        assert len(elements.of("large")) == 1
+        (views,) = [attributes for _, attributes in elements.found if attributes.get("id") == "episode-views"]
+        assert "hidden" not in views
+        # The head shows the first; the entries that it does not have are hidden.
+        hidden = [tag for tag, attributes in elements.found if tag == "div" and "hidden" in attributes]
+        assert len(hidden) == (2 if episodes[0] is small else 0)
+        # Without JavaScript, a large picture that is not the first has a head of its own.
+        assert ("noscript><dl" in page) == (episodes[0] is small)
+
+
+def test_a_wrong_picture_or_number_of_passes_is_refused(zoom_path, large_picture):
+    with pytest.raises(InputError, match="picture: expected the picture of the path, 400 × 300 px"):
+        zoom_data(zoom_path, large_picture[:, :200], Pool(), name="other")
+    with pytest.raises(InputError, match="passes"):
+        zoom_data(zoom_path, large_picture, Pool(), name="other", passes=2)
+    with pytest.raises(InputError, match="at least one look"):
+        zoom_data(replace(zoom_path, glances=()), large_picture, Pool(), name="other")
