@@ -150,12 +150,12 @@ def demo(config: DemoConfig) -> None:
         if zooming is not None and zooming.pays(picture.image):
             folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
             only_likeliest(wanted)
-            path, passes = zoom_in(zooming, picture, config)
+            zoomed, passes = zoom_in(zooming, picture, config)
             small = reduced(picture.image).clamp(0, 1)
-            written.append(viz.save_figure(viz.plot_zoom_path(path, small), folder / "zoom.png"))
+            written.append(viz.save_figure(viz.plot_zoom_path(zoomed, small), folder / "zoom.png"))
             if config.report is not None:
                 given = {"settings": zooming.eye.settings(), "passes": passes}
-                episodes.append(zoom_data(path, picture.image, pool, name=picture.name, **given))
+                episodes.append(zoom_data(zoomed, picture.image, pool, name=picture.name, **given))
             continue
         scanpath = look_at(agent, picture, config, wanted)
         print(told(picture.name, scanpath))

@@ -29,6 +29,10 @@ class Pool:
 
     Attributes:
         pictures: data URIs of the pictures.
+
+    >>> pool, grey = Pool(), torch.full((3, 60, 80), 0.5)
+    >>> pool.add(grey, 40, 75), pool.add(grey, 40, 75), len(pool.pictures)
+    (0, 0, 1)
     """
 
     def __init__(self) -> None:
@@ -98,7 +102,13 @@ def episode_data(
         quality: of the JPEG files.
 
     Returns:
-        The data, for `semfov.report.page.page_html`.
+        The data, for `page_html` and `write_page`.
+
+    Example::
+
+        path, pool = agent.search(image, "cup"), Pool()
+        data = episode_data(path, path.image, path.views(), pool, name="kitchen.jpg")
+        write_page(Path("kitchen.html"), "Search for a cup", [data], pool)
     """
     grid = scanpath.grid
     size = grid.extent.tolist()

@@ -35,6 +35,12 @@ def write_page(path: Path, title: str, episodes: Sequence[Data], pool: Pool, *, 
 
     Returns:
         The path of the file.
+
+    Example::
+
+        path, pool = agent.explore("harbour.tif", passes=16), Pool()
+        data = zoom_data(path, "harbour.tif", pool, name="harbour", passes=16)
+        write_page(Path("harbour.html"), "Harbour", [data], pool)
     """
     write_text(path, page_html(title, episodes, pool, sections=sections))
     return path
@@ -51,6 +57,10 @@ def page_html(title: str, episodes: Sequence[Data], pool: Pool, *, sections: str
 
     Returns:
         The HTML of the page.
+
+    >>> page = page_html("Cats & dogs", [], Pool())
+    >>> page[:15], "<h1>Cats &amp; dogs</h1>" in page
+    ('<!DOCTYPE html>', True)
     """
     # Pictures of large pictures are in the markup, which is complete without the script.
     drawn = {episode["image"] for episode in episodes if "looks" not in episode}
