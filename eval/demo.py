@@ -11,9 +11,10 @@
 
 It prints the detections and the belief at each fixation, and writes pictures and an animation to the folder `out`.
 `--draw` chooses which (`--draw "[scanpath]"`; `--draw "[]"` for none).
-Each picture of a folder is a separate episode. In a video or from a camera, the agent makes one gaze shift or one closer
-look per frame; the belief is carried from frame to frame and fades at a given rate. In a picture that is at least four times as large
-as the detector's input, the agent looks at windows and chooses their places and magnifications.
+Each picture of a folder is a separate episode. In a video or from a camera, the agent makes one gaze shift or one
+closer look per frame; the belief is carried from frame to frame and fades at a given rate. In a picture that is at
+least four times as large as the detector's input, the agent looks at windows and chooses their places and
+magnifications.
 """
 
 import sys

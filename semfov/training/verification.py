@@ -18,7 +18,9 @@ from semfov.belief.verification import FEATURES, Verification
 from semfov.errors import DataError
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.decision_report import mean, percent
+from semfov.experiments.photograph_store import PhotographStore
 from semfov.experiments.progress import track
+from semfov.experiments.run import cache_folder
 from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side
 from semfov.experiments.setup import make_eye, make_scenes, make_target_evidence
 from semfov.experiments.summary import table
@@ -63,6 +65,7 @@ class FitVerificationConfig(Settings):
         folds: number of parts of the photographs; each part is evaluated with a model that is fitted to the others.
         seed: seed of the choice of classes and of the first fixations.
         out: folder for the model and the report.
+        cache: folder for the looks at the photographs, so that an interrupted fit continues (None: the user's cache).
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -83,6 +86,7 @@ class FitVerificationConfig(Settings):
     folds: Annotated[int, Range(2, 1000)] = 5
     seed: Seed = 0
     out: Path = Path("runs/fit_verification")
+    cache: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -143,15 +147,18 @@ def fit_verification(config: FitVerificationConfig) -> None:
     chosen = [index for index, name in enumerate(scenes.ids) if name not in left_out]
     if len(chosen) < config.folds:
         raise DataError(f"data: expected at least {config.folds} photographs for the folds, got {len(chosen)}")
+    size, classes = (config.columns, config.rows), len(eye.detector.classes)
+    store = PhotographStore(cache_folder(config.cache) / "searches", eye.settings(), *size, classes)
     seen = photographs(
         eye,
         scenes,
         chosen,
-        (config.columns, config.rows),
+        size,
         classes=config.classes,
         absent=config.absent,
         max_area=config.max_target_area,
         seed=config.seed,
+        store=store,
     )
     with torch.inference_mode():
         examined = examine(seen, evidence, config)

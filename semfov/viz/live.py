@@ -55,7 +55,6 @@ def draw_moment(image: Tensor, moment: Moment, text: str) -> Frame:
     u, v = ((c + 0.5) * s for c, s in zip(grid.centres[moment.next_cell].tolist(), (across, down), strict=True))
     draw.line((x, y, u, v), fill=GAZE, width=2)
 
-
     def shown(box: Tensor) -> tuple[float, ...]:
         """The box in pixels of the drawing."""
         x1, y1, x2, y2 = (c * s for c, s in zip(box.tolist(), (across, down) * 2, strict=True))

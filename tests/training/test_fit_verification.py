@@ -1,6 +1,9 @@
 """`python -m train.fit_verification`: small on the embedded scenes, and its parts against loops and SciPy."""
 
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from semfov.belief import TargetEvidence, Verification
 from semfov.belief.observers import Target
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError
+from semfov.experiments.photograph_store import PhotographStore
 from semfov.training.closer_looks import photographs, search
 from semfov.training.verification import (
     LEVELS,
@@ -27,6 +31,8 @@ from semfov.training.verification import (
 )
 from tests.small import CLASSES, Blobs
 from train.fit_verification import main
+
+ROOT = Path(__file__).parents[2]
 
 
 def examined(count=200, seed=0):
@@ -95,15 +101,20 @@ def test_the_threshold_is_the_least_with_few_enough_false_alarms(places, share):
     assert chosen == (fits[0] if fits else LEVELS[-1])
 
 
-@pytest.fixture
-def seen():
+def opened(detector, store=None):
     """Three embedded scenes with classes to search for, and the evidence of an untrained model."""
-    eye = Eye(Foveation(9.0), Blobs(), reference=64.0).requires_grad_(False)
+    eye = Eye(Foveation(9.0), detector, reference=64.0).requires_grad_(False)
     scenes = EmbeddedScenes(CLASSES, count=3)
     options = {"classes": 2, "absent": None, "max_area": 1.0, "seed": 0}
     torch.manual_seed(0)
     evidence = TargetEvidence(4, 4, components=4).eval().requires_grad_(False)
-    return photographs(eye, scenes, [0, 1, 2], (4, 3), **options), evidence
+    kept = None if store is None else PhotographStore(store, eye.settings(), 4, 3, len(CLASSES))
+    return photographs(eye, scenes, [0, 1, 2], (4, 3), **options, store=kept), evidence
+
+
+@pytest.fixture
+def seen():
+    return opened(Blobs())
 
 
 def test_looks_that_are_remembered_equal_those_of_the_eye(seen):
@@ -156,11 +167,91 @@ def test_closer_looks_are_labelled_by_the_annotated_boxes(seen):
         examine([], evidence, config)
 
 
+class Limited(Blobs):
+    """A detector that counts its passes and stops after some."""
+
+    def __init__(self, most=10**9):
+        super().__init__()
+        self.most, self.passes = most, 0
+
+    def propose(self, canvas):
+        if self.passes == self.most:
+            raise KeyboardInterrupt
+        self.passes += 1
+        return super().propose(canvas)
+
+
+def all_of(detector, store):
+    """Examine and verify the embedded scenes."""
+    config = FitVerificationConfig(columns=4, rows=3, looks=3, folds=2)
+    found, evidence = opened(detector, store)
+    known = examine(found, evidence, config)
+    return known, list(verify(found, [fit(known, known.fold != fold) for fold in (0, 1)], evidence, config))
+
+
+def test_interrupted_searches_continue_with_the_stored_looks(tmp_path):
+    """Only the photograph that was interrupted is looked at again, and the results are those of one run."""
+    whole = Limited()
+    known, searches = all_of(whole, None)
+    most, total = whole.passes // 2, 0
+    with pytest.raises(KeyboardInterrupt):
+        all_of(Limited(most), tmp_path)
+    finished = len(list(tmp_path.rglob("*.safetensors")))
+    assert 0 < finished < 3
+    resumed = Limited()
+    again, verified = all_of(resumed, tmp_path)
+    total = resumed.passes + most
+    assert whole.passes < total < 2 * whole.passes
+    assert resumed.passes < whole.passes
+    for one, other in zip(vars(known).values(), vars(again).values(), strict=True):
+        assert torch.equal(one, other)
+    assert searches == verified
+    idle = Limited(0)
+    assert all_of(idle, tmp_path)[1] == searches
+    assert idle.passes == 0
+
+
+def test_stored_looks_are_read_as_they_were_written_or_not_at_all(tmp_path):
+    (photograph, *_), _ = opened(Blobs(), tmp_path)
+    centre = photograph.grid.centres[[5]]
+    first, box = photograph.look(5, centre), torch.tensor([3.0, 4.0, 30.1, 40.0])
+    closer = photograph.close_up(box)
+    photograph.close()
+    (path,) = tmp_path.rglob("*.safetensors")
+    (again, *_), _ = opened(Limited(0), tmp_path)
+    assert torch.equal(again.look(5, centre).scores, first.scores)
+    assert torch.equal(again.close_up(box).boxes, closer.boxes)
+    again.close()
+    path.write_bytes(path.read_bytes()[:-9])
+    counting = Limited()
+    (anew, *_), _ = opened(counting, tmp_path)
+    assert torch.equal(anew.look(5, centre).boxes, first.boxes)
+    assert counting.passes == 1
+    # Another grid has other looks.
+    eye = anew.eye
+    assert PhotographStore(tmp_path, eye.settings(), 4, 3, 3).folder == path.parent
+    assert PhotographStore(tmp_path, eye.settings(), 3, 4, 3).folder != path.parent
+
+
+@pytest.mark.weights
+@pytest.mark.long
+def test_a_killed_fit_resumes_with_the_same_model(tmp_path, kill_when):
+    small = ["--data.limit", "3", "--looks", "2", "--folds", "2", "--data.min_instances", "0"]
+    assert main([*small, "--out", str(tmp_path / "whole"), "--cache", str(tmp_path / "other")]) == 0
+    call = [sys.executable, "-m", "train.fit_verification", *small]
+    call += ["--out", str(tmp_path / "killed"), "--cache", str(tmp_path / "cache")]
+    kill_when(call, lambda: list(tmp_path.glob("cache/searches/*/*.safetensors")), cwd=ROOT)
+    assert not (tmp_path / "killed" / "report.md").exists()
+    subprocess.run(call, cwd=ROOT, check=True, capture_output=True)
+    for name in ("yolov3-tiny.safetensors", "report.md", "judged.json"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
 @pytest.mark.weights
 @pytest.mark.slow
 def test_the_command_fits_a_model_that_the_agent_can_load(tmp_path, capsys):
     small = ["--data.limit", "3", "--looks", "2", "--folds", "2", "--data.min_instances", "0"]
-    assert main([*small, "--out", str(tmp_path)]) == 0
+    assert main([*small, "--out", str(tmp_path), "--cache", str(tmp_path / "cache")]) == 0
     model = Verification.from_pretrained(tmp_path / "yolov3-tiny.safetensors")
     assert model.thresholds is not None
     assert model.metadata["training"]["looks"] == 2
