@@ -9,12 +9,12 @@ from torch import Tensor
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
-from semfov.belief.verification import Verification
+from semfov.belief.verification import MATCHED, Verification, match
 from semfov.decision import Decision
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
 from semfov.observation.matching import box_iou
-from semfov.verifier import MOST, SAME, CandidatePlace, CloserLook, Examiner, surely
+from semfov.verifier import MOST, SAME, CandidatePlace, CloserLook, Examiner, cell_of, surely
 
 _SPANS = 2  # spans of `Forgetting` after which nothing is left of a verdict: a quarter of its evidence
 _FLOOR = 1e-6
@@ -25,7 +25,7 @@ class Verdict:
     """What a closer look has told, some frames ago.
 
     Attributes:
-        look: the closer look.
+        look: the closer look; its box and its cell follow the target (`follow`).
         age: number of frames since then.
     """
 
@@ -46,6 +46,8 @@ class LiveVerifier(Examiner):
     where B is the present probability by the belief: of the target in the cell of the place, or in the image. That of a
     place never rises above :math:`P_0`, so a place is found by closer looks alone. After :math:`\ln 2 / r` frames the
     place may be examined again. After twice as many frames the verdict is forgotten.
+
+    If r is not 0 the scene may move, and the boxes of the verdicts follow the detections of each look (`follow`).
 
     Args:
         model: gives the probabilities after closer looks.
@@ -96,6 +98,8 @@ class LiveVerifier(Examiner):
             step: the step of this frame.
         """
         self.candidates.see(step.detections)
+        if self.forgetting.rate:
+            self.verdicts = [self._followed(verdict, step.detections) for verdict in self.verdicts]
         self._plan(step)
 
     def look(self, step: Step, close_up: Callable[[Tensor], Detections]) -> CloserLook:
@@ -143,6 +147,11 @@ class LiveVerifier(Examiner):
         self.candidate = None if spent or sure else self.due(step, over=over)
         self._ended = self.candidate is None and (spent or over)
 
+    def _followed(self, verdict: Verdict, seen: Detections) -> Verdict:
+        """The verdict at the place to which a look has followed its target."""
+        box = follow(verdict.look.box, seen, verdict.look.target)
+        return replace(verdict, look=replace(verdict.look, box=box, cell=cell_of(box, self.candidates.grid)))
+
     def _recent(self, verdict: Verdict) -> bool:
         """Whether at least half of the evidence of a closer look is left."""
         return verdict.age <= self.forgetting.span
@@ -159,6 +168,34 @@ class LiveVerifier(Examiner):
             return told
         before, now = torch.tensor([told, here], dtype=torch.float64).logit(_FLOOR)
         return float((weight * before + (1 - weight) * now).sigmoid())
+
+
+def follow(box: Tensor, seen: Detections, target: int) -> Tensor:
+    """Move the box of a target to the middle of the detection that best shows it (`semfov.belief.verification.match`).
+
+    The box keeps its size, because a closer look measures it better than a look of the fovea.
+
+    Args:
+        box: `(4,)`, the box.
+        seen: detections of a look, a batch of one.
+        target: class 1..K.
+
+    Returns:
+        The box `(4,)`, unmoved if no detection overlaps it by `MATCHED`.
+
+    >>> seen = Detections(torch.tensor([[[2.0, 0, 12, 8]]]), torch.tensor([[[0.2, 0.8]]]), torch.ones(1, 1).bool())
+    >>> follow(torch.tensor([0.0, 0.0, 8.0, 8.0]), seen, 1)
+    tensor([ 3.,  0., 11.,  8.])
+    """
+    shown = seen.mask[0]
+    boxes, scores = seen.boxes[0][shown], seen.scores[0][shown, target]
+    if not len(boxes):
+        return box
+    best, overlap = match(boxes, scores, box)
+    if float(overlap[best]) < MATCHED:
+        return box
+    shift = (boxes[best] - box).view(2, 2).mean(0)
+    return box + shift.repeat(2)
 
 
 def _same(one: CloserLook, other: CloserLook) -> bool:

@@ -190,6 +190,37 @@ def test_the_verdict_fades_towards_the_belief():
     assert place < 0.7
 
 
+def test_a_found_target_is_followed_in_a_scene_that_changes():
+    """Box and cell follow the detections; without forgetting, and without a detection, they stay."""
+    for rate in (0.05, 0.0):
+        judge, closer = verifier({5: SURE}, rate)
+        judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
+        judge.wait()
+        judge.look(step(0, {5: 0.6}, [5], 0.9), closer)
+        box = torch.tensor(box_of(5))
+        for shift in (8.0, 16.0, 24.0, 32.0):
+            judge.wait()
+            # The detection is larger than the closer look's box, and a better one shows another class.
+            wide = box + torch.tensor([shift - 3, -3.0, shift + 3, 3.0])
+            other = box + torch.tensor([shift + 2, 0.0, shift + 2, 0.0])
+            scores = torch.tensor([[[0.2, 0.8, 0.0], [0.0, 0.1, 0.9]]])
+            now = step(
+                1,
+                {5: 0.6, 6: 0.6},
+                [5],
+                0.9,
+                Detections(torch.stack([wide, other])[None], scores, torch.ones(1, 2).bool()),
+            )
+            judge.see(now)
+        decision = judge.decision(now)
+        expected = box + (torch.tensor([32.0, 0.0, 32.0, 0.0]) if rate else 0.0)
+        torch.testing.assert_close(decision.box, expected)
+        assert decision.cell == (6 if rate else 5)
+        judge.wait()
+        judge.see(step(2, {5: 0.6, 6: 0.6}, [5], 0.9, look(11)))
+        torch.testing.assert_close(judge.decision(now).box, expected)
+
+
 def test_a_belief_that_rises_does_not_find_a_place_that_was_dismissed():
     judge, closer = verifier({5: 0.4}, 0.1)
     judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
