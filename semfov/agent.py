@@ -331,7 +331,8 @@ class ActivePerception(nn.Module):
             start: first cell; None draws one at random.
             seed: seed of the generator that draws the start and breaks ties.
             confirm: least probability for `found`, as for `search`; None takes that of the model.
-            give_up: probability below which a cell is not worth a look; None takes that of the model.
+            give_up: probability below which a cell is not worth a look; None takes that of the belief alone, which a
+                belief that fades can reach, or with rate 0 that of `search`.
             closer: largest number of frames, 0 to 100, that are spent on closer looks in the time until half of the
                 evidence is forgotten (ln 2 / rate frames). 0 decides from the foveated looks alone, as for `search`.
 
@@ -346,8 +347,10 @@ class ActivePerception(nn.Module):
         check_whole(closer, "closer", 0, 100)
         strategy = self.exploring if index is None else self.searching
         model = None if index is None else self._verification(closer)
-        chosen = strategy.observer.thresholds if model is None else model.thresholds
-        at = None if chosen is None else chosen.changed(confirm, give_up)
+        own = strategy.observer.thresholds
+        chosen = own if model is None else model.thresholds
+        usual = own.give_up if rate and own is not None else None
+        at = None if chosen is None else chosen.changed(give_up=usual).changed(confirm, give_up)
         parts = self.eye, strategy.observer, strategy.policy, self.classes, (self.columns, self.rows)
         return LivePerception(
             *parts, target=index, rate=rate, start=start, seed=seed, thresholds=at, verification=model, closer=closer

@@ -347,7 +347,9 @@ def test_without_closer_looks_the_belief_decides_as_before(one_thread):
 
 
 def test_thresholds_are_those_of_the_verification_unless_given():
-    assert agent(Counted(3)).live("red").thresholds == AT
+    """A belief that fades gives up at its own threshold, since it stays less certain than in a search."""
+    assert agent(Counted(3)).live("red", rate=0).thresholds == AT
+    assert agent(Counted(3)).live("red").thresholds == Thresholds(AT.confirm, Counted.thresholds.give_up, AT.place)
     assert agent(Counted(3)).live("red", confirm=0.99, give_up=0.5).thresholds == Thresholds(0.99, 0.5, AT.place)
     assert agent(Counted(3)).live("red", closer=0).thresholds == Counted.thresholds
 
