@@ -156,9 +156,7 @@ def test_a_window_counts_for_the_share_that_no_look_at_its_level_or_closer_has_s
         shown[:] = np.maximum(shown, level)
         for at in range(1, lattice.levels):
             span, (across, down) = lattice.span(at), lattice.places(at)
-            expected = [
-                [(closest[y : y + span, x : x + span] < at).mean() for x in range(across)] for y in range(down)
-            ]
+            expected = [[(closest[y : y + span, x : x + span] < at).mean() for x in range(across)] for y in range(down)]
             np.testing.assert_allclose(belief.unseen(at), expected, atol=1e-6)
             chances = torch.from_numpy(np.array(expected)) * belief.odds(at).double().sigmoid()
             np.testing.assert_allclose(belief.chances(at), chances, atol=1e-6)
