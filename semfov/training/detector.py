@@ -20,7 +20,7 @@ from semfov.experiments.setup import detector_options, plain
 from semfov.io.files import write_text
 from semfov.io.manifest import PARTS, Manifest, place_of
 from semfov.sensor import SENSORS
-from semfov.training.detector_parts import Workshop
+from semfov.training.detector_parts.workshop import Workshop
 from semfov.training.detector_report import class_counts, next_commands, report
 from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.evidence_examples import LookingRun, looking_run
@@ -184,7 +184,7 @@ def manifest_of(config: FitDetectorConfig, run: LookingRun, shop: Workshop) -> M
         training={
             "data": run.scenes.fingerprint,
             "photographs": len(run.scenes),
-            "held_out": len(shop.held_out),
+            "held_out": len(shop.bench.held_out),
             "settings": {name: getattr(config, name) for name in SETTINGS},
         },
     )

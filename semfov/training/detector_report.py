@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from semfov.experiments.summary import table
-from semfov.training.detector_parts import Fitted
+from semfov.training.detector_parts.part import Fitted
 from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.evidence_examples import LookingRun
 

@@ -26,7 +26,6 @@ from semfov.io.files import sha256
 from semfov.io.manifest import Manifest, Part
 from semfov.model_folder import ModelFolder
 from semfov.observation.foveal import FovealObservationModel
-from semfov.training import detector_parts
 from semfov.training.detector_report import thin_classes
 from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.evidence import FitSearchConfig, choose_thresholds
@@ -217,10 +216,18 @@ def test_eval_search_with_the_folder_matches_the_report(home, capsys):
     capsys.readouterr()
 
 
+FITS = {"observation": "fit_model", "tempering": "hit_rates", "evidence": "fit_evidence", "map": "fit_map_evidence"}
+
+
+def forbid(monkeypatch, *parts):
+    """Make the fit of parts fail."""
+    for part in parts:
+        monkeypatch.setattr(f"semfov.training.detector_parts.{part}.{FITS[part]}", None)
+
+
 def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
     before = {path.name: path.read_bytes() for path in (home / "models").glob("*.safetensors")}
-    for name in ("fit_model", "fit_evidence", "fit_map_evidence", "hit_rates"):
-        monkeypatch.setattr(detector_parts, name, None)
+    forbid(monkeypatch, *FITS)
     assert main(arguments(home)) == 0
     assert {path.name: path.read_bytes() for path in (home / "models").glob("*.safetensors")} == before
     printed = capsys.readouterr()
@@ -234,8 +241,7 @@ def test_only_a_missing_part_is_fitted_again(home, tmp_path, monkeypatch):
     shutil.copytree(home / "models", tmp_path / "models")
     (tmp_path / "models/map.safetensors").unlink()
     (tmp_path / "models/manifest.json").unlink()
-    for name in ("fit_model", "fit_evidence", "hit_rates"):
-        monkeypatch.setattr(detector_parts, name, None)
+    forbid(monkeypatch, *(FITS.keys() - {"map"}))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     assert main(arguments(home, "--out", str(tmp_path / "models"))) == 0
