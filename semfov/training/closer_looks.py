@@ -29,11 +29,13 @@ class Sought:
         target: the class, 1..K.
         goal: `(X·Y,)` boolean, cells that an object of the class overlaps.
         start: `(1,)`, the first fixated cell.
+        spare: whether the search only serves to choose thresholds, and nothing is fitted to it.
     """
 
     target: int
     goal: Tensor
     start: Tensor
+    spare: bool = False
 
     @property
     def present(self) -> bool:
@@ -51,17 +53,26 @@ class Photograph:
         number: number of the photograph among those that are searched.
         grid: the cells.
         sought: the classes to search for.
+        stored: gives the detections from every cell of a photograph by its index; None looks with the eye.
     """
 
     def __init__(
-        self, eye: Eye, scenes: Scenes, index: int, number: int, grid: Grid, sought: tuple[Sought, ...]
+        self,
+        eye: Eye,
+        scenes: Scenes,
+        index: int,
+        number: int,
+        grid: Grid,
+        sought: tuple[Sought, ...],
+        stored: Callable[[int], Detections] | None = None,
     ) -> None:
         self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
-        self.grid, self.sought = grid, sought
+        self.grid, self.sought, self.stored = grid, sought, stored
         self.seen: dict[int, Detections] = {}
         self.close_up = CloseUps(eye, lambda: self.image)
         self._image: Tensor | None = None
         self._view: View | None = None
+        self._everywhere: Detections | None = None
 
     @property
     def image(self) -> Tensor:
@@ -71,8 +82,11 @@ class Photograph:
         return self._image
 
     def close(self) -> None:
-        """Free the pixels; a later look reads them again."""
+        """Free the pixels and the stored looks; a later look reads them again."""
         self._image = self._view = None
+        if self.stored is not None:
+            self.seen.clear()
+            self._everywhere = None
 
     def look(self, cell: int, fixation: Tensor) -> Detections:
         """Look from a cell.
@@ -85,9 +99,12 @@ class Photograph:
             The detections, a batch of one.
         """
         if cell not in self.seen:
-            if self._view is None:
-                self._view = self.eye.open(self.image)
-            self.seen[cell] = self.eye.look(self._view, fixation)
+            if self.stored is not None:
+                self._everywhere = self.stored(self.index) if self._everywhere is None else self._everywhere
+                self.seen[cell] = self._everywhere[cell : cell + 1]
+            else:
+                self._view = self.eye.open(self.image) if self._view is None else self._view
+                self.seen[cell] = self.eye.look(self._view, fixation)
         return self.seen[cell]
 
 
@@ -119,6 +136,8 @@ def photographs(
     absent: int | None,
     max_area: float,
     seed: int,
+    spare: int = 0,
+    stored: Callable[[int], Detections] | None = None,
 ) -> list[Photograph]:
     """Draw classes to search for in photographs.
 
@@ -131,6 +150,8 @@ def photographs(
         absent: maximum number of absent classes (None: as many as present ones).
         max_area: classes that cover a larger share of the image are left out.
         seed: seed of the classes and of the first fixations.
+        spare: maximum number of further absent classes, which only serve to choose thresholds (`Sought.spare`).
+        stored: gives the detections from every cell of a photograph by its index; None looks with the eye.
 
     Returns:
         The photographs with classes to search for.
@@ -140,16 +161,22 @@ def photographs(
         annotation = scenes.annotation(index)
         grid = Grid(*cells, annotation.size)
         covered = grid.footprint(annotation.boxes)
+        targets = choose_classes(scenes, index, annotation, classes, max_area, seed, absent)
+        held = set(annotation.labels.tolist())
+        more = sum(target not in held for target in targets) + spare
+        # The same draw with a larger number begins with the same classes.
+        wide = choose_classes(scenes, index, annotation, classes, max_area, seed, more)
         sought = tuple(
             Sought(
                 target,
                 covered[annotation.labels == target].any(0),
                 torch.randint(len(grid), (1,), generator=generator_for("start", seed, scenes.ids[index], target)),
+                spare=number >= len(targets),
             )
-            for target in choose_classes(scenes, index, annotation, classes, max_area, seed, absent)
+            for number, target in enumerate(wide)
         )
-        if sought:
-            found.append(Photograph(eye, scenes, index, len(found), grid, sought))
+        if targets:
+            found.append(Photograph(eye, scenes, index, len(found), grid, sought, stored))
     return found
 
 

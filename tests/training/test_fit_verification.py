@@ -15,16 +15,9 @@ from semfov.belief.observers import Target
 from semfov.data.scenes import EmbeddedScenes
 from semfov.errors import DataError
 from semfov.training.closer_looks import photographs, search
-from semfov.training.verification import (
-    LEVELS,
-    Examined,
-    FitVerificationConfig,
-    Verified,
-    choose_confirm,
-    examine,
-    fit,
-    verify,
-)
+from semfov.training.verification_decisions import LEVELS, Verified, choose_confirm, value, verify
+from semfov.training.verification_fit import SHIPPED, STRENGTH, Examined, examine, fit, shipped_mean
+from semfov.training.verification_settings import FitVerificationConfig
 from tests.small import CLASSES, Blobs
 from train.fit_verification import main
 

@@ -16,10 +16,11 @@ from semfov.training.detector_parts.map import MapFit
 from semfov.training.detector_parts.observation import ObservationFit
 from semfov.training.detector_parts.part import Bench, Fitted, PartFit
 from semfov.training.detector_parts.tempering import TemperingFit
+from semfov.training.detector_parts.verification import VerificationFit
 from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.evidence_examples import LookingRun
 
-FITS: tuple[type[PartFit], ...] = (ObservationFit, TemperingFit, EvidenceFit, MapFit)
+FITS: tuple[type[PartFit], ...] = (ObservationFit, TemperingFit, EvidenceFit, VerificationFit, MapFit)
 """The fits of all parts, in the order of `semfov.io.manifest.PARTS`."""
 
 
