@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from semfov.belief.observers import Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.belief.verification import Verification
-from semfov.decision import OUTCOMES, conclude, decide
+from semfov.decision import conclude, decide
 from semfov.episode import Step
 from semfov.experiments.progress import track
 from semfov.training.closer_looks import Photograph, Sought, search
@@ -18,23 +18,8 @@ from semfov.verifier import Verifier, surely
 LEVELS = tuple(number / 100 for number in range(50, 100))
 """Values from which the threshold `confirm` is chosen."""
 
-Place = tuple[float, bool]
-"""The probability that the target is at a place, and whether it is."""
-
-
-@dataclass(frozen=True)
-class Unverified:
-    """A search in which the target evidence alone decides, by its thresholds.
-
-    Attributes:
-        place: at the end, the most evident place of the target: the probability that it is there, and whether it is.
-        found: whether the search ends with `found`.
-        looks: number of looks.
-    """
-
-    place: Place
-    found: bool
-    looks: int
+Ended = tuple[bool | None, int]
+"""End of a search: whether the place that it found is right (None: not found), and the number of looks until then."""
 
 
 @dataclass(frozen=True)
@@ -49,55 +34,25 @@ class Verified:
         ends: for each closer look, the number of looks of both kinds that were made up to it.
         presence: probability that the image holds the target, at the end.
         looks: number of looks of both kinds.
-        unverified: the same search without closer looks.
+        unverified: end of the same search without closer looks, by the thresholds of the target evidence.
     """
 
     photograph: int
     present: bool
     spare: bool
-    places: tuple[Place, ...]
+    places: tuple[tuple[float, bool], ...]
     ends: tuple[int, ...]
     presence: float
     looks: int
-    unverified: Unverified
+    unverified: Ended
 
-    @property
-    def best(self) -> Place:
-        """The most probable place after a closer look; probability 0 if none was made."""
-        return max(self.places, default=(0.0, False))
-
-    def found(self, confirm: float) -> tuple[bool | None, int]:
-        """Decision at a threshold: whether the place is right (None: not found), and the number of looks until then."""
+    def found(self, confirm: float) -> Ended:
+        """Return the end of the search at a threshold."""
         for (place, right), end in zip(self.places, self.ends, strict=True):
             if place >= surely(confirm):
                 return right, end
-        place, right = self.best
+        place, right = max(self.places, default=(0.0, False))
         return (right if place >= confirm else None), self.looks
-
-
-def value(place: Place) -> float:
-    r"""Value of decisions about a place, averaged over all thresholds from 0 to 1.
-
-    At the threshold c, `found` is worth 1 - c if the place is right and -c if it is wrong, and no find is worth 0. So
-    a find pays off exactly if its probability is larger than c. For a place with probability p, which is right
-    (r = 1) or wrong (r = 0), twice the average is
-
-    .. math:: 2 \int_0^p (r - c) \, dc = 2 p r - p^2 = r - (r - p)^2,
-
-    the quadratic score (Brier, 1950) relative to that of saying nothing (Schervish, 1989, *A general method for
-    comparing probability assessors*).
-
-    Args:
-        place: the probability of the place, and whether it is right.
-
-    Returns:
-        The value: 1 for a certain find that is right, -1 for one that is wrong.
-
-    >>> value((1.0, True)), value((0.5, True)), value((0.5, False)), value((0.0, True))
-    (1.0, 0.75, -0.25, 0.0)
-    """
-    probability, right = place
-    return 2 * probability * right - probability**2
 
 
 def verify(
@@ -137,10 +92,8 @@ def verify(
         photograph.close()
 
 
-def unverified(
-    steps: Sequence[Step], photograph: Photograph, sought: Sought, thresholds: Thresholds | None
-) -> Unverified:
-    """Decide along the looks of a search by the belief alone; without thresholds no search ends before its last look.
+def unverified(steps: Sequence[Step], photograph: Photograph, sought: Sought, thresholds: Thresholds | None) -> Ended:
+    """Decide along the looks of a search by the belief alone; nothing is found without thresholds.
 
     Args:
         steps: all steps of the search.
@@ -149,16 +102,16 @@ def unverified(
         thresholds: thresholds of the target evidence.
 
     Returns:
-        The search.
+        The end of the search.
     """
-    outcomes = [0 if thresholds is None else int(decide(step, sought.target, thresholds)) for step in steps]
-    end = next((number for number, outcome in enumerate(outcomes, 1) if outcome), len(steps))
-    belief, shown = steps[end - 1].belief, [step.detections for step in steps[:end]]
-    found = OUTCOMES.index("found")
-    cell = conclude(found, belief, shown, photograph.grid, sought.target).cell
-    assert cell is not None
-    place = float(belief.probability(sought.target)[0, cell]), bool(sought.goal[cell])
-    return Unverified(place, outcomes[end - 1] == found, end)
+    for number, step in enumerate(steps if thresholds is not None else (), 1):
+        assert thresholds is not None
+        outcome = int(decide(step, sought.target, thresholds))
+        if outcome:
+            shown = [each.detections for each in steps[:number]]
+            cell = conclude(outcome, step.belief, shown, photograph.grid, sought.target).cell
+            return (None if cell is None else bool(sought.goal[cell])), number
+    return None, len(steps)
 
 
 def choose_confirm(searches: Sequence[Verified], false_alarms: float, surest: float = LEVELS[-1]) -> float:

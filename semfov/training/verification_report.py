@@ -12,6 +12,7 @@ from semfov.experiments.decision_report import mean, percent
 from semfov.experiments.summary import table
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
+from semfov.training.verification_decisions import Ended
 from semfov.training.verification_fit import FittedVerification
 
 SHOWN = (0.5, 0.6, 0.7, 0.8, 0.9)
@@ -55,9 +56,7 @@ def report(fitted: FittedVerification, count: int) -> tuple[str, dict[str, float
     assert fitted.model.thresholds is not None
     chosen = fitted.model.thresholds.confirm
     decisions = [["confirm", "found, there", "found, not there", "place right", "looks, there", "looks, not there"]]
-    plain = [each.unverified for each in searches]
-    ended = [(each.place[1] if each.found else None, each.looks) for each in plain]
-    decisions.append(["no closer looks", *_row(there.tolist(), ended)])
+    decisions.append(["no closer looks", *_row(there.tolist(), [each.unverified for each in searches])])
     for confirm in sorted({*SHOWN, chosen}):
         mark = " (chosen)" if confirm == chosen else ""
         ended = [each.found(confirm) for each in searches]
@@ -88,7 +87,7 @@ def _shown(figure: float | None) -> str:
     return "-" if figure is None else f"{figure:.3f}"
 
 
-def _row(present: Sequence[bool], ended: Sequence[tuple[bool | None, int]]) -> list[str]:
+def _row(present: Sequence[bool], ended: Sequence[Ended]) -> list[str]:
     """Hits, false alarms, right places and looks of decisions."""
     shares, places, looks = [], [], []
     for kind in (True, False):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -16,7 +17,7 @@ from semfov.training.detector_parts.part import Fitted, PartFit
 from semfov.training.detector_words import in_words
 from semfov.training.held_out import Array, Difference
 from semfov.training.outputs import training_of
-from semfov.training.verification_decisions import Verified, value
+from semfov.training.verification_decisions import Ended, Verified
 from semfov.training.verification_fit import fit_and_verify, shipped_mean
 from semfov.training.verification_report import report
 from semfov.training.verification_settings import FitVerificationConfig
@@ -45,7 +46,7 @@ class VerificationFit(PartFit):
         return {"looking": 2 * judged, "verifying": 3 * judged}
 
     def fit(self) -> Fitted:
-        """Fit in folds, and compare the places that searches report with those before the closer looks."""
+        """Fit in folds, and compare decisions with those of the same agent without closer looks."""
         config, run, judged = self.settings, self.run, self.bench.judged
         evidence = self.bench.model("evidence")
         if not isinstance(evidence, TargetEvidence):
@@ -73,33 +74,37 @@ class VerificationFit(PartFit):
         give_up = min(config.give_up, evidence.thresholds.give_up)
         config = replace(config, folds=min(config.folds, len(seen)), give_up=give_up)
         fitted = fit_and_verify(seen, evidence, config, shipped_mean(), SUREST_OF_FEW)
-        after, before = values(fitted.searches)
+        assert fitted.model.thresholds is not None
+        confirm = fitted.model.thresholds.confirm
+        after = scores(fitted.searches, [each.found(confirm) for each in fitted.searches])
+        before = scores(fitted.searches, [each.unverified for each in fitted.searches])
         gain = Difference.of(after, before)
         why = (
-            f"the reported places are worth {100 * after.mean():.1f} points, {100 * before.mean():.1f} without closer "
-            f"looks; {in_words(gain, 'points gained', 100)}"
+            f"decisions score {100 * after.mean():.1f} points, {100 * before.mean():.1f} without closer looks; "
+            f"{in_words(gain, 'points gained', 100)}"
         )
         fitted.model.metadata = {**run.eye.settings(), **training_of(config, run.scenes, "target_model", "fitted")}
         text = (
-            "Fitted to the held-out photographs only, close to the mean of the shipped models. A right place that is "
-            "reported with probability p is worth 100 (2p - p²) points, and a wrong one -100 p². This is the value of "
-            "the decisions, averaged over all thresholds.\n\n"
+            "Fitted to the held-out photographs only, close to the mean of the shipped models. A decision scores 100 "
+            "points if it finds the target at a right place, -100 points if it finds it at a wrong place or in a "
+            "photograph without the target, and 0 points if it finds nothing. Searches for present and for absent "
+            "classes have equal weight.\n\n"
         )
         return Fitted(self.write(fitted.model, gain.better, why), text + report(fitted, len(seen))[0])
 
 
-def values(searches: list[Verified]) -> tuple[Array, Array]:
-    """Average the values of the reported places in each photograph, after and before closer looks.
+def scores(searches: Sequence[Verified], ends: Sequence[Ended]) -> Array:
+    """Average the scores of decisions in each photograph, with equal weight of present and of absent classes.
 
     Args:
-        searches: the searches; those that only serve to choose thresholds are left out.
+        searches: the searches.
+        ends: their ends. A right place scores 1, a wrong place -1, and a search that finds nothing 0.
 
     Returns:
-        Two arrays `(P,)`, with one value for each photograph.
+        `(P,)`, the mean score of each photograph.
     """
-    pairs: dict[int, list[tuple[float, float]]] = {}
-    for each in searches:
-        if not each.spare:
-            pairs.setdefault(each.photograph, []).append((value(each.best), value(each.unverified.place)))
-    means = np.array([np.mean(each, axis=0) for each in pairs.values()])
-    return means[:, 0], means[:, 1]
+    known: dict[int, dict[bool, list[int]]] = {}
+    for each, (right, _) in zip(searches, ends, strict=True):
+        score = 0 if right is None else 1 if right else -1
+        known.setdefault(each.photograph, {}).setdefault(each.present, []).append(score)
+    return np.array([np.mean([np.mean(kind) for kind in kinds.values()]) for kinds in known.values()])
