@@ -43,7 +43,7 @@ class VerificationFit(PartFit):
     def tasks(self) -> dict[str, float]:
         """The tasks and their seconds."""
         judged = len(self.bench.judged)
-        return {"looking": 2 * judged, "verifying": 3 * judged}
+        return {"looking": judged, "verifying": 0.5 * judged}
 
     def fit(self) -> Fitted:
         """Fit in folds, and compare decisions with those of the same agent without closer looks."""
