@@ -432,6 +432,25 @@ def test_without_the_target_evidence_no_verification_is_fitted(home, tmp_path, m
     assert fitted.part == Part(None, None, False, "not fitted, since the agent does not use the target evidence")
 
 
+def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_left_out(home, tmp_path, monkeypatch):
+    folder = copy_models(home, tmp_path)
+    (folder / "progress/verification.json").unlink()
+    seen = []
+
+    def fail(photographs, *_):
+        seen.extend(photographs)
+        raise DataError("data: too few")
+
+    monkeypatch.setattr("semfov.training.detector_parts.verification.fit_and_verify", fail)
+    assert main(arguments(home, "--out", str(folder))) == 0
+    assert len(seen) >= 2
+    assert {photograph.index for photograph in seen} <= set(range(0, 20, 4))
+    part = Manifest.read(folder).parts["verification"]
+    assert (part.file, part.used, part.why) == (None, False, "could not be fitted: data: too few")
+    assert ActivePerception.from_pretrained(folder, detector=home / "colours.onnx").verification is None
+    assert "Could not be fitted: data: too few" in (folder / "report.md").read_text()
+
+
 def test_decisions_are_scored_by_photograph():
     """Present and absent classes have equal weight, whatever their number."""
     kinds = [(0, True, True), (0, True, None), (0, False, False), (0, False, None), (0, False, None), (4, True, False)]

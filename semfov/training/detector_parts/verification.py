@@ -88,7 +88,7 @@ class VerificationFit(PartFit):
             "Fitted to the held-out photographs only, close to the mean of the shipped models. A decision scores 100 "
             "points if it finds the target at a right place, -100 points if it finds it at a wrong place or in a "
             "photograph without the target, and 0 points if it finds nothing. Searches for present and for absent "
-            "classes have equal weight.\n\n"
+            "classes have equal weight. The threshold was chosen on the same photographs.\n\n"
         )
         return Fitted(self.write(fitted.model, gain.better, why), text + report(fitted, len(seen))[0])
 
