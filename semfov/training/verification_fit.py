@@ -194,7 +194,7 @@ def fit(examined: Examined, chosen: Tensor, prior: Verification | None = None) -
 
 
 def shipped_mean() -> Verification:
-    """Return the mean of the shipped models (`SHIPPED`), without thresholds: a prior for other detectors."""
+    """Return the mean of two shipped models (`SHIPPED`), without thresholds: the centre of the prior."""
     known = [Verification.from_pretrained(name).linear for name in SHIPPED]
     model = Verification()
     with torch.no_grad():

@@ -182,8 +182,23 @@ class ZoomBelief:
             return values
         return values + np.float32(foresight) * self._sum(level, 2)
 
+    def unseen(self, level: int) -> Cells:
+        """Share of each window of a level that no look has shown at that level or closer, `(down, across)`."""
+        span = self.lattice.span(level)
+        whole = min(span, self.lattice.rows) * min(span, self.lattice.columns)
+        return self._sum(level, 0) / np.float32(whole)
+
     def _sum(self, level: int, octaves: int) -> Cells:
-        """`finds` of a level (1), or of looks one octave closer, in cells not looked at from the level yet (2)."""
+        """Sums over the windows of a level.
+
+        Args:
+            level: the level.
+            octaves: 0 for the cells that no look has shown at that level or closer; 1 for `finds`; 2 for the finds of
+                looks one octave closer, in cells not looked at from the level yet.
+
+        Returns:
+            `(down, across)`, not to be written to.
+        """
         if (level, octaves) not in self._sums:
             span = self.lattice.span(level)
             weight = self._rates.taper(span).detach().numpy() if octaves == 1 else np.ones(span, np.float32)
@@ -194,16 +209,31 @@ class ZoomBelief:
         self._summed[level, octaves] = len(self._changes)
         x1, y1, x2, y2 = zip(*changes, strict=True)
         changed = min(x1), min(y1), max(x2), max(y2)
-        cells = self._expect(level) if octaves == 1 else self._expect(level + 1) * (self.source.numpy() < level)
-        return sums.update(cells, changed)
+        if octaves == 1:
+            return sums.update(self._expect(level), changed)
+        cells = self.left.numpy() if octaves == 0 else self._expect(level + 1)
+        return sums.update(cells * (self.source.numpy() < level), changed)
 
     def odds(self, level: int) -> Tensor:
         """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf where unknown."""
         return torch.from_numpy(self._shown().odds(level).copy())
 
     def chances(self, level: int) -> Cells:
-        """Probability that a look at each window of a level shows the class, `(down, across)`, not to be written to."""
-        return self._shown().chances(level)
+        r"""Probability that a look at each window of a level shows the class, and no look at the same place did.
+
+        Looks at a part of a window, from its level or closer, have not shown the class there. If they covered all of
+        the window but the share u (`unseen`), the evidence P counts only for that share, as if the object could be
+        anywhere in the window:
+
+        .. math:: p(w) = u(w) \, P(w)
+
+        Args:
+            level: level of the windows.
+
+        Returns:
+            `(down, across)`.
+        """
+        return self._shown().chances(level) * self.unseen(level)
 
     def _shown(self) -> WindowOdds:
         self._odds.update(self.gists, self.left.numpy())

@@ -12,6 +12,7 @@ from semfov.zoom.evidence import pool, pool_all
 from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.policy import best_find, best_hit, jointly
+from semfov.zoom.search import look_for
 from semfov.zoom.sums import WindowSums
 
 
@@ -143,6 +144,39 @@ def test_cached_odds_equal_recomputed_odds(belief, glances, evidence):
                 anew.add(glance)
             for level in range(1, lattice.levels):
                 torch.testing.assert_close(belief.odds(level), anew.odds(level))
+
+
+def test_a_window_counts_for_the_share_that_no_look_at_its_level_or_closer_has_shown(belief, glances):
+    lattice, generator = belief.lattice, torch.Generator().manual_seed(2)
+    closest = np.full((lattice.rows, lattice.columns), 0)
+    for _ in range(8):
+        level, column, row = lattice.actions[int(torch.randint(len(lattice), (1,), generator=generator))].tolist()
+        belief.add(glances.see([on_lattice(lattice, (level, column, row))])[0])
+        shown = closest[row : row + lattice.span(level), column : column + lattice.span(level)]
+        shown[:] = np.maximum(shown, level)
+        for at in range(1, lattice.levels):
+            span, (across, down) = lattice.span(at), lattice.places(at)
+            expected = [[(closest[y : y + span, x : x + span] < at).mean() for x in range(across)] for y in range(down)]
+            np.testing.assert_allclose(belief.unseen(at), expected, atol=1e-6)
+            chances = torch.from_numpy(np.array(expected)) * belief.odds(at).double().sigmoid()
+            np.testing.assert_allclose(belief.chances(at), chances, atol=1e-6)
+
+
+@pytest.mark.parametrize("target", [1, 2, 3])
+def test_every_look_of_a_search_shows_a_place_closer_than_all_looks_before_it(glances, evidence, target):
+    lattice = glances.lattice
+    closest = np.full((lattice.rows, lattice.columns), -1)
+    count = 0
+    for turn in look_for(glances, evidence, target, confirm=float("inf")):
+        window = turn.glance.window
+        x1, y1, x2, y2 = window.cells
+        shown = closest[y1:y2, x1:x2]
+        assert (shown < window.level).any()
+        shown[:] = np.maximum(shown, window.level)
+        count += 1
+    assert count > lattice.levels
+    # Only when nothing is left to see does a search without thresholds end.
+    assert (closest == lattice.levels - 1).all()
 
 
 def test_foresight_counts_only_cells_that_were_not_seen_as_closely(belief, glances):

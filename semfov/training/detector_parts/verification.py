@@ -29,7 +29,7 @@ ABSENT = 200
 class VerificationFit(PartFit):
     """Fit the verification to held-out photographs, since the target evidence is surer on those it learned from.
 
-    A few photographs cannot determine 16 parameters, so the fit keeps close to the mean of the shipped models.
+    A few photographs cannot determine 16 parameters, so the fit keeps close to shipped models (`shipped_mean`).
     """
 
     name: ClassVar[str] = "verification"
@@ -85,10 +85,10 @@ class VerificationFit(PartFit):
         )
         fitted.model.metadata = {**run.eye.settings(), **training_of(config, run.scenes, "target_model", "fitted")}
         text = (
-            "Fitted to the held-out photographs only, close to the mean of the shipped models. A decision scores 100 "
-            "points if it finds the target at a right place, -100 points if it finds it at a wrong place or in a "
-            "photograph without the target, and 0 points if it finds nothing. Searches for present and for absent "
-            "classes have equal weight. The threshold was chosen on the same photographs.\n\n"
+            "Fitted to the held-out photographs only, close to the mean of the models shipped for other detectors. A "
+            "decision scores 100 points if it finds the target at a right place, -100 points if it finds it at a wrong "
+            "place or in a photograph without the target, and 0 points if it finds nothing. Searches for present and "
+            "for absent classes have equal weight. The threshold was chosen on the same photographs.\n\n"
         )
         return Fitted(self.write(fitted.model, gain.better, why), text + report(fitted, len(seen))[0])
 
