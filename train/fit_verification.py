@@ -16,7 +16,8 @@ import sys
 from collections.abc import Sequence
 
 from semfov.experiments.command import run_command
-from semfov.training.verification import FitVerificationConfig, fit_verification
+from semfov.training.verification import fit_verification
+from semfov.training.verification_settings import FitVerificationConfig
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -32,11 +32,13 @@ class Sought:
         target: the class, 1..K.
         goal: `(X·Y,)` boolean, cells that an object of the class overlaps.
         start: `(1,)`, the first fixated cell.
+        spare: whether the search only serves to choose thresholds, and nothing is fitted to it.
     """
 
     target: int
     goal: Tensor
     start: Tensor
+    spare: bool = False
 
     @property
     def present(self) -> bool:
@@ -55,6 +57,7 @@ class Photograph:
         grid: the cells.
         sought: the classes to search for.
         store: store of all looks; None keeps them in memory.
+        stored: gives the detections from every cell of a photograph by its index; None looks with the eye.
     """
 
     def __init__(
@@ -66,15 +69,17 @@ class Photograph:
         grid: Grid,
         sought: tuple[Sought, ...],
         store: PhotographStore | None = None,
+        stored: Callable[[int], Detections] | None = None,
     ) -> None:
         self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
-        self.grid, self.sought, self.store = grid, sought, store
+        self.grid, self.sought, self.store, self.stored = grid, sought, store, stored
         self.seen: dict[int, Detections] = {}
         self._closely = CloseUps(eye, lambda: self.image)
         # Number of looks in the store; None as long as it was not read.
-        self._stored: int | None = None
+        self._known: int | None = None
         self._image: Tensor | None = None
         self._view: View | None = None
+        self._everywhere: Detections | None = None
 
     @property
     def image(self) -> Tensor:
@@ -85,18 +90,18 @@ class Photograph:
 
     def close(self) -> None:
         """Store new looks, and free the pixels and the stored looks; a later look reads them again."""
-        self._image = self._view = None
-        if self.store is None or self._stored is None:
+        self._image = self._view = self._everywhere = None
+        if self.store is None or self._known is None:
             return
-        if len(self.seen) + len(self._closely.seen) > self._stored:
+        if len(self.seen) + len(self._closely.seen) > self._known:
             self.store.save(self.scenes.digest(self.index), self.seen, self._closely.seen)
-        self.seen, self._closely.seen, self._stored = {}, {}, None
+        self.seen, self._closely.seen, self._known = {}, {}, None
 
     def _recall(self) -> None:
         """Read the stored looks."""
-        if self.store is not None and self._stored is None:
+        if self.store is not None and self._known is None:
             self.seen, self._closely.seen = self.store.load(self.scenes.digest(self.index))
-            self._stored = len(self.seen) + len(self._closely.seen)
+            self._known = len(self.seen) + len(self._closely.seen)
 
     def look(self, cell: int, fixation: Tensor) -> Detections:
         """Look from a cell.
@@ -108,6 +113,9 @@ class Photograph:
         Returns:
             The detections, a batch of one.
         """
+        if self.stored is not None:
+            self._everywhere = self.stored(self.index) if self._everywhere is None else self._everywhere
+            return self._everywhere[cell : cell + 1]
         self._recall()
         if cell not in self.seen:
             with one_thread(), torch.inference_mode():
@@ -150,6 +158,8 @@ def photographs(
     max_area: float,
     seed: int,
     store: PhotographStore | None = None,
+    spare: int = 0,
+    stored: Callable[[int], Detections] | None = None,
 ) -> list[Photograph]:
     """Draw classes to search for in photographs.
 
@@ -163,6 +173,8 @@ def photographs(
         max_area: classes that cover a larger share of the image are left out.
         seed: seed of the classes and of the first fixations.
         store: store of all looks; None keeps them in memory.
+        spare: maximum number of further absent classes, which only serve to choose thresholds (`Sought.spare`).
+        stored: gives the detections from every cell of a photograph by its index; None looks with the eye.
 
     Returns:
         The photographs with classes to search for.
@@ -172,16 +184,22 @@ def photographs(
         annotation = scenes.annotation(index)
         grid = Grid(*cells, annotation.size)
         covered = grid.footprint(annotation.boxes)
+        targets = choose_classes(scenes, index, annotation, classes, max_area, seed, absent)
+        held = set(annotation.labels.tolist())
+        more = sum(target not in held for target in targets) + spare
+        # The same draw with a larger number begins with the same classes.
+        wide = choose_classes(scenes, index, annotation, classes, max_area, seed, more)
         sought = tuple(
             Sought(
                 target,
                 covered[annotation.labels == target].any(0),
                 torch.randint(len(grid), (1,), generator=generator_for("start", seed, scenes.ids[index], target)),
+                spare=number >= len(targets),
             )
-            for target in choose_classes(scenes, index, annotation, classes, max_area, seed, absent)
+            for number, target in enumerate(wide)
         )
-        if sought:
-            found.append(Photograph(eye, scenes, index, len(found), grid, sought, store))
+        if targets:
+            found.append(Photograph(eye, scenes, index, len(found), grid, sought, store, stored))
     return found
 
 
