@@ -146,7 +146,7 @@ class ZoomEye(nn.Module):
         place = _Placement(frames, view.picture.size, selected[0].boxes)
         detections, *weak = place.to_picture(selected)
         found, cut = self._treat(detections, place.cut(selected[0]))
-        return Seen(found, cut, weak[0] if weak else None, torch.tensor(frames).view(-1, 8)[:, :4])
+        return Seen(found, cut, weak[0] if weak else None, torch.tensor(frames, dtype=canvas.dtype).view(-1, 8)[:, :4])
 
     def glimpse(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None
@@ -166,7 +166,7 @@ class ZoomEye(nn.Module):
             InputError: a fixation is not finite, or its magnification is not positive.
         """
         canvases, frames = self._resample(view, fixations, within)
-        return canvases, torch.tensor(frames).view(-1, 8)
+        return canvases, torch.tensor(frames, dtype=canvases.dtype).view(-1, 8)
 
     def _resample(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None
