@@ -21,6 +21,7 @@ from semfov.zoom.lattice import Lattice
 Cut = Literal["keep", "drop", "background"]
 Limit = tuple[float, float, float, float]
 Frame = tuple[int, int, int, int, int, int, int, int]
+"""`(x1, y1, x2, y2)` of a window in picture pixels, then of its place on the canvas in canvas pixels."""
 
 HINTS = Selection(threshold=0.002, iou=0.95, limit=300)
 """Selection of hints: candidates that are too weak to be detections, but show where a closer look pays."""
