@@ -70,7 +70,7 @@ class ZoomBelief:
         self._summed: dict[tuple[int, int], int] = {}
         self._expected: dict[int, Cells] = {}
         self._sums: dict[tuple[int, int], WindowSums] = {}
-        self._odds = WindowOdds(lattice, self._presence)
+        self._odds: WindowOdds | None = None
         self._told: dict[Window, float] = {}
 
     @property
@@ -206,13 +206,10 @@ class ZoomBelief:
         return self._shown().chances(level)
 
     def _shown(self) -> WindowOdds:
+        if self._odds is None:
+            self._odds = WindowOdds(self.lattice, self.evidence, self.target, self.context)
         self._odds.update(self.gists, self.left.numpy())
         return self._odds
-
-    def _presence(self, pooled: Tensor, summary: Tensor, steps: Tensor, before: Tensor | None) -> Tensor:
-        """Log odds of the evidence (`GlimpseEvidence.presence`) plus those of the context."""
-        odds = self.evidence.presence(pooled, summary, steps, self.target, before)
-        return odds if self.context is None else odds + self.context(pooled, self.target)
 
     def odds_of(self, window: Window) -> float:
         """Log odds that a look at a window shows the class; the window need not lie on the lattice."""
@@ -235,8 +232,10 @@ class ZoomBelief:
             )
             pooled, summary = pool(look.scores, box)
             with torch.no_grad():
-                known = None if value is None or look.level == 0 else value.view(1, 1)
-                value = self._presence(pooled[None], summary[None], torch.tensor([steps]), known)
+                known = None if value is None or look.level == 0 else value
+                value = self.evidence.presence(pooled[None], summary[None], torch.tensor([steps]), self.target, known)
+                if self.context is not None:
+                    value = value + self.context(pooled[None], self.target)
         self._told[window] = float("-inf") if value is None else float(value)
         return self._told[window]
 
