@@ -14,7 +14,7 @@ from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
 from semfov.zoom.odds import WindowOdds
-from semfov.zoom.sums import Box, Cells, WindowSums
+from semfov.zoom.sums import Box, Cells, WindowSums, extent
 
 
 class Rates(Protocol):
@@ -61,6 +61,7 @@ class ZoomBelief:
         self.lattice, self.target, self.context = lattice, target, context
         self._evidence = evidence
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
+        self._targets = torch.tensor([target])
         shape = lattice.rows, lattice.columns
         self.rate = torch.zeros(STEPS, *shape)
         self.source = torch.full(shape, -1)
@@ -71,6 +72,7 @@ class ZoomBelief:
         self._expected: dict[int, Cells] = {}
         self._sums: dict[tuple[int, int], WindowSums] = {}
         self._odds: WindowOdds | None = None
+        self._judged = 0
         self._told: dict[Window, float] = {}
 
     @property
@@ -93,17 +95,16 @@ class ZoomBelief:
         before, now = left.numpy(), self.left.numpy()
         differs = before != now
         if differs.any():
-            rows, columns = differs.any(1).nonzero()[0], differs.any(0).nonzero()[0]
             np.copyto(now, before)
-            self._renew((int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1))
+            self._renew(extent(differs))
 
     def add(self, glance: Glance) -> None:
         """Update the belief with the result of a look."""
         if glance.gist is None:
             self.discount(glance.window)
             return
-        self._spread(glance.gist)
         self.gists.append(glance.gist)
+        self._spread(glance.gist)
         self._told.clear()
 
     def discount(self, window: Window) -> None:
@@ -128,7 +129,7 @@ class ZoomBelief:
         if look.level > 0:
             before = before_of(self.rate[:, *at], self.source[at], look)
         with torch.no_grad():
-            logs = self._rates.rates(look, torch.tensor([self.target]), None if before is None else before[None])[0]
+            logs = self._rates.rates(look, self._targets, None if before is None else before[None])[0]
         cells = (logs.exp() / look.scale**2).numpy()
         if look.scale > 1:
             cells = cells.repeat(look.scale, -1).repeat(look.scale, -2)[:, :rows, :columns]
@@ -208,7 +209,9 @@ class ZoomBelief:
     def _shown(self) -> WindowOdds:
         if self._odds is None:
             self._odds = WindowOdds(self.lattice, self.evidence, self.target, self.context)
-        self._odds.update(self.gists, self.left.numpy())
+        if self._judged < len(self._changes):
+            self._odds.update(self.gists, self.left.numpy())
+            self._judged = len(self._changes)
         return self._odds
 
     def odds_of(self, window: Window) -> float:
@@ -251,8 +254,8 @@ def before_of(rate: Tensor, source: Tensor, look: Gist) -> Tensor:
     Returns:
         `(rows, columns)` of the gist.
     """
-    steps = (look.level + 1 - source).clamp(1, STEPS)
-    told = rate.gather(0, (steps - 1)[None])[0]
+    # NumPy, because a call of torch takes longer than the work.
+    told = torch.from_numpy(np.choose(look.level - source.numpy(), rate.numpy(), mode="clip"))
     rows, columns = look.scores.shape[:2]
     if look.scale > 1:
         told = F.pad(told, (0, columns * look.scale - told.shape[1], 0, rows * look.scale - told.shape[0]))

@@ -208,13 +208,16 @@ class GlimpseEvidence(Pretrained):
             InputError: a target is no class.
         """
         if not torch.compiler.is_compiling():
-            check(int(targets.min()) >= 1, "targets", "classes from 1 on", targets.tolist())
-        best, own = features(look.scores.amax(-1)), features(look.scores.movedim(-1, 0)[targets - 1])
-        found = look.found.movedim(-1, 0)[targets - 1].to(own)
-        about, bias = self.prior[targets].unbind(-1)
-        usual = about[:, None, None].expand_as(own)
-        parts = [*hint_maps(own, best, found, look.size), usual, *memory_maps(own, before)]
-        value: Tensor = through(self.rate, torch.stack(parts, -1)) + bias[:, None, None, None] - 6
+            asked = targets.tolist()
+            check(min(asked) >= 1, "targets", "classes from 1 on", asked)
+        wanted = targets - 1
+        shown = torch.cat([look.scores.amax(-1, keepdim=True), look.scores.index_select(-1, wanted)], -1)
+        hints = features(shown.movedim(-1, 0))
+        best, own = hints[0], hints[1:]
+        found = look.found.index_select(-1, wanted).movedim(-1, 0).to(own)
+        usual, bias = self.prior[targets].mT[..., None, None]
+        parts = [*hint_maps(own, best, found, look.size), usual.expand_as(own), *memory_maps(own, before)]
+        value: Tensor = through(self.rate, torch.stack(parts, -1)) + (bias[..., None] - 6)
         return value.clamp(max=3).movedim(-1, 1)
 
     def anywhere(self, best: Tensor, case: Tensor) -> Tensor:

@@ -13,9 +13,8 @@ from semfov.zoom.evidence import GlimpseEvidence, pool_spans
 from semfov.zoom.gist import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
-from semfov.zoom.sums import Box, Cells
+from semfov.zoom.sums import Box, Cells, extent
 
-Rows = NDArray[np.float32]
 Place = tuple[slice, slice]
 """Rows and columns of an array."""
 
@@ -41,13 +40,10 @@ class _Table:
         """View of the rows of an array of the look that belong to these windows, `(down, across, ...)`."""
         return values[self.rows].reshape(*self.shape, *values.shape[1:])
 
-    def holding(self, changed: NDArray[np.bool_]) -> Place:
-        """Windows in the box about changed cells `(rows, columns)`, of which there is at least one."""
-        places = []
-        for axis, n in enumerate(self.shape):
-            along = changed.any(1 - axis).nonzero()[0]
-            places.append(slice(max(int(along[0]) - self.span + 1, 0), min(int(along[-1]) + 1, n)))
-        return places[0], places[1]
+    def holding(self, changed: Box) -> Place:
+        """Windows that hold one of the changed cells of the gist."""
+        (x1, y1, x2, y2), reach = changed, self.span - 1
+        return slice(max(y1 - reach, 0), min(y2, self.shape[0])), slice(max(x1 - reach, 0), min(x2, self.shape[1]))
 
 
 class _Look:
@@ -151,8 +147,7 @@ class WindowOdds:
         changed = [(look.box, look.gist.level) for look in fresh]
         differs = left != self._left
         if differs.any():
-            rows, columns = differs.any(1).nonzero()[0], differs.any(0).nonzero()[0]
-            changed.append(((int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1), -1))
+            changed.append((extent(differs), -1))
             self._left = left.copy()
         if not changed:
             return
@@ -204,21 +199,25 @@ class WindowOdds:
     def _pool(self, look: _Look) -> list[_Pooled]:
         """Pool the hints that are left to see in a look, in the windows where they have changed."""
         last, look.left = look.left, self._left_of(look.gist)
-        changed = look.hinted & (look.left != last) if last is not None else np.ones_like(look.hinted)
-        if not look.tables or not changed.any():
-            return []
+        rows, columns = look.left.shape
+        changed = 0, 0, columns, rows
+        if last is not None:
+            differs = look.hinted & (look.left != last)
+            if not differs.any():
+                return []
+            changed = extent(differs)
         places = {level: table.holding(changed) for level, table in look.tables.items()}
         # The largest windows, which come first, reach over the cells of all others.
-        rows, columns = next(iter(places.values()))
-        reach = next(iter(look.tables.values())).span - 1
-        here = slice(rows.start, rows.stop + reach), slice(columns.start, columns.stop + reach)
+        first = look.gist.level + 1
+        (below, beside), reach = places[first], look.tables[first].span - 1
+        here = slice(below.start, below.stop + reach), slice(beside.start, beside.stop + reach)
         scores, left = look.gist.scores[here], look.left[here]
         if not (left == 1).all():
             scores = scores * torch.from_numpy(left)[..., None]
         pools = pool_spans(scores, [table.span for table in look.tables.values()])
         parts = []
         for (level, (down, across)), maps in zip(places.items(), pools, strict=True):
-            at = _shifted(down, rows.start), _shifted(across, columns.start)
+            at = _shifted(down, below.start), _shifted(across, beside.start)
             parts.append(_Pooled(look, level, (down, across), *(values[at] for values in maps)))
         return parts
 

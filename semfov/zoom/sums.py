@@ -56,3 +56,13 @@ class WindowSums:
         down, across = self._band[: part.shape[0], : bottom - top], self._band[: part.shape[1], : right - left]
         self.sums[top:bottom, left:right] = down.T @ (part @ across)
         return self.sums
+
+
+def extent(marked: NDArray[np.bool_]) -> Box:
+    """The box about the cells that are marked in `(rows, columns)`, of which there is at least one.
+
+    >>> extent(np.array([[False, True, True], [False, False, True]]))
+    (1, 0, 3, 2)
+    """
+    rows, columns = marked.any(1).nonzero()[0], marked.any(0).nonzero()[0]
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
