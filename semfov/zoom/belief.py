@@ -63,7 +63,9 @@ class ZoomBelief:
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
         self._targets = torch.tensor([target])
         shape = lattice.rows, lattice.columns
-        self.rate = torch.zeros(STEPS, *shape)
+        # Rates of cells that a level is not one to three octaves closer to are 0: the first plane and the last one.
+        self._planes = np.zeros((STEPS + 2, *shape), np.float32)
+        self.rate = torch.from_numpy(self._planes[1:-1])
         self.source = torch.full(shape, -1)
         self.left = torch.ones(shape)
         self.gists: list[Gist] = []
@@ -152,9 +154,8 @@ class ZoomBelief:
 
     def _compute(self, level: int, at: tuple[slice, slice]) -> Cells:
         """`expected` in some rows and columns."""
-        steps = level - self.source.numpy()[at]
-        told = np.choose(steps - 1, self.rate.numpy()[:, *at], mode="clip")
-        return told * ((steps >= 1) & (steps <= STEPS)) * self.left.numpy()[at]
+        told: Cells = np.choose(level - self.source.numpy()[at], self._planes[:, *at], mode="clip")
+        return told * self.left.numpy()[at]
 
     def _renew(self, changed: Box) -> None:
         """Compute what is expected anew in cells that have changed."""

@@ -215,7 +215,7 @@ class GlimpseEvidence(Pretrained):
         hints = features(shown.movedim(-1, 0))
         best, own = hints[0], hints[1:]
         found = look.found.index_select(-1, wanted).movedim(-1, 0).to(own)
-        usual, bias = self.prior[targets].mT[..., None, None]
+        usual, bias = self.prior.index_select(0, targets).mT[..., None, None]
         parts = [*hint_maps(own, best, found, look.size), usual.expand_as(own), *memory_maps(own, before)]
         value: Tensor = through(self.rate, torch.stack(parts, -1)) + (bias[..., None] - 6)
         return value.clamp(max=3).movedim(-1, 1)
@@ -320,7 +320,7 @@ def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tenso
         For each size, the results of `pool`, `(down, across, K)` and `(down, across, 3)`.
     """
     best = scores.amax(-1)
-    parts = torch.stack([best, (best > 0).to(best), (best > 0.02).to(best)])
+    parts = torch.stack([best, best > 0, best > 0.02])
     found: dict[int, tuple[Tensor, Tensor]] = {}
     top, have = scores, (1, 1)
     for span in sorted(spans):

@@ -87,7 +87,7 @@ class _Look:
 
 @dataclass
 class _Pooled:
-    """Pooled hints of some windows of a look (`pool`): their level, their place in its table, scores and summaries."""
+    """Pooled hints of N windows of a look: their level, their place in its table, and the results of `pool_all`."""
 
     look: _Look
     level: int
@@ -115,14 +115,10 @@ class WindowOdds:
         self._lattice, self._evidence, self._target, self._context = lattice, evidence, target, context
         self._looks: list[_Look] = []
         self._left = np.ones((lattice.rows, lattice.columns), np.float32)
-        self._odds: dict[int, Cells] = {}
+        self._odds: dict[int, Cells] = {
+            level: np.full(lattice.places(level)[::-1], -np.inf, np.float32) for level in range(1, lattice.levels)
+        }
         self._chances: dict[int, Cells] = {}
-        self._clear()
-
-    def _clear(self) -> None:
-        self._chances.clear()
-        for level in range(1, self._lattice.levels):
-            self._odds[level] = np.full(self._lattice.places(level)[::-1], -np.inf, np.float32)
 
     def odds(self, level: int) -> Cells:
         """Log odds of the windows of a level, `(down, across)`; -inf where nothing is known."""
@@ -158,8 +154,10 @@ class WindowOdds:
         ]
         first = affected.index(True)
         if any(look.left is not None for look in self._looks[first:]):
-            self._clear()
             first = 0
+            self._chances.clear()
+            for odds in self._odds.values():
+                odds.fill(-np.inf)
         self._read([look for look, concerned in zip(self._looks, affected, strict=True) if concerned])
         for look, concerned in zip(self._looks[first:], affected[first:], strict=True):
             if concerned:
@@ -183,18 +181,21 @@ class WindowOdds:
         parts = [part for look in looks for part in self._pool(look)]
         if not parts:
             return
-        counts = [part.summary.shape[0] * part.summary.shape[1] for part in parts]
-        scores = torch.cat([part.scores.flatten(0, 1) for part in parts])
-        summary = torch.cat([part.summary.flatten(0, 1) for part in parts])
-        steps = torch.from_numpy(np.repeat([part.level - part.look.gist.level for part in parts], counts))
-        facts = self._evidence.hint_facts(scores, summary, steps, self._target)[:, 0]
+        counts = [len(part.scores) for part in parts]
+        scores, summary = torch.cat([part.scores for part in parts]), torch.cat([part.summary for part in parts])
+        steps = torch.tensor([part.level - part.look.gist.level for part in parts])
+        if len(parts) > 1:
+            steps = steps.repeat_interleave(torch.tensor(counts))
+        facts = self._evidence.hint_facts(scores, summary, steps.expand(len(scores)), self._target)[:, 0]
         if self._context is not None:
             facts[:, 5] += self._context(scores, self._target)
-        for part, told in zip(parts, np.split(facts.numpy(), np.cumsum(counts)[:-1]), strict=True):
+        told, start = facts.numpy(), 0
+        for part, count in zip(parts, counts, strict=True):
             table = part.look.tables[part.level]
             place = table.of(part.look.facts)[part.place]
-            place[:] = told.reshape(place.shape)
+            place[:] = told[start : start + count].reshape(place.shape)
             table.of(part.look.stale)[part.place] = True
+            start += count
 
     def _pool(self, look: _Look) -> list[_Pooled]:
         """Pool the hints that are left to see in a look, in the windows where they have changed."""
@@ -218,7 +219,7 @@ class WindowOdds:
         parts = []
         for (level, (down, across)), maps in zip(places.items(), pools, strict=True):
             at = _shifted(down, below.start), _shifted(across, beside.start)
-            parts.append(_Pooled(look, level, (down, across), *(values[at] for values in maps)))
+            parts.append(_Pooled(look, level, (down, across), *(values[at].flatten(0, 1) for values in maps)))
         return parts
 
     def _judge(self, look: _Look) -> None:
