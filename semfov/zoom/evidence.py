@@ -320,7 +320,7 @@ def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tenso
         For each size, the results of `pool`, `(down, across, K)` and `(down, across, 3)`.
     """
     best = scores.amax(-1)
-    parts = torch.stack([best, best > 0, best > 0.02])
+    parts = torch.stack([best, (best > 0).to(best), (best > 0.02).to(best)])
     found: dict[int, tuple[Tensor, Tensor]] = {}
     top, have = scores, (1, 1)
     for span in sorted(spans):

@@ -90,10 +90,7 @@ def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None
 
 
 def _gelu(values: Tensor) -> Tensor:
-    """GELU of arrays that torch does not give to oneDNN, whose call costs ten times as much as the work in it.
-
-    These are arrays that are not contiguous: transposed matrices, and repeated vectors.
-    """
+    """GELU of transposed matrices and repeated vectors: torch gives contiguous arrays to oneDNN, whose call is slow."""
     return F.gelu(values.expand(2, -1))[0] if values.ndim == 1 else F.gelu(values.mT).mT
 
 

@@ -30,11 +30,13 @@ class _Table:
         span: number of cells of the gist along a side of a window.
         shape: `(down, across)`, number of windows.
         rows: their rows in the arrays of the look.
+        places: `(down * across,)`, index of each in an array of all windows of the level.
     """
 
     span: int
     shape: tuple[int, int]
     rows: slice
+    places: NDArray[np.intp]
 
     def of(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
         """View of the rows of an array of the look that belong to these windows, `(down, across, ...)`."""
@@ -72,8 +74,15 @@ class _Look:
         for level in range(gist.level + 1, min(gist.level + STEPS, lattice.levels - 1) + 1):
             if span := lattice.span(level) // gist.scale:
                 down, across = (max(n - span, 0) + 1 for n in self.hinted.shape)
-                self.tables[level] = _Table(span, (down, across), slice(count, count + down * across))
-                count += down * across
+                # A cell of a coarse look can reach beyond the last window of a level: it goes by that one.
+                ends = lattice.places(level)
+                x, y = (
+                    np.minimum(low + gist.scale * np.arange(n), end - 1)
+                    for low, n, end in zip(gist.first, (across, down), ends, strict=True)
+                )
+                places = (y[:, None] * ends[0] + x).ravel()
+                self.tables[level] = _Table(span, (down, across), slice(count, count + len(places)), places)
+                count += len(places)
         self.facts = np.zeros((count, 6), np.float32)
         self.before, self.odds = np.full(count, np.nan, np.float32), np.zeros(count, np.float32)
         self.stale = np.ones(count, np.bool_)
@@ -183,10 +192,8 @@ class WindowOdds:
             return
         counts = [len(part.scores) for part in parts]
         scores, summary = torch.cat([part.scores for part in parts]), torch.cat([part.summary for part in parts])
-        steps = torch.tensor([part.level - part.look.gist.level for part in parts])
-        if len(parts) > 1:
-            steps = steps.repeat_interleave(torch.tensor(counts))
-        facts = self._evidence.hint_facts(scores, summary, steps.expand(len(scores)), self._target)[:, 0]
+        steps = torch.cat([torch.full((len(part.scores),), part.level - part.look.gist.level) for part in parts])
+        facts = self._evidence.hint_facts(scores, summary, steps, self._target)[:, 0]
         if self._context is not None:
             facts[:, 5] += self._context(scores, self._target)
         told, start = facts.numpy(), 0
@@ -224,19 +231,16 @@ class WindowOdds:
 
     def _judge(self, look: _Look) -> None:
         """Compute the log odds of the windows of a look for which the facts or the log odds before have changed."""
-        gist, (x, y) = look.gist, look.gist.first
-        if gist.level > 0:
-            for level, table in look.tables.items():
-                # A cell of a coarse look can reach beyond the last window of a level: it goes by that one.
-                rows, columns = (low + gist.scale * np.arange(n) for low, n in zip((y, x), table.shape, strict=True))
-                known = self._odds[level].take(rows, 0, mode="clip").take(columns, 1, mode="clip")
-                known[known == -np.inf] = _UNKNOWN
-                before = table.of(look.before)
-                table.of(look.stale)[known != before] = True
-                before[:] = known
+        coarsest = look.gist.level == 0
+        for level, table in () if coarsest else look.tables.items():
+            known = self._odds[level].take(table.places)
+            known[known == -np.inf] = _UNKNOWN
+            before = look.before[table.rows]
+            look.stale[table.rows] |= known != before
+            before[:] = known
         rows = look.stale.nonzero()[0]
         if len(rows):
-            before = torch.from_numpy(look.before[rows]) if gist.level > 0 else None
+            before = None if coarsest else torch.from_numpy(look.before[rows])
             look.odds[rows] = self._evidence.odds(torch.from_numpy(look.facts[rows]), before).numpy()
             look.stale[:] = False
 

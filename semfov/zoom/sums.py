@@ -59,10 +59,16 @@ class WindowSums:
 
 
 def extent(marked: NDArray[np.bool_]) -> Box:
-    """The box about the cells that are marked in `(rows, columns)`, of which there is at least one.
+    """Find the box about marked cells.
+
+    Args:
+        marked: `(rows, columns)`; at least one cell is marked.
+
+    Returns:
+        The box.
 
     >>> extent(np.array([[False, True, True], [False, False, True]]))
     (1, 0, 3, 2)
     """
-    rows, columns = marked.any(1).nonzero()[0], marked.any(0).nonzero()[0]
+    rows, columns = np.flatnonzero(marked.any(1)), np.flatnonzero(marked.any(0))
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
