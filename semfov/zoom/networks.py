@@ -78,10 +78,10 @@ def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None
     last = len(network) - 1
     for place, layer in enumerate(network):
         if isinstance(layer, nn.Linear):
-            weight, bias = layer.weight, layer.bias
-            if outputs is not None and place == last:
-                weight, bias = weight[outputs], bias[outputs]
-            values = F.linear(values, weight, bias)
+            if outputs is None or place < last:
+                values = F.linear(values, layer.weight, layer.bias)
+            else:
+                values = F.linear(values, layer.weight[outputs], layer.bias[outputs])
         elif isinstance(layer, nn.GELU):
             values = _gelu(values)
         elif layer.training:  # dropout

@@ -56,8 +56,11 @@ class _Look:
         lattice: lattice of the picture.
 
     Attributes:
-        left: `(rows, columns)`, share of each cell that was left to see when the hints were pooled; None before.
+        fresh: whether nothing was predicted from it yet.
         hinted: `(rows, columns)`, whether a cell has hints.
+        scores: `(rows, columns, K)`, those of the gist.
+        left: `(rows, columns)`, share of each cell that is left to see.
+        shown: `(rows, columns, K)`, scores of the hints times that share.
         tables: the windows of each level.
         facts: `(N, 6)`, `GlimpseEvidence.hint_facts`.
         before: `(N,)`, log odds from coarser looks.
@@ -67,8 +70,10 @@ class _Look:
 
     def __init__(self, gist: Gist, lattice: Lattice) -> None:
         self.gist = gist
-        self.left: Cells | None = None
+        self.fresh = True
         self.hinted = gist.scores.amax(-1).numpy() > 0
+        self.left = np.ones(self.hinted.shape, np.float32)
+        self.shown = self.scores = gist.scores.numpy()
         self.tables: dict[int, _Table] = {}
         count = 0
         for level in range(gist.level + 1, min(gist.level + STEPS, lattice.levels - 1) + 1):
@@ -86,6 +91,19 @@ class _Look:
         self.facts = np.zeros((count, 6), np.float32)
         self.before, self.odds = np.full(count, np.nan, np.float32), np.zeros(count, np.float32)
         self.stale = np.ones(count, np.bool_)
+
+    def cover(self, left: Cells) -> Box | None:
+        """Take over the share of each cell that is left to see; return the box about hints that this changes."""
+        differs = self.hinted & (left != self.left)
+        self.left = left
+        if not differs.any():
+            return None
+        x1, y1, x2, y2 = changed = extent(differs)
+        if self.shown is self.scores:
+            self.shown = self.scores.copy()
+        here = slice(y1, y2), slice(x1, x2)
+        np.multiply(self.scores[here], left[here][..., None], out=self.shown[here])
+        return changed
 
     @property
     def box(self) -> Box:
@@ -158,11 +176,11 @@ class WindowOdds:
             return
         self._looks = sorted(self._looks + fresh, key=lambda look: look.gist.level)
         affected = [
-            look.left is None or any(level < look.gist.level and _overlap(look.box, box) for box, level in changed)
+            look.fresh or any(level < look.gist.level and _overlap(look.box, box) for box, level in changed)
             for look in self._looks
         ]
         first = affected.index(True)
-        if any(look.left is not None for look in self._looks[first:]):
+        if not all(look.fresh for look in self._looks[first:]):
             first = 0
             self._chances.clear()
             for odds in self._odds.values():
@@ -206,23 +224,18 @@ class WindowOdds:
 
     def _pool(self, look: _Look) -> list[_Pooled]:
         """Pool the hints that are left to see in a look, in the windows where they have changed."""
-        last, look.left = look.left, self._left_of(look.gist)
-        rows, columns = look.left.shape
-        changed = 0, 0, columns, rows
-        if last is not None:
-            differs = look.hinted & (look.left != last)
-            if not differs.any():
-                return []
-            changed = extent(differs)
+        changed = look.cover(self._left_of(look.gist))
+        if look.fresh:
+            rows, columns = look.hinted.shape
+            changed, look.fresh = (0, 0, columns, rows), False
+        if changed is None:
+            return []
         places = {level: table.holding(changed) for level, table in look.tables.items()}
         # The largest windows, which come first, reach over the cells of all others.
         first = look.gist.level + 1
         (below, beside), reach = places[first], look.tables[first].span - 1
-        here = slice(below.start, below.stop + reach), slice(beside.start, beside.stop + reach)
-        scores, left = look.gist.scores[here], look.left[here]
-        if not (left == 1).all():
-            scores = scores * torch.from_numpy(left)[..., None]
-        pools = pool_spans(scores, [table.span for table in look.tables.values()])
+        shown = look.shown[below.start : below.stop + reach, beside.start : beside.stop + reach]
+        pools = pool_spans(torch.from_numpy(shown), [table.span for table in look.tables.values()])
         parts = []
         for (level, (down, across)), maps in zip(places.items(), pools, strict=True):
             at = _shifted(down, below.start), _shifted(across, beside.start)
@@ -235,9 +248,8 @@ class WindowOdds:
         for level, table in () if coarsest else look.tables.items():
             known = self._odds[level].take(table.places)
             known[known == -np.inf] = _UNKNOWN
-            before = look.before[table.rows]
-            look.stale[table.rows] |= known != before
-            before[:] = known
+            look.stale[table.rows] |= known != look.before[table.rows]
+            look.before[table.rows] = known
         rows = look.stale.nonzero()[0]
         if len(rows):
             before = None if coarsest else torch.from_numpy(look.before[rows])
