@@ -63,14 +63,12 @@ def tapered(border: Tensor, span: int) -> Tensor:
 
 def neighbourhood_peak(values: Tensor, side: int) -> Tensor:
     """Largest value of maps `(T, rows, columns)` in the square about each cell."""
-    reach = side // 2
-    return F.max_pool2d(F.max_pool2d(values, (side, 1), 1, (reach, 0)), (1, side), 1, (0, reach))
+    return F.max_pool2d(values[:, None], side, 1, side // 2)[:, 0]
 
 
 def neighbourhood_mean(values: Tensor, side: int) -> Tensor:
     """Mean of maps `(T, rows, columns)` over the square about each cell; what lies beyond the map counts as 0."""
-    reach = side // 2
-    return F.avg_pool2d(F.avg_pool2d(values, (side, 1), 1, (reach, 0)), (1, side), 1, (0, reach))
+    return F.avg_pool2d(values[:, None], side, 1, side // 2)[:, 0]
 
 
 def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None) -> Tensor:

@@ -1,11 +1,10 @@
-"""Small networks and their maps: each shortened computation against the plain one of torch."""
+"""Small networks: each shortened computation against the plain one."""
 
 import pytest
 import torch
-from torch.nn import functional as F
 
 from semfov.zoom import GlimpseEvidence
-from semfov.zoom.networks import features, neighbourhood_mean, neighbourhood_peak, small_network, through
+from semfov.zoom.networks import features, small_network, through
 
 
 @pytest.mark.parametrize("shape", [(5,), (1, 5), (40, 5), (3, 6, 5), (2, 3, 6, 5)])
@@ -18,14 +17,6 @@ def test_a_network_called_layer_by_layer_equals_the_module(shape, device):
     (gradient,) = torch.autograd.grad(through(network, values).sum(), network[0].weight)
     (wanted,) = torch.autograd.grad(network(values).sum(), network[0].weight)
     torch.testing.assert_close(gradient, wanted)
-
-
-@pytest.mark.parametrize("side", [3, 5, 7, 9])
-@pytest.mark.parametrize("shape", [(1, 16, 16), (2, 32, 20), (8, 3, 11)])
-def test_neighbourhoods_are_squares(side, shape):
-    maps = torch.randn(shape, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(neighbourhood_peak(maps, side), F.max_pool2d(maps, side, 1, side // 2))
-    torch.testing.assert_close(neighbourhood_mean(maps, side), F.avg_pool2d(maps, side, 1, side // 2))
 
 
 @pytest.mark.parametrize("known", [False, True])
