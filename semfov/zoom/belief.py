@@ -37,12 +37,12 @@ class Rates(Protocol):
 class ZoomBelief:
     """What looks at any window of a picture are expected to show, for one class.
 
-    Each cell is predicted from the closest look at it. The belief keeps five numbers, 24 bytes, for a cell: the level
-    of that look, the number of objects centred in the cell that looks one, two and three octaves closer are expected
-    to find, and the share of the cell that is left to see. Hints of all classes are kept for the windows that were
-    looked at, at most 32 × 32 cells of each. A picture of 20,000 × 15,000 px has 49,152 cells: 1.2 MB, and for 80
-    classes at most 0.41 MB for each look. Searches also keep the hints of each look pooled over its windows, at most
-    0.6 MB.
+    Each cell is predicted from the closest look at it. The belief keeps five numbers for a cell: the level of that
+    look, the number of objects centred in the cell that looks one, two and three octaves closer are expected to find,
+    and the share of the cell that is left to see. With two zeros for levels without a prediction these are 32 bytes.
+    Hints of all classes are kept for the windows that were looked at, at most 32 × 32 cells of each. A picture of
+    20,000 × 15,000 px has 49,152 cells: 1.6 MB, and for 80 classes at most 0.41 MB for each look. Searches also keep
+    the hints of each look that are left to see and what they predict for its windows, at most 0.41 MB.
 
     Args:
         lattice: lattice of the picture.
