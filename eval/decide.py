@@ -64,7 +64,8 @@ class DecideConfig(DecidingConfig):
         out: folder for tables, records and the figure.
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
         workers: number of processes (None: one per CPU core).
-        models: folder written by `train.fit_detector`, which defines detector, sensor, grid and learned evidence.
+        models: folder written by `train.fit_detector`, which defines detector, sensor, grid, learned evidence and
+            verification.
     """
 
     data: DataConfig = field(default_factory=DataConfig)

@@ -11,9 +11,10 @@
 
 It prints the detections and the belief at each fixation, and writes pictures and an animation to the folder `out`.
 `--draw` chooses which (`--draw "[scanpath]"`; `--draw "[]"` for none).
-Each picture of a folder is a separate episode. In a video or from a camera, the agent makes one gaze shift per frame;
-the belief is carried from frame to frame and fades at a given rate. In a picture that is at least four times as large
-as the detector's input, the agent looks at windows and chooses their places and magnifications.
+Each picture of a folder is a separate episode. In a video or from a camera, the agent makes one gaze shift or one
+closer look per frame; the belief is carried from frame to frame and fades at a given rate. In a picture that is at
+least four times as large as the detector's input, the agent looks at windows and chooses their places and
+magnifications.
 """
 
 import sys
@@ -49,6 +50,9 @@ from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye, ZoomPath
 
 Drawn = Literal["scanpath", "views", "belief", "belief_bars", "animation"]
 
+LIVE = ("rate", "start", "seed", "confirm", "give_up", "closer")
+"""Settings that a video or camera takes, too."""
+
 PHOTO = "photograph, folder of photographs or video (none: an embedded scene)"
 
 
@@ -78,7 +82,8 @@ class DemoConfig(Settings):
         give_up: a search gives up when, in every cell not fixated yet, the probability of the target is below this
             value (none: the value chosen when the belief was fitted).
         closer: largest number of closer looks, in which a window around a place that seems to hold the target is
-            enlarged to the detector's input; 0: none.
+            enlarged to the detector's input; 0: none. In a video or from a camera, a closer look takes the place of a
+            look, and the number holds for the time until half of the belief has faded.
         price: price of a look in right decisions: a search ends when further looks are not worth it (none: the search
             ends by thresholds).
         until: price of a look in cells: an exploration ends when no look is expected to name this many more cells right
@@ -139,7 +144,7 @@ def demo(config: DemoConfig) -> None:
     agent = make_agent(config) if agent is None else agent
     if stream is not None:
         only_likeliest(wanted)
-        given = {name: getattr(config, name) for name in ("rate", "start", "seed", "confirm", "give_up")}
+        given = {name: getattr(config, name) for name in LIVE}
         path = watch(agent.live(config.target, **given), stream, config.out / "live")
         print(f"written:\n  {path}")
         return

@@ -51,6 +51,8 @@ def told(moment: Moment, live: LivePerception) -> str:
     best = int(moment.probability.argmax())
     row, column = divmod(moment.cell, moment.grid.columns)
     look = f"{moment.number:4d}  at ({column}, {row}): {seen(moment, live)}"
+    if moment.closer is not None:
+        look = f"{moment.number:4d}  closely at ({column}, {row}): p {moment.closer.place:.2f} there"
     row, column = divmod(best, moment.grid.columns)
     return f"{look:60s}  {headline(moment, live)}, most likely at ({column}, {row})"
 
@@ -63,7 +65,8 @@ def headline(moment: Moment, live: LivePerception) -> str:
     name = live.classes[moment.target]
     if moment.decision is None:
         return f"p({name}) up to {highest:.2f}"
-    return f"{name}: {moment.decision.outcome}, p {moment.decision.probability:.2f}"
+    there = "" if moment.decision.place is None else f" (there {moment.decision.place:.2f})"
+    return f"{name}: {moment.decision.outcome}, p {moment.decision.probability:.2f}{there}"
 
 
 def seen(moment: Moment, live: LivePerception, most: int = 2) -> str:

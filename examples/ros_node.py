@@ -1,4 +1,4 @@
-"""A ROS 2 node that searches a camera's images: it publishes detections, and the point where to look next.
+"""A ROS 2 node that searches a camera's images: it publishes detections, the target, and the point to look at next.
 
 Source ROS 2 first, then run it: python -m examples.ros_node --ros-args -p target:=cup -r image:=/camera/image_raw
 """
@@ -21,21 +21,22 @@ class GazeNode(Node):
         target = self.declare_parameter("target", "cup").value
         detector = self.declare_parameter("detector", "yolov3-tiny").value
         self.agent = semfov.ActivePerception.recommended(detector)
-        self.live = self.agent.live(target)
+        self.target, self.live = target, self.agent.live(target)
         self.seen = self.create_publisher(Detection2DArray, "detections", 1)
+        self.found = self.create_publisher(Detection2DArray, "found", 1)
         self.gaze = self.create_publisher(PointStamped, "gaze", 1)
         self.create_subscription(Image, "image", self.look, 1)
 
     def look(self, message: Image) -> None:
-        """Look at an image, update the belief, and publish the detections and the next gaze point."""
+        """Look at an image, and publish the detections, the box of a found target and the next gaze point."""
         moment = self.live.step(ros.picture(message))
         of = {"stamp": message.header.stamp, "frame": message.header.frame_id}
         found = ros.detection_array(moment.detections, self.agent.classes[1:], **of)
         self.seen.publish(ros.fill(Detection2DArray(), found, Detection2D, ObjectHypothesisWithPose))
+        found = ros.found_array(moment.decision, self.target, **of)
+        self.found.publish(ros.fill(Detection2DArray(), found, Detection2D, ObjectHypothesisWithPose))
         following = moment.grid.centres[moment.next_cell]
         self.gaze.publish(ros.fill(PointStamped(), ros.gaze_point(following, **of)))
-        if moment.decision is not None and moment.decision.outcome == "found":
-            self.get_logger().info(f"found, probability {moment.decision.probability:.2f}")
 
 
 def main() -> None:

@@ -252,8 +252,8 @@ class ActivePerception(nn.Module):
             raise InputError(f"price: expected None {case}, got {price}; the recommended agent takes one of them")
         thresholds = None if chosen is None else chosen.changed(confirm, give_up)
         outcome: Callable[[Step], Tensor]
-        verifier, model = None, self.verification
-        if model is not None and model.thresholds is not None and closer and goal is None and price is None:
+        verifier, model = None, self._verification(closer)
+        if model is not None and model.thresholds is not None and goal is None and price is None:
             at = model.thresholds.changed(confirm, give_up)
             outcome = verifier = Verifier(model, partial(self.eye.close_up, image), grid, index, at, closer)
         else:
@@ -319,16 +319,22 @@ class ActivePerception(nn.Module):
         seed: int = 0,
         confirm: float | None = None,
         give_up: float | None = None,
+        closer: int = MOST,
     ) -> LivePerception:
         """Search or explore a camera or a video: one look at every frame, with a belief that fades between frames.
+
+        When a place seems to hold the target, the recommended agent spends a frame on a closer look (`search`).
 
         Args:
             target: class to search for, by name or index 1..K; None explores.
             rate: rate at which belief fades, per frame; 0 forgets nothing (`semfov.live.LivePerception`).
             start: first cell; None draws one at random.
             seed: seed of the generator that draws the start and breaks ties.
-            confirm: least probability that the image holds the target for `found`; None takes that of the model.
-            give_up: probability below which a cell is not worth a look; None takes that of the model.
+            confirm: least probability for `found`, as for `search`; None takes that of the model.
+            give_up: probability below which a cell is not worth a look; None takes that of the belief alone, which a
+                belief that fades can reach, or with rate 0 that of `search`.
+            closer: largest number of frames, 0 to 100, that are spent on closer looks in the time until half of the
+                evidence is forgotten (ln 2 / rate frames). 0 decides from the foveated looks alone, as for `search`.
 
         Returns:
             An object whose `step` takes the frames one by one.
@@ -338,20 +344,22 @@ class ActivePerception(nn.Module):
         """
         index = None if target is None else class_index(target, self.classes[1:], "target")
         check_thresholds(confirm, give_up)
+        check_whole(closer, "closer", 0, 100)
         strategy = self.exploring if index is None else self.searching
-        chosen = strategy.observer.thresholds
+        model = None if index is None else self._verification(closer)
+        own = strategy.observer.thresholds
+        chosen = own if model is None else model.thresholds
+        usual = own.give_up if rate and own is not None else None
+        at = None if chosen is None else chosen.changed(give_up=usual).changed(confirm, give_up)
+        parts = self.eye, strategy.observer, strategy.policy, self.classes, (self.columns, self.rows)
         return LivePerception(
-            self.eye,
-            strategy.observer,
-            strategy.policy,
-            self.classes,
-            (self.columns, self.rows),
-            target=index,
-            rate=rate,
-            start=start,
-            seed=seed,
-            thresholds=None if chosen is None else chosen.changed(confirm, give_up),
+            *parts, target=index, rate=rate, start=start, seed=seed, thresholds=at, verification=model, closer=closer
         )
+
+    def _verification(self, closer: int) -> Verification | None:
+        """The model for closer looks, if they are wanted and it can decide."""
+        model = self.verification
+        return model if closer and model is not None and model.thresholds is not None else None
 
     def _frame(self, picture: ImageLike) -> tuple[Tensor, Grid]:
         """The image as a batch of one, and the grid over it."""
@@ -381,15 +389,9 @@ class ActivePerception(nn.Module):
             ended = int(number), step
             return number > 0
 
-        steps = rollout(
-            looks,
-            strategy.observer,
-            strategy.policy(target, grid),
-            torch.tensor([first], device=image.device),
-            Greedy(drawn_by(generator, len(grid), image)),
-            most=shifts + 1,
-            ends=ends,
-        )
+        begin, choice = torch.tensor([first], device=image.device), Greedy(drawn_by(generator, len(grid), image))
+        policy = strategy.policy(target, grid)
+        steps = rollout(looks, strategy.observer, policy, begin, choice, most=shifts + 1, ends=ends)
         mapper = self.exploring.observer
         beside = None if mapper is strategy.observer else mapper
         scanpath = trace(steps, grid, self.classes, target, beside)

@@ -12,6 +12,7 @@ from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer
 from semfov.belief.target_evidence import Thresholds
+from semfov.belief.verification import Verification
 from semfov.data.inputs import ImageLike, as_image
 from semfov.decision import Decision, conclude, decide
 from semfov.detection.detections import Detections
@@ -20,6 +21,8 @@ from semfov.errors import check
 from semfov.eye import Eye, View
 from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.gaze.policies import Policy
+from semfov.live_verifier import LiveVerifier
+from semfov.verifier import MOST, CandidatePlace, CloserLook
 
 RATE = 0.1
 """Default rate at which belief fades, per frame."""
@@ -35,15 +38,17 @@ class Moment:
         number: number of the frame, from 0.
         grid: the cells.
         target: class 1..K that is searched for; None for exploration.
-        cell: the fixated cell.
+        cell: the fixated cell, or the one that was looked at closely.
         fixation: `(2,)`, the centre of the cell as `(x, y)` in pixels.
         detections: detections of the look, a batch of one.
-        belief: belief of one episode after the look.
+        belief: belief of one episode after the last look that was not a closer one.
         decision: decision at this frame: `found`, `absent`, or `undecided` as long as it is neither; None for
             exploration and for a belief without thresholds.
         visited: `(X·Y,)` boolean, cells that inhibition of return keeps the gaze from.
-        next_cell: the cell to fixate in the next frame.
-        seconds: time of the look by stage; `open` is the fitting of the frame into the detector's input.
+        next_cell: the cell to look at in the next frame.
+        seconds: time of the look by stage; `open` is the fitting of the frame into the detector's input. A closer look
+            has the stage `detect` alone.
+        closer: the closer look, if this frame was spent on one; otherwise None.
 
     Example::
 
@@ -62,6 +67,7 @@ class Moment:
     visited: Tensor
     next_cell: int
     seconds: dict[str, float]
+    closer: CloserLook | None = None
 
     @property
     def probability(self) -> Tensor:
@@ -79,6 +85,12 @@ class LivePerception:
     Fixated cells are free again after :math:`\ln 2 / r` frames (`semfov.episode.Forgetting`, `Observer.fade`). With
     rate 0, frames of a still picture give the same belief as a search of the picture.
 
+    With a model of verification, the target is found by closer looks alone, as in a search. A frame is then either a
+    look of the fovea or a closer look at a place that seems to hold the target, since each costs one pass of the
+    detector. What a closer look has told fades, too (`semfov.live_verifier.LiveVerifier`). With rate 0, frames of a
+    still picture give the looks, the closer looks and the decision of a search up to its end. Only a place that is
+    probable enough, but not enough to end a search at once, is called found earlier, as soon as it was examined.
+
     Args:
         eye: sensor and detector.
         observer: turns looks into a belief.
@@ -89,7 +101,10 @@ class LivePerception:
         rate: r, per frame, 0 or more.
         start: first cell; None draws one at random.
         seed: seed of the generator that draws the start and breaks ties.
-        thresholds: thresholds at which a search decides; None takes those of the observer.
+        thresholds: thresholds at which a search decides; None takes those of the model of verification, or without
+            closer looks those of the observer.
+        verification: probabilities after closer looks; None decides from the looks of the fovea alone.
+        closer: largest number of closer looks in :math:`\ln 2 / r` frames.
 
     Example::
 
@@ -112,14 +127,22 @@ class LivePerception:
         start: int | None = None,
         seed: int = 0,
         thresholds: Thresholds | None = None,
+        verification: Verification | None = None,
+        closer: int = MOST,
     ) -> None:
         self.eye, self.observer, self.policy = eye, observer, policy
         self.classes, self.cells, self.target = classes, cells, target
         self.forgetting = Forgetting(rate)
-        self.thresholds = observer.thresholds if thresholds is None else thresholds
+        usual = observer if verification is None else verification
+        self.thresholds = usual.thresholds if thresholds is None else thresholds
+        self.verification, self.closer = verification, closer
         self._first = first_cell(start, seed, cells[0] * cells[1])
         self._looks: LiveLooks | None = None
         self._steps: Iterator[Step] = iter(())
+        self._verifier: LiveVerifier | None = None
+        self._number = 0
+        # The last look of the fovea, and the number of its frame.
+        self._last: tuple[Step, int] | None = None
         # Detections of the looks of which at least half the evidence is left.
         self._recent: deque[Detections] = deque(maxlen=max(1, int(min(self.forgetting.span, _MOST))))
 
@@ -138,19 +161,57 @@ class LivePerception:
         """
         with torch.inference_mode():
             image = as_image(frame, like=self.eye.sensor.like, argument="frame")[None]
-            watch = Stopwatch()
-            view = self.eye.open(image)
-            watch.lap("open")
-            if self._looks is None:
-                self._looks = self._begin(image, view)
-            grid = self._looks.grid
-            wanted = " × ".join(f"{side:.0f}" for side in grid.extent.tolist())
+            self._check_size(image)
+            if self._verifier is not None:
+                self._verifier.wait()
+            moment = self._look(image) if self._candidate is None else self._look_closely(image, self._candidate)
+            self._number += 1
+            return moment
+
+    def _check_size(self, image: Tensor) -> None:
+        """Raise `InputError` unless the frame has the size of the first one."""
+        if self._looks is not None:
+            wanted = " × ".join(f"{side:.0f}" for side in self._looks.grid.extent.tolist())
             size = f"{image.shape[-1]} × {image.shape[-2]}"
             check(size == wanted, "frame", f"{wanted} pixels, the size of the first frame", size)
-            self._looks.view = view
-            step = next(self._steps)
-            self._recent.append(step.detections)
-            return self._moment(step, grid, watch.seconds)
+
+    @property
+    def _candidate(self) -> CandidatePlace | None:
+        """The place that the next frame is spent on; None for a look of the fovea."""
+        return None if self._verifier is None else self._verifier.candidate
+
+    def _look(self, image: Tensor) -> Moment:
+        """Spend a frame on a look of the fovea."""
+        watch = Stopwatch()
+        view = self.eye.open(image)
+        watch.lap("open")
+        if self._looks is None:
+            self._looks = self._begin(image, view)
+        self._looks.view = view
+        self._looks.frames = 1 if self._last is None else self._number - self._last[1]
+        step = next(self._steps)
+        self._last = step, self._number
+        if self._verifier is not None:
+            self._verifier.see(step)
+        self._recent.append(step.detections)
+        seconds = {**watch.seconds, **step.seconds}
+        return self._moment(step, self._looks.grid, int(step.cell), step.detections, seconds)
+
+    def _look_closely(self, image: Tensor, candidate: CandidatePlace) -> Moment:
+        """Spend a frame on a closer look."""
+        assert self._looks is not None
+        assert self._last is not None
+        assert self._verifier is not None
+        watch, seen = Stopwatch(), []
+
+        def close_up(box: Tensor) -> Detections:
+            seen.append(self.eye.close_up(image, box))
+            return seen[-1]
+
+        step = self._last[0]
+        closer = self._verifier.look(step, close_up)
+        watch.lap("detect")
+        return self._moment(step, self._looks.grid, candidate.cell, seen[-1], watch.seconds, closer)
 
     def _begin(self, image: Tensor, view: View) -> LiveLooks:
         """Start the episode at the first frame."""
@@ -166,23 +227,40 @@ class LivePerception:
             most=sys.maxsize,
             forgetting=self.forgetting,
         )
+        if self.verification is not None and self.target is not None:
+            self._verifier = LiveVerifier(
+                self.verification, grid, self.target, self.forgetting, self.thresholds, self.closer
+            )
         return looks
 
-    def _moment(self, step: Step, grid: Grid, seconds: dict[str, float]) -> Moment:
-        decision = None
-        if self.target is not None and self.thresholds is not None:
-            outcome = int(decide(step, self.target, self.thresholds))
-            decision = conclude(outcome, step.belief, tuple(self._recent), grid, self.target)
+    def _moment(
+        self,
+        step: Step,
+        grid: Grid,
+        cell: int,
+        detections: Detections,
+        seconds: dict[str, float],
+        closer: CloserLook | None = None,
+    ) -> Moment:
         return Moment(
-            step.shift,
+            self._number,
             grid,
             self.target,
-            int(step.cell),
-            step.fixation[0],
-            step.detections,
+            cell,
+            grid.centres[cell].to(step.fixation),
+            detections,
             step.belief,
-            decision,
+            self._decision(step, grid),
             step.visited[0],
-            int(step.next_cell),
-            {**seconds, **step.seconds},
+            int(step.next_cell) if self._candidate is None else self._candidate.cell,
+            seconds,
+            closer,
         )
+
+    def _decision(self, step: Step, grid: Grid) -> Decision | None:
+        if self._verifier is not None:
+            return self._verifier.decision(step)
+        if self.target is None or self.thresholds is None:
+            return None
+        outcome = int(decide(step, self.target, self.thresholds))
+        return conclude(outcome, step.belief, tuple(self._recent), grid, self.target)

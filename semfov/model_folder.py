@@ -11,6 +11,7 @@ from typing import Any
 from semfov.belief.map_evidence import MapEvidence
 from semfov.belief.observers import LearnedMap, Observer, Semantic, Target
 from semfov.belief.target_evidence import TargetEvidence
+from semfov.belief.verification import Verification
 from semfov.detection.detector import Detector
 from semfov.detection.load import load_detector
 from semfov.detection.torchvision import PREFIX
@@ -25,11 +26,12 @@ from semfov.io.shipped import fit_command
 from semfov.observation.foveal import FovealObservationModel
 from semfov.sensor.foveation import Foveation
 
-Model = FovealObservationModel | TargetEvidence | MapEvidence
+Model = FovealObservationModel | TargetEvidence | Verification | MapEvidence
 
 KINDS: dict[str, type[Model]] = {
     "observation": FovealObservationModel,
     "evidence": TargetEvidence,
+    "verification": Verification,
     "map": MapEvidence,
 }
 """Classes of the parts that are models."""
@@ -63,6 +65,7 @@ class ModelFolder:
     """The result of `train.fit_detector`: models for one detector and one sensor, and which of them the agent uses.
 
     The agent does not use a part that was no better than raw scores on held-out photographs, but the folder keeps it.
+    The verification is compared with the same agent without closer looks.
 
     Args:
         path: the folder.
@@ -194,6 +197,11 @@ class ModelFolder:
         evidence = self._models.get("evidence")
         return (Target(evidence) if isinstance(evidence, TargetEvidence) else self.semantic()), NonPredictive()
 
+    def verification(self) -> Verification | None:
+        """The model of closer looks; None for an agent that decides without them."""
+        model = self._models.get("verification")
+        return model if isinstance(model, Verification) and self.used("evidence") else None
+
     def explore(self) -> tuple[Observer, Policy]:
         """Observer and policy for exploration."""
         learned, sensor = self._models.get("map"), self.manifest.sensor
@@ -204,7 +212,13 @@ class ModelFolder:
     def parts(self, **source: Any) -> dict[str, Any]:
         """Arguments of `semfov.ActivePerception`; takes arguments for `load_detector`."""
         grid = self.manifest.grid
-        return {"eye": self.eye(**source), "search": self.search(), "explore": self.explore(), "grid": grid}
+        return {
+            "eye": self.eye(**source),
+            "search": self.search(),
+            "explore": self.explore(),
+            "verification": self.verification(),
+            "grid": grid,
+        }
 
     def _find(self, place: dict[str, str]) -> Path:
         path = find_file(place, self.path)

@@ -13,15 +13,18 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
 from semfov.decision import OUTCOMES, Decision, place_known, strength, strongest
 from semfov.detection.detections import Detections
-from semfov.episode import Step
+from semfov.episode import Forgetting, Step
 from semfov.errors import check, check_whole
 from semfov.observation.matching import box_iou
 
 MOST = 2
 """Default for the largest number of closer looks in a search."""
 
+SAME = 0.5
+"""Boxes with at least this overlap (intersection over union) are of the same object."""
+
 _COVERED = 0.5  # cells that an examined box covers with at least this weight are not examined again
-_SAME = 0.5  # detections with at least this overlap are of the same object
+_MOST_LOOKS = 1000  # largest number of looks at a stream whose detections are kept
 
 
 @dataclass(frozen=True)
@@ -62,25 +65,46 @@ class CandidatePlace:
     probability: float
 
 
+@dataclass(frozen=True)
+class _Dismissed:
+    """Boxes `(2, 4)` and cells `(X·Y,)` of a place that was examined at a frame."""
+
+    frame: int
+    boxes: Tensor
+    cells: Tensor
+
+
 class CandidatePlaces:
     """Places that seem to hold the target of one search, the most evident first, each listed once.
 
     A candidate is the cell with the largest product of probability and evidence. Detections that overlap a box that was
     examined by half, and the cells that it covers, are left out.
 
+    In a scene that changes, evidence of earlier frames counts less, and places that were examined are listed again when
+    half of the evidence is left (`semfov.episode.Forgetting`).
+
     Args:
         grid: the cells.
+        forgetting: forgetting between frames (`wait`); None forgets nothing.
     """
 
-    def __init__(self, grid: Grid) -> None:
+    def __init__(self, grid: Grid, forgetting: Forgetting | None = None) -> None:
         self.grid = grid
-        self.looks: list[Detections] = []
-        self.boxes: list[Tensor] = []
-        self.examined: Tensor | None = None
+        self.forgetting = Forgetting() if forgetting is None else forgetting
+        self._frame = 0
+        self._looks: list[tuple[int, Detections]] = []  # with their frames
+        self._dismissed: list[_Dismissed] = []
 
     def see(self, look: Detections) -> None:
         """Add the detections of a look, a batch of one."""
-        self.looks.append(self._others(look, self.boxes))
+        self._looks.append((self._frame, look))
+
+    def wait(self) -> None:
+        """Let a frame pass: drop looks, and list places again, of which less than half the evidence is left."""
+        self._frame += 1
+        oldest = self._frame - self.forgetting.span
+        self._looks = [(frame, look) for frame, look in self._looks[-_MOST_LOOKS:] if frame >= oldest]
+        self._dismissed = [place for place in self._dismissed if place.frame >= oldest]
 
     def next(self, cells: Tensor, target: int) -> CandidatePlace | None:
         """Find the most evident place that was not examined.
@@ -92,18 +116,20 @@ class CandidatePlaces:
         Returns:
             The candidate; None if no detection that could be the target is left.
         """
-        cells = self.open(cells)
-        shown = torch.stack([torch.zeros_like(cells), *(strength(look, self.grid, target) for look in self.looks)])
+        cells, looks = self.open(cells), self._left()
+        shown = torch.stack([torch.zeros_like(cells), *(strength(look, self.grid, target) for look in looks)])
         value = cells * shown.amax(0)
         cell = int(value.argmax())
-        evidence, box = strongest(self.looks, self.grid, cell, target)
+        evidence, box = strongest(looks, self.grid, cell, target)
         return (
             None if box is None or float(value[cell]) <= 0 else CandidatePlace(cell, box, evidence, float(cells[cell]))
         )
 
     def open(self, cells: Tensor) -> Tensor:
         """The probabilities, with 0 for the cells that were examined."""
-        return cells if self.examined is None else cells.masked_fill(self.examined, 0)
+        for place in self._dismissed:
+            cells = cells.masked_fill(place.cells, 0)
+        return cells
 
     def examine(
         self, candidate: CandidatePlace, presence: float, close_up: Callable[[Tensor], Detections], target: int
@@ -132,20 +158,21 @@ class CandidatePlaces:
             candidate: the candidate.
             box: `(4,)`, the box of the target in the closer look.
         """
-        boxes = [candidate.box, box]
-        covered = (self.grid.footprint(torch.stack(boxes), "soft") >= _COVERED).any(0)
+        boxes = torch.stack([candidate.box, box])
+        covered = (self.grid.footprint(boxes, "soft") >= _COVERED).any(0)
         covered[candidate.cell] = True
-        self.examined = covered if self.examined is None else self.examined | covered
-        self.boxes += boxes
-        self.looks = [self._others(look, boxes) for look in self.looks]
+        self._dismissed.append(_Dismissed(self._frame, boxes, covered))
 
-    @staticmethod
-    def _others(look: Detections, boxes: list[Tensor]) -> Detections:
-        """The look without the detections of objects in boxes."""
-        if not boxes or not look.mask.shape[1]:
-            return look
-        other = (box_iou(look.boxes[0], torch.stack(boxes)) < _SAME).all(-1)
-        return replace(look, mask=look.mask & other)
+    def _left(self) -> list[Detections]:
+        """The looks with faded scores, without the detections of objects that were examined."""
+        looks = [
+            replace(look, scores=look.scores * self.forgetting.keep ** (self._frame - frame))
+            for frame, look in self._looks
+        ]
+        if not self._dismissed:
+            return looks
+        boxes = torch.cat([place.boxes for place in self._dismissed])
+        return [replace(look, mask=look.mask & (box_iou(look.boxes[0], boxes) < SAME).all(-1)) for look in looks]
 
 
 def cell_of(box: Tensor, grid: Grid) -> int:
@@ -158,7 +185,79 @@ def surely(confirm: float) -> float:
     return (1 + confirm) / 2
 
 
-class Verifier:
+class Examiner:
+    """Looks closely at the places of one search that seem to hold the target.
+
+    `Verifier` does it in a picture, and `semfov.live_verifier.LiveVerifier` in a stream of frames.
+
+    Args:
+        model: gives the probabilities after closer looks.
+        grid: the cells.
+        target: class 1..K.
+        thresholds: see `Verification`; None takes those of the model.
+        most: largest number of closer looks.
+        forgetting: forgetting between frames; None forgets nothing.
+
+    Raises:
+        InputError: no thresholds are given and the model has none, or `most` is out of range.
+    """
+
+    def __init__(
+        self,
+        model: Verification,
+        grid: Grid,
+        target: int,
+        thresholds: Thresholds | None,
+        most: int,
+        forgetting: Forgetting | None = None,
+    ) -> None:
+        thresholds = model.thresholds if thresholds is None else thresholds
+        check(thresholds is not None, "thresholds", "thresholds, since the model has none", None)
+        assert thresholds is not None
+        self.model, self.target, self.thresholds = model, target, thresholds
+        check_whole(most, "most", 1, 100)
+        self.most = most
+        self.candidates = CandidatePlaces(grid, forgetting)
+
+    def over(self, step: Step) -> bool:
+        """Whether no cell is worth a further fixation after a step of one search."""
+        left = step.belief.chance(self.target).masked_fill(step.visited, 0).amax()
+        return float(left) < self.thresholds.give_up
+
+    def due(self, step: Step, *, over: bool) -> CandidatePlace | None:
+        """Find the place that is to be looked at closely after a step.
+
+        Args:
+            step: a step of one search.
+            over: whether no further fixation follows. Otherwise the most probable place must have been fixated.
+
+        Returns:
+            The place; None if none is probable enough.
+        """
+        cells, least = step.belief.probability(self.target)[0], self.thresholds.place
+        if not (over or bool(place_known(self.candidates.open(cells), step.visited[0], least))):
+            return None
+        candidate = self.candidates.next(cells, class_meant(step.belief, self.target))
+        return None if candidate is None or candidate.probability < least else candidate
+
+    def examine(self, step: Step, candidate: CandidatePlace, close_up: Callable[[Tensor], Detections]) -> CloserLook:
+        """Look closely at a place.
+
+        Args:
+            step: the last step of the search.
+            candidate: the place.
+            close_up: looks closely at a box `(4,)` (`semfov.Eye.close_up`).
+
+        Returns:
+            The closer look.
+        """
+        presence, target = float(step.belief.presence(self.target)), class_meant(step.belief, self.target)
+        features, box = self.candidates.examine(candidate, presence, close_up, target)
+        place, presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
+        return CloserLook(step.shift, target, cell_of(box, self.candidates.grid), box, place, presence)
+
+
+class Verifier(Examiner):
     """Decides one search, with closer looks at the places that seem to hold the target.
 
     When a fixated cell is probably the target's, or when no cell is worth a further fixation, the most evident place is
@@ -195,13 +294,8 @@ class Verifier:
         thresholds: Thresholds | None = None,
         most: int = MOST,
     ) -> None:
-        thresholds = model.thresholds if thresholds is None else thresholds
-        check(thresholds is not None, "thresholds", "thresholds, since the model has none", None)
-        assert thresholds is not None
-        self.model, self.close_up, self.target, self.thresholds = model, close_up, target, thresholds
-        check_whole(most, "most", 1, 100)
-        self.most = most
-        self.candidates = CandidatePlaces(grid)
+        super().__init__(model, grid, target, thresholds, most)
+        self.close_up = close_up
         self.looks: list[CloserLook] = []
         self._outcome = 0
 
@@ -215,9 +309,7 @@ class Verifier:
             `(1,)`, 0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
         """
         self.candidates.see(step.detections)
-        left = step.belief.chance(self.target).masked_fill(step.visited, 0).amax()
-        over = float(left) < self.thresholds.give_up
-        self._outcome = self._examine(step, over=over)
+        self._outcome = self._verify(step, over=self.over(step))
         return torch.full_like(step.cell, self._outcome)
 
     def conclude(self, step: Step) -> Decision:
@@ -230,23 +322,20 @@ class Verifier:
         Returns:
             The decision.
         """
-        outcome = self._outcome or self._examine(step, over=True)
+        outcome = self._outcome or self._verify(step, over=True)
         presence = self._presence(step.belief)
         if OUTCOMES[outcome] != "found":
             return Decision(OUTCOMES[outcome], presence)
         best = self.best()
         return Decision("found", max(presence, best.place), best.cell, best.box, best.place)
 
-    def _examine(self, step: Step, *, over: bool) -> int:
+    def _verify(self, step: Step, *, over: bool) -> int:
         """Make the closer looks that are due after a step, and return the outcome."""
-        cells, least = step.belief.probability(self.target)[0], self.thresholds.place
-        target = class_meant(step.belief, self.target)
         while len(self.looks) < self.most:
-            seen = over or bool(place_known(self.candidates.open(cells), step.visited[0], least))
-            candidate = self.candidates.next(cells, target) if seen else None
-            if candidate is None or candidate.probability < least:
+            candidate = self.due(step, over=over)
+            if candidate is None:
                 break
-            self.looks.append(self._look(step, candidate, target))
+            self.looks.append(self.examine(step, candidate, self.close_up))
             if self.looks[-1].place >= surely(self.thresholds.confirm):
                 return OUTCOMES.index("found")
         if not over and len(self.looks) < self.most:
@@ -254,13 +343,6 @@ class Verifier:
         if self.looks and self.best().place >= self.thresholds.confirm:
             return OUTCOMES.index("found")
         return OUTCOMES.index("absent") if self._presence(step.belief) < 0.5 else len(OUTCOMES) - 1
-
-    def _look(self, step: Step, candidate: CandidatePlace, target: int) -> CloserLook:
-        """Look closely at a candidate."""
-        presence = float(step.belief.presence(self.target))
-        features, box = self.candidates.examine(candidate, presence, self.close_up, target)
-        place, presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
-        return CloserLook(step.shift, target, cell_of(box, self.candidates.grid), box, place, presence)
 
     def best(self) -> CloserLook:
         """The closer look with the largest probability of the place.

@@ -71,6 +71,7 @@ SUBPACKAGES = [
     "scanpath",
     "zoom",
     "head",
+    "live_verifier",
     "live",
     "model_folder",
     "presets",

@@ -8,15 +8,16 @@ The agent searches the photographs for present and for absent classes with its l
 the places that seem to hold the target are looked at closely: a window around each is enlarged to the detector's input.
 Two logistic regressions learn from these closer looks whether the target is at the place, and whether it is in the
 photograph. Then the searches are repeated, each with a model that was fitted to other photographs, to evaluate the
-decisions and to choose their threshold. The folder `out` gets the model (`<name>.safetensors`) and the report. Looks
-are not stored: an interrupted fit starts again.
+decisions and to choose their threshold. The folder `out` gets the model (`<name>.safetensors`) and the report. All
+looks are stored, photograph by photograph, in the folder `cache`: the same command continues an interrupted fit.
 """
 
 import sys
 from collections.abc import Sequence
 
 from semfov.experiments.command import run_command
-from semfov.training.verification import FitVerificationConfig, fit_verification
+from semfov.training.verification import fit_verification
+from semfov.training.verification_settings import FitVerificationConfig
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -240,6 +240,7 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
             protocol = ProtocolConfig(control=control)
             yield f"{control}-{name}", seek(policies=("random", "target-evidence"), protocol=protocol)
         yield f"decide-{name}", DecideConfig(**common)
+        yield f"decide-published-{name}", DecideConfig(**common, sensor=sensor)
         every = {**common, "data": replace(data, min_instances=0, max_target_area=None)}
         yield f"beliefs-{name}", CalibrationConfig(**every)
         yield f"beyond-explore-{name}", tour(policies=BEYOND_EXPLORATION)

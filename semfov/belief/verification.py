@@ -17,8 +17,9 @@ from semfov.observation.matching import box_iou
 FEATURES = 7
 """Number of features of a closer look (`closer_features`)."""
 
-_SAME = 0.3
-"""Least overlap of a detection in the closer look with the examined box, to replace it."""
+MATCHED = 0.3
+"""Least overlap (intersection over union) of a detection with a box at which it shows the same object."""
+
 _FLOOR = 1e-3
 
 
@@ -137,12 +138,31 @@ def closer_features(
     before = [presence, cell, evidence]
     seen = [0.0] * 4
     if len(boxes):
-        overlap, score = box_iou(boxes, box[None])[:, 0], scores[:, target]
+        score = scores[:, target]
+        best, overlap = match(boxes, score, box)
         other = scores.index_fill(1, torch.tensor([0, target], device=scores.device), 0).amax(-1)
-        best = int((score * overlap).argmax())
         seen = [
             float(each) for each in (score[best] * overlap[best], score.max(), (overlap * other).max(), score[best])
         ]
-        if float(overlap[best]) >= _SAME:
+        if float(overlap[best]) >= MATCHED:
             box = boxes[best]
     return box.new_tensor([*before, *seen]).logit(_FLOOR), box
+
+
+def match(boxes: Tensor, scores: Tensor, box: Tensor) -> tuple[int, Tensor]:
+    r"""Find the detection that best shows the target in a box: :math:`m = \arg\max_l s_l o_l`.
+
+    Args:
+        boxes: `(L, 4)`, boxes of at least one detection.
+        scores: `(L,)`, their scores s for the target.
+        box: `(4,)`, the box.
+
+    Returns:
+        The number m, and the overlaps o (intersection over union), `(L,)`.
+
+    >>> boxes = torch.tensor([[0.0, 0.0, 8.0, 9.0], [30.0, 0.0, 39.0, 9.0]])
+    >>> match(boxes, torch.tensor([0.5, 0.9]), torch.tensor([0.0, 0.0, 9.0, 9.0]))[0]
+    0
+    """
+    overlap = box_iou(boxes, box[None])[:, 0]
+    return int((scores * overlap).argmax()), overlap

@@ -36,18 +36,19 @@ def distinct(boxes: Column, iou: float) -> Index:
     """
     if not len(boxes):
         return np.zeros(0, np.intp)
-    order = (boxes[:, 0] + boxes[:, 2]).argsort(kind="stable")
-    x1, y1, x2, y2 = np.ascontiguousarray(boxes[order].T)
+    order = (boxes[:, 0] + boxes[:, 2]).argsort()
+    x1, y1, x2, y2 = corners = np.ascontiguousarray(boxes[order].T)
     wide, high = x2 - x1, y2 - y1
     area, x, y = wide * high, x1 + x2, y1 + y2
     # x and y are twice the centre. Rounding moves neither by as much as a millionth of the largest coordinate.
-    slack = 1e-6 * float(np.abs(boxes).max())
+    slack = 1e-6 * max(-float(corners.min()), float(corners.max()))
     first, second = neighbours(x, x + wide * (1 / iou - 1) + slack)
-    near = np.flatnonzero(np.abs(y[first] - y[second]) <= (high * (1 / iou - 1) + slack)[first])
-    first, second = first[near], second[near]
+    apart = y.take(second) - y.take(first)
+    near = np.flatnonzero(np.abs(apart, out=apart) <= (high * (1 / iou - 1) + slack).take(first))
+    first, second = first.take(near), second.take(near)
     shared = intersection(x1, y1, x2, y2, first, second)
     # As torchvision does: the quotient in single precision, the comparison in double precision.
-    same = shared / (area[first] + area[second] - shared) > np.float64(iou)
+    same = np.flatnonzero(shared / (area[first] + area[second] - shared) > np.float64(iou))
     one, other = order[first[same]], order[second[same]]
     return survivors(len(boxes), np.minimum(one, other), np.maximum(one, other))
 
@@ -65,10 +66,11 @@ def neighbours(start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[
     >>> neighbours(np.array([0.0, 1.0, 5.0]), np.array([2.0, 3.0, 6.0]))
     (array([0]), array([1]))
     """
-    after = np.arange(1, len(start) + 1)
-    count = start.searchsorted(end, side="right") - after
+    stop = start.searchsorted(end, side="right")
+    count = stop - np.arange(1, len(start) + 1)
     first = np.arange(len(start)).repeat(count)
-    second = np.arange(len(first)) + (after - count.cumsum() + count).repeat(count)
+    # The pairs of an interval stand together, and the last of them is with interval `stop - 1`.
+    second = np.arange(len(first)) + (stop - count.cumsum()).repeat(count)
     return first, second
 
 
@@ -106,9 +108,14 @@ def survivors(count: int, better: Index, worse: Index) -> Index:
     >>> survivors(4, np.array([0, 1, 2]), np.array([1, 2, 3]))
     array([0, 2])
     """
-    pairs = np.sort(better * count + worse)
-    stays = [True] * count
+    doubtful, gone = np.zeros((2, count), np.bool_)
+    doubtful[worse] = True
+    # A box that is never the worse one stays. Only the pairs that this leaves open depend on each other.
+    gone[worse[~doubtful[better]]] = True
+    left = np.flatnonzero(~(gone[better] | gone[worse]))
+    pairs = np.sort(better[left] * count + worse[left])
+    removed = bytearray(gone)
     for one, other in zip((pairs // count).tolist(), (pairs % count).tolist(), strict=True):
-        if stays[one]:
-            stays[other] = False
-    return np.flatnonzero(stays)
+        if not removed[one]:
+            removed[other] = True
+    return np.flatnonzero(np.frombuffer(removed, np.bool_) == 0)

@@ -49,10 +49,10 @@ class Candidates:
             The boxes `(M, 4)` and their scores, without the batch dimension.
         """
         return Candidates(
-            self.boxes[image, index],
-            self.classes[image, index],
-            None if self.objectness is None else self.objectness[image, index],
-            None if self.background is None else self.background[image, index],
+            self.boxes[image].index_select(0, index),
+            self.classes[image].index_select(0, index),
+            None if self.objectness is None else self.objectness[image].index_select(0, index),
+            None if self.background is None else self.background[image].index_select(0, index),
         )
 
 

@@ -1,5 +1,6 @@
 """Selection of a detector's boxes: threshold, non-maximum suppression, and a limit on their number."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -78,9 +79,13 @@ def select_several(
 
 def _check(image: int, confidence: Tensor, boxes: Tensor) -> None:
     """Raise `InputError` where a detector returns NaN or infinite values."""
-    if values_known(confidence, boxes):
-        check_finite(confidence.detach(), f"detector: confidence in image {image}")
-        check_finite(boxes.detach(), f"detector: boxes in image {image}")
+    if not values_known(confidence, boxes):
+        return
+    for name, numbers in (("confidence", confidence.detach()), ("boxes", boxes.detach())):
+        # The range of the numbers takes one pass over them. It is finite only if all of them are.
+        low, high = numbers.aminmax() if numbers.numel() else (0.0, 0.0)
+        if not math.isfinite(high - low):
+            check_finite(numbers, f"detector: {name} in image {image}")
 
 
 def _check_scores(image: int, kept: Candidates) -> None:
@@ -88,8 +93,10 @@ def _check_scores(image: int, kept: Candidates) -> None:
     if not values_known(kept.classes):
         return
     for name, scores in (("class scores", kept.classes), ("objectness", kept.objectness)):
-        inside = scores is None or bool(((scores.detach() >= 0) & (scores.detach() <= 1)).all())
-        check(inside, f"detector: {name} in image {image}", "numbers in [0, 1]", "numbers outside")
+        if scores is not None and scores.numel():
+            low, high = scores.detach().aminmax()
+            inside = float(low) >= 0 and float(high) <= 1
+            check(inside, f"detector: {name} in image {image}", "numbers in [0, 1]", "numbers outside")
 
 
 def _select_one(
@@ -101,64 +108,64 @@ def _select_one(
 ) -> list[Detections]:
     confidence = candidates.confidence[image]
     index = (confidence >= min(selection.threshold for selection in selections)).nonzero()[:, 0]
-    boxes = candidates.boxes[image, index]
+    boxes = candidates.boxes[image].index_select(0, index)
     _check(image, confidence, boxes)
     boxes = boxes if placement is None else placement.boxes_to_image(boxes)
     some = any(selection.per_class for selection in selections)
     labels = candidates.classes[image, index].argmax(-1) if some else index
-    kept = _suppress(boxes, confidence[index], labels, selections)
-    keep = kept[0] if len(kept) == 1 else torch.cat(kept)
-    rows = candidates.take(image, index[keep])
+    kept = _suppress(boxes.detach(), confidence.detach().index_select(0, index), labels, selections)
+    rows = candidates.take(image, index[kept[0] if len(kept) == 1 else torch.cat(kept)])
     _check_scores(image, rows)
-    boxes, scores = boxes[keep], score_vectors(rows, policy)
-    found = []
-    for box, vectors in zip(boxes.split([*map(len, kept)]), scores.split([*map(len, kept)]), strict=True):
+    scores = score_vectors(rows, policy)
+    best = scores[:, 1:].detach().amax(-1)
+    found, lengths = [], [*map(len, kept)]
+    for keep, vectors, value in zip(kept, scores.split(lengths), best.split(lengths), strict=True):
         # Suppression ranks by objectness times class; the shares of a vector can rank otherwise.
-        order = vectors[:, 1:].detach().amax(-1).argsort(descending=True, stable=True)
-        found.append(Detections(box[order][None], vectors[order][None], torch.ones_like(order, dtype=torch.bool)[None]))
+        order = value.argsort(descending=True, stable=True)
+        box, vectors = boxes.index_select(0, keep[order]), vectors.index_select(0, order)
+        found.append(Detections(box[None], vectors[None], torch.ones_like(order, dtype=torch.bool)[None]))
     return found
 
 
 def suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:
     """Indices of the boxes that survive non-maximum suppression, most confident first."""
-    return _suppress(boxes, confidence, labels, [replace(selection, threshold=0.0)])[0]
+    return _suppress(boxes.detach(), confidence.detach(), labels, [replace(selection, threshold=0.0)])[0]
 
 
-@torch.no_grad()
 def _suppress(boxes: Tensor, confidence: Tensor, labels: Tensor, selections: Sequence[Selection]) -> list[Tensor]:
     """Indices of the boxes that are kept by each selection, most confident first."""
     if boxes.dtype in (torch.float16, torch.bfloat16):  # too coarse for pixels, and not there on a CPU
         boxes, confidence = boxes.float(), confidence.float()
-    ranked, order = confidence.sort(descending=True, stable=True)
-    boxes, labels = boxes[order], labels[order]
-    full = (boxes[:, 2:] > boxes[:, :2]).all(-1)
+    full = (boxes[:, 2:] > boxes[:, :2]).all(-1).nonzero()[:, 0]
+    ranked, order = confidence[full].sort(descending=True, stable=True)
+    order = full[order]
+    boxes, labels = boxes.index_select(0, order), labels[order]
     kept = []
     for selection in selections:
-        chosen = (full & (ranked >= selection.threshold)).nonzero()[:, 0]
-        kept.append(order[_survivors(boxes, ranked, labels, chosen, selection)])
+        count = int((ranked >= selection.threshold).sum())
+        kept.append(order[_survivors(boxes[:count], ranked[:count], labels[:count], selection)])
     return kept
 
 
-def _survivors(boxes: Tensor, confidence: Tensor, labels: Tensor, rows: Tensor, selection: Selection) -> Tensor:
-    """Which of some rows survive, of boxes that stand with the most confident first."""
+def _survivors(boxes: Tensor, confidence: Tensor, labels: Tensor, selection: Selection) -> Tensor:
+    """Which boxes survive, of boxes that stand with the most confident first."""
     strict = selection.iou >= LEAST and not selection.per_class
     strict = strict and boxes.dtype == torch.float32 and boxes.device.type == "cpu"
 
     def first(count: int) -> Tensor:
+        if strict:
+            return torch.from_numpy(distinct(boxes[:count].numpy(), selection.iou))
         from torchvision.ops import batched_nms, nms
 
-        some = rows[:count]
-        if strict:
-            return some[torch.from_numpy(distinct(boxes[some].detach().numpy(), selection.iou))]
         if selection.per_class:
-            return some[batched_nms(boxes[some], confidence[some], labels[some], selection.iou)]
-        return some[nms(boxes[some], confidence[some], selection.iou)]
+            return batched_nms(boxes[:count], confidence[:count], labels[:count], selection.iou)
+        return nms(boxes[:count], confidence[:count], selection.iou)
 
     # A box is suppressed by more confident ones alone, so the first survivors are those of the first boxes. Time grows
     # with the square of their number.
     count = (2 if strict else 8) * selection.limit
     keep = first(count)
-    while len(keep) < selection.limit and count < len(rows):
+    while len(keep) < selection.limit and count < len(boxes):
         count *= 2
         keep = first(count)
     return keep[: selection.limit]

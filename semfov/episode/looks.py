@@ -22,6 +22,7 @@ class Sight:
         look: evidence of the looks, from `Observer.weigh`.
         detections: function that returns the detections, a batch of A.
         seconds: time by stage.
+        frames: frames of a stream since the look before, including this one.
 
     >>> from semfov.belief.observers import LandingLook
     >>> sight = Sight(LandingLook(torch.zeros(1, 4, 1), torch.zeros(1, 4)), lambda: None, {"detect": 0.02})
@@ -32,6 +33,7 @@ class Sight:
     look: Look
     detections: Callable[[], Detections]
     seconds: dict[str, float]
+    frames: int = 1
 
 
 class Looks(ABC):
@@ -76,6 +78,9 @@ class LiveLooks(Looks):
         grid: the cells over the image.
         target: class 1..K that all episodes search for; needed by observers that are `by_target`.
 
+    Attributes:
+        frames: frames of a stream since the look before, including the one of the next look.
+
     Example::
 
         looks = LiveLooks(eye, eye.open(image), grid, target=1)
@@ -86,6 +91,7 @@ class LiveLooks(Looks):
     def __init__(self, eye: Eye, view: View, grid: Grid, target: int | None = None) -> None:
         self.eye, self.view, self.grid, self.target = eye, view, grid, target
         self.like = view.canvas
+        self.frames = 1
 
     def see(self, observer: Observer, episodes: Tensor, cell: Tensor, fixation: Tensor) -> Sight:
         """Foveate, detect and weigh."""
@@ -96,7 +102,7 @@ class LiveLooks(Looks):
         watch.lap("detect")
         look = observer.weigh(detections, fixation, self.grid, self.target)
         watch.lap("weigh")
-        return Sight(look, lambda: detections, watch.seconds)
+        return Sight(look, lambda: detections, watch.seconds, self.frames)
 
 
 class StoredLooks(Looks):

@@ -97,15 +97,15 @@ def attend(
     watch = Stopwatch(sight.seconds)
     belief, age = memory.belief, memory.age
     if forgetting is not None:
-        age = age + 1
-        belief = observer.fade(belief, sight.look, forgetting.keep, forgetting.visited(age))
+        age = age + sight.frames
+        belief = observer.fade(belief, sight.look, forgetting.keep**sight.frames, forgetting.visited(age))
     belief = observer.update(belief, sight.look)
     watch.lap("update belief")
     visited = memory.visited.scatter(-1, cell[:, None], True)
     if forgetting is not None:
         age = age.scatter(-1, cell[:, None], 0)
         visited = forgetting.visited(age)
-    return Sight(sight.look, sight.detections, watch.seconds), Memory(belief, visited, age)
+    return replace(sight, seconds=watch.seconds), Memory(belief, visited, age)
 
 
 def rollout(

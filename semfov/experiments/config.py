@@ -355,8 +355,8 @@ class DecidingConfig(Settings):
         place: least probability of a cell that is worth a closer look, or, without closer looks, of the fixated cell
             for a find (None: the model's own threshold).
         closer: largest number of closer looks in a search; 0 decides without them.
-        verification: model of verification, by name or file (None: the one that is shipped for detector and sensor, if
-            there is one).
+        verification: model of verification, by name or file (None: the one of `models` if its agent uses it, or the
+            one that is shipped for detector and sensor, if there is one).
     """
 
     confirm: Share | None = None

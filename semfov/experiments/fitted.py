@@ -5,7 +5,14 @@ from pathlib import Path
 from typing import TypeVar
 
 from semfov.errors import InputError, check
-from semfov.experiments.config import DetectorConfig, ExploreConfig, PolicyConfig, RunConfig, SensorConfig
+from semfov.experiments.config import (
+    DecidingConfig,
+    DetectorConfig,
+    ExploreConfig,
+    PolicyConfig,
+    RunConfig,
+    SensorConfig,
+)
 from semfov.experiments.presets import TARGET_EVIDENCE as EVIDENCE
 from semfov.experiments.presets import Choice, resolve
 from semfov.gaze.policies import POLICIES
@@ -55,7 +62,11 @@ def with_models(config: Config) -> Config:
             raise InputError(
                 f"policies: {policy!r} needs the model {missing!r}, which the folder {config.models} lacks: {why}"
             )
-    return replace(config, detector=detector, sensor=sensor_of(folder), belief=belief, policies=tuple(chosen))
+    config = replace(config, detector=detector, sensor=sensor_of(folder), belief=belief, policies=tuple(chosen))
+    # A model of verification that is given explicitly takes the place of the folder's.
+    if isinstance(config, DecidingConfig) and config.verification is None and folder.used("verification"):
+        config = replace(config, verification=_text(folder.file("verification")))
+    return config
 
 
 def detector_of(folder: ModelFolder, given: DetectorConfig) -> DetectorConfig:

@@ -7,7 +7,7 @@ import torch
 
 from semfov.detection.detections import Detections
 from semfov.experiments.looks import SOURCES, one_thread
-from semfov.experiments.store import SceneStore, pack, unpack
+from semfov.experiments.store import SceneStore, pack, tight, unpack
 from semfov.head.episode import Detect
 from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
@@ -40,19 +40,13 @@ class HeadStore(SceneStore):
         if tensors is None or int(tensors["count"].sum()) != len(tensors["boxes"]):
             return {}
         seen = unpack({name: tensors[name] for name in ("boxes", "scores", "count")})
-        return {action: _tight(seen[n : n + 1]) for n, action in enumerate(tensors["actions"].tolist())}
+        return {action: tight(seen[n : n + 1]) for n, action in enumerate(tensors["actions"].tolist())}
 
     def save(self, digest: str, looks: Mapping[int, Detections]) -> None:
         """Store the looks at a scene."""
         actions = sorted(looks)
         together = Detections.stack([looks[action] for action in actions])
         self.write(digest, {"actions": torch.tensor(actions), **pack(together)})
-
-
-def _tight(look: Detections) -> Detections:
-    """Remove the padding of a batch of one."""
-    mask = look.mask[0]
-    return Detections(look.boxes[:, mask], look.scores[:, mask], look.mask[:, mask])
 
 
 class StoredLooksAround:
@@ -77,7 +71,7 @@ class StoredLooksAround:
         if action not in self._known:
             with one_thread(), torch.inference_mode():
                 self._live = self._open() if self._live is None else self._live
-                self._known[action] = _tight(self._live(action))
+                self._known[action] = tight(self._live(action))
         return self._known[action]
 
     def save(self) -> None:

@@ -138,3 +138,9 @@ def unpack(tensors: dict[str, Tensor]) -> Detections:
     scores = tensors["scores"].new_zeros(*mask.shape, tensors["scores"].shape[-1])
     boxes[mask], scores[mask] = tensors["boxes"], tensors["scores"]
     return Detections(boxes, scores, mask)
+
+
+def tight(look: Detections) -> Detections:
+    """Remove the padding of a batch of one."""
+    mask = look.mask[0]
+    return Detections(look.boxes[:, mask], look.scores[:, mask], look.mask[:, mask])

@@ -18,8 +18,11 @@ FILE = "manifest.json"
 _KIND = "semfov-models"
 _MOST_BYTES = 2**24
 
-PARTS = ("observation", "tempering", "evidence", "map")
-"""Parts that a folder may hold, in the order in which they are fitted."""
+PARTS = ("observation", "tempering", "evidence", "verification", "map")
+"""Parts that a folder may hold, in the order in which they are fitted.
+
+Folders of earlier versions have no `verification`.
+"""
 
 _PLACE = Object({"relative": Text(), "absolute": Text()}, required=("relative", "absolute"))
 

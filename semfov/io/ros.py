@@ -36,6 +36,22 @@ class Seen(Protocol):
         """Which rows hold a detection, `(..., L)` boolean."""
 
 
+class Found(Protocol):
+    """The decision of a search (`semfov.decision.Decision`)."""
+
+    @property
+    def probability(self) -> float:
+        """Probability that the image holds the target."""
+
+    @property
+    def box(self) -> Tensor | None:
+        """Box `(4,)` of the target in pixels, if it was found."""
+
+    @property
+    def place(self) -> float | None:
+        """Probability that the target is at this place, after a closer look."""
+
+
 def header(stamp: Any, frame: str) -> Values:
     """Make a `std_msgs/Header`.
 
@@ -90,6 +106,30 @@ def detection_array(
         ]
         if hypotheses:
             found.append({"header": head, "results": hypotheses, "bbox": _bounds(box), "id": ""})
+    return {"header": head, "detections": found}
+
+
+def found_array(decision: Found | None, name: str, *, stamp: Any, frame: str) -> Values:
+    """Make a `vision_msgs/Detection2DArray` of a decision: the box of the target if it was found, otherwise none.
+
+    Args:
+        decision: `semfov.live.Moment.decision`, or the decision of a search; None counts as not found.
+        name: name of the target's class.
+        stamp: time of the image, as for `header`.
+        frame: frame of reference of the image.
+
+    Returns:
+        The fields of the message. The score is the probability that the target is at this place; for a decision
+        without closer looks, that the image holds it.
+
+    >>> found_array(None, "cup", stamp=0, frame="camera")["detections"]
+    []
+    """
+    head, found = header(stamp, frame), []
+    if decision is not None and decision.box is not None:
+        score = decision.probability if decision.place is None else decision.place
+        result = {"hypothesis": {"class_id": name, "score": score}}
+        found.append({"header": head, "results": [result], "bbox": _bounds(decision.box.tolist()), "id": ""})
     return {"header": head, "detections": found}
 
 

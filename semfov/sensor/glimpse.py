@@ -1,6 +1,6 @@
 """Glimpses: windows of a picture at a chosen magnification, resampled without aliasing."""
 
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import torch
 from torch import Tensor, nn
@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from semfov.errors import check, check_finite, check_shape, lookup, values_known
 
 Padding = Literal["zeros", "border", "fill"]
+Length = TypeVar("Length", float, Tensor)
 
 
 def glimpse(
@@ -91,8 +92,13 @@ def windows_at(points: Tensor, magnification: Tensor, size: tuple[int, int]) -> 
     tensor([[ 7.5000,  5.0000, 12.5000, 15.0000]])
     """
     check_shape(points, "points", 2)
-    half = points.new_tensor(size) / (2 * magnification[..., None])
-    return torch.cat([points + 0.5 - half, points + 0.5 + half], -1)
+    return torch.cat(edges_at(points, magnification[..., None], points.new_tensor(size)), -1)
+
+
+def edges_at(point: Length, magnification: Length, length: Length) -> tuple[Length, Length]:
+    """Edges along one axis of the window that is centred at a point, of a canvas of `length` pixels (`windows_at`)."""
+    centre, half = point + 0.5, length / (2 * magnification)
+    return centre - half, centre + half
 
 
 def window_around(box: Tensor, picture: tuple[int, int], *, context: float = 3.0, least: float = 1 / 3) -> Tensor:

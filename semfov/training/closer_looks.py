@@ -1,4 +1,4 @@
-"""Searches of photographs that can be repeated: looks and closer looks are made once, and remembered."""
+"""Searches of photographs that can be repeated: looks and closer looks are made once, and remembered or stored."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ from semfov.data.scene import Scenes
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight, Step, rollout
 from semfov.experiments.close_ups import CloseUps
+from semfov.experiments.looks import one_thread
+from semfov.experiments.photograph_store import PhotographStore
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.seeds import generator_for
+from semfov.experiments.store import tight
 from semfov.eye import Eye, View
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Greedy, drawn_by
@@ -29,11 +32,13 @@ class Sought:
         target: the class, 1..K.
         goal: `(X·Y,)` boolean, cells that an object of the class overlaps.
         start: `(1,)`, the first fixated cell.
+        spare: whether the search only serves to choose thresholds, and nothing is fitted to it.
     """
 
     target: int
     goal: Tensor
     start: Tensor
+    spare: bool = False
 
     @property
     def present(self) -> bool:
@@ -51,17 +56,30 @@ class Photograph:
         number: number of the photograph among those that are searched.
         grid: the cells.
         sought: the classes to search for.
+        store: store of all looks; None keeps them in memory.
+        stored: gives the detections from every cell of a photograph by its index; None looks with the eye.
     """
 
     def __init__(
-        self, eye: Eye, scenes: Scenes, index: int, number: int, grid: Grid, sought: tuple[Sought, ...]
+        self,
+        eye: Eye,
+        scenes: Scenes,
+        index: int,
+        number: int,
+        grid: Grid,
+        sought: tuple[Sought, ...],
+        store: PhotographStore | None = None,
+        stored: Callable[[int], Detections] | None = None,
     ) -> None:
         self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
-        self.grid, self.sought = grid, sought
+        self.grid, self.sought, self.store, self.stored = grid, sought, store, stored
         self.seen: dict[int, Detections] = {}
-        self.close_up = CloseUps(eye, lambda: self.image)
+        self._closely = CloseUps(eye, lambda: self.image)
+        # Number of looks in the store; None as long as it was not read.
+        self._known: int | None = None
         self._image: Tensor | None = None
         self._view: View | None = None
+        self._everywhere: Detections | None = None
 
     @property
     def image(self) -> Tensor:
@@ -71,8 +89,19 @@ class Photograph:
         return self._image
 
     def close(self) -> None:
-        """Free the pixels; a later look reads them again."""
-        self._image = self._view = None
+        """Store new looks, and free the pixels and the stored looks; a later look reads them again."""
+        self._image = self._view = self._everywhere = None
+        if self.store is None or self._known is None:
+            return
+        if len(self.seen) + len(self._closely.seen) > self._known:
+            self.store.save(self.scenes.digest(self.index), self.seen, self._closely.seen)
+        self.seen, self._closely.seen, self._known = {}, {}, None
+
+    def _recall(self) -> None:
+        """Read the stored looks."""
+        if self.store is not None and self._known is None:
+            self.seen, self._closely.seen = self.store.load(self.scenes.digest(self.index))
+            self._known = len(self.seen) + len(self._closely.seen)
 
     def look(self, cell: int, fixation: Tensor) -> Detections:
         """Look from a cell.
@@ -84,11 +113,20 @@ class Photograph:
         Returns:
             The detections, a batch of one.
         """
+        if self.stored is not None:
+            self._everywhere = self.stored(self.index) if self._everywhere is None else self._everywhere
+            return self._everywhere[cell : cell + 1]
+        self._recall()
         if cell not in self.seen:
-            if self._view is None:
-                self._view = self.eye.open(self.image)
-            self.seen[cell] = self.eye.look(self._view, fixation)
+            with one_thread(), torch.inference_mode():
+                self._view = self.eye.open(self.image) if self._view is None else self._view
+                self.seen[cell] = tight(self.eye.look(self._view, fixation))
         return self.seen[cell]
+
+    def close_up(self, box: Tensor) -> Detections:
+        """Look closely at a box `(4,)`; returns the detections, a batch of one."""
+        self._recall()
+        return self._closely(box)
 
 
 class RememberedLooks(Looks):
@@ -119,6 +157,9 @@ def photographs(
     absent: int | None,
     max_area: float,
     seed: int,
+    store: PhotographStore | None = None,
+    spare: int = 0,
+    stored: Callable[[int], Detections] | None = None,
 ) -> list[Photograph]:
     """Draw classes to search for in photographs.
 
@@ -131,6 +172,9 @@ def photographs(
         absent: maximum number of absent classes (None: as many as present ones).
         max_area: classes that cover a larger share of the image are left out.
         seed: seed of the classes and of the first fixations.
+        store: store of all looks; None keeps them in memory.
+        spare: maximum number of further absent classes, which only serve to choose thresholds (`Sought.spare`).
+        stored: gives the detections from every cell of a photograph by its index; None looks with the eye.
 
     Returns:
         The photographs with classes to search for.
@@ -140,16 +184,22 @@ def photographs(
         annotation = scenes.annotation(index)
         grid = Grid(*cells, annotation.size)
         covered = grid.footprint(annotation.boxes)
+        targets = choose_classes(scenes, index, annotation, classes, max_area, seed, absent)
+        held = set(annotation.labels.tolist())
+        more = sum(target not in held for target in targets) + spare
+        # The same draw with a larger number begins with the same classes.
+        wide = choose_classes(scenes, index, annotation, classes, max_area, seed, more)
         sought = tuple(
             Sought(
                 target,
                 covered[annotation.labels == target].any(0),
                 torch.randint(len(grid), (1,), generator=generator_for("start", seed, scenes.ids[index], target)),
+                spare=number >= len(targets),
             )
-            for target in choose_classes(scenes, index, annotation, classes, max_area, seed, absent)
+            for number, target in enumerate(wide)
         )
-        if sought:
-            found.append(Photograph(eye, scenes, index, len(found), grid, sought))
+        if targets:
+            found.append(Photograph(eye, scenes, index, len(found), grid, sought, store, stored))
     return found
 
 

@@ -20,7 +20,7 @@ from semfov.experiments.setup import detector_options, plain
 from semfov.io.files import write_text
 from semfov.io.manifest import PARTS, Manifest, place_of
 from semfov.sensor import SENSORS
-from semfov.training.detector_parts import Workshop
+from semfov.training.detector_parts.workshop import Workshop
 from semfov.training.detector_report import class_counts, next_commands, report
 from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.evidence_examples import LookingRun, looking_run
@@ -44,8 +44,9 @@ def fit_detector(
     """Fit all models that the recommended agent needs to a detector, and return the agent.
 
     This is `python -m train.fit_detector` as a function. The detector looks at every photograph from every cell. Then
-    an observation model, the exponent of its likelihoods, target evidence and a map of all classes are fitted, and each
-    of them is compared with raw scores on held-out photographs. `ActivePerception.from_pretrained(out)` loads the agent
+    an observation model, the exponent of its likelihoods, target evidence, the verification of targets by closer looks
+    and a map of all classes are fitted. Each of them is compared with raw scores on held-out photographs, and the
+    verification with the same agent without closer looks. `ActivePerception.from_pretrained(out)` loads the agent
     again.
 
     Args:
@@ -61,7 +62,7 @@ def fit_detector(
             `head`, `weights`, `threshold`, …: `DetectorConfig`).
 
     Returns:
-        The agent with the fitted models. It does not use models that were no better than raw scores.
+        The agent with the fitted models. It uses only models that were better on the held-out photographs.
 
     Raises:
         InputError: a setting is unknown or out of range, or there is no such detector.
@@ -184,7 +185,7 @@ def manifest_of(config: FitDetectorConfig, run: LookingRun, shop: Workshop) -> M
         training={
             "data": run.scenes.fingerprint,
             "photographs": len(run.scenes),
-            "held_out": len(shop.held_out),
+            "held_out": len(shop.bench.held_out),
             "settings": {name: getattr(config, name) for name in SETTINGS},
         },
     )

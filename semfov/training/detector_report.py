@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from semfov.experiments.summary import table
-from semfov.training.detector_parts import Fitted
+from semfov.training.detector_parts.part import Fitted
 from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.evidence_examples import LookingRun
 
@@ -16,9 +16,13 @@ TITLES = {
     "observation": "Observation model",
     "tempering": "Tempering",
     "evidence": "Target evidence (searches)",
+    "verification": "Verification (closer looks)",
     "map": "Learned map (explorations)",
 }
 """Titles of the parts in reports."""
+
+UNUSED = {"verification": "no, no closer looks"}
+"""What the agent does without a part that it does not use, other than to use raw scores."""
 
 
 def class_counts(run: LookingRun, scenes: Any) -> dict[str, int]:
@@ -46,7 +50,10 @@ def report(config: FitDetectorConfig, run: LookingRun, parts: dict[str, Fitted],
     held_out = [index for index in range(photographs) if index % holdout == 0]
     counts = class_counts(run, (index for index in range(photographs) if index % holdout))
     rows = [["part", "used", "result on held-out photographs"]]
-    rows += [[TITLES[name], "yes" if each.part.used else "no, raw", each.part.why] for name, each in parts.items()]
+    rows += [
+        [TITLES[name], "yes" if each.part.used else UNUSED.get(name, "no, raw"), each.part.why]
+        for name, each in parts.items()
+    ]
     lines = [
         f"# Models of {run.eye.detector.name}",
         "",
@@ -55,7 +62,8 @@ def report(config: FitDetectorConfig, run: LookingRun, parts: dict[str, Fitted],
         f"sensor {config.sensor.name}; {seconds / 60:.1f} minutes in this run.",
         "",
         "The agent uses a part only if it is better than raw scores by more than one standard error of the paired "
-        "difference over the held-out photographs.",
+        "difference over the held-out photographs. The verification is compared with the same agent without closer "
+        "looks.",
         "",
         *table(rows),
         "",

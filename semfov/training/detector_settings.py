@@ -11,6 +11,7 @@ from semfov.training.evidence import FitSearchConfig
 from semfov.training.map_evidence import FitMapConfig
 from semfov.training.observation_settings import FitConfig
 from semfov.training.tempering import FitTemperingConfig
+from semfov.training.verification_settings import FitVerificationConfig
 
 FEW = 8
 """Detectors with fewer classes also learn from photographs that contain none of them."""
@@ -32,7 +33,8 @@ class FitDetectorConfig(Settings):
         max_target_area: classes that cover a larger share of the image are not searched for.
         holdout: one in every n photographs is held out for the evaluation and for choosing thresholds (None: one in 5,
             or one in 3 if there are fewer than 100 photographs).
-        judged: maximum number of held-out photographs on which searches and explorations are compared with raw scores.
+        judged: maximum number of held-out photographs on which searches and explorations are compared with raw scores,
+            and to which the verification is fitted.
         fixations: looks at each photograph to fit the observation model to.
         steps: training steps of the target evidence (None: 500, fewer with fewer than 100 photographs).
         map_steps: training steps of the map of all classes (None: 1000, fewer with fewer than 100 photographs).
@@ -124,6 +126,17 @@ class FitDetectorConfig(Settings):
             rows=self.rows,
             max_target_area=self.max_target_area,
             steps=self.steps or 500,
+        )
+
+    def verification(self, classes: int) -> FitVerificationConfig:
+        """Return the settings of the verification for a detector with so many classes."""
+        shared = {name: each for name, each in self._common.items() if name != "holdout"}
+        return FitVerificationConfig(
+            **shared,  # type: ignore[arg-type]
+            absent=2 if classes < FEW else None,
+            columns=self.columns,
+            rows=self.rows,
+            max_target_area=self.max_target_area,
         )
 
     @property

@@ -287,7 +287,7 @@ def choose_thresholds(config: Bounds, anywhere: Tensor, place: Tensor, left: Ten
     anyhow = confirming(0.0)
     pairs = (confirming(least) for least in torch.arange(0.95, 0.04, -0.05).tolist())
     chosen = next((pair for pair in pairs if hits(anyhow) - hits(pair) <= lost), anyhow)
-    for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01):
+    for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.007, 0.005, 0.003, 0.002, 0.001):
         if hits(chosen) - hits(chosen.changed(give_up=give_up)) <= lost:
             return chosen.changed(give_up=give_up)
     return chosen

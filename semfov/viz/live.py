@@ -27,7 +27,8 @@ def draw_moment(image: Tensor, moment: Moment, text: str) -> Frame:
     """Draw belief, gaze and decision into a frame.
 
     The opacity of the colour over a cell is proportional to the probability that the cell holds the target, or in an
-    exploration any object. A circle marks the present gaze, and a line leads to the point of the next one.
+    exploration any object. A circle marks the present gaze, and a line leads to the point of the next one. A frame
+    around the box of the target replaces the circle if the look is a closer one.
 
     Args:
         image: `(3, H, W)`, RGB in [0, 1].
@@ -53,11 +54,21 @@ def draw_moment(image: Tensor, moment: Moment, text: str) -> Frame:
     x, y = ((c + 0.5) * s for c, s in zip(moment.fixation.tolist(), (across, down), strict=True))
     u, v = ((c + 0.5) * s for c, s in zip(grid.centres[moment.next_cell].tolist(), (across, down), strict=True))
     draw.line((x, y, u, v), fill=GAZE, width=2)
-    draw.ellipse((x - 9, y - 9, x + 9, y + 9), outline="white", width=5)
-    draw.ellipse((x - 9, y - 9, x + 9, y + 9), outline=GAZE, width=3)
+
+    def shown(box: Tensor) -> tuple[float, ...]:
+        """The box in pixels of the drawing."""
+        x1, y1, x2, y2 = (c * s for c, s in zip(box.tolist(), (across, down) * 2, strict=True))
+        return min(x1, x2), min(y1, y2), max(x1, x2), max(y1, y2)
+
+    if moment.closer is None:
+        mark, here = draw.ellipse, (x - 9, y - 9, x + 9, y + 9)
+    else:
+        left, top, right, bottom = shown(moment.closer.box)
+        mark, here = draw.rectangle, (left - 6, top - 6, right + 6, bottom + 6)
+    mark(here, outline="white", width=5)
+    mark(here, outline=GAZE, width=3)
     if moment.decision is not None and moment.decision.box is not None:
-        x1, y1, x2, y2 = (c * s for c, s in zip(moment.decision.box.tolist(), (across, down) * 2, strict=True))
-        draw.rectangle((min(x1, x2), min(y1, y2), max(x1, x2), max(y1, y2)), outline=FOUND, width=3)
+        draw.rectangle(shown(moment.decision.box), outline=FOUND, width=3)
     font = ImageFont.load_default(14)
     draw.rectangle((0, 0, size[0], 22), fill="black")
     draw.text((6, 2), text, fill="white", font=font)

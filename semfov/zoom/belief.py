@@ -14,7 +14,7 @@ from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
 from semfov.zoom.odds import WindowOdds
-from semfov.zoom.sums import Box, Cells, WindowSums
+from semfov.zoom.sums import Box, Cells, WindowSums, extent
 
 
 class Rates(Protocol):
@@ -37,12 +37,12 @@ class Rates(Protocol):
 class ZoomBelief:
     """What looks at any window of a picture are expected to show, for one class.
 
-    Each cell is predicted from the closest look at it. The belief keeps five numbers, 24 bytes, for a cell: the level
-    of that look, the number of objects centred in the cell that looks one, two and three octaves closer are expected
-    to find, and the share of the cell that is left to see. Hints of all classes are kept for the windows that were
-    looked at, at most 32 × 32 cells of each. A picture of 20,000 × 15,000 px has 49,152 cells: 1.2 MB, and for 80
-    classes at most 0.41 MB for each look. Searches also keep the hints of each look pooled over its windows, at most
-    0.6 MB.
+    Each cell is predicted from the closest look at it. The belief keeps five numbers for a cell: the level of that
+    look, the number of objects centred in the cell that looks one, two and three octaves closer are expected to find,
+    and the share of the cell that is left to see. With two zeros for levels without a prediction these are 32 bytes.
+    Hints of all classes are kept for the windows that were looked at, at most 32 × 32 cells of each. A picture of
+    20,000 × 15,000 px has 49,152 cells: 1.6 MB, and for 80 classes at most 0.41 MB for each look. Searches also keep
+    the hints of each look that are left to see and what they predict for its windows, at most 0.41 MB.
 
     Args:
         lattice: lattice of the picture.
@@ -61,8 +61,11 @@ class ZoomBelief:
         self.lattice, self.target, self.context = lattice, target, context
         self._evidence = evidence
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
+        self._targets = torch.tensor([target])
         shape = lattice.rows, lattice.columns
-        self.rate = torch.zeros(STEPS, *shape)
+        # Rates of cells that a level is not one to three octaves closer to are 0: the first plane and the last one.
+        self._planes = np.zeros((STEPS + 2, *shape), np.float32)
+        self.rate = torch.from_numpy(self._planes[1:-1])
         self.source = torch.full(shape, -1)
         self.left = torch.ones(shape)
         self.gists: list[Gist] = []
@@ -70,7 +73,8 @@ class ZoomBelief:
         self._summed: dict[tuple[int, int], int] = {}
         self._expected: dict[int, Cells] = {}
         self._sums: dict[tuple[int, int], WindowSums] = {}
-        self._odds = WindowOdds(lattice, self._presence)
+        self._odds: WindowOdds | None = None
+        self._judged = 0
         self._told: dict[Window, float] = {}
 
     @property
@@ -93,17 +97,16 @@ class ZoomBelief:
         before, now = left.numpy(), self.left.numpy()
         differs = before != now
         if differs.any():
-            rows, columns = differs.any(1).nonzero()[0], differs.any(0).nonzero()[0]
             np.copyto(now, before)
-            self._renew((int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1))
+            self._renew(extent(differs))
 
     def add(self, glance: Glance) -> None:
         """Update the belief with the result of a look."""
         if glance.gist is None:
             self.discount(glance.window)
             return
-        self._spread(glance.gist)
         self.gists.append(glance.gist)
+        self._spread(glance.gist)
         self._told.clear()
 
     def discount(self, window: Window) -> None:
@@ -128,7 +131,7 @@ class ZoomBelief:
         if look.level > 0:
             before = before_of(self.rate[:, *at], self.source[at], look)
         with torch.no_grad():
-            logs = self._rates.rates(look, torch.tensor([self.target]), None if before is None else before[None])[0]
+            logs = self._rates.rates(look, self._targets, None if before is None else before[None])[0]
         cells = (logs.exp() / look.scale**2).numpy()
         if look.scale > 1:
             cells = cells.repeat(look.scale, -1).repeat(look.scale, -2)[:, :rows, :columns]
@@ -151,9 +154,8 @@ class ZoomBelief:
 
     def _compute(self, level: int, at: tuple[slice, slice]) -> Cells:
         """`expected` in some rows and columns."""
-        steps = level - self.source.numpy()[at]
-        told = np.choose(steps - 1, self.rate.numpy()[:, *at], mode="clip")
-        return told * ((steps >= 1) & (steps <= STEPS)) * self.left.numpy()[at]
+        told: Cells = np.choose(level - self.source.numpy()[at], self._planes[:, *at], mode="clip")
+        return told * self.left.numpy()[at]
 
     def _renew(self, changed: Box) -> None:
         """Compute what is expected anew in cells that have changed."""
@@ -182,8 +184,23 @@ class ZoomBelief:
             return values
         return values + np.float32(foresight) * self._sum(level, 2)
 
+    def unseen(self, level: int) -> Cells:
+        """Share of each window of a level that no look has shown at that level or closer, `(down, across)`."""
+        span = self.lattice.span(level)
+        whole = min(span, self.lattice.rows) * min(span, self.lattice.columns)
+        return self._sum(level, 0) / np.float32(whole)
+
     def _sum(self, level: int, octaves: int) -> Cells:
-        """`finds` of a level (1), or of looks one octave closer, in cells not looked at from the level yet (2)."""
+        """Sums over the windows of a level.
+
+        Args:
+            level: the level.
+            octaves: 0 for the cells that no look has shown at that level or closer; 1 for `finds`; 2 for the finds of
+                looks one octave closer, in cells not looked at from the level yet.
+
+        Returns:
+            `(down, across)`, not to be written to.
+        """
         if (level, octaves) not in self._sums:
             span = self.lattice.span(level)
             weight = self._rates.taper(span).detach().numpy() if octaves == 1 else np.ones(span, np.float32)
@@ -194,25 +211,39 @@ class ZoomBelief:
         self._summed[level, octaves] = len(self._changes)
         x1, y1, x2, y2 = zip(*changes, strict=True)
         changed = min(x1), min(y1), max(x2), max(y2)
-        cells = self._expect(level) if octaves == 1 else self._expect(level + 1) * (self.source.numpy() < level)
-        return sums.update(cells, changed)
+        if octaves == 1:
+            return sums.update(self._expect(level), changed)
+        cells = self.left.numpy() if octaves == 0 else self._expect(level + 1)
+        return sums.update(cells * (self.source.numpy() < level), changed)
 
     def odds(self, level: int) -> Tensor:
         """Log odds that a look at each window of a level shows the class, `(down, across)`; -inf where unknown."""
         return torch.from_numpy(self._shown().odds(level).copy())
 
     def chances(self, level: int) -> Cells:
-        """Probability that a look at each window of a level shows the class, `(down, across)`, not to be written to."""
-        return self._shown().chances(level)
+        r"""Probability that a look at each window of a level shows the class, and no look at the same place did.
+
+        Looks at a part of a window, from its level or closer, have not shown the class there. If they covered all of
+        the window but the share u (`unseen`), the evidence P counts only for that share, as if the object could be
+        anywhere in the window:
+
+        .. math:: p(w) = u(w) \, P(w)
+
+        Args:
+            level: level of the windows.
+
+        Returns:
+            `(down, across)`.
+        """
+        return self._shown().chances(level) * self.unseen(level)
 
     def _shown(self) -> WindowOdds:
-        self._odds.update(self.gists, self.left.numpy())
+        if self._odds is None:
+            self._odds = WindowOdds(self.lattice, self.evidence, self.target, self.context)
+        if self._judged < len(self._changes):
+            self._odds.update(self.gists, self.left.numpy())
+            self._judged = len(self._changes)
         return self._odds
-
-    def _presence(self, pooled: Tensor, summary: Tensor, steps: Tensor, before: Tensor | None) -> Tensor:
-        """Log odds of the evidence (`GlimpseEvidence.presence`) plus those of the context."""
-        odds = self.evidence.presence(pooled, summary, steps, self.target, before)
-        return odds if self.context is None else odds + self.context(pooled, self.target)
 
     def odds_of(self, window: Window) -> float:
         """Log odds that a look at a window shows the class; the window need not lie on the lattice."""
@@ -235,8 +266,10 @@ class ZoomBelief:
             )
             pooled, summary = pool(look.scores, box)
             with torch.no_grad():
-                known = None if value is None or look.level == 0 else value.view(1, 1)
-                value = self._presence(pooled[None], summary[None], torch.tensor([steps]), known)
+                known = None if value is None or look.level == 0 else value
+                value = self.evidence.presence(pooled[None], summary[None], torch.tensor([steps]), self.target, known)
+                if self.context is not None:
+                    value = value + self.context(pooled[None], self.target)
         self._told[window] = float("-inf") if value is None else float(value)
         return self._told[window]
 
@@ -252,8 +285,8 @@ def before_of(rate: Tensor, source: Tensor, look: Gist) -> Tensor:
     Returns:
         `(rows, columns)` of the gist.
     """
-    steps = (look.level + 1 - source).clamp(1, STEPS)
-    told = rate.gather(0, (steps - 1)[None])[0]
+    # NumPy, because a call of torch takes longer than the work.
+    told = torch.from_numpy(np.choose(look.level - source.numpy(), rate.numpy(), mode="clip"))
     rows, columns = look.scores.shape[:2]
     if look.scale > 1:
         told = F.pad(told, (0, columns * look.scale - told.shape[1], 0, rows * look.scale - told.shape[0]))

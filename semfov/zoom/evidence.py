@@ -147,23 +147,50 @@ class GlimpseEvidence(Pretrained):
         Returns:
             Log odds, `(N,)`, or `(N, K)` for all classes.
         """
+        odds = self.odds(self.hint_facts(scores, summary, steps, target), before)
+        return odds if target is None else odds[:, 0]
+
+    def hint_facts(self, scores: Tensor, summary: Tensor, steps: Tensor, target: int | None = None) -> Tensor:
+        """Compute the part of `presence` that does not depend on earlier looks.
+
+        Args:
+            scores: `(N, K)`, as for `presence`.
+            summary: `(N, 3)`, as for `presence`.
+            steps: `(N,)`, as for `presence`.
+            target: class 1..K; None for all.
+
+        Returns:
+            `(N, 1, 6)`, or `(N, K, 6)` for all classes: five inputs of the network g, and the sum of all terms of the
+            log odds but g.
+        """
         hints = features(scores)
         octaves = (steps[:, None] - 1.5).to(hints)
         crowd = (summary + 0.01).log() / 3
         inputs = torch.cat([hints, crowd, octaves], -1)
-        own, slope, offset = hints, torch.as_tensor(self.slope), torch.as_tensor(self.offset)
-        if target is None:
-            company = through(self.company, inputs)
-        else:
+        own, slope, offset, one = hints, torch.as_tensor(self.slope), torch.as_tensor(self.offset), None
+        if target is not None:
             one = slice(target - 1, target)
             own, slope, offset = own[:, one], slope[one], offset[one]
-            company = through(self.company, inputs, one)
+        value = slope * own + offset + through(self.company, inputs, one)
         top = hints.amax(-1, keepdim=True).expand_as(own)
+        parts = [own, top, own - top, octaves.expand_as(own), crowd[:, 2:].expand_as(own), value]
+        return torch.stack(parts, -1)
+
+    def odds(self, facts: Tensor, before: Tensor | None = None) -> Tensor:
+        """Complete `presence` by the log odds of an earlier look.
+
+        Args:
+            facts: `(..., 6)`, from `hint_facts`.
+            before: `(...)`, log odds that an earlier, coarser look gave for the same windows; None for a first look.
+
+        Returns:
+            `(...)`, log odds.
+        """
+        own = facts[..., :1]
         known = torch.zeros_like(own) if before is None else before.view_as(own) / 3
-        first = torch.full_like(own, float(before is not None))
-        parts = [own, top, own - top, octaves.expand_as(own), crowd[:, 2:].expand_as(own), known, first]
-        value: Tensor = slope * own + offset + company + through(self.shape, torch.stack(parts, -1))[..., 0]
-        return value if target is None else value[:, 0]
+        inputs = torch.cat([facts[..., :5], known, torch.full_like(own, float(before is not None))], -1)
+        value: Tensor = facts[..., 5] + through(self.shape, inputs)[..., 0]
+        return value
 
     def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor:
         """Predict how many objects centred in each cell closer looks find that this look did not.
@@ -181,13 +208,16 @@ class GlimpseEvidence(Pretrained):
             InputError: a target is no class.
         """
         if not torch.compiler.is_compiling():
-            check(int(targets.min()) >= 1, "targets", "classes from 1 on", targets.tolist())
-        best, own = features(look.scores.amax(-1)), features(look.scores.movedim(-1, 0)[targets - 1])
-        found = look.found.movedim(-1, 0)[targets - 1].to(own)
-        about, bias = self.prior[targets].unbind(-1)
-        usual = about[:, None, None].expand_as(own)
-        parts = [*hint_maps(own, best, found, look.size), usual, *memory_maps(own, before)]
-        value: Tensor = through(self.rate, torch.stack(parts, -1)) + bias[:, None, None, None] - 6
+            asked = targets.tolist()
+            check(min(asked) >= 1, "targets", "classes from 1 on", asked)
+        wanted = targets - 1
+        shown = torch.cat([look.scores.amax(-1, keepdim=True), look.scores.index_select(-1, wanted)], -1)
+        hints = features(shown.movedim(-1, 0))
+        best, own = hints[0], hints[1:]
+        found = look.found.index_select(-1, wanted).movedim(-1, 0).to(own)
+        usual, bias = self.prior.index_select(0, targets).mT[..., None, None]
+        parts = [*hint_maps(own, best, found, look.size), usual.expand_as(own), *memory_maps(own, before)]
+        value: Tensor = through(self.rate, torch.stack(parts, -1)) + (bias[..., None] - 6)
         return value.clamp(max=3).movedim(-1, 1)
 
     def anywhere(self, best: Tensor, case: Tensor) -> Tensor:
@@ -275,11 +305,20 @@ def pool_all(scores: Tensor, span: int) -> tuple[Tensor, Tensor]:
     Returns:
         The results of `pool`, `(N, K)` and `(N, 3)`, for the windows row by row.
     """
-    return pool_spans(scores, [span])[0]
+    top, sums = pool_spans(scores, [span])[0]
+    return top.flatten(0, 1), sums.flatten(0, 1)
 
 
 def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
-    """`pool_all` for windows of several sizes; each size is pooled from the next smaller one."""
+    """`pool_all` for windows of several sizes; each size is pooled from the next smaller one.
+
+    Args:
+        scores: `(rows, columns, K)`.
+        spans: cells along a side of the windows of each size.
+
+    Returns:
+        For each size, the results of `pool`, `(down, across, K)` and `(down, across, 3)`.
+    """
     best = scores.amax(-1)
     parts = torch.stack([best, (best > 0).to(best), (best > 0.02).to(best)])
     found: dict[int, tuple[Tensor, Tensor]] = {}
@@ -289,10 +328,9 @@ def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tenso
         for axis in (0, 1):
             top = _slide(top, axis, size[axis], have[axis])
         have = size
-        area = torch.tensor([1.0, 1 / (size[0] * size[1]), 1.0])[:, None]
-        sums = F.avg_pool2d(parts, size, 1).flatten(1) * (size[0] * size[1]) * area
-        # The caller may write to the rows, so they share no memory.
-        found[span] = top.flatten(0, 1).clone(), sums.T.contiguous()
+        sums = F.avg_pool2d(F.avg_pool2d(parts, (size[0], 1), 1), (1, size[1]), 1) * (size[0] * size[1])
+        total, hinted, clear = sums.unbind()
+        found[span] = top, torch.stack([total, hinted / (size[0] * size[1]), clear], -1)
     return [found[span] for span in spans]
 
 

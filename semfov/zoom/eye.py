@@ -15,11 +15,13 @@ from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.selection import Selection, select_several
 from semfov.errors import check, check_number, check_shape, lookup
-from semfov.sensor.glimpse import windows_at
+from semfov.sensor.glimpse import edges_at
 from semfov.zoom.lattice import Lattice
 
 Cut = Literal["keep", "drop", "background"]
 Limit = tuple[float, float, float, float]
+Frame = tuple[int, int, int, int, int, int, int, int]
+"""`(x1, y1, x2, y2)` of a window in picture pixels, then of its place on the canvas in canvas pixels."""
 
 HINTS = Selection(threshold=0.002, iou=0.95, limit=300)
 """Selection of hints: candidates that are too weak to be detections, but show where a closer look pays."""
@@ -138,13 +140,14 @@ class ZoomEye(nn.Module):
         Returns:
             Detections and hints of each look.
         """
-        canvas, frames = self.glimpse(view, fixations, within)
+        canvas, frames = self._resample(view, fixations, within)
         candidates = self.detector.propose(canvas)
         wanted = [self.detector.selection, HINTS] if hints else [self.detector.selection]
-        detections, *weak = select_several(candidates, None, wanted, self.detector.background)
-        place = _Placement(frames, view.picture.size, detections.boxes)
-        found, cut = self._treat(place.to_picture(detections), place.cut(detections))
-        return Seen(found, cut, place.to_picture(weak[0]) if weak else None, frames[:, :4])
+        selected = select_several(candidates, None, wanted, self.detector.background)
+        place = _Placement(frames, view.picture.size, selected[0].boxes)
+        detections, *weak = place.to_picture(selected)
+        found, cut = self._treat(detections, place.cut(selected[0]))
+        return Seen(found, cut, weak[0] if weak else None, torch.tensor(frames, dtype=canvas.dtype).view(-1, 8)[:, :4])
 
     def glimpse(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None
@@ -163,6 +166,13 @@ class ZoomEye(nn.Module):
         Raises:
             InputError: a fixation is not finite, or its magnification is not positive.
         """
+        canvases, frames = self._resample(view, fixations, within)
+        return canvases, torch.tensor(frames, dtype=canvases.dtype).view(-1, 8)
+
+    def _resample(
+        self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None
+    ) -> tuple[Tensor, list[Frame]]:
+        """Canvases and frames, as `glimpse` returns them."""
         if fixations.shape[-1] == 2:
             closest = fixations.new_full((*fixations.shape[:-1], 1), view.lattice.magnifications[-1])
             fixations = torch.cat([fixations, closest], -1)
@@ -170,38 +180,22 @@ class ZoomEye(nn.Module):
         rows = fixations.tolist()
         check(all(math.isfinite(n) for row in rows for n in row), "fixations", "finite numbers", rows)
         check(all(row[2] > 0 for row in rows), "fixations", "positive magnifications", [row[2] for row in rows])
-        windows = windows_at(fixations[:, :2].double(), fixations[:, 2].double(), self.detector.input_size)
-        limits = [None] * len(fixations) if within is None else within
+        limits = [None] * len(rows) if within is None else within
         wide, high = self.detector.input_size
-        canvases = torch.empty(len(fixations), 3, high, wide)
+        canvases = torch.empty(len(rows), 3, high, wide)
         frames = [
-            self._show(canvas, view.picture, window, m, limit)
-            for canvas, window, (_, _, m), limit in zip(canvases, windows.tolist(), rows, limits, strict=True)
+            self._show(canvas, view.picture, row, limit)
+            for canvas, row, limit in zip(canvases.unbind(), rows, limits, strict=True)
         ]
-        return canvases, torch.tensor(frames).view(-1, 8)
+        return canvases, frames
 
-    def _show(
-        self, canvas: Tensor, picture: LargePicture, window: list[float], magnification: float, limit: Limit | None
-    ) -> list[float]:
-        """Write one canvas; return its frame (`glimpse`)."""
+    def _show(self, canvas: Tensor, picture: LargePicture, fixation: list[float], limit: Limit | None) -> Frame:
+        """Write one canvas; return its frame."""
         wide, high = self.detector.input_size
-        low, right = (0.0, 0.0), (float(picture.size[0]), float(picture.size[1]))
-        if limit is not None:
-            low = max(low[0], limit[0]), max(low[1], limit[1])
-            right = min(right[0], limit[2]), min(right[1], limit[3])
-        left, top = round(window[0]), round(window[1])
-        x1, y1 = (min(max(edge, round(a)), round(b) - 1) for edge, a, b in zip((left, top), low, right, strict=True))
-        x2, y2 = (
-            min(max(round(edge), start + 1), round(b))
-            for edge, start, b in zip(window[2:], (x1, y1), right, strict=True)
-        )
-        u1, v1 = (
-            min(round((low - edge) * magnification), n - 1) for low, edge, n in ((x1, left, wide), (y1, top, high))
-        )
-        u2, v2 = (
-            min(max(start + round((stop - first) * magnification), start + 1), n)
-            for start, first, stop, n in ((u1, x1, x2, wide), (v1, y1, y2, high))
-        )
+        left, top, right, bottom = (0.0, 0.0, math.inf, math.inf) if limit is None else limit
+        x, y, magnification = fixation
+        x1, x2, u1, u2 = _shown(x, magnification, wide, picture.size[0], left, right)
+        y1, y2, v1, v2 = _shown(y, magnification, high, picture.size[1], top, bottom)
         reduction = 1
         while min((x2 - x1) // (u2 - u1), (y2 - y1) // (v2 - v1)) >= 2 * _REDUCE * reduction:
             reduction *= 2
@@ -214,7 +208,7 @@ class ZoomEye(nn.Module):
             canvas.fill_(float(self.detector.fill))
             canvas = canvas[:, v1:v2, u1:u2]
         canvas.copy_(pixels[0]).div_(255)
-        return [float(n) for n in (x1, y1, x2, y2, u1, v1, u2, v2)]
+        return x1, y1, x2, y2, u1, v1, u2, v2
 
     def _treat(self, detections: Detections, cut: Tensor) -> tuple[Detections, Tensor]:
         """Treat cut boxes as the eye's setting says; also return which of the resulting boxes are cut."""
@@ -255,36 +249,61 @@ class ZoomEye(nn.Module):
         return {"sensor": sensor, "detector": self.detector.settings()}
 
 
+def _shown(
+    point: float, magnification: float, count: int, length: int, low: float, high: float
+) -> tuple[int, int, int, int]:
+    """The pixels that a window shows along one axis: their first and end in the picture, and those on the canvas.
+
+    Args:
+        point: centre of the window.
+        magnification: canvas pixels per picture pixel.
+        count: length of the canvas.
+        length: length of the picture.
+        low: lower limit of the part of the picture that is shown.
+        high: its upper limit.
+
+    Returns:
+        Whole edges between pixels: two in the picture and two on the canvas.
+    """
+    start, stop = edges_at(point, magnification, float(count))
+    start, stop, low, high = round(start), round(stop), round(max(low, 0.0)), round(min(high, length))
+    first = min(max(start, low), high - 1)
+    end = min(max(stop, first + 1), high)
+    begin = min(max(round((first - start) * magnification), 0), count - 1)
+    return first, end, begin, min(max(begin + round((end - first) * magnification), begin + 1), count)
+
+
 class _Placement:
     """Maps boxes from the canvases of several looks to the picture.
 
     Args:
-        frames: `(F, 8)`, from `ZoomEye.glimpse`.
+        frames: frame of each look, from `ZoomEye.glimpse`.
         size: `(width, height)` of the picture.
         like: boxes that have the dtype and device to compute in.
     """
 
-    def __init__(self, frames: Tensor, size: tuple[int, int], like: Tensor) -> None:
+    def __init__(self, frames: Sequence[Frame], size: tuple[int, int], like: Tensor) -> None:
         wide, high = size
-        inf = math.inf
         rows = []
         # Python's numbers: tensors this small spend their time in calls.
-        for x1, y1, x2, y2, u1, v1, u2, v2 in frames.tolist():
+        for x1, y1, x2, y2, u1, v1, u2, v2 in frames:
             scale = (x2 - x1) / (u2 - u1), (y2 - y1) / (v2 - v1)
             # The border of the picture cuts no object.
-            near = u1 + BORDER if x1 > 0 else -inf, v1 + BORDER if y1 > 0 else -inf, -inf, -inf
-            far = inf, inf, u2 - BORDER if x2 < wide else inf, v2 - BORDER if y2 < high else inf
-            rows.append([[x1, y1] * 2, [x2, y2] * 2, [u1, v1] * 2, [*scale] * 2, near, far])
+            near = u1 + BORDER if x1 > 0 else -math.inf, v1 + BORDER if y1 > 0 else -math.inf
+            far = BORDER - u2 if x2 < wide else -math.inf, BORDER - v2 if y2 < high else -math.inf
+            rows.append([[x1, y1] * 2, [x2, y2] * 2, [u1, v1] * 2, [*scale] * 2, [*near, *far], [1, 1, -1, -1]])
         numbers = torch.tensor(rows, dtype=like.dtype, device=like.device).view(-1, 6, 1, 4)
-        self._low, self._high, self._first, self._scale, self._near, self._far = numbers.unbind(1)
+        self._low, self._high, self._first, self._scale, self._border, self._inwards = numbers.unbind(1)
 
-    def to_picture(self, detections: Detections) -> Detections:
-        """Map canvas boxes to picture pixels and cut them to their windows."""
-        boxes = (detections.boxes - self._first) * self._scale + self._low
-        boxes = boxes.clamp(self._low, self._high) * detections.mask[..., None]
-        return Detections(boxes, detections.scores, detections.mask)
+    def to_picture(self, looks: Sequence[Detections]) -> list[Detections]:
+        """Map canvas boxes of several selections to picture pixels and cut them to their windows."""
+        boxes = torch.cat([detections.boxes for detections in looks], 1)
+        boxes = ((boxes - self._first) * self._scale + self._low).clamp(self._low, self._high)
+        if len(boxes) > 1:  # else there is no padding
+            boxes = boxes * torch.cat([detections.mask for detections in looks], 1)[..., None]
+        parts = boxes.split([detections.mask.shape[1] for detections in looks], 1)
+        return [Detections(part, found.scores, found.mask) for part, found in zip(parts, looks, strict=True)]
 
     def cut(self, detections: Detections) -> Tensor:
         """Tell which boxes touch a border of their window that lies inside the picture, `(F, L)`."""
-        touches = (detections.boxes <= self._near) | (detections.boxes >= self._far)
-        return touches.any(-1) & detections.mask
+        return (detections.boxes * self._inwards <= self._border).any(-1) & detections.mask

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from semfov.detection.detections import Detections
@@ -64,22 +63,23 @@ def gist(hints: Detections, detections: Detections, lattice: Lattice, action: tu
     low = np.array([column * lattice.pitch[0], row * lattice.pitch[1]], np.float32)
     pitch = np.array(lattice.pitch, np.float32) * scale
     kinds = hints.scores.shape[-1] - 1
-
-    def cells(corners: NDArray[np.float32]) -> NDArray[np.int64]:
-        place = np.floor(((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch).astype(np.int64)
-        return place[:, 1].clip(0, rows - 1) * columns + place[:, 0].clip(0, columns - 1)
-
     boxes, scores = hints.boxes[0].detach().float().numpy(), hints.scores[0, :, 1:].detach().float().contiguous()
-    at = cells(boxes)
+    confidence, kind = detections.scores[0, :, 1:].detach().max(-1)
+    sure = (confidence >= FOUND).nonzero()[:, 0]
+    corners = np.concatenate([boxes, detections.boxes[0, sure].detach().float().numpy()])
+    cell = np.floor(((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch)
+    across, down = np.minimum(np.maximum(cell, 0), (columns - 1, rows - 1)).astype(np.intp).T
+    cells = down * columns + across
+    at, there = cells[: len(boxes)], cells[len(boxes) :]
     place = torch.from_numpy(at)[:, None].expand(-1, kinds)
     strongest = scores.new_zeros(rows * columns, kinds).scatter_reduce_(0, place, scores, "amax")
-    canvas = np.log2(np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-3)).mean(-1) + math.log2(lattice.magnifications[level])
+    wide, high = np.log2(np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-3)).T
+    canvas = (wide + high) / 2 + math.log2(lattice.magnifications[level])
     size = np.zeros(rows * columns, np.float32)
     # Of several hints in a cell the one written last remains: the most confident, which comes first.
     size[at[::-1]] = np.maximum(canvas, 0)[::-1]
     found = np.zeros((rows * columns, kinds), np.bool_)
-    sure = detections.confidence[0] >= FOUND
-    found[cells(detections.boxes[0, sure].detach().float().numpy()), detections.labels[0, sure].numpy() - 1] = True
+    found[there, kind[sure].numpy()] = True
     shape = rows, columns
     return Gist(
         level,

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -51,8 +52,9 @@ class Glance:
     gist: Gist | None
 
 
+@lru_cache(4096)
 def on_lattice(lattice: Lattice, action: tuple[int, int, int]) -> Window:
-    """The window of an action `(level, column, row)`."""
+    """The window of an action `(level, column, row)`. It is kept, because a search asks for it many times."""
     level, column, row = action
     x, y, magnification = lattice.fixation(level, column, row)
     span = lattice.span(level)

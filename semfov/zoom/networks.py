@@ -12,7 +12,7 @@ _FLOOR = 1e-4
 
 def features(scores: Tensor) -> Tensor:
     """Logarithms of scores, shifted and scaled to about [-1, 1.5]."""
-    return (scores + _FLOOR).log() / 4 + 1.5
+    return (scores + _FLOOR).log().mul_(0.25).add_(1.5)
 
 
 def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor) -> list[Tensor]:
@@ -31,7 +31,8 @@ def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor) -> list[Te
     def wide(values: Tensor) -> Tensor:
         return values.expand(own.shape)
 
-    peak = neighbourhood_peak(own, 3)
+    # One call for the peaks of both: after a pass of the detector a call costs more than the work in it.
+    peak, near = neighbourhood_peak(torch.cat([own, found]), 3).chunk(2)
     return [
         own,
         wide(best),
@@ -42,7 +43,7 @@ def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor) -> list[Te
         wide(size / 4 - 1),
         wide((size > 0).to(own)),
         found,
-        neighbourhood_peak(found, 3),
+        near,
         wide(own.amax((-1, -2), keepdim=True)),
     ]
 
@@ -70,18 +71,25 @@ def neighbourhood_mean(values: Tensor, side: int) -> Tensor:
     return F.avg_pool2d(values[:, None], side, 1, side // 2)[:, 0]
 
 
-def through(network: nn.Sequential, values: Tensor, outputs: slice = slice(None)) -> Tensor:
+def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None) -> Tensor:
     """Some of a network's outputs. Networks this small spend most of their time in calls of modules, left out here."""
     last = len(network) - 1
     for place, layer in enumerate(network):
         if isinstance(layer, nn.Linear):
-            kept = outputs if place == last else slice(None)
-            values = F.linear(values, layer.weight[kept], layer.bias[kept])
+            if outputs is None or place < last:
+                values = F.linear(values, layer.weight, layer.bias)
+            else:
+                values = F.linear(values, layer.weight[outputs], layer.bias[outputs])
         elif isinstance(layer, nn.GELU):
-            values = F.gelu(values)
+            values = _gelu(values)
         elif layer.training:  # dropout
             values = layer(values)
     return values
+
+
+def _gelu(values: Tensor) -> Tensor:
+    """GELU of transposed matrices and repeated vectors: torch gives contiguous arrays to oneDNN, whose call is slow."""
+    return F.gelu(values.expand(2, -1))[0] if values.ndim == 1 else F.gelu(values.mT).mT
 
 
 def small_network(inputs: int, width: int, outputs: int) -> nn.Sequential:

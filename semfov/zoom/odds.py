@@ -1,21 +1,22 @@
 """Log odds that windows show a class, from all looks at a picture, computed anew only where something has changed."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.zoom.evidence import pool_all, pool_spans
+from semfov.zoom.context import WindowContext
+from semfov.zoom.evidence import GlimpseEvidence, pool_spans
 from semfov.zoom.gist import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.networks import STEPS
-from semfov.zoom.sums import Cells
+from semfov.zoom.sums import Box, Cells, extent
 
-Box = tuple[int, int, int, int]
-Presence = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
+Place = tuple[slice, slice]
+"""Rows and columns of an array."""
 
 _UNKNOWN = -4.0
 """Log odds that are used where no earlier look gave any."""
@@ -23,44 +24,103 @@ _UNKNOWN = -4.0
 
 @dataclass
 class _Table:
-    """Predictions of a look for the N windows of a level that lie in it, row by row.
+    """The windows of a level that lie in a look.
 
     Attributes:
         span: number of cells of the gist along a side of a window.
         shape: `(down, across)`, number of windows.
-        pooled: `(N, K)`, strongest hint of each class in each window.
-        summary: `(N, 3)`, summary of all hints in each window (`pool`).
-        before: `(N,)`, log odds from coarser looks; None for the overview.
-        odds: `(N,)`, log odds from this look.
+        rows: their rows in the arrays of the look.
+        places: `(down * across,)`, index of each in an array of all windows of the level.
     """
 
     span: int
     shape: tuple[int, int]
-    pooled: Tensor
-    summary: Tensor
-    before: Cells | None
-    odds: Cells
+    rows: slice
+    places: NDArray[np.intp]
+
+    def of(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
+        """View of the rows of an array of the look that belong to these windows, `(down, across, ...)`."""
+        return values[self.rows].reshape(*self.shape, *values.shape[1:])
+
+    def holding(self, changed: Box) -> Place:
+        """Windows that hold one of the changed cells of the gist."""
+        (x1, y1, x2, y2), reach = changed, self.span - 1
+        return slice(max(y1 - reach, 0), min(y2, self.shape[0])), slice(max(x1 - reach, 0), min(x2, self.shape[1]))
 
 
-@dataclass
 class _Look:
-    """A look and its predictions.
+    """A look and its predictions for N windows: those of up to three closer levels that lie in it.
+
+    Args:
+        gist: gist of the look.
+        lattice: lattice of the picture.
 
     Attributes:
-        gist: gist of the look.
-        left: `(rows, columns)`, share of each of its cells that was left to see when the tables were computed.
-        tables: predictions for the windows of each level.
+        fresh: whether nothing was predicted from it yet.
+        hinted: `(rows, columns)`, whether a cell has hints.
+        scores: `(rows, columns, K)`, those of the gist.
+        left: `(rows, columns)`, share of each cell that is left to see.
+        shown: `(rows, columns, K)`, scores of the hints times that share.
+        tables: the windows of each level.
+        facts: `(N, 6)`, `GlimpseEvidence.hint_facts`.
+        before: `(N,)`, log odds from coarser looks.
+        odds: `(N,)`, log odds from this look.
+        stale: `(N,)`, whether the log odds are to be computed anew.
     """
 
-    gist: Gist
-    left: Cells | None = None
-    tables: dict[int, _Table] = field(default_factory=dict)
+    def __init__(self, gist: Gist, lattice: Lattice) -> None:
+        self.gist = gist
+        self.fresh = True
+        self.hinted = gist.scores.amax(-1).numpy() > 0
+        self.left = np.ones(self.hinted.shape, np.float32)
+        self.shown = self.scores = gist.scores.numpy()
+        self.tables: dict[int, _Table] = {}
+        count = 0
+        for level in range(gist.level + 1, min(gist.level + STEPS, lattice.levels - 1) + 1):
+            if span := lattice.span(level) // gist.scale:
+                down, across = (max(n - span, 0) + 1 for n in self.hinted.shape)
+                # A cell of a coarse look can reach beyond the last window of a level: it goes by that one.
+                ends = lattice.places(level)
+                x, y = (
+                    np.minimum(low + gist.scale * np.arange(n), end - 1)
+                    for low, n, end in zip(gist.first, (across, down), ends, strict=True)
+                )
+                places = (y[:, None] * ends[0] + x).ravel()
+                self.tables[level] = _Table(span, (down, across), slice(count, count + len(places)), places)
+                count += len(places)
+        self.facts = np.zeros((count, 6), np.float32)
+        self.before, self.odds = np.full(count, np.nan, np.float32), np.zeros(count, np.float32)
+        self.stale = np.ones(count, np.bool_)
+
+    def cover(self, left: Cells) -> Box | None:
+        """Take over the share of each cell that is left to see; return the box about hints that this changes."""
+        differs = self.hinted & (left != self.left)
+        self.left = left
+        if not differs.any():
+            return None
+        x1, y1, x2, y2 = changed = extent(differs)
+        if self.shown is self.scores:
+            self.shown = self.scores.copy()
+        here = slice(y1, y2), slice(x1, x2)
+        np.multiply(self.scores[here], left[here][..., None], out=self.shown[here])
+        return changed
 
     @property
     def box(self) -> Box:
         """The cells of the lattice that it shows, `(x1, y1, x2, y2)`."""
-        (x, y), scale, (rows, columns) = self.gist.first, self.gist.scale, self.gist.scores.shape[:2]
+        (x, y), scale, (rows, columns) = self.gist.first, self.gist.scale, self.hinted.shape
         return x, y, x + columns * scale, y + rows * scale
+
+
+@dataclass
+class _Pooled:
+    """Pooled hints of N windows of a look: their level, their place in its table, and the results of `pool_all`."""
+
+    look: _Look
+    level: int
+    place: Place
+    scores: Tensor
+    summary: Tensor
 
 
 class WindowOdds:
@@ -71,21 +131,21 @@ class WindowOdds:
 
     Args:
         lattice: lattice of the picture.
-        presence: `GlimpseEvidence.presence` for the class.
+        evidence: learned evidence.
+        target: class 1..K.
+        context: adds to the log odds by the other classes in a window; None adds nothing.
     """
 
-    def __init__(self, lattice: Lattice, presence: Presence) -> None:
-        self._lattice, self._presence = lattice, presence
+    def __init__(
+        self, lattice: Lattice, evidence: GlimpseEvidence, target: int, context: WindowContext | None = None
+    ) -> None:
+        self._lattice, self._evidence, self._target, self._context = lattice, evidence, target, context
         self._looks: list[_Look] = []
         self._left = np.ones((lattice.rows, lattice.columns), np.float32)
-        self._odds: dict[int, Cells] = {}
+        self._odds: dict[int, Cells] = {
+            level: np.full(lattice.places(level)[::-1], -np.inf, np.float32) for level in range(1, lattice.levels)
+        }
         self._chances: dict[int, Cells] = {}
-        self._clear()
-
-    def _clear(self) -> None:
-        self._chances.clear()
-        for level in range(1, self._lattice.levels):
-            self._odds[level] = np.full(self._lattice.places(level)[::-1], -np.inf, np.float32)
 
     def odds(self, level: int) -> Cells:
         """Log odds of the windows of a level, `(down, across)`; -inf where nothing is known."""
@@ -97,6 +157,7 @@ class WindowOdds:
             self._chances[level] = torch.from_numpy(self._odds[level]).sigmoid().numpy()
         return self._chances[level]
 
+    @torch.no_grad()
     def update(self, gists: Sequence[Gist], left: Cells) -> None:
         """Update the log odds after further looks.
 
@@ -104,92 +165,96 @@ class WindowOdds:
             gists: gists of all looks so far, in their order.
             left: `(rows, columns)` of the lattice, share of each cell that is left to see.
         """
-        fresh = [_Look(gist) for gist in gists[len(self._looks) :]]
+        fresh = [_Look(gist, self._lattice) for gist in gists[len(self._looks) :]]
         # A look changes what closer ones start from, and a change in what is left to see concerns looks of all levels.
         changed = [(look.box, look.gist.level) for look in fresh]
         differs = left != self._left
         if differs.any():
-            rows, columns = differs.any(1).nonzero()[0], differs.any(0).nonzero()[0]
-            changed.append(((int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1), -1))
+            changed.append((extent(differs), -1))
             self._left = left.copy()
         if not changed:
             return
-        self._looks += fresh
-        self._clear()
-        for look in sorted(self._looks, key=lambda look: look.gist.level):
-            level = look.gist.level
-            if look.left is None or any(coarser < level and _overlap(look.box, box) for box, coarser in changed):
-                self._predict(look)
+        self._looks = sorted(self._looks + fresh, key=lambda look: look.gist.level)
+        affected = [
+            look.fresh or any(level < look.gist.level and _overlap(look.box, box) for box, level in changed)
+            for look in self._looks
+        ]
+        first = affected.index(True)
+        if not all(look.fresh for look in self._looks[first:]):
+            first = 0
+            self._chances.clear()
+            for odds in self._odds.values():
+                odds.fill(-np.inf)
+        self._read([look for look, concerned in zip(self._looks, affected, strict=True) if concerned])
+        for look, concerned in zip(self._looks[first:], affected[first:], strict=True):
+            if concerned:
+                self._judge(look)
             self._write(look)
 
     def _write(self, look: _Look) -> None:
         """Write the predictions of a look over those of coarser ones."""
         (x, y), scale = look.gist.first, look.gist.scale
         for level, table in look.tables.items():
-            odds = table.odds.reshape(table.shape)
+            odds = table.of(look.odds)
             if scale > 1:
                 # A gist of large cells has no windows that start inside a cell: they get the odds of the one before.
                 odds = odds.repeat(scale, 0).repeat(scale, 1)
             place = self._odds[level][y : y + odds.shape[0], x : x + odds.shape[1]]
             place[:] = odds[: place.shape[0], : place.shape[1]]
+            self._chances.pop(level, None)
 
-    @torch.no_grad()
-    def _predict(self, look: _Look) -> None:
-        """Compute the predictions of a look anew for the windows in which something has changed."""
-        gist, (x, y) = look.gist, look.gist.first
-        stale = self._pool(look)
-        if gist.level > 0:
-            for level, table in look.tables.items():
-                # A cell of a coarse look can reach beyond the last window of a level: it goes by that one.
-                rows, columns = (low + gist.scale * np.arange(n) for low, n in zip((y, x), table.shape, strict=True))
-                known = self._odds[level].take(rows, 0, mode="clip").take(columns, 1, mode="clip").reshape(-1)
-                before = np.where(known == -np.inf, np.float32(_UNKNOWN), known)
-                if table.before is not None:
-                    stale[level] |= before != table.before
-                table.before = before
-        self._judge(look, stale)
-
-    def _pool(self, look: _Look) -> dict[int, NDArray[np.bool_]]:
-        """Pool the hints that are left to see in a look; return which windows of each level were pooled."""
-        gist, last = look.gist, look.left
-        look.left = left = self._left_of(gist)
-        stale: dict[int, NDArray[np.bool_]] = {}
-        if last is None:
-            levels = range(gist.level + 1, min(gist.level + STEPS, self._lattice.levels - 1) + 1)
-            spans = {level: span for level in levels if (span := self._lattice.span(level) // gist.scale)}
-            pools = pool_spans(gist.scores * torch.from_numpy(left)[..., None], list(spans.values()))
-            for (level, span), (pooled, summary) in zip(spans.items(), pools, strict=True):
-                shape = _places(gist.scores, span)
-                look.tables[level] = _Table(span, shape, pooled, summary, None, np.zeros(len(pooled), np.float32))
-                stale[level] = np.ones(len(pooled), np.bool_)
-            return stale
-        differs = left != last
-        rows, columns = differs.any(1).nonzero()[0], differs.any(0).nonzero()[0]
-        for level, table in look.tables.items():
-            stale[level] = np.zeros(len(table.odds), np.bool_)
-            if len(rows):
-                some = _reach(rows, table, 0), _reach(columns, table, 1)
-                _pool_some(table, gist.scores, left, some)
-                stale[level].reshape(table.shape)[some] = True
-        return stale
-
-    def _judge(self, look: _Look, stale: dict[int, NDArray[np.bool_]]) -> None:
-        """Compute the log odds of windows whose inputs have changed, of all levels in one call of the network."""
-        jobs = [(level, look.tables[level], rows) for level, mask in stale.items() if len(rows := mask.nonzero()[0])]
-        if not jobs:
+    def _read(self, looks: Sequence[_Look]) -> None:
+        """Compute the facts of the windows whose hints have changed, of all looks in one call of the network."""
+        parts = [part for look in looks for part in self._pool(look)]
+        if not parts:
             return
-        index = [torch.from_numpy(rows) for _, _, rows in jobs]
-        pooled = torch.cat([table.pooled[rows] for (_, table, _), rows in zip(jobs, index, strict=True)])
-        summary = torch.cat([table.summary[rows] for (_, table, _), rows in zip(jobs, index, strict=True)])
-        steps = np.concatenate([np.full(len(rows), level - look.gist.level) for level, _, rows in jobs])
-        before = None
-        if look.gist.level > 0:
-            known = [table.before[rows] for _, table, rows in jobs if table.before is not None]
-            before = torch.from_numpy(np.concatenate(known))[:, None]
-        odds = self._presence(pooled, summary, torch.from_numpy(steps), before).numpy()
-        ends = np.cumsum([len(rows) for _, _, rows in jobs])
-        for (_, table, rows), part in zip(jobs, np.split(odds, ends[:-1]), strict=True):
-            table.odds[rows] = part
+        counts = [len(part.scores) for part in parts]
+        scores, summary = torch.cat([part.scores for part in parts]), torch.cat([part.summary for part in parts])
+        steps = torch.cat([torch.full((len(part.scores),), part.level - part.look.gist.level) for part in parts])
+        facts = self._evidence.hint_facts(scores, summary, steps, self._target)[:, 0]
+        if self._context is not None:
+            facts[:, 5] += self._context(scores, self._target)
+        told, start = facts.numpy(), 0
+        for part, count in zip(parts, counts, strict=True):
+            table = part.look.tables[part.level]
+            place = table.of(part.look.facts)[part.place]
+            place[:] = told[start : start + count].reshape(place.shape)
+            table.of(part.look.stale)[part.place] = True
+            start += count
+
+    def _pool(self, look: _Look) -> list[_Pooled]:
+        """Pool the hints that are left to see in a look, in the windows where they have changed."""
+        changed = look.cover(self._left_of(look.gist))
+        if look.fresh:
+            rows, columns = look.hinted.shape
+            changed, look.fresh = (0, 0, columns, rows), False
+        if changed is None:
+            return []
+        places = {level: table.holding(changed) for level, table in look.tables.items()}
+        # The largest windows, which come first, reach over the cells of all others.
+        first = look.gist.level + 1
+        (below, beside), reach = places[first], look.tables[first].span - 1
+        shown = look.shown[below.start : below.stop + reach, beside.start : beside.stop + reach]
+        pools = pool_spans(torch.from_numpy(shown), [table.span for table in look.tables.values()])
+        parts = []
+        for (level, (down, across)), maps in zip(places.items(), pools, strict=True):
+            at = _shifted(down, below.start), _shifted(across, beside.start)
+            parts.append(_Pooled(look, level, (down, across), *(values[at].flatten(0, 1) for values in maps)))
+        return parts
+
+    def _judge(self, look: _Look) -> None:
+        """Compute the log odds of the windows of a look for which the facts or the log odds before have changed."""
+        coarsest = look.gist.level == 0
+        for level, table in () if coarsest else look.tables.items():
+            known = self._odds[level].take(table.places)
+            known[known == -np.inf] = _UNKNOWN
+            look.stale[table.rows] |= known != look.before[table.rows]
+            look.before[table.rows] = known
+        rows = look.stale.nonzero()[0]
+        if len(rows):
+            before = None if coarsest else torch.from_numpy(look.before[rows])
+            look.odds[rows] = self._evidence.odds(torch.from_numpy(look.facts[rows]), before).numpy()
+            look.stale[:] = False
 
     def _left_of(self, gist: Gist) -> Cells:
         """Share of each cell of a gist that is left to see, `(rows, columns)`."""
@@ -206,22 +271,6 @@ def _overlap(box: Box, other: Box) -> bool:
     return box[0] < other[2] and box[1] < other[3] and box[2] > other[0] and box[3] > other[1]
 
 
-def _places(scores: Tensor, span: int) -> tuple[int, int]:
-    """Number of windows of `span` cells in a gist of `(rows, columns, K)`, down a column and along a row."""
-    rows, columns = scores.shape[:2]
-    return max(rows - span, 0) + 1, max(columns - span, 0) + 1
-
-
-def _reach(changed: NDArray[np.intp], table: _Table, axis: int) -> slice:
-    """Windows of a table that hold a changed cell, along an axis."""
-    return slice(max(int(changed[0]) - table.span + 1, 0), min(int(changed[-1]) + 1, table.shape[axis]))
-
-
-def _pool_some(table: _Table, scores: Tensor, left: Cells, some: tuple[slice, slice]) -> None:
-    """Pool the hints of some windows of a table again, given by their rows and columns."""
-    rows, columns = some
-    here = slice(rows.start, rows.stop + table.span - 1), slice(columns.start, columns.stop + table.span - 1)
-    best, crowd = pool_all(scores[here] * torch.from_numpy(left[here])[..., None], table.span)
-    shape = rows.stop - rows.start, columns.stop - columns.start, -1
-    table.pooled.view(*table.shape, -1)[rows, columns] = best.view(shape)
-    table.summary.view(*table.shape, -1)[rows, columns] = crowd.view(shape)
+def _shifted(part: slice, start: int) -> slice:
+    """A part of an array, in an array that begins at `start`."""
+    return slice(part.start - start, part.stop - start)

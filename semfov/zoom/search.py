@@ -233,17 +233,21 @@ def search(
     seen: list[Glance] = []
     values: list[float] = []
     tally: Tally | None = None
-    ended, presence = 0, 0.0
+    ended, presence = 0, None
     for glance, value, ahead, belief in look_for(glances, evidence, target, confirm=float("inf"), context=context):
         tally = tally or Tally(belief)
         tally.add(glance)
         seen.append(glance)
         values.append(value)
-        presence = tally.presence(ahead)
-        ended = int(settle(torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([ahead]), thresholds))
+        presence = None
+        if tally.looked or ahead < thresholds.give_up:  # otherwise no probability ends the search
+            presence = tally.presence(ahead)
+            state = torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([ahead])
+            ended = int(settle(*state, thresholds))
         if ended or len(seen) == passes:
             break
     assert tally is not None
+    presence = tally.presence(ahead) if presence is None else presence
     box = tally.box if OUTCOMES[ended] == "found" else None
     return ZoomPath(
         glances.lattice,

@@ -56,3 +56,19 @@ class WindowSums:
         down, across = self._band[: part.shape[0], : bottom - top], self._band[: part.shape[1], : right - left]
         self.sums[top:bottom, left:right] = down.T @ (part @ across)
         return self.sums
+
+
+def extent(marked: NDArray[np.bool_]) -> Box:
+    """Find the box about marked cells.
+
+    Args:
+        marked: `(rows, columns)`; at least one cell is marked.
+
+    Returns:
+        The box.
+
+    >>> extent(np.array([[False, True, True], [False, False, True]]))
+    (1, 0, 3, 2)
+    """
+    rows, columns = np.flatnonzero(marked.any(1)), np.flatnonzero(marked.any(0))
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

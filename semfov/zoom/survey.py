@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from semfov.io.schema import Field, Number, Object, perceptron
 from semfov.zoom.gist import Gist
@@ -66,10 +67,10 @@ class Survey(nn.Module):
         Returns:
             `(1, 3, rows, columns)`, logarithms of the expected numbers, for looks one, two and three octaves closer.
         """
-        strongest = look.scores.amax(-1)
-        best = features(strongest)
+        hints = features(look.scores)
+        best = hints.amax(-1)
         found = look.found.any(-1).to(best)
-        kinds = self.mix(features(look.scores) - _LOWEST).movedim(-1, 0)
+        kinds = F.linear(hints - _LOWEST, self.mix.weight).movedim(-1, 0)
         parts = [*hint_maps(best[None], best, found[None], look.size), *memory_maps(best[None], before)]
         maps = torch.cat([*parts, kinds, neighbourhood_mean(kinds, 5)])
         value = through(self.rate, maps.movedim(0, -1)) - 6

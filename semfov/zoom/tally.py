@@ -43,12 +43,14 @@ class Tally:
         self._looks += 1
         self._seen += score >= FOUND
         detections = glance.detections
-        if detections.scores.shape[1]:
-            told = detections.scores[0, :, target]
-            place = int(told.argmax())
-            if float(told[place]) > self._found:
-                self._found, self.box = float(told[place]), detections.boxes[0, place]
-            named = told[detections.labels[0] == target]
+        told = detections.scores[0, :, target].detach().float().numpy()
+        if not len(told):
+            return
+        place = int(told.argmax())
+        if told[place] > self._found:
+            self._found, self.box = float(told[place]), detections.boxes[0, place]
+        if told[place] > self._named:
+            named = told[detections.labels[0].numpy() == target]
             self._named = max([self._named, *named.tolist()])
 
     @property

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torchvision.ops import nms
 
-from semfov.detection.near_duplicates import distinct, neighbours
+from semfov.detection.near_duplicates import distinct, neighbours, survivors
 
 
 def crowd(count, seed, extent=400.0):
@@ -43,3 +43,20 @@ def test_neighbours_are_all_pairs_of_intersecting_intervals():
     found = list(zip(*(index.tolist() for index in neighbours(start, end)), strict=True))
     assert len(found) == len(set(found))
     assert set(found) == expected
+
+
+@pytest.mark.parametrize("count", [1, 2, 12, 60])
+def test_survivors_are_those_of_removing_one_box_after_the_other(count):
+    lengths = set()
+    for seed in range(20):
+        generator = np.random.default_rng(seed)
+        pairs = generator.integers(count, size=(2 * count, 2))
+        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+        better, worse = pairs.min(1), pairs.max(1)
+        stays: list[int] = []
+        for box in range(count):
+            if not any(one in stays and other == box for one, other in zip(better, worse, strict=True)):
+                stays.append(box)
+        assert survivors(count, better, worse).tolist() == stays
+        lengths.add(len(stays))
+    assert (len(lengths) > 1) == (count > 1)

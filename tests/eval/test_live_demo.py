@@ -8,11 +8,13 @@ import torch
 
 import eval.demo as program
 from semfov import ActivePerception, Detections, Eye, Foveation, Grid, observers, policies
-from semfov.belief import DirichletBelief
+from semfov.belief import DirichletBelief, Verification
+from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import Picture, Stream, embedded_picture
 from semfov.decision import Decision
 from semfov.detection import Candidates, Detector
 from semfov.live import Moment
+from semfov.verifier import CloserLook
 from semfov.viz.live import draw_moment, video, video_suffix
 
 cv2 = pytest.importorskip("cv2")
@@ -48,6 +50,7 @@ def test_a_target_is_followed_in_a_panning_video_until_it_leaves_the_view(tmp_pa
     assert len(lines) == len(places)
     assert "motorcycle: found" in lines[7]
     assert "motorcycle: absent" in lines[-1]
+    assert any("closely" in line for line in lines)
     left, top, right, bottom = scene.boxes[0].tolist()
     for x, line in zip(places[:14], lines, strict=False):
         column, row = map(int, re.search(r"most likely at \((\d), (\d)\)", line).groups())
@@ -56,7 +59,7 @@ def test_a_target_is_followed_in_a_panning_video_until_it_leaves_the_view(tmp_pa
         assert right - x > 32 * column
         assert top < 48 * (row + 1)
         assert bottom > 48 * row
-    chances = [float(re.search(r"p ([\d.]+), most", line)[1]) for line in lines]
+    chances = [float(re.search(r"p ([\d.]+)( \(there [\d.]+\))?, most", line)[1]) for line in lines]
     assert min(chances[1:14]) > 0.9
     assert chances[-1] < 0.3
     shown = read(tmp_path / "out" / f"live{video_suffix()}")
@@ -79,12 +82,16 @@ class Red(Detector):
 
 
 @pytest.fixture
-def run(monkeypatch, tmp_path, capsys):
+def agent():
     observer = observers.Semantic(3)
     eye = Eye(Foveation(40.0), Red(), reference=160.0)
-    agent = ActivePerception(
+    return ActivePerception(
         eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(8, 6)
     ).eval()
+
+
+@pytest.fixture
+def run(agent, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(program, "make_agent", lambda config: agent)
     monkeypatch.setattr(program, "known_classes", lambda config: None)
 
@@ -119,6 +126,31 @@ def test_a_video_is_searched_and_options_for_photographs_are_refused(run, tmp_pa
         code, printed = run(path, "--target", "red", option, 1)
         assert code == 1
         assert f"{option[2:]}: expected none for a video or a camera" in printed.err
+
+
+class Sure(Verification):
+    """Every place holds the target."""
+
+    def forward(self, features):
+        return torch.full_like(features[..., :2], 4.0)
+
+
+def test_closer_looks_at_a_video_are_printed_unless_they_are_switched_off(run, agent, tmp_path):
+    agent.verification = Sure(thresholds=Thresholds(0.7, 0.01, 0.3))
+    path = write(tmp_path / "red.avi", frames())
+    _, printed = run(path, "--target", "red", "--start", 0)
+    shown = re.findall(
+        r"^ +(\d)  closely at \((\d), (\d)\): p 0\.98 there +red: found, p .* \(there 0\.98\)", printed.out, re.M
+    )
+    assert len(shown) == 1
+    number, column, row = map(int, shown[0])
+    # Red covers rows 40 to 60 of 120, and starts at column 10 of 160 per frame.
+    assert 20 * column < 10 * number + 20
+    assert 20 * (column + 1) > 10 * (number - 1)
+    assert row in (1, 2)
+    _, printed = run(path, "--target", "red", "--start", 0, "--closer", 0)
+    assert "closely" not in printed.out
+    assert "there" not in printed.out
 
 
 def test_a_camera_runs_until_it_is_stopped(run, tmp_path, monkeypatch):
@@ -173,6 +205,17 @@ def test_belief_gaze_next_cell_and_decision_are_drawn_into_a_frame():
     assert changed[110, 110:190].all()
     assert changed[110:190, 110].all()
     assert not changed[115:185, 115:185].any()
+    # A closer look is marked around its box instead of at the fixated point.
+    closer = CloserLook(0, 1, 6, box, 0.9, 0.95)
+    there = {"grid": grid, "fixation": grid.centres[6], "next_cell": 6}
+    close = draw_moment(grey, moment(**there, closer=closer), "cup").astype(int)
+    changed = abs(close - draw_moment(grey, moment(**there), "cup")).max(-1) > 8
+    assert changed[105, 110:190].all()
+    assert changed[110:190, 105].all()
+    assert changed[150, 230:270].any()
+    assert not changed[:98].any()
+    assert not changed[:, 202:238].any()
+    assert not changed[:, 262:].any()
     large = draw_moment(torch.zeros(3, 1001, 1999), moment(grid=Grid(4, 2, (1999, 1001))), "cup")
     assert large.shape == (320, 640, 3)
 

@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 
 import semfov
 from semfov import Detections
+from semfov.belief import Verification
 from semfov.belief.observers import Semantic
+from semfov.belief.target_evidence import Thresholds
+from semfov.decision import Decision
 from semfov.detection import Candidates, Detector
 from semfov.errors import InputError
 from semfov.gaze.policies import NonPredictive, Random
@@ -45,6 +48,20 @@ def test_dictionaries_of_detections_have_the_fields_of_the_message(seen):
     assert one["detections"][0]["results"] == results[:1]
     low = ros.detection_array(seen, CLASSES, stamp=0, frame="", least=0.05)
     assert [len(each["results"]) for each in low["detections"]] == [3, 2]
+
+
+def test_a_found_target_is_a_detection_with_the_probability_of_its_place():
+    box = torch.tensor([10.0, 20, 40, 80])
+    head = {"stamp": {"sec": 3, "nanosec": 0}, "frame_id": "camera"}
+    bbox = {"center": {"position": {"x": 25.0, "y": 50.0}, "theta": 0.0}, "size_x": 30.0, "size_y": 60.0}
+    for place, score in ((0.75, 0.75), (None, 0.5)):
+        got = ros.found_array(Decision("found", 0.5, 3, box, place), "cat", stamp=3, frame="camera")
+        results = [{"hypothesis": {"class_id": "cat", "score": score}}]
+        assert got == {"header": head, "detections": [{"header": head, "results": results, "bbox": bbox, "id": ""}]}
+        message = ros.fill(ARRAY(), got, DETECTION, HYPOTHESIS)
+        assert message.detections[0].results[0].hypothesis.score == score
+    for nothing in (None, Decision("absent", 0.1), Decision("undecided", 0.5)):
+        assert ros.found_array(nothing, "cat", stamp=3, frame="camera") == {"header": head, "detections": []}
 
 
 def test_messages_are_filled_from_dictionaries(seen):
@@ -136,6 +153,13 @@ class Square(Detector):
         return Candidates(box[None, None], canvas.new_tensor([[[0.9, 0.02, 0.02]]]))
 
 
+class Sure(Verification):
+    """Every place holds the target, with log odds of 4."""
+
+    def forward(self, features):
+        return torch.full_like(features[..., :2], 4.0)
+
+
 class Node:
     """A stand-in for the node class of rclpy."""
 
@@ -177,7 +201,8 @@ def test_the_node_publishes_detections_and_the_next_fixation(monkeypatch):
     node_module = importlib.import_module("examples.ros_node")
     eye = semfov.Eye(semfov.Foveation(40.0), Square(), reference=64.0)
     searching, exploring = (Semantic(4), NonPredictive()), (Semantic(4), Random())
-    agent = semfov.ActivePerception(eye, searching, exploring)
+    sure = Sure(thresholds=Thresholds(0.7, 0.01, 0.3))
+    agent = semfov.ActivePerception(eye, searching, exploring, verification=sure)
     monkeypatch.setattr(semfov.ActivePerception, "recommended", lambda name: agent)
     node = node_module.GazeNode()
     pixels = np.full((48, 64, 3), 100, np.uint8)
@@ -186,13 +211,18 @@ def test_the_node_publishes_detections_and_the_next_fixation(monkeypatch):
     message.header.stamp.sec, message.header.frame_id = 7, "camera"
     for _ in range(3):
         node.subscribed["image"](message)
-    found, gaze = node.published["detections"], node.published["gaze"]
-    assert len(found) == len(gaze) == 3
-    assert all(each.header.stamp.sec == 7 and each.header.frame_id == "camera" for each in (*found, *gaze))
+    found, gaze, target = (node.published[topic] for topic in ("detections", "gaze", "found"))
+    assert len(found) == len(gaze) == len(target) == 3
+    assert all(each.header.stamp.sec == 7 and each.header.frame_id == "camera" for each in (*found, *gaze, *target))
     best = found[-1].detections[0]
     assert best.results[0].hypothesis.class_id == "cup"
     centre = best.bbox.center.position
     assert (centre.x, centre.y) == pytest.approx((55, 35), abs=6)
     # The next fixation is where the target is likely: the second look is at the red square.
     assert (gaze[0].point.x, gaze[0].point.y) == pytest.approx((55, 35), abs=12)
+    # The third frame is a closer look, which finds the square.
+    assert [len(each.detections) for each in target] == [0, 0, 1]
+    assert target[-1].detections[0].results[0].hypothesis.score == pytest.approx(0.982, abs=1e-3)
+    centre = target[-1].detections[0].bbox.center.position
+    assert (centre.x, centre.y) == pytest.approx((55, 35), abs=1.5)
     sys.modules.pop("examples.ros_node")

@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,12 +13,15 @@ from PIL import Image
 from scipy import stats
 
 import semfov
+from eval.decide import main as decide
 from eval.demo import main as demo
 from eval.search import main as search
 from semfov import ActivePerception, DataError, InputError
+from semfov.belief import Verification
 from semfov.belief.observers import LearnedMap, Semantic, Target
 from semfov.data.scenes import EmbeddedScenes
 from semfov.experiments.config import DataConfig, DetectorConfig, ExploreConfig, PolicyConfig, SearchConfig
+from semfov.experiments.decisions import DecisionConfig
 from semfov.experiments.fitted import with_models
 from semfov.experiments.progress import Whole, task_bar, track
 from semfov.experiments.search_protocol import choose_classes
@@ -26,11 +30,13 @@ from semfov.io.files import sha256
 from semfov.io.manifest import Manifest, Part
 from semfov.model_folder import ModelFolder
 from semfov.observation.foveal import FovealObservationModel
-from semfov.training import detector_parts
+from semfov.training.detector_parts.part import Bench, Fitted
+from semfov.training.detector_parts.verification import VerificationFit, scores
 from semfov.training.detector_report import thin_classes
 from semfov.training.detector_settings import FitDetectorConfig
 from semfov.training.evidence import FitSearchConfig, choose_thresholds
 from semfov.training.held_out import Difference
+from semfov.training.verification_decisions import Verified
 from train.fit_detector import main
 
 CLASSES = ("red", "green", "blue")
@@ -100,7 +106,7 @@ def write_photographs(folder: Path, count: int = 20) -> Path:
 
 
 SMALL = [
-    "--columns", "4", "--rows", "4", "--holdout", "4", "--steps", "20", "--map_steps", "20", "--fixations", "6",
+    "--columns", "4", "--rows", "4", "--holdout", "4", "--steps", "120", "--map_steps", "20", "--fixations", "6",
     "--sensor.sigma", "60", "--sensor.growth", "1", "--workers", "1",
 ]  # fmt: skip
 
@@ -138,7 +144,7 @@ def test_the_folder_describes_its_models(home):
     assert manifest.detector["model_file"]["relative"] == "../colours.onnx"
     assert manifest.sensor["sigma"] == 60
     assert manifest.sensor["growth"] == 1
-    assert list(manifest.parts) == ["observation", "tempering", "evidence", "map"]
+    assert list(manifest.parts) == ["observation", "tempering", "evidence", "verification", "map"]
     assert manifest.training["photographs"] == 20
     assert manifest.training["held_out"] == 5
     for name, part in manifest.parts.items():
@@ -150,6 +156,13 @@ def test_the_folder_describes_its_models(home):
     assert f"counts as found from a probability of {thresholds.confirm:.2f} on" in text
     assert f"gives up when no cell has a probability of {thresholds.give_up:.2f} or more" in text
     assert "20 photographs, 5 of them held out (one in 4); 3 classes; 4 × 4 cells" in text
+    verification = Verification.from_pretrained(home / "models/verification.safetensors")
+    assert 0.5 <= verification.thresholds.confirm <= 0.9
+    assert verification.thresholds.give_up <= thresholds.give_up
+    assert verification.metadata["detector"] == ModelFolder(home / "models").eye().settings()["detector"]
+    section = text.split("## Verification (closer looks)")[1].split("## ")[0]
+    assert f"| {verification.thresholds.confirm:.2f} (chosen) " in section
+    assert "| no closer looks " in section
     for name in ("reliability.png", "search.png", "explore.png"):
         assert f"({name})" in text
         with Image.open(home / "models" / name) as picture:
@@ -217,10 +230,24 @@ def test_eval_search_with_the_folder_matches_the_report(home, capsys):
     capsys.readouterr()
 
 
+FITS = {
+    "observation": "fit_model",
+    "tempering": "hit_rates",
+    "evidence": "fit_evidence",
+    "verification": "fit_and_verify",
+    "map": "fit_map_evidence",
+}
+
+
+def forbid(monkeypatch, *parts):
+    """Make the fit of parts fail."""
+    for part in parts:
+        monkeypatch.setattr(f"semfov.training.detector_parts.{part}.{FITS[part]}", None)
+
+
 def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
     before = {path.name: path.read_bytes() for path in (home / "models").glob("*.safetensors")}
-    for name in ("fit_model", "fit_evidence", "fit_map_evidence", "hit_rates"):
-        monkeypatch.setattr(detector_parts, name, None)
+    forbid(monkeypatch, *FITS)
     assert main(arguments(home)) == 0
     assert {path.name: path.read_bytes() for path in (home / "models").glob("*.safetensors")} == before
     printed = capsys.readouterr()
@@ -229,18 +256,20 @@ def test_repeating_the_command_fits_nothing(home, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_only_a_missing_part_is_fitted_again(home, tmp_path, monkeypatch):
+@pytest.mark.parametrize("part", ["verification", "map"])
+@pytest.mark.parametrize("lost", ["model", "record"])
+def test_only_a_missing_part_is_fitted_again(home, tmp_path, monkeypatch, part, lost):
     """As after a killed run: finished parts are read, and the missing one is fitted with the same result."""
     shutil.copytree(home / "models", tmp_path / "models")
-    (tmp_path / "models/map.safetensors").unlink()
+    name = f"{part}.safetensors" if lost == "model" else f"progress/{part}.json"
+    (tmp_path / "models" / name).unlink()
     (tmp_path / "models/manifest.json").unlink()
-    for name in ("fit_model", "fit_evidence", "hit_rates"):
-        monkeypatch.setattr(detector_parts, name, None)
+    forbid(monkeypatch, *(FITS.keys() - {part}))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     assert main(arguments(home, "--out", str(tmp_path / "models"))) == 0
     torch.set_num_threads(threads)
-    again, once = (folder / "models/map.safetensors" for folder in (tmp_path, home))
+    again, once = (folder / f"models/{part}.safetensors" for folder in (tmp_path, home))
     assert again.read_bytes() == once.read_bytes()
 
 
@@ -280,7 +309,7 @@ def test_a_moved_network_is_found_next_to_the_folder_or_can_be_given(home, tmp_p
     assert agent.eye.detector.classes == CLASSES
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "evidence.safetensors"])
+@pytest.mark.parametrize("name", ["manifest.json", "evidence.safetensors", "verification.safetensors"])
 def test_a_changed_file_is_refused(home, tmp_path, name):
     folder = copy_models(home, tmp_path)
     content = (folder / name).read_bytes()
@@ -321,6 +350,113 @@ def test_a_part_that_does_not_improve_is_not_used(home, tmp_path):
     given = SearchConfig(models=folder, policies=("recommended", "target-evidence"))
     assert with_models(given).policies == ("non-predictive-raw", "target-evidence")
     assert with_models(ExploreConfig(models=folder, policies=("recommended",))).policies == ("random-raw",)
+
+
+def photograph_with(colour, place):
+    """A grey photograph with a square of one colour, `place` in 8 × 8 squares."""
+    pixels = np.full((SIDE, SIDE, 3), 125, dtype=np.uint8)
+    pixels[8 * place[0] : 8 * place[0] + 8, 8 * place[1] : 8 * place[1] + 8] = COLOURS[colour]
+    return torch.from_numpy(pixels).permute(2, 0, 1) / 255
+
+
+def test_the_agent_of_the_folder_looks_closely_at_a_target(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, used=True)
+    agent = ActivePerception.from_pretrained(folder)
+    fitted = Verification.from_pretrained(folder / "verification.safetensors")
+    assert torch.equal(agent.verification.linear.weight, fitted.linear.weight)
+    image = photograph_with(2, (7, 0))
+    scanpath = agent.search(image, "blue", start=3, shifts=15)
+    assert 1 <= len(scanpath.closer) <= 2
+    look = scanpath.closer[0]
+    assert look.cell == 12
+    # The probability follows from the score of the square in the enlarged window, by the fitted regression.
+    calls = []
+    agent.eye.close_up = lambda image, box: calls.append(box) or type(agent.eye).close_up(agent.eye, image, box)
+    again = agent.search(image, "blue", start=3, shifts=15)
+    assert len(calls) == len(again.closer)
+    assert scanpath.decision.outcome == "found"
+    assert scanpath.decision.place == pytest.approx(max(look.place for look in scanpath.closer))
+    assert agent.search(image, "blue", start=3, shifts=15, closer=0).closer == ()
+
+
+def test_without_verification_or_evidence_the_agent_decides_without_closer_looks(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, used=True)
+    known = Manifest.read(folder).parts
+    for unused in ("verification", "evidence"):
+        rewrite_manifest(folder, used=True)
+        rewrite_manifest(folder, **{unused: replace(known[unused], used=False)})
+        agent = ActivePerception.from_pretrained(folder)
+        assert agent.verification is None
+        assert agent.search(photograph_with(2, (7, 0)), "blue", start=3, shifts=15).closer == ()
+
+
+def test_a_folder_of_an_earlier_version_has_no_verification(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, used=True)
+    known = Manifest.read(folder)
+    earlier = {name: part for name, part in known.parts.items() if name != "verification"}
+    replace(known, parts=earlier).write(folder)
+    (folder / "verification.safetensors").unlink()
+    agent = ActivePerception.from_pretrained(folder)
+    assert agent.verification is None
+    assert isinstance(agent.searching.observer, Target)
+    assert with_models(DecisionConfig(models=folder)).verification is None
+    assert (
+        demo([str(home / "photographs/0.png"), "--target", "red", "--models", str(folder), "--out", str(tmp_path)]) == 0
+    )
+
+
+def test_decisions_are_evaluated_with_the_verification_of_the_folder(home, tmp_path):
+    folder = copy_models(home, tmp_path)
+    rewrite_manifest(folder, used=True)
+    file = str(folder / "verification.safetensors")
+    assert with_models(DecisionConfig(models=folder)).verification == file
+    assert with_models(DecisionConfig(models=folder, verification="other")).verification == "other"
+    given = ["--models", str(folder), "--data.min_instances", "0", "--data.limit", "3", "--workers", "1"]
+    out = tmp_path / "decide"
+    assert decide([*data(home), *given, "--prices", "[]", "--out", str(out), "--cache", str(home / "cache")]) == 0
+    records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    assert any(record["closer"] > 0 for record in records if record["policy"] == "target-evidence")
+    assert {record["closer"] for record in records if "no closer looks" in record["policy"]} == {0}
+
+
+def test_without_the_target_evidence_no_verification_is_fitted(home, tmp_path, monkeypatch):
+    config = FitDetectorConfig(model=home / "colours.onnx", columns=4, rows=4, holdout=4, out=tmp_path)
+    scenes = EmbeddedScenes(("cat", "cup"), count=8)
+    bench = Bench(config, SimpleNamespace(scenes=scenes))
+    bench.parts["evidence"] = Fitted(Part("evidence.safetensors", "0", False, "not better"), "")
+    forbid(monkeypatch, "verification")
+    fitted = VerificationFit(bench).fit()
+    assert fitted.part == Part(None, None, False, "not fitted, since the agent does not use the target evidence")
+
+
+def test_a_verification_that_cannot_be_fitted_to_the_held_out_photographs_is_left_out(home, tmp_path, monkeypatch):
+    folder = copy_models(home, tmp_path)
+    (folder / "progress/verification.json").unlink()
+    seen = []
+
+    def fail(photographs, *_):
+        seen.extend(photographs)
+        raise DataError("data: too few")
+
+    monkeypatch.setattr("semfov.training.detector_parts.verification.fit_and_verify", fail)
+    assert main(arguments(home, "--out", str(folder))) == 0
+    assert len(seen) >= 2
+    assert {photograph.index for photograph in seen} <= set(range(0, 20, 4))
+    part = Manifest.read(folder).parts["verification"]
+    assert (part.file, part.used, part.why) == (None, False, "could not be fitted: data: too few")
+    assert ActivePerception.from_pretrained(folder, detector=home / "colours.onnx").verification is None
+    assert "Could not be fitted: data: too few" in (folder / "report.md").read_text()
+
+
+def test_decisions_are_scored_by_photograph():
+    """Present and absent classes have equal weight, whatever their number."""
+    kinds = [(0, True, True), (0, True, None), (0, False, False), (0, False, None), (0, False, None), (4, True, False)]
+    searches = [Verified(number, present, False, (), (), 0.5, 3, (None, 3)) for number, present, _ in kinds]
+    ends = [(right, 2) for _, _, right in kinds]
+    np.testing.assert_allclose(scores(searches, ends), [(1 / 2 - 1 / 3) / 2, -1])
 
 
 def test_experiments_take_their_settings_from_the_folder(home):

@@ -214,7 +214,7 @@ def best_thresholds_by_loop(config, anywhere, place, left, there):
     confirm, hits = confirm_and_hits(least)
     kept = [
         give_up
-        for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01)
+        for give_up in (0.3, 0.25, 0.2, 0.15, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.007, 0.005, 0.003, 0.002, 0.001)
         if hits - sum(found(search, confirm, least, give_up) for search in holding) <= config.lost * len(holding)
     ]
     return Thresholds(confirm, max(kept, default=0.0), least)

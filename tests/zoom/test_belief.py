@@ -7,11 +7,13 @@ import torch
 from semfov.belief import ContextPrior
 from semfov.errors import InputError
 from semfov.zoom import GlimpseEvidence, WindowContext, ZoomAgent, ZoomEye
-from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.evidence import pool, pool_all
+from semfov.zoom.belief import ZoomBelief, before_of
+from semfov.zoom.evidence import pool, pool_all, pool_spans
+from semfov.zoom.gist import Gist
 from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.lattice import CELLS
 from semfov.zoom.policy import best_find, best_hit, jointly
+from semfov.zoom.search import look_for
 from semfov.zoom.sums import WindowSums
 
 
@@ -81,6 +83,57 @@ def test_pooling_of_all_windows_equals_pooling_of_each():
         torch.testing.assert_close(summary[number], one_summary)
 
 
+def test_pooling_of_several_sizes_at_once_equals_pooling_of_each_window():
+    """Also of windows that are longer than a side of the map."""
+    scores = torch.rand(9, 20, 4, generator=torch.Generator().manual_seed(1)) ** 8
+    scores[torch.rand(9, 20, generator=torch.Generator().manual_seed(2)) < 0.6] = 0
+    spans = [16, 5, 8]
+    for span, (top, summary) in zip(spans, pool_spans(scores, spans), strict=True):
+        assert top.shape[:2] == summary.shape[:2] == (max(9 - span, 0) + 1, 20 - span + 1)
+        for row in range(top.shape[0]):
+            for column in range(top.shape[1]):
+                one, one_summary = pool(scores, (column, row, column + span, row + span))
+                torch.testing.assert_close(top[row, column], one)
+                torch.testing.assert_close(summary[row, column], one_summary)
+
+
+def test_rates_of_earlier_looks_are_those_for_the_next_level():
+    """Cell by cell; beyond three octaves the rate for three counts, and before any look there is none."""
+    generator = torch.Generator().manual_seed(0)
+    rate = torch.rand(3, 4, 6, generator=generator)
+    source = torch.randint(0, 5, (4, 6), generator=generator)
+    look = Gist(4, (0, 0), 1, torch.zeros(4, 6, 3), torch.zeros(4, 6), torch.zeros(4, 6, 3).bool())
+    told = before_of(rate, source, look)
+    for row in range(4):
+        for column in range(6):
+            octaves = min(max(look.level + 1 - int(source[row, column]), 1), 3)
+            expected = float(rate[octaves - 1, row, column] + 1e-6)
+            assert told[row, column] == pytest.approx(np.log(expected), abs=1e-6)
+
+
+def test_changes_in_cells_without_hints_change_no_odds(belief):
+    """They are not computed anew there, and elsewhere they are."""
+    lattice, look = belief.lattice, belief.gists[0]
+    finest = lattice.levels - 1
+    before = {level: belief.odds(level) for level in range(1, lattice.levels)}
+    shown = look.scores.amax(-1) > 0
+    empty = [
+        (row, column)
+        for row in range(lattice.rows - CELLS)
+        for column in range(lattice.columns - CELLS)
+        if not shown[
+            row // look.scale : -(-(row + CELLS) // look.scale),
+            column // look.scale : -(-(column + CELLS) // look.scale),
+        ].any()
+    ]
+    row, column = empty[len(empty) // 2]
+    belief.discount(on_lattice(lattice, (finest, column, row)))
+    assert all(torch.equal(belief.odds(level), odds) for level, odds in before.items())
+    row, column = (int(n) * look.scale for n in shown.nonzero()[0])
+    belief.discount(on_lattice(lattice, (finest, min(column, lattice.columns - CELLS), min(row, lattice.rows - CELLS))))
+    assert not all(torch.equal(belief.odds(level), odds) for level, odds in before.items())
+
+
 def test_odds_of_one_window_equal_those_in_the_table_of_all_windows(belief):
     lattice = belief.lattice
     table = belief.odds(lattice.levels - 1)
@@ -143,6 +196,39 @@ def test_cached_odds_equal_recomputed_odds(belief, glances, evidence):
                 anew.add(glance)
             for level in range(1, lattice.levels):
                 torch.testing.assert_close(belief.odds(level), anew.odds(level))
+
+
+def test_a_window_counts_for_the_share_that_no_look_at_its_level_or_closer_has_shown(belief, glances):
+    lattice, generator = belief.lattice, torch.Generator().manual_seed(2)
+    closest = np.full((lattice.rows, lattice.columns), 0)
+    for _ in range(8):
+        level, column, row = lattice.actions[int(torch.randint(len(lattice), (1,), generator=generator))].tolist()
+        belief.add(glances.see([on_lattice(lattice, (level, column, row))])[0])
+        shown = closest[row : row + lattice.span(level), column : column + lattice.span(level)]
+        shown[:] = np.maximum(shown, level)
+        for at in range(1, lattice.levels):
+            span, (across, down) = lattice.span(at), lattice.places(at)
+            expected = [[(closest[y : y + span, x : x + span] < at).mean() for x in range(across)] for y in range(down)]
+            np.testing.assert_allclose(belief.unseen(at), expected, atol=1e-6)
+            chances = torch.from_numpy(np.array(expected)) * belief.odds(at).double().sigmoid()
+            np.testing.assert_allclose(belief.chances(at), chances, atol=1e-6)
+
+
+@pytest.mark.parametrize("target", [1, 2, 3])
+def test_every_look_of_a_search_shows_a_place_closer_than_all_looks_before_it(glances, evidence, target):
+    lattice = glances.lattice
+    closest = np.full((lattice.rows, lattice.columns), -1)
+    count = 0
+    for turn in look_for(glances, evidence, target, confirm=float("inf")):
+        window = turn.glance.window
+        x1, y1, x2, y2 = window.cells
+        shown = closest[y1:y2, x1:x2]
+        assert (shown < window.level).any()
+        shown[:] = np.maximum(shown, window.level)
+        count += 1
+    assert count > lattice.levels
+    # Only when nothing is left to see does a search without thresholds end.
+    assert (closest == lattice.levels - 1).all()
 
 
 def test_foresight_counts_only_cells_that_were_not_seen_as_closely(belief, glances):

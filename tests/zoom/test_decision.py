@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch.nn import functional as F
 
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import settle
+from semfov.decision import OUTCOMES, settle
 from semfov.metrics.calibration import calibration_error
 from semfov.training.zoom_decision import Searches, fit_judge, judge_searches
 from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye
@@ -106,6 +106,29 @@ def synthetic(count, seed):
     odds = torch.logit(best, eps=1e-4) + 2 * case[..., 2] - case[..., 7] - 1
     there = torch.rand(count, generator=generator) < odds[:, 0].sigmoid()
     return Searches(best, case, best > 0.1, torch.zeros(count, 1), there), odds[:, 0]
+
+
+@pytest.mark.parametrize("target", [1, 2, 3])
+@pytest.mark.parametrize(("confirm", "give_up"), [(0.9, 0.005), (0.3, 0.2), (1.0, 0.0), (0.0, 1.0)])
+def test_searches_end_as_if_every_look_were_judged(eye, picture, target, confirm, give_up):
+    """A search computes the probability only where it can matter; here it is computed after every look."""
+    most, thresholds = 6, Thresholds(confirm, give_up)
+    torch.manual_seed(0)
+    evidence, glances = GlimpseEvidence(3, 8).eval(), LiveGlances(eye, eye.open(picture))
+    tally, passes, ended = None, 0, 0
+    with torch.inference_mode():
+        for turn in look_for(glances, evidence, target, confirm=math.inf):
+            tally = tally or Tally(turn.belief)
+            tally.add(turn.glance)
+            presence, passes = tally.presence(turn.ahead), passes + 1
+            state = torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([turn.ahead])
+            ended = int(settle(*state, thresholds))
+            if ended or passes == most:
+                break
+        path = ZoomAgent(eye, evidence).search(picture, target, passes=most, confirm=confirm, give_up=give_up)
+    assert path.passes == passes
+    assert path.decision.outcome == OUTCOMES[ended]
+    assert path.decision.probability == presence
 
 
 def test_a_fitted_probability_is_calibrated():

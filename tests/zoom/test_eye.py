@@ -8,6 +8,7 @@ from PIL import Image
 from semfov.errors import InputError
 from semfov.sensor.glimpse import glimpse, windows_at
 from semfov.zoom import ZoomEye
+from semfov.zoom.eye import BORDER
 
 
 def test_canvas_is_the_antialiased_glimpse_inside_its_border(detector):
@@ -81,6 +82,55 @@ def test_the_canvas_is_filled_beyond_the_picture(detector, picture):
     canvas, frames = eye.glimpse(eye.open(picture), torch.tensor([[0.0, 0.0, 1.0]]))
     assert frames[0, :4].tolist() == [0, 0, 64, 64]
     assert float(canvas[0, :, :60, :60].abs().max()) == 0
+
+
+def test_a_window_beside_the_picture_shows_its_nearest_pixel(detector):
+    image = torch.rand(3, 60, 90, generator=torch.Generator().manual_seed(0))
+    eye = ZoomEye(detector)
+    canvas, frames = eye.glimpse(eye.open(image), torch.tensor([[500.0, 400.0, 1.0], [-500.0, -400.0, 1.0]]))
+    assert frames.tolist() == [[89, 59, 90, 60, 0, 0, 1, 1], [0, 0, 1, 1, 127, 127, 128, 128]]
+    for number, (place, pixel) in enumerate((((0, 0), (59, 89)), ((127, 127), (0, 0)))):
+        expected = torch.full((3, 128, 128), float(detector.fill))
+        expected[:, *place] = (image[:, *pixel] * 255).round() / 255
+        assert torch.equal(canvas[number], expected)
+
+
+def test_hints_of_a_batch_equal_those_of_its_looks_one_by_one(detector, picture):
+    eye = ZoomEye(detector)
+    view = eye.open(picture)
+    fixations = torch.tensor([[655.5, 335.5, 1.0], [640.0 - 64 + 8 - 0.5, 335.5, 1.0], [511.5, 383.5, 0.125]])
+    together = eye.glance(view, fixations)
+    counts = set()
+    for number in range(3):
+        alone = eye.glance(view, fixations[number : number + 1])
+        for whole, one in ((together.hints, alone.hints), (together.detections, alone.detections)):
+            count = int(one.count)
+            assert count == int(whole.count[number]) > 0
+            torch.testing.assert_close(whole.boxes[number, :count], one.boxes[0, :count])
+            assert float(whole.boxes[number, count:].abs().sum()) == 0
+            counts.add(count)
+        found = int(alone.detections.count)
+        assert torch.equal(together.cut[number, :found], alone.cut[0])
+        assert not bool(together.cut[number, found:].any())
+        assert torch.equal(together.windows[number], alone.windows[0])
+    assert len(counts) > 1
+
+
+def test_cut_boxes_are_those_that_reach_the_border_of_the_canvas_inside_the_picture(detector, picture):
+    eye = ZoomEye(detector)
+    view = eye.open(picture)
+    fixations = torch.tensor([[640.0 - 64 + 8 - 0.5, 335.5, 1.0], [60.0, 60.0, 1.0], [511.5, 383.5, 0.125]])
+    seen = eye.glance(view, fixations)
+    _, frames = eye.glimpse(view, fixations)
+    wide, high = view.picture.size
+    for number, (x1, y1, x2, y2, u1, _, u2, _) in enumerate(frames.tolist()):
+        slack = BORDER * (x2 - x1) / (u2 - u1) + 1e-3
+        for (a, b, c, d), kept, cut in zip(
+            seen.detections.boxes[number].tolist(), seen.detections.mask[number], seen.cut[number], strict=True
+        ):
+            left, top, right, bottom = x1 and a <= x1 + slack, y1 and b <= y1 + slack, c >= x2 - slack, d >= y2 - slack
+            assert bool(cut) == bool(kept and (left or top or (right and x2 < wide) or (bottom and y2 < high)))
+    assert 0 < int(seen.cut.sum()) < int(seen.detections.count.sum())
 
 
 def test_settings_include_the_treatment_of_cut_boxes(detector):

@@ -1,0 +1,132 @@
+"""Searches that verify their target by closer looks, and the choice of the threshold of their decisions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from semfov.belief.observers import Target
+from semfov.belief.target_evidence import TargetEvidence, Thresholds
+from semfov.belief.verification import Verification
+from semfov.decision import conclude, decide
+from semfov.episode import Step
+from semfov.experiments.progress import track
+from semfov.training.closer_looks import Photograph, Sought, search
+from semfov.training.verification_settings import FitVerificationConfig
+from semfov.verifier import Verifier, surely
+
+LEVELS = tuple(number / 100 for number in range(50, 100))
+"""Values from which the threshold `confirm` is chosen."""
+
+Ended = tuple[bool | None, int]
+"""End of a search: whether the place that it found is right (None: not found), and the number of looks until then."""
+
+
+@dataclass(frozen=True)
+class Verified:
+    """A search in which all closer looks were made, whatever they showed.
+
+    Attributes:
+        photograph: number of the photograph.
+        present: whether the photograph holds the target.
+        spare: whether the search only serves to choose thresholds.
+        places: for each closer look, the probability that the target is there, and whether it is.
+        ends: for each closer look, the number of looks of both kinds that were made up to it.
+        presence: probability that the image holds the target, at the end.
+        looks: number of looks of both kinds.
+        unverified: end of the same search without closer looks, by the thresholds of the target evidence.
+    """
+
+    photograph: int
+    present: bool
+    spare: bool
+    places: tuple[tuple[float, bool], ...]
+    ends: tuple[int, ...]
+    presence: float
+    looks: int
+    unverified: Ended
+
+    def found(self, confirm: float) -> Ended:
+        """Return the end of the search at a threshold."""
+        for (place, right), end in zip(self.places, self.ends, strict=True):
+            if place >= surely(confirm):
+                return right, end
+        place, right = max(self.places, default=(0.0, False))
+        return (right if place >= confirm else None), self.looks
+
+
+def verify(
+    seen: Sequence[Photograph], folds: Sequence[Verification], evidence: TargetEvidence, config: FitVerificationConfig
+) -> Iterator[Verified]:
+    """Search every photograph with the model that was not fitted to it, and make all closer looks.
+
+    Args:
+        seen: the photographs.
+        folds: for each fold, the model fitted to the others.
+        evidence: the target evidence.
+        config: the settings.
+
+    Yields:
+        The searches.
+    """
+    always, observer = Thresholds(1.0, config.give_up, config.place), Target(evidence)
+    for photograph in track(seen, "verifying", "photograph"):
+        model = folds[photograph.number % config.folds]
+        for sought in photograph.sought:
+            # Decisions do not move the gaze, so all of them are made along the same looks.
+            steps = list(search(photograph, sought, observer, config.looks))
+            verifier = Verifier(model, photograph.close_up, photograph.grid, sought.target, always)
+            end = next((number for number, step in enumerate(steps, 1) if int(verifier(step))), len(steps))
+            decision = verifier.conclude(steps[end - 1])
+            places = tuple((look.place, bool(sought.goal[look.cell])) for look in verifier.looks)
+            yield Verified(
+                photograph=photograph.number,
+                present=sought.present,
+                spare=sought.spare,
+                places=places,
+                ends=tuple(look.fixation + 1 + number for number, look in enumerate(verifier.looks, 1)),
+                presence=decision.probability,
+                looks=end + len(verifier.looks),
+                unverified=unverified(steps, photograph, sought, evidence.thresholds),
+            )
+        photograph.close()
+
+
+def unverified(steps: Sequence[Step], photograph: Photograph, sought: Sought, thresholds: Thresholds | None) -> Ended:
+    """Decide along the looks of a search by the belief alone; nothing is found without thresholds.
+
+    Args:
+        steps: all steps of the search.
+        photograph: the photograph.
+        sought: the class that is searched for.
+        thresholds: thresholds of the target evidence.
+
+    Returns:
+        The end of the search.
+    """
+    for number, step in enumerate(steps if thresholds is not None else (), 1):
+        assert thresholds is not None
+        outcome = int(decide(step, sought.target, thresholds))
+        if outcome:
+            shown = [each.detections for each in steps[:number]]
+            cell = conclude(outcome, step.belief, shown, photograph.grid, sought.target).cell
+            return (None if cell is None else bool(sought.goal[cell])), number
+    return None, len(steps)
+
+
+def choose_confirm(searches: Sequence[Verified], false_alarms: float, surest: float = LEVELS[-1]) -> float:
+    """Choose the least threshold at which few enough absent targets are found.
+
+    Args:
+        searches: the searches.
+        false_alarms: maximum share of absent targets that may be found.
+        surest: upper limit of the threshold.
+
+    Returns:
+        The threshold, from `LEVELS`; `surest` if no smaller one suffices.
+    """
+    absent = [each for each in searches if not each.present]
+    for confirm in LEVELS:
+        if sum(each.found(confirm)[0] is not None for each in absent) <= false_alarms * len(absent):
+            return min(confirm, surest)
+    return surest

@@ -1,0 +1,379 @@
+"""Closer looks in a stream: they take frames of their own, their verdicts fade, and a still picture is a search."""
+
+import math
+from itertools import pairwise
+from types import SimpleNamespace
+
+import pytest
+import torch
+from scipy.ndimage import find_objects, label
+
+from semfov import ActivePerception, Detections, Eye, Foveation
+from semfov.belief import Verification
+from semfov.belief.observers import Semantic
+from semfov.belief.target_evidence import Thresholds
+from semfov.detection import Candidates, Detector
+from semfov.episode import Forgetting
+from semfov.errors import InputError
+from semfov.gaze.policies import NonPredictive, Random
+from semfov.live_verifier import LiveVerifier
+from tests.test_decision import Scripted
+from tests.test_verifier import AT, GRID, Closer, Told, box_of, look, step
+
+SURE, GREY = 0.9, torch.full((3, 120, 160), 0.4)
+
+
+class Spots(Detector):
+    """Detects each red spot; the score for red (class 1) is its largest contrast, the rest is that for green."""
+
+    def __init__(self) -> None:
+        super().__init__("spots", ("red", "green"), (160, 120))
+
+    def propose(self, canvas):
+        red = (canvas[0, 0] - canvas[0, 1]).cpu()
+        places = find_objects(label((red > 0.1).numpy())[0])
+        if not places:
+            return Candidates(canvas.new_zeros(1, 0, 4), canvas.new_zeros(1, 0, 2))
+        boxes = [[float(x.start), float(y.start), float(x.stop), float(y.stop)] for y, x in places]
+        scores = [min(float(red[place].max()), 0.95) for place in places]
+        return Candidates(canvas.new_tensor([boxes]), canvas.new_tensor([[[s, 0.95 - s] for s in scores]]))
+
+
+class FromScore(Verification):
+    """The probability of the place, and of presence, is the score of the target in the closer look."""
+
+    def forward(self, features):
+        return torch.stack([features[..., 6], features[..., 6]], -1)
+
+
+class Lasting(Scripted):
+    """Scripted beliefs that no forgetting changes."""
+
+    def fade(self, belief, look, keep, visited):
+        return belief
+
+
+def spots(*cells, contrast=0.8):
+    """A picture with a red spot in some cells."""
+    picture = GREY.clone()
+    for cell in cells:
+        row, column = divmod(cell, 4)
+        picture[0, row * 40 + 10 : row * 40 + 30, column * 40 + 10 : column * 40 + 30] = 0.1 + contrast
+        picture[1:, row * 40 + 10 : row * 40 + 30, column * 40 + 10 : column * 40 + 30] = 0.1
+    return picture
+
+
+def agent(observer, thresholds=AT, verification=True):
+    eye = Eye(Foveation(60.0), Spots(), reference=160.0)
+    model = FromScore(thresholds=thresholds) if verification else None
+    search, explore = (observer, NonPredictive()), (Semantic(3), Random())
+    return ActivePerception(eye, search, explore, verification=model, grid=(4, 3)).eval()
+
+
+def script(seed, length=12):
+    """Random beliefs, most cells of which are improbable."""
+    generator = torch.Generator().manual_seed(seed)
+    chances = torch.rand(length, 12, generator=generator) ** 3 * (0.25 if seed % 4 == 3 else 0.9)
+    return [(each.tolist(), float(each.max())) for each in chances]
+
+
+def test_a_still_picture_at_rate_zero_is_searched_frame_by_frame(one_thread):
+    """The same looks, closer looks and decision, to the bit; only a place below `surely` is found earlier."""
+    ways = set()
+    for seed in range(12):
+        picture = spots(0, 5, 7, 10, contrast=(0.9, 0.72, 0.3)[seed % 3])
+        searched = agent(Scripted(*script(seed))).search(picture, "red", seed=seed, closer=3)
+        live = agent(Lasting(*script(seed))).live("red", rate=0, seed=seed, closer=3)
+        moments = [live.step(picture) for _ in range(len(searched.cells) + len(searched.closer))]
+        assert [each.number for each in moments] == list(range(len(moments)))
+        plain = [each for each in moments if each.closer is None]
+        assert [each.cell for each in plain] == searched.cells.tolist()
+        for moment, seen in zip(plain, searched.detections, strict=True):
+            assert torch.equal(moment.detections.boxes, seen.boxes)
+        closely = [each.closer for each in moments if each.closer is not None]
+        for one, other in zip(closely, searched.closer, strict=True):
+            assert torch.equal(one.box, other.box)
+            assert vars(one) | {"box": None} == vars(other) | {"box": None}
+        for before, after in pairwise(moments):
+            assert after.cell == before.next_cell
+        assert searched.ending == "decision"
+        got, expected = moments[-1].decision, searched.decision
+        assert vars(got) | {"box": None} == vars(expected) | {"box": None}
+        assert expected.box is None or torch.equal(got.box, expected.box)
+        for moment in moments[:-1]:
+            if moment.decision.outcome == "found":
+                assert 0.7 <= moment.decision.place < 0.85
+            else:
+                assert moment.decision.outcome == "undecided"
+        ways.add((expected.outcome, bool(searched.closer)))
+    assert ways == {("found", True), ("absent", True), ("absent", False), ("undecided", True)}
+
+
+def test_a_closer_look_takes_the_frame_of_a_look():
+    """The detector runs once in each frame; the closer look is at the frame itself, and the gaze goes on after it."""
+    chances = [0.02] * 12
+    chances[5] = 0.6
+    made = agent(Lasting((chances, 0.9)))
+    passes, propose = [], made.eye.detector.propose
+    made.eye.detector.propose = lambda canvas: passes.append(1) or propose(canvas)
+    live = made.live("red", rate=0.1, start=5)
+    first = live.step(spots(5, contrast=0.9))
+    assert (first.cell, first.next_cell, first.closer) == (5, 5, None)
+    assert first.decision.outcome == "undecided"
+    moved = torch.roll(spots(5, contrast=0.9), 6, -1)
+    moment = live.step(moved)
+    assert moment.cell == 5
+    torch.testing.assert_close(moment.closer.box, torch.tensor([56.0, 50, 76, 70]), atol=1.5, rtol=0)
+    torch.testing.assert_close(moment.detections.boxes[0, 0], moment.closer.box)
+    assert (moment.decision.outcome, moment.decision.cell) == ("found", 5)
+    assert moment.decision.place == moment.closer.place > 0.75
+    assert torch.equal(moment.decision.box, moment.closer.box)
+    assert moment.belief is first.belief
+    assert set(moment.seconds) == {"detect"}
+    after = live.step(moved)
+    assert after.closer is None
+    assert after.cell != 5
+    assert after.cell == moment.next_cell
+    assert after.decision.outcome == "found"
+    assert len(passes) == 3
+
+
+class Counted(Semantic):
+    """The paper's belief, with thresholds."""
+
+    thresholds = Thresholds(0.9, 0.01)
+
+
+def test_evidence_fades_in_the_frame_of_a_closer_look_too():
+    """β − β₀ is multiplied by e^(−2r) from a look to the next one if a closer look was in between."""
+    live = agent(Counted(3, prior=0.25), Thresholds(0.99, 0.01, 0.3)).live("red", rate=0.2, start=5)
+    first = live.step(spots(5))
+    assert first.next_cell == 5
+    assert live.step(GREY).closer is not None
+    after = live.step(GREY)
+    torch.testing.assert_close(after.belief.beta - 0.25, math.exp(-0.4) * (first.belief.beta - 0.25))
+    again = live.step(GREY)
+    torch.testing.assert_close(again.belief.beta - 0.25, math.exp(-0.6) * (first.belief.beta - 0.25))
+    # Inhibition of return counts frames, too: 3.47 of them.
+    assert [moment.visited[5] for moment in (after, again, live.step(GREY))] == [True, True, False]
+
+
+def verifier(scores, rate, **options):
+    closer = Closer(scores)
+    return LiveVerifier(Told(), GRID, 1, Forgetting(rate), AT, **options), closer
+
+
+def faded(told, here, weight):
+    """The mean of log odds, written out."""
+    mean = weight * math.log(told / (1 - told)) + (1 - weight) * math.log(here / (1 - here))
+    return 1 / (1 + math.exp(-mean))
+
+
+def test_the_verdict_fades_towards_the_belief():
+    rate = 0.1
+    judge, closer = verifier({5: SURE}, rate)
+    judge.see(step(0, {5: 0.6}, [5], 0.5, look(5)))
+    judge.wait()
+    told = judge.look(step(0, {5: 0.6}, [5], 0.5), closer)
+    assert (told.place, told.presence) == (pytest.approx(0.9), pytest.approx(0.45, abs=0.5))
+    assert judge.decision(step(0, {5: 0.6}, [5], 0.5)).place == told.place
+    for age in range(1, 12):
+        now = step(age, {5: 0.3}, [5], 0.2)
+        judge.wait()
+        judge.see(now)
+        place = faded(told.place, 0.3, math.exp(-rate * age))
+        decision = judge.decision(now)
+        presence = faded(told.presence, 0.2, math.exp(-rate * age)) if age < math.log(2) / rate else 0.2
+        assert (decision.outcome == "found") == (place >= 0.7)
+        assert decision.place == (pytest.approx(place, abs=1e-5) if place >= 0.7 else None)
+        assert decision.probability == pytest.approx(max(presence, place if place >= 0.7 else 0), abs=1e-5)
+    assert place < 0.7
+
+
+def test_a_found_target_is_followed_in_a_scene_that_changes():
+    """Box and cell follow the detections; without forgetting, and without a detection, they stay."""
+    for rate in (0.05, 0.0):
+        judge, closer = verifier({5: SURE}, rate)
+        judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
+        judge.wait()
+        judge.look(step(0, {5: 0.6}, [5], 0.9), closer)
+        box = torch.tensor(box_of(5))
+        for shift in (8.0, 16.0, 24.0, 32.0):
+            judge.wait()
+            # The detection is larger than the closer look's box, and a better one shows another class.
+            wide = box + torch.tensor([shift - 3, -3.0, shift + 3, 3.0])
+            other = box + torch.tensor([shift + 2, 0.0, shift + 2, 0.0])
+            scores = torch.tensor([[[0.2, 0.8, 0.0], [0.0, 0.1, 0.9]]])
+            now = step(
+                1,
+                {5: 0.6, 6: 0.6},
+                [5],
+                0.9,
+                Detections(torch.stack([wide, other])[None], scores, torch.ones(1, 2).bool()),
+            )
+            judge.see(now)
+        decision = judge.decision(now)
+        expected = box + (torch.tensor([32.0, 0.0, 32.0, 0.0]) if rate else 0.0)
+        torch.testing.assert_close(decision.box, expected)
+        assert decision.cell == (6 if rate else 5)
+        judge.wait()
+        judge.see(step(2, {5: 0.6, 6: 0.6}, [5], 0.9, look(11)))
+        torch.testing.assert_close(judge.decision(now).box, expected)
+
+
+def test_a_belief_that_rises_does_not_find_a_place_that_was_dismissed():
+    judge, closer = verifier({5: 0.4}, 0.1)
+    judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
+    judge.wait()
+    judge.look(step(0, {5: 0.6}, [5], 0.9), closer)
+    for number in range(1, 20):
+        judge.wait()
+        now = step(number, {5: 0.99}, [0], 0.99)
+        judge.see(now)
+        assert judge.decision(now).outcome != "found"
+    assert not judge.verdicts
+
+
+@pytest.mark.parametrize(("rate", "free"), [(0.1, 7), (0.3, 3), (0.0, None)])
+def test_a_place_may_be_examined_again_when_half_of_the_verdict_is_left(rate, free):
+    """ln 2 / 0.1 = 6.9 frames and ln 2 / 0.3 = 2.3 frames; without forgetting never."""
+    judge, closer = verifier({5: 0.4}, rate)
+    examined = []
+    for number in range(20):
+        judge.wait()
+        now = step(number, {5: 0.6}, [5], 0.9, look(5))
+        if judge.candidate is None:
+            judge.see(now)
+        else:
+            judge.look(now, closer)
+            examined.append(number)
+    assert examined[0] == 1
+    # The place is free in this frame, which is a look; the frame after it is a closer look.
+    gaps = {after - before for before, after in pairwise(examined)}
+    assert gaps == (set() if free is None else {free + 1})
+    assert len(judge.verdicts) <= 2
+
+
+def test_a_new_verdict_replaces_the_old_one_of_the_same_place():
+    judge, closer = verifier({5: SURE}, 0.3)
+    judge.see(step(0, {5: 0.6}, [5], 0.9, look(5)))
+    judge.wait()
+    judge.look(step(0, {5: 0.6}, [5], 0.9), closer)
+    closer.scores[5] = 0.4
+    for number in range(1, 4):
+        judge.wait()
+        now = step(number, {5: 0.95}, [5], 0.9, look(5))
+        judge.see(now)
+        assert judge.decision(now).outcome == "found"
+    judge.wait()
+    judge.look(now, closer)
+    assert judge.decision(now).outcome != "found"
+    assert [each.look.place for each in judge.verdicts] == [pytest.approx(0.4)]
+
+
+def test_closer_looks_are_as_many_as_allowed_until_half_of_the_evidence_is_forgotten():
+    for most in (1, 2):
+        judge, closer = verifier(dict.fromkeys(range(12), 0.3), 0.1, most=most)
+        closely = []
+        for number in range(60):
+            judge.wait()
+            now = step(number, dict.fromkeys(range(12), 0.6), range(12), 0.9, look(*range(12)))
+            closely.append(judge.candidate is not None)
+            if judge.candidate is None:
+                judge.see(now)
+            else:
+                judge.look(now, closer)
+        # A closer look counts for 6 frames after its own.
+        assert max(sum(closely[begin : begin + 7]) for begin in range(54)) == most
+        assert sum(closely) >= 6 * most
+
+
+def test_no_other_place_is_examined_while_one_is_surely_known():
+    judge, closer = verifier({5: SURE, 7: 0.8}, 0.1)
+    both = step(0, {5: 0.6, 7: 0.6}, [5, 7], 0.9, look(5, 7))
+    judge.see(both)
+    judge.wait()
+    judge.look(both, closer)
+    assert judge.candidate is None
+    less, other = verifier({5: 0.8, 7: 0.75}, 0.1)
+    less.see(both)
+    less.wait()
+    less.look(both, other)
+    assert less.candidate is not None
+    less.wait()
+    less.look(both, other)
+    assert less.decision(both).cell == 5
+
+
+def test_recent_detections_count_more_as_evidence():
+    """Two places, equally probable: the one that was seen later is examined, unless nothing is forgotten."""
+    for rate, cell in ((0.2, 7), (0.0, 5)):
+        judge, _ = verifier({}, rate)
+        judge.see(step(0, {5: 0.6, 7: 0.6}, [0], 0.9, look(5, score=0.8)))
+        judge.wait()
+        judge.see(step(1, {5: 0.6, 7: 0.6}, [5, 7], 0.9, look(7, score=0.75)))
+        assert judge.candidate.cell == cell
+        assert judge.candidate.evidence == pytest.approx(0.75 if cell == 7 else 0.8)
+        assert judge.candidate.box.tolist() == box_of(cell)
+
+
+def test_without_closer_looks_the_belief_decides_as_before(one_thread):
+    """`closer=0`, no model, a model without thresholds and an exploration: no closer look, and the same to the bit."""
+    pictures = [torch.roll(spots(5, 10), 5 * shift, -1) for shift in range(10)]
+
+    def watch(made, **options):
+        live = made.live("red", rate=0.1, start=3, **options)
+        return [live.step(picture) for picture in pictures]
+
+    plain = watch(agent(Counted(3), verification=False))
+    for others in (watch(agent(Counted(3)), closer=0), watch(agent(Counted(3), thresholds=None))):
+        for one, other in zip(plain, others, strict=True):
+            assert other.closer is None
+            assert (one.cell, one.next_cell, one.number) == (other.cell, other.next_cell, other.number)
+            assert torch.equal(one.belief.beta, other.belief.beta)
+            assert torch.equal(one.detections.scores, other.detections.scores)
+            assert (one.decision.outcome, one.decision.probability, one.decision.cell, one.decision.place) == (
+                other.decision.outcome,
+                other.decision.probability,
+                other.decision.cell,
+                None,
+            )
+    assert any(each.closer is not None for each in watch(agent(Counted(3))))
+    exploring = agent(Counted(3)).live()
+    assert [exploring.step(picture).closer for picture in pictures] == [None] * 10
+    for wrong in (-1, 101, 0.5):
+        with pytest.raises(InputError, match="closer: expected a whole number from 0 to 100"):
+            agent(Counted(3)).live("red", closer=wrong)
+
+
+def test_thresholds_are_those_of_the_verification_unless_given():
+    """A belief that fades gives up at its own threshold, since it stays less certain than in a search."""
+    assert agent(Counted(3)).live("red", rate=0).thresholds == AT
+    assert agent(Counted(3)).live("red").thresholds == Thresholds(AT.confirm, Counted.thresholds.give_up, AT.place)
+    assert agent(Counted(3)).live("red", confirm=0.99, give_up=0.5).thresholds == Thresholds(0.99, 0.5, AT.place)
+    assert agent(Counted(3)).live("red", closer=0).thresholds == Counted.thresholds
+
+
+def test_examined_places_are_worth_a_frame_also_when_no_cell_is_worth_a_look():
+    judge, closer = verifier({9: 0.95}, 0.1)
+    now = step(0, {9: 0.4}, [0], 0.6, look(9))
+    now = SimpleNamespace(**{**vars(now), "visited": torch.ones(1, 12, dtype=torch.bool)})
+    judge.see(now)
+    assert judge.candidate.cell == 9
+    assert judge.decision(now).outcome == "undecided"
+    judge.wait()
+    judge.look(now, closer)
+    assert judge.decision(now).cell == 9
+
+
+def test_absent_is_said_when_no_cell_is_worth_a_look_and_no_place_is_left():
+    judge, _ = verifier({}, 0.1)
+    for cells, presence, outcome in (
+        ({9: 0.2}, 0.2, "undecided"),
+        ({}, 0.2, "absent"),
+        ({}, 0.6, "undecided"),
+    ):
+        judge.wait()
+        now = step(0, cells, [0], presence, Detections.empty(1, 3))
+        judge.see(now)
+        assert judge.decision(now).outcome == outcome
