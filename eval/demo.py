@@ -94,8 +94,8 @@ class DemoConfig(Settings):
         rate: rate at which the belief about a video or camera fades from frame to frame (0: never).
         report: HTML file to write: a page in which to step through the episodes, or through the looks at large
             pictures.
-        draw: figures to draw: `scanpath`, `views` (the foveated views), `belief` (in an exploration: the map of what is
-            where), `belief_bars` and `animation`; `[]` draws nothing.
+        draw: figures to draw: `scanpath` (of a large picture: its windows), `views` (the foveated views), `belief` (in
+            an exploration: the map of what is where), `belief_bars` and `animation`; `[]` draws nothing.
         out: folder for pictures and animations.
     """
 
@@ -156,8 +156,9 @@ def demo(config: DemoConfig) -> None:
             folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
             only_likeliest(wanted)
             zoomed, passes = zoom_in(zooming, picture, config)
-            small = reduced(picture.image).clamp(0, 1)
-            written.append(viz.save_figure(viz.plot_zoom_path(zoomed, small), folder / "zoom.png"))
+            if "scanpath" in config.draw:
+                small = reduced(picture.image).clamp(0, 1)
+                written.append(viz.save_figure(viz.plot_zoom_path(zoomed, small), folder / "zoom.png"))
             if config.report is not None:
                 given = {"settings": zooming.eye.settings(), "passes": passes}
                 episodes.append(zoom_data(zoomed, picture.image, pool, name=picture.name, **given))

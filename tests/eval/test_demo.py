@@ -155,6 +155,10 @@ def test_a_large_picture_is_looked_at_in_windows(run, large, shipped_evidence, t
     assert "in 4 passes" in printed.out
     code, printed = run(large, "--explore", "--until", 1000)
     assert "in 1 pass\n" in printed.out
+    (tmp_path / "out" / "zoom.png").unlink()
+    code, printed = run(large, "--target", "red", "--draw", "[]")
+    assert code == 0
+    assert not (tmp_path / "out" / "zoom.png").exists()
 
 
 def test_a_folder_may_have_small_and_large_pictures(run, photo, large, shipped_evidence, tmp_path):
