@@ -25,6 +25,27 @@ _PLAIN = ("RGB", "L", "CMYK", "YCbCr")  # modes of 8 bits without transparency
 _STRIP = 1 << 24  # pixels of a strip that is read at once for a reduced view
 
 
+_KEPT = 2  # pixels that a reduced window keeps for each wanted pixel, so that antialiasing still works
+
+
+def reduction_for(ratio: int) -> int:
+    """Largest factor by which `LargePicture.read` may reduce a window that is resampled afterwards.
+
+    Args:
+        ratio: pixels of the window for each wanted pixel, along the side where they are fewest.
+
+    Returns:
+        A power of two.
+
+    >>> [reduction_for(ratio) for ratio in (0, 3, 4, 9, 16)]
+    [1, 1, 2, 4, 8]
+    """
+    reduction = 1
+    while ratio >= 2 * _KEPT * reduction:
+        reduction *= 2
+    return reduction
+
+
 class LargePicture(ABC):
     """Base of 8-bit pictures that are read window by window.
 

@@ -7,7 +7,7 @@ import torch
 
 from semfov.detection.detections import Detections
 from semfov.experiments.looks import SOURCES, one_thread
-from semfov.experiments.store import SceneStore, pack, tight, unpack
+from semfov.experiments.store import SceneStore, pack, tight, unpack_each
 from semfov.head.episode import Detect
 from semfov.io.code import modules_digest
 from semfov.io.schema import Field, Schema
@@ -37,10 +37,8 @@ class HeadStore(SceneStore):
     def load(self, digest: str) -> dict[int, Detections]:
         """The stored looks at a scene; empty if they are missing or incomplete."""
         tensors = self.read(digest)
-        if tensors is None or int(tensors["count"].sum()) != len(tensors["boxes"]):
-            return {}
-        seen = unpack({name: tensors[name] for name in ("boxes", "scores", "count")})
-        return {action: tight(seen[n : n + 1]) for n, action in enumerate(tensors["actions"].tolist())}
+        looks = None if tensors is None else unpack_each(tensors)
+        return {} if tensors is None or looks is None else dict(zip(tensors["actions"].tolist(), looks, strict=True))
 
     def save(self, digest: str, looks: Mapping[int, Detections]) -> None:
         """Store the looks at a scene."""

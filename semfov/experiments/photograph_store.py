@@ -6,9 +6,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from semfov.belief.grid import Grid
 from semfov.detection.detections import Detections
-from semfov.experiments.store import SceneStore, looks_digest, pack, tight, unpack
+from semfov.experiments.store import SceneStore, grid_settings, looks_digest, pack, unpack_each
 from semfov.io.schema import Field, Schema
 
 Box = tuple[float, ...]
@@ -26,8 +25,7 @@ class PhotographStore(SceneStore):
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, object], columns: int, rows: int, classes: int) -> None:
-        # The cell centres in a picture of odd size identify the way in which a grid is laid out.
-        what = {"settings": settings, "centres": Grid(columns, rows, (641, 479)).centres.tolist()}
+        what = {"settings": settings, **grid_settings(columns, rows)}
         schema = Schema(
             {
                 "cells": Field(("N",), torch.int64, low=0),
@@ -49,14 +47,12 @@ class PhotographStore(SceneStore):
             The looks by cell, and the closer looks by examined box; empty if they are missing or incomplete.
         """
         tensors = self.read(digest)
-        if tensors is None:
+        looks = None if tensors is None else unpack_each(tensors)
+        if tensors is None or looks is None:
             return {}, {}
         cells, examined = tensors["cells"].tolist(), tensors["examined"].tolist()
-        count = tensors["count"]
-        if len(count) != len(cells) + len(examined) or int(count.sum()) != len(tensors["boxes"]):
+        if len(looks) != len(cells) + len(examined):
             return {}, {}
-        seen = unpack({name: tensors[name] for name in ("boxes", "scores", "count")})
-        looks = [tight(seen[number : number + 1]) for number in range(len(count))]
         closer = zip(map(tuple, examined), looks[len(cells) :], strict=True)
         return dict(zip(cells, looks[: len(cells)], strict=True)), dict(closer)
 

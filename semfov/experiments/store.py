@@ -69,9 +69,7 @@ class DetectionStore(SceneStore):
     def __init__(
         self, folder: Path, settings: Mapping[str, object], columns: int, rows: int, components: int | None = None
     ) -> None:
-        # The cell centres in a picture of odd size identify the way in which a grid is laid out.
-        centres = Grid(columns, rows, (641, 479)).centres.tolist()
-        what = {"settings": settings, "grid": [columns, rows], "centres": centres}
+        what = {"settings": settings, **grid_settings(columns, rows)}
         schema = Schema(
             {
                 "boxes": Field(("M", 4)),
@@ -91,6 +89,12 @@ class DetectionStore(SceneStore):
     def save(self, digest: str, detections: Detections) -> None:
         """Store the detections of a scene."""
         self.write(digest, pack(detections))
+
+
+def grid_settings(columns: int, rows: int) -> dict[str, object]:
+    """Settings of a grid on which looks from its cells depend."""
+    # The cell centres in a picture of odd size identify the way in which a grid is laid out.
+    return {"grid": [columns, rows], "centres": Grid(columns, rows, (641, 479)).centres.tolist()}
 
 
 def versions() -> dict[str, object]:
@@ -138,6 +142,14 @@ def unpack(tensors: dict[str, Tensor]) -> Detections:
     scores = tensors["scores"].new_zeros(*mask.shape, tensors["scores"].shape[-1])
     boxes[mask], scores[mask] = tensors["boxes"], tensors["scores"]
     return Detections(boxes, scores, mask)
+
+
+def unpack_each(tensors: dict[str, Tensor]) -> list[Detections] | None:
+    """Convert the tensors of `pack` back to batches of one without padding; None if they are incomplete."""
+    if int(tensors["count"].sum()) != len(tensors["boxes"]):
+        return None
+    seen = unpack(tensors)
+    return [tight(seen[number : number + 1]) for number in range(len(tensors["count"]))]
 
 
 def tight(look: Detections) -> Detections:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from semfov.data.inputs import ImageLike
-from semfov.data.large import LargePicture, open_large
+from semfov.data.large import LargePicture, open_large, reduction_for
 from semfov.errors import check, check_whole
 from semfov.report.episode import Data, Pool, rounded, tagged
 from semfov.zoom.agent import MOST
@@ -199,7 +199,4 @@ def _whole_pixels(box: tuple[float, float, float, float], size: tuple[int, int])
 
 def _pixels(source: LargePicture, frame: Frame, across: int) -> Any:
     """Pixels `(3, h, w)` of a window in [0, 1]; very large windows are read at a coarser resolution."""
-    reduction = 1
-    while (frame[2] - frame[0]) // across >= 4 * reduction:
-        reduction *= 2
-    return source.read(frame, reduction).float() / 255
+    return source.read(frame, reduction_for((frame[2] - frame[0]) // across)).float() / 255

@@ -57,7 +57,7 @@ class Photograph:
         grid: the cells.
         sought: the classes to search for.
         store: store of all looks; None keeps them in memory.
-        stored: gives the detections from every cell of a photograph by its index; None looks with the eye.
+        everywhere: gives the detections from every cell of a photograph by its index; None looks with the eye.
     """
 
     def __init__(
@@ -69,17 +69,17 @@ class Photograph:
         grid: Grid,
         sought: tuple[Sought, ...],
         store: PhotographStore | None = None,
-        stored: Callable[[int], Detections] | None = None,
+        everywhere: Callable[[int], Detections] | None = None,
     ) -> None:
         self.eye, self.scenes, self.index, self.number = eye, scenes, index, number
-        self.grid, self.sought, self.store, self.stored = grid, sought, store, stored
+        self.grid, self.sought, self.store, self.everywhere = grid, sought, store, everywhere
         self.seen: dict[int, Detections] = {}
         self._closely = CloseUps(eye, lambda: self.image)
         # Number of looks in the store; None as long as it was not read.
         self._known: int | None = None
         self._image: Tensor | None = None
         self._view: View | None = None
-        self._everywhere: Detections | None = None
+        self._from_cells: Detections | None = None
 
     @property
     def image(self) -> Tensor:
@@ -90,7 +90,7 @@ class Photograph:
 
     def close(self) -> None:
         """Store new looks, and free the pixels and the stored looks; a later look reads them again."""
-        self._image = self._view = self._everywhere = None
+        self._image = self._view = self._from_cells = None
         if self.store is None or self._known is None:
             return
         if len(self.seen) + len(self._closely.seen) > self._known:
@@ -113,9 +113,9 @@ class Photograph:
         Returns:
             The detections, a batch of one.
         """
-        if self.stored is not None:
-            self._everywhere = self.stored(self.index) if self._everywhere is None else self._everywhere
-            return self._everywhere[cell : cell + 1]
+        if self.everywhere is not None:
+            self._from_cells = self.everywhere(self.index) if self._from_cells is None else self._from_cells
+            return self._from_cells[cell : cell + 1]
         self._recall()
         if cell not in self.seen:
             with one_thread(), torch.inference_mode():
@@ -159,7 +159,7 @@ def photographs(
     seed: int,
     store: PhotographStore | None = None,
     spare: int = 0,
-    stored: Callable[[int], Detections] | None = None,
+    everywhere: Callable[[int], Detections] | None = None,
 ) -> list[Photograph]:
     """Draw classes to search for in photographs.
 
@@ -174,7 +174,7 @@ def photographs(
         seed: seed of the classes and of the first fixations.
         store: store of all looks; None keeps them in memory.
         spare: maximum number of further absent classes, which only serve to choose thresholds (`Sought.spare`).
-        stored: gives the detections from every cell of a photograph by its index; None looks with the eye.
+        everywhere: gives the detections from every cell of a photograph by its index; None looks with the eye.
 
     Returns:
         The photographs with classes to search for.
@@ -199,7 +199,7 @@ def photographs(
             for number, target in enumerate(wide)
         )
         if targets:
-            found.append(Photograph(eye, scenes, index, len(found), grid, sought, store, stored))
+            found.append(Photograph(eye, scenes, index, len(found), grid, sought, store, everywhere))
     return found
 
 

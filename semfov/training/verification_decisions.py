@@ -104,8 +104,9 @@ def unverified(steps: Sequence[Step], photograph: Photograph, sought: Sought, th
     Returns:
         The end of the search.
     """
-    for number, step in enumerate(steps if thresholds is not None else (), 1):
-        assert thresholds is not None
+    if thresholds is None:
+        return None, len(steps)
+    for number, step in enumerate(steps, 1):
         outcome = int(decide(step, sought.target, thresholds))
         if outcome:
             shown = [each.detections for each in steps[:number]]

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.data.inputs import ImageLike
-from semfov.data.large import LargePicture, open_large
+from semfov.data.large import LargePicture, open_large, reduction_for
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.selection import Selection, select_several
@@ -26,7 +26,6 @@ Frame = tuple[int, int, int, int, int, int, int, int]
 HINTS = Selection(threshold=0.002, iou=0.95, limit=300)
 """Selection of hints: candidates that are too weak to be detections, but show where a closer look pays."""
 
-_REDUCE = 2  # a window is reduced in the source as long as it keeps this many pixels for each canvas pixel
 BORDER = 2.0
 """A box this near to the border of its window, in canvas pixels, counts as cut by it."""
 
@@ -196,9 +195,7 @@ class ZoomEye(nn.Module):
         x, y, magnification = fixation
         x1, x2, u1, u2 = _shown(x, magnification, wide, picture.size[0], left, right)
         y1, y2, v1, v2 = _shown(y, magnification, high, picture.size[1], top, bottom)
-        reduction = 1
-        while min((x2 - x1) // (u2 - u1), (y2 - y1) // (v2 - v1)) >= 2 * _REDUCE * reduction:
-            reduction *= 2
+        reduction = reduction_for(min((x2 - x1) // (u2 - u1), (y2 - y1) // (v2 - v1)))
         pixels = picture.read((x1, y1, x2, y2), reduction)[None]
         if pixels.shape[-2:] != (v2 - v1, u2 - u1):
             # torch takes twice as long where the rows of a window are not adjacent in memory.

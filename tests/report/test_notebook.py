@@ -1,7 +1,6 @@
 """A scanpath in a notebook: the page is shown in a frame, and its size is limited."""
 
 import html
-import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -14,6 +13,7 @@ from semfov.detection import Placement
 from semfov.report import notebook
 from semfov.scanpath import Stimulus
 from semfov.scanpath.stimulus import in_bytes
+from tests.report.pages import data_of
 
 
 class Frame(HTMLParser):
@@ -36,10 +36,6 @@ def with_photograph(scanpath, image):
     placement = Placement((80, 60), (width / 80, height / 60), (0, 0))
     pixels = in_bytes(image)
     return replace(scanpath, stimulus=Stimulus(pixels, pixels, placement, settings))
-
-
-def data_of(page):
-    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)[1])
 
 
 def test_the_frame_contains_the_page(scanpath, image, hostile):

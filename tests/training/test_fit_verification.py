@@ -195,7 +195,7 @@ def test_looks_from_a_store_equal_those_of_the_eye(seen):
         return see_all(eye, scenes[index].image, live[index].grid)
 
     options = {"classes": 2, "absent": None, "max_area": 1.0, "seed": 0}
-    found = photographs(eye, scenes, [0, 1, 2], (4, 3), **options, stored=stored)
+    found = photographs(eye, scenes, [0, 1, 2], (4, 3), **options, everywhere=stored)
     for _ in range(2):
         for one, other in zip(live, found, strict=True):
             for sought in one.sought:

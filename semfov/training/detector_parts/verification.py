@@ -62,7 +62,7 @@ class VerificationFit(PartFit):
             max_area=config.max_target_area,
             seed=config.seed,
             spare=min(20, ABSENT // len(judged)),
-            stored=run.detections,
+            everywhere=run.detections,
         )
         if len(seen) < 2:
             raise DataError(
