@@ -35,11 +35,13 @@ def programs(agent: ZoomAgent, columns: int, rows: int) -> dict[str, tuple[Run, 
 
     def alone(path: ZoomPath) -> Run:
         fixations = torch.tensor([glance.window.fixation for glance in path.glances], dtype=torch.float64)
-        canvases = eye.glimpse(view, fixations)[0]
+        # Bytes, channels last, as the eye passes them on.
+        floats = eye.glimpse(view, fixations)[0]
+        canvases = floats.mul(255).round().to(torch.uint8, memory_format=torch.channels_last)
 
         def run() -> object:
             return [
-                select(detector.propose(canvas[None]), None, detector.selection, detector.background)
+                select(detector.propose_bytes(canvas[None]), None, detector.selection, detector.background)
                 for canvas in canvases
             ]
 

@@ -4,10 +4,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, replace
 
+import torch
 from torch import Tensor, nn
 
 from semfov.detection.detections import Detections
 from semfov.detection.placement import Placement, letterbox
+from semfov.detection.preprocessing import check_bytes
 from semfov.detection.scores import BackgroundPolicy, Candidates
 from semfov.detection.selection import Selection, select
 from semfov.errors import InputError, check, check_pixels, check_whole
@@ -86,6 +88,24 @@ class Detector(nn.Module, ABC):
         Returns:
             The boxes in canvas pixels, with their scores.
         """
+
+    def propose_bytes(self, canvas: Tensor) -> Candidates:
+        """Compute all boxes of the head on a canvas of bytes: `propose(canvas / 255)`.
+
+        A detector that overrides it saves the conversion in between. What a subclass changes in the one it has to
+        change in the other.
+
+        Args:
+            canvas: `(B, 3, H, W)`, RGB, bytes in any order in memory.
+
+        Returns:
+            The boxes in canvas pixels, with their scores.
+
+        Raises:
+            InputError: the canvas has another shape or dtype.
+        """
+        check_bytes(canvas)
+        return self.propose(canvas.to(torch.get_default_dtype(), memory_format=torch.contiguous_format).div_(255))
 
     def fit(self, images: Tensor) -> tuple[Tensor, Placement]:
         """Fit images into the detector's input.

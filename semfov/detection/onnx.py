@@ -101,8 +101,16 @@ class OnnxDetector(Detector):
         check_shape(canvas, "canvas", None, 3, *self.session.shape[2:])
         if not canvas.is_floating_point():
             raise InputError(f"canvas: expected floating-point RGB in [0, 1], got {canvas.dtype}")
-        outputs = self.session(self.preprocessing(canvas.detach()))
-        return self.decode(outputs, (canvas.shape[-1], canvas.shape[-2]))
+        return self._run(self.preprocessing(canvas.detach()))
+
+    def propose_bytes(self, canvas: Tensor) -> Candidates:
+        """Compute all boxes of the head on a canvas of bytes `(B, 3, H, W)`, converted directly to the input."""
+        check_shape(canvas, "canvas", None, 3, *self.session.shape[2:])
+        return self._run(self.preprocessing.of_bytes(canvas))
+
+    def _run(self, image: Tensor) -> Candidates:
+        """Run the network on its input `(B, 3, H, W)`, and decode what it returns."""
+        return self.decode(self.session(image), (image.shape[-1], image.shape[-2]))
 
     def decode(self, outputs: dict[str, Tensor], size: tuple[int, int]) -> Candidates:
         """Decode the outputs of the network, given by name, for a canvas of `(width, height)`."""

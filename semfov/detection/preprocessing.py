@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, Self, get_args
 
+import torch
 from torch import Tensor
 
 from semfov.errors import check, check_shape, lookup
@@ -62,6 +63,33 @@ class Preprocessing:
         shift = canvas.new_tensor([mean / std for mean, std in zip(self.mean, self.std, strict=True)]).view(3, 1, 1)
         return image * factor - shift
 
+    def of_bytes(self, canvas: Tensor) -> Tensor:
+        """Convert a canvas of bytes to the input of the network: `self(canvas / 255)`, in one pass over memory.
+
+        Args:
+            canvas: `(B, 3, H, W)`, RGB, bytes.
+
+        Returns:
+            A new tensor of the same shape, of torch's default dtype.
+
+        Raises:
+            InputError: the canvas has another shape or dtype.
+
+        >>> white = torch.full((1, 3, 1, 1), 255, dtype=torch.uint8)
+        >>> Preprocessing(std=(0.5, 1.0, 2.0)).of_bytes(white).flatten()
+        tensor([2.0000, 1.0000, 0.5000])
+        """
+        check_bytes(canvas)
+        image = torch.empty(canvas.shape, device=canvas.device)
+        order = (2, 1, 0) if self.channels == "bgr" else (0, 1, 2)
+        for plane, source, mean, std in zip(image.unbind(1), order, self.mean, self.std, strict=True):
+            plane.copy_(canvas[:, source])
+            if (factor := self.scale / 255 / std) != 1:
+                plane.mul_(factor)
+            if mean:
+                plane.sub_(mean / std)
+        return image
+
     def merged(self, settings: Mapping[str, Any]) -> Self:
         """Return a copy with some settings replaced; unknown names are refused."""
         for name in settings:
@@ -71,6 +99,12 @@ class Preprocessing:
     def settings(self) -> dict[str, Any]:
         """List all settings as JSON values."""
         return {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self).items()}
+
+
+def check_bytes(canvas: Tensor) -> None:
+    """Raise `InputError` unless a canvas is `(B, 3, H, W)`, bytes."""
+    fits = canvas.ndim == 4 and canvas.shape[1] == 3 and canvas.dtype == torch.uint8
+    check(fits, "canvas", "bytes of shape (B, 3, H, W)", f"{canvas.dtype} of shape {tuple(canvas.shape)}")
 
 
 def _is_number(value: object) -> bool:

@@ -140,13 +140,14 @@ class ZoomEye(nn.Module):
             Detections and hints of each look.
         """
         canvas, frames = self._resample(view, fixations, within)
-        candidates = self.detector.propose(canvas)
+        exact = canvas.dtype == torch.uint8
+        candidates = self.detector.propose_bytes(canvas) if exact else self.detector.propose(canvas / 255)
         wanted = [self.detector.selection, HINTS] if hints else [self.detector.selection]
         selected = select_several(candidates, None, wanted, self.detector.background)
         place = _Placement(frames, view.picture.size, selected[0].boxes)
         detections, *weak = place.to_picture(selected)
         found, cut = self._treat(detections, place.cut(selected[0]))
-        return Seen(found, cut, weak[0] if weak else None, torch.tensor(frames, dtype=canvas.dtype).view(-1, 8)[:, :4])
+        return Seen(found, cut, weak[0] if weak else None, torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)[:, :4])
 
     def glimpse(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None
@@ -166,12 +167,13 @@ class ZoomEye(nn.Module):
             InputError: a fixation is not finite, or its magnification is not positive.
         """
         canvases, frames = self._resample(view, fixations, within)
+        canvases = canvases.to(torch.get_default_dtype(), memory_format=torch.contiguous_format).div_(255)
         return canvases, torch.tensor(frames, dtype=canvases.dtype).view(-1, 8)
 
     def _resample(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None
     ) -> tuple[Tensor, list[Frame]]:
-        """Canvases and frames, as `glimpse` returns them."""
+        """Canvases `(F, 3, h, w)`, RGB from 0 to 255, and frames. They are bytes where the padding is a whole number."""
         if fixations.shape[-1] == 2:
             closest = fixations.new_full((*fixations.shape[:-1], 1), view.lattice.magnifications[-1])
             fixations = torch.cat([fixations, closest], -1)
@@ -180,32 +182,33 @@ class ZoomEye(nn.Module):
         check(all(math.isfinite(n) for row in rows for n in row), "fixations", "finite numbers", rows)
         check(all(row[2] > 0 for row in rows), "fixations", "positive magnifications", [row[2] for row in rows])
         limits = [None] * len(rows) if within is None else within
-        wide, high = self.detector.input_size
-        canvases = torch.empty(len(rows), 3, high, wide)
-        frames = [
-            self._show(canvas, view.picture, row, limit)
-            for canvas, row, limit in zip(canvases.unbind(), rows, limits, strict=True)
-        ]
-        return canvases, frames
+        fill = 255 * float(self.detector.fill)
+        exact = abs(fill - round(fill)) < 1e-6
+        blank = torch.tensor(round(fill), dtype=torch.uint8) if exact else torch.tensor(fill)
+        shown = [self._show(blank, view.picture, row, limit) for row, limit in zip(rows, limits, strict=True)]
+        canvases = [canvas for canvas, _ in shown]
+        return canvases[0] if len(canvases) == 1 else torch.cat(canvases), [frame for _, frame in shown]
 
-    def _show(self, canvas: Tensor, picture: LargePicture, fixation: list[float], limit: Limit | None) -> Frame:
-        """Write one canvas; return its frame."""
+    def _show(
+        self, blank: Tensor, picture: LargePicture, fixation: list[float], limit: Limit | None
+    ) -> tuple[Tensor, Frame]:
+        """One canvas `(1, 3, h, w)` of the dtype of `blank`, a pixel of padding, and its frame."""
         wide, high = self.detector.input_size
         left, top, right, bottom = (0.0, 0.0, math.inf, math.inf) if limit is None else limit
         x, y, magnification = fixation
         x1, x2, u1, u2 = _shown(x, magnification, wide, picture.size[0], left, right)
         y1, y2, v1, v2 = _shown(y, magnification, high, picture.size[1], top, bottom)
         reduction = reduction_for(min((x2 - x1) // (u2 - u1), (y2 - y1) // (v2 - v1)))
-        pixels = picture.read((x1, y1, x2, y2), reduction)[None]
-        if pixels.shape[-2:] != (v2 - v1, u2 - u1):
+        canvas = picture.read((x1, y1, x2, y2), reduction)[None]
+        if canvas.shape[-2:] != (v2 - v1, u2 - u1):
             # torch takes twice as long where the rows of a window are not adjacent in memory.
-            pixels = pixels.contiguous(memory_format=torch.channels_last)
-            pixels = F.interpolate(pixels, (v2 - v1, u2 - u1), mode="bilinear", antialias=True)
+            canvas = canvas.contiguous(memory_format=torch.channels_last)
+            canvas = F.interpolate(canvas, (v2 - v1, u2 - u1), mode="bilinear", antialias=True)
+        canvas = canvas.to(blank.dtype)
         if (u1, v1, u2, v2) != (0, 0, wide, high):
-            canvas.fill_(float(self.detector.fill))
-            canvas = canvas[:, v1:v2, u1:u2]
-        canvas.copy_(pixels[0]).div_(255)
-        return x1, y1, x2, y2, u1, v1, u2, v2
+            pixels, canvas = canvas, blank.expand(1, 3, high, wide).contiguous(memory_format=torch.channels_last)
+            canvas[..., v1:v2, u1:u2] = pixels
+        return canvas, (x1, y1, x2, y2, u1, v1, u2, v2)
 
     def _treat(self, detections: Detections, cut: Tensor) -> tuple[Detections, Tensor]:
         """Treat cut boxes as the eye's setting says; also return which of the resulting boxes are cut."""
