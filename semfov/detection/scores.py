@@ -83,6 +83,12 @@ def score_vectors(candidates: Candidates, policy: BackgroundPolicy = "residual")
     >>> score_vectors(c)
     tensor([[0.5000, 0.3750, 0.1250]])
     """
+    background, classes = shares(candidates, policy)
+    return torch.cat([background[..., None], classes], -1)
+
+
+def shares(candidates: Candidates, policy: BackgroundPolicy) -> tuple[Tensor, Tensor]:
+    """Compute the two parts of `score_vectors`: the background score `(...)` and the scores of the classes `(..., K)`."""
     lookup(policy, get_args(BackgroundPolicy), "background policy")
     classes = candidates.classes
     check_shape(classes, "classes", None)
@@ -104,7 +110,5 @@ def score_vectors(candidates: Candidates, policy: BackgroundPolicy = "residual")
         background = torch.full_like(classes[..., 0], 1 / (classes.shape[-1] + 1))
     else:
         background = torch.zeros_like(classes[..., 0])
-    background = background[..., None]
-    floor = torch.finfo(classes.dtype).tiny
-    shares = classes.clamp(min=floor)
-    return torch.cat([background, (1 - background) * shares / shares.sum(-1, keepdim=True)], -1)
+    classes = classes.clamp(min=torch.finfo(classes.dtype).tiny)
+    return background, (1 - background)[..., None] * classes / classes.sum(-1, keepdim=True)

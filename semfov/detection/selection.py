@@ -77,7 +77,7 @@ def select_several(
     return found[0] if count == 1 else [Detections.stack([image[n] for image in found]) for n in range(len(selections))]
 
 
-def _check(image: int, confidence: Tensor, boxes: Tensor) -> None:
+def check_candidates(image: int, confidence: Tensor, boxes: Tensor) -> None:
     """Raise `InputError` where a detector returns NaN or infinite values."""
     if not values_known(confidence, boxes):
         return
@@ -88,7 +88,7 @@ def _check(image: int, confidence: Tensor, boxes: Tensor) -> None:
             check_finite(numbers, f"detector: {name} in image {image}")
 
 
-def _check_scores(image: int, kept: Candidates) -> None:
+def check_scores(image: int, kept: Candidates) -> None:
     """Raise `InputError` where a selected box has a score outside [0, 1]."""
     if not values_known(kept.classes):
         return
@@ -109,13 +109,13 @@ def _select_one(
     confidence = candidates.confidence[image]
     index = (confidence >= min(selection.threshold for selection in selections)).nonzero()[:, 0]
     boxes = candidates.boxes[image].index_select(0, index)
-    _check(image, confidence, boxes)
+    check_candidates(image, confidence, boxes)
     boxes = boxes if placement is None else placement.boxes_to_image(boxes)
     some = any(selection.per_class for selection in selections)
     labels = candidates.classes[image, index].argmax(-1) if some else index
     kept = _suppress(boxes.detach(), confidence.detach().index_select(0, index), labels, selections)
     rows = candidates.take(image, index[kept[0] if len(kept) == 1 else torch.cat(kept)])
-    _check_scores(image, rows)
+    check_scores(image, rows)
     scores = score_vectors(rows, policy)
     best = scores[:, 1:].detach().amax(-1)
     found, lengths = [], [*map(len, kept)]

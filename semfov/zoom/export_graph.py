@@ -9,6 +9,7 @@ from semfov.detection.export_graph import Graph
 from semfov.detection.selection import Selection
 from semfov.zoom.eye import BORDER
 from semfov.zoom.gist import FOUND
+from semfov.zoom.hints import FAINT
 
 OPSET = 18
 """The first opset whose `Resize` has antialiasing."""
@@ -130,6 +131,17 @@ class LookGraph(Graph):
         _, order = self.add("TopK", best, count, outputs=2, axis=0)
         return self.add("Gather", box, order), self.add("Gather", vector, order)
 
+    def hints(self, boxes: str, confidence: str, vectors: str) -> tuple[str, str, str]:
+        """Take the hints from candidates `(1, N, …)`: canvas boxes `(L, 4)`, vectors `(L, K+1)`, confidence `(L,)`."""
+        enough = self.add("GreaterOrEqual", confidence, self.constant(FAINT))
+        _, index = self.add("Split", self.add("NonZero", enough), self.constant([1, 1]), outputs=2, axis=0)
+        index = self.add("Squeeze", index, self.constant([0]))
+        box, vector, value = (
+            self.add("Gather", self.add("Squeeze", each, self.constant([0])), index)
+            for each in (boxes, vectors, confidence)
+        )
+        return box, vector, value
+
     def placed(self, boxes: str, frame: str, picture: str) -> tuple[str, str]:
         """Map canvas boxes `(L, 4)` to picture pixels, cut to the window; also tell which its border cuts, `(L,)`."""
         window, canvas = self.add("Split", frame, self.constant([4, 4]), outputs=2, axis=0)
@@ -156,13 +168,13 @@ class LookGraph(Graph):
         return mapped, self.add("Cast", any_side, to=_BOOL)
 
     def gist(
-        self, hints: tuple[str, str], detections: tuple[str, str], start: str, cells: int, classes: int
+        self, hints: tuple[str, str, str], detections: tuple[str, str], start: str, cells: int, classes: int
     ) -> tuple[str, str, str]:
         """Compute the gist of a look, as `semfov.zoom.gist.gist` does.
 
         Args:
-            hints: names of boxes in picture pixels and of score vectors.
-            detections: likewise.
+            hints: names of boxes in picture pixels, of score vectors and of confidence.
+            detections: names of boxes and of score vectors.
             start: name of the start of the window, from `window`.
             cells: c, number of cells along a side of the window.
             classes: K.
@@ -171,11 +183,10 @@ class LookGraph(Graph):
             Names of the strongest hint of each class `(c, c, K)`, of the size `(c, c)` and of the classes that are
             found `(c, c, K)`.
         """
-        boxes, vectors = hints
+        boxes, vectors, best = hints
         at, scores = self._cells(boxes, start, cells), self._scores(vectors)
         nothing = self.constant(torch.zeros(cells * cells, classes))
         strongest = self._strongest(nothing, at, scores, classes)
-        best = self._best(vectors)
         alone = self.constant(torch.zeros(cells * cells))
         top = self.add("ScatterElements", alone, at, best, axis=0, reduction="max")
         # The size of a cell is that of its most confident hint.

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import torch
@@ -13,18 +13,16 @@ from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, open_large, reduction_for
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
-from semfov.detection.selection import Selection, select_several
+from semfov.detection.selection import select
 from semfov.errors import check, check_number, check_shape, lookup
 from semfov.sensor.glimpse import edges_at
+from semfov.zoom.hints import Hints, hints_of
 from semfov.zoom.lattice import Lattice
 
 Cut = Literal["keep", "drop", "background"]
 Limit = tuple[float, float, float, float]
 Frame = tuple[int, int, int, int, int, int, int, int]
 """`(x1, y1, x2, y2)` of a window in picture pixels, then of its place on the canvas in canvas pixels."""
-
-HINTS = Selection(threshold=0.002, iou=0.95, limit=300)
-"""Selection of hints: candidates that are too weak to be detections, but show where a closer look pays."""
 
 BORDER = 2.0
 """A box this near to the border of its window, in canvas pixels, counts as cut by it."""
@@ -55,14 +53,13 @@ class Seen:
     Attributes:
         detections: a batch of F, boxes in picture pixels.
         cut: `(F, L)`, boolean, true where the border of the window cuts the box.
-        hints: weak candidates, which may overlap; a batch of F, boxes in picture pixels. None where they were not asked
-            for.
+        hints: hints of each look, F, boxes in picture pixels; None where they were not asked for.
         windows: `(F, 4)`, the windows in picture pixels, cut to the picture.
     """
 
     detections: Detections
     cut: Tensor
-    hints: Detections | None
+    hints: tuple[Hints, ...] | None
     windows: Tensor
 
 
@@ -128,13 +125,13 @@ class ZoomEye(nn.Module):
     def glance(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None, *, hints: bool = True
     ) -> Seen:
-        """Look at a picture and return weak candidates too.
+        """Look at a picture and return hints too.
 
         Args:
             view: the picture, from `open`.
             fixations: `(F, 3)` or `(F, 2)`, as for `look`.
             within: for each look the box of the picture that it shows; None shows all that fits the canvas.
-            hints: whether weak candidates are selected.
+            hints: whether hints are wanted.
 
         Returns:
             Detections and hints of each look.
@@ -142,12 +139,19 @@ class ZoomEye(nn.Module):
         canvas, frames = self._resample(view, fixations, within)
         exact = canvas.dtype == torch.uint8
         candidates = self.detector.propose_bytes(canvas) if exact else self.detector.propose(canvas / 255)
-        wanted = [self.detector.selection, HINTS] if hints else [self.detector.selection]
-        selected = select_several(candidates, None, wanted, self.detector.background)
-        place = _Placement(frames, view.picture.size, selected[0].boxes)
-        detections, *weak = place.to_picture(selected)
-        found, cut = self._treat(detections, place.cut(selected[0]))
-        return Seen(found, cut, weak[0] if weak else None, torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)[:, :4])
+        policy = self.detector.background
+        selected = select(candidates, None, self.detector.selection, policy)
+        place = _Placement(frames, view.picture.size, selected.boxes)
+        boxes = place.to_picture(selected.boxes)
+        if len(boxes) > 1:  # else there is no padding
+            boxes = boxes * selected.mask[..., None]
+        found, cut = self._treat(Detections(boxes, selected.scores, selected.mask), place.cut(selected))
+        windows = torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)[:, :4]
+        if not hints:
+            return Seen(found, cut, None, windows)
+        faint = [hints_of(candidates, number, policy) for number in range(len(frames))]
+        faint = [replace(each, boxes=place.to_picture(each.boxes, number)) for number, each in enumerate(faint)]
+        return Seen(found, cut, tuple(faint), windows)
 
     def glimpse(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None
@@ -295,14 +299,10 @@ class _Placement:
         numbers = torch.tensor(rows, dtype=like.dtype, device=like.device).view(-1, 6, 1, 4)
         self._low, self._high, self._first, self._scale, self._border, self._inwards = numbers.unbind(1)
 
-    def to_picture(self, looks: Sequence[Detections]) -> list[Detections]:
-        """Map canvas boxes of several selections to picture pixels and cut them to their windows."""
-        boxes = torch.cat([detections.boxes for detections in looks], 1)
-        boxes = ((boxes - self._first) * self._scale + self._low).clamp(self._low, self._high)
-        if len(boxes) > 1:  # else there is no padding
-            boxes = boxes * torch.cat([detections.mask for detections in looks], 1)[..., None]
-        parts = boxes.split([detections.mask.shape[1] for detections in looks], 1)
-        return [Detections(part, found.scores, found.mask) for part, found in zip(parts, looks, strict=True)]
+    def to_picture(self, boxes: Tensor, look: int | slice = slice(None)) -> Tensor:
+        """Map canvas boxes of all looks `(F, L, 4)`, or of one `(L, 4)`, to the picture and cut them to their window."""
+        low, high, first, scale = (each[look] for each in (self._low, self._high, self._first, self._scale))
+        return ((boxes - first) * scale + low).clamp(low, high)
 
     def cut(self, detections: Detections) -> Tensor:
         """Tell which boxes touch a border of their window that lies inside the picture, `(F, L)`."""

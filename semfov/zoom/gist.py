@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
+from semfov.zoom.hints import Hints
 from semfov.zoom.lattice import Lattice
 
 FINEST = 32
@@ -43,12 +44,12 @@ class Gist:
     found: Tensor
 
 
-def gist(hints: Detections, detections: Detections, lattice: Lattice, action: tuple[int, int, int]) -> Gist:
+def gist(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[int, int, int]) -> Gist:
     """Compute the gist of a look at a window of the lattice.
 
     Args:
-        hints: hints of the look, a batch of one without padding, in picture pixels.
-        detections: detections of the look, likewise.
+        hints: hints of the look, in picture pixels.
+        detections: detections of the look, a batch of one without padding, likewise.
         lattice: lattice of the picture.
         action: `(level, column, row)` of the window.
 
@@ -62,23 +63,22 @@ def gist(hints: Detections, detections: Detections, lattice: Lattice, action: tu
     rows = -(-min(span, lattice.rows - row) // scale)
     low = np.array([column * lattice.pitch[0], row * lattice.pitch[1]], np.float32)
     pitch = np.array(lattice.pitch, np.float32) * scale
-    kinds = hints.scores.shape[-1] - 1
-    boxes, scores = hints.boxes[0].detach().float().numpy(), hints.scores[0, :, 1:].detach().float().contiguous()
-    confidence, kind = detections.scores[0, :, 1:].detach().max(-1)
-    sure = (confidence >= FOUND).nonzero()[:, 0]
+    kinds, cells = hints.scores.shape[-1], rows * columns
+    boxes, scores, confident = hints.boxes.float().numpy(), hints.scores.float(), hints.confidence.float()
+    certain, kind = detections.scores[0, :, 1:].detach().max(-1)
+    sure = (certain >= FOUND).nonzero()[:, 0]
     corners = np.concatenate([boxes, detections.boxes[0, sure].detach().float().numpy()])
     cell = np.floor(((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch)
     across, down = np.minimum(np.maximum(cell, 0), (columns - 1, rows - 1)).astype(np.intp).T
-    cells = down * columns + across
-    at, there = cells[: len(boxes)], cells[len(boxes) :]
-    place = torch.from_numpy(at)[:, None].expand(-1, kinds)
-    strongest = scores.new_zeros(rows * columns, kinds).scatter_reduce_(0, place, scores, "amax")
-    wide, high = np.log2(np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-3)).T
-    canvas = (wide + high) / 2 + math.log2(lattice.magnifications[level])
-    size = np.zeros(rows * columns, np.float32)
-    # Of several hints in a cell the one written last remains: the most confident, which comes first.
-    size[at[::-1]] = np.maximum(canvas, 0)[::-1]
-    found = np.zeros((rows * columns, kinds), np.bool_)
+    at, there = np.split(down * columns + across, [len(boxes)])
+    place = torch.from_numpy(at)
+    strongest = scores.new_zeros(cells, kinds).scatter_reduce_(0, place[:, None].expand(-1, kinds), scores, "amax")
+    top = confident.new_zeros(cells).scatter_reduce_(0, place, confident, "amax")
+    leads = (confident == top[place]).numpy().nonzero()[0]
+    wide, high = np.log2(np.maximum(boxes[leads, 2:] - boxes[leads, :2], 1e-3)).T
+    size = np.zeros(cells, np.float32)
+    size[at[leads]] = np.maximum((wide + high) / 2 + math.log2(lattice.magnifications[level]), 0)
+    found = np.zeros((cells, kinds), np.bool_)
     found[there, kind[sure].numpy()] = True
     shape = rows, columns
     return Gist(

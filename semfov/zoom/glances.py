@@ -126,11 +126,15 @@ class LiveGlances(Glances):
 def glance(seen: Seen, number: int, window: Window, lattice: Lattice) -> Glance:
     """The result of one of the looks of an eye."""
     detections = _only(seen.detections, number)
-    hints = detections if seen.hints is None else _only(seen.hints, number)
-    scores = hints.scores[0, :, 1:].float()
-    show = scores.amax(0) if len(scores) else scores.new_zeros(scores.shape[-1])
-    whole = _points_closer(window, lattice)
-    told = gist(hints, detections, lattice, (window.level, *window.cells[:2])) if whole else None
+    told = None
+    if seen.hints is None:
+        scores = detections.scores[0, :, 1:]
+    elif _points_closer(window, lattice):
+        told = gist(seen.hints[number], detections, lattice, (window.level, *window.cells[:2]))
+        scores = told.scores.flatten(0, 1)
+    else:
+        scores = seen.hints[number].scores
+    show = scores.amax(0).float() if len(scores) else scores.new_zeros(scores.shape[-1])
     return Glance(window, detections, seen.cut[number, : detections.mask.shape[1]], show, told)
 
 

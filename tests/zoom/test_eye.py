@@ -95,7 +95,7 @@ def test_a_window_beside_the_picture_shows_its_nearest_pixel(detector):
         assert torch.equal(canvas[number], expected)
 
 
-def test_hints_of_a_batch_equal_those_of_its_looks_one_by_one(detector, picture):
+def test_detections_of_a_batch_equal_those_of_its_looks_one_by_one(detector, picture):
     eye = ZoomEye(detector)
     view = eye.open(picture)
     fixations = torch.tensor([[655.5, 335.5, 1.0], [640.0 - 64 + 8 - 0.5, 335.5, 1.0], [511.5, 383.5, 0.125]])
@@ -103,13 +103,12 @@ def test_hints_of_a_batch_equal_those_of_its_looks_one_by_one(detector, picture)
     counts = set()
     for number in range(3):
         alone = eye.glance(view, fixations[number : number + 1])
-        for whole, one in ((together.hints, alone.hints), (together.detections, alone.detections)):
-            count = int(one.count)
-            assert count == int(whole.count[number]) > 0
-            torch.testing.assert_close(whole.boxes[number, :count], one.boxes[0, :count])
-            assert float(whole.boxes[number, count:].abs().sum()) == 0
-            counts.add(count)
-        found = int(alone.detections.count)
+        whole, one = together.detections, alone.detections
+        found = int(one.count)
+        assert found == int(whole.count[number]) > 0
+        torch.testing.assert_close(whole.boxes[number, :found], one.boxes[0, :found])
+        assert float(whole.boxes[number, found:].abs().sum()) == 0
+        counts.add(found)
         assert torch.equal(together.cut[number, :found], alone.cut[0])
         assert not bool(together.cut[number, found:].any())
         assert torch.equal(together.windows[number], alone.windows[0])

@@ -1,0 +1,54 @@
+"""Hints: candidates of a look, also such that are too weak to be detections, which show where a closer look pays."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from semfov.detection.scores import BackgroundPolicy, Candidates, shares
+from semfov.detection.selection import check_candidates, check_scores
+
+FAINT = 0.0005
+"""Confidence from which on a candidate is a hint."""
+
+
+@dataclass(frozen=True)
+class Hints:
+    """The hints of a look, in no order. Several may be of one object.
+
+    Attributes:
+        boxes: `(N, 4)`, `(x1, y1, x2, y2)`.
+        scores: `(N, K)`, score of each class, without background.
+        confidence: `(N,)`, by which the detector ranks them (`Candidates.confidence`).
+    """
+
+    boxes: Tensor
+    scores: Tensor
+    confidence: Tensor
+
+
+def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy) -> Hints:
+    """Take the hints from all boxes of a detector's head.
+
+    Args:
+        candidates: the boxes, in canvas pixels.
+        image: index of the image in the batch.
+        policy: background policy of the scores.
+
+    Returns:
+        The hints, in canvas pixels, without gradients.
+
+    Raises:
+        InputError: the detector returned numbers that are not finite, or scores outside [0, 1].
+
+    >>> import torch
+    >>> found = Candidates(torch.rand(1, 3, 4), torch.tensor([[[0.0001], [0.001], [0.9]]]))
+    >>> hints_of(found, 0, "residual").confidence
+    tensor([0.0010, 0.9000])
+    """
+    confidence = candidates.confidence[image].detach()
+    index = (confidence >= FAINT).nonzero()[:, 0]
+    kept = candidates.take(image, index)
+    boxes = kept.boxes.detach()
+    check_candidates(image, confidence, boxes)
+    check_scores(image, kept)
+    return Hints(boxes, shares(kept, policy)[1].detach(), confidence.index_select(0, index))

@@ -1,0 +1,133 @@
+"""Hints and gists of looks, against loops over all boxes of a detector."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from semfov.detection import Candidates, Detector, Selection
+from semfov.errors import InputError
+from semfov.zoom import ZoomEye
+from semfov.zoom.glances import LiveGlances, on_lattice
+from semfov.zoom.gist import FOUND
+from semfov.zoom.hints import FAINT, hints_of
+
+KINDS = 3
+
+
+class Given(Detector):
+    """Proposes boxes that do not depend on the canvas; most are faint, many lie on each other."""
+
+    def __init__(self, count: int, background: str = "residual") -> None:
+        selection = Selection(threshold=0.02, iou=0.5, limit=20)
+        super().__init__("given", ("a", "b", "c"), (128, 128), background=background, selection=selection)
+        generator = torch.Generator().manual_seed(count)
+        places = torch.rand(count // 4, 2, generator=generator) * 128
+        middle = places.repeat(4, 1) + 0.1 * torch.rand(count // 4 * 4, 2, generator=generator)
+        half = 2 + 20 * torch.rand(len(middle), 2, generator=generator)
+        self.boxes = torch.cat([middle - half, middle + half], -1)
+        self.scores = torch.rand(len(middle), KINDS, generator=generator)
+        # From about 0.00002 to 1: some of the candidates are too faint for hints.
+        self.certain = (-11 * torch.rand(len(middle), generator=generator)).exp()
+
+    def propose(self, canvas: Tensor) -> Candidates:
+        size = len(canvas), len(self.boxes)
+        return Candidates(self.boxes.expand(*size, 4), self.scores.expand(*size, KINDS), self.certain.expand(*size))
+
+
+@pytest.mark.parametrize("count", [40, 2000])
+@pytest.mark.parametrize(("column", "row", "level"), [(0, 0, 0), (4, 3, 1), (16, 8, 1)])
+def test_a_gist_holds_the_strongest_of_all_candidates_of_each_cell(count, column, row, level):
+    detector = Given(count)
+    eye = ZoomEye(detector)
+    view = eye.open(torch.zeros(3, 384, 512))
+    lattice = view.lattice
+    assert column < lattice.places(level)[0] and row < lattice.places(level)[1]
+    window = on_lattice(lattice, (level, column, row))
+    glance = LiveGlances(eye, view).see([window])[0]
+    look = glance.gist
+    rows, columns, _ = look.scores.shape
+    x, y, magnification = window.fixation
+    left, top = x + 0.5 - 64 / magnification, y + 0.5 - 64 / magnification
+    right, bottom = min(left + 128 / magnification, 512), min(top + 128 / magnification, 384)
+    strongest, size = torch.zeros(rows, columns, KINDS), torch.zeros(rows, columns)
+    leads, hints = torch.zeros(rows, columns), 0
+    for box, scores, certain in zip(detector.boxes, detector.scores, detector.certain, strict=True):
+        confidence = float(certain * scores.max())
+        if confidence < FAINT:
+            continue
+        hints += 1
+        x1, y1, x2, y2 = (box / magnification + torch.tensor([left, top, left, top])).tolist()
+        x1, x2 = (min(max(each, left), right) for each in (x1, x2))
+        y1, y2 = (min(max(each, top), bottom) for each in (y1, y2))
+        column_of = min(max(int(((x1 + x2) / 2 - left) // (lattice.pitch[0] * look.scale)), 0), columns - 1)
+        row_of = min(max(int(((y1 + y2) / 2 - top) // (lattice.pitch[1] * look.scale)), 0), rows - 1)
+        cell = row_of, column_of
+        strongest[cell] = torch.maximum(strongest[cell], certain * scores / scores.sum())
+        if confidence > leads[cell]:
+            leads[cell] = confidence
+            wide, high = (max(side * magnification, 1e-3 * magnification) for side in (x2 - x1, y2 - y1))
+            size[cell] = max(math.log2(wide * high) / 2, 0.0)
+    assert 0 < hints < len(detector.boxes)
+    torch.testing.assert_close(look.scores, strongest, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(look.size, size, rtol=0, atol=1e-4)
+    torch.testing.assert_close(glance.show, strongest.amax((0, 1)), rtol=1e-5, atol=1e-7)
+    found = glance.detections.scores[0, :, 1:].amax(-1) >= FOUND
+    assert 0 < int(look.found.sum()) <= int(found.sum()) <= 20
+
+
+def test_looks_of_a_batch_have_their_own_hints():
+    class Lit(Given):
+        """As many boxes as the canvas is bright."""
+
+        def propose(self, canvas: Tensor) -> Candidates:
+            found = super().propose(canvas)
+            bright = canvas.mean((1, 2, 3))[:, None]
+            rank = torch.arange(len(self.boxes)) / len(self.boxes)
+            return Candidates(found.boxes, found.classes, found.objectness * (rank < bright))
+
+    eye = ZoomEye(Lit(400))
+    picture = torch.linspace(0, 1, 512).expand(3, 384, 512)
+    view = eye.open(picture)
+    fixations = torch.tensor([[100.0, 100.0, 1.0], [300.0, 200.0, 0.7], [400.0, 300.0, 1.0]])
+    together = eye.glance(view, fixations)
+    assert len({len(hints.boxes) for hints in together.hints}) == 3
+    for number, hints in enumerate(together.hints):
+        alone = eye.glance(view, fixations[number : number + 1]).hints[0]
+        for name in ("boxes", "scores", "confidence"):
+            assert torch.equal(getattr(hints, name), getattr(alone, name))
+
+
+def test_a_look_without_hints_shows_its_detections():
+    detector = Given(400)
+    eye = ZoomEye(detector)
+    view = eye.open(torch.zeros(3, 384, 512))
+    last = view.lattice.levels - 1
+    window = on_lattice(view.lattice, (last, 3, 3))
+    plain, hinted = (LiveGlances(eye, view).see([window], hints=hints)[0] for hints in (False, True))
+    assert plain.gist is None and hinted.gist is None
+    assert torch.equal(plain.show, plain.detections.scores[0, :, 1:].amax(0))
+    every = detector.certain[:, None] * detector.scores / detector.scores.sum(-1, keepdim=True)
+    torch.testing.assert_close(hinted.show, every.amax(0))
+
+
+def test_hints_share_the_scores_of_detections_for_any_background():
+    for policy in ("residual", "normalised", "uniform", "none"):
+        detector = Given(80, policy)
+        eye = ZoomEye(detector)
+        seen = eye.glance(eye.open(torch.zeros(3, 128, 128)), torch.tensor([[63.5, 63.5, 1.0]]))
+        hints, found = seen.hints[0], seen.detections
+        same = (found.boxes[0][:, None] == hints.boxes).all(-1)
+        assert bool((same.sum(1) == 1).all())
+        torch.testing.assert_close(found.scores[0, :, 1:], hints.scores[same.int().argmax(1)])
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_hints_that_are_not_finite_are_refused(value):
+    boxes, classes = torch.rand(1, 5, 4), torch.full((1, 5, 2), 0.001)
+    boxes[0, 3, 2] = value
+    with pytest.raises(InputError, match="detector: boxes in image 0"):
+        hints_of(Candidates(boxes, classes), 0, "residual")
+    with pytest.raises(InputError, match="detector: objectness in image 0"):
+        hints_of(Candidates(torch.rand(1, 5, 4), classes, torch.full((1, 5), 2.0)), 0, "residual")
