@@ -88,7 +88,7 @@ def score_vectors(candidates: Candidates, policy: BackgroundPolicy = "residual")
 
 
 def shares(candidates: Candidates, policy: BackgroundPolicy) -> tuple[Tensor, Tensor]:
-    """Compute the two parts of `score_vectors`: the background score `(...)` and the scores of the classes `(..., K)`."""
+    """Compute the parts of `score_vectors`: the background score `(...)` and the scores of the classes `(..., K)`."""
     lookup(policy, get_args(BackgroundPolicy), "background policy")
     classes = candidates.classes
     check_shape(classes, "classes", None)

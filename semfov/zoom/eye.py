@@ -177,7 +177,7 @@ class ZoomEye(nn.Module):
     def _resample(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None
     ) -> tuple[Tensor, list[Frame]]:
-        """Canvases `(F, 3, h, w)`, RGB from 0 to 255, and frames. They are bytes where the padding is a whole number."""
+        """Canvases `(F, 3, h, w)`, RGB from 0 to 255, and frames; the canvases are bytes if the padding is a byte."""
         if fixations.shape[-1] == 2:
             closest = fixations.new_full((*fixations.shape[:-1], 1), view.lattice.magnifications[-1])
             fixations = torch.cat([fixations, closest], -1)
@@ -300,7 +300,7 @@ class _Placement:
         self._low, self._high, self._first, self._scale, self._border, self._inwards = numbers.unbind(1)
 
     def to_picture(self, boxes: Tensor, look: int | slice = slice(None)) -> Tensor:
-        """Map canvas boxes of all looks `(F, L, 4)`, or of one `(L, 4)`, to the picture and cut them to their window."""
+        """Map canvas boxes of all looks `(F, L, 4)`, or of one `(L, 4)`, to the picture, cut to the window."""
         low, high, first, scale = (each[look] for each in (self._low, self._high, self._first, self._scale))
         return ((boxes - first) * scale + low).clamp(low, high)
 

@@ -7,7 +7,7 @@ from torch import Tensor
 from semfov.detection.scores import BackgroundPolicy, Candidates, shares
 from semfov.detection.selection import check_candidates, check_scores
 
-FAINT = 0.0005
+FAINT = 0.002
 """Confidence from which on a candidate is a hint."""
 
 
@@ -41,9 +41,9 @@ def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy) -> Hi
         InputError: the detector returned numbers that are not finite, or scores outside [0, 1].
 
     >>> import torch
-    >>> found = Candidates(torch.rand(1, 3, 4), torch.tensor([[[0.0001], [0.001], [0.9]]]))
+    >>> found = Candidates(torch.rand(1, 3, 4), torch.tensor([[[0.001], [0.01], [0.9]]]))
     >>> hints_of(found, 0, "residual").confidence
-    tensor([0.0010, 0.9000])
+    tensor([0.0100, 0.9000])
     """
     confidence = candidates.confidence[image].detach()
     index = (confidence >= FAINT).nonzero()[:, 0]

@@ -9,8 +9,8 @@ from torch import Tensor
 from semfov.detection import Candidates, Detector, Selection
 from semfov.errors import InputError
 from semfov.zoom import ZoomEye
-from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.gist import FOUND
+from semfov.zoom.glances import LiveGlances, on_lattice
 from semfov.zoom.hints import FAINT, hints_of
 
 KINDS = 3
@@ -43,7 +43,8 @@ def test_a_gist_holds_the_strongest_of_all_candidates_of_each_cell(count, column
     eye = ZoomEye(detector)
     view = eye.open(torch.zeros(3, 384, 512))
     lattice = view.lattice
-    assert column < lattice.places(level)[0] and row < lattice.places(level)[1]
+    assert column < lattice.places(level)[0]
+    assert row < lattice.places(level)[1]
     window = on_lattice(lattice, (level, column, row))
     glance = LiveGlances(eye, view).see([window])[0]
     look = glance.gist
@@ -106,7 +107,8 @@ def test_a_look_without_hints_shows_its_detections():
     last = view.lattice.levels - 1
     window = on_lattice(view.lattice, (last, 3, 3))
     plain, hinted = (LiveGlances(eye, view).see([window], hints=hints)[0] for hints in (False, True))
-    assert plain.gist is None and hinted.gist is None
+    assert plain.gist is None
+    assert hinted.gist is None
     assert torch.equal(plain.show, plain.detections.scores[0, :, 1:].amax(0))
     every = detector.certain[:, None] * detector.scores / detector.scores.sum(-1, keepdim=True)
     torch.testing.assert_close(hinted.show, every.amax(0))
@@ -125,7 +127,7 @@ def test_hints_share_the_scores_of_detections_for_any_background():
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_hints_that_are_not_finite_are_refused(value):
-    boxes, classes = torch.rand(1, 5, 4), torch.full((1, 5, 2), 0.001)
+    boxes, classes = torch.rand(1, 5, 4), torch.full((1, 5, 2), 0.01)
     boxes[0, 3, 2] = value
     with pytest.raises(InputError, match="detector: boxes in image 0"):
         hints_of(Candidates(boxes, classes), 0, "residual")
