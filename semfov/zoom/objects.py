@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from semfov.detection.detections import Detections
-from semfov.detection.near_duplicates import intersection, neighbours, survivors
 from semfov.zoom.glances import Glance
+from semfov.zoom.overlaps import intersection, neighbours, survivors
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semfov.detection import Candidates, Selection, letterbox
-from semfov.detection.selection import select, select_several, suppress
+from semfov.detection.selection import select, suppress
 
 
 def overlap(a, b) -> float:
@@ -73,21 +73,6 @@ def test_selection_applies_threshold_suppression_and_order():
         assert {tuple(box) for box in own.boxes[own.mask].tolist()} == {tuple(rows.boxes[i].tolist()) for i in kept}
     assert bool((found.confidence[:, :-1] >= found.confidence[:, 1:]).all())
     torch.testing.assert_close(found.scores.sum(-1), found.mask.double())
-
-
-def test_several_selections_equal_each_selection_alone():
-    candidates = make(90, dtype=torch.float32)
-    selections = [
-        Selection(threshold=0.3, limit=7),
-        Selection(threshold=0.05, iou=0.95, limit=30),
-        Selection(threshold=0.1, iou=0.4, per_class=True),
-        Selection(threshold=1.0),
-    ]
-    for found, selection in zip(select_several(candidates, None, selections, "residual"), selections, strict=True):
-        alone = select(candidates, None, selection, "residual")
-        assert torch.equal(found.mask, alone.mask)
-        assert torch.equal(found.boxes, alone.boxes)
-        assert torch.equal(found.scores, alone.scores)
 
 
 def test_an_image_does_not_depend_on_its_batch():

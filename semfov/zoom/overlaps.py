@@ -10,48 +10,6 @@ from numpy.typing import NDArray
 Column = NDArray[np.float32]
 Index = NDArray[np.intp]
 
-LEAST = 0.9
-"""Intersection over union from which on `distinct` is faster than `torchvision.ops.nms`."""
-
-
-def distinct(boxes: Column, iou: float) -> Index:
-    r"""Boxes that survive non-maximum suppression at a high threshold: those of `torchvision.ops.nms`.
-
-    Two boxes of widths w and w' can only overlap by more than t if their centres are near each other:
-
-    .. math:: |c_x - c_x'| \le \frac{\min(w, w')}{2} \left(\frac{1}{t} - 1\right)
-
-    and likewise for their heights.
-
-    Args:
-        boxes: `(N, 4)`, each with a positive area, most confident first.
-        iou: t. Of two boxes that overlap by more than this, the later one is suppressed.
-
-    Returns:
-        Indices of the survivors, in ascending order.
-
-    >>> boxes = np.array([[0, 0, 100, 100], [1, 1, 101, 101], [50, 0, 150, 100]], np.float32)
-    >>> distinct(boxes, 0.95)
-    array([0, 2])
-    """
-    if not len(boxes):
-        return np.zeros(0, np.intp)
-    order = (boxes[:, 0] + boxes[:, 2]).argsort()
-    x1, y1, x2, y2 = corners = np.ascontiguousarray(boxes[order].T)
-    wide, high = x2 - x1, y2 - y1
-    area, x, y = wide * high, x1 + x2, y1 + y2
-    # x and y are twice the centre. Rounding moves neither by as much as a millionth of the largest coordinate.
-    slack = 1e-6 * max(-float(corners.min()), float(corners.max()))
-    first, second = neighbours(x, x + wide * (1 / iou - 1) + slack)
-    apart = y.take(second) - y.take(first)
-    near = np.flatnonzero(np.abs(apart, out=apart) <= (high * (1 / iou - 1) + slack).take(first))
-    first, second = first.take(near), second.take(near)
-    shared = intersection(x1, y1, x2, y2, first, second)
-    # As torchvision does: the quotient in single precision, the comparison in double precision.
-    same = np.flatnonzero(shared / (area[first] + area[second] - shared) > np.float64(iou))
-    one, other = order[first[same]], order[second[same]]
-    return survivors(len(boxes), np.minimum(one, other), np.maximum(one, other))
-
 
 def neighbours(start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[Index, Index]:
     """Pairs of intervals of which the second starts within the first.
