@@ -278,6 +278,19 @@ def test_fit_and_detect_equal_a_call_of_the_detector(detector):
     torch.testing.assert_close(free.scores[free.mask].sum(-1), torch.ones(int(free.count.sum())))
 
 
+def test_bytes_are_proposed_as_their_share_of_white(detector):
+    width, height = detector.input_size
+    canvas = (photographs(2, height, width) * 255).round().byte()
+    canvas[:, 0] //= 2  # channels that are not alike
+    expected = detector.propose(canvas / 255)
+    for given in (canvas, canvas.contiguous(memory_format=torch.channels_last)):
+        found = detector.propose_bytes(given)
+        torch.testing.assert_close(found.boxes, expected.boxes, rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(found.confidence, expected.confidence, rtol=1e-4, atol=1e-5)
+    with pytest.raises(InputError, match="canvas: expected bytes"):
+        detector.propose_bytes(canvas / 255)
+
+
 def test_detections_are_reproducible(detector):
     images = photographs(2, 45, 64)
     same(detector(images), detector(images), 0.0)

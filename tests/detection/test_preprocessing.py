@@ -30,6 +30,50 @@ def test_every_pixel_equals_the_formula(channels, scale, mean, std, dtype):
     assert torch.equal(canvas, before)
 
 
+@pytest.mark.parametrize("layout", ["planes", "pixels", "part"])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"channels": "bgr", "scale": 255.0},
+        {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)},
+        {"channels": "bgr", "scale": 255.0, "mean": (103.5, 0.0, 123.7), "std": (57.4, 57.1, 1.0)},
+        {},
+    ],
+)
+def test_bytes_equal_the_formula(settings, layout):
+    source = np.random.default_rng(0).integers(256, size=(2, 3, 5, 4), dtype=np.uint8)
+    canvas = torch.from_numpy(source.copy())
+    if layout == "pixels":
+        canvas = canvas.contiguous(memory_format=torch.channels_last)
+    elif layout == "part":
+        canvas = torch.nn.functional.pad(canvas, (1, 2, 3, 1))[..., 3:-1, 1:-2]
+    wanted = Preprocessing(**settings)
+    image = wanted.of_bytes(canvas)
+    expected = np.empty(source.shape)
+    for out in range(3):
+        unit = source[:, out if wanted.channels == "rgb" else 2 - out] / 255
+        expected[:, out] = (unit * wanted.scale - wanted.mean[out]) / wanted.std[out]
+    assert image.dtype == torch.float32
+    assert image.is_contiguous()
+    np.testing.assert_allclose(image.numpy(), expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(image, wanted(canvas.float() / 255), rtol=1e-5, atol=1e-5)
+    assert np.array_equal(canvas.numpy(), source)
+
+
+def test_networks_that_take_bytes_get_them_exactly():
+    canvas = torch.arange(256, dtype=torch.uint8).expand(1, 3, 1, -1)
+    image = Preprocessing(channels="bgr", scale=255.0).of_bytes(canvas)
+    assert torch.equal(image, torch.arange(256.0).expand(1, 3, 1, -1))
+
+
+@pytest.mark.parametrize(
+    "canvas", [torch.zeros(1, 3, 4, 4), torch.zeros(3, 4, 4).byte(), torch.zeros(1, 4, 4, 3).byte()]
+)
+def test_refuses_what_is_no_canvas_of_bytes(canvas):
+    with pytest.raises(InputError, match=r"canvas: expected bytes of shape \(B, 3, H, W\)"):
+        Preprocessing().of_bytes(canvas)
+
+
 @pytest.mark.parametrize(
     "settings",
     [

@@ -84,6 +84,26 @@ def test_the_canvas_is_filled_beyond_the_picture(detector, picture):
     assert float(canvas[0, :, :60, :60].abs().max()) == 0
 
 
+@pytest.mark.parametrize("fill", [0.0, 114 / 255, 0.5, 0.3])
+def test_the_detector_gets_the_glimpse(detector, fill):
+    """A padding that is no byte is kept, too."""
+    detector.fill = fill
+    canvases, propose = [], detector.propose
+    detector.propose = lambda canvas: canvases.append(canvas) or propose(canvas)
+    eye = ZoomEye(detector)
+    view = eye.open(torch.rand(3, 300, 420, generator=torch.Generator().manual_seed(0)))
+    # Resampled, with padding, native pixels, enlarged.
+    fixations = torch.tensor([[199.5, 149.5, 0.64], [0.0, 20.0, 0.5], [199.5, 149.5, 1.0], [30.0, 40.0, 2.0]])
+    for some in (fixations, *fixations.split(1)):
+        eye.look(view, some)
+        canvas, _ = eye.glimpse(view, some)
+        assert torch.equal(canvases[-1], canvas)
+        assert canvas.is_contiguous()
+        assert canvas.shape == (len(some), 3, 128, 128)
+        assert 0.7 < float(canvas.max()) <= 1
+    assert float(canvases[2][0, 0, 0, 0]) == pytest.approx(fill, abs=1e-7)
+
+
 def test_a_window_beside_the_picture_shows_its_nearest_pixel(detector):
     image = torch.rand(3, 60, 90, generator=torch.Generator().manual_seed(0))
     eye = ZoomEye(detector)
