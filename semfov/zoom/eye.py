@@ -138,7 +138,7 @@ class ZoomEye(nn.Module):
         """
         canvas, frames = self._resample(view, fixations, within)
         exact = canvas.dtype == torch.uint8
-        candidates = self.detector.propose_bytes(canvas) if exact else self.detector.propose(canvas / 255)
+        candidates = self.detector.propose_bytes(canvas) if exact else self.detector.propose(_unit(canvas))
         policy = self.detector.background
         selected = select(candidates, None, self.detector.selection, policy)
         place = _Placement(frames, view.picture.size, selected.boxes)
@@ -171,8 +171,7 @@ class ZoomEye(nn.Module):
             InputError: a fixation is not finite, or its magnification is not positive.
         """
         canvases, frames = self._resample(view, fixations, within)
-        canvases = canvases.to(torch.get_default_dtype(), memory_format=torch.contiguous_format).div_(255)
-        return canvases, torch.tensor(frames, dtype=canvases.dtype).view(-1, 8)
+        return _unit(canvases), torch.tensor(frames, dtype=torch.get_default_dtype()).view(-1, 8)
 
     def _resample(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None
@@ -251,6 +250,11 @@ class ZoomEye(nn.Module):
         """
         sensor = {"glimpse": "antialiased bilinear", "finest": self.finest, "cut": self.cut}
         return {"sensor": sensor, "detector": self.detector.settings()}
+
+
+def _unit(canvases: Tensor) -> Tensor:
+    """Canvases in [0, 1], of those from 0 to 255."""
+    return canvases.to(torch.get_default_dtype()).contiguous() / 255
 
 
 def _shown(
