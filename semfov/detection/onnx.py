@@ -1,5 +1,6 @@
 """Detectors from ONNX models of common families, with the full score vector of every box."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
@@ -124,14 +125,16 @@ class OnnxDetector(Detector):
 
     def _check(self, candidates: Candidates) -> None:
         """Raise `DataError` where the numbers show a wrong head or a missing sigmoid."""
-        if not bool(torch.isfinite(candidates.boxes).all()):
+        # The range of numbers takes one pass over them, and is NaN where one of them is.
+        low, high = map(float, candidates.boxes.aminmax()) if candidates.boxes.numel() else (0.0, 0.0)
+        if not (math.isfinite(low) and math.isfinite(high)):
             raise DataError(
                 f"{self.name}: expected finite boxes, got NaN or infinite ones with head {self.head!r}; "
                 f"check that head= names the model's head"
             )
         for scores in (candidates.classes, candidates.objectness):
-            if scores is not None and not bool(((scores >= 0) & (scores <= 1)).all()):
-                low, high = float(scores.min()), float(scores.max())
+            low, high = map(float, scores.aminmax()) if scores is not None and scores.numel() else (0.0, 0.0)
+            if not (low >= 0 and high <= 1):
                 raise DataError(
                     f"{self.name}: expected scores in [0, 1], got [{low:.3g}, {high:.3g}]; "
                     f"set logits=True if the model returns them before the sigmoid, and check that its head is "
