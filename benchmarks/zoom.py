@@ -2,7 +2,7 @@
 
 The agent explores mosaics of embedded scenes, finds all objects of a class in them, and searches them for a class. In
 the same repetition the detector alone, with the selection of its boxes, gets the same canvases. The rest of a pass is
-reading and resampling the window, selecting hints, merging boxes, updating the belief and choosing the next window.
+reading and resampling the window, pooling hints, merging boxes, updating the belief and choosing the next window.
 """
 
 import argparse
