@@ -155,13 +155,13 @@ def demo(config: DemoConfig) -> None:
         if zooming is not None and zooming.pays(picture.image):
             folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
             only_likeliest(wanted)
-            zoomed, passes = zoom_in(zooming, picture, config)
+            zoomed = zoom_in(zooming, picture, config)
             if "scanpath" in config.draw:
                 small = reduced(picture.image).clamp(0, 1)
                 written.append(viz.save_figure(viz.plot_zoom_path(zoomed, small), folder / "zoom.png"))
             if config.report is not None:
-                given = {"settings": zooming.eye.settings(), "passes": passes}
-                episodes.append(zoom_data(zoomed, picture.image, pool, name=picture.name, **given))
+                settings = zooming.eye.settings()
+                episodes.append(zoom_data(zoomed, picture.image, pool, name=picture.name, settings=settings))
             continue
         scanpath = look_at(agent, picture, config, wanted)
         print(told(picture.name, scanpath))
@@ -204,7 +204,7 @@ def zoom_agent(config: DemoConfig, agent: ActivePerception) -> ZoomAgent | None:
     return zooming.eval().requires_grad_(False)
 
 
-def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> tuple[ZoomPath, int]:
+def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> ZoomPath:
     """Search or explore a picture larger than the detector's input, and print its windows.
 
     Args:
@@ -213,7 +213,7 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> tuple[Zoo
         config: the settings.
 
     Returns:
-        The path, and the largest number of passes.
+        The path.
     """
     passes = 24 if config.shifts is None else config.shifts + 1
     if config.target is None:
@@ -223,7 +223,7 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> tuple[Zoo
         given = {"confirm": config.confirm, "give_up": config.give_up}
         path = agent.search(picture.image, config.target, passes=passes, **chosen(given))
     width, height = path.lattice.size
-    print(f"{picture.name}, {width} × {height} px, looked at in windows: {path.describe()}")
+    print(f"{picture.name}, {width} × {height} px, looked at in windows: {path.told()}")
     unused = [name for name in ("sensor", "start", "price") if getattr(config, name) is not None]
     if unused:
         print(f"  ignored for a picture of this size: {', '.join(unused)}")
@@ -232,7 +232,7 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> tuple[Zoo
         count = int((glance.detections.confidence >= viz.CONFIDENT).sum())
         where = f"at ({x:.0f}, {y:.0f})" if number else "the whole picture"
         print(f"  {number:2d}  {where} × {magnification:.2f}: {count} detection{'s' if count != 1 else ''}")
-    return path, passes
+    return path
 
 
 def chosen(values: dict[str, float | None]) -> dict[str, Any]:

@@ -15,7 +15,8 @@ from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, ZoomEye
 from semfov.zoom.glances import LiveGlances
-from semfov.zoom.search import ZoomPath, find_all, search
+from semfov.zoom.path import ZoomPath
+from semfov.zoom.search import find_all, search
 
 MOST = 1_000_000
 """Limit of passes and batches, more than any picture has windows."""
