@@ -83,7 +83,8 @@ class DemoConfig(Settings):
             value (none: the value chosen when the belief was fitted).
         closer: largest number of closer looks, in which a window around a place that seems to hold the target is
             enlarged to the detector's input; 0: none. In a video or from a camera, a closer look takes the place of a
-            look, and the number holds for the time until half of the belief has faded.
+            look, and the number holds for the time until half of the belief has faded. In a large picture each takes
+            one of the passes.
         price: price of a look in right decisions: a search ends when further looks are not worth it (none: the search
             ends by thresholds).
         until: price of a look in cells: an exploration ends when no look is expected to name this many more cells right
@@ -221,17 +222,19 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> ZoomPath:
         path = agent.explore(picture.image, passes=passes, **chosen(given))
     else:
         given = {"confirm": config.confirm, "give_up": config.give_up}
-        path = agent.search(picture.image, config.target, passes=passes, **chosen(given))
+        path = agent.search(picture.image, config.target, passes=passes, closer=config.closer, **chosen(given))
     width, height = path.lattice.size
     print(f"{picture.name}, {width} × {height} px, looked at in windows: {path.told()}")
     unused = [name for name in ("sensor", "start", "price") if getattr(config, name) is not None]
     if unused:
         print(f"  ignored for a picture of this size: {', '.join(unused)}")
+    closer = {look.number: f"; closer look: p {look.place:.3f} there" for look in path.closer}
     for number, glance in enumerate(path.glances):
         x, y, magnification = glance.window.fixation
         count = int((glance.detections.confidence >= viz.CONFIDENT).sum())
         where = f"at ({x:.0f}, {y:.0f})" if number else "the whole picture"
-        print(f"  {number:2d}  {where} × {magnification:.2f}: {count} detection{'s' if count != 1 else ''}")
+        told = f"{count} detection{'s' if count != 1 else ''}{closer.get(number, '')}"
+        print(f"  {number:2d}  {where} × {magnification:.2f}: {told}")
     return path
 
 

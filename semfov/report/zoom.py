@@ -132,17 +132,21 @@ def _look(path: ZoomPath, number: int, objects: list[Data], source: LargePicture
     across = max(1, round((frame[2] - frame[0]) * magnification))
     detections = _detections(path, path.glances[number], frame)
     brought = Counter(each["label"] for each in objects if each["look"] == number)
+    closer = next((look for look in path.closer if look.number == number), None)
     value, kinds = path.values[number], ", ".join(f"{count} × {label}" for label, count in brought.most_common())
     told = [f"Look {number} of {path.passes - 1}"]
     told[0] += f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}." if number else ", at the whole picture."
     if number:
         told.append(f"Its value was {value:.2g}.")
+    if closer is not None:
+        told.append(f"It is a closer look: the target is there with a probability of {closer.place:.2f}.")
     told.append(f"Objects that it brought: {kinds or 'none'}.")
     return {
         "view": pool.add(_pixels(source, frame, across), across, quality),
         "box": list(frame),
         "magnification": rounded(magnification),
         "value": rounded(value),
+        "closer": None if closer is None else f"probability {closer.place:.2f} that the target is there",
         "detections": detections[:SHOWN],
         "count": len(detections),
         "brought": kinds or "none",

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from semfov.decision import Decision
+from semfov.zoom.closer import CloserGlance
 from semfov.zoom.drawing import path_html
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance
@@ -26,10 +27,12 @@ class ZoomPath:
         classes: names of the classes, background first.
         target: class that was searched for; None for all classes.
         glances: looks in their order, the overview first.
-        values: value of each look when it was chosen; that of the overview is infinite.
+        values: value of each look when it was chosen; that of the overview is infinite. For a closer look it is the
+            probability that the target is at the place.
         objects: objects that were found, merged from all looks.
         decision: decision of a search; None where all objects were to be found.
         ending: reason for the end; None if it is not known.
+        closer: closer looks of a search, in their order; they are among the `glances`.
 
     >>> import torch
     >>> nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
@@ -46,6 +49,7 @@ class ZoomPath:
     objects: Objects
     decision: Decision | None = None
     ending: Ending | None = None
+    closer: tuple[CloserGlance, ...] = ()
 
     @property
     def passes(self) -> int:
@@ -73,6 +77,12 @@ class ZoomPath:
         Returns:
             The sentence; empty if the reason is not known.
         """
+        if self.ending == "decision" and self.decision is not None and self.closer:
+            return {
+                "found": "A closer look confirmed the target.",
+                "absent": "No closer look confirmed the target, and it is probably absent.",
+                "undecided": "No closer look confirmed the target, but it is probably there.",
+            }[self.decision.outcome]
         if self.ending == "decision" and self.decision is not None:
             return {
                 "found": "The probability is high enough, and a detection shows the target.",

@@ -7,7 +7,9 @@ import torch
 
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, Decision, settle
+from semfov.verifier import MOST
 from semfov.zoom.belief import Rates, ZoomBelief
+from semfov.zoom.closer import ZoomVerifier
 from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance, Glances, Window, on_lattice
@@ -112,30 +114,41 @@ def search(
     passes: int = 24,
     confirm: float | None = None,
     give_up: float | None = None,
+    closer: int = MOST,
     context: WindowContext | None = None,
 ) -> ZoomPath:
-    """Search a picture for one object of a class and decide whether it is there (`semfov.decision.settle`).
+    """Search a picture for one object of a class and decide whether it is there.
 
-    The target is `found` when the picture holds it with a probability of at least `confirm` and a detection shows it.
-    When the value of every look that is left is below `give_up`, the target is `absent` if its probability is below one
-    half, and the search is `undecided` otherwise. It is also `undecided` when the passes are used up.
+    Places that seem to hold the target are looked at closely, and the target is `found` when it is probable enough at
+    such a place (`semfov.zoom.closer.ZoomVerifier`). Without closer looks it is `found` when the picture holds it with
+    a probability of at least `confirm` and a detection shows it (`semfov.decision.settle`).
+
+    When the value of every look that is left is below `give_up`, or all closer looks were made, the target is `absent`
+    if its probability is below one half, and the search is `undecided` otherwise. It is also `undecided` when the
+    passes are used up.
 
     Args:
         glances: source of looks at the picture.
         evidence: learned evidence by magnification.
         classes: names of the classes, background first.
         target: class 1..K.
-        passes: largest number of passes of the detector.
-        confirm: probability that the picture holds the target, from which on it is found; None takes the threshold of
-            the evidence.
+        passes: largest number of passes of the detector, closer looks included.
+        confirm: probability from which on the target is found: with closer looks, that it is at the place; otherwise,
+            that the picture holds it. None takes the threshold of the evidence.
         give_up: probability that a look shows the target, below which no look is worth a pass; None takes the threshold
             of the evidence.
+        closer: largest number of closer looks; 0 decides without them, as does evidence without fitted verification.
         context: which classes stand beside each other; None leaves it out.
 
     Returns:
         The looks, the objects of the class, and the decision.
     """
-    thresholds = (evidence.thresholds or DEFAULTS).changed(confirm, give_up)
+    thresholds = (evidence.thresholds or DEFAULTS).changed(give_up=give_up)
+    verifier, model = None, evidence.verification
+    if closer and model is not None and model.thresholds is not None:
+        verifier = ZoomVerifier(model, glances, target, model.thresholds.changed(confirm), thresholds.confirm, closer)
+    else:
+        thresholds = thresholds.changed(confirm)
     seen: list[Glance] = []
     values: list[float] = []
     tally: Tally | None = None
@@ -145,16 +158,33 @@ def search(
         tally.add(glance)
         seen.append(glance)
         values.append(value)
-        presence = None
-        if tally.looked or ahead < thresholds.give_up:  # otherwise no probability ends the search
+        if verifier is not None:
+            verifier.suspects.see(glance)
+        presence, over = None, ahead < thresholds.give_up
+        if tally.looked or over:  # otherwise no probability ends the search
             presence = tally.presence(ahead)
-            state = torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([ahead])
-            ended = int(settle(*state, thresholds))
+            if verifier is None:
+                state = torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([ahead])
+                ended = int(settle(*state, thresholds))
+            else:
+                room = passes - len(seen)
+                last = over or ahead == 0 or room <= 1
+                for look, chance in verifier(presence, tally.best, len(seen), room, over=last):
+                    seen.append(look)
+                    values.append(chance)
+                ended = verifier.outcome(presence, over=over)
         if ended or len(seen) == passes:
             break
     assert tally is not None
     presence = tally.presence(ahead) if presence is None else presence
-    box = tally.box if OUTCOMES[ended] == "found" else None
+    box, place = (tally.box if OUTCOMES[ended] == "found" else None), None
+    if verifier is not None:
+        if not ended and OUTCOMES[verifier.outcome(presence, over=True)] == "found":
+            ended = OUTCOMES.index("found")
+        presence = verifier.presence(presence)
+        if OUTCOMES[ended] == "found":
+            best = verifier.best()
+            presence, box, place = max(presence, best.place), best.box, best.place
     ending: Ending = "decision" if ended else "passes" if len(seen) == passes else "windows"
     return ZoomPath(
         glances.lattice,
@@ -163,8 +193,9 @@ def search(
         tuple(seen),
         tuple(values),
         merge(seen, target),
-        Decision(OUTCOMES[ended], presence, None, box),
+        Decision(OUTCOMES[ended], presence, None, box, place),
         ending,
+        () if verifier is None else tuple(verifier.looks),
     )
 
 

@@ -10,7 +10,7 @@ from PIL import Image
 import eval.demo as program
 from eval import demo_text
 from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, observers, policies, read_image
-from semfov.belief import MapEvidence
+from semfov.belief import MapEvidence, Verification
 from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import Picture, embedded_picture
@@ -159,6 +159,21 @@ def test_a_large_picture_is_looked_at_in_windows(run, large, shipped_evidence, t
     code, printed = run(large, "--target", "red", "--draw", "[]")
     assert code == 0
     assert not (tmp_path / "out" / "zoom.png").exists()
+
+
+def test_a_large_picture_is_looked_at_closely(run, large, shipped_evidence, tmp_path):
+    evidence = GlimpseEvidence.from_pretrained("squares")
+    evidence.verification = Verification(thresholds=Thresholds(0.4, 0.0, 0.0))
+    for parameter in evidence.verification.requires_grad_(False).parameters():
+        parameter.zero_()  # all probabilities after closer looks are one half
+    evidence.save(tmp_path / "shipped" / "squares.safetensors")
+    _, printed = run(large, "--target", "red", "--shifts", 5, "--draw", "[]", "--report", tmp_path / "page.html")
+    assert "red: found (0.50) in" in printed.out
+    assert "A closer look confirmed the target." in printed.out
+    assert "; closer look: p 0.500 there\n" in printed.out
+    assert "Closer look" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    _, printed = run(large, "--target", "red", "--shifts", 5, "--draw", "[]", "--closer", 0)
+    assert "closer look:" not in printed.out
 
 
 def test_a_folder_may_have_small_and_large_pictures(run, photo, large, shipped_evidence, tmp_path):

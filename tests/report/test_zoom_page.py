@@ -15,6 +15,7 @@ from semfov.errors import InputError
 from semfov.report import Pool, episode_data, page_html, zoom_data
 from semfov.report.zoom import LISTED, SHOWN
 from semfov.zoom import Objects
+from semfov.zoom.closer import CloserGlance
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
 
@@ -91,6 +92,16 @@ def test_a_look_brought_the_objects_whose_box_comes_from_it(zoom_path, large_pic
     assert [look["brought"] for look in looks] == ["none", f"1 × {hostile}", f"1 × {hostile}"]
     assert looks[0]["status"] == "Look 0 of 2, at the whole picture. Objects that it brought: none."
     assert looks[1]["status"].startswith("Look 1 of 2 at (100, 100), magnification 0.5. Its value was 0.5.")
+
+
+def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
+    path = replace(zoom_path, closer=(CloserGlance(2, zoom_path.decision.box, 0.875, 0.9),), ending="decision")
+    data = zoom_data(path, large_picture, pool := Pool(), name="field")
+    assert data["decision"].endswith("0.93. A closer look confirmed the target.")
+    assert [look["closer"] is None for look in data["looks"]] == [True, True, False]
+    assert "It is a closer look: the target is there with a probability of 0.88." in data["looks"][2]["status"]
+    texts = " ".join(Elements(page_html("field", [data], pool)).texts)
+    assert texts.count("Closer look probability 0.88 that the target is there") == 1
 
 
 def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
