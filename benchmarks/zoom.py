@@ -20,7 +20,7 @@ from semfov import EmbeddedScenes, ZoomAgent
 from semfov.data.large import to_bytes
 from semfov.data.mosaics import Mosaics
 from semfov.detection.selection import select
-from semfov.zoom.search import ZoomPath
+from semfov.zoom.path import ZoomPath
 
 PASSES = 17
 SIZES = {"2560 × 1920 px": (4, 4), "3840 × 2880 px": (6, 6)}
@@ -50,7 +50,8 @@ def programs(agent: ZoomAgent, columns: int, rows: int) -> dict[str, tuple[Run, 
     tasks = {
         "explore": lambda: agent.explore(picture, passes=PASSES, worth=0.0),
         "find all": lambda: agent.find_all(picture, "person", passes=PASSES, worth=0.0),
-        "search": lambda: agent.search(picture, "person", passes=PASSES, confirm=1.0, give_up=0.0),
+        # Without closer looks, which would end it early.
+        "search": lambda: agent.search(picture, "person", passes=PASSES, confirm=1.0, give_up=0.0, closer=0),
     }
     return {name: (task, alone(path := task()), path.passes) for name, task in tasks.items()}
 

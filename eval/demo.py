@@ -83,7 +83,8 @@ class DemoConfig(Settings):
             value (none: the value chosen when the belief was fitted).
         closer: largest number of closer looks, in which a window around a place that seems to hold the target is
             enlarged to the detector's input; 0: none. In a video or from a camera, a closer look takes the place of a
-            look, and the number holds for the time until half of the belief has faded.
+            look, and the number holds for the time until half of the belief has faded. In a large picture each takes
+            one of the passes.
         price: price of a look in right decisions: a search ends when further looks are not worth it (none: the search
             ends by thresholds).
         until: price of a look in cells: an exploration ends when no look is expected to name this many more cells right
@@ -155,13 +156,13 @@ def demo(config: DemoConfig) -> None:
         if zooming is not None and zooming.pays(picture.image):
             folder = config.out / f"{number:03d}-{plain_name(picture.name)}" if several else config.out
             only_likeliest(wanted)
-            zoomed, passes = zoom_in(zooming, picture, config)
+            zoomed = zoom_in(zooming, picture, config)
             if "scanpath" in config.draw:
                 small = reduced(picture.image).clamp(0, 1)
                 written.append(viz.save_figure(viz.plot_zoom_path(zoomed, small), folder / "zoom.png"))
             if config.report is not None:
-                given = {"settings": zooming.eye.settings(), "passes": passes}
-                episodes.append(zoom_data(zoomed, picture.image, pool, name=picture.name, **given))
+                settings = zooming.eye.settings()
+                episodes.append(zoom_data(zoomed, picture.image, pool, name=picture.name, settings=settings))
             continue
         scanpath = look_at(agent, picture, config, wanted)
         print(told(picture.name, scanpath))
@@ -204,7 +205,7 @@ def zoom_agent(config: DemoConfig, agent: ActivePerception) -> ZoomAgent | None:
     return zooming.eval().requires_grad_(False)
 
 
-def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> tuple[ZoomPath, int]:
+def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> ZoomPath:
     """Search or explore a picture larger than the detector's input, and print its windows.
 
     Args:
@@ -213,7 +214,7 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> tuple[Zoo
         config: the settings.
 
     Returns:
-        The path, and the largest number of passes.
+        The path.
     """
     passes = 24 if config.shifts is None else config.shifts + 1
     if config.target is None:
@@ -221,18 +222,20 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> tuple[Zoo
         path = agent.explore(picture.image, passes=passes, **chosen(given))
     else:
         given = {"confirm": config.confirm, "give_up": config.give_up}
-        path = agent.search(picture.image, config.target, passes=passes, **chosen(given))
+        path = agent.search(picture.image, config.target, passes=passes, closer=config.closer, **chosen(given))
     width, height = path.lattice.size
-    print(f"{picture.name}, {width} × {height} px, looked at in windows: {path.describe()}")
+    print(f"{picture.name}, {width} × {height} px, looked at in windows: {path.told()}")
     unused = [name for name in ("sensor", "start", "price") if getattr(config, name) is not None]
     if unused:
         print(f"  ignored for a picture of this size: {', '.join(unused)}")
+    closer = {look.number: f"; closer look: p {look.place:.3f} there" for look in path.closer}
     for number, glance in enumerate(path.glances):
         x, y, magnification = glance.window.fixation
         count = int((glance.detections.confidence >= viz.CONFIDENT).sum())
         where = f"at ({x:.0f}, {y:.0f})" if number else "the whole picture"
-        print(f"  {number:2d}  {where} × {magnification:.2f}: {count} detection{'s' if count != 1 else ''}")
-    return path, passes
+        told = f"{count} detection{'s' if count != 1 else ''}{closer.get(number, '')}"
+        print(f"  {number:2d}  {where} × {magnification:.2f}: {told}")
+    return path
 
 
 def chosen(values: dict[str, float | None]) -> dict[str, Any]:

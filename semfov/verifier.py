@@ -1,6 +1,6 @@
 """Verification of the target by closer looks, before a search decides."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -185,6 +185,34 @@ def surely(confirm: float) -> float:
     return (1 + confirm) / 2
 
 
+def verified(places: Sequence[float], presence: float, confirm: float, *, over: bool) -> int:
+    """Decide a search after closer looks.
+
+    It has found its target if a place is sure (`surely`). When it is over, it has found it if a place is probable
+    enough; otherwise the target is absent if the picture holds it with a probability below one half.
+
+    Args:
+        places: for each closer look, the probability that the target is at its place.
+        presence: probability that the picture holds the target.
+        confirm: least probability of the place, for `found`.
+        over: whether no look follows.
+
+    Returns:
+        0 for a search that continues, otherwise the number of its outcome in `semfov.decision.OUTCOMES`.
+
+    >>> verified([0.3, 0.96], 0.9, 0.9, over=False), verified([0.92], 0.9, 0.9, over=False)
+    (1, 0)
+    >>> [OUTCOMES[verified([place], presence, 0.9, over=True)] for place, presence in ((0.92, 0.9), (0.2, 0.3))]
+    ['found', 'absent']
+    """
+    best = max(places, default=0.0)
+    if places and best >= (confirm if over else surely(confirm)):
+        return OUTCOMES.index("found")
+    if not over:
+        return 0
+    return OUTCOMES.index("absent") if presence < 0.5 else len(OUTCOMES) - 1
+
+
 class Examiner:
     """Looks closely at the places of one search that seem to hold the target.
 
@@ -337,12 +365,10 @@ class Verifier(Examiner):
                 break
             self.looks.append(self.examine(step, candidate, self.close_up))
             if self.looks[-1].place >= surely(self.thresholds.confirm):
-                return OUTCOMES.index("found")
-        if not over and len(self.looks) < self.most:
-            return 0
-        if self.looks and self.best().place >= self.thresholds.confirm:
-            return OUTCOMES.index("found")
-        return OUTCOMES.index("absent") if self._presence(step.belief) < 0.5 else len(OUTCOMES) - 1
+                break
+        over = over or len(self.looks) >= self.most
+        places = [look.place for look in self.looks]
+        return verified(places, self._presence(step.belief), self.thresholds.confirm, over=over)
 
     def best(self) -> CloserLook:
         """The closer look with the largest probability of the place.

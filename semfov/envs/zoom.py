@@ -21,8 +21,8 @@ from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.glances import Glance, Window, on_lattice
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
+from semfov.zoom.path import ZoomPath
 from semfov.zoom.policy import best_find, best_hit
-from semfov.zoom.search import ZoomPath
 
 Action = NDArray[np.float32]
 

@@ -159,7 +159,8 @@ class ZoomRun(SceneRun):
         protocol["contexts"] = [(name, context.prior.digest()) for name, context in self.contexts.items()]
         evidence = self.evidence
         thresholds = None if evidence.thresholds is None else asdict(evidence.thresholds)
-        model = [checksum(evidence.state_dict()), evidence.patience, evidence.foresight, thresholds]
+        verified = None if evidence.verification is None else repr(evidence.verification.thresholds)
+        model = [checksum(evidence.state_dict()), evidence.patience, evidence.foresight, thresholds, verified]
         observed = None if self.observation is None else checksum(self.observation.state_dict())
         return digest_of([self.eye.settings(), self.scenes.fingerprint, protocol, model, observed])
 

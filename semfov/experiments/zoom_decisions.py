@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import torch
 
 from semfov.data.scene import Annotation
+from semfov.decision import OUTCOMES
 from semfov.experiments.decision_report import SHARES, mean, percent, telling
 from semfov.experiments.decisions import overlap
 from semfov.experiments.parts import Record
 from semfov.experiments.summary import table
 from semfov.metrics.calibration import BinarySums
+from semfov.verifier import MOST
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glances, Window
 from semfov.zoom.search import search
+
+OURS, UNVERIFIED = "ours", "ours, without closer looks"
+"""Names of searches with closer looks at places that seem to hold the target, and of searches without them."""
 
 
 def decide_all(
@@ -27,7 +33,7 @@ def decide_all(
     *,
     passes: int,
 ) -> list[Record]:
-    """Search a picture until a decision, for each target.
+    """Search a picture until a decision, for each target, with closer looks and without them.
 
     Args:
         glances: the looks at the picture.
@@ -39,13 +45,14 @@ def decide_all(
         passes: largest number of passes of a search.
 
     Returns:
-        A record for each target: the decision and, for comparison, the target's highest score in the overview, and in
-        the overview and all slices.
+        Records for each target: the decision and, for comparison, the target's highest score in the overview, and in
+        the overview and all slices. Evidence without fitted verification makes no closer looks.
     """
     shown = torch.stack([glance.show for glance in glances.see(slices)])
     records: list[Record] = []
-    for target in targets:
-        path = search(glances, evidence, classes, target, passes=passes)
+    ways = {OURS: MOST} if evidence.verification is None else {OURS: MOST, UNVERIFIED: 0}
+    for target, (way, closer) in product(targets, ways.items()):
+        path = search(glances, evidence, classes, target, passes=passes, closer=closer)
         decision = path.decision
         assert decision is not None
         there = annotation.boxes[annotation.labels == target]
@@ -53,7 +60,7 @@ def decide_all(
         records.append(
             {
                 "measure": "decision",
-                "way": "ours",
+                "way": way,
                 "target": classes[target],
                 "present": len(there) > 0,
                 "outcome": decision.outcome,
@@ -68,40 +75,53 @@ def decide_all(
     return records
 
 
+def by_way(records: Sequence[Record]) -> dict[str, list[Record]]:
+    """The records of each way of searching; all ways have the same searches in the same order."""
+    ways: dict[str, list[Record]] = {}
+    for record in records:
+        ways.setdefault(record["way"], []).append(record)
+    return ways
+
+
 def probabilities(records: Sequence[Record]) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
     """Scores `(M,)` by name that predict whether the target is present, and whether it is, `(M,)`."""
-    names = {"ours": "probability", "the overview, highest score": "overview", "all slices, highest score": "slices"}
-    told = {name: torch.tensor([record[key] for record in records]) for name, key in names.items()}
-    return told, torch.tensor([record["present"] for record in records])
+    ways = by_way(records)
+    told = {way: torch.tensor([record["probability"] for record in of]) for way, of in ways.items()}
+    searches = next(iter(ways.values()))
+    for name, key in (("the overview, highest score", "overview"), ("all slices, highest score", "slices")):
+        told[name] = torch.tensor([record[key] for record in searches])
+    return told, torch.tensor([record["present"] for record in searches])
 
 
 def decision_tables(records: Sequence[Record]) -> list[str]:
     """Tables of how well scores predict the target's presence, and of the decisions, as Markdown."""
     told, there = probabilities(records)
-    passes = {
-        "ours": mean([record["passes"] for record in records]),
-        "the overview, highest score": "1",
-        "all slices, highest score": mean([record["count"] for record in records]),
-    }
+    ways = by_way(records)
+    searches = next(iter(ways.values()))
+    passes = {way: mean([record["passes"] for record in of]) for way, of in ways.items()}
+    passes["the overview, highest score"] = "1"
+    passes["all slices, highest score"] = mean([record["count"] for record in searches])
     rows = [["", "passes", "area under ROC", *(f"hits at {share:.0%}" for share in SHARES), "ECE", "Brier"]]
     for (name, score), figures in zip(told.items(), telling(told, there), strict=True):
         sums = BinarySums.of(score, there)
         rows.append([name, passes[name], *figures, f"{sums.ece:.3f}", f"{sums.brier:.3f}"])
-    present, absent = ([r for r in records if r["present"] is kind] for kind in (True, False))
-    decided = [["", "found", "absent", "undecided", "passes, mean", "probability, mean"]]
-    for name, group in (("it is there", present), ("it is not", absent)):
-        counts = [percent(sum(r["outcome"] == each for r in group), len(group)) for each in decided[0][1:4]]
-        looks = mean([r["passes"] for r in group])
-        decided.append([name, *counts, looks, mean([r["probability"] for r in group], 2)])
-    found = [r for r in present if r["outcome"] == "found"]
-    right = percent(sum((r["overlap"] or 0) >= 0.5 for r in found), len(found))
+    decided = [["", "found", "box right", "absent", "undecided", "passes, mean", "probability, mean"]]
+    for way, of in ways.items():
+        for kind in (True, False):
+            group = [r for r in of if r["present"] is kind]
+            counts = [percent(sum(r["outcome"] == each for r in group), len(group)) for each in OUTCOMES[1:]]
+            found = [r for r in group if r["outcome"] == "found"]
+            right = percent(sum((r["overlap"] or 0) >= 0.5 for r in found), len(found)) if kind else ""
+            looks, chance = mean([r["passes"] for r in group]), mean([r["probability"] for r in group], 2)
+            name = f"it is {'there' if kind else 'not'}{way.removeprefix(OURS)}"
+            decided.append([name, counts[0], right, *counts[1:], looks, chance])
     return [
-        f"Is the target present? {len(records)} searches, {len(present)} of them for a present class; hit rates in % "
-        "at the given false alarm rates. `ours` is the probability at the end of a search.",
+        f"Is the target present? {len(searches)} searches, {int(there.sum())} of them for a present class; hit rates "
+        "in % at the given false alarm rates. `ours` is the probability at the end of a search.",
         "",
         *table(rows),
         "",
-        f"Decisions in %. Among the finds of present targets, the reported box is right (IoU 0.5) in {right} %.",
+        "Decisions in %, and the share of finds of present targets whose box is right (IoU 0.5).",
         "",
         *table(decided),
         "",

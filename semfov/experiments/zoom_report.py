@@ -64,7 +64,7 @@ def summary(records: list[Record], run: ZoomRun) -> str:
             "",
             *_paired(hits),
         ]
-    if decided := groups.get(("decision", "ours")):
+    if decided := [record for record in records if record["measure"] == "decision"]:
         lines += decision_tables(decided)
     return "\n".join(lines)
 

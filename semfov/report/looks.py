@@ -29,7 +29,8 @@ NUMBER = (
 
 PROBABILITY = (
     "The value of a look is the probability that it shows the target. For a wide window it is the sum of these "
-    "probabilities over the closer windows in it, divided by a constant, if that is larger."
+    "probabilities over the closer windows in it, divided by a constant, if that is larger. The value of a closer look "
+    "is the probability, before it, that the target is at the place."
 )
 """What values mean in searches (`semfov.zoom.policy.best_hit`)."""
 
@@ -113,6 +114,8 @@ def _look(data: Data, number: int, pool: Pool, place: str) -> str:
         "Value when it was chosen": value,
         "Objects that it brought": look["brought"],
     }
+    if look["closer"] is not None:
+        facts["Closer look"] = look["closer"]
     told = "".join(f"<div><dt>{key}</dt><dd>{escape(fact)}</dd></div>" for key, fact in facts.items())
     table = "<p>No detections.</p>"
     if len(rows) > 1:

@@ -39,7 +39,7 @@ def write_page(path: Path, title: str, episodes: Sequence[Data], pool: Pool, *, 
     Example::
 
         path, pool = agent.explore("harbour.tif", passes=16), Pool()
-        data = zoom_data(path, "harbour.tif", pool, name="harbour", passes=16)
+        data = zoom_data(path, "harbour.tif", pool, name="harbour")
         write_page(Path("harbour.html"), "Harbour", [data], pool)
     """
     write_text(path, page_html(title, episodes, pool, sections=sections))

@@ -8,14 +8,13 @@ from typing import Any
 
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, open_large, reduction_for
-from semfov.errors import check, check_whole
+from semfov.errors import check
 from semfov.report.episode import Data, Pool, rounded, tagged
-from semfov.zoom.agent import MOST
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import Objects
-from semfov.zoom.search import ZoomPath
+from semfov.zoom.path import ZoomPath
 
 Frame = tuple[int, int, int, int]
 
@@ -36,7 +35,6 @@ def zoom_data(
     *,
     name: str,
     settings: Mapping[str, Any] | None = None,
-    passes: int | None = None,
     width: int = 1280,
     quality: int = 75,
 ) -> Data:
@@ -51,8 +49,6 @@ def zoom_data(
         pool: collects the pictures.
         name: name of the picture.
         settings: settings of the eye (`ZoomEye.settings()`), for the name of the detector; None leaves the name out.
-        passes: largest number of passes that was allowed; None if it is not known. Then the page may not tell why the
-            path ended.
         width: largest width in pixels of the whole picture on the page.
         quality: of the JPEG files.
 
@@ -68,8 +64,8 @@ def zoom_data(
     >>> lattice, nothing = Lattice.over((1600, 1200), (400, 400)), torch.zeros(0)
     >>> look = Glance(on_lattice(lattice, (0, 0, 0)), Detections.empty(1, 1), nothing, nothing, None)
     >>> objects = Objects(nothing.view(0, 4), nothing, nothing.long(), nothing.long())
-    >>> path = ZoomPath(lattice, ("background", "cup"), 1, (look,), (float("inf"),), objects)
-    >>> data = zoom_data(path, torch.rand(3, 1200, 1600), Pool(), name="kitchen.jpg", passes=1)
+    >>> path = ZoomPath(lattice, ("background", "cup"), 1, (look,), (float("inf"),), objects, ending="passes")
+    >>> data = zoom_data(path, torch.rand(3, 1200, 1600), Pool(), name="kitchen.jpg")
     >>> data["sensor"], data["decision"]
     ('windows of 400 × 400 px at magnifications 0.25, 0.5, 1', '0 × cup found. The only pass was used.')
     """
@@ -77,8 +73,6 @@ def zoom_data(
     wide, high = path.lattice.size
     check(tuple(source.size) == (wide, high), "picture", f"the picture of the path, {wide} × {high} px", source.size)
     check(path.passes > 0, "path", "at least one look", path.passes)
-    if passes is not None:
-        check_whole(passes, "passes", path.passes, MOST)
     sure = path.objects.above(FOUND)
     objects = _objects(sure, path.classes)
     target = None if path.target is None else path.classes[path.target]
@@ -88,8 +82,8 @@ def zoom_data(
         "pixels": f"{wide} × {high} px",
         "detector": None if settings is None else settings["detector"]["name"],
         "sensor": windows_in_words(path.lattice),
-        "passes": str(path.passes) if passes is None else f"{path.passes} of at most {passes}",
-        "decision": outcome_in_words(path, passes),
+        "passes": str(path.passes),
+        "decision": outcome_in_words(path),
         "summary": path.describe(),
         "size": [wide, high],
         "target": target,
@@ -110,30 +104,16 @@ def windows_in_words(lattice: Lattice) -> str:
     return f"windows of {wide} × {high} px at magnification{several} {magnifications}"
 
 
-def outcome_in_words(path: ZoomPath, passes: int | None) -> str:
+def outcome_in_words(path: ZoomPath) -> str:
     """Tell the result of a search or an exploration, and why it ended if that is known."""
-    used = path.passes == passes
-    all_used = f"All {passes} passes were used." if passes != 1 else "The only pass was used."
     target = None if path.target is None else path.classes[path.target]
     if path.decision is None:
         count = len(path.objects.above(FOUND))
         told = f"{count} object{'s' if count != 1 else ''} found." if target is None else f"{count} × {target} found."
-        end = "No remaining look is expected to show enough new objects."
-        return f"{told} {'' if passes is None else all_used if used else end}".rstrip()
-    outcome, probability = path.decision.outcome, path.decision.probability
-    told = f"“{target}” {outcome}, probability that the picture holds it: {probability:.2f}."
-    reasons = {
-        "found": "The probability is high enough, and a detection shows the target.",
-        "absent": "No remaining look is worth a pass, and the target is probably absent.",
-        "undecided": "No remaining look is worth a pass, but the target is probably there.",
-    }
-    if outcome != "undecided":
-        return f"{told} {reasons[outcome]}"
-    if passes is None:
-        return told
-    if used:
-        return f"{told} {all_used}"
-    return f"{told} {reasons[outcome] if probability >= 0.5 else 'No remaining look can show the target.'}"
+    else:
+        outcome, probability = path.decision.outcome, path.decision.probability
+        told = f"“{target}” {outcome}, probability that the picture holds it: {probability:.2f}."
+    return f"{told} {path.why_it_ended()}".rstrip()
 
 
 def _objects(objects: Objects, classes: tuple[str, ...]) -> list[Data]:
@@ -152,17 +132,21 @@ def _look(path: ZoomPath, number: int, objects: list[Data], source: LargePicture
     across = max(1, round((frame[2] - frame[0]) * magnification))
     detections = _detections(path, path.glances[number], frame)
     brought = Counter(each["label"] for each in objects if each["look"] == number)
+    closer = next((look for look in path.closer if look.number == number), None)
     value, kinds = path.values[number], ", ".join(f"{count} × {label}" for label, count in brought.most_common())
     told = [f"Look {number} of {path.passes - 1}"]
     told[0] += f" at ({x:.0f}, {y:.0f}), magnification {magnification:.2g}." if number else ", at the whole picture."
     if number:
         told.append(f"Its value was {value:.2g}.")
+    if closer is not None:
+        told.append(f"It is a closer look: the target is there with a probability of {closer.place:.2f}.")
     told.append(f"Objects that it brought: {kinds or 'none'}.")
     return {
         "view": pool.add(_pixels(source, frame, across), across, quality),
         "box": list(frame),
         "magnification": rounded(magnification),
         "value": rounded(value),
+        "closer": None if closer is None else f"probability {closer.place:.2f} that the target is there",
         "detections": detections[:SHOWN],
         "count": len(detections),
         "brought": kinds or "none",

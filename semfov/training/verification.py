@@ -47,5 +47,5 @@ def fit_verification(config: FitVerificationConfig) -> None:
     fitted.model.metadata = {**eye.settings(), **training_of(config, scenes, "target_model")}
     path = model_path(config, eye.detector.name)
     fitted.model.save(path)
-    text, figures = report(fitted, len(seen))
+    text, figures = report(fitted, f"{len(seen)} photographs")
     write_outputs(config, text, ("judged.json", json.dumps(figures, indent=2) + "\n"), path)

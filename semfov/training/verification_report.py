@@ -19,12 +19,17 @@ SHOWN = (0.5, 0.6, 0.7, 0.8, 0.9)
 """Values of the threshold `confirm` in the table, besides the chosen one."""
 
 
-def report(fitted: FittedVerification, count: int) -> tuple[str, dict[str, float | None]]:
+def report(
+    fitted: FittedVerification,
+    pictures: str,
+    how: str = "Each photograph is evaluated with a model fitted to other folds.",
+) -> tuple[str, dict[str, float | None]]:
     """Evaluate the models in folds.
 
     Args:
         fitted: the models with their closer looks and searches.
-        count: number of photographs.
+        pictures: number and kind of the pictures.
+        how: sentence on which pictures a model is evaluated.
 
     Returns:
         The report as Markdown, and its measures by name; None for an area that only one kind of searches leaves
@@ -63,8 +68,8 @@ def report(fitted: FittedVerification, count: int) -> tuple[str, dict[str, float
         decisions.append([f"{confirm:.2f}{mark}", *_row(there.tolist(), ended)])
     return "\n".join(
         [
-            f"{len(searches)} searches of {count} photographs, {int(there.sum())} of them for a present class; "
-            f"{len(examined.fold)} closer looks. Each photograph is evaluated with a model fitted to other folds.",
+            f"{len(searches)} searches of {pictures}, {int(there.sum())} of them for a present class; "
+            f"{len(examined.fold)} closer looks. {how}",
             "",
             "Probability of the target before and after a closer look:",
             "",

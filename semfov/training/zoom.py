@@ -25,12 +25,16 @@ from semfov.training.zoom_presence import fit_presence, pair_windows, presence_l
 from semfov.training.zoom_rates import fit_rates, rate_loss
 from semfov.training.zoom_settings import FitZoomConfig, Part
 from semfov.training.zoom_survey import SurveyExample, fit_survey, judge_survey
+from semfov.training.zoom_verification import fit_closer
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import ZoomEye
 from semfov.zoom.survey import Survey
 
 DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms", "surest", "lost", "tile", "seed")
 """Settings that the thresholds and the probability of presence depend on."""
+
+VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms", "surest", "tile", "seed")
+"""Settings that the verification depends on."""
 
 SURVEYING = ("mosaics", "far", "judged", "judged_far", "survey_steps", "tile", "seed")
 """Settings that the survey depends on."""
@@ -103,7 +107,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
     parts: list[str] = []
     figures = "{}"
     check(len(config.refit) > 0, "refit", "at least one part of the model", config.refit)
-    refit: set[Part] = set(config.refit) if config.evidence else {"decision", "survey"}
+    refit: set[Part] = set(config.refit) if config.evidence else {"decision", "survey", "verification"}
     examples = look_at_all(config, eye, mosaics, store) if "survey" in refit else {}
     if config.evidence is None:
         model = fit_looks(config, eye, mosaics, examples)
@@ -121,6 +125,16 @@ def fit_zoom(config: FitZoomConfig) -> None:
         parts += [*figures_of(measured), "", chosen, "", *table(tried), ""]
     if "decision" in refit:
         parts += fit_decision(config, model, eye, mosaics, store)
+        # A verification belongs to the probability that it was fitted with.
+        model.verification = None
+        model.metadata.pop("verification", None)
+    if "verification" in refit:
+        check(model.thresholds is not None, "evidence", "a model whose decisions were fitted", config.evidence)
+        prepare_worker()
+        opened = {kind: open_all(eye, mosaics[kind], store) for kind in ("searched", "judged")}
+        parts += ["Closer looks:", "", fit_closer(model, mosaics, opened, config)]
+        if model.verification is not None:
+            model.metadata["verification"] = {name: getattr(config, name) for name in VERIFYING}
     path = inside(config.out, f"{eye.detector.name}.safetensors")
     model.save(path)
     write_outputs(config, "\n".join(parts), ("figures.json", figures), path)

@@ -8,7 +8,7 @@ from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.settings import Count, Seed, Settings, Share, Workers
 from semfov.experiments.zoom import Tile
 
-Part = Literal["decision", "survey"]
+Part = Literal["decision", "survey", "verification"]
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,12 @@ class FitZoomConfig(Settings):
         false_alarms: maximum share of absent targets that may be reported as found; it determines the threshold.
         surest: upper limit of that threshold, even if more false alarms result.
         lost: maximum share of the targets that may be missed because the search gives up.
+        place: least probability that the target is at a place, for a closer look there when no other look follows.
         evidence: model that was fitted before. If given, only the parts in `refit` are fitted (None: fit all).
-        refit: parts of that model to fit again: `decision`, the decisions of searches, and `survey`, the number of
-            objects of any class that closer looks find.
+        refit: parts of that model to fit again: `decision`, the decisions of searches, `verification`, the
+            probabilities after closer looks at places that seem to hold the target, and `survey`, the number of objects
+            of any class that closer looks find. The verification has to follow new decisions; without it they are made
+            without closer looks.
         steps: number of training steps for predicting the results of closer looks.
         survey_steps: number of training steps for the number of objects of any class.
         judging: number of training steps for the decisions of searches.
@@ -55,8 +58,9 @@ class FitZoomConfig(Settings):
     false_alarms: Share = 0.03
     surest: Share = 0.9
     lost: Share = 0.02
+    place: Share = 0.2
     evidence: Path | None = None
-    refit: tuple[Part, ...] = ("decision",)
+    refit: tuple[Part, ...] = ("decision", "verification")
     steps: Count = 800
     survey_steps: Count = 2000
     judging: Count = 300

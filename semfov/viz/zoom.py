@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from semfov.viz.style import FOUND, GAZE, TARGET, make_figure, only, styled
-from semfov.zoom.search import ZoomPath
+from semfov.zoom.path import ZoomPath
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

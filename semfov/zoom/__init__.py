@@ -8,7 +8,7 @@ from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import ZoomEye, ZoomView
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import Objects, merge
-from semfov.zoom.search import ZoomPath
+from semfov.zoom.path import ZoomPath
 
 if TYPE_CHECKING:
     from semfov.zoom.export import export_look

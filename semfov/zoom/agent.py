@@ -11,11 +11,13 @@ from semfov.data.large import LargePicture
 from semfov.decision import check_thresholds
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
+from semfov.verifier import MOST as CLOSER
 from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, ZoomEye
 from semfov.zoom.glances import LiveGlances
-from semfov.zoom.search import ZoomPath, find_all, search
+from semfov.zoom.path import ZoomPath
+from semfov.zoom.search import find_all, search
 
 MOST = 1_000_000
 """Limit of passes and batches, more than any picture has windows."""
@@ -101,17 +103,23 @@ class ZoomAgent(nn.Module):
         passes: int = 24,
         confirm: float | None = None,
         give_up: float | None = None,
+        closer: int = CLOSER,
     ) -> ZoomPath:
         """Search for one object of a class and decide whether the picture holds one (`semfov.zoom.search.search`).
+
+        The recommended agent looks closely at places that seem to hold the class before it says `found`
+        (`semfov.zoom.closer`).
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.
             target: name or index (1..K) of the class.
-            passes: largest number of passes of the detector.
-            confirm: the class counts as found when the probability that the picture holds it reaches this value; None
-                takes the threshold of the evidence.
+            passes: largest number of passes of the detector, closer looks included.
+            confirm: the class counts as found when the probability reaches this value: with closer looks, that it is at
+                the place; otherwise, that the picture holds it. None takes the threshold of the evidence.
             give_up: the search ends when no look shows the class with a probability of at least this value; None takes
                 the threshold of the evidence.
+            closer: largest number of closer looks, 0 to 100. 0 decides without them, as does evidence without fitted
+                verification.
 
         Returns:
             The looks, the objects of the class, and the decision.
@@ -122,6 +130,7 @@ class ZoomAgent(nn.Module):
         """
         check_whole(passes, "passes", 1, MOST)
         check_thresholds(confirm, give_up)
+        check_whole(closer, "closer", 0, 100)
         index = class_index(target, self.classes[1:], "target")
         with torch.inference_mode():
             return search(
@@ -132,6 +141,7 @@ class ZoomAgent(nn.Module):
                 passes=passes,
                 confirm=confirm,
                 give_up=give_up,
+                closer=closer,
                 context=self.context,
             )
 

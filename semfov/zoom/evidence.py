@@ -10,10 +10,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.belief.target_evidence import THRESHOLDS, Thresholds
+from semfov.belief.verification import FEATURES, Verification
 from semfov.errors import check, check_number, check_whole
 from semfov.io.compatibility import check_detector
 from semfov.io.pretrained import Pretrained
-from semfov.io.schema import Field, Number, Schema, perceptron
+from semfov.io.schema import Field, Maybe, Number, Object, Schema, perceptron
 from semfov.zoom.gist import Gist
 from semfov.zoom.networks import STEPS, features, hint_maps, memory_maps, small_network, tapered, through
 from semfov.zoom.survey import SURVEY, Survey, survey_fields
@@ -48,7 +49,8 @@ class GlimpseEvidence(Pretrained):
 
       .. math:: \operatorname{logit} P(t) = \operatorname{logit} s^* + j(c)
 
-    Here f, g, λ and j are networks. Another network predicts how many objects of any class a look finds (`survey`).
+    Here f, g, λ and j are networks. Another network predicts how many objects of any class a look finds (`survey`). Two
+    logistic regressions give the probabilities after a closer look at a place that seems to hold t (`verification`).
 
     Args:
         classes: number of classes of the detector, without background.
@@ -57,6 +59,7 @@ class GlimpseEvidence(Pretrained):
             many times as many hits together.
         foresight: share of what still closer looks would find in a window that counts towards its value.
         thresholds: thresholds at which searches decide; None where none were chosen.
+        verification: probabilities after closer looks; None decides searches without them.
         metadata: JSON values kept with the model.
 
     Raises:
@@ -86,6 +89,8 @@ class GlimpseEvidence(Pretrained):
             "prior": Field(("K+1", 2), low=-1e3, high=1e3),
             "border": Field((4,), low=-1e3, high=1e3),
             **survey_fields(),
+            "verification.linear.weight": Field((2, FEATURES), low=-1e3, high=1e3, optional=True),
+            "verification.linear.bias": Field((2,), low=-1e3, high=1e3, optional=True),
         },
         {
             "classes": Number(size="K"),
@@ -94,6 +99,7 @@ class GlimpseEvidence(Pretrained):
             "foresight": Number(0, 1),
             "thresholds": THRESHOLDS,
             "survey": SURVEY,
+            "verification": Maybe(Object({"thresholds": THRESHOLDS}, required=("thresholds",))),
         },
     )
 
@@ -105,6 +111,7 @@ class GlimpseEvidence(Pretrained):
         patience: float = 2.3,
         foresight: float = 0.35,
         thresholds: Thresholds | None = None,
+        verification: Verification | None = None,
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
@@ -130,6 +137,7 @@ class GlimpseEvidence(Pretrained):
         self.prior = nn.Parameter(torch.zeros(classes + 1, 2))
         self.border = nn.Parameter(torch.tensor([0.0, 1.0, 2.0, 2.0]))
         self.survey = Survey(classes, foresight=foresight)
+        self.verification = verification
 
     def presence(
         self, scores: Tensor, summary: Tensor, steps: Tensor, target: int | None = None, before: Tensor | None = None
@@ -254,29 +262,44 @@ class GlimpseEvidence(Pretrained):
 
     def _record(self) -> dict[str, Any]:
         """Sizes and chosen settings, for the file."""
+        verified = self.verification
         return {
             "classes": self.classes,
             "width": self.width,
             "patience": self.patience,
             "foresight": self.foresight,
-            "thresholds": None if self.thresholds is None else asdict(self.thresholds),
+            "thresholds": _listed(self.thresholds),
             "survey": {"foresight": self.survey.foresight},
+            "verification": None if verified is None else {"thresholds": _listed(verified.thresholds)},
         }
 
     @classmethod
     def _restore(cls, record: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """The model from its file."""
+        # Files of earlier versions have no verification.
+        verified = record.get("verification")
         model = cls(
             record["classes"],
             record["width"],
             patience=record["patience"],
             foresight=record["foresight"],
-            thresholds=None if record["thresholds"] is None else Thresholds(**record["thresholds"]),
+            thresholds=_thresholds(record["thresholds"]),
+            verification=None if verified is None else Verification(thresholds=_thresholds(verified["thresholds"])),
             metadata=record["metadata"],
         )
         model.survey.foresight = record["survey"]["foresight"]
         model.load_state_dict(tensors)
         return model
+
+
+def _listed(thresholds: Thresholds | None) -> dict[str, float] | None:
+    """Thresholds as JSON."""
+    return None if thresholds is None else asdict(thresholds)
+
+
+def _thresholds(record: Mapping[str, float] | None) -> Thresholds | None:
+    """Thresholds from JSON."""
+    return None if record is None else Thresholds(**record)
 
 
 def pool(scores: Tensor, box: tuple[int, int, int, int]) -> tuple[Tensor, Tensor]:

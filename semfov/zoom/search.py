@@ -1,117 +1,25 @@
 """Searching and exploring pictures that are larger than the detector's input."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES, Decision, settle
+from semfov.verifier import MOST
 from semfov.zoom.belief import Rates, ZoomBelief
+from semfov.zoom.closer import ZoomVerifier
 from semfov.zoom.context import WindowContext
-from semfov.zoom.drawing import path_html
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance, Glances, Window, on_lattice
-from semfov.zoom.lattice import Lattice
-from semfov.zoom.objects import Objects, merge
+from semfov.zoom.objects import merge
+from semfov.zoom.path import Ending, ZoomPath
 from semfov.zoom.policy import Choice, best_find, best_hit, best_slice, jointly
 from semfov.zoom.tally import Tally
 
 DEFAULTS = Thresholds(0.9, 0.005)
 """Thresholds of searches whose evidence has none."""
-
-
-@dataclass(frozen=True, repr=False)
-class ZoomPath:
-    """The record of a search or an exploration of a large picture.
-
-    In a notebook it shows the windows that were looked at; `semfov.viz.plot_zoom_path` draws them on the picture.
-
-    Attributes:
-        lattice: lattice of the picture.
-        classes: names of the classes, background first.
-        target: class that was searched for; None for all classes.
-        glances: looks in their order, the overview first.
-        values: value of each look when it was chosen; that of the overview is infinite.
-        objects: objects that were found, merged from all looks.
-        decision: decision of a search; None where all objects were to be found.
-
-    >>> nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
-    >>> path = ZoomPath(Lattice.over((2560, 1920), (416, 416)), ("background", "cup"), 1, (), (), nothing)
-    >>> path.describe()
-    '0 × cup in 0 passes'
-    """
-
-    lattice: Lattice
-    classes: tuple[str, ...]
-    target: int | None
-    glances: tuple[Glance, ...]
-    values: tuple[float, ...]
-    objects: Objects
-    decision: Decision | None = None
-
-    @property
-    def passes(self) -> int:
-        """Number of passes of the detector."""
-        return len(self.glances)
-
-    def describe(self) -> str:
-        """Summarise the result.
-
-        Returns:
-            A line of text.
-        """
-        count = len(self.objects.above(FOUND))
-        passes = f"{self.passes} pass{'es' if self.passes != 1 else ''}"
-        if self.decision is not None and self.target is not None:
-            outcome = f"{self.decision.outcome} ({self.decision.probability:.2f})"
-            return f"{self.classes[self.target]}: {outcome} in {passes}"
-        if self.target is None:
-            return f"{count} object{'s' if count != 1 else ''} in {passes}"
-        return f"{count} × {self.classes[self.target]} in {passes}"
-
-    def shown(self, number: int) -> tuple[float, float, float, float]:
-        """Part of the picture that a look showed.
-
-        Args:
-            number: number of the look; the overview is 0.
-
-        Returns:
-            `(x1, y1, x2, y2)` in picture pixels.
-        """
-        window, (width, height) = self.glances[number].window, self.lattice.size
-        if window.within is not None:
-            return window.within
-        (x, y, magnification), (wide, high) = window.fixation, self.lattice.canvas
-        across, down = wide / magnification / 2, high / magnification / 2
-        x, y = x + 0.5, y + 0.5
-        return max(x - across, 0.0), max(y - down, 0.0), min(x + across, float(width)), min(y + down, float(height))
-
-    def __repr__(self) -> str:
-        """The result, the windows and the objects."""
-        looks = [f"({x:.0f}, {y:.0f}) × {m:.2f}" for x, y, m in (glance.window.fixation for glance in self.glances)]
-        path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
-        sure = self.objects.above(FOUND)
-        named = [
-            f"{self.classes[label]} {score:.2f}"
-            for label, score in zip(sure.labels.tolist()[:5], sure.scores.tolist(), strict=False)
-        ]
-        more = ["…"] if len(sure) > 5 else []
-        width, height = self.lattice.size
-        return "\n".join(
-            [
-                f"ZoomPath: {self.describe()}",
-                f"  at (x, y) × magnification: {', '.join(path)} of {width} × {height} px",
-                f"  objects: {', '.join([*named, *more]) or 'none'}",
-            ]
-        )
-
-    def _repr_html_(self) -> str:
-        """A drawing of the windows, numbered in their order, and of the objects."""
-        windows = [self.shown(number) for number in range(self.passes)]
-        return path_html(self.describe(), self.lattice.size, windows, self.objects, self.classes)
 
 
 class Turn(NamedTuple):
@@ -206,30 +114,41 @@ def search(
     passes: int = 24,
     confirm: float | None = None,
     give_up: float | None = None,
+    closer: int = MOST,
     context: WindowContext | None = None,
 ) -> ZoomPath:
-    """Search a picture for one object of a class and decide whether it is there (`semfov.decision.settle`).
+    """Search a picture for one object of a class and decide whether it is there.
 
-    The target is `found` when the picture holds it with a probability of at least `confirm` and a detection shows it.
-    When the value of every look that is left is below `give_up`, the target is `absent` if its probability is below one
-    half, and the search is `undecided` otherwise. It is also `undecided` when the passes are used up.
+    Places that seem to hold the target are looked at closely, and the target is `found` when it is probable enough at
+    such a place (`semfov.zoom.closer.ZoomVerifier`). Without closer looks it is `found` when the picture holds it with
+    a probability of at least `confirm` and a detection shows it (`semfov.decision.settle`).
+
+    When the value of every look that is left is below `give_up`, or all closer looks were made, the target is `absent`
+    if its probability is below one half, and the search is `undecided` otherwise. It is also `undecided` when the
+    passes are used up.
 
     Args:
         glances: source of looks at the picture.
         evidence: learned evidence by magnification.
         classes: names of the classes, background first.
         target: class 1..K.
-        passes: largest number of passes of the detector.
-        confirm: probability that the picture holds the target, from which on it is found; None takes the threshold of
-            the evidence.
+        passes: largest number of passes of the detector, closer looks included.
+        confirm: probability from which on the target is found: with closer looks, that it is at the place; otherwise,
+            that the picture holds it. None takes the threshold of the evidence.
         give_up: probability that a look shows the target, below which no look is worth a pass; None takes the threshold
             of the evidence.
+        closer: largest number of closer looks; 0 decides without them, as does evidence without fitted verification.
         context: which classes stand beside each other; None leaves it out.
 
     Returns:
         The looks, the objects of the class, and the decision.
     """
-    thresholds = (evidence.thresholds or DEFAULTS).changed(confirm, give_up)
+    thresholds = (evidence.thresholds or DEFAULTS).changed(give_up=give_up)
+    verifier, model = None, evidence.verification
+    if closer and model is not None and model.thresholds is not None:
+        verifier = ZoomVerifier(model, glances, target, model.thresholds.changed(confirm), thresholds.confirm, closer)
+    else:
+        thresholds = thresholds.changed(confirm)
     seen: list[Glance] = []
     values: list[float] = []
     tally: Tally | None = None
@@ -239,16 +158,34 @@ def search(
         tally.add(glance)
         seen.append(glance)
         values.append(value)
-        presence = None
-        if tally.looked or ahead < thresholds.give_up:  # otherwise no probability ends the search
+        if verifier is not None:
+            verifier.suspects.see(glance)
+        presence, over = None, ahead < thresholds.give_up
+        if tally.looked or over:  # otherwise no probability ends the search
             presence = tally.presence(ahead)
-            state = torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([ahead])
-            ended = int(settle(*state, thresholds))
+            if verifier is None:
+                state = torch.tensor([presence]), torch.tensor([tally.looked]), torch.tensor([ahead])
+                ended = int(settle(*state, thresholds))
+            else:
+                room = passes - len(seen)
+                last = over or ahead == 0 or room <= 1
+                for look, chance in verifier(presence, tally.best, len(seen), room, over=last):
+                    seen.append(look)
+                    values.append(chance)
+                ended = verifier.outcome(presence, over=over)
         if ended or len(seen) == passes:
             break
     assert tally is not None
     presence = tally.presence(ahead) if presence is None else presence
-    box = tally.box if OUTCOMES[ended] == "found" else None
+    box, place = (tally.box if OUTCOMES[ended] == "found" else None), None
+    if verifier is not None:
+        if not ended and OUTCOMES[verifier.outcome(presence, over=True)] == "found":
+            ended = OUTCOMES.index("found")
+        presence = verifier.presence(presence)
+        if OUTCOMES[ended] == "found":
+            best = verifier.best()
+            presence, box, place = max(presence, best.place), best.box, best.place
+    ending: Ending = "decision" if ended else "passes" if len(seen) == passes else "windows"
     return ZoomPath(
         glances.lattice,
         classes,
@@ -256,7 +193,9 @@ def search(
         tuple(seen),
         tuple(values),
         merge(seen, target),
-        Decision(OUTCOMES[ended], presence, None, box),
+        Decision(OUTCOMES[ended], presence, None, box, place),
+        ending,
+        () if verifier is None else tuple(verifier.looks),
     )
 
 
@@ -286,10 +225,13 @@ def find_all(
     """
     seen: list[Glance] = []
     values: list[float] = []
+    ending: Ending = "price"
     with torch.inference_mode():
         for glance, value in find_everything(glances, evidence, target, batch=batch, worth=worth):
             seen.append(glance)
             values.append(value)
             if len(seen) == passes:
+                ending = "passes"
                 break
-    return ZoomPath(glances.lattice, classes, target, tuple(seen), tuple(values), merge(seen, target))
+    objects = merge(seen, target)
+    return ZoomPath(glances.lattice, classes, target, tuple(seen), tuple(values), objects, ending=ending)

@@ -10,7 +10,7 @@ from PIL import Image
 import eval.demo as program
 from eval import demo_text
 from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, observers, policies, read_image
-from semfov.belief import MapEvidence
+from semfov.belief import MapEvidence, Verification
 from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import Picture, embedded_picture
@@ -147,18 +147,33 @@ def test_a_large_picture_is_looked_at_in_windows(run, large, shipped_evidence, t
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     (episode,) = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])["episodes"]
     assert episode["name"] == "field.png"
-    assert episode["passes"].endswith(" of at most 6")
+    assert episode["passes"] == str(len(episode["looks"]))
     assert episode["decision"].startswith("“red” found")
     assert len(episode["looks"]) == page.count('class="look"')
     code, printed = run(large, "--target", "red", "--confirm", 1, "--give_up", 0, "--shifts", 3)
     assert "red: undecided" in printed.out
-    assert "in 4 passes" in printed.out
+    assert "in 4 passes. All 4 passes were used.\n" in printed.out
     code, printed = run(large, "--explore", "--until", 1000)
-    assert "in 1 pass\n" in printed.out
+    assert "in 1 pass. No remaining look is expected to show enough new objects.\n" in printed.out
     (tmp_path / "out" / "zoom.png").unlink()
     code, printed = run(large, "--target", "red", "--draw", "[]")
     assert code == 0
     assert not (tmp_path / "out" / "zoom.png").exists()
+
+
+def test_a_large_picture_is_looked_at_closely(run, large, shipped_evidence, tmp_path):
+    evidence = GlimpseEvidence.from_pretrained("squares")
+    evidence.verification = Verification(thresholds=Thresholds(0.4, 0.0, 0.0))
+    for parameter in evidence.verification.requires_grad_(False).parameters():
+        parameter.zero_()  # all probabilities after closer looks are one half
+    evidence.save(tmp_path / "shipped" / "squares.safetensors")
+    _, printed = run(large, "--target", "red", "--shifts", 5, "--draw", "[]", "--report", tmp_path / "page.html")
+    assert "red: found (0.50) in" in printed.out
+    assert "A closer look confirmed the target." in printed.out
+    assert "; closer look: p 0.500 there\n" in printed.out
+    assert "Closer look" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    _, printed = run(large, "--target", "red", "--shifts", 5, "--draw", "[]", "--closer", 0)
+    assert "closer look:" not in printed.out
 
 
 def test_a_folder_may_have_small_and_large_pictures(run, photo, large, shipped_evidence, tmp_path):

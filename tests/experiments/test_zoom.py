@@ -119,11 +119,20 @@ def test_tables_of_decisions_match_hand_calculations():
         for row in (line.split("|") for line in text.splitlines())
         if len(row) > 3
     }
-    assert cells["it is there"] == ["100.0", "0.0", "0.0", "4.0", "0.90"]
-    assert cells["it is not"][:4] == ["0.0", "50.0", "50.0", "17.0"]
+    assert cells["it is there"] == ["100.0", "50.0", "0.0", "0.0", "4.0", "0.90"]
+    assert cells["it is not"][:5] == ["0.0", "", "50.0", "50.0", "17.0"]
     assert cells["ours"][:2] == ["10.5", "1.000"]
     assert cells["all slices, highest score"][:2] == ["17.0", "0.500"]
-    assert "in 50.0 %" in text
+    # With closer looks, one of the finds is absent.
+    changed = [record | {"way": "ours, without closer looks"} for record in records]
+    records[0] = records[0] | {"outcome": "absent", "overlap": None, "probability": 0.3}
+    text = "\n".join(decision_tables([each for pair in zip(records, changed, strict=True) for each in pair]))
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.count("|") > 3]
+    rows = {line[0]: line[1:] for line in lines}
+    assert rows["it is there"] == ["50.0", "0.0", "50.0", "0.0", "4.0", "0.57"]
+    assert rows["it is there, without closer looks"] == cells["it is there"]
+    assert rows["ours, without closer looks"] == cells["ours"]
+    assert float(rows["ours"][1]) == 0.75
 
 
 @pytest.mark.parametrize(

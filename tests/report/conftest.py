@@ -116,5 +116,5 @@ def large_picture() -> torch.Tensor:
 def zoom_page(zoom_path: ZoomPath, large_picture: torch.Tensor, hostile: str, tmp_path: Path) -> Path:
     """The page of a large picture whose names are `hostile`."""
     settings = {"detector": {"name": hostile}}
-    data = zoom_data(zoom_path, large_picture, pool := Pool(), name=hostile, settings=settings, passes=5)
+    data = zoom_data(zoom_path, large_picture, pool := Pool(), name=hostile, settings=settings)
     return write_page(tmp_path / "large.html", hostile, [data], pool)

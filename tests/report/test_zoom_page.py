@@ -15,6 +15,7 @@ from semfov.errors import InputError
 from semfov.report import Pool, episode_data, page_html, zoom_data
 from semfov.report.zoom import LISTED, SHOWN
 from semfov.zoom import Objects
+from semfov.zoom.closer import CloserGlance
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
 
@@ -93,6 +94,16 @@ def test_a_look_brought_the_objects_whose_box_comes_from_it(zoom_path, large_pic
     assert looks[1]["status"].startswith("Look 1 of 2 at (100, 100), magnification 0.5. Its value was 0.5.")
 
 
+def test_a_closer_look_tells_what_it_showed(zoom_path, large_picture):
+    path = replace(zoom_path, closer=(CloserGlance(2, zoom_path.decision.box, 0.875, 0.9),), ending="decision")
+    data = zoom_data(path, large_picture, pool := Pool(), name="field")
+    assert data["decision"].endswith("0.93. A closer look confirmed the target.")
+    assert [look["closer"] is None for look in data["looks"]] == [True, True, False]
+    assert "It is a closer look: the target is there with a probability of 0.88." in data["looks"][2]["status"]
+    texts = " ".join(Elements(page_html("field", [data], pool)).texts)
+    assert texts.count("Closer look probability 0.88 that the target is there") == 1
+
+
 def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
     many = LISTED + 7
     scores = torch.linspace(0.9, 0.2, many)
@@ -117,33 +128,33 @@ def test_long_lists_are_cut_and_say_so(zoom_path, large_picture):
 
 
 @pytest.mark.parametrize(
-    ("decision", "passes", "told"),
+    ("decision", "ending", "told"),
     [
         (
             Decision("found", 0.93),
-            5,
+            "decision",
             "“cat” found, probability that the picture holds it: 0.93. The probability is high",
         ),
-        (Decision("absent", 0.1), 5, "“cat” absent, probability that the picture holds it: 0.10. No remaining look is"),
-        (Decision("undecided", 0.6), 3, "“cat” undecided, .* 0.60. All 3 passes were used.$"),
-        (Decision("undecided", 0.6), 5, "0.60. No remaining look is worth a pass, but the target is probably there.$"),
-        (Decision("undecided", 0.2), 5, "0.20. No remaining look can show the target.$"),
+        (Decision("absent", 0.1), "decision", "“cat” absent, .* holds it: 0.10. No remaining look is worth"),
+        (Decision("undecided", 0.6), "passes", "“cat” undecided, .* 0.60. All 3 passes were used.$"),
+        (Decision("undecided", 0.6), "decision", "0.60. No remaining look is worth a pass, but .* probably there.$"),
+        (Decision("undecided", 0.2), "windows", "0.20. No remaining look can show the target.$"),
         (Decision("undecided", 0.6), None, "0.60.$"),
-        (None, 3, "^0 × cat found. All 3 passes were used.$"),
-        (None, 5, "^0 × cat found. No remaining look is expected to show enough new objects.$"),
+        (None, "passes", "^0 × cat found. All 3 passes were used.$"),
+        (None, "price", "^0 × cat found. No remaining look is expected to show enough new objects.$"),
         (None, None, "^0 × cat found.$"),
     ],
 )
-def test_the_head_tells_the_outcome_and_its_reason(zoom_path, large_picture, decision, passes, told):
+def test_the_head_tells_the_outcome_and_its_reason(zoom_path, large_picture, decision, ending, told):
     nothing = zoom_path.objects.above(1)
-    path = replace(zoom_path, target=1, decision=decision, objects=nothing)
-    data = zoom_data(path, large_picture, pool := Pool(), name="field.png", passes=passes)
+    path = replace(zoom_path, target=1, decision=decision, objects=nothing, ending=ending)
+    data = zoom_data(path, large_picture, pool := Pool(), name="field.png")
     assert re.search(told, data["decision"])
     page = page_html("t", [data], pool)
     assert page.index(data["decision"]) < page.index("<main>")
     texts = Elements(page).texts
     assert {"field.png", "400 × 300 px", "windows of 100 × 100 px at magnifications 0.25, 0.5, 1"} <= set(texts)
-    assert ("3" if passes is None else f"3 of at most {passes}") in texts
+    assert "3" in texts
     assert "No objects were found." in texts
 
 
@@ -167,10 +178,8 @@ def test_small_and_large_pictures_share_a_page(zoom_path, large_picture, scanpat
         assert ("noscript><dl" in page) == (episodes[0] is small)
 
 
-def test_a_wrong_picture_or_number_of_passes_is_refused(zoom_path, large_picture):
+def test_a_wrong_picture_or_a_path_without_looks_is_refused(zoom_path, large_picture):
     with pytest.raises(InputError, match="picture: expected the picture of the path, 400 × 300 px"):
         zoom_data(zoom_path, large_picture[:, :200], Pool(), name="other")
-    with pytest.raises(InputError, match="passes"):
-        zoom_data(zoom_path, large_picture, Pool(), name="other", passes=2)
     with pytest.raises(InputError, match="at least one look"):
         zoom_data(replace(zoom_path, glances=()), large_picture, Pool(), name="other")

@@ -7,20 +7,27 @@ from dataclasses import replace
 import pytest
 import torch
 
+from semfov.belief.target_evidence import Thresholds
+from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Annotation, Scene
 from semfov.data.scenes import EmbeddedScenes
+from semfov.detection import Candidates, Detector
 from semfov.errors import InputError
 from semfov.experiments.config import DataConfig
 from semfov.experiments.zoom_samples import MosaicSettings
 from semfov.experiments.zoom_store import GlanceStore, open_scene
 from semfov.observation.foveal import FovealObservationModel
+from semfov.observation.matching import box_iou
 from semfov.training.observation import fit_fom
 from semfov.training.observation_settings import FitConfig
 from semfov.training.zoom import fit_zoom
 from semfov.training.zoom_examples import example_of
 from semfov.training.zoom_settings import FitZoomConfig
+from semfov.training.zoom_verification import fit_closer, searches_of, unverified, verify
 from semfov.zoom import GlimpseEvidence, ZoomEye
 from semfov.zoom.lattice import Lattice
+from semfov.zoom.search import search
 
 pytestmark = pytest.mark.usefixtures("kept_scenes")
 
@@ -123,3 +130,98 @@ def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, 
     lattice = Lattice.over(size, (96, 96))
     assert sum(model.metadata["cells"]) >= lattice.columns * lattice.rows
     assert model.miss_rate.shape == (4, 4)
+
+
+class Colours(Detector):
+    """Frames all pure red, green or blue of a canvas, one box for each class; the score is how bright it is."""
+
+    def __init__(self):
+        super().__init__("colours", ("red", "green", "blue"), (64, 64), fill=0.0)
+
+    def propose(self, canvas):
+        boxes, classes = torch.zeros(len(canvas), 3, 4), torch.zeros(len(canvas), 3, 3)
+        for image, framed, scores in zip(canvas, boxes, classes, strict=True):
+            for kind in range(3):
+                shown = (image[kind] > 0.1) & (image[kind] > 3 * (image.sum(0) - image[kind]))
+                if shown.any():
+                    (top, left), (bottom, right) = shown.nonzero().amin(0), shown.nonzero().amax(0) + 1
+                    framed[kind] = torch.tensor([left, top, right, bottom])
+                    scores[kind, kind] = 0.9 * image[kind][shown].mean()
+        return Candidates(boxes, classes)
+
+
+class Squares:
+    """Pictures of 512 × 384 px with squares; only bright ones are annotated."""
+
+    classes = ("red", "green", "blue")
+    ids = (1, 2, 3, 4, 5, 6)
+
+    def _squares(self, index):
+        generator = torch.Generator().manual_seed(index)
+        for kind in range(3):
+            x, y = (int(n) for n in torch.rand(2, generator=generator) * 320)
+            yield kind, x, y, float(torch.rand((), generator=generator))
+
+    def __len__(self):
+        return len(self.ids)
+
+    def __getitem__(self, index):
+        image = torch.zeros(3, 384, 512)
+        for kind, x, y, light in self._squares(index):
+            image[kind, y : y + 40, x : x + 40] = 0.3 + 0.7 * light
+        told = self.annotation(index)
+        return Scene(self.ids[index], "squares", image, told.boxes, told.labels)
+
+    def digest(self, index):
+        return f"{index:064d}"
+
+    def annotation(self, index):
+        bright = [(x, y, kind) for kind, x, y, light in self._squares(index) if light > 0.5]
+        boxes = torch.tensor([[x, y, x + 40, y + 40] for x, y, _ in bright]).float().view(-1, 4)
+        labels = torch.tensor([kind + 1 for *_, kind in bright]).long()
+        return Annotation(boxes, labels, torch.zeros(len(bright)).bool(), (512, 384))
+
+
+@pytest.mark.slow
+def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
+    eye, scenes = ZoomEye(Colours()), Squares()
+    opened = [open_scene(eye, scenes, n, None) for n in range(len(scenes))]
+    torch.manual_seed(0)
+    model = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.01)).eval().requires_grad_(False)
+    config = FitZoomConfig(sought=3, passes=8, place=0.1, false_alarms=0.5)
+    searches = list(searches_of(model, scenes, opened, config, "test"))
+    names = "background", *scenes.classes
+    for sought in searches:
+        assert sought.present == (sought.target in scenes.annotation(sought.mosaic).labels.tolist())
+        # Looks and end are those of the agent.
+        path = search(sought.looks, model, names, sought.target, passes=8)
+        found, count = unverified(sought, model.thresholds)
+        assert (found is not None, count) == (path.decision.outcome == "found", path.passes)
+        assert [turn.glance.window for turn in sought.turns[:count]] == [each.window for each in path.glances]
+        if found is not None:
+            boxes = scenes.annotation(sought.mosaic).boxes[scenes.annotation(sought.mosaic).labels == sought.target]
+            assert found == any(float(box_iou(path.decision.box[None], box[None])) >= 0.5 for box in boxes)
+    kinds = "searched", "judged"
+    text = fit_closer(model, dict.fromkeys(kinds, scenes), dict.fromkeys(kinds, opened), config)
+    fitted = model.verification.thresholds
+    assert (fitted.place, fitted.give_up) == (0.1, 0.01)
+    assert f"| {fitted.confirm:.2f} (chosen)" in text
+    # The searches from which the threshold was chosen end as those of the agent.
+    ends = []
+    for sought, each in zip(searches, verify(searches, model.verification, model, config), strict=True):
+        path = search(sought.looks, model, names, sought.target, passes=8)
+        right, count = each.found(fitted.confirm)
+        assert (right is not None, count) == (path.decision.outcome == "found", path.passes)
+        assert right is None or right == sought.right(path.decision.box)
+        ends.append((right, sought.present))
+    assert len({right for right, _ in ends}) > 1
+    absent = [right for right, present in ends if not present]
+    assert sum(right is not None for right in absent) <= 0.5 * len(absent)
+
+
+def test_without_right_and_wrong_places_there_is_no_verification():
+    model = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.01), verification=Verification()).eval()
+    kinds = "searched", "judged"
+    text = fit_closer(model, dict.fromkeys(kinds, Squares()), dict.fromkeys(kinds, ()), FitZoomConfig(passes=8))
+    assert text.startswith("None, since there are no places")
+    assert model.verification is None

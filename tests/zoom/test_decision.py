@@ -160,6 +160,8 @@ def test_a_path_has_a_text_and_an_html_form(eye, picture):
     path = agent.explore(picture, passes=9, worth=0.0)
     assert len(repr(path)) < 600
     assert repr(path).startswith(f"ZoomPath: {path.describe()}")
+    assert "All 9 passes were used." in repr(path)
+    assert "All 9 passes were used." in path._repr_html_()
     assert "blue" in repr(path)
     drawing = ElementTree.fromstring(path._repr_html_().replace("<br>", "<br/>")).find("svg")
     rectangles = drawing.findall("rect")

@@ -1,5 +1,7 @@
 """Searches and explorations of large pictures, and merging."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from matplotlib.figure import Figure
@@ -48,6 +50,27 @@ def test_find_all_finds_one_class_and_explore_finds_all(agent, picture):
 
 def test_find_all_ends_when_no_look_has_enough_value(agent, picture):
     assert agent.find_all(picture, "blue", worth=1e9).passes == 1
+
+
+def test_a_path_tells_why_it_ended(agent, picture):
+    found = agent.search(picture, "red")
+    assert (found.ending, found.decision.outcome) == ("decision", "found")
+    # The last pass decides, too.
+    again = agent.search(picture, "red", passes=found.passes)
+    assert (again.ending, again.why_it_ended()) == ("decision", found.why_it_ended())
+    early = agent.search(picture, "red", passes=found.passes - 1)
+    assert early.decision.outcome == "undecided"
+    assert (early.ending, early.why_it_ended()) == ("passes", f"All {early.passes} passes were used.")
+    hopeless = agent.search(picture, "green", give_up=1.0)
+    assert (hopeless.passes, hopeless.ending) == (1, "decision")
+    # Without a limit to what is worth a look, a search looks at everything.
+    everything = agent.search(picture, "green", passes=10_000, confirm=1.0, give_up=0.0)
+    assert (everything.ending, everything.decision.outcome) == ("windows", "undecided")
+    assert everything.why_it_ended() == "No remaining look can show the target."
+    assert agent.explore(picture, passes=1).why_it_ended() == "The only pass was used."
+    assert agent.find_all(picture, "blue", worth=1e9).ending == "price"
+    assert agent.find_all(picture, "blue", passes=3, worth=0.0).ending == "passes"
+    assert replace(found, ending=None).why_it_ended() == ""
 
 
 def test_zooming_pays_only_for_large_pictures(agent, picture):

@@ -90,7 +90,7 @@ class VerificationFit(PartFit):
             "place or in a photograph without the target, and 0 points if it finds nothing. Searches for present and "
             "for absent classes have equal weight. The threshold was chosen on the same photographs.\n\n"
         )
-        return Fitted(self.write(fitted.model, gain.better, why), text + report(fitted, len(seen))[0])
+        return Fitted(self.write(fitted.model, gain.better, why), text + report(fitted, f"{len(seen)} photographs")[0])
 
 
 def scores(searches: Sequence[Verified], ends: Sequence[Ended]) -> Array:

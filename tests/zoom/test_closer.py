@@ -1,0 +1,223 @@
+"""Closer looks of searches in large pictures: their windows, the places that are examined, and decisions."""
+
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from semfov.belief.target_evidence import Thresholds
+from semfov.belief.verification import Verification, closer_features
+from semfov.decision import OUTCOMES
+from semfov.detection.detections import Detections
+from semfov.errors import DataError, InputError
+from semfov.io.storage import read, write
+from semfov.zoom import GlimpseEvidence, Lattice, ZoomAgent, ZoomEye
+from semfov.zoom.closer import Suspects, ZoomVerifier, closer_window
+from semfov.zoom.glances import Glance, Glances, on_lattice
+from tests.zoom.conftest import Squares
+
+AT = Thresholds(confirm=0.6, give_up=0.01, place=0.2)
+LATTICE = Lattice.over((1024, 768), (128, 128))
+
+
+class FromScore(Verification):
+    """The probability of the place is the score of the target in the closer look; that of the picture is given."""
+
+    def __init__(self, presence=0.4, **given):
+        super().__init__(**given)
+        self.presence = presence
+
+    def forward(self, features):
+        return torch.stack([features[..., 6], torch.full_like(features[..., 6], self.presence).logit()], -1)
+
+
+class Fickle(Squares):
+    """Takes pure green for red, unless it fills most of a cell: seen closely it is green."""
+
+    def propose(self, canvas):
+        found = super().propose(canvas)
+        red, green, blue = found.classes.unbind(-1)
+        alike = torch.where(green < 0.9, torch.maximum(red, green), red)
+        classes = torch.stack([alike, green.where(green >= 0.9, torch.zeros(())), blue], -1)
+        return replace(found, classes=classes, objectness=classes.amax(-1))
+
+
+def evidence(presence=0.4, **thresholds):
+    torch.manual_seed(0)
+    model = FromScore(presence, thresholds=replace(AT, **thresholds))
+    return GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.01), verification=model).eval()
+
+
+def seen(boxes, scores):
+    """A look with some detections of class 1 of 2."""
+    vectors = torch.tensor([[1 - score, score, 0.0] for score in scores])[None]
+    found = Detections(torch.tensor(boxes)[None], vectors, torch.ones(1, len(boxes), dtype=torch.bool))
+    return Glance(on_lattice(LATTICE, (0, 0, 0)), found, torch.zeros(len(boxes), dtype=torch.bool), vectors[0], None)
+
+
+class Scripted(Glances):
+    """Closer looks that show class 1 with given scores at the middle of their window, in the size asked for."""
+
+    lattice = LATTICE
+
+    def __init__(self, scores, side=40.0):
+        self.scores, self.side, self.windows = list(scores), side, []
+
+    def see(self, windows, *, hints=True):
+        assert not hints
+        (window,) = windows
+        self.windows.append(window)
+        x, y = (window.within[0] + window.within[2]) / 2, (window.within[1] + window.within[3]) / 2
+        half = self.side / 2
+        return [seen([[x - half, y - half, x + half, y + half]], [self.scores.pop(0)])]
+
+
+@pytest.mark.parametrize(
+    "box", [(300.0, 200, 500, 260), (0.0, 0, 30, 90), (990.0, 740, 1024, 768), (5.0, 5, 1000, 700)]
+)
+def test_the_window_shows_the_box_with_its_surroundings_and_lies_in_the_picture(box):
+    x1, y1, x2, y2 = closer_window(LATTICE, torch.tensor(box)).within
+    assert 0 <= x1 <= box[0]
+    assert box[2] <= x2 <= 1024
+    assert 0 <= y1 <= box[1]
+    assert box[3] <= y2 <= 768
+    # A square of three box sides, and at most one octave closer than the last level, which shows native pixels.
+    side = max(3 * max(box[2] - box[0], box[3] - box[1]), 64)
+    assert (x2 - x1, y2 - y1) == pytest.approx((min(side, 1024), min(side, 768)))
+    magnification = closer_window(LATTICE, torch.tensor(box)).fixation[2]
+    assert magnification == pytest.approx(min(128 / (x2 - x1), 128 / (y2 - y1)))
+    assert magnification <= 2 * LATTICE.magnifications[-1] + 1e-9
+
+
+def test_the_strongest_detection_is_examined_first_and_each_place_once():
+    glances = Scripted([0.9, 0.1, 0.5], side=27.0)  # the boxes of closer looks overlap the others by less than half
+    suspects = Suspects(glances, 1)
+    suspects.see(seen([[100.0, 100, 140, 140], [500.0, 500, 540, 540], [104.0, 100, 144, 140]], [0.6, 0.8, 0.55]))
+    suspects.see(seen([[500.0, 500, 530, 540], [700.0, 100, 740, 140]], [0.7, 0.05]))
+    examined = []
+    while (suspect := suspects.next(0.9, 0.95)) is not None:
+        odds = [math.log(p / (1 - p)) for p in (0.9, suspect.score, 0.95)]
+        assert suspect.probability == pytest.approx(1 / (1 + math.exp(odds[2] - odds[0] - odds[1])), abs=1e-5)
+        glance, features, box = suspects.examine(suspect, 0.9)
+        expected, at = closer_features(0.9, suspect.probability, suspect.score, glance.detections, suspect.box, 1)
+        assert features.tolist() == expected.tolist()
+        assert box.tolist() == at.tolist()
+        examined.append((suspect.score, *suspect.box[:2].tolist()))
+    # The others overlap examined places by half, or have a score below 0.1.
+    assert [tuple(round(n, 4) for n in each) for each in examined] == [(0.8, 500, 500), (0.6, 100, 100)]
+    assert glances.windows == [
+        closer_window(LATTICE, torch.tensor(b)) for b in ([500.0, 500, 540, 540], [100.0, 100, 140, 140])
+    ]
+
+
+@pytest.mark.parametrize(
+    ("scores", "over", "presence", "count", "outcome"),
+    [
+        ([0.9], False, 0.7, 1, "found"),  # sure
+        ([0.7, 0.5], False, 0.7, 2, "found"),  # probable enough, and no further closer look is allowed
+        ([0.5, 0.1], False, 0.7, 2, "undecided"),
+        ([0.5, 0.1], False, 0.3, 2, "absent"),
+        ([0.5, 0.1], True, 0.3, 2, "absent"),
+    ],
+)
+def test_decisions_follow_the_closer_looks(scores, over, presence, count, outcome):
+    verifier = ZoomVerifier(FromScore(presence), Scripted(scores), 1, AT, 0.7, 2)
+    verifier.suspects.see(seen([[100.0, 100, 140, 140], [500.0, 500, 540, 540]], [0.8, 0.8]))
+    made = verifier(0.9, 0.8, 5, 9, over=over)
+    assert [look.number for look in verifier.looks] == list(range(5, 5 + count))
+    assert [round(look.place, 4) for look in verifier.looks] == scores
+    assert [round(chance, 4) for _, chance in made] == [0.9] * count
+    assert OUTCOMES[verifier.outcome(0.99, over=over)] == outcome
+    assert verifier.presence(0.99) == pytest.approx(presence)
+    assert verifier.best().place == pytest.approx(max(scores))
+
+
+def test_improbable_places_are_examined_only_at_the_end():
+    for chance, over, count in ((0.69, False, 0), (0.71, False, 2), (0.21, True, 2), (0.19, True, 0)):
+        verifier = ZoomVerifier(FromScore(), Scripted([0.1, 0.1]), 1, AT, 0.7, 2)
+        verifier.suspects.see(seen([[100.0, 100, 140, 140], [500.0, 500, 540, 540]], [0.8, 0.8]))
+        assert len(verifier(chance, 0.8, 1, 9, over=over)) == count
+        assert OUTCOMES[verifier.outcome(chance, over=False)] == ("absent" if count else "undecided")
+        assert verifier.outcome(chance, over=False) == (2 if count else 0)
+    none_left = ZoomVerifier(FromScore(), Scripted([0.1, 0.1]), 1, AT, 0.7, 2)
+    none_left.suspects.see(seen([[100.0, 100, 140, 140]], [0.8]))
+    assert none_left(0.9, 0.8, 24, 0, over=True) == []
+
+
+def test_a_search_looks_closely_before_it_finds(detector, picture):
+    agent = ZoomAgent(ZoomEye(detector), evidence())
+    plain = agent.search(picture, "red", closer=0)
+    assert (plain.decision.outcome, plain.decision.place, plain.closer) == ("found", None, ())
+    path = agent.search(picture, "red")
+    (look,) = path.closer
+    assert (path.decision.outcome, path.passes) == ("found", plain.passes + 1)
+    assert (look.number, path.decision.place) == (path.passes - 1, look.place)
+    assert path.decision.probability == pytest.approx(max(look.place, look.presence))
+    # The look is a window around the box that the search without it would have found.
+    assert path.glances[look.number].window == closer_window(path.lattice, plain.decision.box)
+    assert path.decision.box.tolist() == look.box.tolist()
+    x1, y1, x2, y2 = path.decision.box.tolist()
+    assert max(x1, 640) < min(x2, 672)
+    assert max(y1, 320) < min(y2, 352)
+    assert path.why_it_ended() == "A closer look confirmed the target."
+    # It costs one of the passes.
+    short = agent.search(picture, "red", passes=plain.passes)
+    assert [look.number for look in short.closer] == [plain.passes - 1]
+    assert agent.search(picture, "red", passes=1).closer == ()
+
+
+def test_what_looks_like_the_target_from_afar_is_not_found_closely(picture):
+    """Green squares look red until a look enlarges them beyond the magnification of the last level."""
+    image = torch.zeros_like(picture)
+    image[1, 320:344, 640:664] = 1
+    agent = ZoomAgent(ZoomEye(Fickle().eval()), evidence(presence=0.3))
+    assert agent.search(image, "red", closer=0).decision.outcome == "found"
+    path = agent.search(image, "red")
+    assert path.decision.outcome == "absent"
+    assert path.decision.box is None
+    assert len(path.closer) == 2
+    assert path.why_it_ended() == "No closer look confirmed the target, and it is probably absent."
+
+
+def test_the_limits_of_a_search_hold(detector, picture):
+    agent = ZoomAgent(ZoomEye(detector), evidence())
+    assert len(agent.search(picture, "red", confirm=1.0, closer=1).closer) == 1
+    for passes in (1, 2, 3):
+        path = agent.search(picture, "red", passes=passes, confirm=1.0, give_up=0.0)
+        assert path.passes <= passes
+    with pytest.raises(InputError, match="closer: expected a whole number from 0 to 100"):
+        agent.search(picture, "red", closer=-1)
+
+
+def test_evidence_without_verification_decides_as_before(detector, picture):
+    with_model = evidence()
+    without = GlimpseEvidence(3, 8, thresholds=with_model.thresholds).eval()
+    without.load_state_dict({name: value for name, value in with_model.state_dict().items() if "verif" not in name})
+    unfitted = evidence()
+    unfitted.verification.thresholds = None
+    expected = ZoomAgent(ZoomEye(detector), with_model).search(picture, "red", closer=0)
+    for other in (without, unfitted):
+        path = ZoomAgent(ZoomEye(detector), other).search(picture, "red")
+        assert path.closer == ()
+        assert path.decision.probability == expected.decision.probability
+        assert [glance.window for glance in path.glances] == [glance.window for glance in expected.glances]
+
+
+def test_the_verification_is_saved_with_the_evidence(tmp_path):
+    torch.manual_seed(0)
+    model = GlimpseEvidence(3, 8, verification=Verification(thresholds=AT))
+    model.save(tmp_path / "own.safetensors")
+    again = GlimpseEvidence.from_pretrained(tmp_path / "own.safetensors")
+    assert again.verification.thresholds == AT
+    assert torch.equal(again.verification.linear.weight, model.verification.linear.weight)
+    tensors, record = read(tmp_path / "own.safetensors", "glimpse-evidence")
+    # Files of earlier versions have neither tensors nor record of a verification.
+    old = {name: tensor for name, tensor in tensors.items() if not name.startswith("verification")}
+    write(tmp_path / "old.safetensors", old, {name: each for name, each in record.items() if name != "verification"})
+    assert GlimpseEvidence.from_pretrained(tmp_path / "old.safetensors").verification is None
+    for parts in ((old, record), (tensors, json.loads(json.dumps(record)) | {"verification": None})):
+        write(tmp_path / "half.safetensors", *parts)
+        with pytest.raises(DataError, match="not a complete model of evidence"):
+            GlimpseEvidence.from_pretrained(tmp_path / "half.safetensors")
