@@ -96,8 +96,8 @@ def export_look(
         "window": (graph.add("Cast", window, to=TensorProto.FLOAT), [4]),
     }
     if evidence is not None:
-        faint, values, confident = graph.hints(boxes, confidence, vectors)
-        hints = graph.placed(faint, frame, "picture")[0], values, confident
+        faint, values = graph.hints(boxes, confidence, vectors)
+        hints = graph.placed(faint, frame, "picture")[0], values
         seen = graph.gist(hints, (placed, scores), start, cells, kinds)
         said = graph.append(_exported(_Saying(evidence, cells), *_examples(cells, kinds)), "evidence/", _named(seen))
         parts = [cells - (cells >> step) + 1 for step in range(1, STEPS + 1)]

@@ -131,16 +131,15 @@ class LookGraph(Graph):
         _, order = self.add("TopK", best, count, outputs=2, axis=0)
         return self.add("Gather", box, order), self.add("Gather", vector, order)
 
-    def hints(self, boxes: str, confidence: str, vectors: str) -> tuple[str, str, str]:
-        """Take the hints from candidates `(1, N, …)`: canvas boxes `(L, 4)`, vectors `(L, K+1)`, confidence `(L,)`."""
+    def hints(self, boxes: str, confidence: str, vectors: str) -> tuple[str, str]:
+        """Take the hints from candidates `(1, N, …)`: canvas boxes `(L, 4)` and score vectors `(L, K+1)`."""
         enough = self.add("GreaterOrEqual", confidence, self.constant(FAINT))
         _, index = self.add("Split", self.add("NonZero", enough), self.constant([1, 1]), outputs=2, axis=0)
         index = self.add("Squeeze", index, self.constant([0]))
-        box, vector, value = (
-            self.add("Gather", self.add("Squeeze", each, self.constant([0])), index)
-            for each in (boxes, vectors, confidence)
+        box, vector = (
+            self.add("Gather", self.add("Squeeze", each, self.constant([0])), index) for each in (boxes, vectors)
         )
-        return box, vector, value
+        return box, vector
 
     def placed(self, boxes: str, frame: str, picture: str) -> tuple[str, str]:
         """Map canvas boxes `(L, 4)` to picture pixels, cut to the window; also tell which its border cuts, `(L,)`."""
@@ -168,12 +167,12 @@ class LookGraph(Graph):
         return mapped, self.add("Cast", any_side, to=_BOOL)
 
     def gist(
-        self, hints: tuple[str, str, str], detections: tuple[str, str], start: str, cells: int, classes: int
+        self, hints: tuple[str, str], detections: tuple[str, str], start: str, cells: int, classes: int
     ) -> tuple[str, str, str]:
         """Compute the gist of a look, as `semfov.zoom.gist.gist` does.
 
         Args:
-            hints: names of boxes in picture pixels, of score vectors and of confidence.
+            hints: names of boxes in picture pixels and of score vectors.
             detections: names of boxes and of score vectors.
             start: name of the start of the window, from `window`.
             cells: c, number of cells along a side of the window.
@@ -183,8 +182,8 @@ class LookGraph(Graph):
             Names of the strongest hint of each class `(c, c, K)`, of the size `(c, c)` and of the classes that are
             found `(c, c, K)`.
         """
-        boxes, vectors, best = hints
-        at, scores = self._cells(boxes, start, cells), self._scores(vectors)
+        boxes, vectors = hints
+        at, scores, best = self._cells(boxes, start, cells), self._scores(vectors), self._best(vectors)
         nothing = self.constant(torch.zeros(cells * cells, classes))
         strongest = self._strongest(nothing, at, scores, classes)
         alone = self.constant(torch.zeros(cells * cells))

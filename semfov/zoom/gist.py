@@ -64,7 +64,8 @@ def gist(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[i
     low = np.array([column * lattice.pitch[0], row * lattice.pitch[1]], np.float32)
     pitch = np.array(lattice.pitch, np.float32) * scale
     kinds, cells = hints.scores.shape[-1], rows * columns
-    boxes, scores, confident = hints.boxes.float().numpy(), hints.scores.float(), hints.confidence.float()
+    boxes, scores = hints.boxes.float().numpy(), hints.scores.float()
+    confident = scores.amax(-1)
     certain, kind = detections.scores[0, :, 1:].detach().max(-1)
     sure = (certain >= FOUND).nonzero()[:, 0]
     corners = np.concatenate([boxes, detections.boxes[0, sure].detach().float().numpy()])

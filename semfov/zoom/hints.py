@@ -18,12 +18,10 @@ class Hints:
     Attributes:
         boxes: `(N, 4)`, `(x1, y1, x2, y2)`.
         scores: `(N, K)`, score of each class, without background.
-        confidence: `(N,)`, by which the detector ranks them (`Candidates.confidence`).
     """
 
     boxes: Tensor
     scores: Tensor
-    confidence: Tensor
 
 
 def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy) -> Hints:
@@ -42,8 +40,9 @@ def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy) -> Hi
 
     >>> import torch
     >>> found = Candidates(torch.rand(1, 3, 4), torch.tensor([[[0.001], [0.01], [0.9]]]))
-    >>> hints_of(found, 0, "residual").confidence
-    tensor([0.0100, 0.9000])
+    >>> hints_of(found, 0, "residual").scores
+    tensor([[0.0100],
+            [0.9000]])
     """
     confidence = candidates.confidence[image].detach()
     index = (confidence >= FAINT).nonzero()[:, 0]
@@ -51,4 +50,4 @@ def hints_of(candidates: Candidates, image: int, policy: BackgroundPolicy) -> Hi
     boxes = kept.boxes.detach()
     check_candidates(image, confidence, boxes)
     check_scores(image, kept)
-    return Hints(boxes, shares(kept, policy)[1].detach(), confidence.index_select(0, index))
+    return Hints(boxes, shares(kept, policy)[1].detach())

@@ -55,9 +55,9 @@ def test_a_gist_holds_the_strongest_of_all_candidates_of_each_cell(count, column
     strongest, size = torch.zeros(rows, columns, KINDS), torch.zeros(rows, columns)
     leads, hints = torch.zeros(rows, columns), 0
     for box, scores, certain in zip(detector.boxes, detector.scores, detector.certain, strict=True):
-        confidence = float(certain * scores.max())
-        if confidence < FAINT:
+        if float(certain * scores.max()) < FAINT:
             continue
+        confidence = float(certain * scores.max() / scores.sum())
         hints += 1
         x1, y1, x2, y2 = (box / magnification + torch.tensor([left, top, left, top])).tolist()
         x1, x2 = (min(max(each, left), right) for each in (x1, x2))
@@ -96,7 +96,7 @@ def test_looks_of_a_batch_have_their_own_hints():
     assert len({len(hints.boxes) for hints in together.hints}) == 3
     for number, hints in enumerate(together.hints):
         alone = eye.glance(view, fixations[number : number + 1]).hints[0]
-        for name in ("boxes", "scores", "confidence"):
+        for name in ("boxes", "scores"):
             assert torch.equal(getattr(hints, name), getattr(alone, name))
 
 
