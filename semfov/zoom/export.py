@@ -22,7 +22,7 @@ from semfov.errors import InputError, check
 from semfov.io.files import replacing
 from semfov.zoom.evidence import GlimpseEvidence, pool_all
 from semfov.zoom.export_graph import IR_VERSION, OPSET, LookGraph
-from semfov.zoom.eye import HINTS, ZoomEye
+from semfov.zoom.eye import ZoomEye
 from semfov.zoom.gist import FINEST, Gist
 from semfov.zoom.networks import STEPS
 
@@ -96,7 +96,7 @@ def export_look(
         "window": (graph.add("Cast", window, to=TensorProto.FLOAT), [4]),
     }
     if evidence is not None:
-        hints, values = graph.selection(boxes, confidence, vectors, HINTS)
+        hints, values = graph.hints(boxes, confidence, vectors)
         seen = graph.gist((graph.placed(hints, frame, "picture")[0], values), (placed, scores), start, cells, kinds)
         said = graph.append(_exported(_Saying(evidence, cells), *_examples(cells, kinds)), "evidence/", _named(seen))
         parts = [cells - (cells >> step) + 1 for step in range(1, STEPS + 1)]

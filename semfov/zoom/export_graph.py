@@ -9,6 +9,7 @@ from semfov.detection.export_graph import Graph
 from semfov.detection.selection import Selection
 from semfov.zoom.eye import BORDER
 from semfov.zoom.gist import FOUND
+from semfov.zoom.hints import HINT
 
 OPSET = 18
 """The first opset whose `Resize` has antialiasing."""
@@ -102,11 +103,7 @@ class LookGraph(Graph):
 
     def selection(self, boxes: str, confidence: str, vectors: str, chosen: Selection) -> tuple[str, str]:
         """Select candidates `(1, N, …)` as `select` does: canvas boxes `(L, 4)` and score vectors `(L, K+1)`."""
-        x1, y1, x2, y2 = self.add("Split", boxes, self.constant([1, 1, 1, 1]), outputs=4, axis=2)
-        full = self.add("And", self.add("Greater", x2, x1), self.add("Greater", y2, y1))
-        full = self.add("Squeeze", full, self.constant([2]))
-        sure = self.add("GreaterOrEqual", confidence, self.constant(chosen.threshold))
-        ranked = self.add("Where", self.add("And", full, sure), confidence, self.constant(0.0))
+        ranked = self.add("Where", self._sure(boxes, confidence, chosen.threshold), confidence, self.constant(0.0))
         apart = boxes
         if chosen.per_class:
             # Boxes of different classes are moved apart, so that they do not overlap.
@@ -129,6 +126,22 @@ class LookGraph(Graph):
         count = self.add("Shape", best)
         _, order = self.add("TopK", best, count, outputs=2, axis=0)
         return self.add("Gather", box, order), self.add("Gather", vector, order)
+
+    def hints(self, boxes: str, confidence: str, vectors: str) -> tuple[str, str]:
+        """Take the hints of candidates `(1, N, …)` as `hints_of` does, in another order; returns as `selection`."""
+        index = self.add("NonZero", self.add("Squeeze", self._sure(boxes, confidence, HINT), self.constant([0])))
+        index = self.add("Squeeze", index, self.constant([0]))
+        box, vector = (
+            self.add("Gather", self.add("Squeeze", each, self.constant([0])), index) for each in (boxes, vectors)
+        )
+        return box, vector
+
+    def _sure(self, boxes: str, confidence: str, threshold: float) -> str:
+        """Which candidates are boxes with an area and confident enough, `(1, N)`."""
+        x1, y1, x2, y2 = self.add("Split", boxes, self.constant([1, 1, 1, 1]), outputs=4, axis=2)
+        full = self.add("And", self.add("Greater", x2, x1), self.add("Greater", y2, y1))
+        full = self.add("Squeeze", full, self.constant([2]))
+        return self.add("And", full, self.add("GreaterOrEqual", confidence, self.constant(threshold)))
 
     def placed(self, boxes: str, frame: str, picture: str) -> tuple[str, str]:
         """Map canvas boxes `(L, 4)` to picture pixels, cut to the window; also tell which its border cuts, `(L,)`."""

@@ -13,18 +13,16 @@ from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture, open_large, reduction_for
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
-from semfov.detection.selection import Selection, select_several
+from semfov.detection.selection import select
 from semfov.errors import check, check_number, check_shape, lookup
 from semfov.sensor.glimpse import edges_at
+from semfov.zoom.hints import hints_of
 from semfov.zoom.lattice import Lattice
 
 Cut = Literal["keep", "drop", "background"]
 Limit = tuple[float, float, float, float]
 Frame = tuple[int, int, int, int, int, int, int, int]
 """`(x1, y1, x2, y2)` of a window in picture pixels, then of its place on the canvas in canvas pixels."""
-
-HINTS = Selection(threshold=0.002, iou=0.95, limit=300)
-"""Selection of hints: candidates that are too weak to be detections, but show where a closer look pays."""
 
 BORDER = 2.0
 """A box this near to the border of its window, in canvas pixels, counts as cut by it."""
@@ -55,8 +53,8 @@ class Seen:
     Attributes:
         detections: a batch of F, boxes in picture pixels.
         cut: `(F, L)`, boolean, true where the border of the window cuts the box.
-        hints: weak candidates, which may overlap; a batch of F, boxes in picture pixels. None where they were not asked
-            for.
+        hints: weak candidates, many of which show the same object (`semfov.zoom.hints`); a batch of F, boxes in picture
+            pixels. None where they were not asked for.
         windows: `(F, 4)`, the windows in picture pixels, cut to the picture.
     """
 
@@ -141,8 +139,9 @@ class ZoomEye(nn.Module):
         """
         canvas, frames = self._resample(view, fixations, within)
         candidates = self.detector.propose(canvas)
-        wanted = [self.detector.selection, HINTS] if hints else [self.detector.selection]
-        selected = select_several(candidates, None, wanted, self.detector.background)
+        selected = [select(candidates, None, self.detector.selection, self.detector.background)]
+        if hints:
+            selected.append(hints_of(candidates, self.detector.background))
         place = _Placement(frames, view.picture.size, selected[0].boxes)
         detections, *weak = place.to_picture(selected)
         found, cut = self._treat(detections, place.cut(selected[0]))

@@ -76,8 +76,9 @@ def gist(hints: Detections, detections: Detections, lattice: Lattice, action: tu
     wide, high = np.log2(np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-3)).T
     canvas = (wide + high) / 2 + math.log2(lattice.magnifications[level])
     size = np.zeros(rows * columns, np.float32)
-    # Of several hints in a cell the one written last remains: the most confident, which comes first.
-    size[at[::-1]] = np.maximum(canvas, 0)[::-1]
+    # Of several hints in a cell the one written last remains: the most confident.
+    order = scores.amax(-1).argsort(descending=True, stable=True).numpy()[::-1]
+    size[at[order]] = np.maximum(canvas, 0)[order]
     found = np.zeros((rows * columns, kinds), np.bool_)
     found[there, kind[sure].numpy()] = True
     shape = rows, columns
