@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from semfov.data.crowded import Crowded
 from semfov.data.mosaics import Mosaics
 from semfov.errors import check
 from semfov.experiments.parallel import available_cores, run_tasks
@@ -36,8 +37,11 @@ DECIDING = ("searched", "judged", "sought", "passes", "judging", "false_alarms",
 VERIFYING = ("searched", "judged", "sought", "passes", "place", "false_alarms", "surest", "tile", "seed")
 """Settings that the verification depends on."""
 
-SURVEYING = ("mosaics", "far", "judged", "judged_far", "survey_steps", "tile", "seed")
+SURVEYING = ("mosaics", "far", "crowded", "judged", "judged_far", "survey_steps", "tile", "seed")
 """Settings that the survey depends on."""
+
+JUDGED = ("judged", "judged far", "judged crowded")
+"""Mosaics of held-out photographs on which foresight is chosen."""
 
 _log = logging.getLogger(__name__)
 
@@ -55,8 +59,8 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
         classes: names of the detector's classes.
 
     Returns:
-        The mosaics: `near` and `far` to fit on, `judged` and `judged far` of held-out photographs, and `searched` to
-        fit decisions on.
+        The mosaics: `near`, `far` and `crowded` to fit on, `judged`, `judged far` and `judged crowded` of held-out
+        photographs, and `searched` to fit decisions on.
     """
     kept, held = split_photographs(config.data, classes, 5)
     tile = config.tile, config.tile * 3 // 4
@@ -66,6 +70,8 @@ def make_mosaics(config: FitZoomConfig, classes: tuple[str, ...]) -> dict[str, M
         "judged": Mosaics(held, 4, 4, tile=tile, count=config.judged, seed=config.seed + 2),
         "judged far": Mosaics(held, 8, 6, tile=tile, count=config.judged_far, seed=config.seed + 3),
         "searched": Mosaics(kept, 4, 4, tile=tile, count=config.searched, seed=config.seed + 4),
+        "crowded": Mosaics(Crowded(kept, 1 / 3), 4, 4, tile=tile, count=config.crowded, seed=config.seed + 5),
+        "judged crowded": Mosaics(Crowded(held, 1 / 3), 4, 4, tile=tile, count=config.judged, seed=config.seed + 6),
     }
 
 
@@ -120,7 +126,7 @@ def fit_zoom(config: FitZoomConfig) -> None:
     if "survey" in refit:
         measured = survey_again(config, model, examples)
         figures = json.dumps({**json.loads(figures), **measured}, indent=1)
-        tried = choose_foresight(model, eye, mosaics["judged"], mosaics["judged far"], store)
+        tried = choose_foresight(model, eye, {kind: mosaics[kind] for kind in JUDGED}, store)
         chosen = f"Foresight chosen for finding all objects: {model.survey.foresight:g}."
         parts += [*figures_of(measured), "", chosen, "", *table(tried), ""]
     if "decision" in refit:
@@ -144,7 +150,7 @@ def look_at_all(
     config: FitZoomConfig, eye: ZoomEye, mosaics: dict[str, Mosaics], store: GlanceStore
 ) -> dict[str, list[ZoomExample]]:
     """Look at all mosaics to fit on and at the held-out ones; returns the looks by kind of mosaic."""
-    looked = {kind: mosaics[kind] for kind in ("near", "far", "judged")}
+    looked = {kind: mosaics[kind] for kind in ("near", "far", "crowded", "judged", "judged crowded")}
     todo = [(kind, n) for kind, some in looked.items() for n in range(len(some))]
     workers = config.workers or available_cores()
     for _ in run_tasks(look, todo, workers=workers, setup=prepare_process, settings=(config,), title="looking",
@@ -176,10 +182,11 @@ def survey_again(
     random.seed(config.seed)
     survey = Survey(model.classes, foresight=model.survey.foresight)
     kinds = {kind: [SurveyExample.of(example) for example in some] for kind, some in examples.items()}
-    fit_survey(survey, kinds["near"] + kinds["far"], config.survey_steps)
+    fit_survey(survey, kinds["near"] + kinds["far"] + kinds["crowded"], config.survey_steps)
     model.survey = survey.eval().requires_grad_(False)
     model.metadata["survey"] = {name: getattr(config, name) for name in SURVEYING}
-    return judge_survey(survey, kinds["judged"])
+    crowded = judge_survey(survey, kinds["judged crowded"])
+    return {**judge_survey(survey, kinds["judged"]), **{f"{name}, crowded": n for name, n in crowded.items()}}
 
 
 def fit_decision(

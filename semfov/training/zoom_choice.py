@@ -1,7 +1,7 @@
 """Choose `foresight` and `patience`, the settings of a search by magnification, on mosaics of held-out photographs."""
 
-from collections.abc import Sequence
-from itertools import islice
+from collections.abc import Mapping, Sequence
+from itertools import chain, islice
 
 import torch
 from tqdm import tqdm
@@ -21,36 +21,34 @@ PATIENCES = (1.5, 1.9, 2.3, 2.8, 3.5)
 
 @torch.inference_mode()
 def choose_foresight(
-    model: GlimpseEvidence, eye: ZoomEye, near: Mosaics, far: Mosaics, store: GlanceStore
+    model: GlimpseEvidence, eye: ZoomEye, kinds: Mapping[str, Mosaics], store: GlanceStore
 ) -> list[list[str]]:
     """Set the `foresight` of the survey to the one with which most objects are found.
 
-    The recall is a mean over passes, from the first to one more than a mosaic has photographs. As the two kinds of
+    The recall is a mean over passes, from the first to one more than a mosaic has photographs. As the kinds of
     mosaics differ in difficulty, the recall of each kind is divided by the highest one that any `foresight` reaches.
 
     Args:
         model: the model; the foresight of its survey is chosen.
         eye: the eye that looks.
-        near: mosaics of few photographs.
-        far: mosaics of many photographs.
+        kinds: mosaics of each kind, by its name.
         store: store of the looks.
 
     Returns:
         A table of the values that were tried.
     """
-    kinds = near, far
-    opened = [open_all(eye, mosaics, store) for mosaics in kinds]
-    objects = [[mosaics.annotation(n) for n in range(len(mosaics))] for mosaics in kinds]
-    rows = [["foresight", "recall, near", "recall, far"]]
+    opened = [open_all(eye, mosaics, store) for mosaics in kinds.values()]
+    objects = [[mosaics.annotation(n) for n in range(len(mosaics))] for mosaics in kinds.values()]
+    rows = [["foresight", *(f"recall, {name}" for name in kinds)]]
     recalls: dict[float, list[float]] = {}
     for value in tqdm(FORESIGHTS, desc="choosing foresight", unit="value", dynamic_ncols=True):
         model.survey.foresight = value
         recalls[value] = [
             mean_recall(model, looks, annotations, len(mosaics.tiles(0)) + 1)
-            for looks, annotations, mosaics in zip(opened, objects, kinds, strict=True)
+            for looks, annotations, mosaics in zip(opened, objects, kinds.values(), strict=True)
         ]
         rows.append([f"{value:g}", *(f"{recall:.4f}" for recall in recalls[value])])
-        for glances in (*opened[0], *opened[1]):
+        for glances in chain.from_iterable(opened):
             glances.save()
     most = [max(*values, 1e-9) for values in zip(*recalls.values(), strict=True)]
     share = {value: sum(r / m for r, m in zip(told, most, strict=True)) for value, told in recalls.items()}

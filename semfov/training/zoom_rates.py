@@ -41,6 +41,7 @@ def descend_examples(
     steps: int,
     batch: int,
     title: str,
+    rate: float = 6e-3,
 ) -> None:
     """Minimise the mean loss of random examples.
 
@@ -51,10 +52,11 @@ def descend_examples(
         steps: number of steps.
         batch: examples in a step.
         title: name of the fit in the log.
+        rate: highest learning rate.
     """
     own = [*parameters]
-    optimizer = torch.optim.AdamW(own, lr=6e-3, weight_decay=0.1)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 6e-3, total_steps=steps)
+    optimizer = torch.optim.AdamW(own, lr=rate, weight_decay=0.1)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
     for step in range(steps):
         losses = [loss_of(example) for example in random.sample(examples, min(batch, len(examples)))]
         loss = torch.stack(losses).mean()

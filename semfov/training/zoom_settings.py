@@ -20,8 +20,10 @@ class FitZoomConfig(Settings):
         detector: the detector.
         mosaics: number of training mosaics of 4 × 4 photographs.
         far: number of training mosaics of 8 × 6 photographs, in which objects are half as large.
+        crowded: number of training mosaics of 4 × 4 photographs of the third that hold most objects, for fitting the
+            number of objects of any class.
         judged: number of mosaics of 4 × 4 held-out photographs, to evaluate the fit and to choose settings of the
-            search and thresholds.
+            search and thresholds; and of the third of them that hold most objects.
         judged_far: number of mosaics of 8 × 6 held-out photographs, to choose settings of the search.
         tile: width in pixels of the slot of a photograph; its height is three quarters of that.
         searched: number of training mosaics of 4 × 4 photographs for fitting the decisions of searches.
@@ -49,6 +51,7 @@ class FitZoomConfig(Settings):
     detector: DetectorConfig = field(default_factory=lambda: DetectorConfig(name="yolox-nano"))
     mosaics: Count = 400
     far: Count = 40
+    crowded: Count = 240
     judged: Count = 80
     judged_far: Count = 4
     tile: Tile = 480
@@ -62,7 +65,7 @@ class FitZoomConfig(Settings):
     evidence: Path | None = None
     refit: tuple[Part, ...] = ("decision", "verification")
     steps: Count = 800
-    survey_steps: Count = 2000
+    survey_steps: Count = 1500
     judging: Count = 300
     seed: Seed = 0
     out: Path = Path("runs/fit_zoom")

@@ -107,7 +107,7 @@ class SurveyExample:
         return found
 
 
-def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, batch: int = 4) -> None:
+def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, batch: int = 8) -> None:
     """Fit the numbers of new objects that closer looks find, by maximum Poisson likelihood.
 
     Args:
@@ -121,7 +121,7 @@ def fit_survey(survey: Survey, examples: Sequence[SurveyExample], steps: int, ba
         closer = random.sample(example.closer, min(LATER, len(example.closer)))
         return torch.stack(example.losses(survey, closer)).mean()
 
-    descend_examples(survey.parameters(), loss_of, examples, steps, batch, "survey")
+    descend_examples(survey.parameters(), loss_of, examples, steps, batch, "survey", rate=2e-3)
 
 
 @torch.no_grad()

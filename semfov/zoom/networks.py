@@ -71,6 +71,12 @@ def neighbourhood_mean(values: Tensor, side: int) -> Tensor:
     return F.avg_pool2d(values[:, None], side, 1, side // 2)[:, 0]
 
 
+def square_mean(values: Tensor, side: int) -> Tensor:
+    """`neighbourhood_mean`, first along columns and then along rows: faster for large squares."""
+    means = F.avg_pool2d(values[:, None], (side, 1), 1, (side // 2, 0))
+    return F.avg_pool2d(means, (1, side), 1, (0, side // 2))[:, 0]
+
+
 def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None) -> Tensor:
     """Some of a network's outputs. Networks this small spend most of their time in calls of modules, left out here."""
     last = len(network) - 1

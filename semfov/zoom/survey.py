@@ -13,13 +13,16 @@ from semfov.zoom.networks import (
     memory_maps,
     neighbourhood_mean,
     small_network,
+    square_mean,
     tapered,
     through,
 )
 
 _CHANNELS, _WIDTH = 8, 48
 _HINTS, _MEMORY = 11, 2
-_INPUTS = _HINTS + _MEMORY + 2 * _CHANNELS
+_NEAR, _WIDE = 5, (9, 17)
+"""Sides in cells of the squares over which sums of hints are averaged: the neighbours, and the surroundings."""
+_INPUTS = _HINTS + _MEMORY + 2 * _CHANNELS + len(_WIDE) * (_CHANNELS + 2)
 _LOWEST = -0.8
 """About the feature of a score of 0."""
 _LARGEST = 1e6
@@ -72,7 +75,9 @@ class Survey(nn.Module):
         found = look.found.any(-1).to(best)
         kinds = F.linear(hints - _LOWEST, self.mix.weight).movedim(-1, 0)
         parts = [*hint_maps(best[None], best, found[None], look.size), *memory_maps(best[None], before)]
-        maps = torch.cat([*parts, kinds, neighbourhood_mean(kinds, 5)])
+        around = torch.cat([kinds, best[None], found[None]])
+        surroundings = [square_mean(around, side) for side in _WIDE]
+        maps = torch.cat([*parts, kinds, neighbourhood_mean(kinds, _NEAR), *surroundings])
         value = through(self.rate, maps.movedim(0, -1)) - 6
         return value.clamp(max=3).movedim(-1, 0)[None]
 

@@ -37,8 +37,8 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, te
     monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures("bright"))
     config = FitZoomConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
-        mosaics=1, far=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=48, steps=3, survey_steps=3,
-        out=tmp_path / "out", cache=tmp_path / "cache", workers=1,
+        mosaics=1, far=1, crowded=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=48,
+        steps=3, survey_steps=3, out=tmp_path / "out", cache=tmp_path / "cache", workers=1,
     )  # fmt: skip
     fit_zoom(config)
     path = tmp_path / "out" / "bright.safetensors"
@@ -49,8 +49,9 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, te
     assert all(map(math.isfinite, figures.values()))
     assert (tmp_path / "out" / "report.md").read_text() in capsys.readouterr().out
     recalls, passes = tables_of_choices((tmp_path / "out" / "report.md").read_text())
-    near, far = (max(*values, 1e-9) for values in zip(*recalls.values(), strict=True))
-    best = max(recalls, key=lambda value: recalls[value][0] / near + recalls[value][1] / far)
+    most = [max(*values, 1e-9) for values in zip(*recalls.values(), strict=True)]
+    assert len(most) == 3
+    best = max(recalls, key=lambda value: sum(recall / high for recall, high in zip(recalls[value], most, strict=True)))
     assert model.survey.foresight == best
     assert model.patience == min(passes, key=passes.get)
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from semfov.zoom import GlimpseEvidence
-from semfov.zoom.networks import features, small_network, through
+from semfov.zoom.networks import features, neighbourhood_mean, small_network, square_mean, through
 
 
 @pytest.mark.parametrize("shape", [(5,), (1, 5), (40, 5), (3, 6, 5), (2, 3, 6, 5)])
@@ -40,3 +40,9 @@ def test_presence_equals_its_formula(known):
     for kind in range(4):
         one = evidence.presence(scores, summary, steps, kind + 1, None if before is None else before[:, kind])
         torch.testing.assert_close(one, told[:, kind])
+
+
+@pytest.mark.parametrize("side", [3, 9, 17])
+def test_the_mean_along_both_axes_in_turn_is_that_over_the_square(side):
+    values = torch.rand(2, 12, 10)
+    torch.testing.assert_close(square_mean(values, side), neighbourhood_mean(values, side))

@@ -51,6 +51,18 @@ def test_rates_depend_on_the_class_of_the_hints(survey):
     assert not torch.allclose(survey.rates(look), survey.rates(other))
 
 
+def test_rates_depend_on_how_much_the_surroundings_hold(survey):
+    """Hints and finds eight cells away matter, although no hint is stronger than one in the cell itself."""
+    look = gist(1, (0, 0))
+    look.scores[0, 0] = 1.0
+    scores, found = look.scores.clone(), look.found.clone()
+    scores[8, 8] = 0.5
+    found[8, 8] = ~found[8, 8].any()
+    changed = [Gist(1, (0, 0), 1, scores, look.size, look.found), Gist(1, (0, 0), 1, look.scores, look.size, found)]
+    for other in changed:
+        assert not torch.equal(survey.rates(look)[..., 0, 0], survey.rates(other)[..., 0, 0])
+
+
 def test_rates_do_not_depend_on_distant_cells(survey):
     """Beyond the widest neighbourhood a cell matters only through the strongest hint of the look."""
     look = gist(1, (0, 0))
