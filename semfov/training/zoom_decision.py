@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from semfov.data.mosaics import Mosaics
+from semfov.data.scene import Annotation
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.summary import table
 from semfov.experiments.zoom_store import StoredGlances
@@ -20,7 +21,7 @@ from semfov.metrics.presence import area_under_roc
 from semfov.training.descent import descend
 from semfov.training.evidence import Bounds, choose_thresholds
 from semfov.zoom.evidence import GlimpseEvidence
-from semfov.zoom.search import look_for
+from semfov.zoom.search import Turn, look_for
 from semfov.zoom.tally import Tally
 
 JUDGED = (1, 4, 8, 16)
@@ -52,7 +53,7 @@ class Searches:
 
 
 @torch.inference_mode()
-def search_mosaics(
+def searches_of(
     model: GlimpseEvidence,
     mosaics: Mosaics,
     opened: Sequence[StoredGlances],
@@ -61,8 +62,8 @@ def search_mosaics(
     passes: int,
     seed: int,
     title: str,
-) -> Searches:
-    """Search every mosaic for some present classes and for as many absent ones.
+) -> Iterator[tuple[int, Annotation, int, Iterator[tuple[Turn, Tally]]]]:
+    """Search every mosaic for some present classes and for as many absent ones, without decisions.
 
     Args:
         model: the evidence that guides the search.
@@ -73,27 +74,51 @@ def search_mosaics(
         seed: seed of the choice of classes.
         title: label of the progress bar.
 
+    Yields:
+        For each search the number and the objects of the mosaic, the class, and the turns with the facts after each.
+        Looks that are made before the next search are stored.
+    """
+    for index, looks in enumerate(tqdm(opened, desc=title, unit="mosaic", dynamic_ncols=True)):
+        annotation = mosaics.annotation(index)
+        for target in choose_classes(mosaics, index, annotation, classes, 1.0, seed):
+            turns = islice(look_for(looks, model, target, confirm=float("inf")), passes)
+            yield index, annotation, target, _tallied(turns)
+        looks.save()
+
+
+def _tallied(turns: Iterable[Turn]) -> Iterator[tuple[Turn, Tally]]:
+    """The turns of a search, each with the facts about the search after it."""
+    tally: Tally | None = None
+    for turn in turns:
+        tally = tally or Tally(turn.belief)
+        tally.add(turn.glance)
+        yield turn, tally
+
+
+@torch.inference_mode()
+def search_mosaics(
+    model: GlimpseEvidence,
+    mosaics: Mosaics,
+    opened: Sequence[StoredGlances],
+    *,
+    classes: int,
+    passes: int,
+    seed: int,
+    title: str,
+) -> Searches:
+    """Take down all searches of `searches_of`, whose arguments these are.
+
     Returns:
         The searches.
     """
     rows: list[list[Tensor]] = []
-    for index, looks in enumerate(tqdm(opened, desc=title, unit="mosaic", dynamic_ncols=True)):
-        annotation = mosaics.annotation(index)
-        held = set(annotation.labels.tolist())
-        for target in choose_classes(mosaics, index, annotation, classes, 1.0, seed):
-            tally: Tally | None = None
-            steps: list[tuple[float, Tensor, bool, float]] = []
-            for turn in islice(look_for(looks, model, target, confirm=float("inf")), passes):
-                tally = tally or Tally(turn.belief)
-                tally.add(turn.glance)
-                steps.append((tally.best, tally.case(turn.ahead), tally.looked, turn.ahead))
-            steps += [(*steps[-1][:3], 0.0)] * (passes - len(steps))
-            best, case, looked, left = zip(*steps, strict=True)
-            rows.append(
-                [torch.tensor(best), torch.stack(case), torch.tensor(looked), torch.tensor(left),
-                 torch.tensor(target in held)]
-            )  # fmt: skip
-        looks.save()
+    searches = searches_of(model, mosaics, opened, classes=classes, passes=passes, seed=seed, title=title)
+    for _, annotation, target, turns in searches:
+        steps = [(tally.best, tally.case(turn.ahead), tally.looked, turn.ahead) for turn, tally in turns]
+        steps += [(*steps[-1][:3], 0.0)] * (passes - len(steps))
+        best, case, looked, left = zip(*steps, strict=True)
+        there = torch.tensor(bool((annotation.labels == target).any()))
+        rows.append([torch.tensor(best), torch.stack(case), torch.tensor(looked), torch.tensor(left), there])
     return Searches(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 

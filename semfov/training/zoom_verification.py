@@ -4,29 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from typing import Protocol
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
 from semfov.decision import OUTCOMES, settle
-from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.zoom_store import StoredGlances
 from semfov.observation.matching import box_iou
 from semfov.training.verification_decisions import Ended, Verified, choose_confirm
 from semfov.training.verification_fit import Examined, FittedVerification, fit
 from semfov.training.verification_report import report
+from semfov.training.zoom_decision import searches_of
 from semfov.verifier import MOST, SAME
 from semfov.zoom.closer import Suspects, ZoomVerifier
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance
-from semfov.zoom.search import look_for
-from semfov.zoom.tally import Tally
 
 AFTER = (1, 3, 5, 8, 12, 16, 24)
 """Numbers of looks after which places are examined for the fit."""
@@ -117,10 +113,10 @@ class Sought:
 
 
 @torch.inference_mode()
-def searches_of(
+def sought_in(
     model: GlimpseEvidence, mosaics: Mosaics, opened: Sequence[StoredGlances], config: Limits, title: str
 ) -> Iterator[Sought]:
-    """Search every mosaic for some present classes and for as many absent ones, without closer looks.
+    """Search every mosaic, without closer looks (`semfov.training.zoom_decision.searches_of`).
 
     Decisions do not move the gaze, so all of them can be made along the same looks.
 
@@ -132,20 +128,17 @@ def searches_of(
         title: label of the progress bar.
 
     Yields:
-        Each search with all its looks. Looks that are made before the next one are stored.
+        Each search with all its looks.
     """
-    for index, looks in enumerate(tqdm(opened, desc=title, unit="mosaic", dynamic_ncols=True)):
-        annotation = mosaics.annotation(index)
-        for target in choose_classes(mosaics, index, annotation, config.sought, 1.0, config.seed):
-            turns: list[Turned] = []
-            tally: Tally | None = None
-            for turn in islice(look_for(looks, model, target, confirm=float("inf")), config.passes):
-                tally = tally or Tally(turn.belief)
-                tally.add(turn.glance)
-                box = tally.box if tally.looked else None
-                turns.append(Turned(turn.glance, tally.presence(turn.ahead), tally.best, turn.ahead, box))
-            yield Sought(index, looks, target, annotation.boxes[annotation.labels == target], tuple(turns))
-        looks.save()
+    searches = searches_of(
+        model, mosaics, opened, classes=config.sought, passes=config.passes, seed=config.seed, title=title
+    )
+    for index, annotation, target, turns in searches:
+        told = [
+            Turned(turn.glance, tally.presence(turn.ahead), tally.best, turn.ahead, tally.box if tally.looked else None)
+            for turn, tally in turns
+        ]
+        yield Sought(index, opened[index], target, annotation.boxes[annotation.labels == target], tuple(told))
 
 
 @torch.inference_mode()
@@ -246,7 +239,7 @@ def fit_closer(
         The report in Markdown, which says so if there are too few places to fit to.
     """
     searches = {
-        kind: list(searches_of(model, mosaics[kind], opened[kind], config, title))
+        kind: list(sought_in(model, mosaics[kind], opened[kind], config, title))
         for kind, title in (("searched", "looking closely"), ("judged", "looking closely at held-out mosaics"))
     }
     known, examined = (examine(searches[kind]) for kind in ("searched", "judged"))

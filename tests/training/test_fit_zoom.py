@@ -24,7 +24,7 @@ from semfov.training.observation_settings import FitConfig
 from semfov.training.zoom import fit_zoom
 from semfov.training.zoom_examples import example_of
 from semfov.training.zoom_settings import FitZoomConfig
-from semfov.training.zoom_verification import fit_closer, searches_of, unverified, verify
+from semfov.training.zoom_verification import fit_closer, sought_in, unverified, verify
 from semfov.zoom import GlimpseEvidence, ZoomEye
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.search import search
@@ -190,7 +190,7 @@ def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
     torch.manual_seed(0)
     model = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.01)).eval().requires_grad_(False)
     config = FitZoomConfig(sought=3, passes=8, place=0.1, false_alarms=0.5)
-    searches = list(searches_of(model, scenes, opened, config, "test"))
+    searches = list(sought_in(model, scenes, opened, config, "test"))
     names = "background", *scenes.classes
     for sought in searches:
         assert sought.present == (sought.target in scenes.annotation(sought.mosaic).labels.tolist())
