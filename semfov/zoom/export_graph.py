@@ -70,11 +70,12 @@ class LookGraph(Graph):
         part = self.add("Slice", picture, start, self._whole(y2, x2), self.constant([0, 1]))
         pixels = self.add("Cast", self.add("Unsqueeze", part, self.constant([0])), to=_FLOAT)
         pixels = self.add("Transpose", pixels, perm=[0, 3, 1, 2])
-        # One axis after the other, rounded to bytes after each, as Pillow and torch resample bytes.
-        rows = self._whole(self.add("Sub", y2, y1))
+        # One axis after the other, rounded to bytes after each; columns of pixels first if they become shorter.
+        rows, across = self._whole(self.add("Sub", y2, y1)), self._whole(self.add("Sub", x2, x1))
         columns, lines = self._whole(self.add("Sub", u2, u1)), self._whole(self.add("Sub", v2, v1))
-        lead = self.constant([1, 3])
-        for size in ([lead, rows, columns], [lead, lines, columns]):
+        lead, shorter = self.constant([1, 3]), self.add("Greater", rows, lines)
+        first = self.add("Where", shorter, lines, rows), self.add("Where", shorter, across, columns)
+        for size in ([lead, *first], [lead, lines, columns]):
             # Weights beyond the border are left out, as by Pillow and torch.
             how: dict[str, Any] = {"mode": "linear", "antialias": 1, "exclude_outside": 1}
             resized = self.add("Resize", pixels, "", "", self.add("Concat", *size, axis=0), **how)

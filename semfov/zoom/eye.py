@@ -202,12 +202,7 @@ class ZoomEye(nn.Module):
         x1, x2, u1, u2 = _shown(x, magnification, wide, picture.size[0], left, right)
         y1, y2, v1, v2 = _shown(y, magnification, high, picture.size[1], top, bottom)
         reduction = reduction_for(min((x2 - x1) // (u2 - u1), (y2 - y1) // (v2 - v1)))
-        canvas = picture.read((x1, y1, x2, y2), reduction)[None]
-        if canvas.shape[-2:] != (v2 - v1, u2 - u1):
-            # torch takes twice as long where the rows of a window are not adjacent in memory.
-            canvas = canvas.contiguous(memory_format=torch.channels_last)
-            canvas = F.interpolate(canvas, (v2 - v1, u2 - u1), mode="bilinear", antialias=True)
-        canvas = canvas.to(blank.dtype)
+        canvas = _resized(picture.read((x1, y1, x2, y2), reduction), (v2 - v1, u2 - u1)).to(blank.dtype)
         if (u1, v1, u2, v2) != (0, 0, wide, high):
             pixels, canvas = canvas, blank.expand(1, 3, high, wide).contiguous(memory_format=torch.channels_last)
             canvas[..., v1:v2, u1:u2] = pixels
@@ -255,6 +250,16 @@ class ZoomEye(nn.Module):
 def _unit(canvases: Tensor) -> Tensor:
     """Canvases in [0, 1], of those from 0 to 255."""
     return canvases.to(torch.get_default_dtype()).contiguous() / 255
+
+
+def _resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """Bytes `(3, h, w)`, channels last in memory, resampled to `size`: `(1, 3, *size)`."""
+    # torch takes twice as long where the rows of a window are not adjacent in memory.
+    canvas = pixels.permute(1, 2, 0).contiguous()[None].permute(0, 3, 1, 2)
+    if canvas.shape[-2] > size[0]:
+        # It reduces rows first. Columns first takes two thirds of the time, because that step is the faster one.
+        canvas = F.interpolate(canvas, (size[0], canvas.shape[-1]), mode="bilinear", antialias=True)
+    return canvas if canvas.shape[-2:] == size else F.interpolate(canvas, size, mode="bilinear", antialias=True)
 
 
 def _shown(

@@ -4,6 +4,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semfov.sensor.lines import constant
+
 STEPS = 3
 """Largest number of octaves between a look and the closer looks that are predicted from it."""
 
@@ -63,18 +65,23 @@ def tapered(border: Tensor, span: int) -> Tensor:
 
 def neighbourhood_peak(values: Tensor, side: int) -> Tensor:
     """Largest value of maps `(T, rows, columns)` in the square about each cell."""
-    return F.max_pool2d(values[:, None], side, 1, side // 2)[:, 0]
+    # One axis after the other: fewer comparisons.
+    along = F.max_pool1d(values, side, 1, side // 2)
+    return F.max_pool1d(along.mT, side, 1, side // 2).mT
 
 
 def neighbourhood_mean(values: Tensor, side: int) -> Tensor:
     """Mean of maps `(T, rows, columns)` over the square about each cell; what lies beyond the map counts as 0."""
-    return F.avg_pool2d(values[:, None], side, 1, side // 2)[:, 0]
+    # Products with banded matrices take a tenth of the time of `avg_pool2d`.
+    down, across = (_band(length, side, values.dtype, values.device) for length in values.shape[-2:])
+    return down @ values @ across
 
 
-def square_mean(values: Tensor, side: int) -> Tensor:
-    """`neighbourhood_mean`, first along columns and then along rows: faster for large squares."""
-    means = F.avg_pool2d(values[:, None], (side, 1), 1, (side // 2, 0))
-    return F.avg_pool2d(means, (1, side), 1, (0, side // 2))[:, 0]
+@constant
+def _band(length: int, side: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix `(length, length)` that takes means over `side` neighbours."""
+    place = torch.arange(length, device=device)
+    return ((place[:, None] - place).abs() <= side // 2).to(dtype) / side
 
 
 def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None) -> Tensor:

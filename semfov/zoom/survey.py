@@ -2,7 +2,6 @@
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from semfov.io.schema import Field, Number, Object, perceptron
 from semfov.zoom.gist import Gist
@@ -13,7 +12,6 @@ from semfov.zoom.networks import (
     memory_maps,
     neighbourhood_mean,
     small_network,
-    square_mean,
     tapered,
     through,
 )
@@ -72,11 +70,13 @@ class Survey(nn.Module):
         """
         hints = features(look.scores)
         best = hints.amax(-1)
-        found = look.found.any(-1).to(best)
-        kinds = F.linear(hints - _LOWEST, self.mix.weight).movedim(-1, 0)
+        # torch takes twice as long for `any` of booleans, and for a matrix of few columns on the right.
+        found = look.found.to(best).amax(-1)
+        mix = self.mix.weight
+        kinds = torch.addmm(-_LOWEST * mix.sum(1, keepdim=True), mix, hints.flatten(0, 1).mT).unflatten(1, best.shape)
         parts = [*hint_maps(best[None], best, found[None], look.size), *memory_maps(best[None], before)]
         around = torch.cat([kinds, best[None], found[None]])
-        surroundings = [square_mean(around, side) for side in _WIDE]
+        surroundings = [neighbourhood_mean(around, side) for side in _WIDE]
         maps = torch.cat([*parts, kinds, neighbourhood_mean(kinds, _NEAR), *surroundings])
         value = through(self.rate, maps.movedim(0, -1)) - 6
         return value.clamp(max=3).movedim(-1, 0)[None]

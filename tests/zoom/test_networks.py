@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from torch.nn import functional
 
 from semfov.zoom import GlimpseEvidence
-from semfov.zoom.networks import features, neighbourhood_mean, small_network, square_mean, through
+from semfov.zoom.networks import features, neighbourhood_mean, neighbourhood_peak, small_network, through
 
 
 @pytest.mark.parametrize("shape", [(5,), (1, 5), (40, 5), (3, 6, 5), (2, 3, 6, 5)])
@@ -43,6 +44,11 @@ def test_presence_equals_its_formula(known):
 
 
 @pytest.mark.parametrize("side", [3, 9, 17])
-def test_the_mean_along_both_axes_in_turn_is_that_over_the_square(side):
-    values = torch.rand(2, 12, 10)
-    torch.testing.assert_close(square_mean(values, side), neighbourhood_mean(values, side))
+@pytest.mark.parametrize("shape", [(2, 12, 10), (1, 1, 5), (4, 32, 32)])
+def test_means_and_peaks_of_neighbourhoods_equal_pooling(side, shape, device):
+    values = torch.randn(shape, device=device)
+    settings = {"kernel_size": side, "stride": 1, "padding": side // 2}
+    expected = functional.avg_pool2d(values[:, None], **settings)[:, 0]
+    torch.testing.assert_close(neighbourhood_mean(values, side), expected)
+    expected = functional.max_pool2d(values[:, None], **settings)[:, 0]
+    torch.testing.assert_close(neighbourhood_peak(values, side), expected, rtol=0, atol=0)
