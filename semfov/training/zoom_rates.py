@@ -5,6 +5,7 @@ import random
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -118,8 +119,8 @@ def rates_before(first: Gist, logs: Tensor, look: Gist) -> Tensor:
     cells = (logs.exp() / first.scale**2).repeat_interleave(first.scale, -1).repeat_interleave(first.scale, -2)
     rows, columns = (n * look.scale for n in look.scores.shape[:2])
     part = cells[..., look.first[1] : look.first[1] + rows, look.first[0] : look.first[0] + columns]
-    source = torch.zeros(part.shape[-2:], dtype=torch.long)
-    return torch.stack([before_of(one, source, look) for one in part])
+    source = np.zeros(part.shape[-2:], np.int64)
+    return torch.stack([before_of(one.numpy(), source, look) for one in part])
 
 
 def _likelihood_loss(

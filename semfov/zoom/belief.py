@@ -1,9 +1,10 @@
 """Belief about a large picture: what looks at it predict for closer looks."""
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -51,7 +52,6 @@ class ZoomBelief:
         context: adds to the log odds of the class by the other classes in a window; None adds nothing.
 
     Attributes:
-        rate: `(3, rows, columns)`, expected objects centred in each cell, for looks one to three octaves closer.
         source: `(rows, columns)`, level of the closest look at each cell that has closer ones; -1 for none.
         left: `(rows, columns)`, share of each cell that is left to see, 0 or 1.
         gists: gists of the looks so far.
@@ -65,7 +65,9 @@ class ZoomBelief:
         shape = lattice.rows, lattice.columns
         # Rates of cells that a level is not one to three octaves closer to are 0: the first plane and the last one.
         self._planes = np.zeros((STEPS + 2, *shape), np.float32)
-        self.rate = torch.from_numpy(self._planes[1:-1])
+        # The level that the rates of a cell are from. Searches for one object need no rates: they wait until asked for.
+        self._rated = np.full(shape, -1, np.int8)
+        self._predicted = 0
         self.source = torch.full(shape, -1)
         self.left = torch.ones(shape)
         self.gists: list[Gist] = []
@@ -98,16 +100,21 @@ class ZoomBelief:
         differs = before != now
         if differs.any():
             np.copyto(now, before)
-            self._renew(extent(differs))
+            box = extent(differs)
+            self._renew(box)
+            self._changes.append(box)
 
     def add(self, glance: Glance) -> None:
         """Update the belief with the result of a look."""
         if glance.gist is None:
             self.discount(glance.window)
             return
-        self.gists.append(glance.gist)
-        self._spread(glance.gist)
+        look, source = glance.gist, self.source.numpy()
+        self.gists.append(look)
         self._told.clear()
+        x1, y1, x2, y2 = box = self._box(look)
+        np.maximum(source[y1:y2, x1:x2], look.level, out=source[y1:y2, x1:x2])
+        self._changes.append(box)
 
     def discount(self, window: Window) -> None:
         """Expect nothing more inside a window, because it was looked at as closely as possible, or is about to be.
@@ -122,25 +129,33 @@ class ZoomBelief:
                 cells[y1:y2, x1:x2] = 0
             self._changes.append((x1, y1, x2, y2))
 
-    def _spread(self, look: Gist) -> None:
-        """Write the rates of a look to the cells that were not looked at as closely before."""
-        rows = min(look.scores.shape[0] * look.scale, self.lattice.rows - look.first[1])
-        columns = min(look.scores.shape[1] * look.scale, self.lattice.columns - look.first[0])
-        at = (slice(look.first[1], look.first[1] + rows), slice(look.first[0], look.first[0] + columns))
-        before = None
-        if look.level > 0:
-            before = before_of(self.rate[:, *at], self.source[at], look)
-        with torch.no_grad():
-            logs = self._rates.rates(look, self._targets, None if before is None else before[None])[0]
-        cells = (logs.exp() / look.scale**2).numpy()
-        if look.scale > 1:
-            cells = cells.repeat(look.scale, -1).repeat(look.scale, -2)[:, :rows, :columns]
-        rate, source = self.rate.numpy()[:, *at], self.source.numpy()[at]
-        newer = source < look.level
-        np.copyto(rate, cells, where=newer)
-        source[newer] = look.level
-        left, top = look.first
-        self._renew((left, top, left + columns, top + rows))
+    @property
+    def rate(self) -> Tensor:
+        """Expected objects centred in each cell, for looks one to three octaves closer, `(3, rows, columns)`."""
+        self._predict()
+        return torch.from_numpy(self._planes[1:-1])
+
+    def _box(self, look: Gist) -> Box:
+        """The cells that a look shows."""
+        (x, y), (rows, columns) = look.first, look.scores.shape[:2]
+        return x, y, min(x + columns * look.scale, self.lattice.columns), min(y + rows * look.scale, self.lattice.rows)
+
+    @torch.no_grad()
+    def _predict(self) -> None:
+        """Write the rates of new looks to the cells that were not looked at as closely before."""
+        new, self._predicted = self.gists[self._predicted :], len(self.gists)
+        for look in new:
+            x1, y1, x2, y2 = box = self._box(look)
+            at = slice(y1, y2), slice(x1, x2)
+            rate, rated = self._planes[1:-1, *at], self._rated[at]
+            before = before_of(rate, rated, look)[None] if look.level > 0 else None
+            cells = self._rates.rates(look, self._targets, before)[0].exp().numpy()
+            if look.scale > 1:
+                cells = cells.repeat(look.scale, -1).repeat(look.scale, -2)[:, : y2 - y1, : x2 - x1] / look.scale**2
+            newer = rated < look.level
+            np.copyto(rate, cells, where=newer)
+            rated[newer] = look.level
+            self._renew(box)
 
     def expected(self, level: int) -> Tensor:
         """Number of objects that looks of a level are expected to find in each cell, `(rows, columns)`."""
@@ -148,13 +163,14 @@ class ZoomBelief:
 
     def _expect(self, level: int) -> Cells:
         """`expected`, not to be written to."""
+        self._predict()
         if level not in self._expected:
             self._expected[level] = self._compute(level, (slice(None), slice(None)))
         return self._expected[level]
 
     def _compute(self, level: int, at: tuple[slice, slice]) -> Cells:
         """`expected` in some rows and columns."""
-        told: Cells = np.choose(level - self.source.numpy()[at], self._planes[:, *at], mode="clip")
+        told: Cells = np.choose(level - self._rated[at], self._planes[:, *at], mode="clip")
         return told * self.left.numpy()[at]
 
     def _renew(self, changed: Box) -> None:
@@ -163,7 +179,6 @@ class ZoomBelief:
         at = slice(y1, y2), slice(x1, x2)
         for level, cells in self._expected.items():
             cells[at] = self._compute(level, at)
-        self._changes.append(changed)
 
     def finds(self, level: int) -> Tensor:
         """Number of objects that a look at each window of a level is expected to find, `(down, across)`."""
@@ -274,7 +289,7 @@ class ZoomBelief:
         return self._told[window]
 
 
-def before_of(rate: Tensor, source: Tensor, look: Gist) -> Tensor:
+def before_of(rate: Cells, source: NDArray[np.integer[Any]], look: Gist) -> Tensor:
     """Logarithms of the rates that earlier looks gave, in the cells of a look, for looks one octave closer than it.
 
     Args:
@@ -286,7 +301,7 @@ def before_of(rate: Tensor, source: Tensor, look: Gist) -> Tensor:
         `(rows, columns)` of the gist.
     """
     # NumPy, because a call of torch takes longer than the work.
-    told = torch.from_numpy(np.choose(look.level - source.numpy(), rate.numpy(), mode="clip"))
+    told = torch.from_numpy(np.choose(look.level - source, rate, mode="clip"))
     rows, columns = look.scores.shape[:2]
     if look.scale > 1:
         told = F.pad(told, (0, columns * look.scale - told.shape[1], 0, rows * look.scale - told.shape[0]))

@@ -8,6 +8,7 @@ from torch import Tensor
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance
+from semfov.zoom.lattice import CELLS
 from semfov.zoom.networks import features
 
 
@@ -63,9 +64,10 @@ class Tally:
 
         As features of scores: the highest and the second highest score of the target in a look, the highest in a look
         of the last level, the score in the overview, the highest of a detection whose best class is the target, and the
-        value of the best look that is left. As logarithms: the number of objects that looks of the last level are still
-        expected to find, and the same after the overview. Then the share of the picture that is left to see. As
-        logarithms: the number of looks with a score of 0.1 or more, and the number of looks.
+        value of the best look that is left. As logarithms: the number of looks of the last level, side by side over the
+        picture, that are still expected to show the target, and the same after the overview. Then the share of the
+        picture that is left to see. As logarithms: the number of looks with a score of 0.1 or more, and the number of
+        looks.
 
         Args:
             ahead: value of the best look that is left.
@@ -80,8 +82,10 @@ class Tally:
         return torch.cat([hints, torch.tensor([*left, float(self.belief.left.mean()), *counts])])
 
     def _left(self) -> float:
-        """Number of objects that looks of the last level are expected to find."""
-        return float(self.belief.expected(self.belief.lattice.levels - 1).sum())
+        """Number of looks of the last level, side by side over the picture, that are expected to show the target."""
+        last = self.belief.lattice.levels - 1
+        # Windows start at every cell: this is the mean over all ways to lay them side by side.
+        return float(self.belief.chances(last).sum()) / CELLS**2 if last else 0.0
 
     @torch.no_grad()
     def presence(self, ahead: float) -> float:

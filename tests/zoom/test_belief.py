@@ -103,7 +103,7 @@ def test_rates_of_earlier_looks_are_those_for_the_next_level():
     rate = torch.rand(3, 4, 6, generator=generator)
     source = torch.randint(0, 5, (4, 6), generator=generator)
     look = Gist(4, (0, 0), 1, torch.zeros(4, 6, 3), torch.zeros(4, 6), torch.zeros(4, 6, 3).bool())
-    told = before_of(rate, source, look)
+    told = before_of(rate.numpy(), source.numpy(), look)
     for row in range(4):
         for column in range(6):
             octaves = min(max(look.level + 1 - int(source[row, column]), 1), 3)
