@@ -34,7 +34,7 @@ class Searches:
 
     Attributes:
         best: `(E, n)`, highest score of the target so far, after each look.
-        case: `(E, n, 11)`, features of the search so far (`Tally.case`).
+        case: `(E, n, 10)`, features of the search so far (`Tally.case`).
         looked: `(E, n)`, whether a detection has shown the target (`Tally.looked`).
         left: `(E, n)`, value of the best remaining look.
         there: `(E,)`, whether the target is in the picture.

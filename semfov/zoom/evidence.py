@@ -22,7 +22,7 @@ from semfov.zoom.survey import SURVEY, Survey, survey_fields
 _SUMMARY = 3
 _SHAPE, _SHAPE_WIDTH = 7, 24
 _RATE, _RATE_WIDTH = 14, 32
-CASE, _JUDGE_WIDTH = 11, 16
+CASE, _JUDGE_WIDTH = 10, 16
 """Number of facts of a search from which the presence of its target is predicted (`semfov.zoom.tally`)."""
 _LARGEST = 1e6
 
@@ -233,7 +233,7 @@ class GlimpseEvidence(Pretrained):
 
         Args:
             best: `(...)`, highest score of the class in any look.
-            case: `(..., 11)`, further facts about the search (`semfov.zoom.tally.Tally.case`).
+            case: `(..., 10)`, further facts about the search (`semfov.zoom.tally.Tally.case`).
 
         Returns:
             Log odds, `(...)`.

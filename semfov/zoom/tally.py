@@ -28,7 +28,6 @@ class Tally:
         self.best, self.box = 0.0, None
         self._second = self._closest = self._first = self._named = self._found = 0.0
         self._looks = self._seen = 0
-        self._expected = 0.0
 
     box: Tensor | None
 
@@ -40,7 +39,7 @@ class Tally:
         if glance.window.level == self.belief.lattice.levels - 1:
             self._closest = max(self._closest, score)
         if not self._looks:
-            self._first, self._expected = score, self._left()
+            self._first = score
         self._looks += 1
         self._seen += score >= FOUND
         detections = glance.detections
@@ -64,22 +63,21 @@ class Tally:
 
         As features of scores: the highest and the second highest score of the target in a look, the highest in a look
         of the last level, the score in the overview, the highest of a detection whose best class is the target, and the
-        value of the best look that is left. As logarithms: the number of looks of the last level, side by side over the
-        picture, that are still expected to show the target, and the same after the overview. Then the share of the
-        picture that is left to see. As logarithms: the number of looks with a score of 0.1 or more, and the number of
-        looks.
+        value of the best look that is left. As a logarithm: the number of looks of the last level, side by side over
+        the picture, that are still expected to show the target. Then the share of the picture that is left to see. As
+        logarithms: the number of looks with a score of 0.1 or more, and the number of looks.
 
         Args:
             ahead: value of the best look that is left.
 
         Returns:
-            `(11,)`.
+            `(10,)`.
         """
         scores = [self.best, self._second, self._closest, self._first, self._named, ahead]
         hints = features(torch.tensor(scores, dtype=torch.float32))
-        left = [math.log(expected + 1e-3) / 4 for expected in (self._left(), self._expected)]
+        left = [math.log(self._left() + 1e-3) / 4, float(self.belief.left.mean())]
         counts = [math.log1p(self._seen) / 2, math.log(self._looks) / 2]
-        return torch.cat([hints, torch.tensor([*left, float(self.belief.left.mean()), *counts])])
+        return torch.cat([hints, torch.tensor([*left, *counts])])
 
     def _left(self) -> float:
         """Number of looks of the last level, side by side over the picture, that are expected to show the target."""

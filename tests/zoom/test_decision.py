@@ -16,6 +16,7 @@ from semfov.training.zoom_decision import Searches, fit_judge, judge_searches
 from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye
 from semfov.zoom.evidence import CASE, features
 from semfov.zoom.glances import LiveGlances
+from semfov.zoom.lattice import CELLS
 from semfov.zoom.search import look_for
 from semfov.zoom.tally import Tally
 
@@ -65,9 +66,13 @@ def test_features_of_a_search_equal_those_computed_from_its_looks(eye, picture):
     case = tally.case(0.25)
     raw = torch.tensor([ordered[0], ordered[1], max([0.0, *closest]), scores[0], max([0.0, *named]), 0.25])
     torch.testing.assert_close(case[:6], features(raw))
-    assert case[8] == pytest.approx(float(seen[0].belief.left.mean()))
-    assert case[9] == pytest.approx(math.log(1 + sum(score >= 0.1 for score in scores)) / 2)
-    assert case[10] == pytest.approx(math.log(len(seen)) / 2)
+    belief = seen[0].belief
+    chances = belief.chances(belief.lattice.levels - 1)
+    laid = [chances[row::CELLS, column::CELLS].sum() for row in range(CELLS) for column in range(CELLS)]
+    assert case[6] == pytest.approx(math.log(sum(laid) / len(laid) + 1e-3) / 4)
+    assert case[7] == pytest.approx(float(belief.left.mean()))
+    assert case[8] == pytest.approx(math.log(1 + sum(score >= 0.1 for score in scores)) / 2)
+    assert case[9] == pytest.approx(math.log(len(seen)) / 2)
     assert case.shape == (CASE,)
     boxes = torch.cat([turn.glance.detections.boxes[0] for turn in seen])
     confidence = torch.cat([turn.glance.detections.scores[0, :, target] for turn in seen])
@@ -103,7 +108,7 @@ def synthetic(count, seed):
     generator = torch.Generator().manual_seed(seed)
     case = torch.randn(count, 1, CASE, generator=generator)
     best = torch.rand(count, 1, generator=generator)
-    odds = torch.logit(best, eps=1e-4) + 2 * case[..., 2] - case[..., 7] - 1
+    odds = torch.logit(best, eps=1e-4) + 2 * case[..., 2] - case[..., 6] - 1
     there = torch.rand(count, generator=generator) < odds[:, 0].sigmoid()
     return Searches(best, case, best > 0.1, torch.zeros(count, 1), there), odds[:, 0]
 
