@@ -38,9 +38,10 @@ class Rates(Protocol):
 class ZoomBelief:
     """What looks at any window of a picture are expected to show, for one class.
 
-    Each cell is predicted from the closest look at it. The belief keeps five numbers for a cell: the level of that
-    look, the number of objects centred in the cell that looks one, two and three octaves closer are expected to find,
-    and the share of the cell that is left to see. With two zeros for levels without a prediction these are 32 bytes.
+    Each cell is predicted from the closest look at it. The belief keeps six numbers for a cell: the level of that look,
+    the share of the cell that is left to see, the number of objects centred in the cell that looks one, two and three
+    octaves closer are expected to find, and the level that these are from: they are predicted when they are asked for.
+    With two zeros for levels without a prediction these are 33 bytes.
     Hints of all classes are kept for the windows that were looked at, at most 32 × 32 cells of each. A picture of
     20,000 × 15,000 px has 49,152 cells: 1.6 MB, and for 80 classes at most 0.41 MB for each look. Searches also keep
     the hints of each look that are left to see and what they predict for its windows, at most 0.41 MB.
@@ -65,7 +66,7 @@ class ZoomBelief:
         shape = lattice.rows, lattice.columns
         # Rates of cells that a level is not one to three octaves closer to are 0: the first plane and the last one.
         self._planes = np.zeros((STEPS + 2, *shape), np.float32)
-        # The level that the rates of a cell are from. Searches for one object need no rates: they wait until asked for.
+        # The level that the rates of a cell are from. Searches for one object ask for none.
         self._rated = np.full(shape, -1, np.int8)
         self._predicted = 0
         self.source = torch.full(shape, -1)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import torch
@@ -150,8 +150,8 @@ class ZoomEye(nn.Module):
         if not hints:
             return Seen(found, cut, None, windows)
         faint = [hints_of(candidates, number, policy) for number in range(len(frames))]
-        faint = [replace(each, boxes=place.to_picture(each.boxes, number)) for number, each in enumerate(faint)]
-        return Seen(found, cut, tuple(faint), windows)
+        placed = [Hints(place.to_picture(each.boxes, number), each.scores) for number, each in enumerate(faint)]
+        return Seen(found, cut, tuple(placed), windows)
 
     def glimpse(
         self, view: ZoomView, fixations: Tensor, within: Sequence[Limit | None] | None = None
@@ -306,13 +306,15 @@ class _Placement:
             far = BORDER - u2 if x2 < wide else -math.inf, BORDER - v2 if y2 < high else -math.inf
             rows.append([[x1, y1] * 2, [x2, y2] * 2, [u1, v1] * 2, [*scale] * 2, [*near, *far], [1, 1, -1, -1]])
         numbers = torch.tensor(rows, dtype=like.dtype, device=like.device).view(-1, 6, 1, 4)
-        self._low, self._high, self._first, self._scale, self._border, self._inwards = numbers.unbind(1)
+        self._numbers = [numbers[number].unbind() for number in range(len(frames))]
+        self._all = numbers.unbind(1)
 
-    def to_picture(self, boxes: Tensor, look: int | slice = slice(None)) -> Tensor:
+    def to_picture(self, boxes: Tensor, look: int | None = None) -> Tensor:
         """Map canvas boxes of all looks `(F, L, 4)`, or of one `(L, 4)`, to the picture, cut to the window."""
-        low, high, first, scale = (each[look] for each in (self._low, self._high, self._first, self._scale))
+        low, high, first, scale, _, _ = self._all if look is None else self._numbers[look]
         return ((boxes - first) * scale + low).clamp(low, high)
 
     def cut(self, detections: Detections) -> Tensor:
         """Tell which boxes touch a border of their window that lies inside the picture, `(F, L)`."""
-        return (detections.boxes * self._inwards <= self._border).any(-1) & detections.mask
+        *_, border, inwards = self._all
+        return (detections.boxes * inwards <= border).any(-1) & detections.mask

@@ -66,21 +66,21 @@ def gist(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[i
     kinds, cells = hints.scores.shape[-1], rows * columns
     boxes, scores = hints.boxes.float().numpy(), hints.scores.float()
     confident = scores.amax(-1)
-    certain, kind = detections.scores[0, :, 1:].detach().max(-1)
-    sure = (certain >= FOUND).nonzero()[:, 0]
-    corners = np.concatenate([boxes, detections.boxes[0, sure].detach().float().numpy()])
-    cell = np.floor(((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch)
+    told = detections.scores[0, :, 1:].detach().float().numpy()
+    sure = (told.max(1, initial=0) >= FOUND).nonzero()[0]
+    corners = np.concatenate([boxes, detections.boxes[0].detach().float().numpy()[sure]])
+    cell = ((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch
     across, down = np.minimum(np.maximum(cell, 0), (columns - 1, rows - 1)).astype(np.intp).T
     at, there = np.split(down * columns + across, [len(boxes)])
     place = torch.from_numpy(at)
     strongest = scores.new_zeros(cells, kinds).scatter_reduce_(0, place[:, None].expand(-1, kinds), scores, "amax")
     top = confident.new_zeros(cells).scatter_reduce_(0, place, confident, "amax")
-    leads = (confident == top[place]).numpy().nonzero()[0]
+    leads = (confident.numpy() == top.numpy()[at]).nonzero()[0]
     wide, high = np.log2(np.maximum(boxes[leads, 2:] - boxes[leads, :2], 1e-3)).T
     size = np.zeros(cells, np.float32)
     size[at[leads]] = np.maximum((wide + high) / 2 + math.log2(lattice.magnifications[level]), 0)
     found = np.zeros((cells, kinds), np.bool_)
-    found[there, kind[sure].numpy()] = True
+    found[there, told[sure].argmax(1)] = True
     shape = rows, columns
     return Gist(
         level,

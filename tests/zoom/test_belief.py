@@ -316,3 +316,31 @@ def test_contexts_of_other_classes_are_refused(detector, evidence):
         ZoomAgent(ZoomEye(detector), evidence, WindowContext(prior))
     with pytest.raises(InputError, match="weight"):
         WindowContext(prior, -1.0)
+
+
+def test_rates_are_the_same_whenever_they_are_asked_for(glances, evidence):
+    """They are predicted at once for all looks since the last question."""
+    asked, waiting = (ZoomBelief(glances.lattice, evidence, 1) for _ in range(2))
+    looks = [(0, 0, 0), (1, 0, 0), (glances.lattice.levels - 1, 1, 1), (1, 1, 0)]
+    levels = range(1, glances.lattice.levels)
+    for action in looks:
+        (glance,) = glances.see([on_lattice(glances.lattice, action)])
+        for belief in (asked, waiting):
+            belief.add(glance)
+        for level in levels:
+            asked.finds(level)
+    torch.testing.assert_close(waiting.rate, asked.rate, rtol=0, atol=0)
+    for level in levels:
+        torch.testing.assert_close(waiting.expected(level), asked.expected(level), rtol=0, atol=0)
+        torch.testing.assert_close(waiting.finds(level), asked.finds(level))
+
+
+def test_a_search_for_one_object_predicts_no_rates(detector, picture, evidence, monkeypatch):
+    def rates(*_):
+        raise AssertionError("rates are predicted")
+
+    monkeypatch.setattr(GlimpseEvidence, "rates", rates)
+    agent = ZoomAgent(ZoomEye(detector), evidence)
+    assert agent.search(picture, "green", passes=4, give_up=0.0).passes == 4
+    with pytest.raises(AssertionError, match="rates are predicted"):
+        agent.find_all(picture, "green", passes=4)

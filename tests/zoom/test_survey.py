@@ -82,7 +82,7 @@ def test_explorations_use_the_survey_and_searches_use_their_class():
     glance = LookedAt(on_lattice(LATTICE, (0, 0, 0)), gist(), torch.rand(CLASSES), torch.zeros(1).bool())
     for target, rates in ((0, evidence.survey.rates(glance.gist)), (2, evidence.rates(glance.gist, torch.tensor([2])))):
         belief = ZoomBelief(LATTICE, evidence, target)
-        belief._spread(glance.gist)
+        belief.add(glance)
         torch.testing.assert_close(belief.rate, rates[0].exp()[:, : LATTICE.rows, : LATTICE.columns])
         assert belief.foresight == (0.125 if target == 0 else 0.35)
 
