@@ -7,7 +7,6 @@ from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from semfov.belief.target_evidence import THRESHOLDS, Thresholds
 from semfov.belief.verification import FEATURES, Verification
@@ -15,8 +14,9 @@ from semfov.errors import check, check_number, check_whole
 from semfov.io.compatibility import check_detector
 from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Field, Maybe, Number, Object, Schema, perceptron
+from semfov.sensor.lines import constant
 from semfov.zoom.gist import Gist
-from semfov.zoom.networks import STEPS, features, hint_maps, memory_maps, small_network, tapered, through
+from semfov.zoom.networks import STEPS, banded, features, hint_maps, memory_maps, small_network, tapered, through
 from semfov.zoom.survey import SURVEY, Survey, survey_fields
 
 _SUMMARY = 3
@@ -343,7 +343,7 @@ def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tenso
         For each size, the results of `pool`, `(down, across, K)` and `(down, across, 3)`.
     """
     best = scores.amax(-1)
-    parts = torch.stack([best, (best > 0).to(best), (best > 0.02).to(best)])
+    parts = torch.cat([best[None], (best > _levels(scores.dtype, scores.device)).to(best)])
     found: dict[int, tuple[Tensor, Tensor]] = {}
     top, have = scores, (1, 1)
     for span in sorted(spans):
@@ -351,10 +351,16 @@ def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tenso
         for axis in (0, 1):
             top = _slide(top, axis, size[axis], have[axis])
         have = size
-        sums = F.avg_pool2d(F.avg_pool2d(parts, (size[0], 1), 1), (1, size[1]), 1) * (size[0] * size[1])
-        total, hinted, clear = sums.unbind()
+        down, across = (banded(n, m, scores.dtype, scores.device) for n, m in zip(best.shape, size, strict=True))
+        total, hinted, clear = (down.mT @ parts @ across).unbind()
         found[span] = top, torch.stack([total, hinted / (size[0] * size[1]), clear], -1)
     return [found[span] for span in spans]
+
+
+@constant
+def _levels(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Scores above which hints are counted, `(2, 1, 1)`: any, and clear ones."""
+    return torch.tensor([0.0, 0.02], dtype=dtype, device=device)[:, None, None]
 
 
 def _slide(values: Tensor, axis: int, width: int, have: int = 1) -> Tensor:
