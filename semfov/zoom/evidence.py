@@ -219,7 +219,7 @@ class GlimpseEvidence(Pretrained):
             asked = targets.tolist()
             check(min(asked) >= 1, "targets", "classes from 1 on", asked)
         wanted = targets - 1
-        shown = torch.cat([look.scores.amax(-1, keepdim=True), look.scores.index_select(-1, wanted)], -1)
+        shown = torch.cat([look.best[..., None], look.scores.index_select(-1, wanted)], -1)
         hints = features(shown.movedim(-1, 0))
         best, own = hints[0], hints[1:]
         found = look.found.index_select(-1, wanted).movedim(-1, 0).to(own)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -42,6 +43,11 @@ class Gist:
     scores: Tensor
     size: Tensor
     found: Tensor
+
+    @cached_property
+    def best(self) -> Tensor:
+        """Highest score of any class among the hints of each cell, `(rows, columns)`."""
+        return self.scores.amax(-1)
 
 
 def gist(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[int, int, int]) -> Gist:

@@ -71,7 +71,7 @@ class _Look:
     def __init__(self, gist: Gist, lattice: Lattice) -> None:
         self.gist = gist
         self.fresh = True
-        self.hinted = gist.scores.amax(-1).numpy() > 0
+        self.hinted = gist.best.numpy() > 0
         self.left = np.ones(self.hinted.shape, np.float32)
         self.shown = self.scores = gist.scores.numpy()
         self.tables: dict[int, _Table] = {}
@@ -210,7 +210,7 @@ class WindowOdds:
             return
         counts = [len(part.scores) for part in parts]
         scores, summary = torch.cat([part.scores for part in parts]), torch.cat([part.summary for part in parts])
-        steps = torch.cat([torch.full((len(part.scores),), part.level - part.look.gist.level) for part in parts])
+        steps = torch.from_numpy(np.repeat([part.level - part.look.gist.level for part in parts], counts))
         facts = self._evidence.hint_facts(scores, summary, steps, self._target)[:, 0]
         if self._context is not None:
             facts[:, 5] += self._context(scores, self._target)

@@ -68,8 +68,7 @@ class Survey(nn.Module):
         Returns:
             `(1, 3, rows, columns)`, logarithms of the expected numbers, for looks one, two and three octaves closer.
         """
-        hints = features(look.scores)
-        best = hints.amax(-1)
+        hints, best = features(look.scores), features(look.best)
         # torch takes twice as long for `any` of booleans, and for a matrix of few columns on the right.
         found = look.found.to(best).amax(-1)
         mix = self.mix.weight
