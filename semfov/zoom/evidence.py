@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from semfov.belief.target_evidence import THRESHOLDS, Thresholds
 from semfov.belief.verification import FEATURES, Verification
@@ -16,7 +17,17 @@ from semfov.io.pretrained import Pretrained
 from semfov.io.schema import Field, Maybe, Number, Object, Schema, perceptron
 from semfov.sensor.lines import constant
 from semfov.zoom.gist import Gist
-from semfov.zoom.networks import STEPS, banded, features, hint_maps, memory_maps, small_network, tapered, through
+from semfov.zoom.networks import (
+    CROWD,
+    STEPS,
+    features,
+    hint_maps,
+    memory_maps,
+    neighbourhood_mean,
+    small_network,
+    tapered,
+    through,
+)
 from semfov.zoom.survey import SURVEY, Survey, survey_fields
 
 _SUMMARY = 3
@@ -224,7 +235,8 @@ class GlimpseEvidence(Pretrained):
         best, own = hints[0], hints[1:]
         found = look.found.index_select(-1, wanted).movedim(-1, 0).to(own)
         usual, bias = self.prior.index_select(0, targets).mT[..., None, None]
-        parts = [*hint_maps(own, best, found, look.size), usual.expand_as(own), *memory_maps(own, before)]
+        crowd = neighbourhood_mean(best[None], CROWD)[0]
+        parts = [*hint_maps(own, best, found, look.size, crowd), usual.expand_as(own), *memory_maps(own, before)]
         value: Tensor = through(self.rate, torch.stack(parts, -1)) + (bias[..., None] - 6)
         return value.clamp(max=3).movedim(-1, 1)
 
@@ -351,8 +363,9 @@ def pool_spans(scores: Tensor, spans: Sequence[int]) -> list[tuple[Tensor, Tenso
         for axis in (0, 1):
             top = _slide(top, axis, size[axis], have[axis])
         have = size
-        down, across = (banded(n, m, scores.dtype, scores.device) for n, m in zip(best.shape, size, strict=True))
-        total, hinted, clear = (down.mT @ parts @ across).unbind()
+        # A product of matrices would be faster, but not right after a pass of the detector.
+        means = F.avg_pool2d(F.avg_pool2d(parts, (size[0], 1), 1), (1, size[1]), 1)
+        total, hinted, clear = (means * (size[0] * size[1])).unbind()
         found[span] = top, torch.stack([total, hinted / (size[0] * size[1]), clear], -1)
     return [found[span] for span in spans]
 

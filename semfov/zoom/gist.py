@@ -67,8 +67,9 @@ def gist(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[i
     scale = max(1, span // FINEST)
     columns = -(-min(span, lattice.columns - column) // scale)
     rows = -(-min(span, lattice.rows - row) // scale)
-    low = np.array([column * lattice.pitch[0], row * lattice.pitch[1]], np.float32)
-    pitch = np.array(lattice.pitch, np.float32) * scale
+    width, height = lattice.pitch
+    numbers = (column * width, row * height), (width * scale, height * scale), (columns - 1, rows - 1)
+    low, pitch, last = np.array(numbers, np.float32)
     kinds, cells = hints.scores.shape[-1], rows * columns
     boxes, scores = hints.boxes.float().numpy(), hints.scores.float()
     confident = scores.amax(-1)
@@ -76,8 +77,9 @@ def gist(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[i
     sure = (told.max(1, initial=0) >= FOUND).nonzero()[0]
     corners = np.concatenate([boxes, detections.boxes[0].detach().float().numpy()[sure]])
     cell = ((corners[:, :2] + corners[:, 2:]) / 2 - low) / pitch
-    across, down = np.minimum(np.maximum(cell, 0), (columns - 1, rows - 1)).astype(np.intp).T
-    at, there = np.split(down * columns + across, [len(boxes)])
+    across, down = np.minimum(np.maximum(cell, 0), last).astype(np.intp).T
+    number = down * columns + across
+    at, there = number[: len(boxes)], number[len(boxes) :]
     place = torch.from_numpy(at)
     strongest = scores.new_zeros(cells, kinds).scatter_reduce_(0, place[:, None].expand(-1, kinds), scores, "amax")
     top = confident.new_zeros(cells).scatter_reduce_(0, place, confident, "amax")

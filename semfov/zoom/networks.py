@@ -9,6 +9,9 @@ from semfov.sensor.lines import constant
 STEPS = 3
 """Largest number of octaves between a look and the closer looks that are predicted from it."""
 
+CROWD = 9
+"""Side in cells of the square over which the networks read the mean of the strongest hints."""
+
 _FLOOR = 1e-4
 
 
@@ -17,7 +20,7 @@ def features(scores: Tensor) -> Tensor:
     return (scores + _FLOOR).log().mul_(0.25).add_(1.5)
 
 
-def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor) -> list[Tensor]:
+def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor, crowd: Tensor) -> list[Tensor]:
     """List what a look shows about each cell.
 
     Args:
@@ -25,6 +28,7 @@ def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor) -> list[Te
         best: `(rows, columns)`, the same of any class.
         found: `(T, rows, columns)`, whether a detection of the target is centred in the cell.
         size: `(rows, columns)`, as in `semfov.zoom.gist.Gist`.
+        crowd: `(rows, columns)`, means of `best` over the square of `CROWD` cells about each cell.
 
     Returns:
         Eleven maps `(T, rows, columns)`.
@@ -41,7 +45,7 @@ def hint_maps(own: Tensor, best: Tensor, found: Tensor, size: Tensor) -> list[Te
         peak,
         neighbourhood_peak(peak, 7),
         neighbourhood_mean(own, 5),
-        wide(neighbourhood_mean(best[None], 9)),
+        wide(crowd),
         wide(size / 4 - 1),
         wide((size > 0).to(own)),
         found,
@@ -73,19 +77,15 @@ def neighbourhood_peak(values: Tensor, side: int) -> Tensor:
 def neighbourhood_mean(values: Tensor, side: int) -> Tensor:
     """Mean of maps `(T, rows, columns)` over the square about each cell; what lies beyond the map counts as 0."""
     # Products with banded matrices take a tenth of the time of `avg_pool2d`.
-    margin = side // 2
-    down, across = (
-        banded(n + 2 * margin, side, values.dtype, values.device)[margin : margin + n] for n in values.shape[-2:]
-    )
-    return down.mT @ values @ across / side**2
+    down, across = (_band(length, side, values.dtype, values.device) for length in values.shape[-2:])
+    return down @ values @ across
 
 
 @constant
-def banded(length: int, span: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Matrix `(length, length - span + 1)` whose product with a line sums every `span` neighbours."""
+def _band(length: int, side: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix `(length, length)` whose product with a line takes the mean over `side` neighbours."""
     place = torch.arange(length, device=device)
-    offset = place[:, None] - place[: length - span + 1]
-    return ((offset >= 0) & (offset < span)).to(dtype)
+    return ((place[:, None] - place).abs() <= side // 2).to(dtype) / side
 
 
 def through(network: nn.Sequential, values: Tensor, outputs: slice | None = None) -> Tensor:

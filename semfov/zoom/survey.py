@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from semfov.io.schema import Field, Number, Object, perceptron
 from semfov.zoom.gist import Gist
 from semfov.zoom.networks import (
+    CROWD,
     STEPS,
     features,
     hint_maps,
@@ -18,7 +19,7 @@ from semfov.zoom.networks import (
 
 _CHANNELS, _WIDTH = 8, 48
 _HINTS, _MEMORY = 11, 2
-_NEAR, _WIDE = 5, (9, 17)
+_NEAR, _WIDE = 5, (CROWD, 17)
 """Sides in cells of the squares over which sums of hints are averaged: the neighbours, and the surroundings."""
 _INPUTS = _HINTS + _MEMORY + 2 * _CHANNELS + len(_WIDE) * (_CHANNELS + 2)
 _LOWEST = -0.8
@@ -73,9 +74,10 @@ class Survey(nn.Module):
         found = look.found.to(best).amax(-1)
         mix = self.mix.weight
         kinds = torch.addmm(-_LOWEST * mix.sum(1, keepdim=True), mix, hints.flatten(0, 1).mT).unflatten(1, best.shape)
-        parts = [*hint_maps(best[None], best, found[None], look.size), *memory_maps(best[None], before)]
         around = torch.cat([kinds, best[None], found[None]])
         surroundings = [neighbourhood_mean(around, side) for side in _WIDE]
+        crowd = surroundings[_WIDE.index(CROWD)][_CHANNELS]
+        parts = [*hint_maps(best[None], best, found[None], look.size, crowd), *memory_maps(best[None], before)]
         maps = torch.cat([*parts, kinds, neighbourhood_mean(kinds, _NEAR), *surroundings])
         value = through(self.rate, maps.movedim(0, -1)) - 6
         return value.clamp(max=3).movedim(-1, 0)[None]
