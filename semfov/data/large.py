@@ -5,6 +5,7 @@ import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -16,34 +17,11 @@ from torch import Tensor
 
 from semfov.data.images import orientation, read_image, turned
 from semfov.data.inputs import ImageLike, as_image, channels_first, pixels_of
+from semfov.data.reduction import FIRST, LARGE, Box, ReducedCopies, bytes_of, reduction_for
 from semfov.errors import DataError, SemfovError, check, check_pixels
 from semfov.io.files import check_regular
 
-Box = tuple[int, int, int, int]
-
 _PLAIN = ("RGB", "L", "CMYK", "YCbCr")  # modes of 8 bits without transparency
-_STRIP = 1 << 24  # pixels of a strip that is read at once for a reduced view
-
-
-_KEPT = 2  # pixels that a reduced window keeps for each wanted pixel, so that antialiasing still works
-
-
-def reduction_for(ratio: int) -> int:
-    """Largest factor by which `LargePicture.read` may reduce a window that is resampled afterwards.
-
-    Args:
-        ratio: pixels of the window for each wanted pixel, along the side where they are fewest.
-
-    Returns:
-        A power of two.
-
-    >>> [reduction_for(ratio) for ratio in (0, 3, 4, 9, 16)]
-    [1, 1, 2, 4, 8]
-    """
-    reduction = 1
-    while ratio >= 2 * _KEPT * reduction:
-        reduction *= 2
-    return reduction
 
 
 class LargePicture(ABC):
@@ -66,16 +44,29 @@ class LargePicture(ABC):
             RGB bytes `(h, w, 3)`.
         """
 
-    def read(self, box: Box, reduction: int = 1) -> Tensor:
-        """Read a window, and reduce a large one to save memory.
+    def reduction(self, ratio: float) -> int:
+        """Factor by which windows are read that are resampled afterwards; their edges are to be multiples of it.
 
-        Windows of more than 16 million pixels are read in strips, and each strip is averaged over squares of
-        `reduction` × `reduction` pixels. So no more than a strip of 16 million pixels (48 MB) is in memory at full
-        resolution.
+        Args:
+            ratio: pixels of a window for each wanted pixel.
+
+        Returns:
+            A power of two; 1 for windows that are read as they are: those of pictures of up to 16 million pixels, and
+            those that keep more than an eighth of the pixels along a side.
+        """
+        many = self.size[0] * self.size[1] > LARGE
+        reduction = reduction_for(int(ratio)) if many else 1
+        return reduction if reduction >= FIRST else 1
+
+    def read(self, box: Box, reduction: int = 1) -> Tensor:
+        """Read a window; coarse windows of pictures of more than 16 million pixels are read from reduced copies.
+
+        The copies are made strip by strip, when one is first needed. So no more than a strip of 8 million pixels
+        (25 MB) is in memory at full resolution. They are kept, and take a twelfth of the memory of the whole picture.
 
         Args:
             box: `(x1, y1, x2, y2)` in whole pixels, inside the picture.
-            reduction: factor by which a large window may be reduced, a power of two.
+            reduction: factor by which the window may be reduced, a power of two.
 
         Returns:
             `(3, h, w)`, bytes, channels last in memory.
@@ -87,16 +78,13 @@ class LargePicture(ABC):
         width, height = self.size
         inside = 0 <= x1 < x2 <= width and 0 <= y1 < y2 <= height
         check(inside, "box", f"a window inside {width} × {height} pixels", box)
-        if reduction <= 1 or (x2 - x1) * (y2 - y1) <= _STRIP:
-            return _tensor(self.pixels(box))
-        from PIL import Image
+        if reduction < FIRST or width * height <= LARGE:
+            return bytes_of(self.pixels(box))
+        return self._copies.window(box, reduction)
 
-        rows = max(1, _STRIP // (x2 - x1) // reduction) * reduction
-        strips = []
-        for top in range(y1, y2, rows):
-            strip = self.pixels((x1, top, x2, min(y2, top + rows)))
-            strips.append(np.asarray(Image.fromarray(strip).reduce(reduction)))
-        return _tensor(np.concatenate(strips))
+    @cached_property
+    def _copies(self) -> ReducedCopies:
+        return ReducedCopies(self.size, self.pixels)
 
 
 class ArrayPicture(LargePicture):
@@ -177,6 +165,11 @@ class PhotographPicture(LargePicture):
         x1, y1, x2, y2 = box
         return self._whole()[y1:y2, x1:x2]
 
+    def reduction(self, ratio: float) -> int:
+        """Factor by which windows are read; a JPEG that is not decoded yet can be decoded at a coarse resolution."""
+        undecoded = self._drafts and self._array is None
+        return reduction_for(int(ratio)) if undecoded else super().reduction(ratio)
+
     def read(self, box: Box, reduction: int = 1) -> Tensor:
         """Read a window; the whole of a JPEG that is not decoded yet is read as the coarsest draft allowed."""
         whole = box == (0, 0, *self.size)
@@ -186,7 +179,7 @@ class PhotographPicture(LargePicture):
 
         with _opening(self.path, "decoded"), Image.open(self.path) as image:
             image.draft("RGB", (-(-self.size[0] // reduction), -(-self.size[1] // reduction)))
-            return _tensor(np.asarray(image.convert("RGB")))
+            return bytes_of(np.asarray(image.convert("RGB")))
 
     def _whole(self) -> NDArray[np.uint8]:
         if self._array is None:
@@ -313,9 +306,3 @@ def _opening(path: Path, what: str) -> Iterator[None]:
         except Exception as error:  # decoders of damaged files raise errors of many kinds
             reason = " ".join(str(error).split()) or type(error).__name__
             raise DataError(f"image {path}: cannot be {what} ({reason}); replace it") from None
-
-
-def _tensor(pixels: NDArray[np.uint8]) -> Tensor:
-    """Bytes `(h, w, 3)` as `(3, h, w)`, without a copy where memory may be shared."""
-    shared = pixels.flags.writeable and min(pixels.strides) >= 0
-    return torch.from_numpy(pixels if shared else pixels.copy()).permute(2, 0, 1)

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from semfov.data.inputs import ImageLike
-from semfov.data.large import LargePicture, open_large, reduction_for
+from semfov.data.large import LargePicture, open_large
+from semfov.data.reduction import reduction_for
 from semfov.errors import check
 from semfov.report.episode import Data, Pool, rounded, tagged
 from semfov.zoom.gist import FOUND

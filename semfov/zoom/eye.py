@@ -7,10 +7,10 @@ from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from semfov.data.inputs import ImageLike
-from semfov.data.large import LargePicture, open_large, reduction_for
+from semfov.data.large import LargePicture, open_large
+from semfov.data.reduction import resized
 from semfov.detection.detections import Detections
 from semfov.detection.detector import Detector
 from semfov.detection.selection import select
@@ -67,8 +67,9 @@ class ZoomEye(nn.Module):
     """Looks at windows of a picture: resamples a window to the detector's input and detects in it.
 
     A look costs one pass of the detector, whatever the size of the picture. The borders of windows are rounded to whole
-    pixels. Windows are resampled as bytes by the antialiased filter of `semfov.sensor.glimpse`, from the pixels inside
-    them alone.
+    pixels. In pictures of more than 16 million pixels those of coarse windows are rounded to pixels of a reduced copy
+    (`semfov.data.reduction`). Windows are resampled as bytes by the antialiased filter of `semfov.sensor.glimpse`, from
+    the pixels inside them alone.
 
     Where the border of a window cuts an object, only a part of the object is visible, and its box encloses that part.
     Such boxes can be kept (`keep`), left out (`drop`), or kept with the scores of background (`background`). The border
@@ -199,10 +200,10 @@ class ZoomEye(nn.Module):
         wide, high = self.detector.input_size
         left, top, right, bottom = (0.0, 0.0, math.inf, math.inf) if limit is None else limit
         x, y, magnification = fixation
-        x1, x2, u1, u2 = _shown(x, magnification, wide, picture.size[0], left, right)
-        y1, y2, v1, v2 = _shown(y, magnification, high, picture.size[1], top, bottom)
-        reduction = reduction_for(min((x2 - x1) // (u2 - u1), (y2 - y1) // (v2 - v1)))
-        canvas = _resized(picture.read((x1, y1, x2, y2), reduction), (v2 - v1, u2 - u1)).to(blank.dtype)
+        reduction = picture.reduction(1 / magnification)
+        x1, x2, u1, u2 = _shown(x, magnification, wide, picture.size[0], left, right, reduction)
+        y1, y2, v1, v2 = _shown(y, magnification, high, picture.size[1], top, bottom, reduction)
+        canvas = resized(picture.read((x1, y1, x2, y2), reduction), (v2 - v1, u2 - u1)).to(blank.dtype)
         if (u1, v1, u2, v2) != (0, 0, wide, high):
             pixels, canvas = canvas, blank.expand(1, 3, high, wide).contiguous(memory_format=torch.channels_last)
             canvas[..., v1:v2, u1:u2] = pixels
@@ -252,18 +253,8 @@ def _unit(canvases: Tensor) -> Tensor:
     return canvases.to(torch.get_default_dtype()).contiguous() / 255
 
 
-def _resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Bytes `(3, h, w)`, channels last in memory, resampled to `size`: `(1, 3, *size)`."""
-    # torch takes twice as long where the rows of a window are not adjacent in memory.
-    canvas = pixels.permute(1, 2, 0).contiguous()[None].permute(0, 3, 1, 2)
-    if canvas.shape[-2] > size[0]:
-        # It reduces rows first. Columns first takes two thirds of the time, because that step is the faster one.
-        canvas = F.interpolate(canvas, (size[0], canvas.shape[-1]), mode="bilinear", antialias=True)
-    return canvas if canvas.shape[-2:] == size else F.interpolate(canvas, size, mode="bilinear", antialias=True)
-
-
 def _shown(
-    point: float, magnification: float, count: int, length: int, low: float, high: float
+    point: float, magnification: float, count: int, length: int, low: float, high: float, step: int
 ) -> tuple[int, int, int, int]:
     """The pixels that a window shows along one axis: their first and end in the picture, and those on the canvas.
 
@@ -274,12 +265,14 @@ def _shown(
         length: length of the picture.
         low: lower limit of the part of the picture that is shown.
         high: its upper limit.
+        step: edges of the window are multiples of it.
 
     Returns:
         Whole edges between pixels: two in the picture and two on the canvas.
     """
     start, stop = edges_at(point, magnification, float(count))
-    start, stop, low, high = round(start), round(stop), round(max(low, 0.0)), round(min(high, length))
+    start, stop = step * round(start / step), step * round(stop / step)
+    low, high = round(max(low, 0.0)), round(min(high, length))
     first = min(max(start, low), high - 1)
     end = min(max(stop, first + 1), high)
     begin = min(max(round((first - start) * magnification), 0), count - 1)

@@ -60,14 +60,6 @@ def test_rotated_photographs_are_read_upright(tmp_path):
     assert np.array_equal(picture.pixels((0, 0, 150, 230)), np.rot90(array, -1))
 
 
-def test_reduced_windows_are_means_of_square_blocks(monkeypatch):
-    monkeypatch.setattr("semfov.data.large._STRIP", 2000)
-    array = pixels(128, 192)
-    got = ArrayPicture(array).read((0, 0, 192, 128), 4).permute(1, 2, 0).double()
-    expected = torch.from_numpy(array.reshape(32, 4, 48, 4, 3).mean((1, 3)))
-    assert float((got - expected).abs().max()) <= 0.5 + 1e-9
-
-
 def test_a_reduced_jpeg_is_decoded_at_reduced_size(tmp_path):
     smooth = Image.fromarray(pixels(8, 8)).resize((1600, 1200), Image.Resampling.BICUBIC)
     smooth.save(tmp_path / "a.jpg", quality=95)

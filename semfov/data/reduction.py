@@ -1,0 +1,128 @@
+"""Copies of a large picture at a quarter of its resolution and less, from which coarse windows are read."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+Box = tuple[int, int, int, int]
+
+LARGE = 1 << 24
+"""Pictures with more pixels have copies."""
+
+STRIP = 1 << 23
+"""Pixels that are read at once for a copy."""
+
+FIRST = 4
+"""Factor by which the largest copy is reduced. All copies together take a twelfth of the memory of the picture."""
+
+_KEPT = 2  # pixels that a reduced window keeps for each wanted pixel, so that antialiasing still works
+
+
+def reduction_for(ratio: int) -> int:
+    """Largest factor by which a window may be reduced that is resampled afterwards.
+
+    Args:
+        ratio: pixels of the window for each wanted pixel, along the side where they are fewest.
+
+    Returns:
+        A power of two.
+
+    >>> [reduction_for(ratio) for ratio in (0, 3, 4, 9, 16)]
+    [1, 1, 2, 4, 8]
+    """
+    reduction = 1
+    while ratio >= 2 * _KEPT * reduction:
+        reduction *= 2
+    return reduction
+
+
+def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """Resample bytes with the antialiased bilinear filter.
+
+    Args:
+        pixels: `(3, h, w)`, channels last in memory.
+        size: `(height, width)` of the result.
+
+    Returns:
+        `(1, 3, height, width)`, bytes, channels last in memory.
+    """
+    # torch takes twice as long where the rows of a window are not adjacent in memory.
+    canvas = pixels.permute(1, 2, 0).contiguous()[None].permute(0, 3, 1, 2)
+    if canvas.shape[-2] > size[0]:
+        # torch shortens rows first. Columns first takes two thirds of the time, because that step is the faster one.
+        canvas = F.interpolate(canvas, (size[0], canvas.shape[-1]), mode="bilinear", antialias=True)
+    return canvas if canvas.shape[-2:] == size else F.interpolate(canvas, size, mode="bilinear", antialias=True)
+
+
+def bytes_of(pixels: NDArray[np.uint8]) -> Tensor:
+    """Bytes `(h, w, 3)` as `(3, h, w)`, without a copy where memory may be shared."""
+    shared = pixels.flags.writeable and min(pixels.strides) >= 0
+    return torch.from_numpy(pixels if shared else pixels.copy()).permute(2, 0, 1)
+
+
+class ReducedCopies:
+    """Copies of a picture, each reduced by a power of two. A copy is made when it is first needed, and kept.
+
+    A pixel of a copy is the part of the picture that its place says, exactly: what is left at the right and lower
+    borders of a picture whose sides are no multiples of the reduction, less than one pixel of the copy, is left out.
+
+    Args:
+        size: `(width, height)` of the picture.
+        read: returns the bytes `(h, w, 3)` of a box `(x1, y1, x2, y2)`.
+
+    >>> picture = np.full((40, 64, 3), 7, np.uint8)
+    >>> copies = ReducedCopies((64, 40), lambda box: picture[box[1] : box[3], box[0] : box[2]])
+    >>> copies.window((16, 8, 48, 40), 4).shape
+    torch.Size([3, 8, 8])
+    """
+
+    def __init__(self, size: tuple[int, int], read: Callable[[Box], NDArray[np.uint8]]) -> None:
+        self.size = size
+        self._read = read
+        self._copies: dict[int, Tensor] = {}
+
+    def window(self, box: Box, reduction: int) -> Tensor:
+        """Read a window from a copy.
+
+        Args:
+            box: `(x1, y1, x2, y2)` in pixels of the picture. Edges between multiples of the reduction move outwards.
+            reduction: factor by which the copy is reduced, a power of two from `FIRST` on.
+
+        Returns:
+            `(3, h, w)`, bytes, channels last in memory.
+        """
+        copy = self._copy(reduction)
+        high, wide = copy.shape[1:]
+        x1, y1, x2, y2 = box
+        left, top = min(x1 // reduction, wide - 1), min(y1 // reduction, high - 1)
+        return copy[:, top : max(-(-y2 // reduction), top + 1), left : max(-(-x2 // reduction), left + 1)]
+
+    def _copy(self, reduction: int) -> Tensor:
+        """The picture reduced by a factor, `(3, h, w)`, channels last in memory."""
+        if reduction not in self._copies:
+            if reduction == FIRST:
+                self._copies[reduction] = self._largest()
+            else:
+                larger = self._copy(reduction // 2)
+                high, wide = (max(1, length // 2) for length in larger.shape[1:])
+                self._copies[reduction] = resized(larger[:, : 2 * high, : 2 * wide], (high, wide))[0]
+        return self._copies[reduction]
+
+    def _largest(self) -> Tensor:
+        """The picture reduced by `FIRST`, strip by strip."""
+        wide, high = (max(1, length // FIRST) for length in self.size)
+        width, height = (min(length, count * FIRST) for length, count in zip(self.size, (wide, high), strict=True))
+        rows = max(1, STRIP // self.size[0] // FIRST)
+        parts = []
+        for top in range(0, high, rows):
+            bottom = min(top + rows, high)
+            # The filter reaches over the borders of a strip by less than one pixel of the copy.
+            low, end = max(top - 1, 0), min(bottom + 1, high)
+            strip = bytes_of(self._read((0, low * FIRST, width, min(end * FIRST, height))))
+            part = resized(strip, (end - low, wide))[0, :, top - low : bottom - low]
+            parts.append(part.permute(1, 2, 0))
+        return torch.cat(parts).permute(2, 0, 1)
