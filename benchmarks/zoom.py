@@ -23,7 +23,7 @@ from semfov.detection.selection import select
 from semfov.zoom.path import ZoomPath
 
 PASSES = 17
-SIZES = {"2560 × 1920 px": (4, 4), "3840 × 2880 px": (6, 6)}
+SIZES = {"2560 × 1920 px": (4, 4), "3840 × 2880 px": (6, 6), "10240 × 7680 px": (16, 16)}
 
 
 def programs(agent: ZoomAgent, columns: int, rows: int) -> dict[str, tuple[Run, Run, int]]:

@@ -1,6 +1,7 @@
 """Sums over all windows of a level, computed anew only where cells have changed."""
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 Cells = NDArray[np.float32]
@@ -54,7 +55,9 @@ class WindowSums:
         bottom, right = min(y2, self._places[0]), min(x2, self._places[1])
         part = cells[top : bottom + reach, left : right + reach]
         down, across = self._band[: part.shape[0], : bottom - top], self._band[: part.shape[1], : right - left]
-        self.sums[top:bottom, left:right] = down.T @ (part @ across)
+        # NumPy would start threads for large pictures, and they would wait at full load for the next product.
+        lines = torch.from_numpy(part) @ torch.from_numpy(across)
+        self.sums[top:bottom, left:right] = (torch.from_numpy(down).mT @ lines).numpy()
         return self.sums
 
 
