@@ -12,7 +12,7 @@ from semfov.io.compatibility import learned_for, recommended
 from semfov.presets import PUBLISHED_SENSORS
 from semfov.sensor import SENSORS
 from semfov.zoom import GlimpseEvidence
-from semfov.zoom.evidence import features
+from semfov.zoom.evidence import CASE, features
 
 OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors"))
 TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
@@ -170,10 +170,10 @@ def test_shipped_models_of_glimpse_evidence(path):
     assert bool((odds.diff() > 0).all())
     # The higher and the more frequent the scores of a class, the more probable is its presence in the image.
     assert model.thresholds is not None
-    case = torch.zeros(3, 11)
+    case = torch.zeros(3, CASE)
     best = torch.tensor([0.02, 0.3, 0.9])
     case[:, [0, 1, 2, 4]] = features(best)[:, None]
-    case[:, 9] = torch.tensor([0.0, 0.35, 0.7])
+    case[:, 8] = torch.tensor([0.0, 0.35, 0.7])
     with torch.no_grad():
         assert bool((model.anywhere(best, case).diff() > 0).all())
     # Objects in the middle of a window are detected; objects at its border may be cut.
