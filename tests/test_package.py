@@ -116,8 +116,6 @@ COMMANDS = [
     ("eval.explore", ["--detector.name", "yolo"]),
     ("train.fit_fom", ["--help"]),
     ("train.fit_map", ["--steps", "-1"]),
-    ("train.finetune_foveal", ["--help"]),
-    ("eval.foveal_training", ["--help"]),
 ]
 
 # Each command runs in a separate fork: all start with the package imported, and their imports stay separate.

@@ -63,17 +63,6 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def processor_seconds() -> float:
-    """CPU time in seconds of this process and of its child processes that have ended.
-
-    Elapsed time depends on what else the machine is doing; CPU time measures the work of these processes.
-
-    Returns:
-        User and system time together.
-    """
-    return sum(os.times()[:4])
-
-
 def run_tasks(
     function: Callable[[Task], Result],
     tasks: Sequence[Task],
