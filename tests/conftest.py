@@ -13,8 +13,6 @@ import torch
 from hypothesis import HealthCheck, settings
 
 from semfov.data.scenes import EmbeddedScenes
-from semfov.detection.detector import Detector
-from semfov.detection.scores import Candidates
 
 pytest.register_assert_rewrite("tests.base_tester")
 settings.register_profile("semfov", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -46,27 +44,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def device(request: pytest.FixtureRequest) -> torch.device:
     """Each device of this machine."""
     return torch.device(request.param)
-
-
-class Textures(Detector):
-    """Boxes of 16 px whose scores follow the colours under them."""
-
-    def __init__(self, name: str = "textures") -> None:
-        super().__init__(name, ("person", "cat", "cup"), (96, 96))
-
-    def propose(self, canvas: torch.Tensor) -> Candidates:
-        means = torch.nn.functional.avg_pool2d(canvas, 16)
-        rows, columns = means.shape[-2:]
-        y, x = torch.meshgrid(torch.arange(rows) * 16.0, torch.arange(columns) * 16.0, indexing="ij")
-        boxes = torch.stack([x, y, x + 16, y + 16], -1).reshape(1, -1, 4).expand(len(canvas), -1, -1)
-        classes = means.flatten(2).mT.clamp(0, 1) ** 2
-        return Candidates(boxes, classes, classes.amax(-1))
-
-
-@pytest.fixture
-def textures() -> type[Textures]:
-    """A detector without weights that detects something everywhere."""
-    return Textures
 
 
 @pytest.fixture(scope="module")

@@ -1,12 +1,13 @@
-"""Small models, beliefs, looks and images, made from seeded random numbers."""
+"""Small models, beliefs, looks and detectors: seeded random numbers, or a rule that a test can state."""
 
 import torch
 from torch import Tensor, nn
 
-from semfov import FovealObservationModel, Grid
+from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, Grid
 from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
 from semfov.belief.observers import Semantic
 from semfov.detection import Candidates, Detections, Detector, Selection
+from semfov.gaze.policies import NonPredictive, Random
 
 CLASSES = ("cat", "cup", "person")
 GRID = Grid(4, 3, (64, 48))
@@ -83,3 +84,67 @@ class Blobs(Detector):
         boxes = torch.cat([corners, corners + canvas.new_tensor([32, 24])], -1)
         colours = nn.functional.avg_pool2d(canvas, (24, 32)).flatten(2).mT
         return Candidates(boxes.expand(len(canvas), 4, 4), self.score(colours).sigmoid().to(canvas))
+
+
+class Coloured(Detector):
+    """One box around all pixels that are red (class 1), green (2) or blue (3).
+
+    The score is the largest contrast with the other colours, or a given one. A colour that does not occur has an empty
+    box and the score 0.
+    """
+
+    def __init__(self, classes=("red", "green"), size=(160, 120), *, score=None, **options) -> None:
+        super().__init__("coloured", classes, size, **options)
+        self.score = score
+
+    def propose(self, canvas: Tensor) -> Candidates:
+        kinds = len(self.classes)
+        boxes, scores = canvas.new_zeros(len(canvas), kinds, 4), canvas.new_zeros(len(canvas), kinds, kinds)
+        for row, image in enumerate(canvas):
+            for kind in range(kinds):
+                contrast = image[kind] - image[[channel for channel in range(3) if channel != kind]].amax(0)
+                ys, xs = (contrast > 0.1).nonzero(as_tuple=True)
+                if len(xs):
+                    boxes[row, kind] = torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas)
+                    scores[row, kind, kind] = contrast.max().clamp(0, 1) if self.score is None else self.score
+        return Candidates(boxes, scores)
+
+
+class Tiles(Detector):
+    """A box for every tile of 16 pixels, scored by its mean red, green and blue, squared.
+
+    With `pure`, the score is how much of the tile shows only this colour.
+    """
+
+    def __init__(self, classes=("person", "cat", "cup"), size=(96, 96), *, name="tiles", pure=False, **options) -> None:
+        super().__init__(name, classes, size, **options)
+        self.pure = pure
+
+    def propose(self, canvas: Tensor) -> Candidates:
+        shown = (2 * canvas - canvas.sum(1, keepdim=True)).clamp(0, 1) if self.pure else canvas
+        means = nn.functional.avg_pool2d(shown, 16)
+        rows, columns = means.shape[-2:]
+        y, x = torch.meshgrid(torch.arange(rows) * 16.0, torch.arange(columns) * 16.0, indexing="ij")
+        boxes = torch.stack([x, y, x + 16, y + 16], -1).reshape(1, -1, 4).expand(len(canvas), -1, -1)
+        classes = means.flatten(2).mT.clamp(0, 1) ** (1 if self.pure else 2)
+        return Candidates(boxes, classes, classes.amax(-1))
+
+
+class Fixed(Detector):
+    """The same candidates on every canvas: one box of the first class, unless others are given."""
+
+    def __init__(self, classes=("cup", "cat"), candidates: Candidates | None = None, **options) -> None:
+        super().__init__("fixed", classes, (32, 32), **options)
+        self.candidates = candidates
+
+    def propose(self, canvas: Tensor) -> Candidates:
+        if self.candidates is not None:
+            return self.candidates
+        box = canvas.new_tensor([[4.0, 4, 20, 20]]).expand(len(canvas), 1, 4)
+        return Candidates(box, canvas.new_tensor([[0.9, 0.1]]).expand(len(canvas), 1, 2))
+
+
+def agent(detector: Detector, *, grid=(8, 6), sigma=40.0, reference=160.0) -> ActivePerception:
+    """An agent with the beliefs of the paper from raw scores; it explores at random."""
+    observer, eye = Semantic(len(detector.classes) + 1), Eye(Foveation(sigma), detector, reference=reference)
+    return ActivePerception(eye, (observer, NonPredictive()), (observer, Random()), grid=grid).eval()

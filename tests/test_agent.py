@@ -9,34 +9,16 @@ from semfov import ActivePerception, FovealObservationModel, Foveation, Grid
 from semfov.belief import ContextPrior, TargetEvidence
 from semfov.belief.observers import Context, Semantic, Target
 from semfov.decision import confirms
-from semfov.detection import Candidates, Detections, Detector
+from semfov.detection import Detections
 from semfov.episode import STAGES
 from semfov.errors import InputError
 from semfov.eye import Eye
 from semfov.gaze import LearnedGaze
 from semfov.gaze.policies import KL, Learned, NonPredictive, Predictive, Random
 from semfov.sensor import foveate
+from tests.small import Coloured
 
 SIZE = (160, 120)
-
-
-class Squares(Detector):
-    """Detects the bounding boxes of red (class 1) and green (class 2) pixels; the score is their saturation."""
-
-    def __init__(self) -> None:
-        super().__init__("squares", ("red", "green"), SIZE)
-
-    def propose(self, canvas):
-        boxes, classes = [], []
-        for channel in (0, 1):
-            colour = canvas[0, channel] - canvas[0, 1 - channel]
-            ys, xs = (colour > 0.1).nonzero(as_tuple=True)
-            if len(xs):
-                boxes.append(torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas))
-                classes.append(torch.nn.functional.one_hot(torch.tensor(channel), 2) * colour.max().clamp(0, 1))
-        if not boxes:
-            return Candidates(canvas.new_zeros(1, 0, 4), canvas.new_zeros(1, 0, 2))
-        return Candidates(torch.stack(boxes)[None], torch.stack(classes)[None])
 
 
 @pytest.fixture
@@ -49,7 +31,7 @@ def image():
 
 
 def squares_eye():
-    return Eye(Foveation(40.0), Squares(), reference=160.0)
+    return Eye(Foveation(40.0), Coloured(), reference=160.0)
 
 
 @pytest.fixture
@@ -332,7 +314,7 @@ def test_confirmation_of_a_batch_equals_that_of_each_look():
 
 def test_view_is_foveated_at_the_resolution_of_the_detector(image):
     """A photograph of twice the size gives the same view, as the fovea is scaled with it."""
-    eye = Eye(Foveation(30.0), Squares(), reference=160.0)
+    eye = Eye(Foveation(30.0), Coloured(), reference=160.0)
     large = image.repeat_interleave(2, -1).repeat_interleave(2, -2)
     small_view = eye.foveated(eye.open(image[None]), torch.tensor([[39.5, 19.5]]))
     large_view = eye.foveated(eye.open(large[None]), torch.tensor([[79.5, 39.5]]))
@@ -352,7 +334,7 @@ def test_view_equals_the_reduced_output_of_the_sensor(growth):
         coarse = torch.rand(1, 3, 480 // n, 640 // n, generator=generator)
         picture += torch.nn.functional.interpolate(coarse, (480, 640), mode="bilinear") / 5
     gaze = torch.tensor([[200.0, 250.0]])
-    eye = Eye(Foveation(60.0, growth=growth), Squares())
+    eye = Eye(Foveation(60.0, growth=growth), Coloured())
     view = eye.open(picture)
     got = eye.foveated(view, gaze)
     shown, _ = eye.detector.fit(Foveation(60.0, growth=growth)(picture, gaze[None])[0])

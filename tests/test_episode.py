@@ -13,13 +13,14 @@ from semfov import FovealObservationModel, Foveation, Grid, InputError
 from semfov.belief import ContextPrior, TargetEvidence
 from semfov.belief.evidence import Gathered
 from semfov.belief.observers import Context, Semantic, Target
-from semfov.detection import Candidates, Detections, Detector, Selection
+from semfov.detection import Detections, Selection
 from semfov.episode import STAGES, LiveLooks, Looks, Sight, StoredLooks, rollout
 from semfov.eye import Eye
 from semfov.gaze import Choice, Given, Greedy, LearnedGaze, Relaxed, soft_fixation
 from semfov.gaze.acquisition import AcquisitionFunction, Static, TargetPosterior, Uniform
 from semfov.gaze.choice import drawn_by, drawn_from
 from semfov.gaze.policies import KL, Learned, NonPredictive, Random
+from tests.small import Coloured
 
 GRID = Grid(3, 2, (90, 60))
 CELLS = len(GRID)
@@ -324,21 +325,10 @@ def test_an_observer_of_targets_without_a_target_is_refused():
         list(steps)
 
 
-class Quarters(Detector):
-    """Detects each quarter of the canvas, scored by its brightest colour; dark quarters give no detection."""
-
-    def __init__(self):
-        super().__init__("quarters", ("red", "green", "blue"), (96, 64), selection=Selection(threshold=0.3, iou=1.0))
-
-    def propose(self, canvas):
-        corners = canvas.new_tensor([[0, 0], [48, 0], [0, 32], [48, 32]])
-        boxes = torch.cat([corners, corners + canvas.new_tensor([48, 32])], -1)
-        colours = nn.functional.max_pool2d(canvas, (32, 48)).flatten(2).mT
-        return Candidates(boxes.expand(len(canvas), 4, 4), colours)
-
-
 def live():
-    eye = Eye(Foveation(8.0), Quarters(), reference=90.0)
+    eye = Eye(
+        Foveation(8.0), Coloured(("red", "green", "blue"), (96, 64), selection=Selection(threshold=0.3)), reference=90.0
+    )
     picture = 0.1 + 0.1 * rand(1, 3, 60, 90).float()
     for channel, (x, y) in enumerate([(20, 10), (70, 40), (75, 8)]):
         picture[0, channel, y : y + 6, x : x + 6] = 0.9

@@ -9,27 +9,12 @@ from semfov import ActivePerception, Foveation, Grid
 from semfov.agent import PRICE
 from semfov.belief import MapEvidence
 from semfov.belief.observers import LearnedMap, Semantic
-from semfov.detection import Candidates, Detector
 from semfov.errors import InputError
 from semfov.eye import Eye
 from semfov.gaze.policies import Closer, Gain, NonPredictive, Random
+from tests.small import Coloured
 
 SIZE = (160, 120)
-
-
-class Square(Detector):
-    """Detects the bounding box of red pixels; the score is their saturation."""
-
-    def __init__(self) -> None:
-        super().__init__("square", ("red", "green"), SIZE)
-
-    def propose(self, canvas):
-        colour = canvas[0, 0] - canvas[0, 1]
-        ys, xs = (colour > 0.1).nonzero(as_tuple=True)
-        if not len(xs):
-            return Candidates(canvas.new_zeros(1, 0, 4), canvas.new_zeros(1, 0, 2))
-        box = torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas)
-        return Candidates(box[None, None], torch.stack([colour.max().clamp(0, 1), colour.new_tensor(0)])[None, None])
 
 
 @pytest.fixture
@@ -52,7 +37,7 @@ def model():
 
 
 def agent_of(model, policy=None, grid=(5, 4)):
-    eye, observer = Eye(Foveation(40.0), Square(), reference=160.0), LearnedMap(model)
+    eye, observer = Eye(Foveation(40.0), Coloured(), reference=160.0), LearnedMap(model)
     return ActivePerception(eye, (Semantic(3), NonPredictive()), (observer, policy or Closer(0.25)), grid=grid)
 
 
@@ -156,7 +141,7 @@ def test_the_map_of_a_search_is_the_learned_map(model, image):
 
 
 def test_until_needs_an_agent_with_a_learned_map(image):
-    eye = Eye(Foveation(40.0), Square(), reference=160.0)
+    eye = Eye(Foveation(40.0), Coloured(), reference=160.0)
     agent = ActivePerception(eye, (Semantic(3), NonPredictive()), (Semantic(3), Random()), grid=(5, 4))
     with pytest.raises(InputError, match=r"^until: expected None for an agent without a learned map"):
         agent.explore(image, until=0.1)

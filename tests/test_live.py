@@ -12,31 +12,13 @@ from semfov.belief import ContextPrior, MapEvidence, TargetEvidence
 from semfov.belief.look_features import class_features, nothing_seen
 from semfov.belief.observers import Context, LearnedMap, Semantic, Target
 from semfov.belief.target_evidence import Thresholds
-from semfov.detection import Candidates, Detections, Detector
+from semfov.detection import Detections
 from semfov.episode import Forgetting
 from semfov.errors import InputError
 from semfov.gaze.policies import Closer, NonPredictive, Random
+from tests.small import Coloured
 
 SIZE = (160, 120)
-
-
-class Squares(Detector):
-    """Detects the bounding boxes of red (class 1) and green (class 2) pixels; the score is their saturation."""
-
-    def __init__(self) -> None:
-        super().__init__("squares", ("red", "green"), SIZE)
-
-    def propose(self, canvas):
-        boxes, classes = [], []
-        for channel in (0, 1):
-            colour = canvas[0, channel] - canvas[0, 1 - channel]
-            ys, xs = (colour > 0.1).nonzero(as_tuple=True)
-            if len(xs):
-                boxes.append(torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas))
-                classes.append(torch.nn.functional.one_hot(torch.tensor(channel), 2) * colour.max().clamp(0, 1))
-        if not boxes:
-            return Candidates(canvas.new_zeros(1, 0, 4), canvas.new_zeros(1, 0, 2))
-        return Candidates(torch.stack(boxes)[None], torch.stack(classes)[None])
 
 
 def scene(x, y=8, size=24):
@@ -66,7 +48,7 @@ def observers():
 
 
 def agent_with(observer, policy=None):
-    eye = Eye(Foveation(40.0), Squares(), reference=160.0)
+    eye = Eye(Foveation(40.0), Coloured(), reference=160.0)
     policy = policy or NonPredictive()
     mapper = Semantic(3) if observer.by_target else observer
     return ActivePerception(eye, (observer, policy), (mapper, Random()), grid=(8, 6)).eval()

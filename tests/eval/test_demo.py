@@ -9,39 +9,21 @@ from PIL import Image
 
 import eval.demo as program
 from eval import demo_text
-from semfov import ActivePerception, Eye, FovealObservationModel, Foveation, observers, policies, read_image
+from semfov import ActivePerception, FovealObservationModel, observers, policies, read_image
 from semfov.belief import MapEvidence, Verification
 from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import Picture, embedded_picture
-from semfov.detection import Candidates, Detector
 from semfov.episode import STAGES
 from semfov.gaze import LearnedGaze
 from semfov.gaze.policies import Means, named_policy, policy_names
 from semfov.zoom import GlimpseEvidence
-
-
-class Squares(Detector):
-    """A detector of the bounding box of all red pixels; its score is their saturation."""
-
-    def __init__(self) -> None:
-        super().__init__("squares", ("red", "wine glass"), (160, 120))
-
-    def propose(self, canvas):
-        colour = canvas[0, 0] - canvas[0, 1]
-        ys, xs = (colour > 0.1).nonzero(as_tuple=True)
-        if not len(xs):
-            return Candidates(canvas.new_zeros(1, 0, 4), canvas.new_zeros(1, 0, 2))
-        box = torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas)
-        return Candidates(box[None, None], torch.stack([colour.max().clamp(0, 1), colour.new_tensor(0)])[None, None])
+from tests import small
 
 
 @pytest.fixture
 def agent():
-    eye, observer = Eye(Foveation(40.0), Squares(), reference=160.0), observers.Semantic(3)
-    return ActivePerception(
-        eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(8, 6)
-    ).eval()
+    return small.agent(small.Coloured(("red", "wine glass")))
 
 
 @pytest.fixture
@@ -131,7 +113,7 @@ def shipped_evidence(tmp_path, monkeypatch):
     monkeypatch.setattr(GlimpseEvidence, "shipped", tmp_path / "shipped")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        GlimpseEvidence(2, 8).save(tmp_path / "shipped" / "squares.safetensors")
+        GlimpseEvidence(2, 8).save(tmp_path / "shipped" / "coloured.safetensors")
 
 
 def test_a_large_picture_is_looked_at_in_windows(run, large, shipped_evidence, tmp_path):
@@ -162,11 +144,11 @@ def test_a_large_picture_is_looked_at_in_windows(run, large, shipped_evidence, t
 
 
 def test_a_large_picture_is_looked_at_closely(run, large, shipped_evidence, tmp_path):
-    evidence = GlimpseEvidence.from_pretrained("squares")
+    evidence = GlimpseEvidence.from_pretrained("coloured")
     evidence.verification = Verification(thresholds=Thresholds(0.4, 0.0, 0.0))
     for parameter in evidence.verification.requires_grad_(False).parameters():
         parameter.zero_()  # all probabilities after closer looks are one half
-    evidence.save(tmp_path / "shipped" / "squares.safetensors")
+    evidence.save(tmp_path / "shipped" / "coloured.safetensors")
     _, printed = run(large, "--target", "red", "--shifts", 5, "--draw", "[]", "--report", tmp_path / "page.html")
     assert "red: found (0.50) in" in printed.out
     assert "A closer look confirmed the target." in printed.out

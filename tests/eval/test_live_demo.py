@@ -7,15 +7,15 @@ import pytest
 import torch
 
 import eval.demo as program
-from semfov import ActivePerception, Detections, Eye, Foveation, Grid, observers, policies
+from semfov import ActivePerception, Detections, Grid
 from semfov.belief import DirichletBelief, Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import Picture, Stream, embedded_picture
 from semfov.decision import Decision
-from semfov.detection import Candidates, Detector
 from semfov.live import Moment
 from semfov.verifier import CloserLook
 from semfov.viz.live import draw_moment, video, video_suffix
+from tests import small
 
 cv2 = pytest.importorskip("cv2")
 
@@ -67,27 +67,9 @@ def test_a_target_is_followed_in_a_panning_video_until_it_leaves_the_view(tmp_pa
     assert shown[0].shape == (480, 320, 3)
 
 
-class Red(Detector):
-    """A detector of the bounding box of all red pixels."""
-
-    def __init__(self):
-        super().__init__("red", ("red", "green"), (160, 120))
-
-    def propose(self, canvas):
-        ys, xs = (canvas[0, 0] - canvas[0, 1] > 0.1).nonzero(as_tuple=True)
-        if not len(xs):
-            return Candidates(canvas.new_zeros(1, 0, 4), canvas.new_zeros(1, 0, 2))
-        box = torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas)
-        return Candidates(box[None, None], canvas.new_tensor([[[0.9, 0.0]]]))
-
-
 @pytest.fixture
 def agent():
-    observer = observers.Semantic(3)
-    eye = Eye(Foveation(40.0), Red(), reference=160.0)
-    return ActivePerception(
-        eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(8, 6)
-    ).eval()
+    return small.agent(small.Coloured(score=0.9))
 
 
 @pytest.fixture

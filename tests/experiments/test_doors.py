@@ -5,30 +5,18 @@ import dataclasses
 import pytest
 import torch
 
-from semfov import ActivePerception, Eye, Foveation, load_detector, observers, policies
+from semfov import load_detector
 from semfov.data.scenes import EmbeddedScenes
-from semfov.detection import Candidates, Detector, Selection
+from semfov.detection import Selection
 from semfov.errors import InputError
 from semfov.experiments import config as settings
 from semfov.experiments.settings import Range, check_settings
-
-
-class OneCup(Detector):
-    """A detector that always detects one cup."""
-
-    def __init__(self, **options):
-        super().__init__("quiet", ("cup", "cat"), (32, 32), **options)
-
-    def propose(self, canvas):
-        box = canvas.new_tensor([[4.0, 4, 20, 20]]).expand(len(canvas), 1, 4)
-        return Candidates(box, canvas.new_tensor([[0.9, 0.1]]).expand(len(canvas), 1, 2), None)
+from tests import small
 
 
 @pytest.fixture
 def agent():
-    observer = observers.Semantic(3)
-    eye = Eye(Foveation(10.0), OneCup(), reference=64.0)
-    return ActivePerception(eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(4, 3))
+    return small.agent(small.Fixed(), grid=(4, 3), sigma=10.0, reference=64.0)
 
 
 IMAGE = torch.rand(3, 40, 50, generator=torch.Generator().manual_seed(0))
@@ -99,7 +87,7 @@ def test_invalid_selections_are_refused(wrong):
 @pytest.mark.parametrize("stride", ["auto", 0, -32, 1.5, True])
 def test_invalid_strides_are_refused(stride):
     with pytest.raises(InputError, match=r"^stride: expected a whole number from 1"):
-        OneCup(stride=stride)
+        small.Fixed(stride=stride)
 
 
 @pytest.mark.weights

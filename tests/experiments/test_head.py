@@ -15,6 +15,7 @@ from semfov.errors import InputError
 from semfov.experiments import head_report
 from semfov.experiments.head import HeadConfig, HeadRun, answers_of, raster
 from semfov.head.views import Views
+from tests.small import Tiles
 
 pytestmark = pytest.mark.usefixtures("kept_scenes")
 
@@ -44,8 +45,8 @@ class NoiseScenes:
 
 
 @pytest.fixture(params=["panorama", "mosaic"])
-def config(request, tmp_path, monkeypatch, textures):
-    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures())
+def config(request, tmp_path, monkeypatch):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Tiles())
     monkeypatch.setattr("semfov.experiments.head.make_scenes", lambda data, classes: NoiseScenes())
     torch.manual_seed(0)
     models = TargetEvidence(components=4).requires_grad_(False), MapEvidence(components=4).requires_grad_(False)

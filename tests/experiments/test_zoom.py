@@ -16,13 +16,14 @@ from semfov.experiments.zoom_orders import quad_tree, ranked, raster, shuffled, 
 from semfov.experiments.zoom_store import pack, unpack
 from semfov.zoom import GlimpseEvidence
 from semfov.zoom.lattice import Lattice
+from tests.small import Tiles
 
 pytestmark = pytest.mark.usefixtures("kept_scenes")
 
 
 @pytest.fixture
-def config(tmp_path, monkeypatch, textures):
-    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures())
+def config(tmp_path, monkeypatch):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Tiles())
     torch.manual_seed(0)
     GlimpseEvidence(3, 8).save(tmp_path / "model.safetensors")
     return ZoomConfig(

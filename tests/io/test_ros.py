@@ -16,10 +16,10 @@ from semfov.belief import Verification
 from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import Decision
-from semfov.detection import Candidates, Detector
 from semfov.errors import InputError
 from semfov.gaze.policies import NonPredictive, Random
 from semfov.io import ros
+from tests.small import Coloured
 
 from .messages import KINDS, plain
 
@@ -139,20 +139,6 @@ def test_bad_input(seen):
         ros.picture(cut)
 
 
-class Square(Detector):
-    """Detects red pixels."""
-
-    def __init__(self):
-        super().__init__("square", CLASSES, (64, 64))
-
-    def propose(self, canvas):
-        ys, xs = (canvas[0, 0] - canvas[0, 1] > 0.2).nonzero(as_tuple=True)
-        if not len(xs):
-            return Candidates(canvas.new_zeros(1, 0, 4), canvas.new_zeros(1, 0, 3))
-        box = torch.stack([xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]).to(canvas)
-        return Candidates(box[None, None], canvas.new_tensor([[[0.9, 0.02, 0.02]]]))
-
-
 class Sure(Verification):
     """Every place holds the target, with log odds of 4."""
 
@@ -199,7 +185,7 @@ def test_the_node_publishes_detections_and_the_next_fixation(monkeypatch):
     module("rclpy.node", Node=Node)
     monkeypatch.delitem(sys.modules, "examples.ros_node", raising=False)
     node_module = importlib.import_module("examples.ros_node")
-    eye = semfov.Eye(semfov.Foveation(40.0), Square(), reference=64.0)
+    eye = semfov.Eye(semfov.Foveation(40.0), Coloured(CLASSES, (64, 64), score=0.9), reference=64.0)
     searching, exploring = (Semantic(4), NonPredictive()), (Semantic(4), Random())
     sure = Sure(thresholds=Thresholds(0.7, 0.01, 0.3))
     agent = semfov.ActivePerception(eye, searching, exploring, verification=sure)

@@ -3,19 +3,9 @@
 import pytest
 import torch
 
-from semfov.detection import Candidates, Detector
+from semfov.detection import Candidates
 from semfov.errors import DataError, InputError
-
-
-class Given(Detector):
-    """Returns given candidates for every canvas."""
-
-    def __init__(self, candidates):
-        super().__init__("given", ("cat", "cup"), (32, 32))
-        self.candidates = candidates
-
-    def propose(self, canvas):
-        return self.candidates
+from tests.small import Fixed
 
 
 def candidates(**changes):
@@ -42,9 +32,9 @@ def candidates(**changes):
 )
 def test_invalid_detections_are_refused(changes, message):
     image = torch.rand(1, 3, 32, 32)
-    assert Given(candidates())(image).count.tolist() == [2]
+    assert Fixed(candidates=candidates())(image).count.tolist() == [2]
     with pytest.raises(InputError, match=message):
-        Given(candidates(**changes))(image)
+        Fixed(candidates=candidates(**changes))(image)
 
 
 def test_a_network_with_a_huge_kernel_is_refused():

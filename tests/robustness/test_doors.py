@@ -11,25 +11,22 @@ from PIL import Image
 import eval.demo as program
 from semfov import (
     ActivePerception,
-    Eye,
-    Foveation,
     MapEvidence,
     TargetEvidence,
     ZoomAgent,
     ZoomEye,
     as_image,
     foveate,
-    observers,
-    policies,
 )
 from semfov.data.classes import class_index
 from semfov.data.synonyms import SYNONYMS
-from semfov.detection import Candidates, Detector
 from semfov.detection.coco_classes import COCO_CLASSES
 from semfov.detection.load import check_detector
 from semfov.errors import SemfovError
 from semfov.zoom import GlimpseEvidence
+from tests import small
 
+CUP = small.Fixed(("cup", "wine glass"))
 RNG = np.random.default_rng(0)
 PIXELS = RNG.integers(0, 256, (30, 44, 3), dtype=np.uint8)
 GREY = RNG.integers(0, 256, (30, 44), dtype=np.uint8)
@@ -39,28 +36,16 @@ GREYS = torch.from_numpy(GREY)[None].expand(3, -1, -1) / 255
 DEEPS = torch.from_numpy(DEEP.astype(np.int32))[None].expand(3, -1, -1) / 65535
 
 
-class OneCup(Detector):
-    """Detects one cup at the same place of every canvas."""
-
-    def __init__(self):
-        super().__init__("quiet", ("cup", "wine glass"), (32, 32))
-
-    def propose(self, canvas):
-        box = canvas.new_tensor([[4.0, 4, 20, 20]]).expand(len(canvas), 1, 4)
-        return Candidates(box, canvas.new_tensor([[0.9, 0.1]]).expand(len(canvas), 1, 2), None)
-
-
 @pytest.fixture(scope="module")
 def agent():
-    observer, eye = observers.Semantic(3), Eye(Foveation(10.0), OneCup(), reference=64.0)
-    return ActivePerception(eye, (observer, policies.NonPredictive()), (observer, policies.Random()), grid=(4, 3))
+    return small.agent(CUP, grid=(4, 3), sigma=10.0, reference=64.0)
 
 
 @pytest.fixture(scope="module")
 def zooming():
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        return ZoomAgent(ZoomEye(OneCup()), GlimpseEvidence(2, 8)).eval()
+        return ZoomAgent(ZoomEye(CUP), GlimpseEvidence(2, 8)).eval()
 
 
 @pytest.fixture(scope="module")

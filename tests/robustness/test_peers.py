@@ -8,27 +8,11 @@ import pytest
 import torch
 
 from benchmarks import acuity
-from semfov.detection.detector import Detector
-from semfov.detection.scores import Candidates
 from semfov.eye import Eye
 from semfov.sensor import Foveation, LogPolar
+from tests.small import Coloured
 
 pytestmark = pytest.mark.slow
-
-
-class RedSquares(Detector):
-    """Proposes one box around all red pixels, of the second of two classes."""
-
-    def __init__(self, size=(64, 64)):
-        super().__init__("red", ("nothing", "red"), size, fill=0.0)
-
-    def propose(self, canvas):
-        red = canvas[0, 0] > 0.5
-        if not red.any():
-            return Candidates(torch.zeros(1, 0, 4), torch.zeros(1, 0, 2), torch.zeros(1, 0))
-        y, x = red.nonzero().unbind(-1)
-        box = torch.stack([x.min(), y.min(), x.max() + 1, y.max() + 1]).float()
-        return Candidates(box.view(1, 1, 4), torch.tensor([[[0.0, 0.75]]]), torch.tensor([[0.8]]))
 
 
 def test_contrast_of_a_sensor_without_blur_is_1():
@@ -48,9 +32,9 @@ def test_wavelengths_of_the_finest_gratings_grow_with_the_distance():
 def test_errors_and_found_objects_are_counted_by_distance():
     image = torch.zeros(1, 3, 64, 640)
     image[0, 0, 20:40, 100:120] = 1
-    boxes, labels = torch.tensor([[100.0, 20, 120, 40], [600, 20, 620, 40]]), torch.tensor([2, 2])
+    boxes, labels = torch.tensor([[100.0, 20, 120, 40], [600, 20, 620, 40]]), torch.tensor([1, 1])
     tally = acuity.Tally()
-    detector = RedSquares((640, 64))
+    detector = Coloured(("red",), (640, 64), score=0.75)
     tally.add(Eye(Foveation(1e9), detector), image, torch.tensor([[109.5, 29.5], [300.0, 29.5]]), boxes, labels)
     assert tally.looks == 2
     assert tally.objects.tolist() == [1, 0, 0, 0, 1, 0, 1]  # at 0 and 500 px, and at 190 and 310 px
@@ -74,12 +58,12 @@ def test_sahi_accepts_a_detector_of_semfov():
 
     picture = np.zeros((128, 192, 3), dtype=np.uint8)
     picture[70:90, 140:150, 0] = 255
-    model = Slicing(RedSquares(), None, 0.1)
+    model = Slicing(Coloured(("red",), (64, 64), score=0.8), None, 0.1)
     found = get_sliced_prediction(picture, model, slice_height=64, slice_width=64, overlap_height_ratio=0.2,
                                   overlap_width_ratio=0.2, verbose=0).object_prediction_list  # fmt: skip
     assert model.passes == 1 + 3 * 4
-    assert [(each.category.id, each.category.name) for each in found] == [(2, "red")] * len(found)
+    assert [(each.category.id, each.category.name) for each in found] == [(1, "red")] * len(found)
     assert [140, 70, 150, 90] in [[round(side) for side in each.bbox.to_xyxy()] for each in found]
     assert found[0].score.value == pytest.approx(0.8)
-    rare = Slicing(RedSquares(), 1, 0.1)
+    rare = Slicing(Coloured(("red",), (64, 64), score=0.8), 1, 0.1)
     assert not get_sliced_prediction(picture, rare, slice_height=64, slice_width=64, verbose=0).object_prediction_list

@@ -9,10 +9,10 @@ from eval.search import main as search
 from semfov import EmbeddedScenes, load_detector
 from semfov.detection.architectures import yolov3_tiny
 from semfov.detection.darknet import Darknet
-from semfov.detection.detector import Detector
 from semfov.errors import InputError
 from semfov.gaze import ClassTemplates
 from semfov.training.templates import TemplateSums, objects_of
+from tests.small import Fixed
 from train.fit_templates import main
 
 
@@ -97,9 +97,5 @@ def test_a_run_writes_templates_that_a_search_uses(tmp_path, capsys):
 
 
 def test_a_detector_without_access_to_its_features_is_refused():
-    class ClosedDetector(Detector):
-        def propose(self, canvas):
-            raise NotImplementedError
-
-    with pytest.raises(InputError, match=r"access to its features.*closed"):
-        ClosedDetector("closed", ("cup",), (32, 32)).features(torch.zeros(1, 3, 32, 32))
+    with pytest.raises(InputError, match=r"access to its features.*fixed"):
+        Fixed().features(torch.zeros(1, 3, 32, 32))

@@ -12,7 +12,6 @@ from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scene
 from semfov.data.scenes import EmbeddedScenes
-from semfov.detection import Candidates, Detector
 from semfov.errors import InputError
 from semfov.experiments.config import DataConfig
 from semfov.experiments.zoom_samples import MosaicSettings
@@ -28,13 +27,14 @@ from semfov.training.zoom_verification import fit_closer, sought_in, unverified,
 from semfov.zoom import GlimpseEvidence, ZoomEye
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.search import search
+from tests.small import Coloured, Tiles
 
 pytestmark = pytest.mark.usefixtures("kept_scenes")
 
 
 @pytest.mark.slow
-def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, textures):
-    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures("bright"))
+def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Tiles(name="bright"))
     config = FitZoomConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
         mosaics=1, far=1, crowded=1, judged=1, judged_far=1, searched=1, sought=1, passes=4, tile=48,
@@ -43,7 +43,7 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, te
     fit_zoom(config)
     path = tmp_path / "out" / "bright.safetensors"
     model = GlimpseEvidence.from_pretrained(path)
-    model.check_compatible(ZoomEye(textures("bright")).settings())
+    model.check_compatible(ZoomEye(Tiles(name="bright")).settings())
     assert model.metadata["training"]["steps"] == 3
     figures = json.loads((tmp_path / "out" / "figures.json").read_text())
     assert all(map(math.isfinite, figures.values()))
@@ -62,7 +62,7 @@ def test_the_command_writes_a_model_that_loads(tmp_path, monkeypatch, capsys, te
     assert changed
     assert all(name.startswith("survey.") for name in changed)
     # Looks come from the store, and a fit with the same seed gives the same model.
-    monkeypatch.setattr(textures, "propose", None)
+    monkeypatch.setattr(Tiles, "propose", None)
     fit_zoom(config)
     again = GlimpseEvidence.from_pretrained(tmp_path / "out" / "bright.safetensors")
     assert all(torch.equal(before[name], tensor) for name, tensor in again.state_dict().items())
@@ -83,8 +83,8 @@ def tables_of_choices(report):
     return recalls, {float(value): float(row[0]) for value, row in tables["patience"].items()}
 
 
-def test_examples_do_not_depend_on_the_store(tmp_path, textures):
-    eye = ZoomEye(textures("bright"))
+def test_examples_do_not_depend_on_the_store(tmp_path):
+    eye = ZoomEye(Tiles(name="bright"))
     mosaics = Mosaics(EmbeddedScenes(("person", "cat", "cup"), count=3), 2, 2, tile=(96, 72), count=1)
     store = GlanceStore(tmp_path, eye.settings(), 3)
     glances = open_scene(eye, mosaics, 0, store)
@@ -109,8 +109,8 @@ def test_settings_out_of_range_are_refused():
 
 
 @pytest.mark.slow
-def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys, textures):
-    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: textures("bright"))
+def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("semfov.experiments.setup.load_detector", lambda name, **options: Tiles(name="bright"))
     monkeypatch.setattr("semfov.experiments.zoom_samples.TILE", (96, 72))
     config = FitConfig(
         data=DataConfig(limit=4, min_instances=0, max_target_area=None),
@@ -122,7 +122,7 @@ def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, 
     model = FovealObservationModel.from_pretrained(tmp_path / "out" / "bright-zoom.safetensors")
     assert model.edges.tolist() == [0.5, 1.5, 2.5]
     assert model.metadata["sensor"]["glimpse"] == "antialiased bilinear"
-    model.check_compatible(ZoomEye(textures("bright")).settings())
+    model.check_compatible(ZoomEye(Tiles(name="bright")).settings())
     # The model was fitted on one of the two mosaics and evaluated on the other; all samples of the first are counted.
     sampler = MosaicSettings.of(config).sampler()
     samples = sampler.load(tmp_path / "out" / "samples", 1)
@@ -131,24 +131,6 @@ def test_observation_models_are_fitted_on_mosaics_by_the_same_command(tmp_path, 
     lattice = Lattice.over(size, (96, 96))
     assert sum(model.metadata["cells"]) >= lattice.columns * lattice.rows
     assert model.miss_rate.shape == (4, 4)
-
-
-class Colours(Detector):
-    """Frames all pure red, green or blue of a canvas, one box for each class; the score is how bright it is."""
-
-    def __init__(self):
-        super().__init__("colours", ("red", "green", "blue"), (64, 64), fill=0.0)
-
-    def propose(self, canvas):
-        boxes, classes = torch.zeros(len(canvas), 3, 4), torch.zeros(len(canvas), 3, 3)
-        for image, framed, scores in zip(canvas, boxes, classes, strict=True):
-            for kind in range(3):
-                shown = (image[kind] > 0.1) & (image[kind] > 3 * (image.sum(0) - image[kind]))
-                if shown.any():
-                    (top, left), (bottom, right) = shown.nonzero().amin(0), shown.nonzero().amax(0) + 1
-                    framed[kind] = torch.tensor([left, top, right, bottom])
-                    scores[kind, kind] = 0.9 * image[kind][shown].mean()
-        return Candidates(boxes, classes)
 
 
 class Squares:
@@ -185,7 +167,7 @@ class Squares:
 
 @pytest.mark.slow
 def test_the_verification_is_fitted_to_closer_looks_at_mosaics():
-    eye, scenes = ZoomEye(Colours()), Squares()
+    eye, scenes = ZoomEye(Coloured(("red", "green", "blue"), (64, 64), fill=0.0)), Squares()
     opened = [open_scene(eye, scenes, n, None) for n in range(len(scenes))]
     torch.manual_seed(0)
     model = GlimpseEvidence(3, 8, thresholds=Thresholds(0.3, 0.01)).eval().requires_grad_(False)
