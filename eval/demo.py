@@ -34,6 +34,7 @@ from semfov import ActivePerception, Scanpath, viz
 from semfov.data.classes import class_index
 from semfov.data.sources import Picture, Stream, embedded_picture, is_video, open_pictures, open_stream
 from semfov.data.word_vectors import WordVectors, spread
+from semfov.decision import MOST
 from semfov.detection.load import check_detector
 from semfov.errors import InputError, check
 from semfov.experiments.command import run_command
@@ -44,7 +45,6 @@ from semfov.report import Pool, episode_data, write_page, zoom_data
 from semfov.scanpath.stimulus import reduced
 from semfov.sensor import SENSORS
 from semfov.sensor.named import SensorName
-from semfov.verifier import MOST
 from semfov.viz.animation import film_of
 from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye, ZoomPath
 

@@ -26,6 +26,7 @@ def told(name: str, scanpath: Scanpath) -> str:
     if scanpath.target is None:
         lines += ["", "what is where:", *named(scanpath)]
     for number, look in enumerate(scanpath.closer, 1):
+        assert look.cell is not None
         chance = f"p {look.place:.3f} there, {look.presence:.3f} anywhere"
         lines.append(f"closer look {number}, after fixation {look.fixation}, at {place(scanpath, look.cell)}: {chance}")
     return "\n".join([f"{name}: {viz.describe(scanpath)}. {viz.why_it_ended(scanpath)}".rstrip(), *lines, ""])

@@ -15,7 +15,7 @@ from semfov.belief.observers.any_of import TargetLike, class_meant
 from semfov.belief.verification import Verification
 from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike, as_image
-from semfov.decision import check_thresholds, conclude, goal_cells, outcome_by_gain, outcome_of
+from semfov.decision import MOST, Verifier, check_thresholds, conclude, goal_cells, outcome_by_gain, outcome_of
 from semfov.episode import LiveLooks, Step, rollout
 from semfov.errors import InputError, check, check_whole
 from semfov.eye import Eye
@@ -28,7 +28,6 @@ from semfov.model_folder import open_folder
 from semfov.presets import published_parts, raw_parts, recommended_parts
 from semfov.scanpath import Ending, Scanpath, Stimulus, trace
 from semfov.strategy import Strategy
-from semfov.verifier import MOST, Verifier
 
 PRICE = 0.1
 """Default price of a look in an exploration by a learned map: the least expected increase in the number of correctly
@@ -202,7 +201,7 @@ class ActivePerception(nn.Module):
         """Search an image for a target class, and decide whether it is there (`Scanpath.decision`).
 
         The recommended agent looks closely at places that seem to hold the target: it enlarges a window around them to
-        the detector's input (`semfov.verifier.Verifier`). The search ends with `found` when the target is probable
+        the detector's input (`semfov.decision.Verifier`). The search ends with `found` when the target is probable
         enough at such a place. It ends without the target when no remaining cell is probable enough to be worth a look,
         and after `shifts` gaze shifts.
 

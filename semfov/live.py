@@ -14,15 +14,13 @@ from semfov.belief.observers import Observer
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.inputs import ImageLike, as_image
-from semfov.decision import Decision, conclude, decide
+from semfov.decision import MOST, CandidatePlace, CloserLook, Decision, LiveVerifier, conclude, decide
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, LiveLooks, Step, Stopwatch, rollout
 from semfov.errors import check
 from semfov.eye import Eye, View
 from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.gaze.policies import Policy
-from semfov.live_verifier import LiveVerifier
-from semfov.verifier import MOST, CandidatePlace, CloserLook
 
 RATE = 0.1
 """Default rate at which belief fades, per frame."""
@@ -87,7 +85,7 @@ class LivePerception:
 
     With a model of verification, the target is found by closer looks alone, as in a search. A frame is then either a
     look of the fovea or a closer look at a place that seems to hold the target, since each costs one pass of the
-    detector. What a closer look has told fades, too (`semfov.live_verifier.LiveVerifier`). With rate 0, frames of a
+    detector. What a closer look has told fades, too (`semfov.decision.LiveVerifier`). With rate 0, frames of a
     still picture give the looks, the closer looks and the decision of a search up to its end. Only a place that is
     probable enough, but not enough to end a search at once, is called found earlier, as soon as it was examined.
 

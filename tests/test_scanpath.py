@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from semfov import ActivePerception, Detections, Eye, Foveation, Grid, InputError, Scanpath, observers, policies
-from semfov.decision import Decision
+from semfov.decision import CloserLook, Decision
 from semfov.detection import Candidates, Detector, Placement
 from semfov.errors import DataError
 from semfov.io.storage import read, write
@@ -21,7 +21,6 @@ from semfov.scanpath import Stimulus
 from semfov.scanpath.files import KIND
 from semfov.scanpath.stimulus import LONGEST
 from semfov.sensor.foveation import foveate
-from semfov.verifier import CloserLook
 
 
 class Bright(Detector):

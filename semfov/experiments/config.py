@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from semfov.belief.grid import Footprint
 from semfov.belief.observers import Memory
+from semfov.decision import MOST
 from semfov.detection.onnx_twin import Runtime
 from semfov.detection.scores import BackgroundPolicy
 from semfov.experiments.settings import (
@@ -24,7 +25,6 @@ from semfov.experiments.settings import (
 from semfov.gaze.saliency.cells import Reduction
 from semfov.sensor import SENSORS, Foveation, named_sensor
 from semfov.sensor.named import SensorName
-from semfov.verifier import MOST
 
 SaliencyModel = Literal["vocus2", "itti-koch"]
 Context = Literal["none", "place", "cooccurrence", "both"]

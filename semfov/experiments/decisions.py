@@ -17,7 +17,7 @@ from semfov.belief.look_features import highest_score
 from semfov.belief.observers import Semantic, Target
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
-from semfov.decision import conclude, confirms, decide, decide_by_price
+from semfov.decision import Verifier, conclude, confirms, decide, decide_by_price
 from semfov.detection.detections import Detections
 from semfov.episode import Step, Stopwatch, StoredLooks, rollout
 from semfov.errors import InputError, check
@@ -34,7 +34,6 @@ from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
 from semfov.strategy import Strategy
-from semfov.verifier import Verifier
 
 Rule = Callable[[Step, int, Grid], Tensor]
 """Maps a step of searches, their target and their grid to the number of each search's outcome; 0: it goes on."""

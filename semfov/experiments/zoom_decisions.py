@@ -8,13 +8,12 @@ from itertools import product
 import torch
 
 from semfov.data.scene import Annotation
-from semfov.decision import OUTCOMES
+from semfov.decision import MOST, OUTCOMES
 from semfov.experiments.decision_report import SHARES, mean, percent, telling
 from semfov.experiments.decisions import overlap
 from semfov.experiments.parts import Record
 from semfov.experiments.summary import table
 from semfov.metrics.calibration import BinarySums
-from semfov.verifier import MOST
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glances, Window
 from semfov.zoom.search import search

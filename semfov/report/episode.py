@@ -153,6 +153,7 @@ def about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
         row, column = divmod(scanpath.decision.cell, scanpath.grid.columns)
         decision += f" It is at column {column}, row {row}."
     for look in scanpath.closer:
+        assert look.cell is not None
         row, column = divmod(look.cell, scanpath.grid.columns)
         decision += f" Closer look at column {column}, row {row}: probability {look.place:.2f}."
     told = None if settings is None else sensor_in_words(settings["sensor"])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.decision import Decision, Outcome
+from semfov.decision import CloserLook, Decision, Outcome
 from semfov.detection.detections import Detections
 from semfov.detection.placement import Placement
 from semfov.episode import STAGES
@@ -18,7 +18,6 @@ from semfov.errors import DataError, InputError, check
 from semfov.io.schema import Anything, Array, Field, Flag, Json, Maybe, Number, Object, Pair, Schema, Text
 from semfov.io.storage import read, write
 from semfov.scanpath.stimulus import LONGEST, Stimulus
-from semfov.verifier import CloserLook
 from semfov.version import __version__
 
 KIND = "scanpath"

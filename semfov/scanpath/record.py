@@ -11,13 +11,12 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations
-from semfov.decision import Decision
+from semfov.decision import CloserLook, Decision
 from semfov.detection.detections import Detections
 from semfov.errors import InputError
 from semfov.scanpath.drawing import drawn_by
 from semfov.scanpath.files import read_fields, write_fields
 from semfov.scanpath.stimulus import Stimulus
-from semfov.verifier import CloserLook
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -53,7 +52,7 @@ class Scanpath:
             for exploration.
         presence: `(n,)`, probability that the image holds the target after each look; None for exploration.
         decision: decision of the search; None for exploration, and for a search that ended on a given box.
-        closer: closer looks of a search, in order (`semfov.verifier.Verifier`).
+        closer: closer looks of a search, in order (`semfov.decision.Verifier`).
         ending: reason for the end; None if it is not known.
         seconds: time of each look by stage (`semfov.episode.STAGES`).
         stimulus: the photograph, and the data for the foveated views of it; None if it was not kept.

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from semfov.belief.observers import Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.belief.verification import Verification
-from semfov.decision import conclude, decide
+from semfov.decision import Verifier, conclude, decide, surely
 from semfov.episode import Step
 from semfov.experiments.progress import track
 from semfov.training.closer_looks import Photograph, Sought, search
 from semfov.training.verification_settings import FitVerificationConfig
-from semfov.verifier import Verifier, surely
 
 LEVELS = tuple(number / 100 for number in range(50, 100))
 """Values from which the threshold `confirm` is chosen."""
@@ -84,7 +83,11 @@ def verify(
                 present=sought.present,
                 spare=sought.spare,
                 places=places,
-                ends=tuple(look.fixation + 1 + number for number, look in enumerate(verifier.looks, 1)),
+                ends=tuple(
+                    look.fixation + 1 + number
+                    for number, look in enumerate(verifier.looks, 1)
+                    if look.fixation is not None
+                ),
                 presence=decision.probability,
                 looks=end + len(verifier.looks),
                 unverified=unverified(steps, photograph, sought, evidence.thresholds),

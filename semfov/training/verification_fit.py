@@ -12,12 +12,12 @@ from torch.nn import functional as F
 from semfov.belief.observers import Target
 from semfov.belief.target_evidence import TargetEvidence, Thresholds
 from semfov.belief.verification import FEATURES, Verification
+from semfov.decision import CandidatePlaces, cell_of
 from semfov.errors import DataError
 from semfov.experiments.progress import track
 from semfov.training.closer_looks import Photograph, search
 from semfov.training.verification_decisions import LEVELS, Verified, choose_confirm, verify
 from semfov.training.verification_settings import FitVerificationConfig
-from semfov.verifier import CandidatePlaces, cell_of
 
 AFTER = (1, 3, 5, 8, 12)
 """Numbers of looks after which candidates are examined for the fit."""

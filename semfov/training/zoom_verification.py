@@ -12,14 +12,13 @@ from torch import Tensor
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
-from semfov.decision import OUTCOMES, settle
+from semfov.decision import MOST, OUTCOMES, SAME, settle
 from semfov.experiments.zoom_store import StoredGlances
 from semfov.observation.matching import box_iou
 from semfov.training.verification_decisions import Ended, Verified, choose_confirm
 from semfov.training.verification_fit import Examined, FittedVerification, fit
 from semfov.training.verification_report import report
 from semfov.training.zoom_decision import searches_of
-from semfov.verifier import MOST, SAME
 from semfov.zoom.closer import Suspects, ZoomVerifier
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance
@@ -203,7 +202,7 @@ def verify(
             present=sought.present,
             spare=False,
             places=tuple((look.place, sought.right(look.box)) for look in verifier.looks),
-            ends=tuple(look.number + 1 for look in verifier.looks),
+            ends=tuple(look.number + 1 for look in verifier.looks if look.number is not None),
             presence=verifier.presence(presence),
             looks=count,
             unverified=unverified(sought, evidence.thresholds),

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
+from semfov.decision import CloserLook
 from semfov.errors import check
 from semfov.scanpath import Scanpath, describe
-from semfov.verifier import CloserLook
 from semfov.viz.belief import draw_belief
 from semfov.viz.drawing import (
     choose_fixations,

@@ -8,10 +8,10 @@ from torch import nn
 from semfov.data.classes import class_index
 from semfov.data.inputs import ImageLike
 from semfov.data.large import LargePicture
+from semfov.decision import MOST as CLOSER
 from semfov.decision import check_thresholds
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
-from semfov.verifier import MOST as CLOSER
 from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, ZoomEye

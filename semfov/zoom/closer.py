@@ -7,9 +7,9 @@ from torch import Tensor
 
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification, closer_features
+from semfov.decision import SAME, CloserLook, surely, verified
 from semfov.observation.matching import box_iou
 from semfov.sensor.glimpse import window_around
-from semfov.verifier import SAME, surely, verified
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance, Glances, Window, around
 from semfov.zoom.lattice import Lattice
@@ -18,23 +18,6 @@ CONTEXT = 3.0
 """Side of the window of a closer look, in longer sides of the examined box."""
 
 _SMALLEST = 1e-4
-
-
-@dataclass(frozen=True)
-class CloserGlance:
-    """A closer look at a place that seems to hold the target.
-
-    Attributes:
-        number: number of the look in the path; the overview is 0.
-        box: `(4,)`, the box of the target as `(x1, y1, x2, y2)` in picture pixels, if it is there.
-        place: probability that the target is there.
-        presence: probability that the picture holds the target, after this look.
-    """
-
-    number: int
-    box: Tensor
-    place: float
-    presence: float
 
 
 @dataclass(frozen=True)
@@ -143,7 +126,7 @@ class Suspects:
 
 
 class ZoomVerifier:
-    """Looks closely at places of a large picture before a search decides (small ones: `semfov.verifier.Verifier`).
+    """Looks closely at places of a large picture before a search decides (small ones: `semfov.decision.Verifier`).
 
     A place is examined if the target is there with a probability of `likely`, or of the threshold `place` when no other
     look follows. The search ends at once if a closer look shows the target with a probability halfway between `confirm`
@@ -168,7 +151,7 @@ class ZoomVerifier:
     ) -> None:
         self.model, self.thresholds, self.likely, self.most = model, thresholds, likely, most
         self.suspects = Suspects(glances, target)
-        self.looks: list[CloserGlance] = []
+        self.looks: list[CloserLook] = []
 
     def __call__(
         self, presence: float, best: float, number: int, room: int, *, over: bool
@@ -194,7 +177,9 @@ class ZoomVerifier:
             glance, features, box = self.suspects.examine(suspect, presence)
             with torch.no_grad():
                 place, after = self.model(features).sigmoid().tolist()
-            self.looks.append(CloserGlance(number + len(made), box, place, after))
+            self.looks.append(
+                CloserLook(None, self.suspects.target, None, box, place, after, number=number + len(made))
+            )
             made.append((glance, suspect.probability))
             if place >= surely(self.thresholds.confirm):
                 break
@@ -218,6 +203,6 @@ class ZoomVerifier:
         """Probability that the picture holds the target: the largest after a closer look, or the one that is given."""
         return max((look.presence for look in self.looks), default=presence)
 
-    def best(self) -> CloserGlance:
+    def best(self) -> CloserLook:
         """The closer look with the largest probability of the place; there must be one."""
         return max(self.looks, key=lambda look: look.place)

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from semfov.decision import Decision
-from semfov.zoom.closer import CloserGlance
+from semfov.decision import CloserLook, Decision
 from semfov.zoom.drawing import path_html
 from semfov.zoom.gist import FOUND
 from semfov.zoom.glances import Glance
@@ -49,7 +48,7 @@ class ZoomPath:
     objects: Objects
     decision: Decision | None = None
     ending: Ending | None = None
-    closer: tuple[CloserGlance, ...] = ()
+    closer: tuple[CloserLook, ...] = ()
 
     @property
     def passes(self) -> int:

@@ -6,8 +6,7 @@ from typing import NamedTuple
 import torch
 
 from semfov.belief.target_evidence import Thresholds
-from semfov.decision import OUTCOMES, Decision, settle
-from semfov.verifier import MOST
+from semfov.decision import MOST, OUTCOMES, Decision, settle
 from semfov.zoom.belief import Rates, ZoomBelief
 from semfov.zoom.closer import ZoomVerifier
 from semfov.zoom.context import WindowContext

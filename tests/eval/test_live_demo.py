@@ -11,9 +11,8 @@ from semfov import ActivePerception, Detections, Grid
 from semfov.belief import DirichletBelief, Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import Picture, Stream, embedded_picture
-from semfov.decision import Decision
+from semfov.decision import CloserLook, Decision
 from semfov.live import Moment
-from semfov.verifier import CloserLook
 from semfov.viz.live import draw_moment, video, video_suffix
 from tests import small
 

@@ -11,9 +11,10 @@ from torch import Tensor
 from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
+from semfov.decision.evidence import confirms, strength, strongest
 from semfov.detection.detections import Detections
 from semfov.episode import Step
-from semfov.errors import check, check_finite, check_shape
+from semfov.errors import check
 from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.io.schema import is_number
 
@@ -38,7 +39,7 @@ class Decision:
         box: `(4,)`, the box `(x1, y1, x2, y2)` of the detection with the strongest evidence for the target in that
             cell; None if there is none.
         place: for `found` after a closer look, the probability that the target is at that place
-            (`semfov.verifier.Verifier`); otherwise None.
+            (`semfov.decision.Verifier`); otherwise None.
     """
 
     outcome: Outcome
@@ -179,38 +180,37 @@ def conclude(
     return Decision("found", probability, cell, strongest(looks, grid, cell, target)[1])
 
 
-def strength(seen: Detections, grid: Grid, target: int) -> Tensor:
-    """Evidence of the detections of one look for the target in each cell, `(X·Y,)`: score times `soft` footprint."""
-    shown = grid.footprint(seen.boxes, "soft")[0] * (seen.mask[0] * seen.scores[0, :, target])[:, None]
-    return shown.amax(0) if len(shown) else shown.sum(0)
+def surely(confirm: float) -> float:
+    """Probability of a place from which a search ends at once: halfway between the threshold `confirm` and 1."""
+    return (1 + confirm) / 2
 
 
-def strongest(looks: Sequence[Detections], grid: Grid, cell: int, target: int) -> tuple[float, Tensor | None]:
-    """Detection with the strongest evidence for the target in a cell: score times `soft` footprint.
+def verified(places: Sequence[float], presence: float, confirm: float, *, over: bool) -> int:
+    """Decide a search after closer looks.
+
+    It has found its target if a place is sure (`surely`). When it is over, it has found it if a place is probable
+    enough; otherwise the target is absent if the picture holds it with a probability below one half.
 
     Args:
-        looks: the detections of each look, batches of one.
-        grid: the cells.
-        cell: the cell.
-        target: class 1..K.
+        places: for each closer look, the probability that the target is at its place.
+        presence: probability that the picture holds the target.
+        confirm: least probability of the place, for `found`.
+        over: whether no look follows.
 
     Returns:
-        The evidence, and the box `(4,)` as `(x1, y1, x2, y2)`; 0 and None if no detection overlaps the cell.
+        0 for a search that continues, otherwise the number of its outcome in `OUTCOMES`.
+
+    >>> verified([0.3, 0.96], 0.9, 0.9, over=False), verified([0.92], 0.9, 0.9, over=False)
+    (1, 0)
+    >>> [OUTCOMES[verified([place], presence, 0.9, over=True)] for place, presence in ((0.92, 0.9), (0.2, 0.3))]
+    ['found', 'absent']
     """
-    evidence, box = 0.0, None
-    for seen in looks:
-        weight = grid.footprint(seen.boxes, "soft")[0, :, cell] * seen.mask[0]
-        scores = weight * seen.scores[0, :, target]
-        if scores.numel() and float(scores.max()) > evidence:
-            evidence, box = float(scores.max()), seen.boxes[0, int(scores.argmax())]
-    return evidence, box
-
-
-def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:
-    """Whether a detection over each cell `(B,)` has `target` as its best class with at least this score, `(B,)`."""
-    sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score) & detections.mask
-    there = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
-    return (there & sure).any(-1)
+    best = max(places, default=0.0)
+    if places and best >= (confirm if over else surely(confirm)):
+        return OUTCOMES.index("found")
+    if not over:
+        return 0
+    return OUTCOMES.index("absent") if presence < 0.5 else len(OUTCOMES) - 1
 
 
 def outcome_of(
@@ -269,34 +269,6 @@ def outcome_by_gain(gain: AcquisitionFunction, price: float) -> Callable[[Step],
         return ((best < price) & (price > 0) & ~step.visited.all(-1)).long()
 
     return outcome
-
-
-def goal_cells(boxes: Tensor | Sequence[Sequence[float]], grid: Grid, like: Tensor) -> Tensor:
-    """Cells that boxes overlap; by the protocol of the paper a search ends when it fixates one of them.
-
-    Args:
-        boxes: `(M, 4)`, as `(x1, y1, x2, y2)` in pixels of the image.
-        grid: the cells.
-        like: a tensor that gives dtype and device.
-
-    Returns:
-        `(X·Y,)` boolean.
-
-    Raises:
-        InputError: the shape is wrong, a number is not finite, or a box has no area.
-    """
-    tensor = torch.as_tensor(boxes).to(like)
-    check_shape(tensor, "boxes", None, 4)
-    check(tensor.ndim == 2, "boxes", "shape (M, 4)", tuple(tensor.shape))
-    check_finite(tensor, "boxes")
-    full = bool((tensor[:, 2:] > tensor[:, :2]).all())
-    check(
-        full,
-        "boxes",
-        "(x1, y1, x2, y2) with x1 < x2 and y1 < y2",
-        "others; convert (x, y, width, height) to (x, y, x + width, y + height)",
-    )
-    return grid.footprint(tensor).any(-2)
 
 
 def check_thresholds(confirm: float | None, give_up: float | None) -> None:

@@ -8,10 +8,10 @@ import torch
 from semfov import Detections, Grid
 from semfov.belief import Verification
 from semfov.belief.target_evidence import Thresholds
+from semfov.decision import CandidatePlaces, Verifier
 from semfov.errors import InputError
-from semfov.verifier import CandidatePlaces, Verifier
 from tests.belief.test_verification import overlap
-from tests.test_decision import Known, random_looks
+from tests.decision.test_rule import Known, random_looks
 
 GRID = Grid(4, 3, (160, 120))
 AT = Thresholds(confirm=0.7, give_up=0.1, place=0.3)

@@ -12,13 +12,13 @@ from semfov import ActivePerception, Detections, Eye, Foveation
 from semfov.belief import Verification
 from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
+from semfov.decision import LiveVerifier
 from semfov.detection import Candidates, Detector
 from semfov.episode import Forgetting
 from semfov.errors import InputError
 from semfov.gaze.policies import NonPredictive, Random
-from semfov.live_verifier import LiveVerifier
-from tests.test_decision import Scripted
-from tests.test_verifier import AT, GRID, Closer, Told, box_of, look, step
+from tests.decision.test_rule import Scripted
+from tests.decision.test_verifier import AT, GRID, Closer, Told, box_of, look, step
 
 SURE, GREY = 0.9, torch.full((3, 120, 160), 0.4)
 

@@ -13,7 +13,7 @@ from semfov.detection import Candidates
 from semfov.errors import DataError, InputError
 from semfov.gaze.policies import NonPredictive, Random
 from semfov.scanpath import describe, why_it_ended
-from tests.test_decision import Nothing, Scripted, Square, cells
+from tests.decision.test_rule import Nothing, Scripted, Square, cells
 
 
 class Fine(Square):

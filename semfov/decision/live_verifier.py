@@ -10,11 +10,14 @@ from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import MATCHED, Verification, match
-from semfov.decision import Decision
+from semfov.decision.candidates import SAME, CandidatePlace
+from semfov.decision.closer_look import CloserLook
+from semfov.decision.evidence import cell_of
+from semfov.decision.rule import Decision, surely
+from semfov.decision.verifier import MOST, Examiner
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
 from semfov.observation.matching import box_iou
-from semfov.verifier import MOST, SAME, CandidatePlace, CloserLook, Examiner, cell_of, surely
 
 _SPANS = 2  # spans of `Forgetting` after which nothing is left of a verdict: a quarter of its evidence
 _FLOOR = 1e-6
@@ -37,7 +40,7 @@ class LiveVerifier(Examiner):
     r"""Decides a search in a stream of frames, with closer looks that take the place of looks.
 
     A frame costs one pass of the detector. After each frame the verifier says which place the next frame is spent on
-    (`candidate`), by the rules of `semfov.verifier.Verifier`. The next frame is a look of the fovea if there is none.
+    (`candidate`), by the rules of `semfov.decision.Verifier`. The next frame is a look of the fovea if there is none.
 
     The probabilities of a closer look fade towards the belief. With the rate r of `Forgetting`, after a frames
 

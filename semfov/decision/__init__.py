@@ -1,0 +1,52 @@
+"""Decisions of searches: the rule, the evidence that it rests on, and closer looks at places."""
+
+from semfov.decision.candidates import SAME, CandidatePlace, CandidatePlaces
+from semfov.decision.closer_look import CloserLook
+from semfov.decision.evidence import cell_of, confirms, goal_cells, strength, strongest
+from semfov.decision.live_verifier import LiveVerifier
+from semfov.decision.rule import (
+    NEARLY,
+    OUTCOMES,
+    Decision,
+    Outcome,
+    check_thresholds,
+    conclude,
+    decide,
+    decide_by_price,
+    outcome_by_gain,
+    outcome_of,
+    place_known,
+    settle,
+    surely,
+    verified,
+)
+from semfov.decision.verifier import MOST, Verifier
+
+__all__ = [
+    "MOST",
+    "NEARLY",
+    "OUTCOMES",
+    "SAME",
+    "CandidatePlace",
+    "CandidatePlaces",
+    "CloserLook",
+    "Decision",
+    "LiveVerifier",
+    "Outcome",
+    "Verifier",
+    "cell_of",
+    "check_thresholds",
+    "conclude",
+    "confirms",
+    "decide",
+    "decide_by_price",
+    "goal_cells",
+    "outcome_by_gain",
+    "outcome_of",
+    "place_known",
+    "settle",
+    "strength",
+    "strongest",
+    "surely",
+    "verified",
+]

@@ -1,0 +1,77 @@
+"""What detections show of a target in the cells of a grid."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.detection.detections import Detections
+from semfov.errors import check, check_finite, check_shape
+
+
+def strength(seen: Detections, grid: Grid, target: int) -> Tensor:
+    """Evidence of the detections of one look for the target in each cell, `(X·Y,)`: score times `soft` footprint."""
+    shown = grid.footprint(seen.boxes, "soft")[0] * (seen.mask[0] * seen.scores[0, :, target])[:, None]
+    return shown.amax(0) if len(shown) else shown.sum(0)
+
+
+def strongest(looks: Sequence[Detections], grid: Grid, cell: int, target: int) -> tuple[float, Tensor | None]:
+    """Detection with the strongest evidence for the target in a cell: score times `soft` footprint.
+
+    Args:
+        looks: the detections of each look, batches of one.
+        grid: the cells.
+        cell: the cell.
+        target: class 1..K.
+
+    Returns:
+        The evidence, and the box `(4,)` as `(x1, y1, x2, y2)`; 0 and None if no detection overlaps the cell.
+    """
+    evidence, box = 0.0, None
+    for seen in looks:
+        weight = grid.footprint(seen.boxes, "soft")[0, :, cell] * seen.mask[0]
+        scores = weight * seen.scores[0, :, target]
+        if scores.numel() and float(scores.max()) > evidence:
+            evidence, box = float(scores.max()), seen.boxes[0, int(scores.argmax())]
+    return evidence, box
+
+
+def confirms(detections: Detections, grid: Grid, cell: Tensor, target: int, score: float) -> Tensor:
+    """Whether a detection over each cell `(B,)` has `target` as its best class with at least this score, `(B,)`."""
+    sure = (detections.scores.argmax(-1) == target) & (detections.scores[..., target] >= score) & detections.mask
+    there = grid.footprint(detections.boxes).take_along_dim(cell[:, None, None], -1)[..., 0]
+    return (there & sure).any(-1)
+
+
+def goal_cells(boxes: Tensor | Sequence[Sequence[float]], grid: Grid, like: Tensor) -> Tensor:
+    """Cells that boxes overlap; by the protocol of the paper a search ends when it fixates one of them.
+
+    Args:
+        boxes: `(M, 4)`, as `(x1, y1, x2, y2)` in pixels of the image.
+        grid: the cells.
+        like: a tensor that gives dtype and device.
+
+    Returns:
+        `(X·Y,)` boolean.
+
+    Raises:
+        InputError: the shape is wrong, a number is not finite, or a box has no area.
+    """
+    tensor = torch.as_tensor(boxes).to(like)
+    check_shape(tensor, "boxes", None, 4)
+    check(tensor.ndim == 2, "boxes", "shape (M, 4)", tuple(tensor.shape))
+    check_finite(tensor, "boxes")
+    full = bool((tensor[:, 2:] > tensor[:, :2]).all())
+    check(
+        full,
+        "boxes",
+        "(x1, y1, x2, y2) with x1 < x2 and y1 < y2",
+        "others; convert (x, y, width, height) to (x, y, x + width, y + height)",
+    )
+    return grid.footprint(tensor).any(-2)
+
+
+def cell_of(box: Tensor, grid: Grid) -> int:
+    """The cell that a box `(4,)` covers most (its `soft` footprint)."""
+    return int(grid.footprint(box[None], "soft")[0].argmax())
