@@ -6,7 +6,7 @@
 The arms are: no context; context counted from annotations (the upper reference); the context of each table; and that of
 the same table with its classes permuted at random (the control). The tables give the share of targets found after n
 gaze shifts, and the paired difference from no context with its standard error. A second table is restricted to searches
-whose first look misses the target, where context could matter most. For mosaics: `python -m eval.zoom --contexts`.
+whose first look misses the target, where context could matter most.
 """
 
 import sys

@@ -226,7 +226,7 @@ def make_templates(name: str | None, eye: Eye) -> ClassTemplates:
     return model
 
 
-def make_context(name: str, eye: Eye | ZoomEye) -> ContextPrior:
+def make_context(name: str, eye: Eye) -> ContextPrior:
     """Load a fitted context; check that it knows the detector's classes."""
     prior = ContextPrior.from_pretrained(name)
     prior.check_compatible(eye.detector.classes)

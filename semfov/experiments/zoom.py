@@ -16,33 +16,26 @@ from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation, Scenes
 from semfov.detection.detections import Detections
 from semfov.episode import Stopwatch
-from semfov.errors import DataError, check
+from semfov.errors import DataError
 from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.parts import Record
 from semfov.experiments.run import SceneRun, cache_folder, digest_of
 from semfov.experiments.search_protocol import choose_classes
-from semfov.experiments.settings import Count, Range, Seed, Settings, Side, Weight, Whole, Workers
-from semfov.experiments.setup import make_context, make_detector, make_scenes, make_zoom_observation
+from semfov.experiments.settings import Count, Range, Seed, Settings, Side, Whole, Workers
+from semfov.experiments.setup import make_detector, make_scenes, make_zoom_observation
 from semfov.experiments.zoom_decisions import decide_all
 from semfov.experiments.zoom_orders import oracle, quad_tree, ranked, raster, shuffled, slices
 from semfov.experiments.zoom_store import GlanceStore, StoredGlances, open_scene
 from semfov.io.storage import checksum
 from semfov.observation.matching import box_iou
-from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, ZoomEye
 from semfov.zoom.gist import FOUND
-from semfov.zoom.glances import Glance, Glances, Window, around, half_steps, on_lattice
+from semfov.zoom.glances import Glance, Glances, Window, around, half_steps
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import merge
 from semfov.zoom.observed import ObservedRates
 from semfov.zoom.search import find_everything, look_for
-
-FREE = "ours, free windows"
-"""Name of the way of looking to which contexts are added."""
-
-UNSEEN = 0.02
-"""The overview gives no hint of a class if its highest score is below this."""
 
 SHOWN = 0.3
 """Smallest score with which a look confirms a class."""
@@ -78,9 +71,6 @@ class ZoomConfig(Settings):
         model: fitted evidence by magnification, by name or file (None: the one shipped for the detector).
         observation: observation model by magnification to compare with, by name or file (None: the one shipped for
             the detector, if there is one).
-        contexts: fitted contexts, by name or file; the passes to the first hit are also counted with each context, and
-            with the same context with permuted classes as a control.
-        context_weight: weight of the contexts (`semfov.zoom.WindowContext`).
         seed: random seed of mosaics and random orders.
         out: folder for tables, records and figures.
         cache: folder for the stored looks, shared between runs (None: the user's cache).
@@ -103,8 +93,6 @@ class ZoomConfig(Settings):
     cut: Cut = "keep"
     model: str | None = None
     observation: str | None = None
-    contexts: tuple[str, ...] = ()
-    context_weight: Weight = 1.0
     seed: Seed = 0
     out: Path = Path("runs/zoom")
     cache: Path | None = None
@@ -138,12 +126,6 @@ class ZoomRun(SceneRun):
                 photographs, config.columns, config.rows, tile=size, count=config.mosaics, seed=config.seed
             )
         names = detector.classes
-        self.contexts: dict[str, WindowContext] = {}
-        for each in config.contexts:
-            prior = make_context(each, self.eye)
-            for label, kind in ((Path(each).stem, prior), (f"{Path(each).stem}, permuted", prior.permuted())):
-                check(label not in self.contexts, "contexts", "files of different names", label)
-                self.contexts[label] = WindowContext(kind, config.context_weight)
         self.target = None if config.target is None else class_index(config.target, names, "target")
         self.store = GlanceStore(cache_folder(config.cache) / "glances", self.eye.settings(), len(names))
         self.make_key()
@@ -156,7 +138,6 @@ class ZoomRun(SceneRun):
         settings = asdict(self.config)
         besides = ("out", "cache", "store", "workers", "data", "detector", "model", "observation")
         protocol = {name: value for name, value in settings.items() if name not in besides}
-        protocol["contexts"] = [(name, context.prior.digest()) for name, context in self.contexts.items()]
         evidence = self.evidence
         thresholds = None if evidence.thresholds is None else asdict(evidence.thresholds)
         verified = None if evidence.verification is None else repr(evidence.verification.thresholds)
@@ -248,17 +229,12 @@ class ZoomRun(SceneRun):
             "windows": [list(glance.window.fixation) for glance in seen],
         }
 
-    def _in_context(self, glances: Glances, target: int, context: WindowContext) -> Iterator[Glance]:
-        """Looks at free windows, chosen with context."""
-        for glance, *_ in look_for(glances, self.evidence, target, closest=True, context=context):
-            yield glance
-
     def _first_hits(self, index: int, glances: Glances) -> list[Record]:
         """Count passes until a class that a slice shows is first seen at a slice's magnification or a higher one."""
         cut = self.slices(index, glances.lattice)
         shown = torch.stack([glance.show for glance in glances.see(cut)]) >= SHOWN
         closest = min(window.level for window in cut)
-        limit, overview = len(cut) + 1, glances.see([on_lattice(glances.lattice, (0, 0, 0))])[0]
+        limit = len(cut) + 1
         records: list[Record] = []
         for target in (shown.any(0).nonzero()[:, 0] + 1).tolist():
             ways = {
@@ -267,9 +243,8 @@ class ZoomRun(SceneRun):
                 "slices, ranked by the overview": ranked(glances, cut, target, most=True),
                 "quad-tree, best first": quad_tree(glances, target, most=True),
                 "ours": (glance for glance, *_ in look_for(glances, self.evidence, target, slices=cut)),
-                FREE: (g for g, *_ in look_for(glances, self.evidence, target, closest=True)),
+                "ours, free windows": (g for g, *_ in look_for(glances, self.evidence, target, closest=True)),
             }
-            ways |= {f"context {name}": self._in_context(glances, target, each) for name, each in self.contexts.items()}
             for name, looks in ways.items():
                 passes, hit = 0, False
                 for glance in islice(looks, limit):
@@ -285,7 +260,6 @@ class ZoomRun(SceneRun):
                         "target": self.scenes.classes[target - 1],
                         "passes": passes if hit else limit,
                         "hit": hit,
-                        "overview": float(overview.show[target - 1]),
                     }
                 )
         return records

@@ -1,18 +1,14 @@
 """Runs an experiment with large pictures to its end, and writes its tables and curves."""
 
 from collections import defaultdict
-from collections.abc import Iterable
 from statistics import mean, median
-from typing import Any
 
-import numpy as np
 import torch
 
 from semfov.experiments.parts import Record
-from semfov.experiments.summary import announce, by_scene, complete, table, write_summary
-from semfov.experiments.zoom import FREE, UNSEEN, ZoomConfig, ZoomRun
+from semfov.experiments.summary import announce, complete, table, write_summary
+from semfov.experiments.zoom import ZoomConfig, ZoomRun
 from semfov.experiments.zoom_decisions import decision_tables, probabilities
-from semfov.metrics.averages import standard_error
 from semfov.viz.reliability import plot_reliability
 from semfov.viz.style import save_figure
 
@@ -62,7 +58,6 @@ def summary(records: list[Record], run: ZoomRun) -> str:
             "",
             *table(rows),
             "",
-            *_paired(hits),
         ]
     if decided := [record for record in records if record["measure"] == "decision"]:
         lines += decision_tables(decided)
@@ -88,31 +83,6 @@ def recalls(finding: dict[str, list[Record]], run: ZoomRun) -> list[str]:
         *table(rows),
         "",
     ]
-
-
-def _paired(hits: dict[str, list[Record]]) -> list[str]:
-    """Passes saved by contexts in all searches, and where the overview shows no hint, as lines of Markdown."""
-    contexts = [way for way in hits if way.startswith("context ")]
-    if not contexts:
-        return []
-    rows = [["", "passes saved", "where the overview shows no hint", "searches"]]
-    for way in contexts:
-        pairs = list(zip(hits[FREE], hits[way], strict=True))
-        saved = [(a["scene"], a["passes"] - b["passes"]) for a, b in pairs]
-        unseen = [each for each, (a, _) in zip(saved, pairs, strict=True) if a["overview"] < UNSEEN]
-        rows.append([way, _over_scenes(saved), _over_scenes(unseen), f"{len(saved)}, {len(unseen)}"])
-    return [
-        f"The same searches with and without context ({FREE}), mean ± standard error over pictures.",
-        "",
-        *table(rows),
-        "",
-    ]
-
-
-def _over_scenes(values: Iterable[tuple[Any, float]]) -> str:
-    """Mean over scenes and its standard error."""
-    means = np.array([*by_scene(values).values()])
-    return f"{means.mean():+.3f} ± {float(standard_error(means)):.3f}" if len(means) else ""
 
 
 def _curves(records: list[Record], run: ZoomRun):  # type: ignore[no-untyped-def]

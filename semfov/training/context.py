@@ -58,7 +58,6 @@ def fit_context(config: FitContextConfig) -> None:
     )
     path = model_path(config, "context")
     model.save(path)
-    write_table(inside(config.out, "pictures.csv"), scenes.classes, scenes.classes, shared_pictures(known))
     text = report(judged, weights, len(known), config)
     write_outputs(config, text, ("judged.json", json.dumps(judged, indent=2) + "\n"), path)
 
@@ -163,26 +162,6 @@ def occupation(places: Sequence[Places], smoothing: float) -> Tensor:
         raise DataError("data: no photograph contains a class that may be searched for; raise max_target_area")
     average = (there.sum(0) + 0.5) / (pictures.sum() + 1)
     return (there + smoothing * average) / (pictures[:, None] + smoothing)
-
-
-def shared_pictures(places: Sequence[Places], smoothing: float = 5.0) -> Tensor:
-    r"""Compute how much more often two classes share a picture than chance predicts, for `semfov.zoom.WindowContext`.
-
-    .. math:: v_{tj} = \ln \frac{n_{tj} + s}{n_t n_j / n + s}
-
-    where :math:`n_t` of the n pictures contain class t, and :math:`n_{tj}` contain both classes.
-
-    Args:
-        places: the objects of the pictures.
-        smoothing: s, pictures added to both counts.
-
-    Returns:
-        Log ratios `(K, K)`, NaN on the diagonal.
-    """
-    there = torch.stack([place.occupied.any(0)[1:] for place in places]).float()
-    alone = there.sum(0)
-    ratio = ((there.mT @ there + smoothing) / (alone[:, None] * alone / len(there) + smoothing)).log()
-    return ratio.fill_diagonal_(torch.nan)
 
 
 def count_pairs(places: Sequence[Places], chance: Tensor, edges: Sequence[float]) -> tuple[Tensor, Tensor]:

@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING, Any
 
 from semfov.zoom.agent import ZoomAgent
-from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import ZoomEye, ZoomView
 from semfov.zoom.lattice import Lattice
@@ -17,7 +16,6 @@ __all__ = [
     "GlimpseEvidence",
     "Lattice",
     "Objects",
-    "WindowContext",
     "ZoomAgent",
     "ZoomEye",
     "ZoomPath",

@@ -12,7 +12,6 @@ from semfov.decision import MOST as CLOSER
 from semfov.decision import check_thresholds
 from semfov.detection.load import load_detector
 from semfov.errors import check, check_number, check_whole
-from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.eye import Cut, ZoomEye
 from semfov.zoom.glances import LiveGlances
@@ -34,10 +33,9 @@ class ZoomAgent(nn.Module):
     Args:
         eye: resamples a window and detects in it.
         evidence: predicts from a look what closer looks will find.
-        context: which classes stand beside each other, used in searches; None leaves it out.
 
     Raises:
-        InputError: the evidence or the context was made for other classes, or the evidence for another detector.
+        InputError: the evidence was made for other classes, or for another detector.
 
     Example::
 
@@ -46,16 +44,13 @@ class ZoomAgent(nn.Module):
         print(path.objects.boxes, path.passes)
     """
 
-    def __init__(self, eye: ZoomEye, evidence: GlimpseEvidence, context: WindowContext | None = None) -> None:
+    def __init__(self, eye: ZoomEye, evidence: GlimpseEvidence) -> None:
         super().__init__()
         kinds = len(eye.detector.classes)
         check(evidence.classes == kinds, "evidence", f"one for the detector's {kinds} classes", evidence.classes)
         evidence.check_compatible(eye.settings())
-        if context is not None:
-            context.prior.check_compatible(eye.detector.classes)
         self.eye = eye
         self.evidence = evidence
-        self.context = context
 
     @classmethod
     def recommended(cls, name: str = "yolox-nano", *, finest: float = 1.0, cut: Cut = "keep", **options: Any) -> Self:
@@ -142,7 +137,6 @@ class ZoomAgent(nn.Module):
                 confirm=confirm,
                 give_up=give_up,
                 closer=closer,
-                context=self.context,
             )
 
     def find_all(

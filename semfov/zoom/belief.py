@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence, pool
 from semfov.zoom.gist import Gist
 from semfov.zoom.glances import Glance, Window
@@ -50,7 +49,6 @@ class ZoomBelief:
         lattice: lattice of the picture.
         evidence: learned evidence. An explorer that looks for all objects needs its rates alone.
         target: class 1..K, or 0 for any.
-        context: adds to the log odds of the class by the other classes in a window; None adds nothing.
 
     Attributes:
         source: `(rows, columns)`, level of the closest look at each cell that has closer ones; -1 for none.
@@ -58,8 +56,8 @@ class ZoomBelief:
         gists: gists of the looks so far.
     """
 
-    def __init__(self, lattice: Lattice, evidence: Rates, target: int, context: WindowContext | None = None) -> None:
-        self.lattice, self.target, self.context = lattice, target, context
+    def __init__(self, lattice: Lattice, evidence: Rates, target: int) -> None:
+        self.lattice, self.target = lattice, target
         self._evidence = evidence
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
         self._targets = torch.tensor([target])
@@ -255,7 +253,7 @@ class ZoomBelief:
 
     def _shown(self) -> WindowOdds:
         if self._odds is None:
-            self._odds = WindowOdds(self.lattice, self.evidence, self.target, self.context)
+            self._odds = WindowOdds(self.lattice, self.evidence, self.target)
         if self._judged < len(self._changes):
             self._odds.update(self.gists, self.left.numpy())
             self._judged = len(self._changes)
@@ -284,8 +282,6 @@ class ZoomBelief:
             with torch.no_grad():
                 known = None if value is None or look.level == 0 else value
                 value = self.evidence.presence(pooled[None], summary[None], torch.tensor([steps]), self.target, known)
-                if self.context is not None:
-                    value = value + self.context(pooled[None], self.target)
         self._told[window] = float("-inf") if value is None else float(value)
         return self._told[window]
 

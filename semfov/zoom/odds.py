@@ -8,7 +8,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence, pool_spans
 from semfov.zoom.gist import Gist
 from semfov.zoom.lattice import Lattice
@@ -133,13 +132,10 @@ class WindowOdds:
         lattice: lattice of the picture.
         evidence: learned evidence.
         target: class 1..K.
-        context: adds to the log odds by the other classes in a window; None adds nothing.
     """
 
-    def __init__(
-        self, lattice: Lattice, evidence: GlimpseEvidence, target: int, context: WindowContext | None = None
-    ) -> None:
-        self._lattice, self._evidence, self._target, self._context = lattice, evidence, target, context
+    def __init__(self, lattice: Lattice, evidence: GlimpseEvidence, target: int) -> None:
+        self._lattice, self._evidence, self._target = lattice, evidence, target
         self._looks: list[_Look] = []
         self._left = np.ones((lattice.rows, lattice.columns), np.float32)
         self._odds: dict[int, Cells] = {
@@ -212,8 +208,6 @@ class WindowOdds:
         scores, summary = torch.cat([part.scores for part in parts]), torch.cat([part.summary for part in parts])
         steps = torch.from_numpy(np.repeat([part.level - part.look.gist.level for part in parts], counts))
         facts = self._evidence.hint_facts(scores, summary, steps, self._target)[:, 0]
-        if self._context is not None:
-            facts[:, 5] += self._context(scores, self._target)
         told, start = facts.numpy(), 0
         for part, count in zip(parts, counts, strict=True):
             table = part.look.tables[part.level]

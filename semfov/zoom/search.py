@@ -9,7 +9,6 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.decision import MOST, OUTCOMES, Decision, settle
 from semfov.zoom.belief import Rates, ZoomBelief
 from semfov.zoom.closer import ZoomVerifier
-from semfov.zoom.context import WindowContext
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance, Glances, Window, on_lattice
 from semfov.zoom.objects import merge
@@ -45,7 +44,6 @@ def look_for(
     confirm: float = 0.3,
     slices: Sequence[Window] | None = None,
     closest: bool = False,
-    context: WindowContext | None = None,
 ) -> Iterator[Turn]:
     """Look for one object of a class, look by look, until a look confirms it or nothing is left to look at.
 
@@ -56,12 +54,11 @@ def look_for(
         confirm: score from which on a look confirms the target.
         slices: windows that can confirm the target; None lets windows of all magnifications confirm it.
         closest: whether only windows of the last level can confirm it.
-        context: which classes stand beside each other; None leaves it out.
 
     Yields:
         Each turn.
     """
-    belief, done = ZoomBelief(glances.lattice, evidence, target, context), set[Window]()
+    belief, done = ZoomBelief(glances.lattice, evidence, target), set[Window]()
     window, worth = on_lattice(glances.lattice, (0, 0, 0)), float("inf")
     allowed = None if slices is None else set(slices)
     while True:
@@ -114,7 +111,6 @@ def search(
     confirm: float | None = None,
     give_up: float | None = None,
     closer: int = MOST,
-    context: WindowContext | None = None,
 ) -> ZoomPath:
     """Search a picture for one object of a class and decide whether it is there.
 
@@ -137,7 +133,6 @@ def search(
         give_up: probability that a look shows the target, below which no look is worth a pass; None takes the threshold
             of the evidence.
         closer: largest number of closer looks; 0 decides without them, as does evidence without fitted verification.
-        context: which classes stand beside each other; None leaves it out.
 
     Returns:
         The looks, the objects of the class, and the decision.
@@ -152,7 +147,7 @@ def search(
     values: list[float] = []
     tally: Tally | None = None
     ended, presence = 0, None
-    for glance, value, ahead, belief in look_for(glances, evidence, target, confirm=float("inf"), context=context):
+    for glance, value, ahead, belief in look_for(glances, evidence, target, confirm=float("inf")):
         tally = tally or Tally(belief)
         tally.add(glance)
         seen.append(glance)

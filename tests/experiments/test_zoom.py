@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from semfov.belief import ContextPrior
 from semfov.errors import InputError
 from semfov.experiments import zoom_report
 from semfov.experiments.config import DataConfig
@@ -184,31 +183,3 @@ def test_slices_match_those_of_sahi():
     corners = [window.within for window in windows]
     assert corners[0] == (0, 0, 640, 640)
     assert corners[-1] == (3200, 1520, 3840, 2160)
-
-
-@pytest.mark.slow
-def test_contexts_are_compared_search_by_search(config, tmp_path):
-    generator = torch.Generator().manual_seed(1)
-    pairs = torch.randn(4, 4, 1, generator=generator)
-    prior = ContextPrior(["person", "cat", "cup"], torch.zeros(4, 1, 1), pairs, [])
-    prior.save(tmp_path / "noise.safetensors")
-    config = replace(config, contexts=(str(tmp_path / "noise.safetensors"),), context_weight=5.0)
-    run = ZoomRun(config)
-    assert list(run.contexts) == ["noise", "noise, permuted"]
-    records = [record for index in range(len(run.scenes)) for record in run.outcomes(index)[0]]
-    hits = {}
-    for record in records:
-        if record["measure"] == "first hit":
-            hits.setdefault(record["way"], []).append(record)
-    without, noise = hits["ours, free windows"], hits["context noise"]
-    assert [(r["scene"], r["target"]) for r in noise] == [(r["scene"], r["target"]) for r in without]
-    scenes = {}
-    for a, b in zip(without, noise, strict=True):
-        scenes.setdefault(a["scene"], []).append(a["passes"] - b["passes"])
-    means = [sum(each) / len(each) for each in scenes.values()]
-    text = zoom_report.summary(records, run)
-    row = next(line for line in text.splitlines() if line.startswith("| context noise ") and "±" in line)
-    assert f"{sum(means) / len(means):+.3f} ± " in row
-    plain = replace(config, contexts=())
-    assert ZoomRun(plain).settings_key != run.settings_key
-    assert "± standard error" not in zoom_report.summary([r for r in records if "context" not in r["way"]], run)

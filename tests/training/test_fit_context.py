@@ -9,7 +9,7 @@ import torch
 from semfov import Grid
 from semfov.belief import ContextPrior
 from semfov.belief.context_table import read_table
-from semfov.training.context import count_pairs, cross_fit, judge, occupation, shared_pictures, shrunk_ratio
+from semfov.training.context import count_pairs, cross_fit, judge, occupation, shrunk_ratio
 from semfov.training.context_weights import SIZES, Cases, fit_weights, hit, landed, likeliest_weights
 from semfov.training.places import FitContextConfig, Places
 from train.fit_context import main
@@ -159,24 +159,14 @@ def test_command_writes_a_prior_from_annotations(tmp_path):
     names = ["nothing", "place", "co-occurrence", "both", "both, of other classes"]
     assert [row["context"] for row in rows] == names
     assert "not fitted on looks" in (tmp_path / "report.md").read_text()
-    # The same command accepts its table of counts by pictures.
-    table = ["--table", str(tmp_path / "pictures.csv"), "--source", "pictures", "--name", "shared"]
+    # The same command accepts a table.
+    (tmp_path / "beside.csv").write_text(",dog,cat\nperson,2,1\ndog,,3\n")
+    table = ["--table", str(tmp_path / "beside.csv"), "--source", "guesses", "--name", "shared"]
     assert main([*call[:-1], str(tmp_path / "again"), *table]) == 0
     shared = ContextPrior.from_pretrained(tmp_path / "again" / "shared.safetensors")
-    assert shared.metadata["table"]["source"] == "pictures"
+    assert shared.metadata["table"]["source"] == "guesses"
     assert str(tmp_path) not in json.dumps(shared.metadata)
     assert "From a table" in (tmp_path / "again" / "report.md").read_text()
-
-
-def test_ratios_of_shared_pictures_equal_a_loop_over_classes(places):
-    got = shared_pictures(places, 2.0)
-    sets = [set(place.occupied.any(0).nonzero()[:, 0].tolist()) for place in places]
-    for t in range(1, 4):
-        for j in range(1, 4):
-            both = sum(t in each and j in each for each in sets)
-            alone = sum(t in each for each in sets) * sum(j in each for each in sets) / len(sets)
-            expected = math.nan if t == j else math.log((both + 2) / (alone + 2))
-            assert float(got[t - 1, j - 1]) == pytest.approx(expected, abs=1e-5, nan_ok=True)
 
 
 def test_word_vectors_make_a_table(tmp_path):

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from semfov.belief import ContextPrior
-from semfov.errors import InputError
-from semfov.zoom import GlimpseEvidence, WindowContext, ZoomAgent, ZoomEye
+from semfov.zoom import GlimpseEvidence, ZoomAgent, ZoomEye
 from semfov.zoom.belief import ZoomBelief, before_of
 from semfov.zoom.evidence import pool, pool_all, pool_spans
 from semfov.zoom.gist import Gist
@@ -286,36 +284,6 @@ def test_a_saved_model_is_loaded_unchanged(tmp_path, evidence):
     for target in (1, 2, 3):
         one = same.presence(scores, summary, torch.tensor([1, 1, 2, 2, 3]), target)
         torch.testing.assert_close(one, every[:, target - 1])
-
-
-def test_context_adds_to_the_odds_of_every_window(glances, evidence, belief):
-    pairs = torch.zeros(4, 4, 2)
-    pairs[1, 3] = torch.tensor([2.0, -2.0])  # red objects occur near blue ones
-    prior = ContextPrior(["red", "green", "blue"], torch.zeros(4, 1, 1), pairs, [0.1])
-    context, plain = WindowContext(prior, 1.5), belief
-    known = ZoomBelief(glances.lattice, evidence, 1, context)
-    known.add(glances.see([on_lattice(glances.lattice, (0, 0, 0))])[0])
-    level = glances.lattice.levels - 1
-    gain = known.odds(level) - plain.odds(level)
-    look = known.gists[0]
-    span = glances.lattice.span(level) // look.scale
-    assert bool((look.scores[..., 2] > 0).any())
-    rows, columns = (n - span + 1 for n in look.scores.shape[:2])
-    for row in range(0, rows, 3):
-        for column in range(0, columns, 3):
-            blue = float(look.scores[row : row + span, column : column + span, 2].max())
-            got = float(gain[row * look.scale, column * look.scale])
-            assert got == pytest.approx(1.5 * 2.0 * blue, abs=1e-4)
-    window = on_lattice(glances.lattice, (level, 0, 0))
-    assert known.odds_of(window) == pytest.approx(float(known.odds(level)[0, 0]), abs=1e-4)
-
-
-def test_contexts_of_other_classes_are_refused(detector, evidence):
-    prior = ContextPrior(["a", "b", "c"], torch.zeros(4, 1, 1), torch.zeros(4, 4, 1), [])
-    with pytest.raises(InputError, match="class"):
-        ZoomAgent(ZoomEye(detector), evidence, WindowContext(prior))
-    with pytest.raises(InputError, match="weight"):
-        WindowContext(prior, -1.0)
 
 
 def test_rates_are_the_same_whenever_they_are_asked_for(glances, evidence):
