@@ -33,11 +33,12 @@ from semfov.experiments.config import (
     SensorConfig,
 )
 from semfov.experiments.parallel import rank
-from semfov.experiments.run import finish
 from semfov.experiments.samples import Samples, SampleSettings, collect
+from semfov.experiments.scene_run import finish
 from semfov.experiments.settings import Count, Seed, Settings, Share, Side, Workers
 from semfov.experiments.setup import make_observation, plain, published_model
-from semfov.experiments.summary import announce, table
+from semfov.experiments.summary import announce
+from semfov.experiments.tables import table
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
 from semfov.viz import plot_reliability

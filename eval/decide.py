@@ -27,7 +27,7 @@ from semfov.experiments.config import (
     ProtocolConfig,
     SensorConfig,
 )
-from semfov.experiments.decision_report import SHARES, mean, percent, telling
+from semfov.experiments.decision_report import SHARES, telling
 from semfov.experiments.decisions import (
     AGENT,
     LANDINGS,
@@ -40,9 +40,10 @@ from semfov.experiments.decisions import (
 from semfov.experiments.fitted import with_models
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
-from semfov.experiments.run import finish
+from semfov.experiments.scene_run import finish, gather
 from semfov.experiments.settings import Positive, Workers
-from semfov.experiments.summary import announce, gather, sensing, table
+from semfov.experiments.summary import announce, sensing
+from semfov.experiments.tables import mean, share, table
 from semfov.io.files import write_text
 from semfov.metrics.calibration import calibration_error
 from semfov.viz.presence import plot_roc
@@ -131,12 +132,12 @@ def summary(records: Sequence[Record], sensed: str, prices: Sequence[float]) -> 
         decided.append(
             [
                 name,
-                percent(len(found), len(present)),
-                percent(sum(record["outcome"] == "found" for record in absent), len(absent)),
-                percent(sum(record["outcome"] == "undecided" for record in group), len(group)),
+                share(len(found), len(present)),
+                share(sum(record["outcome"] == "found" for record in absent), len(absent)),
+                share(sum(record["outcome"] == "undecided" for record in group), len(group)),
                 mean([record["looks"] for record in present]),
                 mean([record["looks"] for record in absent]),
-                percent(sum(places), len(places)),
+                share(sum(places), len(places)),
                 mean(expected),
                 mean([record["overlap"] for record in found if record["overlap"] is not None], 2),
             ]
@@ -181,12 +182,12 @@ def sharp_decisions(records: Sequence[Record]) -> list[str]:
     there = [record["sharp_place"]["overlap"] for record in told if record["present"]]
     return [
         "one sharp look",
-        percent(len(there), len(present)),
-        percent(len(told) - len(there), len(records) - len(present)),
+        share(len(there), len(present)),
+        share(len(told) - len(there), len(records) - len(present)),
         "-",
         "1.0",
         "1.0",
-        percent(sum(record["sharp_place"]["right"] for record in told), len(told)),
+        share(sum(record["sharp_place"]["right"] for record in told), len(told)),
         "-",
         mean(there, 2),
     ]

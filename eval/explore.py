@@ -16,8 +16,8 @@ from semfov.experiments.config import ExploreConfig
 from semfov.experiments.explore_report import report
 from semfov.experiments.fitted import with_models
 from semfov.experiments.parallel import rank
-from semfov.experiments.run import finish
 from semfov.experiments.runs import ExploreRun
+from semfov.experiments.scene_run import finish
 
 
 def explore(config: ExploreConfig) -> None:

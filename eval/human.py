@@ -17,7 +17,7 @@ from typing import Any
 
 from semfov.experiments.command import run_command
 from semfov.experiments.parallel import rank
-from semfov.experiments.run import finish
+from semfov.experiments.scene_run import finish
 from semfov.experiments.searching.compare import compare
 from semfov.experiments.searching.config import PeopleSearchConfig
 from semfov.experiments.viewing.config import ViewingConfig

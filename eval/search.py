@@ -16,8 +16,8 @@ from semfov.experiments.command import run_command
 from semfov.experiments.config import SearchConfig
 from semfov.experiments.fitted import with_models
 from semfov.experiments.parallel import rank
-from semfov.experiments.run import finish
 from semfov.experiments.runs import SearchRun
+from semfov.experiments.scene_run import finish
 from semfov.experiments.search_report import report
 
 

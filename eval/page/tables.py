@@ -20,7 +20,7 @@ from eval.page.curves import (
 from eval.page.experiments import DETECTORS, FOVEAE, STUDIES, Experiment
 from semfov.errors import DataError
 from semfov.experiments.presets import label as name_of
-from semfov.experiments.summary import table
+from semfov.experiments.tables import table
 from semfov.metrics.averages import standard_error
 from semfov.metrics.search import random_search
 

@@ -84,7 +84,6 @@ class BeliefCalibrationRun(Run):
         evidence = self._if_shipped(LEARNED, make_target_evidence, belief.target_model)
         evidence_map = self._if_shipped(MAP, make_map_evidence, belief.map_model)
         self.models = replace(self.models, evidence=evidence, map=evidence_map)
-        self.make_key()
         self.observers: dict[str, Observer] = {
             name: self.strategies[label(choice, self.task)].observer for name, choice in ALL_CLASSES.items()
         }

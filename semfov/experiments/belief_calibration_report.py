@@ -16,7 +16,9 @@ from semfov.errors import DataError
 from semfov.experiments.belief_calibration import BANDS, CELLS, MAP, BeliefCalibrationRun
 from semfov.experiments.decisions import LANDINGS, LANDINGS_TOLD, landing_cells
 from semfov.experiments.parts import Record
-from semfov.experiments.summary import gather, sensing, table
+from semfov.experiments.scene_run import gather
+from semfov.experiments.summary import sensing
+from semfov.experiments.tables import table
 from semfov.io.files import write_text
 from semfov.metrics.calibration import BinarySums
 from semfov.viz import plot_cell_reliability

@@ -238,7 +238,32 @@ class ProtocolConfig(Settings):
 
 
 @dataclass(frozen=True)
-class SearchConfig(Settings):
+class LookingConfig(Settings):
+    """Looks at scenes from every cell of a grid.
+
+    Args:
+        data: the scenes.
+        detector: the detector, which is applied to each foveated view.
+        sensor: the foveal sensor.
+        belief: the belief; its columns and rows are the cells.
+        out: folder of the outcomes.
+        cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
+        store: keep detections on disk; false computes them anew in each run (the result is the same).
+        workers: number of processes (None: one per CPU core).
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
+    out: Path = Path("runs/looks")
+    cache: Path | None = None
+    store: bool = True
+    workers: Workers | None = None
+
+
+@dataclass(frozen=True)
+class SearchConfig(LookingConfig):
     """Visual search: find a target class by moving a fovea, and count the gaze shifts that this takes.
 
     Args:
@@ -265,10 +290,6 @@ class SearchConfig(Settings):
         models: folder written by `train.fit_detector`, which defines detector, sensor, grid and fitted models.
     """
 
-    data: DataConfig = field(default_factory=DataConfig)
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    belief: BeliefConfig = field(default_factory=BeliefConfig)
     saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
     protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     policies: tuple[str | PolicyConfig, ...] = (
@@ -282,15 +303,12 @@ class SearchConfig(Settings):
     gaze_model: str | None = None
     templates: str | None = None
     out: Path = Path("runs/search")
-    cache: Path | None = None
-    store: bool = True
-    workers: Workers | None = None
     scanpaths: Whole = 3
     models: Path | None = None
 
 
 @dataclass(frozen=True)
-class ExploreConfig(Settings):
+class ExploreConfig(LookingConfig):
     """Scene exploration: learn what is where by moving a fovea, and count the cells whose class is right.
 
     Args:
@@ -314,10 +332,6 @@ class ExploreConfig(Settings):
         models: folder written by `train.fit_detector`, which defines detector, sensor, grid and fitted models.
     """
 
-    data: DataConfig = field(default_factory=DataConfig)
-    detector: DetectorConfig = field(default_factory=DetectorConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    belief: BeliefConfig = field(default_factory=BeliefConfig)
     saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
     protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(shifts=20))
     policies: tuple[str | PolicyConfig, ...] = (
@@ -334,9 +348,6 @@ class ExploreConfig(Settings):
         "recommended",
     )
     out: Path = Path("runs/explore")
-    cache: Path | None = None
-    store: bool = True
-    workers: Workers | None = None
     models: Path | None = None
 
 

@@ -1,6 +1,6 @@
-"""Measures and formatting that several tables of decisions share."""
+"""How well scores tell whether a target is present, as rows of tables."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from torch import Tensor
 
@@ -26,13 +26,3 @@ def telling(told: Mapping[str, Tensor], there: Tensor) -> list[list[str]]:
         [f"{area_under_roc(score, there):.3f}", *(f"{100 * hits_at(score, there, share):.0f}" for share in SHARES)]
         for score in told.values()
     ]
-
-
-def percent(count: int, total: int) -> str:
-    """`count` in percent of `total`, or a dash where the total is 0."""
-    return f"{100 * count / total:.1f}" if total else "-"
-
-
-def mean(values: Sequence[float], digits: int = 1) -> str:
-    """The mean with `digits` decimal places, or a dash where there are no values."""
-    return f"{sum(values) / len(values):.{digits}f}" if values else "-"

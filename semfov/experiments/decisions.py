@@ -19,17 +19,16 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.belief.verification import Verification
 from semfov.decision import Verifier, conclude, confirms, decide, decide_by_price
 from semfov.detection.detections import Detections
-from semfov.episode import Step, Stopwatch, StoredLooks, rollout
+from semfov.episode import Step, Stopwatch, StoredLooks
 from semfov.errors import InputError, check
 from semfov.experiments.close_ups import CloseUps
 from semfov.experiments.config import DecidingConfig, PolicyConfig, SearchConfig
 from semfov.experiments.parts import Record
 from semfov.experiments.run import Run
-from semfov.experiments.search_protocol import choose_classes
+from semfov.experiments.search_protocol import choose_classes, search_steps
 from semfov.experiments.seeds import generator_for, noise_for
 from semfov.experiments.settings import Positive
 from semfov.experiments.setup import make_observation, make_verification, published_model
-from semfov.gaze.choice import Greedy, drawn_from
 from semfov.gaze.policies import NonPredictive, Predictive, Random, Task
 from semfov.observation.foveal import FovealObservationModel
 from semfov.observation.matching import box_iou
@@ -105,7 +104,6 @@ class DecisionRun(Run):
             self.models = replace(self.models, observation=model)
             published = Strategy(Semantic(len(self.eye.detector.classes) + 1, model), Predictive(model))
             self.compared |= {PUBLISHED: (published, self._by_thresholds), AT_THE_GAZE: (published, at_the_gaze)}
-        self.make_key()
 
     def _by_thresholds(self, step: Step, target: int, grid: Grid) -> Tensor:
         return decide(step, target, self.thresholds)
@@ -237,27 +235,6 @@ def sharp_place(seen: Detections, grid: Grid, target: int, goal: Tensor, boxes: 
     box = seen.boxes[0, int(score.argmax())]
     cell = int(grid.footprint(box[None], "soft")[0].argmax())
     return {"right": bool(goal[cell]), "overlap": overlap(box, boxes)}
-
-
-def search_steps(
-    looks: StoredLooks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
-) -> list[Step]:
-    """Run one search until it decides or all looks are spent.
-
-    Args:
-        looks: the looks at the scene.
-        strategy: observer and policy of the search.
-        target: the class to search for.
-        start: `(1,)`, the first cell.
-        noise: `(1, N, X·Y)`, random numbers that break ties in at most N looks.
-        rule: maps a step to a number `(1,)`; a number above 0 ends the search.
-
-    Returns:
-        The steps of the search.
-    """
-    policy, choice = strategy.policy(target, looks.grid), Greedy(drawn_from(noise))
-    ends: Callable[[Step], Tensor] = lambda step: rule(step) > 0  # noqa: E731
-    return list(rollout(looks, strategy.observer, policy, start, choice, most=noise.shape[1], ends=ends))
 
 
 def quarters(image: Tensor) -> list[Tensor]:

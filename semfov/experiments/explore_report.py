@@ -18,9 +18,9 @@ from semfov.experiments.summary import (
     curve_rows,
     curves_csv,
     sensing,
-    table,
     write_files,
 )
+from semfov.experiments.tables import table
 from semfov.metrics.exploration import success_rate
 from semfov.viz.style import save_figure
 

@@ -21,7 +21,7 @@ from semfov.errors import DataError, check
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.head_store import HeadStore, StoredLooksAround
 from semfov.experiments.parts import Record
-from semfov.experiments.run import SceneRun, cache_folder, digest_of
+from semfov.experiments.scene_run import SceneRun, cache_folder, digest_of
 from semfov.experiments.settings import Count, Positive, Range, Seed, Settings, Share, Weight, Whole, Workers
 from semfov.experiments.setup import make_eye, make_map_evidence, make_scenes, make_target_evidence
 from semfov.gaze.acquisition.base import AcquisitionFunction
@@ -128,7 +128,6 @@ class HeadRun(SceneRun):
         )
         looks = {"eye": self.eye.settings(), "fields": config.fields}
         self.store = HeadStore(cache_folder(config.cache) / "head", looks, len(self.eye.detector.classes))
-        self.make_key()
 
     def _key(self) -> str:
         besides = ("out", "cache", "store", "workers", "data", "detector")

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from semfov.experiments.head import OURS, HeadConfig, HeadRun
 from semfov.experiments.parts import Record
-from semfov.experiments.summary import announce, by_scene, complete, percent, table, write_summary
+from semfov.experiments.scene_run import complete
+from semfov.experiments.summary import announce, by_scene, write_summary
+from semfov.experiments.tables import percent, table
 from semfov.metrics.averages import standard_error
 from semfov.viz.style import line_style, save_figure
 

@@ -1,6 +1,6 @@
 """The protocol of searches: the episodes of a scene, and their results."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +15,7 @@ from semfov.experiments.config import ProtocolConfig
 from semfov.experiments.seeds import generator_for, noise_for
 from semfov.gaze.acquisition import AcquisitionFunction
 from semfov.gaze.choice import Greedy, drawn_from
+from semfov.strategy import Strategy
 
 
 @dataclass(frozen=True)
@@ -197,3 +198,24 @@ def _run_batch(
         visits[number, step.shift + 1] = step.next_cell[going]
         found_at[number[lands(step)[going]]] = step.shift + 1
     return [Outcome(tuple(row[row >= 0].tolist()), int(at)) for row, at in zip(visits, found_at, strict=True)]
+
+
+def search_steps(
+    looks: StoredLooks, strategy: Strategy, target: int, start: Tensor, noise: Tensor, rule: Callable[[Step], Tensor]
+) -> list[Step]:
+    """Run one search until it decides or all looks are spent.
+
+    Args:
+        looks: the looks at the scene.
+        strategy: observer and policy of the search.
+        target: the class to search for.
+        start: `(1,)`, the first cell.
+        noise: `(1, N, X·Y)`, random numbers that break ties in at most N looks.
+        rule: maps a step to a number `(1,)`; a number above 0 ends the search.
+
+    Returns:
+        The steps of the search.
+    """
+    policy, choice = strategy.policy(target, looks.grid), Greedy(drawn_from(noise))
+    ends: Callable[[Step], Tensor] = lambda step: rule(step) > 0  # noqa: E731
+    return list(rollout(looks, strategy.observer, policy, start, choice, most=noise.shape[1], ends=ends))

@@ -23,9 +23,9 @@ from semfov.experiments.summary import (
     curve_rows,
     curves_csv,
     sensing,
-    table,
     write_files,
 )
+from semfov.experiments.tables import table
 from semfov.io.files import clean, inside
 from semfov.metrics.search import cumulative_performance, random_search
 from semfov.viz.style import save_figure

@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import platform
-import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable
@@ -17,11 +16,12 @@ import torch
 import yaml
 from numpy.typing import NDArray
 
-from semfov.errors import DataError
-from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
-from semfov.experiments.run import Run, SceneRun, finish
+from semfov.experiments.run import Run
+from semfov.experiments.scene_run import gather
 from semfov.experiments.setup import fovea_of, plain
+from semfov.experiments.tables import percent
+from semfov.io.code import commit
 from semfov.io.compatibility import recommended
 from semfov.io.files import inside, write_text
 from semfov.io.storage import checksum
@@ -80,20 +80,6 @@ def collect(run: Run) -> tuple[list[Record], dict[str, float]]:
     return records, seconds
 
 
-def complete(run: SceneRun, title: str) -> list[Record] | None:
-    """Run all scenes that are not finished yet.
-
-    Args:
-        run: the run.
-        title: label of the progress bar.
-
-    Returns:
-        The records of all scenes; None in a process of torchrun that does not write the report.
-    """
-    finish(run, title)
-    return gather(run)[0] if rank() == 0 else None
-
-
 def by_scene(values: Iterable[tuple[Any, float]]) -> dict[Any, float]:
     """Mean value of each scene, from pairs of scene and value.
 
@@ -110,20 +96,6 @@ def by_scene(values: Iterable[tuple[Any, float]]) -> dict[Any, float]:
     for scene, value in values:
         scenes[scene].append(value)
     return {scene: float(np.mean(group)) for scene, group in scenes.items()}
-
-
-def gather(run: SceneRun) -> tuple[list[Record], dict[str, float]]:
-    """Records of all scenes in their order, and the seconds that each stage took."""
-    records: list[Record] = []
-    seconds: dict[str, float] = defaultdict(float)
-    for index in range(len(run.scenes)):
-        part = run.parts.load(index)
-        if part is None:
-            raise DataError(f"{run.parts.path(index)} is missing or damaged; run the same command again")
-        records += part["records"]
-        for stage, value in part["seconds"].items():
-            seconds[stage] += value
-    return records, dict(seconds)
 
 
 def write_summary(out: Path, name: str, text: str, records: list[Record]) -> list[Path]:
@@ -200,20 +172,6 @@ LAST_COLUMN = "max. SEM over repetitions"
 """Heading of the last column of `curve_rows`: the largest standard error of the mean over the starts (published)."""
 
 
-def percent(value: float, error: float) -> str:
-    """A share and its standard error in percent, such as `12.3 ± 0.4`."""
-    return f"{100 * value:.1f} ± {100 * error:.1f}" if np.isfinite(error) else f"{100 * value:.1f}"
-
-
-def table(rows: list[list[str]]) -> list[str]:
-    """A Markdown table with aligned columns; the first row holds the headings."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
-    ]
-    return [lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]]
-
-
 def manifest(run: Run, program: str, seconds: dict[str, float]) -> dict[str, object]:
     """Provenance of the results: versions, commit, checksums and seed; and the time that each stage took."""
     return {
@@ -236,20 +194,6 @@ def manifest(run: Run, program: str, seconds: dict[str, float]) -> dict[str, obj
         "seed": run.config.protocol.seed,
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
     }
-
-
-def commit() -> str | None:
-    """Commit of the git checkout, followed by `+` if it has uncommitted changes; None outside a checkout."""
-    folder = Path(__file__).parent
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(folder), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return None
 
 
 def sensing(run: Run) -> str:

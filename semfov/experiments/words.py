@@ -25,11 +25,12 @@ from semfov.experiments.config import (
 )
 from semfov.experiments.parallel import rank
 from semfov.experiments.parts import Record
-from semfov.experiments.run import finish
 from semfov.experiments.runs import SearchRun
+from semfov.experiments.scene_run import finish
 from semfov.experiments.settings import Seed, Settings, Share, Weight, Workers
 from semfov.experiments.setup import plain
-from semfov.experiments.summary import Array, Curve, announce, collect, curve_of, manifest, sensing, table
+from semfov.experiments.summary import Array, Curve, announce, collect, curve_of, manifest, sensing
+from semfov.experiments.tables import table
 from semfov.io.files import clean, inside, write_text
 from semfov.metrics.search import cumulative_performance
 

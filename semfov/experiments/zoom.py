@@ -19,7 +19,7 @@ from semfov.episode import Stopwatch
 from semfov.errors import DataError
 from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.parts import Record
-from semfov.experiments.run import SceneRun, cache_folder, digest_of
+from semfov.experiments.scene_run import SceneRun, cache_folder, digest_of
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.settings import Count, Range, Seed, Settings, Side, Whole, Workers
 from semfov.experiments.setup import make_detector, make_scenes, make_zoom_observation
@@ -128,7 +128,6 @@ class ZoomRun(SceneRun):
         names = detector.classes
         self.target = None if config.target is None else class_index(config.target, names, "target")
         self.store = GlanceStore(cache_folder(config.cache) / "glances", self.eye.settings(), len(names))
-        self.make_key()
 
     def open_scenes(self, classes: tuple[str, ...]) -> Scenes:
         """Open the photographs of the run; a subclass may open others."""

@@ -9,10 +9,10 @@ import torch
 
 from semfov.data.scene import Annotation
 from semfov.decision import MOST, OUTCOMES
-from semfov.experiments.decision_report import SHARES, mean, percent, telling
+from semfov.experiments.decision_report import SHARES, telling
 from semfov.experiments.decisions import overlap
 from semfov.experiments.parts import Record
-from semfov.experiments.summary import table
+from semfov.experiments.tables import mean, share, table
 from semfov.metrics.calibration import BinarySums
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glances, Window
@@ -108,9 +108,9 @@ def decision_tables(records: Sequence[Record]) -> list[str]:
     for way, of in ways.items():
         for kind in (True, False):
             group = [r for r in of if r["present"] is kind]
-            counts = [percent(sum(r["outcome"] == each for r in group), len(group)) for each in OUTCOMES[1:]]
+            counts = [share(sum(r["outcome"] == each for r in group), len(group)) for each in OUTCOMES[1:]]
             found = [r for r in group if r["outcome"] == "found"]
-            right = percent(sum((r["overlap"] or 0) >= 0.5 for r in found), len(found)) if kind else ""
+            right = share(sum((r["overlap"] or 0) >= 0.5 for r in found), len(found)) if kind else ""
             looks, chance = mean([r["passes"] for r in group]), mean([r["probability"] for r in group], 2)
             name = f"it is {'there' if kind else 'not'}{way.removeprefix(OURS)}"
             decided.append([name, counts[0], right, *counts[1:], looks, chance])

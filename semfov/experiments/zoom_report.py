@@ -6,7 +6,9 @@ from statistics import mean, median
 import torch
 
 from semfov.experiments.parts import Record
-from semfov.experiments.summary import announce, complete, table, write_summary
+from semfov.experiments.scene_run import complete
+from semfov.experiments.summary import announce, write_summary
+from semfov.experiments.tables import table
 from semfov.experiments.zoom import ZoomConfig, ZoomRun
 from semfov.experiments.zoom_decisions import decision_tables, probabilities
 from semfov.viz.reliability import plot_reliability

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import subprocess
 import sys
 import sysconfig
 import uuid
@@ -145,3 +146,17 @@ def _of_others(name: str) -> bool:
         return True
     file = _file(top) or _file(name)
     return file is not None and any(file.resolve().is_relative_to(folder) for folder in _LIBRARIES)
+
+
+def commit() -> str | None:
+    """Commit of the git checkout, followed by `+` if it has uncommitted changes; None outside a checkout."""
+    folder = Path(__file__).parent
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(folder), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None

@@ -20,7 +20,7 @@ from semfov.experiments.config import (
 )
 from semfov.experiments.settings import Count, Positive, Range, Seed, Settings, Share, Shifts, Side, Weight
 from semfov.experiments.setup import check_sources, prepare_worker
-from semfov.experiments.summary import table
+from semfov.experiments.tables import table
 from semfov.io import storage
 from semfov.io.files import inside
 from semfov.metrics.averages import standard_error

@@ -16,7 +16,7 @@ from semfov.errors import DataError, check
 from semfov.experiments.parallel import rank
 from semfov.experiments.samples import SampleSettings, collect
 from semfov.experiments.setup import make_scenes
-from semfov.experiments.summary import table
+from semfov.experiments.tables import table
 from semfov.io.files import inside
 from semfov.metrics.averages import standard_error
 from semfov.training.context_weights import fit_weights, make_cases

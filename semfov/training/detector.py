@@ -13,9 +13,10 @@ import yaml
 from semfov.agent import ActivePerception
 from semfov.errors import InputError
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.experiments.looking import Looking, looking_of
 from semfov.experiments.parallel import available_cores, rank
 from semfov.experiments.progress import Whole
-from semfov.experiments.run import finish
+from semfov.experiments.scene_run import finish
 from semfov.experiments.setup import detector_options, plain
 from semfov.io.files import write_text
 from semfov.io.manifest import PARTS, Manifest, place_of
@@ -23,7 +24,6 @@ from semfov.sensor import SENSORS
 from semfov.training.detector_parts.workshop import Workshop
 from semfov.training.detector_report import class_counts, next_commands, report
 from semfov.training.detector_settings import FitDetectorConfig
-from semfov.training.evidence_examples import LookingRun, looking_run
 
 _log = logging.getLogger(__name__)
 
@@ -101,7 +101,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
     """Look at all photographs, fit all parts, and write the model folder with its report and figures."""
     config = config.named()
     started = time.monotonic()
-    run = looking_run(replace(config, out=config.out / "progress"))
+    run = looking_of(replace(config, out=config.out / "progress"))
     shop = Workshop(config, run)
     config = shop.config
     missing = class_counts(run, range(len(run.scenes)))
@@ -125,7 +125,7 @@ def fit_folder(config: FitDetectorConfig) -> None:
     print(f"\nnext:\n{next_commands(config, run)}")
 
 
-def seconds_of_looks(run: LookingRun) -> float:
+def seconds_of_looks(run: Looking) -> float:
     """Estimate the seconds that the remaining looks will take, from the time of one look."""
     left = [index for index in range(len(run.scenes)) if run.store.load(run.digest(index)) is None]
     if not left:
@@ -154,7 +154,7 @@ def _tell(counts: dict[str, int]) -> None:
         )
 
 
-def manifest_of(config: FitDetectorConfig, run: LookingRun, shop: Workshop) -> Manifest:
+def manifest_of(config: FitDetectorConfig, run: Looking, shop: Workshop) -> Manifest:
     """Build the manifest of the model folder.
 
     Args:

@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 
-from semfov.experiments.summary import table
+from semfov.experiments.looking import Looking
+from semfov.experiments.tables import table
 from semfov.training.detector_parts.part import Fitted
 from semfov.training.detector_settings import FitDetectorConfig
-from semfov.training.evidence_examples import LookingRun
 
 TITLES = {
     "observation": "Observation model",
@@ -25,7 +25,7 @@ UNUSED = {"verification": "no, no closer looks"}
 """What the agent does without a part that it does not use, other than to use raw scores."""
 
 
-def class_counts(run: LookingRun, scenes: Any) -> dict[str, int]:
+def class_counts(run: Looking, scenes: Any) -> dict[str, int]:
     """Count the objects of each class in the photographs with the given indices."""
     count = torch.zeros(len(run.scenes.classes) + 1, dtype=torch.int64)
     for index in scenes:
@@ -33,7 +33,7 @@ def class_counts(run: LookingRun, scenes: Any) -> dict[str, int]:
     return dict(zip(run.scenes.classes, count[1:].tolist(), strict=True))
 
 
-def report(config: FitDetectorConfig, run: LookingRun, parts: dict[str, Fitted], seconds: float) -> str:
+def report(config: FitDetectorConfig, run: Looking, parts: dict[str, Fitted], seconds: float) -> str:
     """Write the report as Markdown.
 
     Args:
@@ -105,7 +105,7 @@ def thin_classes(counts: dict[str, int], thin: int) -> list[str]:
     return lines
 
 
-def next_commands(config: FitDetectorConfig, run: LookingRun) -> str:
+def next_commands(config: FitDetectorConfig, run: Looking) -> str:
     """Return example commands that use the model folder."""
     out = fspath(config.out)
     target = max(class_counts(run, range(len(run.scenes))).items(), key=lambda pair: pair[1])[0]

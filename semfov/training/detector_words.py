@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from semfov.experiments.summary import percent, table
+from semfov.experiments.tables import percent, table
 from semfov.gaze.policies import Task
 from semfov.metrics.averages import standard_error
 from semfov.training.held_out import Array, Difference

@@ -15,14 +15,15 @@ from semfov.belief.observers import Target, TargetBelief
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import place_known
 from semfov.episode import Step, rollout
+from semfov.experiments.looking import Looking
 from semfov.experiments.settings import Count, Positive, Share, Weight
-from semfov.experiments.summary import table
+from semfov.experiments.tables import table
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.choice import Exploratory
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.training.descent import descend
-from semfov.training.evidence_examples import ExampleLooks, Examples, LookingRun, make_examples
+from semfov.training.evidence_examples import ExampleLooks, Examples, make_examples
 from semfov.training.frame import Fit, FitOnLooksConfig, fit_and_write, split
 from semfov.training.outputs import training_of
 
@@ -64,7 +65,7 @@ def fit_search(config: FitSearchConfig) -> None:
     fit_and_write(config, fit_evidence)
 
 
-def fit_evidence(config: FitSearchConfig, run: LookingRun) -> Fit[TargetEvidence]:
+def fit_evidence(config: FitSearchConfig, run: Looking) -> Fit[TargetEvidence]:
     """Fit the model and its thresholds.
 
     Args:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -17,53 +16,9 @@ from semfov.belief.observers.target import Target, TargetLook
 from semfov.detection.detections import Detections
 from semfov.episode import Looks, Sight
 from semfov.errors import DataError
-from semfov.experiments.config import BeliefConfig, SearchConfig
-from semfov.experiments.parts import Record
+from semfov.experiments.looking import Looking
 from semfov.experiments.progress import track
-from semfov.experiments.run import Run, finish
 from semfov.experiments.search_protocol import choose_classes
-from semfov.gaze.policies import Task
-
-
-class LookingRun(Run):
-    """A run that looks at every scene from every cell and stores the detections. It has no episodes."""
-
-    task: ClassVar[Task] = "search"
-
-    def outcomes(self, index: int) -> tuple[list[Record], dict[str, float]]:
-        """Look at a scene and return no records."""
-        self.detections(index)
-        return [], {}
-
-
-def looking_run(config: Any) -> LookingRun:
-    """Prepare a run that will look at all photographs of a fit from every cell.
-
-    Args:
-        config: settings of the fit: data, detector, sensor, columns, rows, out, cache and workers.
-
-    Returns:
-        The run, which has not looked yet.
-    """
-    return LookingRun(
-        SearchConfig(
-            data=config.data,
-            detector=config.detector,
-            sensor=config.sensor,
-            belief=BeliefConfig(columns=config.columns, rows=config.rows),
-            policies=("random",),
-            out=config.out,
-            cache=config.cache,
-            workers=config.workers,
-        )
-    )
-
-
-def looking(config: Any) -> LookingRun:
-    """Make a run (`looking_run`) and let it look at all photographs."""
-    run = looking_run(config)
-    finish(run, "looking")
-    return run
 
 
 @dataclass(frozen=True)
@@ -127,7 +82,7 @@ def no_detections() -> Detections:
 
 
 def make_examples(
-    run: LookingRun,
+    run: Looking,
     classes: int,
     max_area: float,
     seed: int,

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from semfov.errors import DataError
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
+from semfov.experiments.looking import Looking, looking_of
 from semfov.experiments.parallel import rank
+from semfov.experiments.scene_run import finish
 from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Workers
 from semfov.io.pretrained import Pretrained
-from semfov.training.evidence_examples import LookingRun, looking
 from semfov.training.outputs import model_path, write_outputs
 
 Model = TypeVar("Model", bound=Pretrained)
@@ -101,14 +102,15 @@ def split(scene: Tensor, holdout: int) -> Tensor:
     return held_out
 
 
-def fit_and_write(config: FitOnLooksConfig, fit: Callable[[Any, LookingRun], Fit[Any]]) -> None:
+def fit_and_write(config: FitOnLooksConfig, fit: Callable[[Any, Looking], Fit[Any]]) -> None:
     """Look from every cell, fit, and write the model, the report, the settings and the measures.
 
     Args:
         config: settings of the fit.
         fit: makes the model from the settings and the finished looks.
     """
-    run = looking(config)
+    run = looking_of(config)
+    finish(run, "looking")
     if rank() > 0:
         return
     fitted = fit(config, run)

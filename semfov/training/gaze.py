@@ -20,7 +20,7 @@ from semfov.experiments.seeds import generator_for
 from semfov.experiments.settings import Count, Name, Positive, Range, Seed, Settings, Share, Side, Weight
 from semfov.experiments.setup import check_sources, fovea_of, make_eye, make_scenes, prepare_worker
 from semfov.experiments.store import versions
-from semfov.experiments.summary import table
+from semfov.experiments.tables import table
 from semfov.eye import Eye
 from semfov.gaze.learned import LearnedGaze
 from semfov.io import storage

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from semfov.experiments.summary import table
+from semfov.experiments.tables import table
 from semfov.gaze.habits import GazeHabits
 from semfov.training.habits import AGES, EDGES, Fitted, Halves
 

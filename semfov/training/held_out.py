@@ -19,16 +19,15 @@ from semfov.decision import OUTCOMES, confirms
 from semfov.episode import Step, StoredLooks
 from semfov.experiments.candidates import Candidate
 from semfov.experiments.config import ProtocolConfig
-from semfov.experiments.decisions import search_steps
 from semfov.experiments.exploration_protocol import explorations_of, explore_noise, run_explorations
+from semfov.experiments.looking import Looking
 from semfov.experiments.progress import track
-from semfov.experiments.search_protocol import choose_classes, episodes_of, run_episodes, tie_noise
+from semfov.experiments.search_protocol import choose_classes, episodes_of, run_episodes, search_steps, tie_noise
 from semfov.experiments.seeds import generator_for, noise_for
 from semfov.metrics.averages import standard_error
 from semfov.metrics.exploration import answers_of, success_rate
 from semfov.metrics.search import cumulative_performance
 from semfov.strategy import Strategy
-from semfov.training.evidence_examples import LookingRun
 
 Array = NDArray[np.float64]
 Ways = Mapping[str, Strategy]
@@ -69,7 +68,7 @@ class Difference:
 
 
 def search_curves(
-    run: LookingRun, scenes: Sequence[int], ways: Ways, protocol: ProtocolConfig, max_area: float
+    run: Looking, scenes: Sequence[int], ways: Ways, protocol: ProtocolConfig, max_area: float
 ) -> dict[str, Array]:
     """Measure the cumulative performance of search strategies on every photograph with a target.
 
@@ -109,7 +108,7 @@ def search_curves(
 
 
 def explore_curves(
-    run: LookingRun, scenes: Sequence[int], ways: Ways, protocol: ProtocolConfig
+    run: Looking, scenes: Sequence[int], ways: Ways, protocol: ProtocolConfig
 ) -> dict[str, dict[str, Array]]:
     """Measure the share of cells that exploration strategies classify correctly.
 
@@ -177,7 +176,7 @@ class Decided:
 
 
 def decisions(
-    run: LookingRun,
+    run: Looking,
     scenes: Sequence[int],
     ways: Mapping[str, tuple[Strategy, Rule]],
     protocol: ProtocolConfig,

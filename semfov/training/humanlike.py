@@ -27,8 +27,8 @@ from semfov.experiments.config import (
 )
 from semfov.experiments.looks import see_all
 from semfov.experiments.presets import SALIENCY, label, resolve
-from semfov.experiments.run import cache_folder
 from semfov.experiments.saliency_store import saliency_table
+from semfov.experiments.scene_run import cache_folder
 from semfov.experiments.settings import Count, Name, Positive, Settings
 from semfov.experiments.setup import fovea_of, make_eye, prepare_worker
 from semfov.experiments.store import DetectionStore

@@ -14,14 +14,14 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers import LearnedMap, MapBelief
 from semfov.episode import Step, rollout
 from semfov.errors import check
+from semfov.experiments.looking import Looking
 from semfov.experiments.settings import Count, Range, Share
-from semfov.experiments.summary import table
+from semfov.experiments.tables import table
 from semfov.gaze.acquisition import CloserLook
 from semfov.gaze.choice import Exploratory
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.exploration import answers_of
 from semfov.training.descent import descend
-from semfov.training.evidence_examples import LookingRun
 from semfov.training.frame import Fit, FitOnLooksConfig, fit_and_write, split
 from semfov.training.map_examples import MapExampleLooks, MapExamples, make_map_examples
 from semfov.training.outputs import training_of
@@ -57,7 +57,7 @@ def fit_map(config: FitMapConfig) -> None:
     fit_and_write(config, fit_map_evidence)
 
 
-def fit_map_evidence(config: FitMapConfig, run: LookingRun) -> Fit[MapEvidence]:
+def fit_map_evidence(config: FitMapConfig, run: Looking) -> Fit[MapEvidence]:
     """Fit the model.
 
     Args:
@@ -83,7 +83,7 @@ def fit_map_evidence(config: FitMapConfig, run: LookingRun) -> Fit[MapEvidence]:
     return Fit(model, judged, *counts, report(judged, *counts))
 
 
-def frequencies(run: LookingRun, holdout: int) -> Tensor:
+def frequencies(run: Looking, holdout: int) -> Tensor:
     """Count how often a cell contains each class in the training photographs.
 
     Args:

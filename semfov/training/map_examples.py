@@ -13,10 +13,11 @@ from semfov.belief.observers import LearnedMap, MapLook, Observer
 from semfov.belief.observers.base import own
 from semfov.episode import Looks, Sight
 from semfov.errors import DataError
+from semfov.experiments.looking import Looking
 from semfov.experiments.progress import track
 from semfov.experiments.seeds import generator_for
 from semfov.metrics.exploration import answers_of
-from semfov.training.evidence_examples import LookingRun, no_detections
+from semfov.training.evidence_examples import no_detections
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class MapExampleLooks(Looks):
         return Sight(look, no_detections, {})
 
 
-def make_map_examples(run: LookingRun, classes: int, others: int, seed: int) -> MapExamples:
+def make_map_examples(run: Looking, classes: int, others: int, seed: int) -> MapExamples:
     """Make examples from all photographs with objects.
 
     Args:

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from semfov.experiments.samples import Samples
 from semfov.experiments.setup import plain
-from semfov.experiments.summary import commit, table
+from semfov.experiments.tables import table
+from semfov.io.code import commit
 from semfov.io.files import write_text
 from semfov.metrics.calibration import Calibration, calibration
 from semfov.observation.foveal import FovealObservationModel

@@ -19,7 +19,7 @@ from semfov.experiments.progress import track
 from semfov.experiments.samples import Sampler, Samples, SampleSettings, collect
 from semfov.experiments.settings import Count, Positive, Range, Seed, Settings, Share, Side, Whole, Workers
 from semfov.experiments.setup import make_observation
-from semfov.experiments.summary import table
+from semfov.experiments.tables import table
 from semfov.observation.foveal import FovealObservationModel
 from semfov.training.outputs import write_outputs
 

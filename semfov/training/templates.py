@@ -18,7 +18,7 @@ from semfov.errors import DataError
 from semfov.experiments.config import DataConfig, DetectorConfig
 from semfov.experiments.settings import Name, Range, Settings
 from semfov.experiments.setup import make_detector, make_scenes, prepare_worker
-from semfov.experiments.summary import table
+from semfov.experiments.tables import table
 from semfov.gaze.templates import ClassTemplates, at_points, unit
 from semfov.training.outputs import model_path, training_of, write_outputs
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from semfov.errors import DataError
 from semfov.experiments.photograph_store import PhotographStore
-from semfov.experiments.run import cache_folder
+from semfov.experiments.scene_run import cache_folder
 from semfov.experiments.setup import make_eye, make_scenes, make_target_evidence
 from semfov.training.closer_looks import photographs
 from semfov.training.outputs import model_path, training_of, write_outputs

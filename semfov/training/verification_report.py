@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semfov.experiments.decision_report import mean, percent
-from semfov.experiments.summary import table
+from semfov.experiments.tables import mean, share, table
 from semfov.metrics.calibration import calibration_error
 from semfov.metrics.presence import area_under_roc
 from semfov.training.verification_decisions import Ended
@@ -98,7 +97,7 @@ def _row(present: Sequence[bool], ended: Sequence[Ended]) -> list[str]:
     for kind in (True, False):
         of_kind = [each for each, there in zip(ended, present, strict=True) if there == kind]
         found = [right for right, _ in of_kind if right is not None]
-        shares.append(percent(len(found), len(of_kind)))
+        shares.append(share(len(found), len(of_kind)))
         looks.append(mean([end for _, end in of_kind]))
         places += found
-    return [*shares, percent(sum(places), len(places)), *looks]
+    return [*shares, share(sum(places), len(places)), *looks]

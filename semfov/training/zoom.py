@@ -13,9 +13,9 @@ from semfov.data.crowded import Crowded
 from semfov.data.mosaics import Mosaics
 from semfov.errors import check
 from semfov.experiments.parallel import available_cores, run_tasks
-from semfov.experiments.run import cache_folder
+from semfov.experiments.scene_run import cache_folder
 from semfov.experiments.setup import make_detector, prepare_worker, split_photographs
-from semfov.experiments.summary import table
+from semfov.experiments.tables import table
 from semfov.experiments.zoom_store import GlanceStore, open_scene
 from semfov.io.files import inside
 from semfov.training.outputs import training_of, write_outputs

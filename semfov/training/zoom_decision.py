@@ -14,7 +14,7 @@ from tqdm import tqdm
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import Annotation
 from semfov.experiments.search_protocol import choose_classes
-from semfov.experiments.summary import table
+from semfov.experiments.tables import table
 from semfov.experiments.zoom_store import StoredGlances
 from semfov.metrics.calibration import BinarySums
 from semfov.metrics.presence import area_under_roc

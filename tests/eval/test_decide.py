@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from eval.decide import DecideConfig, main, mean, percent, search_and_decide, summary, utility
+from eval.decide import DecideConfig, main, mean, search_and_decide, share, summary, utility
 from semfov.belief import TargetEvidence
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import OUTCOMES
@@ -211,5 +211,5 @@ def test_the_table_counts_closer_looks():
 
 
 def test_shares_and_means_of_nothing_are_shown_as_a_dash():
-    assert (percent(1, 8), percent(0, 3), percent(0, 0)) == ("12.5", "0.0", "-")
+    assert (share(1, 8), share(0, 3), share(0, 0)) == ("12.5", "0.0", "-")
     assert (mean([1, 2]), mean([0.125], 2), mean([])) == ("1.5", "0.12", "-")

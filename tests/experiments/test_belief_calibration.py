@@ -20,7 +20,7 @@ from semfov.experiments.config import (
     SearchConfig,
     SensorConfig,
 )
-from semfov.experiments.run import finish
+from semfov.experiments.scene_run import finish
 from semfov.experiments.search_protocol import choose_classes
 from semfov.experiments.seeds import generator_for, noise_for
 from semfov.experiments.setup import make_eye, published_model

@@ -15,11 +15,11 @@ import torch
 from eval.search import main
 from semfov.errors import InputError
 from semfov.experiments import run as run_module
+from semfov.experiments import scene_run
 from semfov.experiments.config import BeliefConfig, DataConfig, PolicyConfig, ProtocolConfig, SearchConfig
 from semfov.experiments.parts import Parts
-from semfov.experiments.run import finish
 from semfov.experiments.runs import SearchRun
-from semfov.experiments.summary import gather
+from semfov.experiments.scene_run import finish, gather
 from semfov.gaze.acquisition import TargetPosterior
 from semfov.gaze.policies import POLICIES, Policy
 
@@ -55,7 +55,7 @@ def test_a_run_finished_by_other_code_is_reported_and_computed_again(config, mon
     assert first.parts.load(0) is not None
     finish(SearchRun(config), "searching")
     assert not caplog.records
-    monkeypatch.setattr(run_module, "package_digest", lambda: "0" * 64)
+    monkeypatch.setattr(scene_run, "package_digest", lambda: "0" * 64)
     second = SearchRun(config)
     assert second.settings_key == first.settings_key
     assert second.key != first.key
@@ -184,6 +184,6 @@ def test_parts_of_other_library_versions_are_not_loaded(config, monkeypatch):
     run = SearchRun(config)
     finish(run, "searching")
     assert gather(run)[0]
-    monkeypatch.setattr(run_module, "versions", lambda: {"torch": "another"})
+    monkeypatch.setattr(scene_run, "versions", lambda: {"torch": "another"})
     other = SearchRun(config)
     assert other.parts.load(0) is None

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from semfov.experiments import explore_report, search_report
-from semfov.experiments.summary import LAST_COLUMN, curve_of, curve_rows, curves_csv, percent
+from semfov.experiments.summary import LAST_COLUMN, curve_of, curve_rows, curves_csv
+from semfov.experiments.tables import percent
 from semfov.metrics.exploration import success_rate
 
 # Gaze shift at which each search found its target (-1: not found), by image and repetition.

@@ -13,13 +13,12 @@ from semfov.belief.grid import Grid
 from semfov.data.fixations import Fixations, by_picture
 from semfov.errors import DataError, check
 from semfov.experiments.parallel import rank
-from semfov.experiments.run import finish
+from semfov.experiments.scene_run import finish, gather
 from semfov.experiments.searching.config import PeopleSearchConfig
 from semfov.experiments.searching.report import report
 from semfov.experiments.searching.run import PeopleSearchRun
 from semfov.experiments.searching.scores import Beside, People
 from semfov.experiments.searching.trials import drawn_searches, read_searches
-from semfov.experiments.summary import gather
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,9 @@ from semfov.data.fixations import Fixations, write_table
 from semfov.experiments.searching.config import PeopleSearchConfig
 from semfov.experiments.searching.scores import DIMENSIONS, Beside
 from semfov.experiments.setup import plain
-from semfov.experiments.summary import announce, commit, table
+from semfov.experiments.summary import announce
+from semfov.experiments.tables import table
+from semfov.io.code import commit
 from semfov.io.files import clean, sha256, write_text
 from semfov.version import __version__
 from semfov.viz.style import save_figure

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from semfov.experiments.summary import announce, gather, sensing, table, write_files
+from semfov.experiments.scene_run import gather
+from semfov.experiments.summary import announce, sensing, write_files
+from semfov.experiments.tables import table
 from semfov.experiments.viewing.rows import PEOPLE, Half
 from semfov.experiments.viewing.run import ViewingRun
 from semfov.experiments.viewing.scores import FIGURES, Scored

@@ -26,8 +26,9 @@ from semfov.experiments.candidates import Candidate
 from semfov.experiments.config import PolicyConfig
 from semfov.experiments.looks import one_thread
 from semfov.experiments.parts import Record
-from semfov.experiments.run import Run, cache_folder
+from semfov.experiments.run import Run
 from semfov.experiments.saliency_store import SALIENCY_MODELS
+from semfov.experiments.scene_run import cache_folder
 from semfov.experiments.viewing.config import ViewingConfig
 from semfov.experiments.viewing.follow import FineLooks, MapStore, follow
 from semfov.experiments.viewing.raster import Events, enlarged, events_of

@@ -12,6 +12,7 @@ import torch
 
 from semfov.belief.observers import Observer, Semantic
 from semfov.experiments.config import ProtocolConfig
+from semfov.experiments.looking import Looking
 from semfov.experiments.samples import Samples
 from semfov.experiments.seeds import generator_for
 from semfov.gaze.policies import Policy
@@ -21,7 +22,6 @@ from semfov.model_folder import KINDS, Model
 from semfov.observation.foveal import FovealObservationModel
 from semfov.strategy import Strategy
 from semfov.training.detector_settings import FitDetectorConfig
-from semfov.training.evidence_examples import LookingRun
 
 SHIFTS = 5
 """Gaze shifts after which searches and explorations are compared."""
@@ -52,7 +52,7 @@ class Bench:
         run: the finished looks from every cell of all photographs.
     """
 
-    def __init__(self, config: FitDetectorConfig, run: LookingRun) -> None:
+    def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
         self.config, self.run = config.sized(len(run.scenes)), run
         self.components = len(run.scenes.classes) + 1
         self.holdout = self.config.observation.holdout

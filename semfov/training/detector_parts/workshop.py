@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from semfov.errors import DataError, InputError
-from semfov.experiments.run import digest_of
+from semfov.experiments.looking import Looking
+from semfov.experiments.scene_run import digest_of
 from semfov.io.files import sha256, write_text
 from semfov.io.manifest import Part
 from semfov.training.detector_parts.evidence import EvidenceFit
@@ -18,7 +19,6 @@ from semfov.training.detector_parts.part import Bench, Fitted, PartFit
 from semfov.training.detector_parts.tempering import TemperingFit
 from semfov.training.detector_parts.verification import VerificationFit
 from semfov.training.detector_settings import FitDetectorConfig
-from semfov.training.evidence_examples import LookingRun
 
 FITS: tuple[type[PartFit], ...] = (ObservationFit, TemperingFit, EvidenceFit, VerificationFit, MapFit)
 """The fits of all parts, in the order of `semfov.io.manifest.PARTS`."""
@@ -32,7 +32,7 @@ class Workshop:
         run: the finished looks from every cell of all photographs.
     """
 
-    def __init__(self, config: FitDetectorConfig, run: LookingRun) -> None:
+    def __init__(self, config: FitDetectorConfig, run: Looking) -> None:
         self.bench = Bench(config, run)
         self.fits = {each.name: each(self.bench) for each in FITS}
 

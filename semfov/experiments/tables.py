@@ -1,0 +1,28 @@
+"""Tables in Markdown, and the figures in their cells."""
+
+import math
+from collections.abc import Sequence
+
+
+def table(rows: list[list[str]]) -> list[str]:
+    """A Markdown table with aligned columns; the first row holds the headings."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
+    ]
+    return [lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]]
+
+
+def percent(value: float, error: float) -> str:
+    """A share and its standard error in percent, such as `12.3 ± 0.4`."""
+    return f"{100 * value:.1f} ± {100 * error:.1f}" if math.isfinite(error) else f"{100 * value:.1f}"
+
+
+def share(count: int, total: int) -> str:
+    """`count` in percent of `total`, or a dash where the total is 0."""
+    return f"{100 * count / total:.1f}" if total else "-"
+
+
+def mean(values: Sequence[float], digits: int = 1) -> str:
+    """The mean with `digits` decimal places, or a dash where there are no values."""
+    return f"{sum(values) / len(values):.{digits}f}" if values else "-"
