@@ -20,7 +20,7 @@ from eval.decide import DecideConfig, search_and_decide
 from eval.explore import explore
 from eval.page import paper
 from eval.page.curves import OBJECTS
-from eval.page.experiments import CENTRAL, STUDIES, ResultsConfig, experiments
+from eval.page.experiments import STUDIES, ResultsConfig, experiments
 from eval.page.figures import draw_figures
 from eval.page.findings import findings
 from eval.page.tables import (
@@ -42,7 +42,6 @@ from eval.search import search
 from semfov.errors import DataError, lookup
 from semfov.experiments.command import run_command
 from semfov.experiments.config import ExploreConfig, SearchConfig
-from semfov.experiments.presets import label
 from semfov.io.files import write_text
 
 NOT_RUN = ["*Not run yet.*"]
@@ -111,7 +110,6 @@ TABLES: dict[str, Callable[[Path], list[str]]] = {
     "agreement": agreement,
     "first-fixations": first_fixations,
     "paired-search": partial(paired, baseline="random", shifts=(1, 5, 15, 30)),
-    "paired-learned": partial(paired, baseline=label(CENTRAL, "search"), shifts=(1, 5, 10, 15, 30)),
     "paired-explore": partial(paired, baseline="random-raw", shifts=EXPLORED),
     "paired-explore-calibrated": partial(paired, baseline="random-calibrated", shifts=EXPLORED),
     "presence": partial(told_table, "decisions.md", 0),

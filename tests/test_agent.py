@@ -13,8 +13,7 @@ from semfov.detection import Detections
 from semfov.episode import STAGES
 from semfov.errors import InputError
 from semfov.eye import Eye
-from semfov.gaze import LearnedGaze
-from semfov.gaze.policies import KL, Learned, NonPredictive, Predictive, Random
+from semfov.gaze.policies import KL, NonPredictive, Predictive, Random
 from semfov.sensor import foveate
 from tests.small import Coloured
 
@@ -172,25 +171,6 @@ def test_a_model_shared_by_observer_and_policy_is_stored_once(image):
     twin = copy.deepcopy(agent)
     assert twin.exploring.policy.model is twin.searching.policy.model is twin.searching.observer.observation
     assert twin.exploring.observer is twin.searching.observer
-
-
-def test_a_learned_policy_reads_the_belief_of_its_observer(image):
-    torch.manual_seed(0)
-    gaze = LearnedGaze(4).requires_grad_(False)
-    torch.nn.init.normal_(gaze.network[-1].weight)
-    agent = ActivePerception(
-        squares_eye(), (gaze.observer(3), Learned(gaze)), (Semantic(3), Random()), grid=(8, 6)
-    ).eval()
-    scanpath = agent.search(image, "green", start=0, shifts=3, boxes=torch.tensor([[0.0, 119, 1, 120]]))
-    grid, observer = Grid(8, 6, SIZE), gaze.observer(3)
-    belief, visited = observer.start(1, grid, image), torch.zeros(1, 48, dtype=torch.bool)
-    for number, fixation in enumerate(scanpath.fixations):
-        belief = observer(belief, scanpath.detections[number], fixation[None], grid)
-        visited[0, scanpath.cells[number]] = True
-        torch.testing.assert_close(gaze(belief, visited, 2, 8)[0], scanpath.values[number])
-        left = scanpath.values[number].masked_fill(visited[0], -torch.inf)
-        if number < scanpath.shifts:
-            assert left.argmax() == scanpath.cells[number + 1]
 
 
 def test_same_seed_same_scanpath(agent, image):

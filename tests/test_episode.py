@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from torch import nn
 
 import semfov
 from semfov import FovealObservationModel, Foveation, Grid, InputError
@@ -16,10 +15,10 @@ from semfov.belief.observers import Context, Semantic, Target
 from semfov.detection import Detections, Selection
 from semfov.episode import STAGES, LiveLooks, Looks, Sight, StoredLooks, rollout
 from semfov.eye import Eye
-from semfov.gaze import Choice, Given, Greedy, LearnedGaze, Relaxed, soft_fixation
+from semfov.gaze import Choice, Given, Greedy, Relaxed, soft_fixation
 from semfov.gaze.acquisition import AcquisitionFunction, Static, TargetPosterior, Uniform
 from semfov.gaze.choice import drawn_by, drawn_from
-from semfov.gaze.policies import KL, Learned, NonPredictive, Random
+from semfov.gaze.policies import KL, NonPredictive, Random
 from tests.small import Coloured
 
 GRID = Grid(3, 2, (90, 60))
@@ -370,14 +369,6 @@ def tensors_of(instance):
     return found
 
 
-def learned_gaze():
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        gaze = LearnedGaze(4).requires_grad_(False)
-        nn.init.normal_(gaze.network[-1].weight)
-    return gaze
-
-
 def observed():
     names = [f"class {number}" for number in range(1, 21)]
     alpha = 0.5 + 4 * rand(21, 2, 21) + 3 * torch.eye(21)[:, None]
@@ -387,7 +378,7 @@ def observed():
 STRATEGIES = {
     "map, non-predictive": lambda: (Semantic(21), NonPredictive()),
     "map with misses, non-predictive": lambda: (Semantic(21, observed(), misses=observed()), NonPredictive()),
-    "soft map, learned": lambda: (Semantic(21, tempering=0.25, footprint="soft"), Learned(learned_gaze())),
+    "soft map, non-predictive": lambda: (Semantic(21, tempering=0.25, footprint="soft"), NonPredictive()),
     "closest look, kl": lambda: (Semantic(21, memory="closest"), KL(observed())),
     "target, non-predictive": lambda: (Target(evidence()), NonPredictive()),
     "context of a map, non-predictive": lambda: (Context(Semantic(21), context(20).float()), NonPredictive()),

@@ -66,6 +66,16 @@ def test_own_policy_needs_fewer_gaze_shifts(run):
     assert found[0][2] == found[1][2] != "0"
 
 
+def test_learned_gaze_finds_more_than_random_gaze(run):
+    output = run("learned_gaze", "--scenes", 2, "--steps", 50)
+    found = re.findall(r"^([\w-]+): of (\d+) targets .* (\d+) % within 1, (\d+) % within 3", output, re.MULTILINE)
+    assert [name for name, *_ in found] == ["random", "learned", "non-predictive"]
+    assert len({count for _, count, *_ in found} - {"0"}) == 1
+    random, learned, _ = found
+    assert int(learned[2]) > int(random[2]) + 10
+    assert int(learned[3]) > int(random[3]) + 10
+
+
 def test_own_sensor_recognises_objects_too_small_for_the_published_fovea(run):
     output = run("own_sensor")
     found = re.findall(r"^([\w ]+): (\d+) of (\d+) objects are recognised when they are fixated$", output, re.MULTILINE)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import semfov
-from semfov.belief import ContextPrior, DirichletBelief
+from semfov.belief import ContextPrior
 from semfov.io.compatibility import learned_for, recommended
 from semfov.presets import PUBLISHED_SENSORS
 from semfov.sensor import SENSORS
@@ -18,7 +18,6 @@ OBSERVATION = sorted(semfov.FovealObservationModel.shipped.glob("*.safetensors")
 TARGET = sorted(semfov.TargetEvidence.shipped.glob("*.safetensors"))
 MAPS = sorted(semfov.MapEvidence.shipped.glob("*.safetensors"))
 ZOOM = sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
-GAZE = sorted(semfov.gaze.LearnedGaze.shipped.glob("*.safetensors"))
 
 
 @pytest.mark.parametrize("path", OBSERVATION, ids=lambda path: path.stem)
@@ -102,23 +101,6 @@ def test_shipped_context_priors(path):
     assert bool((prior.cooccurrence.diagonal() == 0).all())
     text = json.dumps(prior.metadata)
     assert "/" not in text.replace("://", "")
-
-
-def test_shipped_learned_gaze():
-    assert [path.stem for path in GAZE] == ["yolov3-tiny"]
-    gaze = semfov.gaze.LearnedGaze.from_pretrained("yolov3-tiny")
-    assert GAZE[0].stat().st_size < 20_000
-    assert gaze.metadata["detector"]["name"] == "yolov3-tiny"
-    assert "/" not in json.dumps(gaze.metadata)
-    # The gaze goes to the cell where the target was detected, not to the visited cell.
-    start = gaze.observer(81).start(1, semfov.Grid(10, 10, (640, 480)), torch.empty(0))
-    for cell in (0, 37, 99):
-        beta, visited = start.beta.clone(), torch.zeros(1, 100, dtype=torch.bool)
-        beta[0, cell, 7] += 1
-        visited[0, 50] = True
-        closest = (torch.arange(100) - 50.0).abs()[None] / 100
-        with torch.no_grad():
-            assert gaze(DirichletBelief(beta, closest), visited, 7, 10).argmax() == cell
 
 
 def test_shipped_class_templates():

@@ -15,7 +15,6 @@ from torch import Tensor
 from benchmarks.fuzz.runner import attempt, choose, draw_rng, failed, outcome
 from semfov import FovealObservationModel, TargetEvidence
 from semfov.belief import ContextPrior
-from semfov.gaze.learned import LearnedGaze
 from semfov.io import storage
 from semfov.io.pretrained import Pretrained
 
@@ -114,10 +113,4 @@ def _context() -> Pretrained:
     return ContextPrior(CLASSES, torch.zeros(3, 2, 2), torch.zeros(3, 3, 2), [0.1], weights={"map": (1.0, 0.5)})
 
 
-def _gaze() -> Pretrained:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        return LearnedGaze(2)
-
-
-_MODELS: tuple[Callable[[], Pretrained], ...] = (_observation, _evidence, _context, _gaze)
+_MODELS: tuple[Callable[[], Pretrained], ...] = (_observation, _evidence, _context)

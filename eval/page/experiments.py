@@ -30,7 +30,7 @@ FOVEAE: dict[SensorName, str] = {"published": "wide", "published-narrow": "narro
 """Published sensors, in the paper's words."""
 
 CENTRAL = PolicyConfig("non-predictive", tempering=0.25, footprint="box_centre")
-"""Non-predictive search with manually chosen settings, from which the learned gaze policy was initialised."""
+"""Non-predictive search with manually chosen settings."""
 
 GUIDED = (
     PolicyConfig("non-predictive", "calibrated", saliency="vocus2"),
@@ -245,8 +245,6 @@ def _measured(config: ResultsConfig) -> Iterator[tuple[str, Experiment]]:
         yield f"beliefs-{name}", CalibrationConfig(**every)
         yield f"beyond-explore-{name}", tour(policies=BEYOND_EXPLORATION)
         yield f"beyond-explore-published-{name}", tour(policies=BEYOND_EXPLORATION, sensor=sensor)
-        if name == "tiny":
-            yield "learned-tiny", seek(policies=(CENTRAL, "learned"))
 
 
 def _studies(config: ResultsConfig) -> Iterator[tuple[str, RunConfig]]:

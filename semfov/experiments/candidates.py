@@ -16,7 +16,6 @@ from semfov.experiments.config import BeliefConfig, PolicyConfig, RunConfig, Sea
 from semfov.experiments.presets import IVSN, SALIENCY, TARGET_EVIDENCE, resolve
 from semfov.experiments.setup import (
     make_context,
-    make_learned_gaze,
     make_map_evidence,
     make_observation,
     make_target_evidence,
@@ -24,7 +23,6 @@ from semfov.experiments.setup import (
 )
 from semfov.eye import Eye
 from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static, TemplateAttention
-from semfov.gaze.learned import LearnedGaze
 from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, Task, named_policy, wanted
 from semfov.gaze.templates import ClassTemplates
 from semfov.observation.foveal import FovealObservationModel
@@ -77,7 +75,6 @@ class Models:
     observation: FovealObservationModel | None = None
     evidence: TargetEvidence | None = None
     context: Mapping[str, ContextPrior] = field(default_factory=dict)
-    gaze: LearnedGaze | None = None
     map: MapEvidence | None = None
     templates: ClassTemplates | None = None
 
@@ -87,7 +84,6 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
     check(len(config.policies) > 0, "policies", "at least one policy", "none")
     policies = [resolve(choice, task) for choice in config.policies]
     belief = config.belief
-    gazes = any(policy.policy in POLICIES and POLICIES[policy.policy].needs_gaze for policy in policies)
     return Models(
         make_observation(belief.model, eye) if needs_observation(policies, belief) else None,
         make_target_evidence(belief.target_model, eye)
@@ -101,7 +97,6 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
                 if _of(policy.context, belief.context) != "none"
             )
         },
-        make_learned_gaze(config.gaze_model, eye) if gazes and isinstance(config, SearchConfig) else None,
         make_map_evidence(belief.map_model, eye)
         if any(policy.scores == "learned" and not by_evidence(policy, task) for policy in policies)
         else None,
@@ -165,10 +160,8 @@ def _strategy(
 ) -> Strategy:
     if policy.policy == TARGET_EVIDENCE:
         return Strategy(Target(_given(models.evidence, "policy", "learned target evidence")), NonPredictive())
-    means = Means(models.observation, models.gaze, models.map, fovea, belief.prior)
+    means = Means(models.observation, models.map, fovea, belief.prior)
     chosen = Random() if policy.policy in (SALIENCY, IVSN) else named_policy(policy.policy, task, means)
-    if chosen.needs_gaze and models.gaze is not None:
-        return Strategy(models.gaze.observer(components), chosen)
     if by_evidence(policy, task):
         return Strategy(Target(_given(models.evidence, "scores", "learned target evidence")), chosen)
     if policy.scores == "learned":

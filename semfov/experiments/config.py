@@ -275,12 +275,11 @@ class SearchConfig(LookingConfig):
         protocol: the protocol of the experiment.
         policies: policies to compare, each a preset by name or a mapping of settings such as `{policy: non-predictive,
             scores: calibrated, tempering: 0.25}` (`PolicyConfig`). Presets: `recommended` (target-evidence),
-            `published` (predictive-calibrated), `target-evidence`, `learned`, `ivsn`, `random`, `vocus2`, `itti-koch`;
+            `published` (predictive-calibrated), `target-evidence`, `ivsn`, `random`, `vocus2`, `itti-koch`;
             and `non-predictive` (also called `maximum-a-posteriori`), `predictive`, `neighbourhood`, `foveal-hit`,
             `place-information`, `entropy-limit` or `ideal-observer`, each followed by `-raw` or `-calibrated`. The last
             four also take `-learned`, which uses the same evidence as `target-evidence`;
             `maximum-a-posteriori-learned` is `target-evidence` itself.
-        gaze_model: learned gaze policy of `learned`, by name or file (None: the one shipped for the detector).
         templates: class templates of `ivsn`, by name or file (None: those shipped for the detector).
         out: folder for tables, figures, per-episode records and the manifest.
         cache: folder for the stored detections from every cell, shared between runs (None: the user's cache).
@@ -300,7 +299,6 @@ class SearchConfig(LookingConfig):
         "predictive-calibrated",
         "target-evidence",
     )
-    gaze_model: str | None = None
     templates: str | None = None
     out: Path = Path("runs/search")
     scanpaths: Whole = 3

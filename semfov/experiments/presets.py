@@ -47,7 +47,7 @@ def presets(task: Task) -> Mapping[str, PolicyConfig]:
 @cache
 def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig]:
     if task == "search":
-        alone = {name: PolicyConfig(name) for name in ("random", "learned", TARGET_EVIDENCE, IVSN)}
+        alone = {name: PolicyConfig(name) for name in ("random", TARGET_EVIDENCE, IVSN)}
         alone |= {name: PolicyConfig(SALIENCY, saliency=name) for name in SALIENCY_MODELS}
         best, published = PolicyConfig(TARGET_EVIDENCE), PolicyConfig("predictive", "calibrated")
         scored = {name: PolicyConfig(name) for name in policies if name not in alone}
@@ -107,8 +107,7 @@ def resolve(choice: Choice, task: Task) -> PolicyConfig:
     if choice.scores not in scores:
         expected = " or ".join(map(repr, scores))
         raise InputError(f"scores: expected {expected} for policy {choice.policy!r}, got {choice.scores!r}")
-    own = choice.scores == "learned" or choice.policy == TARGET_EVIDENCE
-    if own or (choice.policy in POLICIES and POLICIES[choice.policy].needs_gaze):
+    if choice.scores == "learned" or choice.policy == TARGET_EVIDENCE:
         given = next((setting for setting in OF_THE_MAP if getattr(choice, setting) is not None), None)
         if given is not None:
             raise InputError(

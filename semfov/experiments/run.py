@@ -64,11 +64,7 @@ class Run(Looking):
         config, models = self.config, self.models
         fitted = {
             name: None if model is None else checksum(model.state_dict())
-            for name, model in (
-                ("observation", models.observation),
-                ("evidence", models.evidence),
-                ("gaze", models.gaze),
-            )
+            for name, model in (("observation", models.observation), ("evidence", models.evidence))
         }
         contexts = {name: prior.digest() for name, prior in models.context.items()}
         if models.templates is not None:

@@ -18,7 +18,6 @@ from semfov.errors import DataError, InputError, check
 from semfov.experiments.config import DataConfig, DetectorConfig, SensorConfig
 from semfov.experiments.looks import one_thread
 from semfov.eye import Eye
-from semfov.gaze.learned import LearnedGaze
 from semfov.gaze.templates import ClassTemplates
 from semfov.io.compatibility import learned_for, recommended
 from semfov.io.files import check_regular
@@ -210,13 +209,6 @@ def make_map_evidence(name: str | None, eye: Eye) -> MapEvidence:
     model = MapEvidence.from_pretrained(name or shipped_model(MapEvidence, own, "MODEL"))
     model.check_compatible(eye.settings())
     return model.requires_grad_(False)
-
-
-def make_learned_gaze(name: str | None, eye: Eye) -> LearnedGaze:
-    """Load a learned gaze policy by name, or the one shipped for the detector; check that it fits the eye."""
-    gaze = LearnedGaze.from_pretrained(name or eye.detector.name)
-    gaze.check_compatible(eye.settings())
-    return gaze.requires_grad_(False)
 
 
 def make_templates(name: str | None, eye: Eye) -> ClassTemplates:

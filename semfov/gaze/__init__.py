@@ -4,7 +4,6 @@ from semfov.gaze import acquisition, policies, saliency
 from semfov.gaze.choice import Choice, Given, Greedy, Relaxed, Softmax
 from semfov.gaze.habits import GazeHabits, Habitual
 from semfov.gaze.ivsn import IVSN
-from semfov.gaze.learned import LearnedGaze
 from semfov.gaze.policies import Policy
 from semfov.gaze.relaxation import soft_fixation
 from semfov.gaze.selection import select_fixation
@@ -18,7 +17,6 @@ __all__ = [
     "Given",
     "Greedy",
     "Habitual",
-    "LearnedGaze",
     "Policy",
     "Relaxed",
     "Softmax",

@@ -282,12 +282,6 @@ def perceptron(name: str, inputs: int, hidden: Size, outputs: int = 1, *, larges
     return tensors
 
 
-def convolution(name: str, into: Size, out: Size, side: int, *, largest: float = 1e6) -> dict[str, Field]:
-    """Requirements of the tensors of an `nn.Conv2d`."""
-    weight = Field((out, into, side, side), low=-largest, high=largest)
-    return {f"{name}.weight": weight, f"{name}.bias": Field((out,), low=-largest, high=largest)}
-
-
 def interval(low: float, high: float, above: float = -math.inf) -> str:
     """Write a range in words.
 

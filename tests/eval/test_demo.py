@@ -15,7 +15,6 @@ from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import Picture, embedded_picture
 from semfov.episode import STAGES
-from semfov.gaze import LearnedGaze
 from semfov.gaze.policies import Means, named_policy, policy_names
 from semfov.zoom import GlimpseEvidence
 from tests import small
@@ -302,9 +301,8 @@ def demo_and_agent(agent, picture, **how):
 def means(default_agent) -> Means:
     """Models with which every policy can be made."""
     name = default_agent.eye.detector.name
-    model, gaze = FovealObservationModel.from_pretrained(name), LearnedGaze.from_pretrained(name)
-    everything = MapEvidence.from_pretrained(name)
-    return Means(*(each.requires_grad_(False) for each in (model, gaze, everything)))
+    models = FovealObservationModel.from_pretrained(name), MapEvidence.from_pretrained(name)
+    return Means(*(each.requires_grad_(False) for each in models))
 
 
 @pytest.fixture(scope="module")
@@ -318,7 +316,7 @@ def dirichlet_map(default_agent):
 def test_the_demonstration_searches_as_the_agent_does_with_every_policy(name, default_agent, means, dirichlet_map, cup):
     """With a map of all classes for policies that need one, otherwise with the belief of the agent."""
     mapping = default_agent.exploring.observer, default_agent.exploring.policy
-    observer = dirichlet_map if name in ("predictive", "neighbourhood", "learned") else default_agent.searching.observer
+    observer = dirichlet_map if name in ("predictive", "neighbourhood") else default_agent.searching.observer
     agent = ActivePerception(default_agent.eye, (observer, named_policy(name, "search", means)), mapping).eval()
     shown, plain = demo_and_agent(agent, cup, target="cup")
     assert torch.equal(shown.cells, plain.cells)

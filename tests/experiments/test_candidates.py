@@ -13,7 +13,6 @@ from semfov.experiments import candidates
 from semfov.experiments.candidates import Candidate, Models, load_models, make_strategy, needs_observation
 from semfov.experiments.config import BeliefConfig, ExploreConfig, PolicyConfig, SearchConfig
 from semfov.experiments.presets import known_policies, presets, resolve
-from semfov.gaze import LearnedGaze
 from semfov.gaze.acquisition import (
     ExpectedAccuracy,
     NeighbourhoodPosterior,
@@ -50,7 +49,7 @@ def needs_model(belief=None, *choices, task="search"):
 
 def test_prediction_calibration_and_misses_need_an_observation_model():
     soft = PolicyConfig("non-predictive", footprint="soft")
-    assert not needs_model(None, "random", "target-evidence", "learned", "vocus2", "non-predictive-raw", soft)
+    assert not needs_model(None, "random", "target-evidence", "vocus2", "non-predictive-raw", soft)
     assert not needs_model(None, "random-raw", "closer-look-raw", "itti-koch-raw", "recommended", task="exploration")
     assert needs_model(None, PolicyConfig("non-predictive", misses=True))
     assert needs_model(None, "random", "non-predictive-calibrated")
@@ -68,7 +67,7 @@ def test_prediction_calibration_and_misses_need_an_observation_model():
 
 def test_presets_that_need_an_observation_model_cannot_be_made_without_it(model):
     """`needs_observation` agrees with what making the strategy requires."""
-    others = {"evidence": TargetEvidence(4, 4), "gaze": LearnedGaze(4), "map": MapEvidence(4, 4)}
+    others = {"evidence": TargetEvidence(4, 4), "map": MapEvidence(4, 4)}
     for task in ("search", "exploration"):
         for preset in presets(task).values():
             assert isinstance(strategy(preset, task, observation=model, **others), Strategy)
@@ -80,7 +79,7 @@ def test_presets_that_need_an_observation_model_cannot_be_made_without_it(model)
 
 
 def test_saliency_does_not_change_which_models_a_policy_needs():
-    for policy in ("random", "non-predictive", "predictive", "target-evidence", "learned"):
+    for policy in ("random", "non-predictive", "predictive", "target-evidence"):
         assert needs_model(None, PolicyConfig(policy, saliency="vocus2")) == needs_model(None, PolicyConfig(policy))
 
 
@@ -88,7 +87,7 @@ def test_saliency_does_not_change_which_models_a_policy_needs():
 def loaded(monkeypatch):
     """The models that a run loads, as pairs of kind and name."""
     loaded = []
-    for kind in ("observation", "target_evidence", "map_evidence", "context", "learned_gaze"):
+    for kind in ("observation", "target_evidence", "map_evidence", "context"):
 
         def make(name, eye, kind=kind):
             loaded.append((kind, name))
@@ -109,15 +108,13 @@ def test_a_run_loads_only_the_models_that_its_policies_need(loaded):
     loaded.clear()
     guided = PolicyConfig("target-evidence", saliency="vocus2", context="place")
     every = SearchConfig(
-        policies=("random", guided, "learned", "predictive-raw"),
+        policies=("random", guided, "predictive-raw"),
         belief=BeliefConfig(model="mine", target_model="sought", context_model="cooccurrence"),
-        gaze_model="gaze",
     )
     models = load_models(every, "search", eye)
-    assert models == Models("observation", "target_evidence", {"cooccurrence": "context"}, "learned_gaze")
+    assert models == Models("observation", "target_evidence", {"cooccurrence": "context"})
     assert sorted(loaded) == [
         ("context", "cooccurrence"),
-        ("learned_gaze", "gaze"),
         ("observation", "mine"),
         ("target_evidence", "sought"),
     ]
@@ -196,19 +193,14 @@ def test_closer_look_uses_the_fovea_of_the_run():
     assert strategy("closer-look-raw", "exploration", fovea=0.07).policy.fovea == 0.07
 
 
-def test_learned_policies_bring_their_own_belief():
-    evidence, gaze = TargetEvidence(4, 4), LearnedGaze(4)
+def test_target_evidence_brings_its_own_belief():
+    evidence = TargetEvidence(4, 4)
     sought = strategy("target-evidence", evidence=evidence)
     assert isinstance(sought.observer, observers.Target)
     assert sought.observer.model is evidence
     assert isinstance(sought.policy, policies.NonPredictive)
-    learned = strategy("learned", belief=BeliefConfig(prior=0.3), gaze=gaze)
-    own = gaze.observer(3)
-    assert (learned.observer.prior, learned.observer.tempering) == (own.prior, own.tempering)
-    assert learned.policy.gaze is gaze
-    for name in ("target-evidence", "learned"):
-        with pytest.raises(InputError, match="learned"):
-            strategy(name)
+    with pytest.raises(InputError, match="learned"):
+        strategy("target-evidence")
 
 
 def test_context_is_added_when_a_policy_or_the_run_asks_for_it(context):

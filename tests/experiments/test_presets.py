@@ -48,7 +48,6 @@ def test_every_policy_has_a_preset(task):
 def test_names_give_policy_scores_and_saliency():
     assert resolve("predictive-calibrated", "search") == PolicyConfig("predictive", "calibrated")
     assert resolve("place-information-raw", "search") == PolicyConfig("place-information", "raw")
-    assert resolve("learned", "search") == PolicyConfig("learned")
     assert resolve("entropy-limit-learned", "search") == PolicyConfig("entropy-limit", "learned")
     assert resolve("vocus2", "search") == PolicyConfig("saliency", saliency="vocus2")
     assert resolve("expected-accuracy-raw", "exploration") == PolicyConfig("expected-accuracy")
@@ -140,7 +139,7 @@ def test_an_exponent_out_of_range_is_refused(tempering):
         resolve(PolicyConfig("kl", tempering=tempering), "exploration")
 
 
-@pytest.mark.parametrize("policy", ["random", "learned", "target-evidence", "saliency"])
+@pytest.mark.parametrize("policy", ["random", "target-evidence", "saliency"])
 def test_scores_are_refused_for_policies_that_do_not_use_them(policy):
     """Its label would be the same as with raw scores."""
     saliency = "vocus2" if policy == "saliency" else None
@@ -148,13 +147,12 @@ def test_scores_are_refused_for_policies_that_do_not_use_them(policy):
         resolve(PolicyConfig(policy, "calibrated", saliency=saliency), "search")
 
 
-@pytest.mark.parametrize("policy", ["learned", "target-evidence"])
 @pytest.mark.parametrize(
     "change", [{"tempering": 0.25}, {"footprint": "soft"}, {"memory": "all"}, {"misses": True}], ids=str
 )
-def test_settings_of_a_map_are_refused_for_policies_with_their_own_belief(policy, change):
-    with pytest.raises(InputError, match=f"^{next(iter(change))}: .*'{policy}'"):
-        resolve(PolicyConfig(policy, **change), "search")
+def test_settings_of_a_map_are_refused_for_policies_with_their_own_belief(change):
+    with pytest.raises(InputError, match=f"^{next(iter(change))}: .*'target-evidence'"):
+        resolve(PolicyConfig("target-evidence", **change), "search")
 
 
 def parsed(config, *arguments):

@@ -28,7 +28,6 @@ SEMANTIC = (
     "non-predictive-raw",
     PolicyConfig("predictive", "calibrated", tempering=0.25, memory="closest"),
     PolicyConfig("non-predictive", footprint="soft", saliency="vocus2"),
-    "learned",
     "vocus2",
 )
 WITH_CONTEXT = PolicyConfig(SOUGHT, context="both")

@@ -8,8 +8,6 @@ import torch
 from semfov import DirichletBelief, FovealObservationModel, Grid, InputError, acquisition
 from semfov.belief.observers.context import ContextBelief
 from semfov.belief.observers.target import TargetBelief
-from semfov.gaze import LearnedGaze
-from semfov.gaze.policies import Learned
 
 GRID = Grid(4, 3, (80, 60))
 TARGETS = torch.tensor([2, 1, 3])
@@ -25,21 +23,12 @@ def model():
     return FovealObservationModel(alpha, [0.2, 0.5], names, miss_rate=misses).requires_grad_(False)
 
 
-def learned():
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        gaze = LearnedGaze(4).double().requires_grad_(False)
-        torch.nn.init.normal_(gaze.network[-1].weight)
-    return Learned(gaze)(TARGETS, GRID)
-
-
 SEARCH = {
     "TargetPosterior": lambda: acquisition.TargetPosterior(TARGETS),
     "PredictedTargetPosterior": lambda: acquisition.PredictedTargetPosterior(TARGETS, model()),
     "NeighbourhoodPosterior": lambda: acquisition.NeighbourhoodPosterior(TARGETS, model(), GRID),
     "FovealHit": lambda: acquisition.FovealHit(TARGETS, model(), GRID),
     "PlaceInformation": lambda: acquisition.PlaceInformation(TARGETS, model(), GRID),
-    "LearnedAcquisition": learned,
 }
 EXPLORATION = {
     "KLDivergence": lambda: acquisition.KLDivergence(model(), GRID),
@@ -93,7 +82,7 @@ def name(request):
 def test_every_acquisition_function_is_tested():
     # These have their own tests: they need a learned map, d', templates, or all classes except background.
     own = {"ExpectedGain", "EntropyLimit", "CorrectLocalisation", "TemplateAttention", "ObjectEvidence"}
-    assert set(acquisition.__all__) - {"AcquisitionFunction"} == (set(EVERY) - {"LearnedAcquisition"}) | own
+    assert set(acquisition.__all__) - {"AcquisitionFunction"} == set(EVERY) | own
 
 
 def test_every_function_takes_belief_and_visited(name):
@@ -139,22 +128,20 @@ def test_values_have_the_dtype_of_the_belief(name):
     """An observation model in double precision works with beliefs in single precision."""
     function, known = EVERY[name](), beliefs()
     single = DirichletBelief(known.beta.float(), known.closest.float())
-    if name in ("LearnedAcquisition", "Static"):
+    if name == "Static":
         function = function.float()
     values = function(single, visits())
     assert values.dtype == torch.float32
     torch.testing.assert_close(values.double(), EVERY[name]()(known, visits()), rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", [name for name in EVERY if name != "LearnedAcquisition"])
 def test_a_belief_before_the_first_look(name):
-    """Without `closest`, and with no visited cell; a learned gaze needs at least one look."""
+    """Without `closest`, and with no visited cell."""
     values = EVERY[name]()(DirichletBelief(torch.full((3, 12, 4), 0.5)), torch.zeros(3, 12, dtype=torch.bool))
     assert values.shape == (3, 12)
     assert bool(values.isfinite().all())
 
 
-@pytest.mark.parametrize("name", [name for name in EVERY if name != "LearnedAcquisition"])
 def test_values_do_not_depend_on_visited_cells(name):
     function = EVERY[name]()
     assert torch.equal(function(beliefs(), visits()), function(beliefs(), ~visits()))
@@ -192,7 +179,7 @@ def test_arguments_are_not_modified(name):
     assert torch.equal(visited, visits())
 
 
-@pytest.mark.parametrize("name", [name for name in EVERY if name not in ("LearnedAcquisition", "Static")])
+@pytest.mark.parametrize("name", [name for name in EVERY if name != "Static"])
 def test_a_function_in_double_precision_keeps_the_dtype_of_the_belief(name):
     """Its values are compared with other values of that belief, so they have the same dtype."""
     known = beliefs()

@@ -6,7 +6,7 @@ from torch import nn
 from semfov import acquisition, policies, saliency
 from semfov.belief import DirichletBelief
 from semfov.belief.observers import LearnedMap
-from semfov.gaze import IVSN, GazeHabits, LearnedGaze
+from semfov.gaze import IVSN, GazeHabits
 from semfov.gaze.templates import ClassTemplates
 from tests.base_tester import GraphTester, TensorTester
 from tests.small import GRID, detections, look, mapping, memory, model, rand
@@ -209,24 +209,6 @@ class TestIdealObserver(TensorTester):
 
     def make(self):
         return policies.IdealObserver(model())
-
-
-class TestLearned(PolicyTester):
-    def make(self):
-        return policies.Learned(LearnedGaze())
-
-
-class TestLearnedGaze(PolicyTester):
-    """Called as by its policy."""
-
-    test_compile, test_export = GraphTester.test_compile, GraphTester.test_export
-
-    def make(self):
-        return LearnedGaze()
-
-    @staticmethod
-    def call(module, beta, closest):
-        return PolicyTester.call(policies.Learned(module), beta, closest)
 
 
 class TestCloser(PolicyTester):

@@ -9,7 +9,7 @@ import torch
 from semfov import FovealObservationModel
 from semfov.belief import DirichletBelief, Grid, MapEvidence
 from semfov.errors import InputError
-from semfov.gaze import LearnedGaze, acquisition, policies
+from semfov.gaze import acquisition, policies
 from semfov.gaze.policies import POLICIES, Means, Policy, named_policy, policy_names
 
 GRID = Grid(4, 3, (80, 60))
@@ -32,10 +32,8 @@ def model():
 def means(model):
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        gaze = LearnedGaze(4).requires_grad_(False)
-        torch.nn.init.normal_(gaze.network[-1].weight)
         everything = MapEvidence(4, 4, components=3).requires_grad_(False)
-    return Means(model, gaze, everything)
+    return Means(model, everything)
 
 
 def test_policy_names_of_each_task():
@@ -48,7 +46,6 @@ def test_policy_names_of_each_task():
         "place-information",
         "entropy-limit",
         "ideal-observer",
-        "learned",
     ]
     assert sorted(policy_names("exploration")) == sorted(
         [
@@ -79,12 +76,8 @@ def test_models_are_submodules_of_the_policy(name, means):
     """They are in its state dict, and change dtype with it."""
     policy = POLICIES[name].make(means)
     assert isinstance(policy, Policy)
-    part = means.model if policy.needs_model else means.gaze if policy.needs_gaze else None
-    part = means.map if policy.needs_map else part
-    owned = list(policy.state_dict())
-    assert owned == (
-        [] if part is None else [f"{'gaze' if policy.needs_gaze else 'model'}.{n}" for n in part.state_dict()]
-    )
+    part = means.model if policy.needs_model else means.map if policy.needs_map else None
+    assert list(policy.state_dict()) == ([] if part is None else [f"model.{name}" for name in part.state_dict()])
     policy.double()
     moved = [tensor.dtype for tensor in policy.state_dict().values() if tensor.is_floating_point()]
     assert set(moved) <= {torch.float64}
@@ -124,7 +117,7 @@ def test_a_copied_or_pickled_search_policy_gives_equal_values(name, means):
         assert torch.equal(values_of(other(1, GRID), beta), expected)
         mine = {tensor.data_ptr() for tensor in policy.state_dict().values()}
         assert mine.isdisjoint(tensor.data_ptr() for tensor in other.state_dict().values())
-        if name not in ("non-predictive", "learned"):
+        if name != "non-predictive":
             assert other.model is not means.model
 
 
@@ -145,8 +138,7 @@ def test_a_missing_model_is_an_error_when_the_policy_is_made():
             if name in free:
                 named_policy(name, task)(1, GRID)
                 continue
-            learned = {"learned": "a learned gaze policy", "expected-gain": "a learned map"}
-            needed = learned.get(name, "an observation model")
+            needed = "a learned map" if name == "expected-gain" else "an observation model"
             with pytest.raises(InputError, match=f"policy '{name}': expected {needed}"):
                 named_policy(name, task)
 

@@ -9,7 +9,6 @@ from safetensors.torch import save_file
 from semfov import DirichletStatistics, FovealObservationModel, TargetEvidence
 from semfov.belief import ContextPrior
 from semfov.errors import DataError, InputError
-from semfov.gaze.learned import LearnedGaze
 from semfov.io import storage
 from semfov.io.cached import read_tensors, write_tensors
 from semfov.io.schema import Array, Field, Flag, Maybe, Number, Object, Pair, Schema, Text, is_number, is_plain
@@ -33,19 +32,13 @@ def context():
     return ContextPrior(CLASSES, torch.zeros(3, 2, 2), torch.zeros(3, 3, 2), [0.1], weights={"map": (1.0, 0.5)})
 
 
-def gaze():
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        return LearnedGaze(2)
-
-
 def glimpses():
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         return GlimpseEvidence(3, 2, patience=1.5, foresight=0.25)
 
 
-MODELS = {make.__name__: make for make in (observation, evidence, context, gaze, glimpses)}
+MODELS = {make.__name__: make for make in (observation, evidence, context, glimpses)}
 LOADERS = {name: type(make()) for name, make in MODELS.items()}
 
 

@@ -51,7 +51,6 @@ class PeopleSearchConfig(Settings):
         saliency: the saliency baselines.
         protocol: the protocol; a search has failed after `shifts` gaze shifts, and `seed` draws the random baselines.
         policies: policies to compare (`python -m eval.search --help`).
-        gaze_model: learned gaze policy, by name or file.
         bandwidth: bandwidth, in screen pixels, of the clusters of fixations that make up the letters of a sequence.
         bootstrap: number of bootstrap samples of the pictures for the standard errors of TFP-AUC.
         out: folder for tables, figures and the manifest.
@@ -70,7 +69,6 @@ class PeopleSearchConfig(Settings):
     saliency: SaliencyConfig = field(default_factory=SaliencyConfig)
     protocol: ProtocolConfig = field(default_factory=lambda: ProtocolConfig(shifts=9))
     policies: tuple[str | PolicyConfig, ...] = ("non-predictive-raw", "predictive-calibrated", "target-evidence")
-    gaze_model: str | None = None
     bandwidth: Positive = 100.0
     bootstrap: Annotated[int, Range(2, 10_000)] = 200
     out: Path = Path("runs/human_search")

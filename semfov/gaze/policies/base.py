@@ -14,7 +14,6 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.gaze.acquisition.ideal import SignalModel
 from semfov.gaze.acquisition.lookahead import LevelledModel
 from semfov.gaze.acquisition.place import MissModel
-from semfov.gaze.learned import LearnedGaze
 
 Task = Literal["search", "exploration"]
 
@@ -29,7 +28,6 @@ class Means:
 
     Attributes:
         model: observation model, for the expected scores and the miss rates.
-        gaze: learned gaze policy.
         map: learned map.
         fovea: width σ of the fovea in units of the image's longer side.
         prior: Dirichlet parameter of every class before the first look.
@@ -41,7 +39,6 @@ class Means:
     """
 
     model: GazeModel | None = None
-    gaze: LearnedGaze | None = None
     map: MapEvidence | None = None
     fovea: float = 100 / 640
     prior: float = 0.5
@@ -51,13 +48,12 @@ class Policy(nn.Module, ABC):
     """Base of all policies: how to choose where to look, for any target on any grid.
 
     A subclass is registered under its `name` when it is defined, and settings can then refer to it by that name.
-    `needs_model`, `needs_gaze` and `needs_map` declare what it is made from, and `make` takes that from `Means`.
+    `needs_model` and `needs_map` declare what it is made from, and `make` takes that from `Means`.
 
     Attributes:
         name: name in settings.
         tasks: tasks that the policy is for.
         needs_model: whether it is made from an observation model.
-        needs_gaze: whether it is made from a learned gaze policy.
         needs_map: whether it is made from a learned map, and works on the belief of that map alone.
         by_place: whether it searches by the probability of the target in every cell alone, and so works on any belief.
 
@@ -74,7 +70,6 @@ class Policy(nn.Module, ABC):
     name: ClassVar[str]
     tasks: ClassVar[tuple[Task, ...]]
     needs_model: ClassVar[bool] = False
-    needs_gaze: ClassVar[bool] = False
     needs_map: ClassVar[bool] = False
     by_place: ClassVar[bool] = False
 
@@ -171,8 +166,6 @@ def named_policy(name: str, task: Task, means: Means | None = None) -> Policy:
     means = means or Means()
     if kind.needs_model and means.model is None:
         raise InputError(f"policy {name!r}: expected an observation model in `Means.model`, got none")
-    if kind.needs_gaze and means.gaze is None:
-        raise InputError(f"policy {name!r}: expected a learned gaze policy in `Means.gaze`, got none")
     if kind.needs_map and means.map is None:
         raise InputError(f"policy {name!r}: expected a learned map in `Means.map`, got none")
     return kind.make(means)

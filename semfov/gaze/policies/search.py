@@ -5,7 +5,7 @@
 `non-predictive`. The others are ours.
 """
 
-from typing import ClassVar, Self
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -15,8 +15,7 @@ from semfov.gaze.acquisition.ideal import CorrectLocalisation, EntropyLimit
 from semfov.gaze.acquisition.place import FovealHit, PlaceInformation
 from semfov.gaze.acquisition.search import NeighbourhoodPosterior, PredictedTargetPosterior, TargetPosterior
 from semfov.gaze.acquisition.static import Uniform
-from semfov.gaze.learned import LearnedAcquisition, LearnedGaze
-from semfov.gaze.policies.base import Means, ModelPolicy, Policy, Task, wanted
+from semfov.gaze.policies.base import ModelPolicy, Policy, Task, wanted
 
 
 class Random(Policy):
@@ -182,32 +181,3 @@ class IdealObserver(ModelPolicy):
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
         """The probability of a correct localisation."""
         return CorrectLocalisation(wanted(target, self.name), self.model, grid)
-
-
-class Learned(Policy):
-    """Look where a network learned end to end gives the highest value (`semfov.gaze.LearnedGaze`).
-
-    Args:
-        gaze: the learned network.
-
-    >>> type(Learned(LearnedGaze())(1, Grid(4, 3, (40, 30)))).__name__
-    'LearnedAcquisition'
-    """
-
-    name = "learned"
-    tasks = ("search",)
-    needs_gaze = True
-
-    def __init__(self, gaze: LearnedGaze) -> None:
-        super().__init__()
-        self.gaze = gaze
-
-    @classmethod
-    def make(cls, means: Means) -> Self:
-        """Make the policy with the learned network."""
-        assert means.gaze is not None
-        return cls(means.gaze)
-
-    def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:
-        """The values of the network."""
-        return LearnedAcquisition(self.gaze, wanted(target, self.name), grid)
