@@ -21,7 +21,7 @@ MODULES = (
     "semfov.gaze.saliency",
     "semfov.episode",
     "semfov.live",
-    "semfov.scanpath",
+    "semfov.paths",
     "semfov.viz",
     "semfov.report",
     "semfov.zoom",

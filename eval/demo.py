@@ -41,8 +41,8 @@ from semfov.experiments.command import run_command
 from semfov.experiments.settings import Range, Seed, Settings, Share, Shifts, Weight, Whole
 from semfov.io.manifest import Manifest
 from semfov.live import RATE
+from semfov.paths.stimulus import reduced
 from semfov.report import Pool, episode_data, write_page, zoom_data
-from semfov.scanpath.stimulus import reduced
 from semfov.sensor import SENSORS
 from semfov.sensor.named import SensorName
 from semfov.viz.animation import film_of
@@ -224,7 +224,7 @@ def zoom_in(agent: ZoomAgent, picture: Picture, config: DemoConfig) -> ZoomPath:
         given = {"confirm": config.confirm, "give_up": config.give_up}
         path = agent.search(picture.image, config.target, passes=passes, closer=config.closer, **chosen(given))
     width, height = path.lattice.size
-    print(f"{picture.name}, {width} × {height} px, looked at in windows: {path.told()}")
+    print(f"{picture.name}, {width} × {height} px, looked at in windows: {path.summary()}")
     unused = [name for name in ("sensor", "start", "price") if getattr(config, name) is not None]
     if unused:
         print(f"  ignored for a picture of this size: {', '.join(unused)}")

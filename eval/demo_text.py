@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 
 from semfov import Scanpath, viz
+from semfov.paths import detections_in_words
 
 
 def told(name: str, scanpath: Scanpath) -> str:
@@ -20,7 +21,8 @@ def told(name: str, scanpath: Scanpath) -> str:
         milliseconds = 1000 * sum(scanpath.seconds[number].values())
         figures = [f"{float(value[cell]):.3f}", f"{float(value[best]):.3f}", place(scanpath, best)]
         figures += [] if anywhere is None else [f"{anywhere[number]:.3f}"]
-        rows.append([str(number), place(scanpath, cell), seen(scanpath, number), *figures, f"{milliseconds:.0f}"])
+        seen = detections_in_words(scanpath.detections[number], scanpath.classes, score=viz.CONFIDENT)
+        rows.append([str(number), place(scanpath, cell), seen, *figures, f"{milliseconds:.0f}"])
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     if scanpath.target is None:
@@ -29,7 +31,7 @@ def told(name: str, scanpath: Scanpath) -> str:
         assert look.cell is not None
         chance = f"p {look.place:.3f} there, {look.presence:.3f} anywhere"
         lines.append(f"closer look {number}, after fixation {look.fixation}, at {place(scanpath, look.cell)}: {chance}")
-    return "\n".join([f"{name}: {viz.describe(scanpath)}. {viz.why_it_ended(scanpath)}".rstrip(), *lines, ""])
+    return "\n".join([f"{name}: {scanpath.summary()}", *lines, ""])
 
 
 def named(scanpath: Scanpath) -> list[str]:
@@ -44,15 +46,6 @@ def named(scanpath: Scanpath) -> list[str]:
         many = f"{len(cells)} cell{'s' if len(cells) != 1 else ''}"
         lines.append(f"  {label}: {many}, p up to {float(chance.max()):.2f} at {place(scanpath, best)}")
     return lines or ["  nothing that is more probable than background"]
-
-
-def seen(scanpath: Scanpath, fixation: int, most: int = 3) -> str:
-    """The most confident detections of a look, as text."""
-    detections = scanpath.detections[fixation]
-    pairs = zip(detections.labels[0].tolist(), detections.confidence[0].tolist(), strict=True)
-    sure = [f"{scanpath.classes[label]} {score:.2f}" for label, score in pairs if score >= viz.CONFIDENT]
-    more = f" and {len(sure) - most} more" if len(sure) > most else ""
-    return ", ".join(sure[:most]) + more or "nothing"
 
 
 def place(scanpath: Scanpath, cell: int) -> str:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from semfov import viz
 from semfov.data.sources import Stream
-from semfov.live import LivePerception, Moment
+from semfov.live import LivePerception
+from semfov.paths import Moment, detections_in_words
 from semfov.viz.live import draw_moment, video, video_suffix
 
 UNKNOWN_RATE = 15.0
@@ -36,8 +37,8 @@ def watch(live: LivePerception, stream: Stream, path: Path) -> Path:
                 looking += sum(moment.seconds.values())
                 lately.append(time.perf_counter())
                 speed = f"{(len(lately) - 1) / (lately[-1] - lately[0]):.1f} frames/s"
-                print(f"  {told(moment, live)}  {speed}", flush=True)
-                add(draw_moment(picture.image, moment, f"{headline(moment, live)}   {speed}"))
+                print(f"  {told(moment)}  {speed}", flush=True)
+                add(draw_moment(picture.image, moment, f"{moment.describe()}   {speed}"))
         except KeyboardInterrupt:
             print("  stopped")
     whole = time.perf_counter() - began
@@ -46,33 +47,13 @@ def watch(live: LivePerception, stream: Stream, path: Path) -> Path:
     return path
 
 
-def told(moment: Moment, live: LivePerception) -> str:
+def told(moment: Moment) -> str:
     """Detections and belief at a frame, as one line."""
     best = int(moment.probability.argmax())
     row, column = divmod(moment.cell, moment.grid.columns)
-    look = f"{moment.number:4d}  at ({column}, {row}): {seen(moment, live)}"
+    seen = detections_in_words(moment.detections, moment.classes, 2, viz.CONFIDENT)
+    look = f"{moment.number:4d}  at ({column}, {row}): {seen}"
     if moment.closer is not None:
         look = f"{moment.number:4d}  closely at ({column}, {row}): p {moment.closer.place:.2f} there"
     row, column = divmod(best, moment.grid.columns)
-    return f"{look:60s}  {headline(moment, live)}, most likely at ({column}, {row})"
-
-
-def headline(moment: Moment, live: LivePerception) -> str:
-    """The belief at a frame, in a few words."""
-    highest = float(moment.probability.max())
-    if moment.target is None:
-        return f"p(object) up to {highest:.2f}"
-    name = live.classes[moment.target]
-    if moment.decision is None:
-        return f"p({name}) up to {highest:.2f}"
-    there = "" if moment.decision.place is None else f" (there {moment.decision.place:.2f})"
-    return f"{name}: {moment.decision.outcome}, p {moment.decision.probability:.2f}{there}"
-
-
-def seen(moment: Moment, live: LivePerception, most: int = 2) -> str:
-    """The most confident detections of a look, as text."""
-    detections = moment.detections
-    pairs = zip(detections.labels[0].tolist(), detections.confidence[0].tolist(), strict=True)
-    sure = [f"{live.classes[label]} {score:.2f}" for label, score in pairs if score >= viz.CONFIDENT]
-    more = f" and {len(sure) - most} more" if len(sure) > most else ""
-    return ", ".join(sure[:most]) + more or "nothing"
+    return f"{look:60s}  {moment.describe()}, most likely at ({column}, {row})"

@@ -27,7 +27,7 @@ def main() -> None:
 
     for number, (x, y) in enumerate(scanpath.fixations.tolist()):
         print(f"fixation {number} at ({x:.0f}, {y:.0f})")
-    print(viz.describe(scanpath))
+    print(scanpath.describe())
     viz.plot_scanpath(scanpath, image).savefig(arguments.out, dpi=150)
 
 

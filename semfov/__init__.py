@@ -12,8 +12,8 @@ from semfov.errors import DataError, InputError, SemfovError
 from semfov.eye import Eye
 from semfov.gaze import acquisition, policies, saliency
 from semfov.observation import DirichletStatistics, FovealObservationModel, dirichlet
+from semfov.paths import Scanpath
 from semfov.report import notebook as _notebook  # noqa: F401 (scanpaths are drawn there)
-from semfov.scanpath import Scanpath
 from semfov.sensor import Foveation, foveate
 from semfov.version import __version__
 from semfov.zoom import ZoomAgent, ZoomEye

@@ -25,8 +25,8 @@ from semfov.gaze.policies import Policy
 from semfov.io.schema import is_number
 from semfov.live import RATE, LivePerception
 from semfov.model_folder import open_folder
+from semfov.paths import Ending, Scanpath, Stimulus, trace
 from semfov.presets import published_parts, raw_parts, recommended_parts
-from semfov.scanpath import Ending, Scanpath, Stimulus, trace
 from semfov.strategy import Strategy
 
 PRICE = 0.1

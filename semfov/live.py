@@ -3,12 +3,10 @@
 import sys
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers import Observer
 from semfov.belief.target_evidence import Thresholds
@@ -21,58 +19,12 @@ from semfov.errors import check
 from semfov.eye import Eye, View
 from semfov.gaze.choice import Greedy, drawn_by, first_cell
 from semfov.gaze.policies import Policy
+from semfov.paths import Moment
 
 RATE = 0.1
 """Default rate at which belief fades, per frame."""
 
 _MOST = 1000  # largest number of looks whose detections are kept
-
-
-@dataclass(frozen=True)
-class Moment:
-    """Look, belief and decision at one frame.
-
-    Attributes:
-        number: number of the frame, from 0.
-        grid: the cells.
-        target: class 1..K that is searched for; None for exploration.
-        cell: the fixated cell, or the one that was looked at closely.
-        fixation: `(2,)`, the centre of the cell as `(x, y)` in pixels.
-        detections: detections of the look, a batch of one.
-        belief: belief of one episode after the last look that was not a closer one.
-        decision: decision at this frame: `found`, `absent`, or `undecided` as long as it is neither; None for
-            exploration and for a belief without thresholds.
-        visited: `(X·Y,)` boolean, cells that inhibition of return keeps the gaze from.
-        next_cell: the cell to look at in the next frame.
-        seconds: time of the look by stage; `open` is the fitting of the frame into the detector's input. A closer look
-            has the stage `detect` alone.
-        closer: the closer look, if this frame was spent on one; otherwise None.
-
-    Example::
-
-        moment = live.step(frame)
-        print(moment.decision.outcome, moment.probability.max())
-    """
-
-    number: int
-    grid: Grid
-    target: int | None
-    cell: int
-    fixation: Tensor
-    detections: Detections
-    belief: Belief
-    decision: Decision | None
-    visited: Tensor
-    next_cell: int
-    seconds: dict[str, float]
-    closer: CloserLook | None = None
-
-    @property
-    def probability(self) -> Tensor:
-        """Probability that each cell holds the target, or any object in an exploration, `(X·Y,)`."""
-        if self.target is None:
-            return 1 - self.belief.class_probabilities()[0, :, 0]
-        return self.belief.probability(self.target)[0]
 
 
 class LivePerception:
@@ -241,18 +193,19 @@ class LivePerception:
         closer: CloserLook | None = None,
     ) -> Moment:
         return Moment(
-            self._number,
-            grid,
-            self.target,
-            cell,
-            grid.centres[cell].to(step.fixation),
-            detections,
-            step.belief,
-            self._decision(step, grid),
-            step.visited[0],
-            int(step.next_cell) if self._candidate is None else self._candidate.cell,
-            seconds,
-            closer,
+            classes=self.classes,
+            target=self.target,
+            decision=self._decision(step, grid),
+            number=self._number,
+            grid=grid,
+            cell=cell,
+            fixation=grid.centres[cell].to(step.fixation),
+            detections=detections,
+            belief=step.belief,
+            visited=step.visited[0],
+            next_cell=int(step.next_cell) if self._candidate is None else self._candidate.cell,
+            seconds=seconds,
+            closer=closer,
         )
 
     def _decision(self, step: Step, grid: Grid) -> Decision | None:

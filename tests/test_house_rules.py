@@ -16,7 +16,7 @@ PACKAGE = Path(semfov.__file__).parent
 ROOT = PACKAGE.parent
 LIBRARY = sorted(PACKAGE.rglob("*.py"))
 SOURCES = LIBRARY + sorted(file for folder in ("eval", "train", "examples") for file in (ROOT / folder).rglob("*.py"))
-MOST_LINES = 400
+MOST_LINES = 600
 DOCUMENTED = {"os._exit"}
 
 
@@ -70,7 +70,7 @@ def test_no_private_names_of_other_packages_are_used():
     assert {name: parts for name, parts in found.items() if parts} == {}
 
 
-def test_files_of_the_library_have_at_most_400_lines():
+def test_files_of_the_library_have_at_most_600_lines():
     lines = {str(file.relative_to(ROOT)): len(file.read_text(encoding="utf-8").splitlines()) for file in LIBRARY}
     assert len(lines) > 200
     assert {name: count for name, count in lines.items() if count > MOST_LINES} == {}

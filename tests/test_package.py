@@ -67,7 +67,7 @@ SUBPACKAGES = [
     "eye",
     "episode",
     "decision",
-    "scanpath",
+    "paths",
     "zoom",
     "head",
     "live",

@@ -141,8 +141,8 @@ def test_belief_is_laid_over_a_grey_photograph(scanpath, image):
 
 def test_figures_use_the_photograph_that_the_scanpath_kept(scanpath, image):
     from semfov.detection import Placement
-    from semfov.scanpath import Stimulus
-    from semfov.scanpath.stimulus import in_bytes
+    from semfov.paths import Stimulus
+    from semfov.paths.stimulus import in_bytes
 
     sensor = {"sigma": 20.0, "levels": 2, "growth": 2.0, "convention": "kornia", "reference": 640.0}
     placement = Placement((80, 60), (1.0, 1.0), (0, 0))
@@ -257,9 +257,15 @@ def test_semantic_map_names_classes_that_are_more_probable_than_background():
     grid = Grid(3, 2, (30, 20))
     nothing = Detections.empty(1, 2)
     scanpath = Scanpath(
-        grid, ("background", "cat", "cup"), None, torch.tensor([0]), grid.centres[:1], (nothing,), p[None],
-        torch.zeros(1, 6), False,
-    )  # fmt: skip
+        grid=grid,
+        classes=("background", "cat", "cup"),
+        target=None,
+        cells=torch.tensor([0]),
+        fixations=grid.centres[:1],
+        detections=(nothing,),
+        probabilities=p[None],
+        values=torch.zeros(1, 6),
+    )
     named, unsure, *_ = draw(plot_semantic_map(scanpath)).axes
     texts = {text.get_text(): text.get_position() for text in named.texts}
     assert set(texts) == {"cat", "cup"}
@@ -350,6 +356,5 @@ def test_reliability_of_cells_lies_on_the_diagonal_in_log_odds():
 
 
 def test_belief_of_a_scanpath_without_target_needs_a_target(scanpath):
-    fields = {name: getattr(scanpath, name) for name in scanpath.__dataclass_fields__}
     with pytest.raises(InputError, match="target"):
-        plot_belief(Scanpath(**{**fields, "target": None}))
+        plot_belief(replace(scanpath, target=None))

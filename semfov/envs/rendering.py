@@ -10,7 +10,7 @@ from semfov.belief.observers import Observer, Semantic
 from semfov.envs.gazes import Gazes
 from semfov.episode import Sight, Step
 from semfov.experiments.search_protocol import Episode
-from semfov.scanpath import Scanpath, Stimulus, trace
+from semfov.paths import Scanpath, Stimulus, trace
 from semfov.viz.animation import render
 from semfov.viz.fixation import plot_fixation
 

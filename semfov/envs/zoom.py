@@ -265,9 +265,14 @@ class ZoomEnv(gymnasium.Env[Arrays, Action]):
         if self.render_mode is None:
             return None
         target = self.target or None
-        objects = merge(self.seen, target)
-        values = (float("inf"),) * len(self.seen)
-        path = ZoomPath(self.glances.lattice, self.scenery.classes, target, tuple(self.seen), values, objects)
+        path = ZoomPath(
+            lattice=self.glances.lattice,
+            classes=self.scenery.classes,
+            target=target,
+            glances=tuple(self.seen),
+            values=(float("inf"),) * len(self.seen),
+            objects=merge(self.seen, target),
+        )
         image = self.scenery.image(self.scene)[None]
         share = min(1.0, _SHOWN_SIDE / max(image.shape[-2:]))
         size = [max(1, round(n * share)) for n in image.shape[-2:]]

@@ -11,7 +11,7 @@ from semfov.experiments.parts import Record
 from semfov.experiments.run import Run
 from semfov.experiments.setup import make_map_evidence
 from semfov.gaze.choice import Given
-from semfov.scanpath import Scanpath, trace
+from semfov.paths import Scanpath, trace
 
 
 def replay(run: Run, index: int, record: Record) -> Scanpath:

@@ -1,8 +1,6 @@
 """An agent that moves its eye and turns its head."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Self
 
 import torch
@@ -20,11 +18,13 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 from semfov.head.belief import SceneObserver
 from semfov.head.episode import live, look_around
 from semfov.head.gain import FORESIGHT, PRIOR, ExploreGain, PerPrice, SearchGain
+from semfov.head.path import HeadPath
 from semfov.head.speeds import Speeds
 from semfov.head.views import Views
-from semfov.head.world import Places, World
+from semfov.head.world import World
 from semfov.io.compatibility import learned_for
 from semfov.io.shipped import shipped_model
+from semfov.paths import Ending
 from semfov.sensor.foveation import Foveation
 
 SIGMA = 100.0
@@ -32,94 +32,6 @@ SIGMA = 100.0
 
 CONFIRM = 0.7
 """Probability of the target in the fixated cell at which a search ends as found."""
-
-
-@dataclass(frozen=True)
-class HeadPath:
-    """The record of an episode: where eye and head looked, what was seen and what was believed.
-
-    Attributes:
-        views: the views and fixations that were possible.
-        target: class that was searched for; None for an exploration.
-        classes: names of the classes, background first.
-        actions: number of the pose and cell of each look (`Views`).
-        seconds: time at the end of each look.
-        detections: detections of each look, a batch of one, with boxes in pixels of its view.
-        maps: `(N, S)`, after each look, the probability that a cell of the scene holds the target, or any object in an
-            exploration.
-        found: whether the last look found the target.
-
-    Example::
-
-        path = agent.search(Panorama("street.jpg"), "bicycle")
-        print(path.turns, path.seconds[-1])  # turns of the head, and the time taken
-        regions, labels, scores = path.places(-1)  # objects of the last look
-    """
-
-    views: Views
-    target: int | None
-    classes: tuple[str, ...]
-    actions: tuple[int, ...]
-    seconds: tuple[float, ...]
-    detections: tuple[Detections, ...]
-    maps: Tensor
-    found: bool
-
-    def __len__(self) -> int:
-        """Number of looks."""
-        return len(self.actions)
-
-    @property
-    def turns(self) -> int:
-        """Number of times that the head moved."""
-        poses = [action // self.views.cells for action in self.actions]
-        return sum(one != other for one, other in pairwise(poses))
-
-    def pose(self, look: int) -> Tensor:
-        """Pose of the head in a look.
-
-        Args:
-            look: number of the look; negative numbers count from the end.
-
-        Returns:
-            `(3,)`, as `World` defines it: the position of the window, and its field of view in degrees.
-        """
-        return self.views.poses[self.actions[look] // self.views.cells]
-
-    def gaze(self, look: int) -> Tensor:
-        """Point of the scene that the eye fixated in a look.
-
-        Args:
-            look: number of the look; negative numbers count from the end.
-
-        Returns:
-            `(D,)`, a unit direction in a panorama, or pixels of a flat scene.
-        """
-        return self.views.gaze[self.actions[look]]
-
-    def places(self, look: int, score: float = 0.1) -> tuple[Places, Tensor, Tensor]:
-        """Objects detected in a look, in coordinates of the scene.
-
-        Args:
-            look: number of the look; negative numbers count from the end.
-            score: least score of an object. For a search, only objects of the target class are returned.
-
-        Returns:
-            The regions that the objects cover, their classes `(M,)` and their scores `(M,)`.
-        """
-        seen = self.detections[look]
-        best, label = seen.scores[0, :, 1:].max(-1)
-        label = label + 1
-        kept = seen.mask[0] & (best >= score)
-        if self.target is not None:
-            kept &= label == self.target
-        return self.views.world.places(seen.boxes[0, kept], self.pose(look)), label[kept], best[kept]
-
-    def __repr__(self) -> str:
-        """One line on the outcome of the episode."""
-        what = "exploration" if self.target is None else self.classes[self.target]
-        found = "" if self.target is None else (", found" if self.found else ", not found")
-        return f"HeadPath: {what}{found}, {len(self)} looks, {self.turns} turns of the head, {self.seconds[-1]:.1f} s"
 
 
 class HeadAgent(nn.Module):
@@ -301,6 +213,17 @@ class HeadAgent(nn.Module):
             found = target is not None and float(told[views.gaze_cell[step.action]]) >= confirm
             if found:
                 break
+        ending: Ending = "decision" if found else "passes" if len(actions) == passes else "seconds"
+        if not found and len(actions) == len(views.grid):
+            ending = "cells"
         return HeadPath(
-            views, target, self.classes, tuple(actions), tuple(times), tuple(seen), torch.stack(maps), found
+            views=views,
+            target=target,
+            classes=self.classes,
+            actions=tuple(actions),
+            seconds=tuple(times),
+            detections=tuple(seen),
+            maps=torch.stack(maps),
+            found=found,
+            ending=ending,
         )

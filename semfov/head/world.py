@@ -12,12 +12,14 @@ from torch.nn import functional as F
 from semfov.belief.grid import Grid
 from semfov.data.inputs import ImageLike, as_image
 from semfov.data.large import LargePicture, open_large
-from semfov.errors import check
+from semfov.errors import InputError, check
 from semfov.sensor.perspective import even_rows, go_around, sample
 from semfov.sensor.sphere import Camera, Regions, angle_between, panorama_directions, panorama_points
 
 VIEW = (416, 312)
 """Default `(width, height)` of a view in pixels."""
+
+_BLANK = "picture: expected a scene with its picture to view, got its size alone, as a path from a file has it"
 
 
 class Places(Protocol):
@@ -169,7 +171,8 @@ class Panorama(World):
     A pose is the camera's yaw, pitch and horizontal field of view in degrees. Points are unit directions, so D is 3.
 
     Args:
-        image: equirectangular picture of any common kind (`semfov.as_image`), with an even number of columns.
+        image: equirectangular picture of any common kind (`semfov.as_image`), with an even number of columns; or its
+            `(width, height)` alone, for the geometry of a scene that is not viewed.
         size: `(w, h)` of a view in pixels.
         cell: height of the scene's cells in degrees.
         reach: how far up and down the head turns, in degrees.
@@ -183,21 +186,33 @@ class Panorama(World):
     """
 
     def __init__(
-        self, image: ImageLike, size: tuple[int, int] = VIEW, *, cell: float = 6.0, reach: float = 60.0
+        self,
+        image: ImageLike | tuple[int, int],
+        size: tuple[int, int] = VIEW,
+        *,
+        cell: float = 6.0,
+        reach: float = 60.0,
     ) -> None:
-        pixels = as_image(image)
-        check(pixels.shape[-1] % 2 == 0, "image", "an even number of columns", pixels.shape[-1])
+        pixels: Tensor | None = None
+        if isinstance(image, tuple):
+            picture = image
+        else:
+            pixels = as_image(image)
+            picture = pixels.shape[-1], pixels.shape[-2]
+        check(picture[0] % 2 == 0, "image", "an even number of columns", picture[0])
         check(0 < cell <= 90, "cell", "a positive angle of at most 90 degrees", cell)
         check(0 <= reach <= 90, "reach", "an angle from 0 to 90 degrees", reach)
-        self.picture, self.size, self.reach = (pixels.shape[-1], pixels.shape[-2]), size, reach
+        self.picture, self.size, self.cell, self.reach = picture, size, cell, reach
         self.scene = Grid(round(360 / cell), round(180 / cell), self.picture)
         self.centres = panorama_directions(self.scene.centres, self.picture)
         weight = torch.linalg.vector_norm(self.centres[:, ::2], dim=-1)
         self.area = weight / weight.mean()
-        self._source = go_around(even_rows(pixels)[None])[0]
+        self._source = None if pixels is None else go_around(even_rows(pixels)[None])[0]
 
     def view(self, pose: Tensor) -> Tensor:
         """Render the view of the camera."""
+        if self._source is None:
+            raise InputError(_BLANK)
         return sample(self._source, pose, self.size).clamp(0, 1)
 
     def to_view(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
@@ -302,7 +317,8 @@ class Flat(World):
     middle of the window in pixels, and the window's width in degrees. Points are pixels, so D is 2.
 
     Args:
-        picture: picture of any common kind (`semfov.data.large.open_large`).
+        picture: picture of any common kind (`semfov.data.large.open_large`); or its `(width, height)` alone, for the
+            geometry of a scene that is not viewed.
         size: `(w, h)` of a view in pixels.
         degree: number of pixels of the picture per degree.
         cell: height of the scene's cells in degrees.
@@ -317,7 +333,7 @@ class Flat(World):
 
     def __init__(
         self,
-        picture: LargePicture | ImageLike,
+        picture: LargePicture | ImageLike | tuple[int, int],
         size: tuple[int, int] = VIEW,
         *,
         degree: float = 640 / 60,
@@ -325,8 +341,11 @@ class Flat(World):
     ) -> None:
         check(degree > 0, "degree", "a positive number of pixels", degree)
         check(cell > 0, "cell", "a positive number of degrees", cell)
-        self.opened, self.size, self.degree = open_large(picture), size, degree
-        self.picture = self.opened.size
+        self.opened: LargePicture | None = None
+        if not isinstance(picture, tuple):
+            self.opened = open_large(picture)
+            picture = self.opened.size
+        self.picture, self.size, self.cell, self.degree = picture, size, cell, degree
         columns, rows = (max(1, round(side / degree / cell)) for side in self.picture)
         self.scene = Grid(columns, rows, self.picture)
         self.centres = self.scene.centres
@@ -345,6 +364,8 @@ class Flat(World):
 
     def view(self, pose: Tensor) -> Tensor:
         """The content of the window, resampled to the size of a view."""
+        if self.opened is None:
+            raise InputError(_BLANK)
         pixels = self.opened.read(self._box(pose)).float()[None] / 255
         return F.interpolate(pixels, self.size[::-1], mode="bilinear", antialias=True)[0].clamp(0, 1)
 

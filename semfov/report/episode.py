@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from semfov.detection.placement import resize
-from semfov.scanpath import Scanpath, describe, sensor_in_words, why_it_ended
+from semfov.paths import Scanpath, sensor_in_words
 from semfov.viz.belief import class_posterior
 from semfov.viz.labels import Box, place_labels
 from semfov.viz.semantic import entropy
@@ -129,7 +129,7 @@ def episode_data(
     return {
         "name": name,
         **about_data(scanpath, settings),
-        "summary": describe(scanpath),
+        "summary": scanpath.describe(),
         "outcome": outcome_data(scanpath),
         "presence": None if scanpath.presence is None else [rounded(p) for p in scanpath.presence.tolist()],
         "size": size,
@@ -148,7 +148,7 @@ def about_data(scanpath: Scanpath, settings: Mapping[str, Any] | None) -> Data:
     """Detector, sensor and decision in words; None for parts that were not kept."""
     if settings is None and scanpath.stimulus is not None:
         settings = scanpath.stimulus.settings
-    decision = f"{describe(scanpath)}. {why_it_ended(scanpath)}".rstrip()
+    decision = scanpath.summary()
     if scanpath.decision is not None and scanpath.decision.cell is not None:
         row, column = divmod(scanpath.decision.cell, scanpath.grid.columns)
         decision += f" It is at column {column}, row {row}."
@@ -170,7 +170,7 @@ def outcome_data(scanpath: Scanpath) -> Data:
     found = decision is not None and decision.outcome == "found"
     box = decision.box if decision is not None and found else None
     return {
-        "why": why_it_ended(scanpath),
+        "why": scanpath.why_it_ended(),
         "cell": decision.cell if decision is not None and found else None,
         "box": None if box is None else [round(x, 1) for x in box.tolist()],
     }

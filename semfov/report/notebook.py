@@ -1,15 +1,20 @@
-"""The display of a scanpath in a notebook: the page to step through, in a frame, with a limited size."""
+"""The display of records in a notebook: for a scanpath the page to step through, in a frame, with a limited size."""
 
 from __future__ import annotations
 
 from html import escape
 
+from semfov.head.path import HeadPath
+from semfov.paths import Record, Scanpath
+from semfov.paths.drawing import draws
+from semfov.report.drawing import path_html
 from semfov.report.episode import Pool, episode_data
 from semfov.report.page import page_html
-from semfov.scanpath import Scanpath, describe
-from semfov.scanpath.drawing import draws
 from semfov.viz.animation import animate
+from semfov.viz.head import plot_head_path
 from semfov.viz.scanpath import plot_scanpath
+from semfov.viz.zoom import plot_zoom_path
+from semfov.zoom.path import ZoomPath
 
 MOST = 3_000_000
 """Largest number of bytes that a scanpath adds to a notebook's file."""
@@ -46,7 +51,7 @@ def notebook_html(scanpath: Scanpath) -> str:
             data = episode_data(
                 scanpath, scanpath.image, views, pool, name=name, classes=classes, width=width, quality=quality
             )
-            frame = framed(page_html(f"semfov: {describe(scanpath)}", [data], pool), describe(scanpath))
+            frame = framed(page_html(f"semfov: {scanpath.describe()}", [data], pool), scanpath.describe())
             if len(frame.encode()) <= MOST:
                 return frame
     words = escape(repr(scanpath))
@@ -69,6 +74,15 @@ def _classes_that_fit(scanpath: Scanpath) -> int:
     return min(len(scanpath.classes) - 1, int(room // bytes_of_map))
 
 
-draws("notebook", notebook_html)
-draws("plot", plot_scanpath)
-draws("animate", animate)
+def record_html(record: Record) -> str:
+    """The text form of a record, for kinds that have no page or drawing."""
+    return f"<pre>{escape(repr(record))}</pre>"
+
+
+draws("notebook", Record, record_html)
+draws("notebook", Scanpath, notebook_html)
+draws("notebook", ZoomPath, path_html)
+draws("plot", Scanpath, plot_scanpath)
+draws("plot", ZoomPath, plot_zoom_path)
+draws("plot", HeadPath, plot_head_path)
+draws("animate", Scanpath, animate)

@@ -65,7 +65,10 @@ def zoom_data(
     >>> lattice, nothing = Lattice.over((1600, 1200), (400, 400)), torch.zeros(0)
     >>> look = Glance(on_lattice(lattice, (0, 0, 0)), Detections.empty(1, 1), nothing, nothing, None)
     >>> objects = Objects(nothing.view(0, 4), nothing, nothing.long(), nothing.long())
-    >>> path = ZoomPath(lattice, ("background", "cup"), 1, (look,), (float("inf"),), objects, ending="passes")
+    >>> path = ZoomPath(
+    ...     lattice=lattice, classes=("background", "cup"), target=1, glances=(look,), values=(float("inf"),),
+    ...     objects=objects, ending="passes",
+    ... )
     >>> data = zoom_data(path, torch.rand(3, 1200, 1600), Pool(), name="kitchen.jpg")
     >>> data["sensor"], data["decision"]
     ('windows of 400 × 400 px at magnifications 0.25, 0.5, 1', '0 × cup found. The only pass was used.')
@@ -76,7 +79,6 @@ def zoom_data(
     check(path.passes > 0, "path", "at least one look", path.passes)
     sure = path.objects.above(FOUND)
     objects = _objects(sure, path.classes)
-    target = None if path.target is None else path.classes[path.target]
     found = None if path.decision is None else path.decision.box
     return {
         "name": name,
@@ -87,7 +89,7 @@ def zoom_data(
         "decision": outcome_in_words(path),
         "summary": path.describe(),
         "size": [wide, high],
-        "target": target,
+        "target": path.target_name,
         "decided": path.decision is not None,
         "image": pool.add(_pixels(source, (0, 0, wide, high), min(width, wide)), width, quality),
         "found": None if found is None else [round(x, 1) for x in found.tolist()],
@@ -107,7 +109,7 @@ def windows_in_words(lattice: Lattice) -> str:
 
 def outcome_in_words(path: ZoomPath) -> str:
     """Tell the result of a search or an exploration, and why it ended if that is known."""
-    target = None if path.target is None else path.classes[path.target]
+    target = path.target_name
     if path.decision is None:
         count = len(path.objects.above(FOUND))
         told = f"{count} object{'s' if count != 1 else ''} found." if target is None else f"{count} × {target} found."
@@ -129,7 +131,7 @@ def _objects(objects: Objects, classes: tuple[str, ...]) -> list[Data]:
 def _look(path: ZoomPath, number: int, objects: list[Data], source: LargePicture, pool: Pool, quality: int) -> Data:
     """A look: its window, the value for which it was chosen, its detections and the number of its objects by class."""
     x, y, magnification = path.glances[number].window.fixation
-    frame = _whole_pixels(path.shown(number), path.lattice.size)
+    frame = _whole_pixels(path.region(number), path.lattice.size)
     across = max(1, round((frame[2] - frame[0]) * magnification))
     detections = _detections(path, path.glances[number], frame)
     brought = Counter(each["label"] for each in objects if each["look"] == number)

@@ -4,7 +4,6 @@ Save a figure with `save_figure(figure, "name.pdf")` (PNG and SVG too). In a not
 last value of a cell. To draw in an existing figure, give its axes as `ax=` or `axes=`.
 """
 
-from semfov.scanpath import describe, why_it_ended
 from semfov.viz.animation import animate
 from semfov.viz.belief import class_posterior, plot_belief, plot_belief_bars, plot_belief_strip
 from semfov.viz.curves import plot_cumulative_performance, plot_curve_panels, plot_success_rate
@@ -23,7 +22,6 @@ __all__ = [
     "CONFIDENT",
     "animate",
     "class_posterior",
-    "describe",
     "entropy",
     "named_regions",
     "plot_belief",
@@ -43,5 +41,4 @@ __all__ = [
     "plot_success_rate",
     "plot_zoom_path",
     "save_figure",
-    "why_it_ended",
 ]

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from semfov.errors import DataError, check
 from semfov.io.files import replacing
-from semfov.scanpath import Scanpath, describe
+from semfov.paths import Scanpath
 from semfov.viz.drawing import photograph_of
 from semfov.viz.fixation import FixationFigure
 from semfov.viz.scanpath import views_of
@@ -117,7 +117,7 @@ def film_of(
     check(seconds > 0, "seconds", "a positive time", seconds)
     check(hold >= 0, "hold", "0 seconds or more", hold)
     frames = episode_frames(scanpath, photograph_of(scanpath, image), views_of(scanpath, views), boxes)
-    return Film(frames, seconds, hold, describe(scanpath))
+    return Film(frames, seconds, hold, scanpath.describe())
 
 
 def episode_frames(

@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from semfov.errors import InputError, check
-from semfov.scanpath import Scanpath
+from semfov.paths import Scanpath
 from semfov.viz.drawing import check_fixation, choose_fixations, draw_gaze, draw_image, draw_overlay, draw_scale
 from semfov.viz.style import PROBABILITY, make_figure, only, root, styled
 
@@ -36,7 +36,8 @@ def class_posterior(scanpath: Scanpath, target: int | None = None) -> Tensor:
     >>> from semfov import Grid
     >>> grid, p = Grid(2, 1, (20, 10)), torch.tensor([[[0.5, 0.5], [0.9, 0.1]]])
     >>> cells, values = torch.tensor([0]), torch.zeros(1, 2)
-    >>> path = Scanpath(grid, ("background", "cup"), 1, cells, grid.centres[cells], (), p, values, found=False)
+    >>> path = Scanpath(grid=grid, classes=("background", "cup"), target=1, cells=cells, fixations=grid.centres[cells],
+    ...                 detections=(), probabilities=p, values=values)
     >>> class_posterior(path)
     tensor([[0.5000, 0.1000]])
     """

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from semfov.belief.grid import Grid
 from semfov.errors import InputError, check, check_shape
-from semfov.scanpath import Scanpath
+from semfov.paths import GazeRecord, Scanpath
 from semfov.viz.labels import Box, place_labels
 from semfov.viz.style import GAZE, OTHER, TARGET, overlay_colours
 
@@ -25,11 +25,11 @@ CONFIDENT = 0.1
 _LABEL_POINTS = 6.5
 
 
-def photograph_of(scanpath: Scanpath, image: Tensor | None) -> Tensor:
-    """The given image, or the one that the scanpath kept.
+def photograph_of(record: GazeRecord, image: Tensor | None) -> Tensor:
+    """The given image, or the one that the record kept.
 
     Args:
-        scanpath: the episode.
+        record: the record.
         image: `(3, h, w)`, or None.
 
     Returns:
@@ -38,9 +38,9 @@ def photograph_of(scanpath: Scanpath, image: Tensor | None) -> Tensor:
     Raises:
         InputError: there is neither.
     """
-    shown = scanpath.image if image is None else image
+    shown = record.image if image is None else image
     if shown is None:
-        raise InputError("image: expected the photograph, as the scanpath kept none, got None")
+        raise InputError(f"image: expected the photograph, as the {type(record).__name__.lower()} kept none, got None")
     return shown
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from semfov.scanpath import Scanpath
+from semfov.paths import Scanpath
 from semfov.viz.belief import belief_title, draw_belief
 from semfov.viz.belief import class_posterior as posterior_of
 from semfov.viz.drawing import (

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from semfov.data.inputs import ImageLike, as_image
 from semfov.errors import check
-from semfov.head.agent import HeadPath
+from semfov.head.path import HeadPath
 from semfov.viz.animation import Film, render
-from semfov.viz.drawing import draw_image, pixels_of
+from semfov.viz.drawing import draw_image, photograph_of, pixels_of
 from semfov.viz.style import FOUND, GAZE, OTHER, STYLE, TARGET, make_figure, only, styled
 
 if TYPE_CHECKING:
@@ -23,22 +23,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def describe_head(path: HeadPath) -> str:
-    """One sentence on the outcome of an episode."""
-    what = "exploration" if path.target is None else path.classes[path.target]
-    found = "" if path.target is None else (" found" if path.found else " not found")
-    looks = f"{len(path)} look{'s' if len(path) != 1 else ''}"
-    turns = f"{path.turns} turn{'s' if path.turns != 1 else ''} of the head"
-    return f"{what}{found} in {path.seconds[-1]:.1f} s: {looks}, {turns}"
-
-
 @styled
-def plot_head_path(path: HeadPath, image: ImageLike, *, looks: int | None = None, ax: Axes | None = None) -> Figure:
+def plot_head_path(
+    path: HeadPath, image: ImageLike | None = None, *, looks: int | None = None, ax: Axes | None = None
+) -> Figure:
     """Plot the windows that the head turned to, the fixations in their order, and the objects that were found.
 
     Args:
         path: record of a search or an exploration.
-        image: the scene's picture in any size, of any common kind (`semfov.as_image`).
+        image: the scene's picture in any size, of any common kind (`semfov.as_image`); it must be given.
         looks: number of looks to draw, from the first; None draws all.
         ax: axes to draw in; None makes a figure.
 
@@ -46,21 +39,22 @@ def plot_head_path(path: HeadPath, image: ImageLike, *, looks: int | None = None
         The figure.
 
     Raises:
-        InputError: there are fewer looks.
+        InputError: the picture is not given, or there are fewer looks.
 
     Example::
 
         path = agent.search(Panorama("street.jpg"), "bicycle")
         save_figure(plot_head_path(path, "street.jpg"), "path.png")
     """
+    picture = photograph_of(path, None if image is None else as_image(image))
     count = len(path) if looks is None else looks
     check(1 <= count <= len(path), "looks", f"a number from 1 to {len(path)}", count)
     width, height = path.views.world.scene.extent.tolist()
     figure, (axes,) = make_figure(
         1, 1, width=7.2, height=7.2 * height / width + 0.3, layout="compressed", given=only(ax)
     )
-    draw_path(axes, path, as_image(image), count)
-    axes.set_title(describe_head(path), parse_math=False)
+    draw_path(axes, path, picture, count)
+    axes.set_title(path.describe(), parse_math=False)
     return figure
 
 
@@ -145,7 +139,7 @@ def animate_head(
     from matplotlib import rc_context
 
     with rc_context(STYLE):
-        film = Film(render(_frames(path, as_image(image))), seconds, hold, describe_head(path))
+        film = Film(render(_frames(path, as_image(image))), seconds, hold, path.describe())
     return film if file is None else film.save(file)[0]
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from semfov.errors import DataError
 from semfov.io.files import replacing
-from semfov.live import Moment
+from semfov.paths import Moment
 from semfov.viz.style import FOUND, GAZE, TARGET
 
 Frame = NDArray[np.uint8]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from semfov.scanpath import Scanpath
+from semfov.paths import Scanpath
 from semfov.viz.drawing import lightness, per_point
 from semfov.viz.labels import Box, place_numbers
 from semfov.viz.style import FOUND, TIME

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from semfov.decision import CloserLook
 from semfov.errors import check
-from semfov.scanpath import Scanpath, describe
+from semfov.paths import Scanpath
 from semfov.viz.belief import draw_belief
 from semfov.viz.drawing import (
     choose_fixations,
@@ -74,7 +74,7 @@ def plot_scanpath(
         draw_boxes(axes, box[None], FOUND, width=2.0)
     for look in dismissed(scanpath):
         draw_boxes(axes, look.box[None], FOUND, ":", 1.6)
-    axes.set_title(describe(scanpath), parse_math=False)
+    axes.set_title(scanpath.describe(), parse_math=False)
     draw_legend(axes, scanpath, boxes, len(scanpath) - 1 if detections else None)
     lay_out(figure)
     path = GazePath(axes, scanpath)
@@ -172,7 +172,7 @@ def plot_episode(
     left, right = sides
     first = left.subplots()
     draw_place(first, scanpath, image, boxes)
-    first.set_title(describe(scanpath), parse_math=False)
+    first.set_title(scanpath.describe(), parse_math=False)
     draw_legend(first, scanpath, boxes, None)
     panels = right.subplots(2, len(shown), squeeze=False)
     for (above, below), fixation in zip(panels.T, shown, strict=True):

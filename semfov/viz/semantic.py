@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from semfov.belief.grid import Grid
-from semfov.scanpath import Scanpath
+from semfov.paths import Scanpath
 from semfov.viz.drawing import (
     check_fixation,
     draw_cells,
@@ -48,7 +48,8 @@ def entropy(scanpath: Scanpath) -> Tensor:
 
     >>> grid, p = Grid(2, 1, (20, 10)), torch.tensor([[[0.5, 0.5], [0.0, 1.0]]])
     >>> cells, values = torch.tensor([0]), torch.zeros(1, 2)
-    >>> path = Scanpath(grid, ("background", "cup"), None, cells, grid.centres[cells], (), p, values, found=False)
+    >>> path = Scanpath(grid=grid, classes=("background", "cup"), target=None, cells=cells,
+    ...                 fixations=grid.centres[cells], detections=(), probabilities=p, values=values)
     >>> entropy(path)
     tensor([[1., 0.]])
     """
@@ -182,7 +183,8 @@ def named_regions(scanpath: Scanpath, fixation: int = -1) -> list[tuple[str, lis
 
     >>> grid, p = Grid(2, 1, (20, 10)), torch.tensor([[[0.1, 0.9], [0.2, 0.8]]])
     >>> cells, values = torch.tensor([0]), torch.zeros(1, 2)
-    >>> path = Scanpath(grid, ("background", "cup"), None, cells, grid.centres[cells], (), p, values, found=False)
+    >>> path = Scanpath(grid=grid, classes=("background", "cup"), target=None, cells=cells,
+    ...                 fixations=grid.centres[cells], detections=(), probabilities=p, values=values)
     >>> [(name, region, round(p, 2)) for name, region, p in named_regions(path)]
     [('cup', [0, 1], 0.9)]
     """

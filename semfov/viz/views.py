@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from semfov.eye import Eye
-from semfov.scanpath import Stimulus
+from semfov.paths import Stimulus
 
 
 def foveated_views(eye: Eye, image: Tensor, fixations: Tensor) -> list[Tensor]:

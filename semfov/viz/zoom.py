@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
+from semfov.viz.drawing import photograph_of
 from semfov.viz.style import FOUND, GAZE, TARGET, make_figure, only, styled
 from semfov.zoom.path import ZoomPath
 
@@ -15,19 +16,24 @@ if TYPE_CHECKING:
 
 
 @styled
-def plot_zoom_path(path: ZoomPath, image: Tensor, *, score: float = 0.1, ax: Axes | None = None) -> Figure:
+def plot_zoom_path(
+    path: ZoomPath, image: Tensor | None = None, *, score: float = 0.1, ax: Axes | None = None
+) -> Figure:
     """Plot the windows that were looked at, numbered in their order, and the objects that were found.
 
     The first look, at the whole picture, is not drawn. Objects have names where all classes were looked for.
 
     Args:
         path: record of a search or an exploration.
-        image: `(3, h, w)`, RGB in [0, 1], the picture in any size.
+        image: `(3, h, w)`, RGB in [0, 1], the picture in any size; it must be given.
         score: least score of the objects that are drawn.
         ax: axes to draw in; None makes a figure.
 
     Returns:
         The figure.
+
+    Raises:
+        InputError: the picture is not given.
 
     Example::
 
@@ -36,6 +42,7 @@ def plot_zoom_path(path: ZoomPath, image: Tensor, *, score: float = 0.1, ax: Axe
     """
     from matplotlib.patches import Rectangle
 
+    image = photograph_of(path, image)
     width, height = path.lattice.size
     size = 7.2, 7.2 * height / width + 0.3
     figure, (axes,) = make_figure(1, 1, width=size[0], height=size[1], layout="compressed", given=only(ax))
@@ -45,7 +52,7 @@ def plot_zoom_path(path: ZoomPath, image: Tensor, *, score: float = 0.1, ax: Axe
     for number, glance in enumerate(path.glances):
         if number == 0:
             continue
-        box = path.shown(number)
+        box = path.region(number)
         x1, y1, x2, y2 = box
         line: dict[str, Any] = {"fill": False, "edgecolor": GAZE, "linewidth": 0.8 + 0.5 * (glance.window.level == 1)}
         axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, **line))

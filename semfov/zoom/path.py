@@ -1,54 +1,102 @@
-"""The record of a search or an exploration of a large picture."""
+"""The record of a search or an exploration of a large picture: windows, objects and the decision."""
 
-from dataclasses import dataclass
-from typing import Literal
+from __future__ import annotations
 
-from semfov.decision import CloserLook, Decision
-from semfov.zoom.drawing import path_html
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from semfov.detection.detections import Detections
+from semfov.errors import check
+from semfov.io.schema import Array, Field, Maybe, Number, Object, Pair
+from semfov.paths.base import GazeRecord
+from semfov.paths.endings import WINDOWS
+from semfov.paths.files import POSITIVE, WHOLE, Format, pair
 from semfov.zoom.gist import FOUND
-from semfov.zoom.glances import Glance
+from semfov.zoom.glances import Glance, Window
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.objects import Objects
 
-Ending = Literal["decision", "price", "passes", "windows"]
-"""Why a path ended: the search decided, no look was worth its price in objects, the passes were used up, or no window
-was left that can show the target."""
+_WINDOW = {
+    "fixation": Pair((Number(), Number(), POSITIVE)),
+    "level": WHOLE,
+    "cells": Array(Number(whole=True), 4),
+    "within": Maybe(Array(Number(), 4)),
+}
+_LATTICE = {
+    "size": pair(Number(low=1, whole=True)),
+    "canvas": pair(Number(low=1, whole=True)),
+    "magnifications": Array(POSITIVE, least=1, ascending=True),
+}
+_OBJECTS = ("boxes", "scores", "labels", "passes")
+
+FORMAT = Format.of(
+    "zoom path",
+    {
+        "values": Field(("n",), mixed=True, finite=False),
+        "cut": Field(("M",), dtype=torch.bool),
+        "show": Field(("n", "C-1"), mixed=True),
+        "object_boxes": Field(("P", 4), mixed=True),
+        "object_scores": Field(("P",), mixed=True),
+        "object_labels": Field(("P",), dtype=torch.int64, low=1),
+        "object_passes": Field(("P",), dtype=torch.int64, low=0),
+    },
+    {
+        "lattice": Object(_LATTICE, None, tuple(_LATTICE)),
+        "windows": Array(Object(_WINDOW, None, tuple(_WINDOW)), "n"),
+    },
+    endings=("decision", "price", "passes", "windows"),
+    closer=("number", "target", "place", "presence"),
+)
+"""Format of the files of paths through large pictures."""
 
 
-@dataclass(frozen=True, repr=False)
-class ZoomPath:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ZoomPath(GazeRecord):
     """The record of a search or an exploration of a large picture.
 
-    In a notebook it shows the windows that were looked at; `semfov.viz.plot_zoom_path` draws them on the picture.
+    In a notebook it shows the windows that were looked at; `plot` draws them on the picture.
+
+    Beside the attributes of `semfov.paths.GazeRecord` it has those of its looks.
 
     Attributes:
         lattice: lattice of the picture.
-        classes: names of the classes, background first.
-        target: class that was searched for; None for all classes.
-        glances: looks in their order, the overview first.
+        glances: looks in their order, the overview first. In a path from a file they have no gist.
         values: value of each look when it was chosen; that of the overview is infinite. For a closer look it is the
             probability that the target is at the place.
         objects: objects that were found, merged from all looks.
-        decision: decision of a search; None where all objects were to be found.
-        ending: reason for the end; None if it is not known.
+        detections: detections of each look, batches of one, with boxes in picture pixels.
+        found: whether the decision is `found`, or without a decision, whether an object of the target was found.
         closer: closer looks of a search, in their order; they are among the `glances`.
 
-    >>> import torch
     >>> nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
-    >>> path = ZoomPath(Lattice.over((2560, 1920), (416, 416)), ("background", "cup"), 1, (), (), nothing)
+    >>> lattice = Lattice.over((2560, 1920), (416, 416))
+    >>> path = ZoomPath(
+    ...     lattice=lattice, classes=("background", "cup"), target=1, glances=(), values=(), objects=nothing
+    ... )
     >>> path.describe()
     '0 × cup in 0 passes'
     """
 
     lattice: Lattice
-    classes: tuple[str, ...]
-    target: int | None
     glances: tuple[Glance, ...]
     values: tuple[float, ...]
     objects: Objects
-    decision: Decision | None = None
-    ending: Ending | None = None
-    closer: tuple[CloserLook, ...] = ()
+    detections: tuple[Detections, ...] = field(init=False)
+    found: bool = field(init=False)
+
+    _format = FORMAT
+    _sentences = WINDOWS
+
+    def __post_init__(self) -> None:
+        """Derive what the looks and the decision tell."""
+        some = self.target is not None and len(self.objects.above(FOUND)) > 0
+        found = some if self.decision is None else self.decision.outcome == "found"
+        object.__setattr__(self, "found", found)
+        object.__setattr__(self, "detections", tuple(glance.detections for glance in self.glances))
 
     @property
     def passes(self) -> int:
@@ -65,45 +113,12 @@ class ZoomPath:
         passes = f"{self.passes} pass{'es' if self.passes != 1 else ''}"
         if self.decision is not None and self.target is not None:
             outcome = f"{self.decision.outcome} ({self.decision.probability:.2f})"
-            return f"{self.classes[self.target]}: {outcome} in {passes}"
+            return f"{self.target_name}: {outcome} in {passes}"
         if self.target is None:
             return f"{count} object{'s' if count != 1 else ''} in {passes}"
-        return f"{count} × {self.classes[self.target]} in {passes}"
+        return f"{count} × {self.target_name} in {passes}"
 
-    def why_it_ended(self) -> str:
-        """Explain in one sentence why the search or exploration ended.
-
-        Returns:
-            The sentence; empty if the reason is not known.
-        """
-        if self.ending == "decision" and self.decision is not None and self.closer:
-            return {
-                "found": "A closer look confirmed the target.",
-                "absent": "No closer look confirmed the target, and it is probably absent.",
-                "undecided": "No closer look confirmed the target, but it is probably there.",
-            }[self.decision.outcome]
-        if self.ending == "decision" and self.decision is not None:
-            return {
-                "found": "The probability is high enough, and a detection shows the target.",
-                "absent": "No remaining look is worth a pass, and the target is probably absent.",
-                "undecided": "No remaining look is worth a pass, but the target is probably there.",
-            }[self.decision.outcome]
-        reasons = {
-            "price": "No remaining look is expected to show enough new objects.",
-            "passes": f"All {self.passes} passes were used." if self.passes != 1 else "The only pass was used.",
-            "windows": "No remaining look can show the target.",
-        }
-        return reasons.get(self.ending or "", "")
-
-    def told(self) -> str:
-        """Summarise the result, and explain why the search or exploration ended.
-
-        Returns:
-            A line of text.
-        """
-        return f"{self.describe()}. {self.why_it_ended()}".rstrip()
-
-    def shown(self, number: int) -> tuple[float, float, float, float]:
+    def region(self, number: int) -> tuple[float, float, float, float]:
         """Part of the picture that a look showed.
 
         Args:
@@ -120,8 +135,8 @@ class ZoomPath:
         x, y = x + 0.5, y + 0.5
         return max(x - across, 0.0), max(y - down, 0.0), min(x + across, float(width)), min(y + down, float(height))
 
-    def __repr__(self) -> str:
-        """The result, the windows and the objects."""
+    def _lines(self) -> list[str]:
+        """The windows and the objects."""
         looks = [f"({x:.0f}, {y:.0f}) × {m:.2f}" for x, y, m in (glance.window.fixation for glance in self.glances)]
         path = looks if len(looks) <= 6 else [*looks[:4], "…", looks[-1]]
         sure = self.objects.above(FOUND)
@@ -131,15 +146,75 @@ class ZoomPath:
         ]
         more = ["…"] if len(sure) > 5 else []
         width, height = self.lattice.size
-        return "\n".join(
-            [
-                f"ZoomPath: {self.told()}",
-                f"  at (x, y) × magnification: {', '.join(path)} of {width} × {height} px",
-                f"  objects: {', '.join([*named, *more]) or 'none'}",
-            ]
-        )
+        return [
+            f"at (x, y) × magnification: {', '.join(path)} of {width} × {height} px",
+            f"objects: {', '.join([*named, *more]) or 'none'}",
+        ]
 
-    def _repr_html_(self) -> str:
-        """A drawing of the windows, numbered in their order, and of the objects."""
-        windows = [self.shown(number) for number in range(self.passes)]
-        return path_html(self.told(), self.lattice.size, windows, self.objects, self.classes)
+    def rows(self) -> list[dict[str, Any]]:
+        """The looks as a table of plain values, one row for each look.
+
+        `value` is the value for which the look was chosen, None for the overview, and `closer` the probability that the
+        target is at the place of a closer look. `detections` is the number of detections, `seen` the class of the most
+        confident one, and `score` its confidence.
+
+        Returns:
+            One dictionary for each look.
+        """
+        closer = {look.number: look.place for look in self.closer}
+        rows = []
+        for number, (glance, value) in enumerate(zip(self.glances, self.values, strict=True)):
+            x, y, magnification = glance.window.fixation
+            rows.append(
+                {
+                    "look": number,
+                    "x": x,
+                    "y": y,
+                    "magnification": magnification,
+                    "level": glance.window.level,
+                    "value": value if abs(value) < float("inf") else None,
+                    "closer": closer.get(number),
+                    **self._detected(glance.detections),
+                }
+            )
+        return rows
+
+    def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
+        return torch.tensor([glance.window.fixation[:2] for glance in self.glances]), self.lattice.size
+
+    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        tensors = {f"object_{name}": getattr(self.objects, name) for name in _OBJECTS}
+        tensors["values"] = torch.tensor(self.values, dtype=torch.float64)
+        tensors["cut"] = torch.cat([glance.cut for glance in self.glances])
+        tensors["show"] = torch.stack([glance.show for glance in self.glances])
+        windows = [{name: getattr(glance.window, name) for name in _WINDOW} for glance in self.glances]
+        return tensors, {"lattice": {name: getattr(self.lattice, name) for name in _LATTICE}, "windows": windows}
+
+    @classmethod
+    def _fields(
+        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        lattice = Lattice(**{name: tuple(value) for name, value in record["lattice"].items()})
+        objects = Objects(*(tensors[f"object_{name}"] for name in _OBJECTS))
+        looks, classes = shared["detections"], shared["classes"]
+        for name, values, most in (("labels", objects.labels, len(classes)), ("passes", objects.passes, len(looks))):
+            fits = not len(values) or int(values.max()) < most
+            check(fits, f"object_{name}", f"numbers below {most}", values.tolist())
+        windows = [
+            Window(
+                tuple(each["fixation"]), each["level"], tuple(each["cells"]), each["within"] and tuple(each["within"])
+            )
+            for each in record["windows"]
+        ]
+        for window in windows:
+            check(window.level < lattice.levels, "windows", f"levels below {lattice.levels}", window.level)
+        cuts = tensors["cut"].split(record["lengths"])
+        return {
+            "lattice": lattice,
+            "glances": tuple(
+                Glance(window, seen, cut, show, None)
+                for window, seen, cut, show in zip(windows, looks, cuts, tensors["show"], strict=True)
+            ),
+            "values": tuple(tensors["values"].tolist()),
+            "objects": objects,
+        }

@@ -7,12 +7,13 @@ import torch
 
 from semfov.belief.target_evidence import Thresholds
 from semfov.decision import MOST, OUTCOMES, Decision, settle
+from semfov.paths.endings import Ending
 from semfov.zoom.belief import Rates, ZoomBelief
 from semfov.zoom.closer import ZoomVerifier
 from semfov.zoom.evidence import GlimpseEvidence
 from semfov.zoom.glances import Glance, Glances, Window, on_lattice
 from semfov.zoom.objects import merge
-from semfov.zoom.path import Ending, ZoomPath
+from semfov.zoom.path import ZoomPath
 from semfov.zoom.policy import Choice, best_find, best_hit, best_slice, jointly
 from semfov.zoom.tally import Tally
 
@@ -181,15 +182,15 @@ def search(
             presence, box, place = max(presence, best.place), best.box, best.place
     ending: Ending = "decision" if ended else "passes" if len(seen) == passes else "windows"
     return ZoomPath(
-        glances.lattice,
-        classes,
-        target,
-        tuple(seen),
-        tuple(values),
-        merge(seen, target),
-        Decision(OUTCOMES[ended], presence, None, box, place),
-        ending,
-        () if verifier is None else tuple(verifier.looks),
+        lattice=glances.lattice,
+        classes=classes,
+        target=target,
+        glances=tuple(seen),
+        values=tuple(values),
+        objects=merge(seen, target),
+        decision=Decision(OUTCOMES[ended], presence, None, box, place),
+        ending=ending,
+        closer=() if verifier is None else tuple(verifier.looks),
     )
 
 
@@ -227,5 +228,12 @@ def find_all(
             if len(seen) == passes:
                 ending = "passes"
                 break
-    objects = merge(seen, target)
-    return ZoomPath(glances.lattice, classes, target, tuple(seen), tuple(values), objects, ending=ending)
+    return ZoomPath(
+        lattice=glances.lattice,
+        classes=classes,
+        target=target,
+        glances=tuple(seen),
+        values=tuple(values),
+        objects=merge(seen, target),
+        ending=ending,
+    )

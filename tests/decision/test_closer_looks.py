@@ -12,7 +12,6 @@ from semfov.belief.target_evidence import Thresholds
 from semfov.detection import Candidates
 from semfov.errors import DataError, InputError
 from semfov.gaze.policies import NonPredictive, Random
-from semfov.scanpath import describe, why_it_ended
 from tests.decision.test_rule import Nothing, Scripted, Square, cells
 
 
@@ -84,8 +83,8 @@ def test_the_search_ends_with_the_box_of_the_closer_look(image):
     assert scanpath.decision.place == pytest.approx(float(seen.scores[0, 0, 1]), abs=1e-6)
     (look,) = scanpath.closer
     assert (look.fixation, look.target, look.cell) == (2, 1, 11)
-    assert describe(scanpath).startswith("“red” found after 2 gaze shifts and 1 closer look (probability 0.")
-    assert why_it_ended(scanpath) == "A closer look confirmed the target."
+    assert scanpath.describe().startswith("“red” found after 2 gaze shifts and 1 closer look (probability 0.")
+    assert scanpath.why_it_ended() == "A closer look confirmed the target."
 
 
 def test_what_looks_like_the_target_from_afar_is_not_found_closely(image):

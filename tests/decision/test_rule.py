@@ -28,7 +28,6 @@ from semfov.detection import Candidates, Detector
 from semfov.errors import InputError
 from semfov.eye import Eye
 from semfov.gaze.policies import NonPredictive, Random
-from semfov.viz.scanpath import describe
 
 SIZE = (160, 120)
 AT = Thresholds(0.8, 0.1)
@@ -303,7 +302,7 @@ def test_search_ends_when_the_target_is_found(image):
     torch.testing.assert_close(decision.box, torch.tensor([130.0, 90, 150, 110]), atol=6, rtol=0)
     boxes = torch.cat([seen.boxes[0] for seen in scanpath.detections])
     assert bool((boxes == decision.box).all(-1).any())
-    assert describe(scanpath) == "“red” found after 2 gaze shifts (probability 0.97)"
+    assert scanpath.describe() == "“red” found after 2 gaze shifts (probability 0.97)"
 
 
 def test_the_target_may_be_found_in_another_cell_than_the_last_fixation(image):
@@ -413,14 +412,14 @@ def test_search_gives_up_and_describes_the_outcome(image, presence, outcome, wor
     assert scanpath.cells.tolist() == [0, 5]
     assert not scanpath.found
     assert scanpath.decision == Decision(outcome, pytest.approx(presence))
-    assert describe(scanpath) == f"“red” {words} after 1 gaze shift (probability {presence:.2f})"
+    assert scanpath.describe() == f"“red” {words} after 1 gaze shift (probability {presence:.2f})"
 
 
 def test_search_without_shifts_left_is_undecided(image):
     scanpath = agent(Scripted((cells(), 0.1))).search(image, "red", start=0, shifts=4)
     assert scanpath.shifts == 4
     assert scanpath.decision == Decision("undecided", pytest.approx(0.1))
-    assert describe(scanpath) == "“red” undecided after 4 gaze shifts (probability 0.10)"
+    assert scanpath.describe() == "“red” undecided after 4 gaze shifts (probability 0.10)"
 
 
 def test_search_without_cells_left_decides_absent(image):
@@ -456,18 +455,18 @@ def test_search_with_annotated_boxes_makes_no_decision(image):
     scanpath = agent(Scripted(*script)).search(image, "red", start=0, boxes=boxes, shifts=1)
     assert scanpath.cells.tolist() == [0, 5]
     assert (scanpath.found, scanpath.decision) == (False, None)
-    assert describe(scanpath) == "“red” not found in 1 gaze shift"
+    assert scanpath.describe() == "“red” not found in 1 gaze shift"
     script[1] = (cells(c6=0.3), 0.9)
     scanpath = agent(Scripted(*script)).search(image, "red", start=0, boxes=boxes)
     assert scanpath.cells.tolist() == [0, 5, 6]
     assert (scanpath.found, scanpath.decision) == (True, None)
-    assert describe(scanpath) == "“red” found after 2 gaze shifts"
+    assert scanpath.describe() == "“red” found after 2 gaze shifts"
 
 
 def test_exploration_makes_no_decision(image):
     scanpath = agent(Scripted((cells(), 0.5))).explore(image, start=0, shifts=1)
     assert scanpath.decision is None
-    assert describe(scanpath) == "explored with 1 gaze shift"
+    assert scanpath.describe() == "explored with 1 gaze shift"
 
 
 def test_without_thresholds_a_detection_confirms_the_target(image):

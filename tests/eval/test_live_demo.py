@@ -12,7 +12,7 @@ from semfov.belief import DirichletBelief, Verification
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import Picture, Stream, embedded_picture
 from semfov.decision import CloserLook, Decision
-from semfov.live import Moment
+from semfov.paths import Moment
 from semfov.viz.live import draw_moment, video, video_suffix
 from tests import small
 
@@ -158,6 +158,7 @@ def moment(**changes):
     belief = DirichletBelief(beta)
     seen = Detections(torch.zeros(1, 0, 4), torch.zeros(1, 0, 2), torch.zeros(1, 0, dtype=torch.bool))
     made = {
+        "classes": ("background", "cup"),
         "number": 0, "grid": grid, "target": 1, "cell": 0, "fixation": grid.centres[0], "detections": seen,
         "belief": belief, "decision": None, "visited": torch.zeros(8, dtype=torch.bool), "next_cell": 3, "seconds": {},
     }  # fmt: skip

@@ -9,7 +9,7 @@ from semfov.errors import InputError
 from semfov.head import Flat, HeadAgent, Panorama, Speeds
 from semfov.head.episode import live
 from semfov.sensor.sphere import Regions
-from semfov.viz.head import animate_head, describe_head, plot_head_path
+from semfov.viz.head import animate_head, plot_head_path
 
 
 @pytest.fixture
@@ -82,7 +82,7 @@ def test_paths_can_be_plotted_and_animated(agent, panorama, tmp_path):
     world = Panorama(panorama)
     for path in (agent.search(world, "blue", passes=3, confirm=1.0), agent.explore(world, passes=2)):
         figure = plot_head_path(path, panorama)
-        assert figure.axes[0].get_title() == describe_head(path)
+        assert figure.axes[0].get_title() == path.describe()
         film = animate_head(path, panorama)
         assert len(film) == len(path)
         frames = [frame.shape for frame in film.frames]

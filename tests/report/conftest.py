@@ -102,7 +102,15 @@ def zoom_path(hostile: str) -> ZoomPath:
     objects = Objects(boxes[1:, 0], torch.tensor([0.8, 0.2]), torch.tensor([2, 2]), torch.tensor([1, 2]))
     classes = ("background", "cat", hostile, "cup")
     decision = Decision("found", 0.93, None, boxes[1, 0])
-    return ZoomPath(lattice, classes, 2, glances, (float("inf"), 0.5, 0.25), objects, decision)
+    return ZoomPath(
+        lattice=lattice,
+        classes=classes,
+        target=2,
+        glances=glances,
+        values=(float("inf"), 0.5, 0.25),
+        objects=objects,
+        decision=decision,
+    )
 
 
 @pytest.fixture

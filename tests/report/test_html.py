@@ -14,7 +14,6 @@ from semfov.decision import Decision
 from semfov.report.curves import curves_html, table_html
 from semfov.report.episode import Pool, episode_data
 from semfov.report.page import write_page
-from semfov.viz import why_it_ended
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 
 
@@ -175,12 +174,12 @@ def test_the_page_contains_the_outcome(scanpath, image):
     presence = torch.tensor([0.25, 0.5, 0.97])
     searched = replace(scanpath, decision=decision, ending="decision", presence=presence)
     data = episode_data(searched, image, [image] * 3, Pool(), name="sought")
-    assert data["outcome"] == {"why": why_it_ended(searched), "cell": 6, "box": [1.0, 2.0, 30.2, 40.0]}
+    assert data["outcome"] == {"why": searched.why_it_ended(), "cell": 6, "box": [1.0, 2.0, 30.2, 40.0]}
     assert data["presence"] == [0.25, 0.5, 0.97]
-    assert data["outcome"]["why"] != why_it_ended(replace(searched, decision=Decision("absent", 0.1))) != ""
+    assert data["outcome"]["why"] != replace(searched, decision=Decision("absent", 0.1)).why_it_ended() != ""
     for ending in ("box", "price", "shifts", "cells"):
         ended = replace(scanpath, ending=ending)
         data = episode_data(ended, image, [image] * 3, Pool(), name="other")
-        assert data["outcome"] == {"why": why_it_ended(ended), "cell": None, "box": None}
+        assert data["outcome"] == {"why": ended.why_it_ended(), "cell": None, "box": None}
         assert data["outcome"]["why"].endswith(".")
-    assert why_it_ended(replace(scanpath, ending=None)) == ""
+    assert replace(scanpath, ending=None).why_it_ended() == ""

@@ -10,9 +10,9 @@ import torch
 
 from semfov import Detections, Grid, Scanpath
 from semfov.detection import Placement
+from semfov.paths import Stimulus
+from semfov.paths.stimulus import in_bytes
 from semfov.report import notebook
-from semfov.scanpath import Stimulus
-from semfov.scanpath.stimulus import in_bytes
 from tests.report.pages import data_of
 
 

@@ -10,6 +10,7 @@ import pytest
 from docs.api import entries
 
 SECTION = re.compile(r"(?m)^(Args|Attributes|Returns|Yields|Raises):\n((?: +.*\n?|\n)*)")
+PARTS = ("Args", "Attributes")
 PLACES = [pytest.param(thing, id=f"{module}.{name}") for module, things in entries().items() for name, thing in things]
 
 
@@ -46,11 +47,15 @@ def check_function(function, text):
     assert raised(function) <= explained(told.get("Raises", ""))
 
 
+def is_ours(cls):
+    return cls.__module__.startswith("semfov")
+
+
 def methods(cls):
     """Public methods that a class defines, except those documented in a base class of the package."""
     for name, thing in vars(cls).items():
         function = inspect.unwrap(getattr(thing, "__func__", thing)) if callable(thing) or name in vars(cls) else thing
-        bases = [base for base in cls.__mro__[1:] if base.__module__.startswith("semfov")]
+        bases = [base for base in cls.__mro__[1:] if is_ours(base)]
         inherited = any(inspect.getdoc(vars(base).get(name)) for base in bases if name in vars(base))
         own = inspect.isfunction(function) and (function.__module__ or "").startswith("semfov")
         if own and not name.startswith("_") and not inherited:
@@ -71,7 +76,9 @@ def test_docstrings_of_classes_are_complete(thing):
         assert ">>>" in text or "Example" in text
         init = vars(thing).get("__init__")
         if inspect.isfunction(init) and not getattr(thing, "_is_protocol", False):
-            told = sections(text)
-            assert arguments(init) <= explained(told.get("Args", "")) | explained(told.get("Attributes", ""))
+            # A data class explains its own attributes, and its base classes explain theirs.
+            texts = [text, *(inspect.getdoc(base) or "" for base in thing.__mro__[1:] if is_ours(base))]
+            told = [sections(each) for each in texts]
+            assert arguments(init) <= {n for each in told for part in PARTS for n in explained(each.get(part, ""))}
     for function in methods(thing):
         check_function(function, inspect.getdoc(function))

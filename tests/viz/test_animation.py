@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from semfov import Detections, Grid, InputError, Scanpath
-from semfov.viz import animate, describe, plot_fixation
+from semfov.viz import animate, plot_fixation
 from semfov.viz.animation import episode_frames, in_one_palette, render, save_animation
 from semfov.viz.fixation import FixationFigure
 
@@ -99,7 +99,7 @@ def test_a_film_is_shown_in_notebooks_as_the_gif_that_it_writes(searched, tmp_pa
     scanpath, image, views = searched
     film = animate(scanpath, image=image, views=views, seconds=0.5, hold=1)
     assert len(film) == 3
-    assert repr(film).startswith(f"Film: {describe(scanpath)}, 3 frames of ")
+    assert repr(film).startswith(f"Film: {scanpath.describe()}, 3 frames of ")
     inside = re.fullmatch(r'<img [^>]*src="data:image/gif;base64,([^"]+)">', film._repr_html_())
     path = animate(scanpath, tmp_path / "film.gif", image=image, views=views, seconds=0.5, hold=1)
     assert path.read_bytes() == base64.b64decode(inside[1])

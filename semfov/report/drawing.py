@@ -4,9 +4,7 @@ from collections.abc import Sequence
 from html import escape
 
 from semfov.zoom.gist import FOUND
-from semfov.zoom.objects import Objects
-
-Box = tuple[float, float, float, float]
+from semfov.zoom.path import ZoomPath
 
 WIDTH = 480
 """Width of the drawing in pixels of the screen."""
@@ -15,33 +13,28 @@ MOST = 500
 """Largest number of objects that are drawn; the most confident ones are."""
 
 
-def path_html(
-    title: str, size: tuple[int, int], windows: Sequence[Box], objects: Objects, classes: Sequence[str]
-) -> str:
-    """Draw windows and objects as HTML, under a line of text.
+def path_html(path: ZoomPath) -> str:
+    """Draw windows, numbered in their order, and objects as HTML, under a line of text.
 
     Args:
-        title: the line of text.
-        size: `(width, height)` of the picture.
-        windows: the windows that were looked at, `(x1, y1, x2, y2)`, the overview first.
-        objects: the objects that were found.
-        classes: names of the classes, background first.
+        path: the search or exploration.
 
     Returns:
         An HTML element.
     """
-    width, height = size
+    windows = [path.region(number) for number in range(path.passes)]
+    width, height = path.lattice.size
     unit = max(width, height) / WIDTH
     shapes = [f'<rect width="{width}" height="{height}" fill="#eee"/>']
     for number, window in enumerate(windows[1:], 1):
         shapes.append(_rect(window, "#0072b2", unit))
         at = f'x="{window[0] + 3 * unit:.0f}" y="{window[1] + 11 * unit:.0f}"'
         shapes.append(f'<text {at} font-size="{10 * unit:.0f}" fill="#0072b2">{number}</text>')
-    sure = objects.above(FOUND)
+    sure = path.objects.above(FOUND)
     for box, label, score in zip(sure.boxes.tolist()[:MOST], sure.labels.tolist(), sure.scores.tolist(), strict=False):
-        shapes.append(_rect(box, "#d55e00", unit, f"<title>{escape(classes[label])} {score:.2f}</title>"))
+        shapes.append(_rect(box, "#d55e00", unit, f"<title>{escape(path.classes[label])} {score:.2f}</title>"))
     drawing = f'<svg viewBox="0 0 {width} {height}" style="width:{WIDTH}px;max-width:100%">{"".join(shapes)}</svg>'
-    return f"<div>{escape(title)}<br>{drawing}</div>"
+    return f"<div>{escape(path.summary())}<br>{drawing}</div>"
 
 
 def _rect(box: Sequence[float], colour: str, unit: float, inside: str = "") -> str:

@@ -8,7 +8,7 @@ from semfov.belief.belief import Belief
 from semfov.belief.grid import Grid
 from semfov.belief.observers.base import Observer
 from semfov.episode import Step
-from semfov.scanpath.record import Scanpath
+from semfov.paths.scanpath import Scanpath
 
 
 def trace(

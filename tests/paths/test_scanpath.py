@@ -17,9 +17,8 @@ from semfov.decision import CloserLook, Decision
 from semfov.detection import Candidates, Detector, Placement
 from semfov.errors import DataError
 from semfov.io.storage import read, write
-from semfov.scanpath import Stimulus
-from semfov.scanpath.files import KIND
-from semfov.scanpath.stimulus import LONGEST
+from semfov.paths import Stimulus
+from semfov.paths.stimulus import LONGEST
 from semfov.sensor.foveation import foveate
 
 
@@ -285,14 +284,14 @@ def spoil(tensors, record):
 
 def test_inconsistent_files_are_refused_with_the_name_of_the_field(scanpath, tmp_path):
     scanpath.save(tmp_path / "a.safetensors")
-    tensors, record = read(tmp_path / "a.safetensors", KIND)
+    tensors, record = read(tmp_path / "a.safetensors", "scanpath")
     record.pop("kind")
     for number, (named, (parts, told)) in enumerate(spoil(tensors, record)):
         # Fields that may be null may also be missing.
         if named in ("decision", "closer", "ending", "target", "placement", "settings") and len(told) < len(record):
             continue
         path = tmp_path / f"{number}.safetensors"
-        write(path, parts, {"kind": KIND, **told})
+        write(path, parts, {"kind": "scanpath", **told})
         with pytest.raises(DataError, match="expected a complete scanpath") as caught:
             Scanpath.load(path)
         assert named in str(caught.value), (named, caught.value)

@@ -65,6 +65,40 @@ class Stimulus:
             canvas, placement = eye.detector.fit(image)
             return cls(in_bytes(reduced(image[0])), in_bytes(canvas[0]), placement, eye.settings(), eye.sensor)
 
+    @classmethod
+    def restored(cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any]) -> Self | None:
+        """Make the stimulus from the content of a file, and check that its parts fit each other.
+
+        Args:
+            tensors: tensors of the file; those of the stimulus are `photograph` and `canvas`.
+            record: JSON values of the file; those of the stimulus are `placement` and `settings`.
+
+        Returns:
+            The stimulus; None if none was saved.
+
+        Raises:
+            InputError: a part is missing, or the photograph does not fit on the canvas.
+        """
+        kept = [tensors[name] for name in ("photograph", "canvas") if name in tensors]
+        values = [record[name] for name in ("placement", "settings") if record.get(name) is not None]
+        if not kept and not values:
+            return None
+        check(
+            len(kept) == len(values) == 2,
+            "photograph",
+            "photograph, canvas, placement and settings together",
+            f"{len(kept) + len(values)} of these 4",
+        )
+        photograph, canvas = kept
+        longest = max(photograph.shape[1:])
+        check(min(photograph.shape[1:]) >= 1 and longest <= LONGEST, "photograph", f"1 to {LONGEST} px", longest)
+        placement = Placement(**{name: tuple(value) for name, value in values[0].items()})
+        for axis in (0, 1):
+            room, side = canvas.shape[2 - axis], placement.size[axis] * placement.scale[axis]
+            fits = round(side) >= 1 and placement.offset[axis] + round(side) <= room
+            check(fits, "placement", f"the photograph on a canvas of {room} px", f"{side:g} px")
+        return cls(photograph, canvas, placement, values[1])
+
     @property
     def image(self) -> Tensor:
         """The photograph, `(3, h, w)` in [0, 1]."""

@@ -1,0 +1,212 @@
+"""The record of an episode of eye and head: where both looked, what was seen and what was believed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from semfov.errors import InputError, check
+from semfov.head.views import Views
+from semfov.head.world import Flat, Panorama, Places, World
+from semfov.io.schema import Array, Field, Number, Object, Text
+from semfov.paths.base import GazeRecord
+from semfov.paths.files import POSITIVE, Format, pair
+
+_WORLDS: dict[str, tuple[type[Panorama] | type[Flat], tuple[str, ...]]] = {
+    "panorama": (Panorama, ("picture", "size", "cell", "reach")),
+    "flat": (Flat, ("picture", "size", "cell", "degree")),
+}
+_WORLD = {
+    "kind": Text(tuple(_WORLDS)),
+    "picture": pair(Number(low=1, whole=True)),
+    "size": pair(Number(low=1, whole=True)),
+    "cell": POSITIVE,
+    "reach": Number(0, 90),
+    "degree": POSITIVE,
+}
+
+FORMAT = Format.of(
+    "head path",
+    {
+        "actions": Field(("n",), dtype=torch.int64, low=0),
+        "maps": Field(("n", "cells"), mixed=True, low=0, high=1 + 1e-3),
+    },
+    {
+        "world": Object(_WORLD, None, ("kind", "picture", "size", "cell")),
+        "fields": Array(POSITIVE, least=1, ascending=True),
+        "fovea": POSITIVE,
+        "seconds": Array(Number(low=0), "n"),
+    },
+    endings=("decision", "passes", "seconds", "cells"),
+    closer=("fixation", "target", "cell", "place", "presence"),
+)
+"""Format of the files of paths of eye and head."""
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class HeadPath(GazeRecord):
+    """The record of an episode: where eye and head looked, what was seen and what was believed.
+
+    Beside the attributes of `semfov.paths.GazeRecord` it has those of its looks.
+
+    Attributes:
+        views: the views and fixations that were possible. Those of a path from a file have the geometry of the scene,
+            without its picture.
+        actions: number of the pose and cell of each look (`Views`).
+        seconds: time at the end of each look.
+        detections: detections of each look, a batch of one, with boxes in pixels of its view.
+        maps: `(N, S)`, after each look, the probability that a cell of the scene holds the target, or any object in an
+            exploration.
+        found: whether the last look found the target.
+
+    Example::
+
+        path = agent.search(Panorama("street.jpg"), "bicycle")
+        print(path.turns, path.seconds[-1])  # turns of the head, and the time taken
+        regions, labels, scores = path.places(-1)  # objects of the last look
+    """
+
+    views: Views
+    actions: tuple[int, ...]
+    seconds: tuple[float, ...]
+    maps: Tensor
+
+    _format = FORMAT
+
+    @property
+    def turns(self) -> int:
+        """Number of times that the head moved."""
+        poses = [action // self.views.cells for action in self.actions]
+        return sum(one != other for one, other in pairwise(poses))
+
+    def pose(self, look: int) -> Tensor:
+        """Pose of the head in a look.
+
+        Args:
+            look: number of the look; negative numbers count from the end.
+
+        Returns:
+            `(3,)`, as `World` defines it: the position of the window, and its field of view in degrees.
+        """
+        return self.views.poses[self.actions[look] // self.views.cells]
+
+    def gaze(self, look: int) -> Tensor:
+        """Point of the scene that the eye fixated in a look.
+
+        Args:
+            look: number of the look; negative numbers count from the end.
+
+        Returns:
+            `(D,)`, a unit direction in a panorama, or pixels of a flat scene.
+        """
+        return self.views.gaze[self.actions[look]]
+
+    def places(self, look: int, score: float = 0.1) -> tuple[Places, Tensor, Tensor]:
+        """Objects detected in a look, in coordinates of the scene.
+
+        Args:
+            look: number of the look; negative numbers count from the end.
+            score: least score of an object. For a search, only objects of the target class are returned.
+
+        Returns:
+            The regions that the objects cover, their classes `(M,)` and their scores `(M,)`.
+        """
+        seen = self.detections[look]
+        best, label = seen.scores[0, :, 1:].max(-1)
+        label = label + 1
+        kept = seen.mask[0] & (best >= score)
+        if self.target is not None:
+            kept &= label == self.target
+        return self.views.world.places(seen.boxes[0, kept], self.pose(look)), label[kept], best[kept]
+
+    def describe(self) -> str:
+        """Describe the outcome in one line.
+
+        Returns:
+            The line.
+        """
+        what = "exploration" if self.target is None else self.target_name
+        found = "" if self.target is None else (" found" if self.found else " not found")
+        looks = f"{len(self)} look{'s' if len(self) != 1 else ''}"
+        turns = f"{self.turns} turn{'s' if self.turns != 1 else ''} of the head"
+        return f"{what}{found} in {self.seconds[-1]:.1f} s: {looks}, {turns}"
+
+    def __repr__(self) -> str:
+        """One line on the outcome of the episode."""
+        what = "exploration" if self.target is None else self.target_name
+        found = "" if self.target is None else (", found" if self.found else ", not found")
+        return f"HeadPath: {what}{found}, {len(self)} looks, {self.turns} turns of the head, {self.seconds[-1]:.1f} s"
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The looks as a table of plain values, one row for each look.
+
+        `x` and `y` are the fixated point in pixels of the scene's picture, and `field` the field of view in degrees.
+        `probability` is the probability of the target, or of any object in an exploration, in the fixated cell of the
+        scene, and `highest` the largest one of all cells. `detections` is the number of detections, `seen` the class of
+        the most confident one, and `score` its confidence. `seconds` is the time at the end of the look.
+
+        Returns:
+            One dictionary for each look.
+        """
+        rows = []
+        for number, (action, (x, y)) in enumerate(zip(self.actions, self._gaze()[0].tolist(), strict=True)):
+            cell = int(self.views.gaze_cell[action])
+            rows.append(
+                {
+                    "look": number,
+                    "action": action,
+                    "x": x,
+                    "y": y,
+                    "field": float(self.pose(number)[2]),
+                    "cell": cell,
+                    "probability": float(self.maps[number, cell]),
+                    "highest": float(self.maps[number].max()),
+                    "highest_cell": int(self.maps[number].argmax()),
+                    **self._detected(self.detections[number]),
+                    "seconds": self.seconds[number],
+                }
+            )
+        return rows
+
+    def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
+        width, height = (int(side) for side in self.views.world.scene.extent)
+        return self.views.world.pixels_of(self.views.gaze[[*self.actions]]), (width, height)
+
+    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        views = self.views
+        record = {"fields": list(views.fields), "fovea": views.fovea, "seconds": list(self.seconds)}
+        tensors = {"actions": torch.tensor(self.actions), "maps": self.maps}
+        return tensors, {"world": _settings(views.world), **record}
+
+    @classmethod
+    def _fields(
+        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        views = Views(_world(record["world"]), record["fields"], fovea=record["fovea"])
+        actions, cells = tensors["actions"], len(views.world.scene)
+        check(int(actions.max()) < len(views.gaze), "actions", f"numbers below {len(views.gaze)}", int(actions.max()))
+        maps = tensors["maps"]
+        check(maps.shape[-1] == cells, "maps", f"values of {cells} cells", maps.shape[-1])
+        return {"views": views, "actions": tuple(actions.tolist()), "maps": maps, "seconds": tuple(record["seconds"])}
+
+
+def _settings(world: World) -> dict[str, Any]:
+    """The geometry of a scene as JSON values."""
+    for kind, (made, names) in _WORLDS.items():
+        if type(world) is made:
+            return {"kind": kind, **{name: getattr(world, name) for name in names}}
+    raise InputError(f"views: expected a scene that files can describe, Panorama or Flat, got {type(world).__name__}")
+
+
+def _world(settings: Mapping[str, Any]) -> World:
+    """A scene with this geometry, without its picture."""
+    made, names = _WORLDS[settings["kind"]]
+    for name in names:
+        check(name in settings, f"world.{name}", "a value", "nothing")
+    picture, size = tuple(settings["picture"]), tuple(settings["size"])
+    return made(picture, size, **{name: settings[name] for name in names[2:]})

@@ -1,0 +1,20 @@
+"""Records of what happened: looks, detections, beliefs and decisions of searches and explorations."""
+
+from semfov.paths.base import GazeRecord, Record, detections_in_words
+from semfov.paths.endings import Ending
+from semfov.paths.moment import Moment
+from semfov.paths.scanpath import Scanpath
+from semfov.paths.stimulus import Stimulus, sensor_in_words
+from semfov.paths.trace import trace
+
+__all__ = [
+    "Ending",
+    "GazeRecord",
+    "Moment",
+    "Record",
+    "Scanpath",
+    "Stimulus",
+    "detections_in_words",
+    "sensor_in_words",
+    "trace",
+]

@@ -1,0 +1,65 @@
+"""Reasons for the end of a search or an exploration, and the sentences that explain them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+from semfov.decision import Outcome
+
+Ending = Literal["box", "decision", "price", "shifts", "cells", "passes", "windows", "seconds"]
+"""Reason for the end of a search or an exploration: the gaze was on a given box, the search decided, no look was worth
+its price, all gaze shifts were made, every cell was fixated, the passes were used up, no window was left that can show
+the target, or the time was over."""
+
+FIXATIONS = {
+    "box": "The gaze is on a box of the target.",
+    "price": "No look is expected to classify enough more cells correctly.",
+    "cells": "Every cell was fixated.",
+    "seconds": "The next look would end after the time limit.",
+    "found": "The target is probable enough, and was looked at closely enough.",
+    "absent": "No remaining cell is worth a look, and the target is probably absent.",
+    "undecided": "No remaining cell is worth a look, but the target is probably there.",
+    "closer found": "A closer look confirmed the target.",
+    "closer undecided": "No closer look confirmed the target, but it is probably there.",
+}
+"""Sentences for looks of a fovea, by the ending, or by the outcome of the decision that ended the search."""
+
+WINDOWS = {
+    "price": "No remaining look is expected to show enough new objects.",
+    "windows": "No remaining look can show the target.",
+    "found": "The probability is high enough, and a detection shows the target.",
+    "absent": "No remaining look is worth a pass, and the target is probably absent.",
+    "undecided": "No remaining look is worth a pass, but the target is probably there.",
+    "closer found": "A closer look confirmed the target.",
+    "closer absent": "No closer look confirmed the target, and it is probably absent.",
+    "closer undecided": "No closer look confirmed the target, but it is probably there.",
+}
+"""Sentences for looks at windows, by the ending, or by the outcome of the decision that ended the search."""
+
+
+def sentence(
+    sentences: Mapping[str, str], ending: Ending | None, outcome: Outcome | None, looks: int, *, closer: bool
+) -> str:
+    """Explain in one sentence why a search or an exploration ended.
+
+    Args:
+        sentences: `FIXATIONS` or `WINDOWS`.
+        ending: reason for the end; None if it is not known.
+        outcome: outcome of the decision; None without one.
+        looks: number of looks.
+        closer: whether closer looks were made.
+
+    Returns:
+        The sentence; empty if the reason is not known.
+
+    >>> sentence(FIXATIONS, "shifts", None, 8, closer=False), sentence(WINDOWS, "decision", "absent", 3, closer=True)
+    ('All 7 gaze shifts were made.', 'No closer look confirmed the target, and it is probably absent.')
+    """
+    if ending == "decision" and outcome is not None:
+        return sentences.get(f"closer {outcome}", sentences[outcome]) if closer else sentences[outcome]
+    if ending == "shifts":
+        return f"All {looks - 1} gaze shifts were made."
+    if ending == "passes":
+        return f"All {looks} passes were used." if looks != 1 else "The only pass was used."
+    return sentences.get(ending or "", "")

@@ -1,0 +1,270 @@
+"""The record of an episode in a photograph: fixations, detections, beliefs and the decision."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from semfov.belief.grid import Grid
+from semfov.episode import STAGES
+from semfov.errors import InputError, check
+from semfov.io.schema import Anything, Array, Field, Maybe, Number, Object, Pair, Text
+from semfov.paths.base import GazeRecord, detections_in_words
+from semfov.paths.drawing import drawn_by
+from semfov.paths.files import POSITIVE, WHOLE, Format, pair
+from semfov.paths.stimulus import Stimulus
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_SENSOR = {
+    "sigma": POSITIVE,
+    "levels": Number(low=0, high=16, whole=True),
+    "growth": POSITIVE,
+    "convention": Text(("kornia", "opencv")),
+    "reference": POSITIVE,
+}
+_SETTINGS = Object(
+    {
+        # Other settings, of a user's own sensor, are kept without a check.
+        "sensor": Object(_SENSOR, Anything(), ("reference",)),
+        "detector": Object({"name": Text()}, Anything(), ("name",)),
+    },
+    Anything(),
+    ("sensor", "detector"),
+)
+_PLACEMENT = {"size": pair(POSITIVE), "scale": pair(POSITIVE), "offset": pair(WHOLE)}
+_OPTIONAL = ("posterior", "presence")
+
+FORMAT = Format.of(
+    "scanpath",
+    {
+        "cells": Field(("n",), dtype=torch.int64, low=0),
+        "fixations": Field(("n", 2), mixed=True),
+        "probabilities": Field(("n", "cells", "C"), mixed=True, low=0, high=1 + 1e-3),
+        "values": Field(("n", "cells"), mixed=True, finite=False),
+        "posterior": Field(("n", "cells"), mixed=True, low=0, high=1 + 1e-3, optional=True),
+        "presence": Field(("n",), mixed=True, low=0, high=1 + 1e-3, optional=True),
+        "photograph": Field((3, "h", "w"), dtype=torch.uint8, optional=True),
+        "canvas": Field((3, "H", "W"), dtype=torch.uint8, optional=True),
+    },
+    {
+        "grid": Pair((Number(low=1, high=10_000, whole=True), Number(low=1, high=10_000, whole=True))),
+        "size": pair(POSITIVE),
+        "seconds": Array(Object(dict.fromkeys(STAGES, Number(low=0)), Number(low=0))),
+        "placement": Maybe(Object(_PLACEMENT, None, tuple(_PLACEMENT))),
+        "settings": Maybe(_SETTINGS),
+    },
+    endings=("box", "decision", "price", "shifts", "cells"),
+    closer=("fixation", "target", "cell", "place", "presence"),
+)
+"""Format of the files of scanpaths."""
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Scanpath(GazeRecord):
+    """Fixations of one episode in order, with the detections and the belief at each of them.
+
+    A notebook shows a scanpath as an interactive page. `plot`, `animate`, `to_frame` and `save` make a picture, an
+    animation, a table and a file.
+
+    Beside the attributes of `semfov.paths.GazeRecord` it has those of its looks.
+
+    Attributes:
+        grid: the cells of the image.
+        cells: `(n,)`, fixated cells.
+        fixations: `(n, 2)`, centres of the fixated cells as `(x, y)` in pixels.
+        probabilities: `(n, X·Y, K+1)`, probability that each cell holds each class after each look, background first.
+            A learned map gives marginal probabilities: several classes can share a cell, so they need not sum to 1.
+        values: `(n, X·Y)`, values of the acquisition function, by which the next fixation was chosen.
+        posterior: `(n, X·Y)`, probability of the target in each cell after each look, by the belief of the search; None
+            for exploration.
+        presence: `(n,)`, probability that the image holds the target after each look; None for exploration.
+        seconds: time of each look by stage (`semfov.episode.STAGES`).
+        stimulus: the photograph, and the data for the foveated views of it; None if it was not kept.
+
+    Example::
+
+        scanpath = agent.search(read_image("kitchen.jpg"), "cup")
+        scanpath.plot().savefig("scanpath.png")
+        scanpath.save("scanpath.safetensors")
+    """
+
+    grid: Grid
+    cells: Tensor
+    fixations: Tensor
+    probabilities: Tensor
+    values: Tensor
+    posterior: Tensor | None = None
+    presence: Tensor | None = None
+    seconds: tuple[Mapping[str, float], ...] = ()
+    stimulus: Stimulus | None = None
+
+    _format = FORMAT
+
+    def __len__(self) -> int:
+        """Number of fixations, the start included."""
+        return len(self.cells)
+
+    @property
+    def shifts(self) -> int:
+        """Number of gaze shifts (saccades): fixations after the start."""
+        return len(self) - 1
+
+    @property
+    def image(self) -> Tensor | None:
+        """The photograph, `(3, h, w)` in [0, 1]; None if it was not kept."""
+        return None if self.stimulus is None else self.stimulus.image
+
+    def views(self) -> list[Tensor]:
+        """The foveated photograph at each fixation.
+
+        Returns:
+            One view `(3, h, w)` in [0, 1] for each fixation.
+
+        Raises:
+            InputError: the photograph was not kept.
+        """
+        if self.stimulus is None:
+            raise InputError("scanpath: expected one with its stimulus, as an agent makes it, got one without")
+        return self.stimulus.views(self.fixations)
+
+    def describe(self) -> str:
+        """Describe the outcome of the episode in one line.
+
+        Returns:
+            The line.
+
+        >>> grid, none = Grid(2, 1, (10, 10)), torch.zeros(2, 2)
+        >>> Scanpath(grid=grid, classes=("background", "cup"), target=1, cells=torch.arange(2), fixations=none,
+        ...          detections=(), probabilities=none, values=none, found=True).describe()
+        '“cup” found after 1 gaze shift'
+        """
+        shifts = f"{self.shifts} gaze shift{'s' if self.shifts != 1 else ''}"
+        if self.target is None:
+            return f"explored with {shifts}"
+        name, decision = self.classes[self.target], self.decision
+        if decision is None:
+            return f"“{name}” {'found after' if self.found else 'not found in'} {shifts}"
+        sure = f"probability {decision.probability:.2f}"
+        if decision.place is not None:
+            sure += f", {decision.place:.2f} at this place"
+        if self.closer:
+            shifts += f" and {len(self.closer)} closer look{'s' if len(self.closer) != 1 else ''}"
+        if decision.outcome == "found":
+            return f"“{name}” found after {shifts} ({sure})"
+        return f"“{name}” {'not there' if decision.outcome == 'absent' else 'undecided'} after {shifts} ({sure})"
+
+    def _lines(self) -> list[str]:
+        """The fixated cells and the detections of the last look."""
+        grid, cells = self.grid, [self._place(cell) for cell in self.cells.tolist()]
+        path = cells if len(cells) <= 8 else [*cells[:6], "…", cells[-1]]
+        width, height = grid.extent.tolist()
+        of = f"{grid.columns} × {grid.rows} cells over {width:.0f} × {height:.0f} px"
+        return [
+            f"at (column, row): {' '.join(path)} of {of}",
+            f"seen last: {detections_in_words(self.detections[-1], self.classes)}",
+        ]
+
+    def _place(self, cell: int) -> str:
+        row, column = divmod(cell, self.grid.columns)
+        return f"({column}, {row})"
+
+    def animate(self, path: str | PathLike[str] | None = None, **options: Any) -> Path | Any:
+        """Draw the episode as an animation, one frame for each fixation.
+
+        Args:
+            path: path of the GIF to write; None returns the animation for a notebook.
+            options: `seconds`, the duration of a frame; `hold`, the additional duration of the last frame; and `boxes`
+                `(M, 4)`, the true boxes of the target.
+
+        Returns:
+            The path, or an object that a notebook shows as an animation.
+
+        Raises:
+            InputError: the photograph was not kept.
+        """
+        return drawn_by("animate", type(self))(self, path, **options)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The episode as a table of plain values, one row for each fixation.
+
+        `probability` is the probability of the target in the fixated cell, `highest` the largest one of all cells, and
+        `presence` the probability that the image holds the target; all are None for exploration. `detections` is the
+        number of detections, `seen` the class of the most confident one, and `score` its confidence.
+
+        Returns:
+            One dictionary for each fixation.
+        """
+        belief = self.posterior
+        if belief is None and self.target is not None:
+            belief = self.probabilities[..., self.target]
+        rows = []
+        for number, (cell, (x, y)) in enumerate(zip(self.cells.tolist(), self.fixations.tolist(), strict=True)):
+            row, column = divmod(cell, self.grid.columns)
+            rows.append(
+                {
+                    "fixation": number,
+                    "cell": cell,
+                    "column": column,
+                    "row": row,
+                    "x": x,
+                    "y": y,
+                    "probability": None if belief is None else float(belief[number, cell]),
+                    "highest": None if belief is None else float(belief[number].max()),
+                    "highest_cell": None if belief is None else int(belief[number].argmax()),
+                    "presence": None if self.presence is None else float(self.presence[number]),
+                    **self._detected(self.detections[number]),
+                    "seconds": sum(self.seconds[number].values()) if self.seconds else None,
+                }
+            )
+        return rows
+
+    def _gaze(self) -> tuple[Tensor, tuple[int, int]]:
+        width, height = (int(side) for side in self.grid.extent)
+        return self.fixations, (width, height)
+
+    def _parts(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        tensors = {name: getattr(self, name) for name in ("cells", "fixations", "probabilities", "values")}
+        tensors |= {name: getattr(self, name) for name in _OPTIONAL if getattr(self, name) is not None}
+        size = self.grid.size.tolist() if isinstance(self.grid.size, Tensor) else list(self.grid.size)
+        record: dict[str, Any] = {
+            "grid": [self.grid.columns, self.grid.rows],
+            "size": size,
+            "seconds": [dict(each) for each in self.seconds],
+            "placement": None,
+            "settings": None,
+        }
+        if self.stimulus is not None:
+            tensors |= {name: getattr(self.stimulus, name) for name in ("photograph", "canvas")}
+            record["placement"] = {name: list(getattr(self.stimulus.placement, name)) for name in _PLACEMENT}
+            record["settings"] = dict(self.stimulus.settings)
+        return tensors, record
+
+    @classmethod
+    def _fields(
+        cls, tensors: Mapping[str, Tensor], record: Mapping[str, Any], shared: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        columns, rows = record["grid"]
+        grid, cells, seconds = Grid(columns, rows, tuple(record["size"])), tensors["cells"], record["seconds"]
+        check(tensors["values"].shape[-1] == len(grid), "values", f"one for each of {len(grid)} cells",
+              tensors["values"].shape[-1])  # fmt: skip
+        check(int(cells.max()) < len(grid), "cells", f"cell numbers below {len(grid)}", int(cells.max()))
+        check(len(seconds) in (0, len(cells)), "seconds", f"times of {len(cells)} looks, or none", len(seconds))
+        decision = shared["decision"]
+        found = None if decision is None else decision.cell
+        check(found is None or found < len(grid), "decision.cell", f"a cell number below {len(grid)}", found)
+        for look in shared["closer"]:
+            check(look.cell < len(grid), "closer", f"a cell below {len(grid)}", look.cell)
+        return {
+            "grid": grid,
+            **{name: tensors[name] for name in ("cells", "fixations", "probabilities", "values")},
+            **{name: tensors.get(name) for name in _OPTIONAL},
+            "seconds": tuple(seconds),
+            "stimulus": Stimulus.restored(tensors, record),
+        }

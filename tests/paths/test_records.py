@@ -1,0 +1,302 @@
+"""What all records share: words, tables, files, notebooks, and the files of earlier versions."""
+
+import dataclasses
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+from matplotlib.figure import Figure
+
+from semfov import Detections, DirichletBelief, Grid, InputError, Scanpath
+from semfov.decision import CloserLook, Decision
+from semfov.errors import DataError
+from semfov.head import Flat, HeadPath, Panorama, Views
+from semfov.io.storage import read, write
+from semfov.paths import GazeRecord, Moment, Record
+from semfov.zoom import Lattice, Objects, ZoomPath
+from semfov.zoom.glances import Glance, around, on_lattice
+
+CLASSES = ("background", "cup", "cat")
+BOX = torch.tensor([1.0, 2, 9, 10])
+
+
+def looks(count):
+    """Detections of looks: none in the first, and one more in each of the others."""
+    generator = torch.Generator().manual_seed(0)
+    made = []
+    for number in range(count):
+        corner = torch.rand(1, number, 2, generator=generator) * 10
+        scores = torch.rand(1, number, 3, generator=generator).softmax(-1)
+        order = scores[..., 1:].amax(-1).argsort(descending=True)[0]
+        boxes = torch.cat([corner, corner + 5], -1)
+        made.append(Detections(boxes[:, order], scores[:, order], torch.ones(1, number, dtype=torch.bool)))
+    return tuple(made)
+
+
+def scanpath():
+    grid, cells = Grid(4, 3, (80, 60)), torch.tensor([0, 6, 11])
+    generator = torch.Generator().manual_seed(1)
+    return Scanpath(
+        grid=grid,
+        classes=CLASSES,
+        target=1,
+        cells=cells,
+        fixations=grid.centres[cells],
+        detections=looks(3),
+        probabilities=torch.rand(3, 12, 3, generator=generator).softmax(-1),
+        values=torch.rand(3, 12, generator=generator),
+        found=True,
+        decision=Decision("found", 0.9, 6, BOX, 0.8),
+        closer=(CloserLook(1, 1, 6, BOX, 0.8, 0.9),),
+        ending="decision",
+        seconds=({"detect": 0.5}, {"detect": 0.25}, {"detect": 0.125}),
+    )
+
+
+def zoom_path():
+    lattice = Lattice.over((400, 300), (100, 100))
+    windows = [
+        on_lattice(lattice, (0, 0, 0)),
+        on_lattice(lattice, (1, 16, 8)),
+        around(lattice, (10.0, 20.5, 60.0, 80.0)),
+    ]
+    glances = tuple(
+        Glance(window, seen, torch.arange(seen.mask.shape[1]) % 2 == 1, torch.tensor([0.3, 0.1 * number]), None)
+        for number, (window, seen) in enumerate(zip(windows, looks(3), strict=True))
+    )
+    objects = Objects(BOX[None] * 2, torch.tensor([0.7]), torch.tensor([1]), torch.tensor([2]))
+    return ZoomPath(
+        lattice=lattice,
+        classes=CLASSES,
+        target=1,
+        glances=glances,
+        values=(float("inf"), 0.1 + 0.2, 0.75),
+        objects=objects,
+        decision=Decision("found", 0.9, None, BOX, 0.8),
+        closer=(CloserLook(None, 1, None, BOX, 0.8, 0.9, number=2),),
+        ending="decision",
+    )
+
+
+def head_path(world=None):
+    views = Views(Panorama(torch.rand(3, 64, 128), (40, 30)) if world is None else world)
+    actions = (205, 217, 30)
+    return HeadPath(
+        views=views,
+        classes=CLASSES,
+        target=2,
+        actions=actions,
+        seconds=(0.2, 0.5, 1.25),
+        detections=looks(3),
+        maps=torch.rand(3, len(views.world.scene), generator=torch.Generator().manual_seed(2)),
+        ending="passes",
+    )
+
+
+def moment():
+    grid = Grid(4, 2, (40, 20))
+    belief = DirichletBelief(torch.rand(1, 8, 3, generator=torch.Generator().manual_seed(3)) + 1)
+    return Moment(
+        classes=CLASSES,
+        target=1,
+        decision=Decision("undecided", 0.25),
+        number=7,
+        grid=grid,
+        cell=5,
+        fixation=grid.centres[5],
+        detections=looks(3)[2],
+        belief=belief,
+        visited=torch.zeros(8, dtype=torch.bool),
+        next_cell=3,
+        seconds={"open": 0.25, "detect": 0.5},
+    )
+
+
+RECORDS = [scanpath, zoom_path, head_path, moment]
+WHOLE = RECORDS[:3]
+WORDS = {
+    "scanpath": (
+        "“cup” found after 2 gaze shifts and 1 closer look (probability 0.90, 0.80 at this place)",
+        "A closer look confirmed the target.",
+    ),
+    "zoom_path": ("cup: found (0.90) in 3 passes", "A closer look confirmed the target."),
+    "head_path": ("cat not found in 1.2 s: 3 looks, 1 turn of the head", "All 3 passes were used."),
+    "moment": ("cup: undecided, p 0.25", None),
+}
+
+
+def same(a, b):
+    """Whether two values of any type, also nested ones, are equal to the bit."""
+    if isinstance(a, torch.Tensor):
+        return a.dtype == b.dtype and a.shape == b.shape and torch.equal(a.nan_to_num(7.0), b.nan_to_num(7.0))
+    if dataclasses.is_dataclass(a):
+        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    if isinstance(a, Views):
+        return all(
+            same(getattr(a, name), getattr(b, name)) for name in ("fields", "fovea", "poses", "gaze", "gaze_cell")
+        )
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return type(a) is type(b) and a == b
+
+
+@pytest.mark.parametrize("make", RECORDS)
+def test_every_record_has_words_rows_and_a_notebook_view(make):
+    record = make()
+    described, why = WORDS[make.__name__]
+    assert isinstance(record, Record)
+    assert record.describe() == described
+    assert record.target_name in described
+    if why is not None:
+        assert record.why_it_ended() == why
+        assert record.summary() == f"{described}. {why}"
+    first = repr(record).splitlines()[0]
+    assert first.startswith(f"{type(record).__name__}: ")
+    assert make is head_path or first == f"{type(record).__name__}: {record.summary()}"
+    rows = record.rows()
+    json.dumps(rows, allow_nan=False)
+    assert all({"x", "y", "detections", "seen", "score"} <= row.keys() for row in rows)
+    assert record.to_frame().to_dict("records")[0].keys() == rows[0].keys()
+    assert isinstance(record.to_frame(), pd.DataFrame)
+    shown = record._repr_html_()
+    assert shown.startswith("<")
+    assert "cup" in shown or "cat" in shown
+
+
+@pytest.mark.parametrize("make", WHOLE)
+def test_every_path_is_saved_and_loaded(make, tmp_path):
+    record = make()
+    file = tmp_path / "a.safetensors"
+    record.save(file)
+    loaded = type(record).load(file)
+    for field in dataclasses.fields(record):
+        assert same(getattr(record, field.name), getattr(loaded, field.name)), field.name
+    assert repr(loaded) == repr(record)
+    assert loaded.rows() == record.rows()
+    loaded.save(tmp_path / "b.safetensors")
+    assert (tmp_path / "b.safetensors").read_bytes() == file.read_bytes()
+    bare = replace(record, target=None, decision=None, closer=(), ending=None)
+    bare.save(file)
+    assert type(record).load(file).summary() == bare.summary()
+
+
+@pytest.mark.parametrize("make", WHOLE)
+def test_rows_and_fixations_match_the_looks(make):
+    record = make()
+    rows = record.rows()
+    assert len(rows) == len(record) == 3
+    assert isinstance(record, GazeRecord)
+    assert [row["detections"] for row in rows] == [0, 1, 2]
+    assert [row["seen"] for row in rows] == [None, *(CLASSES[int(d.labels[0, 0])] for d in record.detections[1:])]
+    fixations = record.as_fixations("a.jpg")
+    assert fixations.points.tolist() == [[row["x"], row["y"]] for row in rows]
+    assert (fixations.target, fixations.found) == (record.target_name, record.found)
+
+
+@pytest.mark.parametrize("make", WHOLE)
+def test_every_path_is_drawn_on_the_given_picture(make):
+    record = make()
+    assert isinstance(record.plot(image=torch.rand(3, 60, 80)), Figure)
+    with pytest.raises(InputError, match="image: expected the photograph"):
+        record.plot()
+
+
+@pytest.mark.parametrize("make", WHOLE)
+def test_files_of_another_kind_or_with_wrong_content_are_refused(make, tmp_path):
+    record = make()
+    file, other = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
+    record.save(file)
+    for wrong in {Scanpath, ZoomPath, HeadPath} - {type(record)}:
+        with pytest.raises(DataError, match="expected a file of kind"):
+            wrong.load(file)
+    kind = json.loads(json.dumps(record._format.kind))
+    tensors, values = read(file, kind)
+    for name, changed in {
+        "target": 3,
+        "ending": "boredom",
+        "lengths": [0, 1, 1],
+        "more": 1,
+        "classes": ["cup"],
+    }.items():
+        write(other, tensors, {**values, name: changed})
+        with pytest.raises(DataError, match=f"expected a complete {kind}"):
+            type(record).load(other)
+    for name in tensors.keys() - {"box"}:
+        write(other, {key: value for key, value in tensors.items() if key != name}, values)
+        with pytest.raises(DataError, match=name):
+            type(record).load(other)
+
+
+def test_windows_objects_and_actions_out_of_range_are_refused(tmp_path):
+    file = tmp_path / "a.safetensors"
+    zoom_path().save(file)
+    tensors, values = read(file, "zoom path")
+    windows = [{**window, "level": 9} for window in values["windows"]]
+    for parts, record, message in (
+        ({**tensors, "object_labels": torch.tensor([3])}, values, "object_labels"),
+        ({**tensors, "object_passes": torch.tensor([3])}, values, "object_passes"),
+        (tensors, {**values, "windows": windows}, "windows: expected levels below"),
+        (tensors, {**values, "closer": [{**values["closer"][0], "number": 3}]}, "closer"),
+    ):
+        write(file, parts, record)
+        with pytest.raises(DataError, match=message):
+            ZoomPath.load(file)
+    head_path().save(file)
+    tensors, values = read(file, "head path")
+    world = {name: value for name, value in values["world"].items() if name != "reach"}
+    for parts, record, message in (
+        ({**tensors, "actions": tensors["actions"] + 10**6}, values, "actions: expected numbers below"),
+        ({**tensors, "maps": tensors["maps"][:, 1:]}, values, "maps: expected values of"),
+        (tensors, {**values, "world": world}, "world.reach: expected a value"),
+    ):
+        write(file, parts, record)
+        with pytest.raises(DataError, match=message):
+            HeadPath.load(file)
+
+
+def test_a_head_path_from_a_file_has_the_geometry_of_its_scene(tmp_path):
+    flat = Flat(torch.rand(3, 480, 640), (40, 30), degree=8, cell=5.0)
+    for number, path in enumerate((head_path(), head_path(flat))):
+        path.save(tmp_path / f"{number}.safetensors")
+        loaded = HeadPath.load(tmp_path / f"{number}.safetensors")
+        assert loaded.turns == path.turns
+        assert same(loaded.gaze(-1), path.gaze(-1))
+        regions, labels, scores = loaded.places(-1, 0.0)
+        assert len(regions) == len(labels) == len(scores)
+        with pytest.raises(InputError, match="picture: expected a scene with its picture"):
+            loaded.views.world.view(loaded.pose(0))
+
+    class Own(Flat):
+        """A scene that files do not describe."""
+
+    own = head_path(Own(torch.rand(3, 480, 640), (40, 30), degree=8))
+    with pytest.raises(InputError, match="expected a scene that files can describe"):
+        own.save(tmp_path / "own.safetensors")
+
+
+def test_scanpaths_that_version_0_1_saved_are_loaded():
+    """The file was written by version 0.1.0, from the values that the test compares."""
+    loaded = Scanpath.load(Path(__file__).with_name("scanpath-0.1.safetensors"))
+    assert repr(loaded).splitlines() == [
+        "Scanpath: “cup” found after 1 gaze shift and 1 closer look (probability 0.94, 0.94 at this place). "
+        "A closer look confirmed the target.",
+        "  at (column, row): (1, 0) (0, 0) of 2 × 1 cells over 8 × 4 px",
+        "  seen last: cup 0.75",
+    ]
+    assert loaded.classes == ("background", "cup")
+    assert loaded.grid.size == (8, 4)
+    assert loaded.fixations.tolist() == [[5.5, 1.5], [1.5, 1.5]]
+    assert loaded.values.tolist() == [[0.5, float("-inf")], [1.0, 2.0]]
+    assert loaded.probabilities.tolist() == [[[0.5, 0.5], [0.75, 0.25]], [[0.125, 0.875], [0.75, 0.25]]]
+    assert loaded.posterior.tolist() == [[0.5, 0.25], [0.875, 0.25]]
+    assert loaded.presence.tolist() == [0.625, 0.90625]
+    assert loaded.seconds == ({"detect": 0.5}, {"detect": 0.25, "weigh": 0.125})
+    box = torch.tensor([0.0, 0, 4, 4])
+    assert same(loaded.decision, Decision("found", 0.9375, 0, box, 0.9375))
+    assert same(loaded.closer, (CloserLook(1, 1, 0, box, 0.9375, 0.875),))
+    assert (loaded.ending, loaded.found) == ("decision", True)
+    assert same(loaded.stimulus.photograph, torch.arange(96, dtype=torch.uint8).view(3, 4, 8))
+    assert [view.shape for view in loaded.views()] == [(3, 4, 8)] * 2
