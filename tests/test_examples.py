@@ -93,6 +93,19 @@ def test_own_detector_gets_an_observation_model(run, tmp_path):
     assert int(np.sum(model.metadata["counts"])) == int(re.search(r"fitted to (\d+)", output)[1])
 
 
+def test_a_trained_agent_finds_more_than_random_gaze(run, tmp_path):
+    pytest.importorskip("sb3_contrib")
+    small = ["--scenes", 2, "--steps", 6000, "--grid", 5, 4, "--shifts", 10, "--cache", tmp_path]
+    output = run("train_agent", *small)
+    found = re.findall(r"^([\w-]+): of (\d+) targets .* (\d+) % within 1, (\d+) % within 3", output, re.MULTILINE)
+    assert [name for name, *_ in found] == ["random", "hand-made", "trained"]
+    assert len({count for _, count, *_ in found} - {"0"}) == 1
+    random, hand_made, trained = found
+    for agent in (hand_made, trained):
+        assert int(agent[2]) > int(random[2]) + 15
+        assert int(agent[3]) > int(random[3]) + 15
+
+
 def test_looking_around_turns_the_head_and_draws_it(run, tmp_path):
     output = run("look_around", "--seconds", 6, "--out", tmp_path / "head.png", "--film", tmp_path / "head.gif")
     seconds = [float(value) for value in re.findall(r"([\d.]+) s: head at yaw", output)]

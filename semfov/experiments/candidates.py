@@ -6,14 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-import torch
 from torch import Tensor
 
 from semfov.belief import ContextPrior, Grid, MapEvidence, TargetEvidence
 from semfov.belief.observers import Context, LearnedMap, Observer, Semantic, Target
 from semfov.errors import InputError, check
 from semfov.experiments.config import BeliefConfig, PolicyConfig, RunConfig, SearchConfig
-from semfov.experiments.presets import IVSN, SALIENCY, TARGET_EVIDENCE, resolve
+from semfov.experiments.presets import TARGET_EVIDENCE, resolve, table_of
 from semfov.experiments.setup import (
     make_context,
     make_map_evidence,
@@ -22,8 +21,9 @@ from semfov.experiments.setup import (
     make_templates,
 )
 from semfov.eye import Eye
-from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior, Static, TemplateAttention
-from semfov.gaze.policies import POLICIES, Means, NonPredictive, Random, Task, named_policy, wanted
+from semfov.gaze.acquisition import AcquisitionFunction, SaliencyPrior
+from semfov.gaze.policies import POLICIES, Means, NonPredictive, Task, named_policy
+from semfov.gaze.policies.tables import salient_from
 from semfov.gaze.templates import ClassTemplates
 from semfov.observation.foveal import FovealObservationModel
 from semfov.strategy import Strategy
@@ -37,19 +37,16 @@ class Candidate:
 
     Attributes:
         strategy: observer and policy.
-        saliency: saliency of all cells, seen from each cell, `(X·Y, X·Y)`, or the same for all fixations, `(1, X·Y)`.
-        weight: weight of the saliency as a prior over the cells (`SaliencyPrior`); None: saliency alone chooses the
-            next cell, instead of the policy.
-        attention: `(X·Y, K, X·Y)`, attention to every class in every cell, seen from each cell (`TemplateAttention`);
-            if given, it chooses the next cell instead of the policy.
-        fovea: width of the fovea as a fraction of the image's longer side; attention falls off with it.
+        table: the table of the scene that the policy needs (`Policy.table`); None if it needs none.
+        saliency: saliency of all cells as a prior over them (`SaliencyPrior`), seen from each cell, `(X·Y, X·Y)`, or
+            the same for all fixations, `(1, X·Y)`; None for no prior.
+        weight: weight of this prior.
     """
 
     strategy: Strategy
+    table: Tensor | None = None
     saliency: Tensor | None = None
-    weight: float | None = None
-    attention: Tensor | None = None
-    fovea: float = 100 / 640
+    weight: float = 1.0
 
     @property
     def observer(self) -> Observer:
@@ -58,14 +55,10 @@ class Candidate:
 
     def acquisition(self, target: int | Tensor | None, grid: Grid, cell: Tensor) -> AcquisitionFunction:
         """The acquisition function of episodes that fixate `cell` `(B,)`."""
-        if self.attention is not None:
-            return TemplateAttention(wanted(target, IVSN), self.attention, grid, self.fovea)
+        acquisition = self.strategy.policy.in_scene(target, grid, self.table, cell)
         if self.saliency is None:
-            return self.strategy.policy(target, grid)
-        salient = self.saliency[cell if len(self.saliency) > 1 else torch.zeros_like(cell)]
-        if self.weight is None:
-            return Static(salient)
-        return SaliencyPrior(self.strategy.policy(target, grid), salient, weight=self.weight)
+            return acquisition
+        return SaliencyPrior(acquisition, salient_from(self.saliency, cell), weight=self.weight)
 
 
 @dataclass(frozen=True)
@@ -101,7 +94,7 @@ def load_models(config: RunConfig, task: Task, eye: Eye) -> Models:
         if any(policy.scores == "learned" and not by_evidence(policy, task) for policy in policies)
         else None,
         make_templates(config.templates, eye)
-        if isinstance(config, SearchConfig) and any(policy.policy == IVSN for policy in policies)
+        if isinstance(config, SearchConfig) and any(table_of(policy) == "attention" for policy in policies)
         else None,
     )
 
@@ -161,7 +154,7 @@ def _strategy(
     if policy.policy == TARGET_EVIDENCE:
         return Strategy(Target(_given(models.evidence, "policy", "learned target evidence")), NonPredictive())
     means = Means(models.observation, models.map, fovea, belief.prior)
-    chosen = Random() if policy.policy in (SALIENCY, IVSN) else named_policy(policy.policy, task, means)
+    chosen = named_policy(policy.policy, task, means)
     if by_evidence(policy, task):
         return Strategy(Target(_given(models.evidence, "scores", "learned target evidence")), chosen)
     if policy.scores == "learned":

@@ -187,8 +187,8 @@ class PolicyConfig(Settings):
     A setting that is null is taken from the `belief` settings of the run.
 
     Args:
-        policy: name of a registered policy (`semfov.gaze.policies`), or `saliency` (fixates the most salient cell),
-            `target-evidence` (uses the learned evidence for the target) or `ivsn` (uses class templates).
+        policy: name of a registered policy (`semfov.gaze.policies`), such as `saliency` (fixates the most salient cell)
+            and `ivsn` (uses class templates), or `target-evidence` (uses the learned evidence for the target).
         scores: `raw` uses the detector's scores as likelihoods; `calibrated` passes them through the observation model
             first; `learned` uses a learned belief, which is the learned map in explorations and the learned target
             evidence in searches.

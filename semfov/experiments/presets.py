@@ -10,11 +10,9 @@ from semfov.belief.grid import Footprint
 from semfov.belief.observers import Memory
 from semfov.errors import InputError, check, lookup
 from semfov.experiments.config import Context, PolicyConfig, SaliencyModel, Scores
-from semfov.gaze.policies import POLICIES, Task, policy_names
+from semfov.gaze.policies import POLICIES, Random, Table, Task, policy_names
 
-SALIENCY = "saliency"
 TARGET_EVIDENCE = "target-evidence"
-IVSN = "ivsn"
 SALIENCY_MODELS: tuple[SaliencyModel, ...] = get_args(SaliencyModel)
 
 WORDS = {"scores": Scores, "footprint": Footprint, "memory": Memory, "saliency": SaliencyModel, "context": Context}
@@ -35,8 +33,12 @@ Choice = str | PolicyConfig
 
 def known_policies(task: Task) -> list[str]:
     """The values that `PolicyConfig.policy` may have."""
-    own = [SALIENCY, TARGET_EVIDENCE, IVSN] if task == "search" else [SALIENCY]
-    return [*policy_names(task), *own]
+    return [*policy_names(task), *([TARGET_EVIDENCE] if task == "search" else [])]
+
+
+def table_of(policy: PolicyConfig) -> Table | None:
+    """The table that a policy needs of every scene."""
+    return POLICIES[policy.policy].table if policy.policy in POLICIES else None
 
 
 def presets(task: Task) -> Mapping[str, PolicyConfig]:
@@ -46,20 +48,27 @@ def presets(task: Task) -> Mapping[str, PolicyConfig]:
 
 @cache
 def _presets(task: Task, policies: tuple[str, ...]) -> Mapping[str, PolicyConfig]:
+    plain = {name: PolicyConfig(name) for name in policies if POLICIES[name].table != "saliency"}
+    salient = {
+        model: PolicyConfig(name, saliency=model)
+        for name in policies
+        if POLICIES[name].table == "saliency"
+        for model in SALIENCY_MODELS
+    }
     if task == "search":
-        alone = {name: PolicyConfig(name) for name in ("random", TARGET_EVIDENCE, IVSN)}
-        alone |= {name: PolicyConfig(SALIENCY, saliency=name) for name in SALIENCY_MODELS}
+        # The scores do not matter to these: no belief guides them, or one of their own.
+        alone = {name: PolicyConfig(name) for name in (Random.name, TARGET_EVIDENCE)}
+        alone |= {name: policy for name, policy in plain.items() if table_of(policy) is not None} | salient
         best, published = PolicyConfig(TARGET_EVIDENCE), PolicyConfig("predictive", "calibrated")
-        scored = {name: PolicyConfig(name) for name in policies if name not in alone}
+        scored = {name: policy for name, policy in plain.items() if name not in alone}
         alone |= {f"{name}-learned": PolicyConfig(name, "learned") for name in scored if POLICIES[name].by_place}
     else:
         best, published = PolicyConfig("closer-look", "learned"), PolicyConfig("kl", "calibrated")
-        scored = {name: PolicyConfig(name) for name in policies if not POLICIES[name].needs_map}
-        scored |= {name: PolicyConfig(SALIENCY, saliency=name) for name in SALIENCY_MODELS}
+        scored = {name: policy for name, policy in plain.items() if not POLICIES[name].needs_map} | salient
         alone = {
             f"{name}-learned": PolicyConfig(policy.policy, "learned", saliency=policy.saliency)
             for name, policy in {**scored, "expected-gain": PolicyConfig("expected-gain")}.items()
-            if policy.policy not in POLICIES or not POLICIES[policy.policy].needs_model
+            if not POLICIES[policy.policy].needs_model
         }
     both = {
         f"{name}-{scores}": PolicyConfig(policy.policy, scores, saliency=policy.saliency)
@@ -95,9 +104,9 @@ def resolve(choice: Choice, task: Task) -> PolicyConfig:
             raise InputError(f"policies: expected names of presets, or mappings with the keys {settings}; got {choice}")
         return known[lookup(choice, known, "policy")]
     lookup(choice.policy, known_policies(task), "policy")
-    if choice.policy == SALIENCY and choice.saliency is None:
+    if table_of(choice) == "saliency" and choice.saliency is None:
         models = ", ".join(SALIENCY_MODELS)
-        raise InputError(f"saliency: expected a saliency model ({models}) for policy 'saliency', got none")
+        raise InputError(f"saliency: expected a saliency model ({models}) for policy {choice.policy!r}, got none")
     for setting, words in WORDS.items():
         if getattr(choice, setting) is not None:
             lookup(getattr(choice, setting), get_args(words), setting)
@@ -136,7 +145,7 @@ def label(choice: Choice, task: Task) -> str:
         for name, preset in presets(task).items()
         if name not in ALIASES and not name.startswith(MAXIMUM_A_POSTERIORI)
     }
-    alone = settings.saliency if settings.policy == SALIENCY else None
+    alone = settings.saliency if table_of(settings) == "saliency" else None
     base = names[PolicyConfig(settings.policy, settings.scores, saliency=alone)]
     differs = []
     for field in fields(PolicyConfig)[2:]:
@@ -149,5 +158,5 @@ def label(choice: Choice, task: Task) -> str:
 
 def _scored(policy: PolicyConfig, task: Task, scores: Scores) -> bool:
     """Whether there is a preset of this policy with these scores."""
-    saliency = policy.saliency if policy.policy == SALIENCY else None
+    saliency = policy.saliency if table_of(policy) == "saliency" else None
     return PolicyConfig(policy.policy, scores, saliency=saliency) in presets(task).values()

@@ -14,7 +14,7 @@ from semfov.experiments.candidates import Candidate, load_models, make_strategy
 from semfov.experiments.config import RunConfig, SaliencyModel
 from semfov.experiments.looking import Looking
 from semfov.experiments.parts import Record
-from semfov.experiments.presets import IVSN, SALIENCY, label, resolve
+from semfov.experiments.presets import label, resolve
 from semfov.experiments.saliency_store import SaliencyStore, saliency_table
 from semfov.experiments.scene_run import cache_folder, digest_of
 from semfov.experiments.setup import fovea_of
@@ -87,13 +87,15 @@ class Run(Looking):
     def candidate(self, name: str, index: int) -> Candidate:
         """The policy of this name in tables, for a scene."""
         policy = self.policies[lookup(name, self.policies, "policy of this run")]
-        if policy.policy == IVSN:
-            fovea = self.config.sensor.fovea
-            return Candidate(self.strategies[name], attention=self.attention(index), fovea=fovea)
+        strategy = self.strategies[name]
+        if strategy.policy.table == "attention":
+            return Candidate(strategy, self.attention(index))
         if policy.saliency is None:
-            return Candidate(self.strategies[name])
-        weight = None if policy.policy == SALIENCY else self.config.saliency.weight
-        return Candidate(self.strategies[name], self.saliency(policy.saliency, index), weight)
+            return Candidate(strategy)
+        saliency = self.saliency(policy.saliency, index)
+        if strategy.policy.table == "saliency":
+            return Candidate(strategy, saliency)
+        return Candidate(strategy, saliency=saliency, weight=self.config.saliency.weight)
 
     def attention(self, index: int) -> Tensor:
         """Attention to every class in the cells of a scene, from every cell; computed at each call, never stored."""

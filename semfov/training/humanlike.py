@@ -26,7 +26,7 @@ from semfov.experiments.config import (
     SensorConfig,
 )
 from semfov.experiments.looks import see_all
-from semfov.experiments.presets import SALIENCY, label, resolve
+from semfov.experiments.presets import label, resolve
 from semfov.experiments.saliency_store import saliency_table
 from semfov.experiments.scene_run import cache_folder
 from semfov.experiments.settings import Count, Name, Positive, Settings
@@ -182,7 +182,10 @@ class Viewer:
     def candidate(self, name: str, image: Tensor, grid: Grid) -> Candidate:
         """Prepare a policy for a picture."""
         policy, saliency = self.policies[name], self.config.saliency
+        strategy = self.strategies[name]
         if policy.saliency is None:
-            return Candidate(self.strategies[name])
+            return Candidate(strategy)
         maps = saliency_table(policy.saliency, saliency, fovea_of(self.eye), self.config.sensor.reference, image, grid)
-        return Candidate(self.strategies[name], maps, None if policy.policy == SALIENCY else saliency.weight)
+        if strategy.policy.table == "saliency":
+            return Candidate(strategy, maps)
+        return Candidate(strategy, saliency=maps, weight=saliency.weight)

@@ -15,7 +15,7 @@ from semfov.belief.observers import Semantic
 from semfov.belief.target_evidence import Thresholds
 from semfov.data.sources import Picture, embedded_picture
 from semfov.episode import STAGES
-from semfov.gaze.policies import Means, named_policy, policy_names
+from semfov.gaze.policies import POLICIES, Means, named_policy, policy_names
 from semfov.zoom import GlimpseEvidence
 from tests import small
 
@@ -312,7 +312,7 @@ def dirichlet_map(default_agent):
 
 
 @pytest.mark.weights
-@pytest.mark.parametrize("name", policy_names("search"))
+@pytest.mark.parametrize("name", [name for name in policy_names("search") if POLICIES[name].table is None])
 def test_the_demonstration_searches_as_the_agent_does_with_every_policy(name, default_agent, means, dirichlet_map, cup):
     """With a map of all classes for policies that need one, otherwise with the belief of the agent."""
     mapping = default_agent.exploring.observer, default_agent.exploring.policy
@@ -324,7 +324,7 @@ def test_the_demonstration_searches_as_the_agent_does_with_every_policy(name, de
 
 
 @pytest.mark.weights
-@pytest.mark.parametrize("name", policy_names("exploration"))
+@pytest.mark.parametrize("name", [name for name in policy_names("exploration") if POLICIES[name].table is None])
 def test_the_demonstration_explores_as_the_agent_does_with_every_policy(name, default_agent, means, dirichlet_map, cup):
     seeking = default_agent.searching.observer, default_agent.searching.policy
     observer = default_agent.exploring.observer if name in ("random", "closer-look", "expected-gain") else dirichlet_map

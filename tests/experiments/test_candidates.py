@@ -234,7 +234,7 @@ def test_context_is_refused_for_policies_that_cannot_use_it(context, model):
 
 def test_saliency_alone_keeps_the_belief_of_the_run(model):
     made = strategy(PolicyConfig("saliency", "calibrated", saliency="vocus2"), "exploration", observation=model)
-    assert isinstance(made.policy, policies.Random)
+    assert isinstance(made.policy, policies.SaliencyMaximum)
     assert made.observer.observation is model
 
 
@@ -244,12 +244,12 @@ def test_saliency_replaces_a_policy_or_is_combined_with_it(rows):
     table = torch.rand(rows, 12, generator=torch.Generator().manual_seed(0))
     seen = table[cell] if rows > 1 else table.expand(2, -1)
     belief = DirichletBelief(0.5 + torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)))
-    random = Strategy(observers.Semantic(3), policies.Random())
-    alone = Candidate(random, table).acquisition(1, GRID, cell)
+    salient = Strategy(observers.Semantic(3), policies.SaliencyMaximum())
+    alone = Candidate(salient, table).acquisition(1, GRID, cell)
     assert isinstance(alone, Static)
     torch.testing.assert_close(alone(belief, visited), seen)
     sought = Strategy(observers.Semantic(3), policies.NonPredictive())
-    beside = Candidate(sought, table, 0.4).acquisition(1, GRID, cell)
+    beside = Candidate(sought, saliency=table, weight=0.4).acquisition(1, GRID, cell)
     assert isinstance(beside, SaliencyPrior)
     raised = seen + 1e-3 * seen.amax(-1, keepdim=True)
     expected = belief.probability(1).log() + 0.4 * (raised / raised.sum(-1, keepdim=True)).log()
@@ -276,7 +276,7 @@ def test_policies_that_need_a_target_position_work_with_learned_evidence(model, 
 
 def test_attention_maps_replace_a_policy():
     attention = torch.rand(12, 2, 12)
-    candidate = Candidate(strategy("ivsn"), attention=attention, fovea=0.2)
+    candidate = Candidate(strategy("ivsn", fovea=0.2), attention)
     acquisition = candidate.acquisition(torch.tensor([2]), GRID, torch.tensor([5]))
     visited = torch.zeros(1, 12, dtype=torch.bool)
     visited[0, 5] = True

@@ -153,7 +153,10 @@ def test_saliency_prior_is_that_of_the_fixated_cell(look, model):
     noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
     table = torch.rand(12, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64) + 0.1
     observer, policy = FixedLook(look), policies.Surprise(model)
-    explorer, answers = Candidate(Strategy(observer, policy), table, 0.5), answers_of(ANNOTATION, GRID, 4)
+    explorer, answers = (
+        Candidate(Strategy(observer, policy), saliency=table, weight=0.5),
+        answers_of(ANNOTATION, GRID, 4),
+    )
     progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=6, batch=3)
     for outcome in progress:
         belief, visited = observer.start(1, GRID, look.likelihood), torch.zeros(1, 12, dtype=torch.bool)
@@ -173,7 +176,7 @@ def test_saliency_alone_replaces_the_policy(look):
     noise = torch.stack([explore_noise(Scenes(), episode, 12, protocol) for episode in episodes])
     saliency = torch.rand(12, 12, generator=torch.Generator().manual_seed(1))
     for table in (saliency, saliency[:1]):
-        explorer = Candidate(Strategy(FixedLook(look), policies.Random()), table)
+        explorer = Candidate(Strategy(FixedLook(look), policies.SaliencyMaximum()), table)
         answers = answers_of(ANNOTATION, GRID, 4)
         progress = run_explorations(episodes, explorer, NOTHING, GRID, answers, noise, shifts=11, batch=100)
         for episode, outcome in zip(episodes, progress, strict=True):

@@ -124,7 +124,7 @@ def test_saliency_alone_replaces_the_policy(scenes, look):
     noise = torch.stack([tie_noise(scenes, episode, 25, protocol) for episode in episodes])
     saliency = torch.rand(25, 25, generator=torch.Generator().manual_seed(0))
     for table in (saliency, saliency[:1]):
-        candidate = Candidate(Strategy(FixedLook(look), policies.Random()), table)
+        candidate = Candidate(Strategy(FixedLook(look), policies.SaliencyMaximum()), table)
         outcomes = run_episodes(episodes, candidate, NOTHING, GRID, noise, shifts=8, batch=4)
         for episode, outcome in zip(episodes, outcomes, strict=True):
             cells = [episode.start]

@@ -11,7 +11,7 @@ from semfov.experiments.candidates import Models, make_strategy
 from semfov.experiments.config import BeliefConfig, PolicyConfig
 from semfov.experiments.presets import label, presets, resolve
 from semfov.gaze.acquisition import CloserLook, ExpectedGain
-from semfov.gaze.policies import POLICIES, Closer, Gain, Means, Random, named_policy, policy_names
+from semfov.gaze.policies import POLICIES, Closer, Gain, Means, Random, SaliencyMaximum, named_policy, policy_names
 from semfov.strategy import Strategy
 
 GRID = Grid(5, 4, (50, 40))
@@ -187,7 +187,7 @@ def test_strategies_of_learned_maps(model):
     def strategy(name, **models):
         return make_strategy(resolve(name, "exploration"), "exploration", BeliefConfig(), 4, Models(**models), 0.15)
 
-    for name, kind in zip(LEARNED, (Random, Closer, Gain, Random, Random), strict=True):
+    for name, kind in zip(LEARNED, (Random, Closer, Gain, SaliencyMaximum, SaliencyMaximum), strict=True):
         made = strategy(name, map=model)
         assert isinstance(made, Strategy)
         assert isinstance(made.observer, LearnedMap)

@@ -46,6 +46,8 @@ def test_policy_names_of_each_task():
         "place-information",
         "entropy-limit",
         "ideal-observer",
+        "saliency",
+        "ivsn",
     ]
     assert sorted(policy_names("exploration")) == sorted(
         [
@@ -60,6 +62,7 @@ def test_policy_names_of_each_task():
             "closer-look",
             "expected-gain",
             "objects",
+            "saliency",
         ]
     )
 
@@ -107,7 +110,10 @@ def test_a_user_defined_policy_is_registered_under_its_name():
         del POLICIES["last-of-all"]
 
 
-@pytest.mark.parametrize("name", [name for name in policy_names("search") if name != "random"])
+SCENELESS = [name for name in policy_names("search") if POLICIES[name].table is None]
+
+
+@pytest.mark.parametrize("name", [name for name in SCENELESS if name != "random"])
 def test_a_copied_or_pickled_search_policy_gives_equal_values(name, means):
     policy = named_policy(name, "search", means)
     beta = torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)) + 0.1
@@ -132,18 +138,18 @@ def test_a_copied_or_pickled_exploration_policy_gives_equal_values(name, means):
 
 
 def test_a_missing_model_is_an_error_when_the_policy_is_made():
-    free = {"random", "non-predictive", "closer-look", "objects"}
+    free = {"random", "non-predictive", "closer-look", "objects", "saliency", "ivsn"}
     for task in ("search", "exploration"):
         for name in policy_names(task):
             if name in free:
-                named_policy(name, task)(1, GRID)
+                named_policy(name, task)
                 continue
             needed = "a learned map" if name == "expected-gain" else "an observation model"
             with pytest.raises(InputError, match=f"policy '{name}': expected {needed}"):
                 named_policy(name, task)
 
 
-@pytest.mark.parametrize("name", [name for name in policy_names("search") if name != "random"])
+@pytest.mark.parametrize("name", [name for name in SCENELESS if name != "random"])
 def test_the_error_for_a_missing_target_names_the_policy(name, means):
     with pytest.raises(InputError, match=f"policy '{name}': expected a target"):
         named_policy(name, "search", means)(None, GRID)
@@ -154,3 +160,37 @@ def test_a_policy_for_another_task_is_refused(means):
         named_policy("kl", "search", means)
     with pytest.raises(InputError, match="exploration policy 'predictive'"):
         named_policy("predictive", "exploration", means)
+
+
+@pytest.mark.parametrize("name", SCENELESS)
+def test_a_policy_without_a_table_makes_the_same_in_every_scene(name, means):
+    policy = named_policy(name, "search", means)
+    beta = torch.rand(2, 12, 3, generator=torch.Generator().manual_seed(1)) + 0.1
+    inside = policy.in_scene(1, GRID, None, torch.tensor([3, 5]))
+    assert torch.equal(values_of(inside, beta), values_of(policy(1, GRID), beta))
+
+
+def test_policies_take_their_table_of_a_scene():
+    """Of the saliency seen from the fixated cell, and of the attention seen from it to the target."""
+    draws = torch.Generator().manual_seed(2)
+    saliency, attention, cell = torch.rand(12, 12, generator=draws), torch.rand(12, 2, 12, generator=draws), [3, 7]
+    closest, visited = GRID.cell_distance[cell], torch.zeros(2, 12, dtype=torch.bool)
+    visited[0, 3] = visited[1, 7] = True
+    belief = DirichletBelief(torch.ones(2, 12, 3), closest)
+
+    def values(name, table):
+        policy = named_policy(name, "search", Means(fovea=0.2))
+        return policy.in_scene(torch.tensor([2, 1]), GRID, table, torch.tensor(cell))(belief, visited)
+
+    assert torch.equal(values("saliency", saliency), saliency[cell])
+    assert torch.equal(values("saliency", saliency[:1]), saliency[[0, 0]])
+    torch.testing.assert_close(values("ivsn", attention), attention[cell, [1, 0]])
+    assert named_policy("ivsn", "search", Means(fovea=0.2)).fovea == 0.2
+
+
+@pytest.mark.parametrize("name", [name for name, kind in POLICIES.items() if kind.table is not None])
+def test_a_missing_table_is_an_error_that_names_the_policy(name):
+    policy = named_policy(name, "search")
+    for make in (lambda: policy(1, GRID), lambda: policy.in_scene(1, GRID, None, torch.tensor([0]))):
+        with pytest.raises(InputError, match=f"policy '{name}': expected the {policy.table} of "):
+            make()

@@ -1,6 +1,16 @@
 """Policies, registered by name: each makes the acquisition function for a target on a grid."""
 
-from semfov.gaze.policies.base import POLICIES, Means, ModelPolicy, Policy, Task, named_policy, policy_names, wanted
+from semfov.gaze.policies.base import (
+    POLICIES,
+    Means,
+    ModelPolicy,
+    Policy,
+    Table,
+    Task,
+    named_policy,
+    policy_names,
+    wanted,
+)
 from semfov.gaze.policies.exploration import (
     KL,
     Accuracy,
@@ -23,6 +33,7 @@ from semfov.gaze.policies.search import (
     Predictive,
     Random,
 )
+from semfov.gaze.policies.tables import SaliencyMaximum, TablePolicy, TemplateSearch
 
 __all__ = [
     "KL",
@@ -46,8 +57,12 @@ __all__ = [
     "Policy",
     "Predictive",
     "Random",
+    "SaliencyMaximum",
     "Surprise",
+    "Table",
+    "TablePolicy",
     "Task",
+    "TemplateSearch",
     "named_policy",
     "policy_names",
     "wanted",
